@@ -1,0 +1,116 @@
+"""Rigid motions in three dimensions as plain arrays.
+
+A pose ``b_from_a`` is ``(..., 7)`` float64: quaternion x, y, z, w, then translation, with ``x_b = R x_a + t``.
+Every function broadcasts over leading axes. Quaternions and rotation formulas follow Sola et al., "A micro Lie theory
+for state estimation in robotics", 2018, and Sola, "Quaternion kinematics for the error-state Kalman filter", 2017.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+IDENTITY: Array = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+
+
+def skew(v: ArrayLike) -> Array:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3): ``skew(v) @ w == cross(v, w)``."""
+    v = np.asarray(v, np.float64)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def rotation_matrix(pose_or_quaternion: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) of poses (..., 7) or unit quaternions (..., 4), x y z w."""
+    q = np.asarray(pose_or_quaternion, np.float64)
+    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def quaternion(rotation: ArrayLike) -> Array:
+    """Unit quaternions (..., 4), x y z w with w >= 0, of rotation matrices (..., 3, 3).
+
+    Shepperd's method: the largest of the four components is found first, so that nothing cancels.
+    """
+    m = np.asarray(rotation, np.float64)
+    trace = np.trace(m, axis1=-2, axis2=-1)
+    # 4 q_i q_j, from sums and differences of the entries; row i is 4 q_i times the quaternion.
+    products = np.empty((*m.shape[:-2], 4, 4))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        products[..., i, i] = 1 + 2 * m[..., i, i] - trace
+        products[..., i, j] = products[..., j, i] = m[..., j, i] + m[..., i, j]
+        products[..., i, 3] = products[..., 3, i] = m[..., k, j] - m[..., j, k]
+    products[..., 3, 3] = 1 + trace
+    largest = np.argmax(np.diagonal(products, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., 3:] < 0, -q, q)
+
+
+def from_matrix(rotation: ArrayLike, translation: ArrayLike) -> Array:
+    """Poses (..., 7) of rotation matrices (..., 3, 3) and translations (..., 3)."""
+    return np.concatenate([quaternion(rotation), np.asarray(translation, np.float64)], -1)
+
+
+def compose(c_from_b: ArrayLike, b_from_a: ArrayLike) -> Array:
+    """``c_from_a``: first the second argument, then the first; read as fractions that cancel."""
+    left, right = np.asarray(c_from_b, np.float64), np.asarray(b_from_a, np.float64)
+    rotation = rotation_matrix(left) @ rotation_matrix(right)
+    return from_matrix(rotation, apply(left, right[..., 4:]))
+
+
+def inverse(b_from_a: ArrayLike) -> Array:
+    """``a_from_b``."""
+    pose = np.asarray(b_from_a, np.float64)
+    q = pose[..., :4] * np.array([-1.0, -1.0, -1.0, 1.0])
+    translation = -np.einsum("...ij,...j->...i", rotation_matrix(q), pose[..., 4:])
+    return np.concatenate([q, translation], -1)
+
+
+def apply(b_from_a: ArrayLike, x_a: ArrayLike) -> Array:
+    """Points (..., 3) moved from frame a to frame b."""
+    pose = np.asarray(b_from_a, np.float64)
+    return np.einsum("...ij,...j->...i", rotation_matrix(pose), np.asarray(x_a, np.float64)) + pose[..., 4:]
+
+
+def center(cam_from_world: ArrayLike) -> Array:
+    """Camera centres (..., 3) in the world: ``-R^T t``."""
+    return inverse(cam_from_world)[..., 4:]
+
+
+def exp_so3(w: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians (Rodrigues)."""
+    w = np.asarray(w, np.float64)
+    angle2 = np.sum(w * w, -1)
+    angle = np.sqrt(angle2)
+    small = angle2 < 1e-12
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1 - angle2 / 6, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - angle2 / 24, (1 - np.cos(safe)) / safe**2)
+    k = skew(w)
+    return np.eye(3) + a[..., None, None] * k + b[..., None, None] * (k @ k)
+
+
+def log_so3(rotation: ArrayLike) -> Array:
+    """Rotation vectors (..., 3) in radians, of norm at most pi, of rotation matrices (..., 3, 3)."""
+    q = quaternion(rotation)
+    norm = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    half = np.arctan2(norm, q[..., 3:])
+    # sin(x)/x by its series near zero, where the quotient would lose its digits
+    factor = np.where(norm < 1e-8, 2.0 / np.maximum(q[..., 3:], 0.5), 2 * half / np.where(norm < 1e-8, 1.0, norm))
+    return factor * q[..., :3]
+
+
+def rotation_angle_deg(rotation: ArrayLike) -> Array:
+    """Angles (...) in degrees, 0 to 180, of rotation matrices (..., 3, 3)."""
+    return np.degrees(np.linalg.norm(log_so3(rotation), axis=-1))

@@ -1,0 +1,147 @@
+"""The state of a reconstruction: cameras, poses and points beside the tracks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.geometry import rigid3
+from sfmapp.scene.camera import Camera, distort
+from sfmapp.scene.tracks import Tracks
+
+
+@dataclass
+class Reconstruction:
+    """Flat arrays over images (I), tracks (T) and observations (O).
+
+    Attributes:
+        cameras: intrinsics, few.
+        image_names: I names, relative to the image folder, with forward slashes.
+        image_camera_idx: (I,) int32, position in ``cameras``.
+        cam_from_world: (I, 7) float64, quaternion x y z w and translation; NaN where unregistered.
+        tracks: the observations.
+        point_xyz: (T, 3) float64, world; NaN where not triangulated.
+        obs_is_inlier: (O,) bool: the observation supports its point. False wherever the image is unregistered or the
+            point not triangulated.
+        point_rgb: (T, 3) uint8.
+    """
+
+    cameras: list[Camera]
+    image_names: list[str]
+    image_camera_idx: NDArray[np.int32]
+    cam_from_world: NDArray[np.float64]
+    tracks: Tracks
+    point_xyz: NDArray[np.float64]
+    obs_is_inlier: NDArray[np.bool_]
+    point_rgb: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+
+    def __post_init__(self) -> None:
+        if len(self.point_rgb) != self.tracks.num_tracks:
+            self.point_rgb = np.zeros((self.tracks.num_tracks, 3), np.uint8)
+
+    @staticmethod
+    def empty(
+        cameras: list[Camera], image_names: list[str], image_camera_idx: NDArray[np.int32], tracks: Tracks
+    ) -> Reconstruction:
+        """Nothing registered and nothing triangulated yet."""
+        return Reconstruction(
+            list(cameras),
+            list(image_names),
+            np.asarray(image_camera_idx, np.int32),
+            np.full((len(image_names), 7), np.nan),
+            tracks,
+            np.full((tracks.num_tracks, 3), np.nan),
+            np.zeros(tracks.num_observations, bool),
+        )
+
+    def copy(self) -> Reconstruction:
+        """A copy that shares only the tracks and the (immutable) cameras."""
+        return Reconstruction(
+            list(self.cameras),
+            list(self.image_names),
+            self.image_camera_idx.copy(),
+            self.cam_from_world.copy(),
+            self.tracks,
+            self.point_xyz.copy(),
+            self.obs_is_inlier.copy(),
+            self.point_rgb.copy(),
+        )
+
+    @property
+    def is_registered(self) -> NDArray[np.bool_]:
+        """(I,) bool."""
+        return ~np.isnan(self.cam_from_world[:, 0])
+
+    @property
+    def registered_idx(self) -> NDArray[np.int64]:
+        """(R,) positions of the registered images."""
+        return np.flatnonzero(self.is_registered)
+
+    @property
+    def is_triangulated(self) -> NDArray[np.bool_]:
+        """(T,) bool."""
+        return ~np.isnan(self.point_xyz[:, 0])
+
+    @property
+    def centers(self) -> NDArray[np.float64]:
+        """(I, 3) camera centres in the world, NaN where unregistered."""
+        return rigid3.center(self.cam_from_world)
+
+    def canonical_cameras(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """(C, 8) canonical intrinsics and (C,) fisheye flags for the kernels."""
+        return (
+            np.array([camera.canonical for camera in self.cameras]).reshape(-1, 8),
+            np.array([camera.is_fisheye for camera in self.cameras], bool),
+        )
+
+    def residuals_px(self) -> NDArray[np.float64]:
+        """(O, 2) projected minus observed pixel; NaN where the image or the point is missing, or behind the camera."""
+        canonical, fisheye = self.canonical_cameras()
+        out = np.empty((self.tracks.num_observations, 2))
+        reprojection_residuals(
+            rigid3.rotation_matrix(self.cam_from_world), self.cam_from_world[:, 4:].copy(), self.image_camera_idx,
+            canonical, fisheye, self.point_xyz, self.tracks.obs_image_idx, self.tracks.obs_track_idx,
+            self.tracks.obs_xy, out,
+        )  # fmt: skip
+        return out
+
+    def summary(self) -> dict[str, float | int]:
+        """Counts and errors as the report prints them; the error is the mean length of the residuals in pixels."""
+        used = self.obs_is_inlier
+        errors = np.linalg.norm(self.residuals_px()[used], axis=1)
+        num_points = int(self.is_triangulated.sum())
+        num_registered = int(self.is_registered.sum())
+        return {
+            "num_images": len(self.image_names),
+            "num_registered": num_registered,
+            "num_points": num_points,
+            "num_observations": int(used.sum()),
+            "mean_track_length": float(used.sum() / num_points) if num_points else 0.0,
+            "mean_observations_per_image": float(used.sum() / num_registered) if num_registered else 0.0,
+            "mean_reprojection_error_px": float(errors.mean()) if len(errors) else 0.0,
+            "rms_reprojection_error_px": float(np.sqrt((errors**2).mean())) if len(errors) else 0.0,
+        }
+
+
+@numba.njit(cache=True, nogil=True)
+def reprojection_residuals(
+    rotation, translation, image_camera_idx, canonical, fisheye, point_xyz, obs_image_idx, obs_track_idx, obs_xy, out
+):  # type: ignore[no-untyped-def]
+    """Fill out (O, 2) with projected minus observed pixels; NaN for missing images and points and behind the camera."""
+    for o in range(obs_image_idx.shape[0]):
+        i = obs_image_idx[o]
+        p = obs_track_idx[o]
+        x0, x1, x2 = point_xyz[p, 0], point_xyz[p, 1], point_xyz[p, 2]
+        z = rotation[i, 2, 0] * x0 + rotation[i, 2, 1] * x1 + rotation[i, 2, 2] * x2 + translation[i, 2]
+        if not z > 1e-12:
+            out[o, 0] = out[o, 1] = np.nan
+            continue
+        x = rotation[i, 0, 0] * x0 + rotation[i, 0, 1] * x1 + rotation[i, 0, 2] * x2 + translation[i, 0]
+        y = rotation[i, 1, 0] * x0 + rotation[i, 1, 1] * x1 + rotation[i, 1, 2] * x2 + translation[i, 1]
+        k = image_camera_idx[i]
+        u, v = distort(fisheye[k], canonical[k], x / z, y / z)
+        out[o, 0] = u - obs_xy[o, 0]
+        out[o, 1] = v - obs_xy[o, 1]
