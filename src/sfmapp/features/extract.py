@@ -1,0 +1,270 @@
+"""The stage that finds and describes keypoints in every image."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.errors import InputError, UsageError
+from sfmapp.events import Events
+from sfmapp.features.features import Features
+from sfmapp.features.orb import extract_orb
+from sfmapp.features.sift import CONTRAST_THRESHOLD, extract_sift
+
+if TYPE_CHECKING:
+    from sfmapp.images.folder import ImageRecord, ImageSet
+
+STAGE = "features"
+# fewer keypoints than this and an image will hardly be registered: the report says so
+FEW_FEATURES = 100
+
+
+@dataclass(frozen=True)
+class FeatureOptions:
+    """Options of the stage ``features``."""
+
+    kind: Literal["sift", "orb"] = "sift"
+    """Detector and descriptor; orb is some ten times faster and less exact."""
+    max_num_features: int = 8192
+    """Keypoints per image, at most; the strongest are kept."""
+    max_size_px: int = 3200
+    """Larger images are scaled down to this longer side for detection; coordinates stay those of the full image."""
+    contrast_threshold: float = CONTRAST_THRESHOLD
+    """SIFT: least contrast over an octave, grey levels in [0, 1]; lowered for images that would yield few keypoints."""
+    edge_threshold: float = 10.0
+    """SIFT: largest ratio of principal curvatures; larger keeps more keypoints along edges."""
+    max_num_orientations: int = 2
+    """SIFT: descriptors at one place, at most."""
+    memory_mb: int | None = None
+    """Memory that all workers together may take; None for half of what is free at the start."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("sift", "orb"):
+            raise UsageError(f"features.kind must be sift or orb, got {self.kind!r}")
+        for name in ("max_num_features", "max_size_px", "max_num_orientations"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"features.{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("contrast_threshold", "edge_threshold"):
+            if not getattr(self, name) > 0:
+                raise UsageError(f"features.{name} must be positive, got {getattr(self, name)}")
+        if self.memory_mb is not None and self.memory_mb < 1:
+            raise UsageError(f"features.memory_mb must be at least 1, got {self.memory_mb}")
+
+
+def extract_features(
+    image_set: ImageSet,
+    options: FeatureOptions,
+    *,
+    threads: int,
+    events: Events,
+    known: Mapping[int, Features] | None = None,
+    on_features: Callable[[int, Features], None] | None = None,
+) -> tuple[list[Features], dict[str, Any]]:
+    """Find and describe the keypoints of all images.
+
+    Args:
+        image_set: the images.
+        options: see :class:`FeatureOptions`.
+        threads: images worked on at a time, at most; fewer where memory is short. The result does not depend on it.
+        events: receives the progress, image by image, and warnings that name the file.
+        known: features by position of the image that need not be extracted again.
+        on_features: called with position and features of each newly extracted image, in the calling thread, in the
+            order in which images are done: the place to store them.
+
+    Returns:
+        Features in the order of the images, empty for an image that cannot be read, and a JSON-able report.
+    """
+    known = known or {}
+    images = image_set.images
+    result = [known.get(i) for i in range(len(images))]
+    todo = [i for i in range(len(images)) if result[i] is None]
+    reports: dict[int, dict[str, Any]] = {}
+    start, start_cpu = time.perf_counter(), time.process_time()
+    events.started(STAGE, f"{options.kind} on {len(todo)} images", total=len(todo), num_known=len(images) - len(todo))
+    budget = _MemoryBudget(_budget_bytes(options))
+
+    def work(i: int) -> tuple[Features, dict[str, Any]]:
+        with budget.hold(_bytes_needed(images[i], options)):
+            return extract_image(images[i], options)
+
+    with _single_threaded_opencv(), ThreadPoolExecutor(max(1, threads)) as pool:
+        jobs: dict[Future[tuple[Features, dict[str, Any]]], int] = {pool.submit(work, i): i for i in todo}
+        try:
+            for job in as_completed(jobs):
+                i = jobs[job]
+                features, reports[i] = job.result()
+                result[i] = features
+                if on_features is not None:
+                    on_features(i, features)
+                for warning in reports[i]["warnings"]:
+                    events.warned(STAGE, warning, image=images[i].name)
+                events.advanced(STAGE, message=images[i].name, image_idx=i, num_features=len(features))
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    done = [features for features in result if features is not None]
+    report = _report(images, done, reports, options)
+    report |= {"seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - start_cpu}
+    events.finished(STAGE, f"{report['num_features']} keypoints in {len(images)} images", **report)
+    return done, report
+
+
+def extract_image(record: ImageRecord, options: FeatureOptions) -> tuple[Features, dict[str, Any]]:
+    """Features of one image and the line of the report about it; no features if it cannot be read."""
+    from sfmapp.images.pixels import read_mask, read_rgb
+
+    start = time.thread_time()
+    line: dict[str, Any] = {"name": record.name, "num_features": 0, "warnings": []}
+    try:
+        rgb = read_rgb(record)
+        usable = read_mask(record)
+    except InputError as error:
+        line["warnings"].append(f"{record.name}: no features, {error}")
+        return empty_features(options.kind), line
+    features, line["scale"], line["contrast_threshold"] = features_from_pixels(rgb, usable, options)
+    line["num_features"] = len(features)
+    line["cpu_seconds"] = time.thread_time() - start
+    if len(features) == 0:
+        line["warnings"].append(f"{record.name}: no features found ({_why_none(rgb, usable)})")
+    elif len(features) < min(FEW_FEATURES, options.max_num_features):
+        line["warnings"].append(f"{record.name}: only {len(features)} features found: too little texture or contrast")
+    return features, line
+
+
+def features_from_pixels(
+    rgb: NDArray[np.uint8], usable: NDArray[np.bool_] | None, options: FeatureOptions
+) -> tuple[Features, float, float | None]:
+    """Features of pixels in memory.
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        usable: (H, W) bool, False where nothing may be detected; None for everywhere.
+
+    Returns:
+        The features, the factor that the image was scaled by, and the contrast threshold in use (None for ORB).
+    """
+    import cv2
+
+    height, width = rgb.shape[:2]
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    scale = min(1.0, options.max_size_px / max(height, width))
+    if scale < 1.0:
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+        if usable is not None:
+            usable = cv2.resize(usable.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) != 0
+    threshold: float | None = None
+    if options.kind == "sift":
+        keypoints, descriptors, threshold = extract_sift(
+            gray,
+            usable,
+            max_num_features=options.max_num_features,
+            max_num_orientations=options.max_num_orientations,
+            contrast_threshold=options.contrast_threshold,
+            edge_threshold=options.edge_threshold,
+        )
+    else:
+        keypoints, descriptors = extract_orb(gray, usable, max_num_features=options.max_num_features)
+    if scale < 1.0:
+        # house pixels have their origin at the corner of the image, so scaling is a plain product
+        factor = np.array([width / gray.shape[1], height / gray.shape[0]], np.float32)
+        keypoints[:, :2] *= factor
+        keypoints[:, 2] *= factor.mean()
+    x = np.clip(keypoints[:, 0].astype(np.int64), 0, width - 1)
+    y = np.clip(keypoints[:, 1].astype(np.int64), 0, height - 1)
+    return Features(keypoints, descriptors, rgb[y, x]), scale, threshold
+
+
+def empty_features(kind: str) -> Features:
+    """No keypoints."""
+    length = 32 if kind == "orb" else 128
+    return Features(np.zeros((0, 4), np.float32), np.zeros((0, length), np.uint8), np.zeros((0, 3), np.uint8))
+
+
+def _why_none(rgb: NDArray[np.uint8], usable: NDArray[np.bool_] | None) -> str:
+    if min(rgb.shape[:2]) < 16:
+        return f"it is {rgb.shape[1]} x {rgb.shape[0]} pixels"
+    if usable is not None and not usable.any():
+        return "the mask covers all of it"
+    if int(rgb.max()) - int(rgb.min()) <= 2:
+        return "all pixels have the same colour"
+    return "too little texture or contrast"
+
+
+def _report(
+    images: tuple[ImageRecord, ...], done: list[Features], lines: dict[int, dict[str, Any]], options: FeatureOptions
+) -> dict[str, Any]:
+    per_image = [
+        lines.get(i, {"name": image.name, "num_features": len(done[i]), "known": True, "warnings": []})
+        for i, image in enumerate(images)
+    ]
+    return {
+        "kind": options.kind,
+        "num_images": len(images),
+        "num_known": len(images) - len(lines),
+        "num_features": sum(len(features) for features in done),
+        "images": per_image,
+        "warnings": [warning for line in per_image for warning in line["warnings"]],
+    }
+
+
+def _bytes_needed(record: ImageRecord, options: FeatureOptions) -> int:
+    """Estimate of the memory that one image takes at the peak of its extraction."""
+    pixels = record.width * record.height
+    detected = pixels * min(1.0, options.max_size_px / max(record.width, record.height)) ** 2
+    # three channels, grey and mask of the full image; OpenCV keeps the whole pyramid of the doubled image
+    per_pixel = 260 if options.kind == "sift" else 12
+    return int(5 * pixels + per_pixel * detected)
+
+
+def _budget_bytes(options: FeatureOptions) -> int:
+    if options.memory_mb is not None:
+        return options.memory_mb << 20
+    try:
+        with open("/proc/meminfo") as lines:
+            free_kb = next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        free_kb = 4 << 20
+    return free_kb << 9
+
+
+class _MemoryBudget:
+    """Lets workers go ahead while their needs together fit; a single one may exceed it, alone."""
+
+    def __init__(self, num_bytes: int) -> None:
+        self._free = self._total = num_bytes
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def hold(self, num_bytes: int) -> Iterator[None]:
+        need = min(num_bytes, self._total)
+        with self._changed:
+            self._changed.wait_for(lambda: self._free >= need)
+            self._free -= need
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._free += need
+                self._changed.notify_all()
+
+
+@contextmanager
+def _single_threaded_opencv() -> Iterator[None]:
+    """Images are the unit of parallel work: OpenCV's own threads would only compete with it."""
+    import cv2
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
