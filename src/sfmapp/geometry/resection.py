@@ -1,0 +1,89 @@
+"""The pose of a camera from points with known positions: RANSAC over P3P, with the focal length searched if unknown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.geometry import rigid3
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Resection:
+    """A pose and the correspondences that agree with it.
+
+    Attributes:
+        cam_from_world: (7,) float64.
+        is_inlier: (N,) bool.
+        focal_scale: factor on the focal length that the normalised points were made with; 1 unless it was searched.
+    """
+
+    cam_from_world: Array
+    is_inlier: NDArray[np.bool_]
+    focal_scale: float = 1.0
+
+    @property
+    def num_inliers(self) -> int:
+        return int(self.is_inlier.sum())
+
+
+def estimate_pose(
+    xyz: Array, normalized: Array, max_error: float, *, confidence: float = 0.9999, max_iterations: int = 10_000
+) -> Resection | None:
+    """Pose from 3D-2D correspondences by RANSAC over P3P (Fischler and Bolles, CACM 1981; OpenCV's loop).
+
+    The result is the same at every call: OpenCV's loop starts from a fixed seed.
+
+    Args:
+        xyz: (N, 3) float64 points in the world.
+        normalized: (N, 2) float64 undistorted image points X/Z, Y/Z; NaN where the lens has no inverse.
+        max_error: largest distance of an inlier in the normalised image plane.
+        confidence: wanted probability that one all-inlier sample was drawn.
+        max_iterations: bound on the number of samples.
+
+    Returns:
+        The pose with at least four inliers in front of the camera, or None.
+    """
+    import cv2
+
+    valid = np.flatnonzero(~np.isnan(normalized[:, 0]))
+    if len(valid) < 4:
+        return None
+    try:
+        found, rotation_vector, translation, _ = cv2.solvePnPRansac(
+            np.ascontiguousarray(xyz[valid]), np.ascontiguousarray(normalized[valid]), np.eye(3), None,
+            flags=cv2.SOLVEPNP_P3P, reprojectionError=max_error, confidence=confidence, iterationsCount=max_iterations,
+        )  # fmt: skip
+    except cv2.error:  # degenerate samples only, such as points on a line
+        return None
+    if not found or not (np.isfinite(rotation_vector).all() and np.isfinite(translation).all()):
+        return None
+    pose = rigid3.from_matrix(rigid3.exp_so3(rotation_vector.ravel()), translation.ravel())
+    in_camera = rigid3.apply(pose, xyz)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.linalg.norm(in_camera[:, :2] / in_camera[:, 2:] - normalized, axis=1)
+    is_inlier = (in_camera[:, 2] > 0) & (error <= max_error)  # False for NaN
+    return Resection(pose, is_inlier) if is_inlier.sum() >= 4 else None
+
+
+def estimate_pose_and_focal(xyz: Array, normalized: Array, max_error: float, focal_scales: Array) -> Resection | None:
+    """Pose and focal length: :func:`estimate_pose` over a grid of focal lengths, the one with most inliers wins.
+
+    The lens distortion is taken as small: scaling the focal scales the normalised points.
+
+    Args:
+        xyz, normalized, max_error: as in :func:`estimate_pose`, made with a focal length f0.
+        focal_scales: (K,) factors on f0 to try, the most plausible first; ties go to the earlier one.
+    """
+    best: Resection | None = None
+    for scale in focal_scales:
+        found = estimate_pose(
+            xyz, normalized / scale, max_error / scale, confidence=0.99, max_iterations=1000
+        )
+        if found is not None and (best is None or found.num_inliers > best.num_inliers):
+            best = Resection(found.cam_from_world, found.is_inlier, float(scale))
+    return best

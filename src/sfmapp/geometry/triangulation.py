@@ -1,0 +1,326 @@
+"""Points from rays: two-view and robust multi-view triangulation over flat arrays.
+
+Two rays give the midpoint of their common perpendicular (Hartley and Sturm, "Triangulation", CVIU 1997, section 5.3).
+A track is triangulated like COLMAP's (Schoenberger and Frahm, CVPR 2016, section 4.3): hypotheses from pairs of
+observations, the one with most inliers wins. The winner is refined on its inliers by minimising the angular error,
+reweighted by depth: for the small residuals that are left this is the reprojection error to first order.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.scene.camera import distort, undistort
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Int32s = NDArray[np.int32]
+Bools = NDArray[np.bool_]
+
+# A track of 10 observations has 45 pairs; longer ones are sampled with about as many.
+MAX_HYPOTHESES = 45
+
+
+@numba.njit(cache=True, nogil=True)
+def _midpoint(c1: Array, d1: Array, c2: Array, d2: Array, out: Array) -> float:
+    """Midpoint of two rays into out (3,); returns the cosine between the rays, 2.0 if the point is behind a camera."""
+    b = d1[0] * d2[0] + d1[1] * d2[1] + d1[2] * d2[2]
+    w0, w1, w2 = c2[0] - c1[0], c2[1] - c1[1], c2[2] - c1[2]
+    p = w0 * d1[0] + w1 * d1[1] + w2 * d1[2]
+    q = w0 * d2[0] + w1 * d2[1] + w2 * d2[2]
+    det = 1.0 - b * b
+    if det < 1e-12:
+        return 2.0
+    s = (p - b * q) / det
+    t = (b * p - q) / det
+    if s <= 0.0 or t <= 0.0:
+        return 2.0
+    for k in range(3):
+        out[k] = 0.5 * (c1[k] + s * d1[k] + c2[k] + t * d2[k])
+    return b
+
+
+@numba.njit(cache=True, nogil=True)
+def _squared_error(
+    xyz: Array, rotation: Array, translation: Array, fisheye: bool, c: Array, u: float, v: float
+) -> float:
+    """Squared reprojection error in pixels; infinite behind the camera."""
+    z = rotation[2, 0] * xyz[0] + rotation[2, 1] * xyz[1] + rotation[2, 2] * xyz[2] + translation[2]
+    if not z > 1e-12:
+        return math.inf
+    x = rotation[0, 0] * xyz[0] + rotation[0, 1] * xyz[1] + rotation[0, 2] * xyz[2] + translation[0]
+    y = rotation[1, 0] * xyz[0] + rotation[1, 1] * xyz[1] + rotation[1, 2] * xyz[2] + translation[1]
+    pu, pv = distort(fisheye, c, x / z, y / z)
+    du, dv = pu - u, pv - v
+    return du * du + dv * dv
+
+
+@numba.njit(cache=True, nogil=True)
+def _refine(xyz: Array, centers: Array, rays: Array, used: Bools, k: int) -> bool:
+    """Three rounds of depth-weighted least squares on the distances to the used rays; False if it fails."""
+    for _ in range(3):
+        a00 = a01 = a02 = a11 = a12 = a22 = 0.0
+        b0 = b1 = b2 = 0.0
+        for i in range(k):
+            if not used[i]:
+                continue
+            dx, dy, dz = rays[i, 0], rays[i, 1], rays[i, 2]
+            cx, cy, cz = centers[i, 0], centers[i, 1], centers[i, 2]
+            depth2 = (xyz[0] - cx) ** 2 + (xyz[1] - cy) ** 2 + (xyz[2] - cz) ** 2
+            w = 1.0 / max(depth2, 1e-300)
+            m00, m01, m02 = w * (1.0 - dx * dx), -w * dx * dy, -w * dx * dz
+            m11, m12, m22 = w * (1.0 - dy * dy), -w * dy * dz, w * (1.0 - dz * dz)
+            a00 += m00
+            a01 += m01
+            a02 += m02
+            a11 += m11
+            a12 += m12
+            a22 += m22
+            b0 += m00 * cx + m01 * cy + m02 * cz
+            b1 += m01 * cx + m11 * cy + m12 * cz
+            b2 += m02 * cx + m12 * cy + m22 * cz
+        c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
+        det = a00 * c00 + a01 * c01 + a02 * c02
+        trace = a00 + a11 + a22
+        if not det > 1e-18 * trace * trace * trace:
+            return False
+        c11, c12, c22 = a00 * a22 - a02 * a02, a01 * a02 - a00 * a12, a00 * a11 - a01 * a01
+        xyz[0] = (c00 * b0 + c01 * b1 + c02 * b2) / det
+        xyz[1] = (c01 * b0 + c11 * b1 + c12 * b2) / det
+        xyz[2] = (c02 * b0 + c12 * b1 + c22 * b2) / det
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _min_cosine(xyz: Array, centers: Array, used: Bools, k: int, enough: float) -> float:
+    """Cosine of the widest angle under which the used centres see the point; stops once it is below enough."""
+    best = 1.0
+    for i in range(k):
+        if not used[i]:
+            continue
+        ax, ay, az = centers[i, 0] - xyz[0], centers[i, 1] - xyz[1], centers[i, 2] - xyz[2]
+        na = math.sqrt(ax * ax + ay * ay + az * az)
+        for j in range(i + 1, k):
+            if not used[j]:
+                continue
+            bx, by, bz = centers[j, 0] - xyz[0], centers[j, 1] - xyz[1], centers[j, 2] - xyz[2]
+            nb = math.sqrt(bx * bx + by * by + bz * bz)
+            best = min(best, (ax * bx + ay * by + az * bz) / max(na * nb, 1e-300))
+            if best <= enough:
+                return best
+    return best
+
+
+@numba.njit(cache=True, nogil=True)
+def triangulate_tracks(
+    tracks: Ints,
+    track_ptr: Ints,
+    obs_image_idx: Int32s,
+    obs_xy: Array,
+    rotation: Array,
+    translation: Array,
+    image_camera_idx: Int32s,
+    canonical: Array,
+    fisheye: Bools,
+    max_error_px: float,
+    min_angle_rad: float,
+    point_xyz: Array,
+    obs_is_inlier: Bools,
+) -> int:
+    """Triangulate tracks robustly from the registered images; returns how many succeeded.
+
+    Args:
+        tracks: (K,) int64, the tracks to try.
+        track_ptr, obs_image_idx, obs_xy: as in Tracks.
+        rotation, translation: (I, 3, 3), (I, 3) cam_from_world, NaN where unregistered.
+        image_camera_idx, canonical, fisheye: intrinsics as in Reconstruction.
+        max_error_px: largest reprojection error of an inlier.
+        min_angle_rad: smallest angle between two rays of an accepted point.
+        point_xyz, obs_is_inlier: written for the given tracks only; NaN and False where triangulation fails.
+    """
+    longest = 2
+    for t in tracks:
+        longest = max(longest, track_ptr[t + 1] - track_ptr[t])
+    obs = np.empty(longest, np.int64)
+    centers = np.empty((longest, 3))
+    rays = np.empty((longest, 3))
+    used = np.empty(longest, np.bool_)
+    best_used = np.empty(longest, np.bool_)
+    xyz = np.empty(3)
+    best_xyz = np.empty(3)
+    max_cosine = math.cos(min_angle_rad)
+    limit = max_error_px * max_error_px
+    count = 0
+    for t in tracks:
+        k = 0
+        for o in range(track_ptr[t], track_ptr[t + 1]):
+            obs_is_inlier[o] = False
+            i = obs_image_idx[o]
+            if math.isnan(translation[i, 0]):
+                continue
+            cam = image_camera_idx[i]
+            x, y = undistort(fisheye[cam], canonical[cam], obs_xy[o, 0], obs_xy[o, 1])
+            if math.isnan(x):
+                continue
+            norm = 1.0 / math.sqrt(x * x + y * y + 1.0)
+            r = rotation[i]
+            for a in range(3):
+                rays[k, a] = (r[0, a] * x + r[1, a] * y + r[2, a]) * norm
+                centers[k, a] = -(
+                    r[0, a] * translation[i, 0] + r[1, a] * translation[i, 1] + r[2, a] * translation[i, 2]
+                )
+            obs[k] = o
+            k += 1
+        for a in range(3):
+            point_xyz[t, a] = math.nan
+        if k < 2:
+            continue
+        num_pairs = k * (k - 1) // 2
+        stride = max(1, num_pairs // MAX_HYPOTHESES)
+        if stride > 1 and stride % 2 == 0:
+            stride += 1
+        best_count = 1
+        best_cost = math.inf
+        index = 0
+        for i in range(k):
+            for j in range(i + 1, k):
+                index += 1
+                if index % stride != 0:
+                    continue
+                cosine = _midpoint(centers[i], rays[i], centers[j], rays[j], xyz)
+                if cosine > max_cosine:
+                    continue
+                inliers = 0
+                cost = 0.0
+                for m in range(k):
+                    image = obs_image_idx[obs[m]]
+                    cam = image_camera_idx[image]
+                    error = _squared_error(
+                        xyz, rotation[image], translation[image], fisheye[cam], canonical[cam],
+                        obs_xy[obs[m], 0], obs_xy[obs[m], 1],
+                    )  # fmt: skip
+                    used[m] = error <= limit
+                    if used[m]:
+                        inliers += 1
+                        cost += error
+                    else:
+                        cost += limit
+                if inliers > best_count or (inliers == best_count and cost < best_cost and inliers > 1):
+                    best_count, best_cost = inliers, cost
+                    for a in range(3):
+                        best_xyz[a] = xyz[a]
+                    for m in range(k):
+                        best_used[m] = used[m]
+        if best_cost == math.inf:
+            continue
+        if k > 2 and not _refine(best_xyz, centers, rays, best_used, k):
+            continue
+        inliers = 0
+        for m in range(k):
+            image = obs_image_idx[obs[m]]
+            cam = image_camera_idx[image]
+            best_used[m] = (
+                _squared_error(
+                    best_xyz, rotation[image], translation[image], fisheye[cam], canonical[cam],
+                    obs_xy[obs[m], 0], obs_xy[obs[m], 1],
+                )
+                <= limit
+            )  # fmt: skip
+            inliers += best_used[m]
+        if inliers < 2 or _min_cosine(best_xyz, centers, best_used, k, max_cosine) > max_cosine:
+            continue
+        for a in range(3):
+            point_xyz[t, a] = best_xyz[a]
+        for m in range(k):
+            obs_is_inlier[obs[m]] = best_used[m]
+        count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def classify_observations(
+    tracks: Ints,
+    track_ptr: Ints,
+    obs_image_idx: Int32s,
+    obs_xy: Array,
+    rotation: Array,
+    translation: Array,
+    image_camera_idx: Int32s,
+    canonical: Array,
+    fisheye: Bools,
+    max_error_px: float,
+    min_angle_rad: float,
+    point_xyz: Array,
+    obs_is_inlier: Bools,
+) -> int:
+    """Decide afresh which observations support the given triangulated tracks; returns how many points were dropped.
+
+    Arguments as in :func:`triangulate_tracks`. An observation is an inlier if its image is registered and its
+    reprojection error small enough; a point with fewer than two inliers or too small an angle becomes NaN.
+    """
+    longest = 2
+    for t in tracks:
+        longest = max(longest, track_ptr[t + 1] - track_ptr[t])
+    centers = np.empty((longest, 3))
+    used = np.empty(longest, np.bool_)
+    max_cosine = math.cos(min_angle_rad)
+    limit = max_error_px * max_error_px
+    dropped = 0
+    for t in tracks:
+        if math.isnan(point_xyz[t, 0]):
+            continue
+        k = 0
+        inliers = 0
+        for o in range(track_ptr[t], track_ptr[t + 1]):
+            i = obs_image_idx[o]
+            cam = image_camera_idx[i]
+            error = math.inf
+            if not math.isnan(translation[i, 0]):
+                error = _squared_error(
+                    point_xyz[t], rotation[i], translation[i], fisheye[cam], canonical[cam], obs_xy[o, 0], obs_xy[o, 1]
+                )
+            used[k] = error <= limit
+            obs_is_inlier[o] = used[k]
+            if used[k]:
+                inliers += 1
+                r = rotation[i]
+                for a in range(3):
+                    centers[k, a] = -(
+                        r[0, a] * translation[i, 0] + r[1, a] * translation[i, 1] + r[2, a] * translation[i, 2]
+                    )
+            k += 1
+        if inliers >= 2 and _min_cosine(point_xyz[t], centers, used, k, max_cosine) <= max_cosine:
+            continue
+        dropped += 1
+        for a in range(3):
+            point_xyz[t, a] = math.nan
+        for o in range(track_ptr[t], track_ptr[t + 1]):
+            obs_is_inlier[o] = False
+    return dropped
+
+
+@numba.njit(cache=True, nogil=True)
+def widest_angles(
+    tracks: Ints, track_ptr: Ints, obs_image_idx: Int32s, obs_is_inlier: Bools, image_centers: Array, point_xyz: Array
+) -> Array:
+    """(K,) radians: widest angle under which the inlier observations of each track see its point."""
+    longest = 2
+    for t in tracks:
+        longest = max(longest, track_ptr[t + 1] - track_ptr[t])
+    centers = np.empty((longest, 3))
+    used = np.ones(longest, np.bool_)
+    out = np.empty(len(tracks))
+    for n in range(len(tracks)):
+        t = tracks[n]
+        k = 0
+        for o in range(track_ptr[t], track_ptr[t + 1]):
+            if obs_is_inlier[o]:
+                for a in range(3):
+                    centers[k, a] = image_centers[obs_image_idx[o], a]
+                k += 1
+        out[n] = math.acos(max(-1.0, min(1.0, _min_cosine(point_xyz[t], centers, used, k, -2.0))))
+    return out

@@ -1,0 +1,387 @@
+"""Incremental structure from motion: from verified matches to cameras and points.
+
+The stage reads in order: :func:`map_images` makes one model after another, :class:`Mapper` grows one. Schoenberger and
+Frahm, "Structure-from-Motion Revisited", CVPR 2016, is the pattern; the differences are that tracks are fixed before
+mapping begins and that the adjustment is cheap enough to be called after every step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.solver import adjust_bundle
+from sfmapp.errors import NoReconstructionError
+from sfmapp.events import Events
+from sfmapp.features.features import Features
+from sfmapp.images.folder import ImageSet
+from sfmapp.mapping import structure
+from sfmapp.mapping.focal import estimate_focal_ratio
+from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_initial_pairs
+from sfmapp.mapping.options import MappingOptions
+from sfmapp.mapping.register import Registration, rank_next_images, register_image
+from sfmapp.mapping.tracks import build_tracks, track_colors
+from sfmapp.scene.camera import Camera
+from sfmapp.scene.correspondences import Correspondences
+from sfmapp.scene.reconstruction import Reconstruction
+
+STAGE = "mapping"
+
+
+def map_images(
+    image_set: ImageSet,
+    features: Sequence[Features],
+    correspondences: Correspondences,
+    options: MappingOptions,
+    *,
+    adjust_options: AdjustOptions,
+    threads: int,
+    events: Events,
+) -> tuple[list[Reconstruction], dict[str, Any]]:
+    """Reconstruct cameras and points from verified matches.
+
+    Args:
+        image_set: names and cameras of the images.
+        features: of every image.
+        correspondences: verified matches between pairs of them.
+        options, adjust_options: what is accepted, and how it is adjusted.
+        threads: workers; the result does not depend on it.
+        events: told of every decision; ``decided`` events carry a ``snapshot`` of the map for a recording.
+
+    Returns:
+        The models, the one with most images first, and the report: per image what was tried and why it failed.
+
+    Raises:
+        NoReconstructionError: no model could be started; its ``report`` attribute holds the report.
+    """
+    names = [record.name for record in image_set.images]
+    image_camera_idx = np.array([record.camera_idx for record in image_set.images], np.int32)
+    tracks, track_report = build_tracks(correspondences, features)
+    events.decided(STAGE, f"{track_report['num_tracks']} tracks", **track_report)
+    cameras, focal_report = _first_cameras(image_set.cameras, image_camera_idx, correspondences, options, events)
+    attempts: dict[int, Registration] = {}
+    initial_reports: list[dict[str, Any]] = []
+    models: list[Reconstruction] = []
+    free = np.ones(len(names), bool)
+    events.started(STAGE, "mapping", total=len(names))
+    with ThreadPoolExecutor(threads) as pool:
+        while free.sum() >= 2:
+            empty = Reconstruction.empty(cameras, names, image_camera_idx, tracks)
+            mapper = Mapper(empty, correspondences, options, adjust_options, events, pool, free, attempts)
+            tried = mapper.start()
+            initial_reports.append({"model": len(models), "pairs": tried})
+            if mapper.reconstruction.is_registered.sum() < 2:
+                break
+            mapper.grow()
+            mapper.finish()
+            registered = mapper.reconstruction.is_registered
+            if registered.sum() < min(options.min_model_images, len(names)):
+                events.decided(STAGE, f"model dropped: it has only {int(registered.sum())} images")
+                free &= ~registered
+                continue
+            mapper.reconstruction.point_rgb = track_colors(tracks, features)
+            models.append(mapper.reconstruction)
+            free &= ~registered
+            if not options.multiple_models:
+                break
+    models.sort(key=lambda model: -int(model.is_registered.sum()))
+    report = {
+        "tracks": track_report,
+        "focal": focal_report,
+        "initial_pairs": initial_reports,
+        "images": _image_reports(names, models, attempts),
+        "models": [model.summary() for model in models],
+    }
+    events.finished(STAGE, f"{len(models)} model(s)", num_models=len(models))
+    if not models:
+        raise no_reconstruction(report)
+    return models, report
+
+
+def no_reconstruction(report: dict[str, Any]) -> NoReconstructionError:
+    """The failure of a run in which no model could be started, with the reasons of the best pairs."""
+    pairs = report["initial_pairs"][0]["pairs"] if report["initial_pairs"] else []
+    reason = pairs[0]["reason"] if pairs else "no two images share enough verified matches"
+    error = NoReconstructionError(
+        f"no initial pair: {reason}",
+        "take photographs that overlap by more than half while moving sideways between them; turning on the spot "
+        "gives no depth",
+    )
+    error.report = report
+    return error
+
+
+def _first_cameras(
+    cameras: Sequence[Camera],
+    image_camera_idx: NDArray[np.int32],
+    correspondences: Correspondences,
+    options: MappingOptions,
+    events: Events,
+) -> tuple[list[Camera], dict[str, Any]]:
+    """The cameras with a focal length from the pairs where nothing else is known."""
+    cameras = list(cameras)
+    if not options.estimate_focal:
+        return cameras, {}
+    ratio, data = estimate_focal_ratio(cameras, image_camera_idx, correspondences)
+    if ratio is None:
+        return cameras, data
+    events.decided(STAGE, f"first focal length {ratio:.2f} x the longer side, from {data['num_pairs']} pairs", **data)
+    return [c.with_focal(ratio * max(c.width, c.height)) if c.focal_source == "default" else c for c in cameras], data
+
+
+@dataclass
+class Mapper:
+    """Grows one model. Every method is a step of the method and changes ``reconstruction`` in place."""
+
+    reconstruction: Reconstruction
+    correspondences: Correspondences
+    options: MappingOptions
+    adjust_options: AdjustOptions
+    events: Events
+    pool: Executor
+    free: NDArray[np.bool_]
+    attempts: dict[int, Registration]
+    failed_with: dict[int, int] = field(default_factory=dict)
+    size_at_global: tuple[int, int] = (0, 0)
+
+    # ------------------------------------------------------------------ start
+
+    def start(self) -> list[dict[str, Any]]:
+        """Register the first two images; returns the pairs that were tried, each with the reason it was rejected."""
+        options = self.options
+        tried: list[dict[str, Any]] = []
+        ranked = rank_initial_pairs(self.reconstruction, self.correspondences, self.free, options)
+        inliers, angle = options.min_initial_inliers, options.min_initial_angle_deg
+        while True:
+            for pair in ranked:
+                reason = pair.reason or pair.shortfall(inliers, angle)
+                tried.append({**pair.describe(self.reconstruction.image_names), "reason": reason})
+                if not reason and self._start_from(pair):
+                    return tried
+            if inliers <= options.min_pose_inliers and angle < 2 * options.min_triangulation_angle_deg:
+                return tried
+            inliers, angle = max(inliers // 2, options.min_pose_inliers), angle / 2
+            self.events.decided(STAGE, f"no initial pair; relaxing to {inliers} matches and {angle:.1f} degrees")
+
+    def _start_from(self, pair: InitialPair) -> bool:
+        initialize_from_pair(self.reconstruction, pair)
+        self.triangulate_images(list(pair.image_idx))
+        self.adjust_globally()
+        names = [self.reconstruction.image_names[i] for i in pair.image_idx]
+        num_points = int(self.reconstruction.is_triangulated.sum())
+        if num_points < self.options.min_pose_inliers:
+            self._forget(list(pair.image_idx))
+            return False
+        self._decided(f"initial pair {names[0]} - {names[1]}: {num_points} points", list(pair.image_idx))
+        self.events.advanced(STAGE, 2)
+        return True
+
+    def _forget(self, images: list[int]) -> None:
+        self.reconstruction.cam_from_world[images] = np.nan
+        self.reconstruction.point_xyz[:] = np.nan
+        self.reconstruction.obs_is_inlier[:] = False
+
+    # ------------------------------------------------------------------- grow
+
+    def grow(self) -> None:
+        """Register images until none is left or none fits; then once more after everything was adjusted."""
+        while True:
+            while registered := self.register_next_images():
+                self.triangulate_images(registered)
+                if self.is_grown():
+                    self.adjust_globally()
+                else:
+                    self.adjust_around(registered)
+                self._decided(f"registered {self._names(registered)}", registered)
+                self.events.advanced(STAGE, len(registered))
+            if not self._candidates().size or self._size() == self.size_at_global:
+                return
+            # a second chance: the adjusted map may hold more points and better poses
+            self.adjust_globally()
+            self.failed_with.clear()
+
+    def register_next_images(self) -> list[int]:
+        """Register the best next image, and with it others that see as much of the map; returns them.
+
+        Images that failed are tried again once they see half as many points more.
+        """
+        order, scores, counts = rank_next_images(self.reconstruction, self._candidates())
+        worth = [
+            (int(i), int(s))
+            for i, s, n in zip(order, scores, counts, strict=True)
+            if n >= max(self.options.min_pose_inliers, 1.5 * self.failed_with.get(int(i), 0))
+        ]
+        registered: list[int] = []
+        while worth and not registered:
+            # "as much": the map around them is as settled as around the best, and no image hangs on another
+            batch = [i for i, score in worth if score >= 0.75 * worth[0][1]]
+            worth = worth[len(batch) :]
+            known = self._known_cameras()
+            results = self.pool.map(lambda i, known=known: self._attempt(i, known), batch)
+            registered = [result.image_idx for result in results if self._accept(result)]
+        return registered
+
+    def _attempt(self, image_idx: int, known_cameras: NDArray[np.bool_]) -> Registration:
+        camera_idx = self.reconstruction.image_camera_idx[image_idx]
+        camera = self.reconstruction.cameras[camera_idx]
+        search_focal = camera.focal_source == "default" and not camera.is_fixed and not known_cameras[camera_idx]
+        return register_image(self.reconstruction, image_idx, self.options, search_focal=search_focal)
+
+    def _accept(self, result: Registration) -> bool:
+        self.attempts[result.image_idx] = result
+        name = self.reconstruction.image_names[result.image_idx]
+        if result.cam_from_world is None:
+            self.failed_with[result.image_idx] = result.num_correspondences
+            self.events.decided(STAGE, f"{name}: {result.reason}")
+            return False
+        self.reconstruction.cam_from_world[result.image_idx] = result.cam_from_world
+        if result.focal_scale != 1.0:
+            camera_idx = self.reconstruction.image_camera_idx[result.image_idx]
+            camera = self.reconstruction.cameras[camera_idx]
+            self.reconstruction.cameras[camera_idx] = camera.with_focal(camera.focal * result.focal_scale)
+        return True
+
+    def triangulate_images(self, images: list[int]) -> None:
+        """Add the observations of newly registered images to their points, and triangulate what they make possible."""
+        tracks = self.reconstruction.tracks
+        seen = np.unique(np.concatenate([tracks.obs_track_idx[tracks.observations_of_image(i)] for i in images]))
+        seen = seen.astype(np.int64)
+        exists = self.reconstruction.is_triangulated[seen]
+        structure.filter_observations(self.reconstruction, self.options, self.pool, seen[exists])
+        missing = seen[~self.reconstruction.is_triangulated[seen]]
+        structure.triangulate(self.reconstruction, missing, self.options, self.pool)
+
+    # ----------------------------------------------------------------- adjust
+
+    def is_grown(self) -> bool:
+        """True if the model is small enough to be adjusted whole, or has grown enough since it last was."""
+        images, points = self._size()
+        return (
+            images <= 2 * self.options.local_window
+            or images >= self.options.global_growth * self.size_at_global[0]
+            or points >= self.options.global_growth * self.size_at_global[1]
+        )
+
+    def adjust_around(self, images: list[int]) -> None:
+        """Adjust new images, the registered ones that share most points with them, and those points."""
+        variable = np.zeros(len(self.free), bool)
+        variable[images] = True
+        variable[self._covisible_images(images)] = True
+        reconstruction, tracks = self.reconstruction, self.reconstruction.tracks
+        # intrinsics vary only where no image outside the window depends on them
+        outside = reconstruction.is_registered & ~variable
+        cameras = np.zeros(len(reconstruction.cameras), bool)
+        cameras[reconstruction.image_camera_idx[variable]] = True
+        cameras[reconstruction.image_camera_idx[outside]] = False
+        seen = np.unique(np.concatenate([tracks.obs_track_idx[tracks.observations_of_image(i)] for i in images]))
+        seen = seen[reconstruction.is_triangulated[seen]].astype(np.int64)
+        points = np.zeros(tracks.num_tracks, bool)
+        points[seen] = True
+        adjust_bundle(
+            reconstruction, replace(self.adjust_options, max_iterations=15, relative_cost_tolerance=1e-4),
+            variable_images=variable, variable_cameras=cameras, points=points,
+        )  # fmt: skip
+        structure.filter_observations(reconstruction, self.options, self.pool, seen)
+
+    def adjust_globally(self, final: bool = False) -> None:
+        """Adjust everything, filter, and triangulate again what was lost or has become possible."""
+        reconstruction = self.reconstruction
+        two = int(reconstruction.is_registered.sum()) < 3
+        options = self.adjust_options
+        if not final:
+            options = replace(options, max_iterations=25, relative_cost_tolerance=1e-4, refine_principal_point=False)
+        if two:  # two views cannot tell the lens from the scene
+            options = replace(options, refine_focal=False, refine_distortion=False, refine_principal_point=False)
+        adjust_bundle(reconstruction, options)
+        structure.filter_observations(reconstruction, self.options, self.pool)
+        missing = np.flatnonzero(~reconstruction.is_triangulated)
+        structure.triangulate(reconstruction, missing, self.options, self.pool)
+        self.size_at_global = self._size()
+
+    def finish(self) -> None:
+        """Adjust until the set of inliers settles."""
+        for _ in range(5):
+            before = self.reconstruction.obs_is_inlier.copy()
+            self.adjust_globally(final=True)
+            changed = int((before != self.reconstruction.obs_is_inlier).sum())
+            self.events.decided(STAGE, f"final adjustment changed {changed} observations", **self.reconstruction.summary())
+            if changed <= 1e-3 * before.sum():
+                return
+
+    # ---------------------------------------------------------------- helpers
+
+    def _size(self) -> tuple[int, int]:
+        return int(self.reconstruction.is_registered.sum()), int(self.reconstruction.is_triangulated.sum())
+
+    def _candidates(self) -> NDArray[np.int64]:
+        return np.flatnonzero(self.free & ~self.reconstruction.is_registered)
+
+    def _known_cameras(self) -> NDArray[np.bool_]:
+        """(C,) cameras that the adjustment has refined: those with at least three registered images... or any."""
+        counts = np.bincount(
+            self.reconstruction.image_camera_idx[self.reconstruction.is_registered],
+            minlength=len(self.reconstruction.cameras),
+        )
+        return counts > 0
+
+    def _covisible_images(self, images: list[int]) -> NDArray[np.int64]:
+        """The registered images that share most points with the given ones, as many as the window holds."""
+        tracks, used = self.reconstruction.tracks, self.reconstruction.obs_is_inlier
+        is_seen = np.zeros(tracks.num_tracks, bool)
+        for i in images:
+            obs = tracks.observations_of_image(i)
+            is_seen[tracks.obs_track_idx[obs[used[obs]]]] = True
+        shared = np.bincount(
+            tracks.obs_image_idx[used & is_seen[tracks.obs_track_idx]], minlength=len(self.free)
+        ).astype(np.int64)
+        shared[images] = 0
+        order = np.argsort(-shared, kind="stable")[: max(1, self.options.local_window - len(images))]
+        return order[shared[order] > 0]
+
+    def _names(self, images: list[int]) -> str:
+        return ", ".join(self.reconstruction.image_names[i] for i in images)
+
+    def _decided(self, message: str, images: list[int]) -> None:
+        summary = self.reconstruction.summary()
+        self.events.decided(
+            STAGE, f"{message}; {summary['num_points']} points, {summary['mean_reprojection_error_px']:.2f} px",
+            **summary,
+            snapshot={
+                "image_idx": images,
+                "cam_from_world": self.reconstruction.cam_from_world.copy(),
+                "point_xyz": self.reconstruction.point_xyz.astype(np.float32),
+                "num_registered": summary["num_registered"],
+                "num_points": summary["num_points"],
+                "mean_error_px": summary["mean_reprojection_error_px"],
+            },
+        )  # fmt: skip
+
+
+def _image_reports(
+    names: list[str], models: list[Reconstruction], attempts: dict[int, Registration]
+) -> list[dict[str, Any]]:
+    """Per image: the model it is in, its points and observations, and what the last attempt to register it met."""
+    reports: list[dict[str, Any]] = []
+    for i, name in enumerate(names):
+        model = next((m for m, r in enumerate(models) if r.is_registered[i]), None)
+        attempt = attempts.get(i)
+        entry: dict[str, Any] = {"name": name, "model": model, "reason": "", "num_observations": 0}
+        if attempt is not None:
+            entry.update(num_correspondences=attempt.num_correspondences, num_pose_inliers=attempt.num_inliers)
+        if model is not None:
+            reconstruction = models[model]
+            obs = reconstruction.tracks.observations_of_image(i)
+            used = obs[reconstruction.obs_is_inlier[obs]]
+            entry["num_observations"] = len(used)
+        elif attempt is not None:
+            entry["reason"] = attempt.reason
+        else:
+            entry["reason"] = "shares too few verified matches with any model"
+        reports.append(entry)
+    return reports

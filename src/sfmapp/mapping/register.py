@@ -1,0 +1,135 @@
+"""Which image comes next, and its pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.geometry import resection
+from sfmapp.mapping.options import MappingOptions
+from sfmapp.scene.camera import pixels_to_normalized
+from sfmapp.scene.reconstruction import Reconstruction
+
+PYRAMID_LEVELS = 6
+
+# Focal lengths to try for a camera that nothing is known about, as factors on its prior: 1 first, then outwards.
+_FACTORS = np.geomspace(1.0, 4.0, 9)
+FOCAL_SCALES = np.unique(np.concatenate([_FACTORS, 1 / _FACTORS]))
+FOCAL_SCALES = FOCAL_SCALES[np.argsort(np.abs(np.log(FOCAL_SCALES)), kind="stable")]
+
+
+@dataclass(frozen=True)
+class Registration:
+    """What came of the attempt to register an image.
+
+    Attributes:
+        image_idx: the image.
+        num_correspondences: keypoints whose tracks are triangulated.
+        num_inliers: how many of them agree with the pose.
+        cam_from_world: (7,) float64, or None if the attempt failed.
+        focal_scale: factor on the focal length of the image's camera.
+        reason: why it failed, with the numbers; empty if it succeeded.
+    """
+
+    image_idx: int
+    num_correspondences: int
+    num_inliers: int
+    cam_from_world: NDArray[np.float64] | None
+    focal_scale: float = 1.0
+    reason: str = ""
+
+
+@numba.njit(cache=True, nogil=True)
+def visibility_scores(
+    images: NDArray[np.int64],
+    image_ptr: NDArray[np.int64],
+    image_obs: NDArray[np.int64],
+    obs_track_idx: NDArray[np.int32],
+    obs_xy: NDArray[np.float64],
+    point_xyz: NDArray[np.float64],
+    image_size: NDArray[np.float64],
+    scores: NDArray[np.int64],
+    counts: NDArray[np.int64],
+) -> None:
+    """Pyramid scores (Schoenberger and Frahm, CVPR 2016, section 4.2) and counts of the visible triangulated points.
+
+    The image is divided into 2^l x 2^l cells, l = 1..6; every occupied cell scores 2^l x 2^l: many points, well spread,
+    score most.
+    """
+    side = 1 << PYRAMID_LEVELS
+    occupied = np.zeros((PYRAMID_LEVELS + 1, side * side), np.int64)
+    for n in range(len(images)):
+        i = images[n]
+        score = 0
+        count = 0
+        for index in range(image_ptr[i], image_ptr[i + 1]):
+            o = image_obs[index]
+            if np.isnan(point_xyz[obs_track_idx[o], 0]):
+                continue
+            count += 1
+            x = min(side - 1, max(0, int(obs_xy[o, 0] / image_size[i, 0] * side)))
+            y = min(side - 1, max(0, int(obs_xy[o, 1] / image_size[i, 1] * side)))
+            for level in range(PYRAMID_LEVELS, 0, -1):
+                cell = (y << PYRAMID_LEVELS) + x
+                if occupied[level, cell] == n + 1:
+                    break  # then it is occupied at all coarser levels too
+                occupied[level, cell] = n + 1
+                score += 1 << (2 * level)
+                x >>= 1
+                y >>= 1
+        scores[n] = score
+        counts[n] = count
+
+
+def rank_next_images(
+    reconstruction: Reconstruction, candidates: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Candidates sorted by pyramid score, best first, with their scores and numbers of visible points."""
+    tracks = reconstruction.tracks
+    sizes = np.array([(c.width, c.height) for c in reconstruction.cameras], np.float64)
+    scores = np.zeros(len(candidates), np.int64)
+    counts = np.zeros(len(candidates), np.int64)
+    visibility_scores(
+        candidates, tracks.image_ptr, tracks.image_obs, tracks.obs_track_idx, tracks.obs_xy, reconstruction.point_xyz,
+        sizes[reconstruction.image_camera_idx], scores, counts,
+    )  # fmt: skip
+    order = np.lexsort((candidates, -scores))
+    return candidates[order], scores[order], counts[order]
+
+
+def register_image(
+    reconstruction: Reconstruction, image_idx: int, options: MappingOptions, *, search_focal: bool
+) -> Registration:
+    """Pose of an image from the points that it sees; the reconstruction is not changed.
+
+    Args:
+        reconstruction: the map so far.
+        image_idx: an unregistered image.
+        options: thresholds.
+        search_focal: try other focal lengths too, as nothing is known about this camera yet.
+    """
+    tracks = reconstruction.tracks
+    obs = tracks.observations_of_image(image_idx)
+    obs = obs[reconstruction.is_triangulated[tracks.obs_track_idx[obs]]]
+    if len(obs) < options.min_pose_inliers:
+        return Registration(
+            image_idx, len(obs), 0, None,
+            reason=f"sees {len(obs)} points of the map, at least {options.min_pose_inliers} are needed",
+        )  # fmt: skip
+    camera = reconstruction.cameras[reconstruction.image_camera_idx[image_idx]]
+    xyz = reconstruction.point_xyz[tracks.obs_track_idx[obs]]
+    normalized = pixels_to_normalized(camera, tracks.obs_xy[obs])
+    max_error = options.max_pose_error_px / camera.focal
+    if search_focal:
+        found = resection.estimate_pose_and_focal(xyz, normalized, max_error, FOCAL_SCALES)
+    else:
+        found = resection.estimate_pose(xyz, normalized, max_error)
+    num_inliers = found.num_inliers if found is not None else 0
+    needed = max(options.min_pose_inliers, int(np.ceil(options.min_pose_inlier_ratio * len(obs))))
+    if found is None or num_inliers < needed:
+        reason = f"{num_inliers} of {len(obs)} points agree with one pose, at least {needed} are needed"
+        return Registration(image_idx, len(obs), num_inliers, None, reason=reason)
+    return Registration(image_idx, len(obs), num_inliers, found.cam_from_world, found.focal_scale)

@@ -1,0 +1,78 @@
+"""Points of a growing reconstruction: triangulate, add observations, filter. Threads over chunks of tracks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import Executor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.geometry import rigid3, triangulation
+from sfmapp.mapping.options import MappingOptions
+from sfmapp.scene.reconstruction import Reconstruction
+
+# Tracks are independent of each other, so that chunks of any size give the same result.
+CHUNK = 4096
+
+
+def triangulate(
+    reconstruction: Reconstruction, tracks: NDArray[np.int64], options: MappingOptions, pool: Executor
+) -> int:
+    """Triangulate the given tracks afresh from the registered images, in place; returns how many succeeded."""
+    return _over_chunks(triangulation.triangulate_tracks, reconstruction, tracks, options, pool)
+
+
+def filter_observations(
+    reconstruction: Reconstruction,
+    options: MappingOptions,
+    pool: Executor,
+    tracks: NDArray[np.int64] | None = None,
+    max_error_px: float | None = None,
+) -> int:
+    """Decide afresh which observations support their points, in place; returns the number of points dropped.
+
+    Observations come back as well as go: those of newly registered images join the points that they agree with.
+
+    Args:
+        reconstruction: changed in place.
+        options: thresholds.
+        pool: runs the chunks.
+        tracks: (K,) int64 tracks to look at, None for all that are triangulated.
+        max_error_px: overrides the threshold of the options.
+    """
+    if tracks is None:
+        tracks = np.flatnonzero(reconstruction.is_triangulated)
+    return _over_chunks(triangulation.classify_observations, reconstruction, tracks, options, pool, max_error_px)
+
+
+def residual_scale_px(reconstruction: Reconstruction) -> float:
+    """Robust standard deviation of one residual coordinate of the inliers in pixels; NaN without observations.
+
+    The length of a residual of two normal coordinates is Rayleigh distributed with median 1.1774 sigma.
+    """
+    used = reconstruction.obs_is_inlier
+    if not used.any():
+        return math.nan
+    return float(np.median(np.linalg.norm(reconstruction.residuals_px()[used], axis=1)) / 1.1774)
+
+
+def _over_chunks(
+    kernel: Callable[..., int],
+    reconstruction: Reconstruction,
+    tracks: NDArray[np.int64],
+    options: MappingOptions,
+    pool: Executor,
+    max_error_px: float | None = None,
+) -> int:
+    canonical, fisheye = reconstruction.canonical_cameras()
+    t = reconstruction.tracks
+    arguments = (
+        t.track_ptr, t.obs_image_idx, t.obs_xy, rigid3.rotation_matrix(reconstruction.cam_from_world),
+        np.ascontiguousarray(reconstruction.cam_from_world[:, 4:]), reconstruction.image_camera_idx, canonical,
+        fisheye, max_error_px or options.max_reprojection_error_px, math.radians(options.min_triangulation_angle_deg),
+        reconstruction.point_xyz, reconstruction.obs_is_inlier,
+    )  # fmt: skip
+    chunks = [tracks[i : i + CHUNK] for i in range(0, len(tracks), CHUNK)]
+    return sum(pool.map(lambda chunk: kernel(chunk, *arguments), chunks))
