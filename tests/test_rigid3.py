@@ -1,0 +1,56 @@
+"""Group axioms of rigid motions, and agreement with scipy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
+from sfmapp.geometry import rigid3
+
+vectors = arrays(np.float64, (3,), elements=st.floats(-10, 10))
+poses = st.builds(lambda w, t: rigid3.from_matrix(rigid3.exp_so3(w), t), vectors, vectors)
+
+
+@given(poses, poses, poses, vectors)
+def test_composition_is_associative_and_acts_on_points(a, b, c, x):
+    left = rigid3.compose(rigid3.compose(a, b), c)
+    right = rigid3.compose(a, rigid3.compose(b, c))
+    np.testing.assert_allclose(rigid3.apply(left, x), rigid3.apply(right, x), atol=1e-12)
+    np.testing.assert_allclose(rigid3.apply(left, x), rigid3.apply(a, rigid3.apply(b, rigid3.apply(c, x))), atol=1e-12)
+
+
+@given(poses, vectors)
+def test_inverse_undoes(pose, x):
+    np.testing.assert_allclose(rigid3.apply(rigid3.inverse(pose), rigid3.apply(pose, x)), x, atol=1e-12)
+    np.testing.assert_allclose(rigid3.apply(pose, rigid3.center(pose)), 0.0, atol=1e-12)
+
+
+@given(arrays(np.float64, (3,), elements=st.floats(-3, 3)))
+def test_exp_and_log_agree_with_scipy(w):
+    rotation = rigid3.exp_so3(w)
+    oracle = Rotation.from_rotvec(w)
+    np.testing.assert_allclose(rotation, oracle.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(rigid3.exp_so3(rigid3.log_so3(rotation)), rotation, atol=1e-9)
+    quaternion = rigid3.quaternion(rotation)
+    assert abs(abs(quaternion @ oracle.as_quat()) - 1) < 1e-12
+    assert quaternion[3] >= 0
+
+
+@pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.8, 0]])
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-7, 1e-4, np.pi - 1e-7, np.pi])
+def test_exp_and_log_at_the_ends(axis, angle):
+    rotation = rigid3.exp_so3(angle * np.array(axis))
+    assert rigid3.rotation_angle_deg(rotation) == pytest.approx(np.degrees(angle), abs=1e-9)
+    np.testing.assert_allclose(rigid3.exp_so3(rigid3.log_so3(rotation)), rotation, atol=1e-12)
+
+
+def test_functions_broadcast():
+    rng = np.random.default_rng(0)
+    many = rigid3.from_matrix(rigid3.exp_so3(rng.normal(size=(4, 5, 3))), rng.normal(size=(4, 5, 3)))
+    one = rigid3.compose(many[2, 3], many[1, 1])
+    np.testing.assert_allclose(rigid3.compose(many, many[1, 1])[2, 3], one, atol=1e-14)
+    np.testing.assert_allclose(rigid3.inverse(many)[3, 4], rigid3.inverse(many[3, 4]), atol=1e-14)
