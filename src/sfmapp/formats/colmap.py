@@ -1,0 +1,79 @@
+"""COLMAP models: folders of cameras, images, points3D, rigs and frames, binary or text.
+
+COLMAP's conventions are the house's own (cam_from_world, top-left pixel centre at 0.5, 0.5) but for the quaternion,
+which its files hold as w x y z. See https://colmap.github.io/format.html.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sfmapp.errors import InputError
+from sfmapp.formats.atomic import replaced_folder
+from sfmapp.formats.colmap_binary import read_binary, write_binary
+from sfmapp.formats.colmap_model import Keypoints, model_from_reconstruction, reconstruction_from_model
+from sfmapp.formats.colmap_text import read_text, write_text
+from sfmapp.scene.reconstruction import Reconstruction
+
+_STEMS = ("cameras", "images", "points3D", "rigs", "frames")
+_FILES = frozenset(f"{stem}.{ending}" for stem in _STEMS for ending in ("bin", "txt"))
+
+
+def write_model(folder: str | Path, reconstruction: Reconstruction, keypoints: Keypoints | None = None) -> None:
+    """Write the registered part of a reconstruction as a binary model that COLMAP 3.x and 4.x read.
+
+    The ids of images and cameras are positions plus one, that of a point is the position of its track plus one. The
+    same input gives the same bytes. The folder appears at once; other files that lie in an older one stay.
+
+    Args:
+        folder: where the five files go.
+        reconstruction: images without a pose and points without coordinates are left out.
+        keypoints: for every image, registered or not, (N, 2) or wider, pixels: all become keypoints of the model, so
+            that their positions agree with the database; tracked ones take the pixel from the tracks, which may have
+            been refined. None: just the tracked ones, in the order of their positions.
+
+    Raises:
+        InputError: the folder cannot be written.
+        ValueError: a pose or point is infinite, or a keypoint belongs to two points.
+    """
+    model = model_from_reconstruction(reconstruction, keypoints)
+    with replaced_folder(Path(folder), _FILES) as beside:
+        write_binary(beside, model)
+
+
+def write_model_text(folder: str | Path, reconstruction: Reconstruction, keypoints: Keypoints | None = None) -> None:
+    """As :func:`write_model`, as text; numbers are printed so that reading gives the same bits.
+
+    Raises:
+        UsageError: an image name holds white space, at which COLMAP's reader would cut it off.
+    """
+    model = model_from_reconstruction(reconstruction, keypoints)
+    with replaced_folder(Path(folder), _FILES) as beside:
+        write_text(beside, model)
+
+
+def has_model(folder: str | Path) -> bool:
+    """Whether the folder holds the files of a model, binary or text."""
+    return any((Path(folder) / f"images.{ending}").is_file() for ending in ("bin", "txt"))
+
+
+def read_model(folder: str | Path) -> tuple[Reconstruction, Keypoints]:
+    """Read a model, binary (preferred, as COLMAP does) or text, with rigs and frames or without.
+
+    Images, cameras and points stand in ascending order of their ids; every track element is an inlier.
+
+    Returns:
+        The reconstruction, and for each image the pixels (N, 2) float64 of its keypoints.
+
+    Raises:
+        InputError: a file is missing, truncated, malformed or disagrees with the others, or a camera model is not ours.
+    """
+    folder = Path(folder)
+    if (folder / "images.bin").exists():
+        return reconstruction_from_model(folder, read_binary(folder))
+    if (folder / "images.txt").exists():
+        return reconstruction_from_model(folder, read_text(folder))
+    found = "no such folder" if not folder.is_dir() else ", ".join(sorted(p.name for p in folder.iterdir())[:8])
+    raise InputError(
+        f"{folder}: expected a COLMAP model (images.bin or images.txt), found {found or 'an empty folder'}"
+    )

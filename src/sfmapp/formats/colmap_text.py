@@ -1,0 +1,237 @@
+"""COLMAP's text model files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.errors import InputError
+from sfmapp.formats.colmap_binary import poses_wxyz
+from sfmapp.formats.colmap_model import (
+    ColmapModel,
+    Frame,
+    Keypoints,
+    Rig,
+    checked_camera,
+    checked_names,
+    checked_poses,
+    poses_from_frames,
+)
+from sfmapp.geometry import rigid3
+from sfmapp.scene.camera import Camera
+
+_LARGEST_ID = 2**53  # ids pass through float64, which is exact up to here
+
+
+def write_text(folder: Path, model: ColmapModel) -> None:
+    """Write cameras, rigs, frames, images and points3D .txt into an existing folder; numbers round-trip exactly.
+
+    Raises:
+        UsageError: an image name holds white space.
+    """
+    checked_names(model.image_names)
+    cameras = [
+        f"{camera_id} {camera.model.name} {camera.width} {camera.height} {_numbers(camera.params)}"
+        for camera_id, camera in zip(model.camera_ids, model.cameras, strict=True)
+    ]
+    rigs = [f"{camera_id} 1 CAMERA {camera_id}" for camera_id in model.camera_ids]
+    frames, images = [], []
+    for i, pose in enumerate(poses_wxyz(model.cam_from_world)):
+        image_id, camera_id = model.image_ids[i], model.image_camera_ids[i]
+        frames.append(f"{image_id} {camera_id} {_numbers(pose)} 1 CAMERA {camera_id} {image_id}")
+        images.append(f"{image_id} {_numbers(pose)} {camera_id} {model.image_names[i]}")
+        pairs = zip(model.points2d_xy[i].tolist(), model.points2d_point_ids[i].tolist(), strict=True)
+        images.append(" ".join(f"{x!r} {y!r} {point_id}" for (x, y), point_id in pairs))
+    track = np.stack([model.track_image_ids, model.track_point2d_idx], 1)
+    points = []
+    for i, (r, g, b) in enumerate(model.point_rgb.tolist()):
+        elements = track[model.track_ptr[i] : model.track_ptr[i + 1]].ravel().tolist()
+        line = f"{model.point_ids[i]} {_numbers(model.point_xyz[i])} {r} {g} {b} {float(model.point_error_px[i])!r}"
+        points.append(" ".join([line, *map(str, elements)]))
+    heads = {
+        "cameras": "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
+        "rigs": "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[]",
+        "frames": "FRAME_ID, RIG_ID, RIG_FROM_WORLD[QW, QX, QY, QZ, TX, TY, TZ], NUM_DATA_IDS, DATA_IDS[]",
+        "images": "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then X, Y, POINT3D_ID of its keypoints",
+        "points3D": "POINT3D_ID, X, Y, Z, R, G, B, ERROR, then IMAGE_ID, POINT2D_IDX of its track",
+    }
+    bodies = {"cameras": cameras, "rigs": rigs, "frames": frames, "images": images, "points3D": points}
+    for name, lines in bodies.items():
+        (folder / f"{name}.txt").write_text("\n".join([f"# {heads[name]}", *lines, ""]), encoding="utf-8")
+
+
+def _numbers(values: NDArray[np.float64]) -> str:
+    return " ".join(map(repr, values.tolist()))
+
+
+def read_text(folder: Path) -> ColmapModel:
+    """Read a text model, with rigs and frames or without. Raises InputError for anything malformed."""
+    camera_ids, cameras = _read_cameras(folder / "cameras.txt")
+    image_ids, camera_of, names, poses, xy, point_ids = _read_images(folder / "images.txt")
+    if (folder / "frames.txt").exists():
+        rigs = _read_rigs(folder / "rigs.txt")
+        frames = _read_frames(folder / "frames.txt")
+        poses = poses_from_frames(folder / "frames.txt", image_ids, rigs, frames)
+    table, tracks = _read_points(folder / "points3D.txt")
+    lengths = np.array([len(track) for track in tracks], np.int64)
+    flat = np.concatenate([*tracks, np.zeros((0, 2), np.int64)])
+    return ColmapModel(
+        camera_ids, cameras, image_ids, camera_of, names, poses, xy, point_ids,
+        table[:, 0].astype(np.int64), table[:, 1:4].copy(), table[:, 4:7].astype(np.uint8), table[:, 7].copy(),
+        np.concatenate([[0], np.cumsum(lengths)]), flat[:, 0].copy(), flat[:, 1].copy(),
+    )  # fmt: skip
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: expected UTF-8 text, found other bytes") from None
+
+
+def _records(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Place (for messages) and fields of every line that is neither empty nor a comment."""
+    for number, line in enumerate(_lines(path), 1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield f"{path}:{number}", line.split()
+
+
+def _floats(place: str, fields: list[str], what: str) -> NDArray[np.float64]:
+    """(N,) finite numbers."""
+    try:
+        values = np.array([float(field) for field in fields], np.float64)
+    except ValueError:
+        raise InputError(f"{place}: expected numbers for {what}, found {' '.join(fields)[:80]!r}") from None
+    if not np.isfinite(values).all():
+        raise InputError(f"{place}: expected finite numbers for {what}, found NaN or infinity")
+    return values
+
+
+def _ints(place: str, fields: list[str], what: str, low: int = 0, high: int = _LARGEST_ID) -> list[int]:
+    """Whole numbers from low to high."""
+    try:
+        values = [int(field) for field in fields]
+    except ValueError:
+        raise InputError(f"{place}: expected whole numbers for {what}, found {' '.join(fields)[:80]!r}") from None
+    if any(not low <= value <= high for value in values):
+        raise InputError(f"{place}: expected {what} from {low} to {high}, found {' '.join(fields)[:80]!r}")
+    return values
+
+
+def _need(place: str, fields: list[str], count: int, what: str) -> None:
+    if len(fields) < count:
+        raise InputError(f"{place}: expected at least {count} fields of {what}, found {len(fields)}")
+
+
+def _read_cameras(path: Path) -> tuple[NDArray[np.int64], list[Camera]]:
+    ids, cameras = [], []
+    for place, fields in _records(path):
+        _need(place, fields, 5, "a camera")
+        camera_id, width, height = _ints(place, [fields[0], *fields[2:4]], "a camera")
+        params = _floats(place, fields[4:], "the parameters of a camera")
+        ids.append(camera_id)
+        cameras.append(checked_camera(path, camera_id, fields[1], width, height, params))
+    return np.array(ids, np.int64), cameras
+
+
+def _read_images(
+    path: Path,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], list[str], NDArray[np.float64], Keypoints, list[NDArray[np.int64]]]:
+    """Image ids, camera ids, names, poses (I, 7), keypoints and their point ids."""
+    ids: list[int] = []
+    camera_ids: list[int] = []
+    names: list[str] = []
+    poses, xy, point_ids = [], [], []
+    lines = enumerate(_lines(path), 1)
+    for number, line in lines:
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        place = f"{path}:{number}"
+        fields = line.split(maxsplit=9)
+        _need(place, fields, 10, "an image")
+        image_id, camera_id = _ints(place, [fields[0], fields[8]], "ids of an image")
+        ids.append(image_id)
+        camera_ids.append(camera_id)
+        names.append(fields[9].rstrip())
+        poses.append(_floats(place, fields[1:8], "a pose"))
+        # the line that follows belongs to the image even if it is empty
+        number, line = next(lines, (number, ""))
+        table = _floats(f"{path}:{number}", line.split(), "keypoints")
+        if len(table) % 3:
+            raise InputError(f"{path}:{number}: expected three fields per keypoint, found {len(table)} in all")
+        table = table.reshape(-1, 3)
+        if ((table[:, 2] < -1) | (table[:, 2] > _LARGEST_ID) | (table[:, 2] % 1 != 0)).any():
+            raise InputError(f"{path}:{number}: expected -1 or the id of a point in every third field")
+        xy.append(table[:, :2].copy())
+        point_ids.append(table[:, 2].astype(np.int64))
+    id_array = np.array(ids, np.int64)
+    checked = checked_poses(path, "image", id_array, np.array(poses).reshape(-1, 7))
+    return id_array, np.array(camera_ids, np.int64), names, checked, xy, point_ids
+
+
+def _read_points(path: Path) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
+    """Table (P, 8) of id, xyz, rgb, error, and P tracks (K, 2)."""
+    heads, tracks = [], []
+    for place, fields in _records(path):
+        _need(place, fields, 8, "a point")
+        _ints(place, fields[:1], "the id of a point")
+        _ints(place, fields[4:7], "a colour", 0, 255)
+        heads.append(_floats(place, fields[:7], "a point"))
+        track = _ints(place, fields[8:], "a track", 0, 2**32 - 1)
+        if len(track) % 2:
+            raise InputError(f"{place}: expected two fields per observation, found {len(track)} in all")
+        tracks.append(np.array(track, np.int64).reshape(-1, 2))
+        heads[-1] = np.append(heads[-1], _error_px(place, fields[7]))
+    return np.array(heads).reshape(-1, 8), tracks
+
+
+def _error_px(place: str, field: str) -> float:
+    try:
+        return float(field)
+    except ValueError:
+        raise InputError(f"{place}: expected a number for the error of a point, found {field[:40]!r}") from None
+
+
+def _read_rigs(path: Path) -> dict[int, Rig]:
+    rigs: dict[int, Rig] = {}
+    for place, fields in _records(path):
+        _need(place, fields, 2, "a rig")
+        rig_id, num_sensors = _ints(place, fields[:2], "a rig")
+        sensors: dict[int, NDArray[np.float64]] = {}
+        rest = fields[2:]
+        for i in range(num_sensors):
+            _need(place, rest, 2 if i == 0 else 3, "a sensor")
+            kind, (sensor_id,), pose = rest[0], _ints(place, rest[1:2], "a sensor"), rigid3.IDENTITY
+            has_pose = i > 0 and rest[2] != "0"
+            rest = rest[2:] if i == 0 else rest[3:]
+            if has_pose:
+                _need(place, rest, 7, "the pose of a sensor")
+                values = _floats(place, rest[:7], "the pose of a sensor")[None]
+                pose = checked_poses(path, "sensor", np.array([sensor_id]), values)[0]
+                rest = rest[7:]
+            if kind == "CAMERA" and (i == 0 or has_pose):
+                sensors[sensor_id] = pose
+        rigs[rig_id] = Rig(sensors)
+    return rigs
+
+
+def _read_frames(path: Path) -> list[Frame]:
+    frames = []
+    for place, fields in _records(path):
+        _need(place, fields, 10, "a frame")
+        frame_id, rig_id, num_data = _ints(place, [*fields[:2], fields[9]], "a frame")
+        _need(place, fields[10:], 3 * num_data, "the data of a frame")
+        values = _floats(place, fields[2:9], "a pose")[None]
+        pose = checked_poses(path, "frame", np.array([frame_id]), values)[0]
+        images = []
+        for kind, *ids in zip(fields[10::3], fields[11::3], fields[12::3], strict=False):
+            sensor_id, data_id = _ints(place, ids, "the data of a frame")
+            if kind == "CAMERA":
+                images.append((sensor_id, data_id))
+        frames.append(Frame(rig_id, pose, images))
+    return frames
