@@ -1,0 +1,57 @@
+"""What the commands share: flags, listeners, and the two ways to stop a run."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import signal
+from collections.abc import Iterator
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from sfmapp.cli.progress import make_listener
+
+if TYPE_CHECKING:
+    from sfmapp.events import Events
+
+
+def add_output_flags(parser: argparse.ArgumentParser) -> None:
+    """Flags on how much is said, and in which form."""
+    group = parser.add_argument_group("output")
+    loudness = group.add_mutually_exclusive_group()
+    loudness.add_argument("-q", "--quiet", action="store_true", help="say only what went wrong")
+    loudness.add_argument("-v", "--verbose", action="store_true", help="say every decision; show tracebacks of bugs")
+    group.add_argument("--json", action="store_true", help="result as JSON on stdout, events as JSON lines on stderr")
+
+
+@contextlib.contextmanager
+def listening(args: argparse.Namespace) -> Iterator[Events]:
+    """Events, shown as the flags ask. Ctrl-C (or SIGTERM) ends the run at its next step, a second one at once."""
+    from sfmapp.events import Events
+
+    listener = make_listener(quiet=args.quiet, verbose=args.verbose, as_json=args.json)
+    events = Events(listener)
+
+    def stop(number: int, _: FrameType | None) -> None:
+        for name in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(name, signal.SIG_DFL)
+        events.cancel()
+        if not args.json:  # no print: the signal may have come in the middle of one
+            os.write(2, b"\nstopping at the next step; Ctrl-C again ends at once\n")
+
+    before = {name: signal.signal(name, stop) for name in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield events
+    finally:
+        listener.close()
+        for name, handler in before.items():
+            signal.signal(name, handler)
+
+
+def print_json(value: Any) -> None:
+    """The machine-readable result of a command: one JSON document on stdout."""
+    from sfmapp.pipelines.workspace import plain_number
+
+    print(json.dumps(value, default=plain_number), flush=True)

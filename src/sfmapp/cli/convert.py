@@ -1,0 +1,34 @@
+"""``sfmapp export``: a model in the format of another program."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sfmapp.cli.common import add_output_flags, print_json
+
+FORMATS = ("colmap", "colmap-text", "ply", "bundler", "nerfstudio")
+
+
+def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the commands of this family to the parser."""
+    parser = commands.add_parser(
+        "export", help="write a model in another program's format",
+        description="Write OUT/sparse/0 in another format, read it back, and print the worst reprojection difference.",
+    )  # fmt: skip
+    parser.add_argument("output", metavar="OUT", type=Path, help="folder of a run")
+    parser.add_argument("--to", metavar="FORMAT", required=True, choices=FORMATS, help=", ".join(FORMATS))
+    parser.add_argument("-o", dest="path", metavar="PATH", type=Path, required=True, help="where to write it")
+    add_output_flags(parser)
+    parser.set_defaults(run=_export)
+
+
+def _export(args: argparse.Namespace) -> int:
+    from sfmapp.pipelines.export import export
+
+    result = export(args.output, args.to, args.path)
+    if args.json:
+        print_json({"exit_code": 0, **result})
+    else:
+        print(f"wrote {args.path} ({args.to}), read it back: worst reprojection difference {result['max_px']:.2g} px")
+    return 0

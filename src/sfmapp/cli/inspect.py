@@ -1,0 +1,53 @@
+"""``sfmapp view`` and ``sfmapp validate``: look at a result, and doubt it."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sfmapp.cli.common import add_output_flags, listening, print_json
+
+
+def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the commands of this family to the parser."""
+    parser = commands.add_parser(
+        "view", help="open the recording of a run in rerun",
+        description="Open OUT/recording.rrd in rerun's viewer; serve it on 127.0.0.1 where there is no display.",
+    )  # fmt: skip
+    parser.add_argument("output", metavar="OUT", type=Path, help="folder of a run")
+    add_output_flags(parser)
+    parser.set_defaults(run=_view)
+
+    parser = commands.add_parser(
+        "validate", help="compare with pycolmap on the same photographs, and with the truth",
+        description="Run pycolmap on the same photographs and print both results side by side.",
+    )  # fmt: skip
+    parser.add_argument("output", metavar="OUT", type=Path, help="folder of a run")
+    parser.add_argument("--truth", metavar="FILE", type=Path, help="COLMAP model, cameras.json or TUM trajectory")
+    add_output_flags(parser)
+    parser.set_defaults(run=_validate)
+
+
+def _view(args: argparse.Namespace) -> int:
+    from sfmapp.errors import InputError
+    from sfmapp.pipelines.workspace import read_manifest
+    from sfmapp.viewer.view import view
+
+    read_manifest(args.output)
+    recording = args.output / "recording.rrd"
+    if not recording.is_file():
+        raise InputError(f"{recording} does not exist", "run sfmapp reconstruct again without --no-recording")
+    view(recording)
+    return 0
+
+
+def _validate(args: argparse.Namespace) -> int:
+    from sfmapp.pipelines.validate import validate
+
+    with listening(args) as events:
+        result = validate(args.output, args.truth, events=events)
+    if args.json:
+        print_json({"exit_code": 0, **result.to_dict()})
+    else:
+        print(result.table())
+    return 0

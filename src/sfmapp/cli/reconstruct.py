@@ -1,0 +1,171 @@
+"""``sfmapp reconstruct`` and ``sfmapp demo``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sfmapp.cli.common import add_output_flags, listening, print_json
+
+if TYPE_CHECKING:
+    from sfmapp.pipelines.options import Options
+
+CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
+
+EXAMPLES = """\
+examples:
+  sfmapp reconstruct photos/ -o out/
+  sfmapp reconstruct photos/ -o out/ --preset quality --set features.max_num_features=12000
+  sfmapp reconstruct 'frames/*.png' -o out/ --camera-model OPENCV_FISHEYE --seed 7
+
+The same command again resumes a run that was cut off, does nothing where all is done, and re-runs only what a changed
+option touches. The largest model is OUT/sparse/0, in COLMAP's format; OUT/report.html tells how good it is and why."""
+
+
+def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the commands of this family to the parser."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = commands.add_parser(
+        "reconstruct", help="photographs to cameras and points", epilog=EXAMPLES, formatter_class=raw,
+        description="Reconstruct cameras and points from photographs.",
+    )  # fmt: skip
+    parser.add_argument(
+        "images", metavar="IMAGES", nargs="?", help="a folder, a glob in quotes, or a .txt list"
+    )
+    parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="folder of the results, made if need be")
+    parser.add_argument("--list-options", action="store_true", help="list every stage.option and its default")
+    _add_option_flags(parser)
+    add_output_flags(parser)
+    parser.set_defaults(run=_reconstruct, parser=parser)
+
+    parser = commands.add_parser(
+        "demo", help="reconstruct the bundled sample and compare it with the truth",
+        description="Reconstruct the bundled sample, a rendered courtyard, and print the pose error against the truth.",
+    )  # fmt: skip
+    parser.add_argument("-o", "--output", metavar="OUT", type=Path, default=Path("demo"), help="default: demo")
+    _add_option_flags(parser)
+    add_output_flags(parser)
+    parser.set_defaults(run=_demo, parser=parser)
+
+
+def _add_option_flags(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("options (later ones win: presets in order, then --set, then the flags)")
+    group.add_argument(
+        "--preset", metavar="NAME|FILE", action="append", default=[],
+        help="default, fast, quality, or a TOML file of yours; may be repeated",
+    )  # fmt: skip
+    group.add_argument("--set", metavar="STAGE.OPTION=VALUE", action="append", default=[], help="may be repeated")
+    group.add_argument("--seed", metavar="N", help="start of every random choice; the same seed, the same bytes")
+    group.add_argument("--threads", metavar="N", help="workers; default: all cores. Results do not depend on it")
+    group.add_argument("--camera-model", metavar="MODEL", help=", ".join(CAMERA_MODELS))
+    group.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black is ignored")
+    group.add_argument("--min-registered", metavar="N", help="exit code 5 if fewer images are registered")
+    group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, which replays the run")
+
+
+def _options(args: argparse.Namespace) -> Options:
+    """The effective options of a command line."""
+    _limit_library_threads()
+    from sfmapp.pipelines.options import load_options
+
+    flags = {
+        "seed": args.seed,
+        "threads": args.threads,
+        "images.camera_model": args.camera_model,
+        "images.mask_path": args.mask_path,
+        "min_registered": args.min_registered,
+    }
+    settings = [*args.set, *(f"{name}={value}" for name, value in flags.items() if value is not None)]
+    return load_options(args.preset, settings)
+
+
+def _limit_library_threads() -> None:
+    """Before numpy is imported: our own workers use the cores; a thread pool in the linear algebra beneath each of them
+    would only compete with them for the cores, and would make sums depend on their number."""
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
+
+def _reconstruct(args: argparse.Namespace) -> int:
+    if args.list_options:
+        return _list_options(args)
+    if args.images is None or args.output is None:
+        args.parser.error("IMAGES and -o OUT are needed")
+    report = _run(args, args.images, _options(args))
+    if args.json:
+        print_json({"exit_code": 0, **_result(args.output, report)})
+    elif not args.quiet:
+        _print_summary(args.output, report)
+    return 0
+
+
+def _demo(args: argparse.Namespace) -> int:
+    options = _options(args)
+    from sfmapp.pipelines.demo import compare_with_truth
+    from sfmapp.pipelines.resources import sample_folder
+
+    sample = sample_folder()
+    report = _run(args, str(sample / "images"), options)
+    errors = compare_with_truth(args.output, sample)
+    if args.json:
+        print_json({"exit_code": 0, **_result(args.output, report), "truth": errors})
+        return 0
+    if not args.quiet:
+        _print_summary(args.output, report)
+    print(
+        f"against the truth: centres {errors['median_center_error']:.2g} m median, {errors['max_center_error']:.2g} m worst"
+        f" ({100 * errors['median_center_error_of_size']:.3f} % of the scene's size);"
+        f" rotations {errors['median_rotation_error_deg']:.2g} deg median, {errors['max_rotation_error_deg']:.2g} worst"
+    )
+    return 0
+
+
+def _run(args: argparse.Namespace, images: str, options: Options) -> dict[str, Any]:
+    from sfmapp.pipelines.reconstruct import reconstruct
+    from sfmapp.pipelines.usage import Stopwatch
+
+    watch = Stopwatch(whole_process=True)
+    with listening(args) as events:
+        result = reconstruct(images, args.output, options, events=events, record=not args.no_recording, watch=watch)
+    return result.report
+
+
+def _list_options(args: argparse.Namespace) -> int:
+    from sfmapp.pipelines.options import list_options
+
+    rows = list_options()
+    if args.json:
+        print_json([dict(zip(("name", "type", "default", "comment"), row, strict=True)) for row in rows])
+        return 0
+    width = max(len(name) for name, *_ in rows)
+    for name, kind, default, comment in rows:
+        print(f"{name:<{width}}  {default}  [{kind}]\n{'':<{width}}  {comment}")
+    return 0
+
+
+def _result(output: Path, report: dict[str, Any]) -> dict[str, Any]:
+    """What ``--json`` prints: the outcome in numbers; the rest is in report.json."""
+    missing = [image["name"] for image in report["images"] if not image["is_registered"]]
+    paths = {"model": str(output / "sparse" / "0"), "report": str(output / "report.json")}
+    return {"output": str(output), **paths, **report["models"][0], "not_registered": missing, "run": report["run"]}
+
+
+def _print_summary(output: Path, report: dict[str, Any]) -> None:
+    model, run = report["models"][0], report["run"]
+    print(
+        f"{model['num_registered']} of {model['num_images']} images registered, {model['num_points']} points,"
+        f" tracks of {model['mean_track_length']:.2f}, reprojection error {model['mean_reprojection_error_px']:.2f} px"
+    )
+    for image in report["images"]:
+        if not image["is_registered"]:
+            print(f"  not registered: {image['name']}: {image['reason']}. {image['remedy']}")
+    if len(report["models"]) > 1:
+        sizes = ", ".join(str(other["num_registered"]) for other in report["models"])
+        print(f"  the photographs fall into {len(report['models'])} models of {sizes} images: sparse/0, sparse/1, ...")
+    if run["is_up_to_date"]:
+        print(f"{output} is up to date: nothing to do")
+    else:
+        print(f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB")
+    print(f"model {output / 'sparse' / '0'}, report {output / 'report.html'}; look at it: sfmapp view {output}")

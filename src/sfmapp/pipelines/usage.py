@@ -1,0 +1,33 @@
+"""What a run and its stages take: wall seconds, CPU seconds and memory."""
+
+from __future__ import annotations
+
+import resource
+import time
+
+
+class Stopwatch:
+    """Counts from its making. CPU seconds are user and system, of all threads and of children that have ended."""
+
+    def __init__(self, *, whole_process: bool = False) -> None:
+        """``whole_process`` counts the CPU seconds since the process began, imports included."""
+        self._wall = time.monotonic()
+        self._cpu = 0.0 if whole_process else _cpu_s()
+
+    def read(self) -> dict[str, float]:
+        """``wall_s``, ``cpu_s`` and ``peak_memory_mb`` (1e6 bytes; largest resident set of the process, or of one of
+        its children where that is larger, since the process began)."""
+        return {
+            "wall_s": round(time.monotonic() - self._wall, 4),
+            "cpu_s": round(_cpu_s() - self._cpu, 4),
+            "peak_memory_mb": round(max(_peak_mb(resource.RUSAGE_SELF), _peak_mb(resource.RUSAGE_CHILDREN)), 1),
+        }
+
+
+def _cpu_s() -> float:
+    usages = (resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN))
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
+
+
+def _peak_mb(who: int) -> float:
+    return resource.getrusage(who).ru_maxrss * 1024 / 1e6

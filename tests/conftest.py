@@ -1,0 +1,31 @@
+"""Fixtures that all tests share: where the data lie."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def data_root() -> Path:
+    """Folder of the real data, SFMAPP_DATA or shared/data beside the checkout; skips where there is none."""
+    root = Path(os.environ.get("SFMAPP_DATA", CHECKOUT.parent / "shared" / "data"))
+    if not root.is_dir():
+        pytest.skip(f"real data not found in {root}; SFMAPP_DATA names its folder")
+    return root
+
+
+@pytest.fixture(scope="session")
+def sample() -> Path:
+    """Folder of the bundled sample, with images/ and cameras.json."""
+    from sfmapp.errors import InputError
+    from sfmapp.pipelines.resources import sample_folder
+
+    try:
+        return sample_folder()
+    except InputError as error:
+        pytest.skip(str(error))
