@@ -1,9 +1,9 @@
 """Run another program and measure it: wall seconds, CPU seconds and peak memory, children included.
 
-The peak is taken with care. ``ru_maxrss`` of a child starts at the resident size of the parent it was forked from (Linux
-keeps the larger of the two across ``exec``), so a small child of a large parent would look large. Hence the child's own
-high-water mark ``VmHWM``, which starts afresh at ``exec``, is read while it runs, and ``ru_maxrss`` counts only where it
-exceeds what the parent itself ever held.
+The peak is taken with care. ``ru_maxrss`` of a child starts at the resident size of the parent it was forked from
+(Linux keeps the larger of the two across ``exec``), so a small child of a large parent would look large. Hence the
+child's own high-water mark ``VmHWM``, which starts afresh at ``exec``, is read while it runs, and ``ru_maxrss`` counts
+only where it exceeds what the parent itself ever held.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class ProcessUsage:
         exit_code: as in :mod:`subprocess`; negative for a signal.
         wall_s: seconds from the start of the process to its end, interpreter start included.
         cpu_s: user plus system seconds of the process and of all its children that it waited for.
-        peak_memory_mb: largest resident set in units of 1e6 bytes of the process (or, if larger, of one of its children).
+        peak_memory_mb: largest resident set of the process (or, if larger, of one of its children), 1e6 bytes.
     """
 
     exit_code: int
