@@ -1,0 +1,29 @@
+"""Options of the matching stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class MatchingOptions:
+    """How keypoints are paired between two images and how the pairs are verified.
+
+    Distances between descriptors are Euclidean with SIFT descriptors scaled to unit norm (0 to sqrt 2), and a share of
+    the bits for ORB.
+    """
+
+    # Best distance over second best, in both directions (Lowe, IJCV 2004).
+    max_ratio: float = 0.8
+    # Largest distance of a match.
+    max_distance: float = 0.7
+    # Inlier threshold on pixels in the full-size image. None: 0.2 % of the image diagonal, within 2 to 8 px.
+    max_error_px: float | None = None
+    # Fewest verified matches of a pair that counts.
+    min_inliers: int = 15
+    # An essential matrix is believed if it explains this share of what the fundamental matrix explains.
+    min_e_f_ratio: float = 0.95
+    # A pair is planar or panoramic if a homography explains more than this share of the inliers.
+    max_h_ratio: float = 0.8
+    # Most RANSAC hypotheses for each model.
+    max_ransac_trials: int = 5000

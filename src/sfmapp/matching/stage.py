@@ -1,0 +1,188 @@
+"""The matching stage: descriptors of image pairs in, verified correspondences out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.events import Events
+from sfmapp.features.features import Features
+from sfmapp.geometry import epipolar
+from sfmapp.matching import descriptors
+from sfmapp.matching.options import MatchingOptions
+from sfmapp.matching.two_view import TwoViewGeometry, verify_pair
+from sfmapp.scene.camera import Camera
+from sfmapp.scene.correspondences import Correspondences
+
+if TYPE_CHECKING:
+    from sfmapp.images.folder import ImageSet
+
+__all__ = ["MatchedPair", "MatchingOptions", "compile_kernels", "match_images", "match_pair"]
+
+_STAGE = "matching"
+
+
+@dataclass(frozen=True)
+class MatchedPair:
+    """One pair when it is done: the unit of resuming.
+
+    Attributes:
+        matches: (K, 2) int32 verified matches.
+        num_putative: matches before verification.
+        geometry: the two-view geometry; its ``is_inlier`` is dropped for the matches above.
+        cpu_s: processor seconds of the thread that did it.
+    """
+
+    matches: NDArray[np.int32]
+    num_putative: int
+    geometry: TwoViewGeometry
+    cpu_s: float = 0.0
+
+
+def match_images(
+    image_set: ImageSet,
+    features: Sequence[Features],
+    pair_image_idx: NDArray[np.int32],
+    options: MatchingOptions,
+    *,
+    seed: int,
+    threads: int,
+    events: Events,
+    known: Mapping[tuple[int, int], MatchedPair] | None = None,
+    on_pair: Callable[[int, int, MatchedPair], None] | None = None,
+) -> tuple[Correspondences, dict[str, Any]]:
+    """Match and verify pairs of images. The result is the same, byte for byte, for any number of threads.
+
+    Args:
+        image_set: whose images have ``camera_idx``, and whose cameras stand in ``cameras``.
+        features: one for each image.
+        pair_image_idx: (P, 2) int32 positions i < j of images, sorted.
+        known: pairs that an earlier run has finished; they are taken over as they are.
+        on_pair: called in the calling thread with i, j and the result as each new pair is done, in any order.
+
+    Returns:
+        The correspondences, and a report: totals, counts by configuration, and one entry for each pair.
+
+    Raises:
+        InterruptedRunError: a stop was asked for; pairs given to ``on_pair`` are complete.
+    """
+    cameras = [image_set.cameras[image.camera_idx] for image in image_set.images]
+    pairs = [(int(i), int(j)) for i, j in pair_image_idx]
+    done: dict[tuple[int, int], MatchedPair] = {p: known[p] for p in pairs if p in known} if known else {}
+    num_known = len(done)
+    start = time.monotonic()
+    events.started(_STAGE, f"matching {len(pairs)} pairs", total=len(pairs))
+    if num_known:
+        events.advanced(_STAGE, num_known)
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        futures: dict[Future[MatchedPair], tuple[int, int]] = {
+            pool.submit(match_pair, features[i], features[j], cameras[i], cameras[j], options, (seed, i, j)): (i, j)
+            for i, j in pairs
+            if (i, j) not in done
+        }
+        try:
+            for future in as_completed(futures):
+                i, j = futures[future]
+                done[i, j] = future.result()
+                if on_pair is not None:
+                    on_pair(i, j, done[i, j])
+                events.advanced(_STAGE)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    results = [done[p] for p in pairs]
+    report = _report(pairs, results, num_known, time.monotonic() - start)
+    events.finished(_STAGE, f"{report['num_verified_pairs']} of {len(pairs)} pairs verified", **report)
+    return _assemble(pair_image_idx, results), report
+
+
+def match_pair(
+    features1: Features,
+    features2: Features,
+    camera1: Camera,
+    camera2: Camera,
+    options: MatchingOptions,
+    seed: tuple[int, int, int],
+) -> MatchedPair:
+    """Match and verify one pair; seed is the run's seed and the positions of the two images."""
+    start = time.thread_time()
+    is_binary = features1.descriptors.shape[1] != 128
+    match = descriptors.match_binary if is_binary else descriptors.match_sift
+    putative = match(features1.descriptors, features2.descriptors, options.max_ratio, options.max_distance)
+    xy1 = np.ascontiguousarray(features1.keypoints[putative[:, 0], :2], np.float64)
+    xy2 = np.ascontiguousarray(features2.keypoints[putative[:, 1], :2], np.float64)
+    # 31 bits: OpenCV's state is a signed int
+    state = int(np.random.SeedSequence(seed).generate_state(1)[0]) & 0x7FFFFFFF
+    geometry = verify_pair(xy1, xy2, camera1, camera2, options, seed=state)
+    matches = np.ascontiguousarray(putative[geometry.is_inlier])
+    geometry.is_inlier = np.empty(0, bool)
+    return MatchedPair(matches, len(putative), geometry, time.thread_time() - start)
+
+
+def _assemble(pair_image_idx: NDArray[np.int32], results: Sequence[MatchedPair]) -> Correspondences:
+    geometries = [r.geometry for r in results]
+
+    def stack(name: str, shape: tuple[int, ...], dtype: Any) -> Any:
+        return np.array([getattr(g, name) for g in geometries], dtype).reshape((len(results), *shape))
+
+    pair_ptr = np.zeros(len(results) + 1, np.int64)
+    np.cumsum([len(r.matches) for r in results], out=pair_ptr[1:])
+    return Correspondences(
+        pair_image_idx=np.ascontiguousarray(pair_image_idx, np.int32).reshape(-1, 2),
+        pair_ptr=pair_ptr,
+        matches=np.concatenate([np.empty((0, 2), np.int32), *(r.matches for r in results)]),
+        config=stack("config", (), np.int8),
+        fundamental=stack("fundamental", (3, 3), np.float64),
+        essential=stack("essential", (3, 3), np.float64),
+        homography=stack("homography", (3, 3), np.float64),
+        cam2_from_cam1=stack("cam2_from_cam1", (7,), np.float64),
+        median_angle_deg=stack("median_angle_deg", (), np.float64),
+        num_putative=np.array([r.num_putative for r in results], np.int32).reshape(-1),
+        num_inliers_f=stack("num_inliers_f", (), np.int32),
+        num_inliers_e=stack("num_inliers_e", (), np.int32),
+        num_inliers_h=stack("num_inliers_h", (), np.int32),
+    )
+
+
+def _report(
+    pairs: Sequence[tuple[int, int]], results: Sequence[MatchedPair], num_known: int, wall_s: float
+) -> dict[str, Any]:
+    configs = [r.geometry.config.name for r in results]
+    return {
+        "num_pairs": len(pairs),
+        "num_resumed_pairs": num_known,
+        "num_verified_pairs": sum(len(r.matches) > 0 for r in results),
+        "num_matches": sum(len(r.matches) for r in results),
+        "configs": {name: configs.count(name) for name in sorted(set(configs))},
+        "cpu_s": sum(r.cpu_s for r in results),
+        "wall_s": wall_s,
+        "pairs": [
+            {
+                "image_idx": pair,
+                "config": result.geometry.config.name,
+                "num_putative": result.num_putative,
+                "num_verified": len(result.matches),
+                "num_inliers_f": result.geometry.num_inliers_f,
+                "num_inliers_e": result.geometry.num_inliers_e,
+                "num_inliers_h": result.geometry.num_inliers_h,
+                "median_angle_deg": None
+                if np.isnan(result.geometry.median_angle_deg)
+                else round(float(result.geometry.median_angle_deg), 3),
+                "cpu_s": round(result.cpu_s, 4),
+            }
+            for pair, result in zip(pairs, results, strict=True)
+        ],
+    }
+
+
+def compile_kernels() -> None:
+    """Compile the kernels that this package uses, or load them from numba's cache."""
+    epipolar.compile_kernels()
+    tiny = np.arange(4 * 128, dtype=np.uint8).reshape(4, 128)
+    descriptors.match_sift(tiny, tiny, 0.8, 0.7)
