@@ -1,0 +1,169 @@
+"""Which photographs were taken by the same camera, and what is known of it beforehand."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+from statistics import median, pstdev
+from typing import Any
+
+from sfmapp.errors import UsageError
+from sfmapp.images.exif import ExifFacts, FocalPrior, focal_prior
+from sfmapp.images.image_set import ImageOptions
+from sfmapp.scene.camera import Camera, simple_camera
+
+# Trust in what a user gives without fixing it: a focal length copied from a data sheet, or a calibration.
+_SIGMA_USER_FOCAL, _SIGMA_USER_PARAMS = 0.03, 0.01
+# Frames of one video or one shoot have one size; a few strays must not split them, while photographs collected from
+# many people come in many sizes, none of which holds nearly all.
+_SERIES_SHARE = 0.9
+# That many names that differ in their numbers alone make a series of their own.
+_SERIES_LENGTH = 5
+_SOURCE_RANK = ("exif_35mm", "exif_sensor", "default")
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What cameras are told apart by: a name, a size after orientation, and EXIF."""
+
+    name: str
+    width: int
+    height: int
+    facts: ExifFacts
+
+
+def group_cameras(
+    shots: Sequence[Shot], options: ImageOptions
+) -> tuple[list[Camera], list[int], list[dict[str, Any]], list[tuple[str, str]]]:
+    """Cameras, the camera index of each shot, a report entry per camera, and warnings.
+
+    ``auto`` shares a camera between shots with the same make, model, lens, serial number, focal length and size. Where
+    EXIF does not tell, a series (one folder, one file type, names that differ in their numbers alone) shares a camera
+    if nearly all of it has one size; otherwise the photographs may come from anyone, and each has a camera of its own.
+
+    Returns:
+        cameras in order of first use; camera_idx per shot; JSON-able dicts; (image name, problem) pairs.
+
+    Raises:
+        UsageError: ``camera_params`` with images of several sizes.
+    """
+    sizes = {(shot.width, shot.height) for shot in shots}
+    if options.camera_params is not None and len(sizes) > 1:
+        shown = ", ".join(f"{w}x{h}" for w, h in sorted(sizes)[:4])
+        raise UsageError(
+            f"camera_params describe one camera, but the images have several sizes: {shown}",
+            "give focal_px instead, or leave out the images of other sizes",
+        )
+    keys, rules = _sharing_keys(shots, options)
+    index = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    members: list[list[int]] = [[] for _ in index]
+    for i, key in enumerate(keys):
+        members[index[key]].append(i)
+    priors = [focal_prior(shot.facts, shot.width, shot.height) for shot in shots]
+    warnings = [(shot.name, problem) for shot, prior in zip(shots, priors, strict=True) for problem in prior.problems]
+    cameras, entries = [], []
+    for camera_idx, group in enumerate(members):
+        shot = shots[group[0]]
+        camera, reason = _camera(shot, [priors[i] for i in group], options)
+        cameras.append(camera)
+        entries.append(
+            {
+                "camera_idx": camera_idx,
+                "num_images": len(group),
+                "model": camera.model.name,
+                "width": camera.width,
+                "height": camera.height,
+                "params": [float(value) for value in camera.params],
+                "focal_px": camera.focal,
+                "focal_sigma_px": camera.focal_sigma,
+                "focal_source": camera.focal_source,
+                "focal_reason": reason,
+                "is_fixed": camera.is_fixed,
+                "make": shot.facts.make,
+                "camera": shot.facts.model,
+                "sharing": rules[group[0]],
+            }
+        )
+    return cameras, [index[key] for key in keys], entries, warnings
+
+
+def _camera(shot: Shot, priors: list[FocalPrior], options: ImageOptions) -> tuple[Camera, str]:
+    model, width, height = options.camera_model, shot.width, shot.height
+    if options.camera_params is not None:
+        camera = simple_camera(model, width, height, 1.0, source="user").with_params(options.camera_params)
+        camera = replace(camera, focal_sigma=_SIGMA_USER_PARAMS * camera.focal)
+        reason = "camera_params"
+    elif options.focal_px is not None:
+        sigma = _SIGMA_USER_FOCAL * options.focal_px
+        camera = simple_camera(model, width, height, options.focal_px, sigma, "user")
+        reason = "focal_px"
+    else:
+        prior = _common_prior(priors)
+        camera = simple_camera(model, width, height, prior.focal_px, prior.sigma_px, prior.source)
+        reason = prior.reason
+    return replace(camera, is_fixed=options.fix_intrinsics), reason
+
+
+def _common_prior(priors: list[FocalPrior]) -> FocalPrior:
+    """One prior for images that share a camera: the median of the best source, no surer than they agree."""
+    best = min(priors, key=lambda prior: _SOURCE_RANK.index(prior.source)).source
+    of_best = [prior for prior in priors if prior.source == best]
+    focals = [prior.focal_px for prior in of_best]
+    sigma = (median(prior.sigma_px for prior in of_best) ** 2 + pstdev(focals) ** 2) ** 0.5
+    return replace(of_best[0], focal_px=float(median(focals)), sigma_px=sigma)
+
+
+def _sharing_keys(shots: Sequence[Shot], options: ImageOptions) -> tuple[list[Hashable], list[str]]:
+    """A key per shot, equal for those that share a camera, and the rule behind it."""
+    sharing = options.camera_sharing
+    if sharing == "auto" and options.camera_params is not None:
+        sharing = "all"
+    if sharing == "per_image":
+        return [shot.name for shot in shots], ["a camera per image"] * len(shots)
+    if sharing == "all":
+        return [(shot.width, shot.height) for shot in shots], ["a camera per image size"] * len(shots)
+    if sharing == "per_folder":
+        folders = [str(PurePosixPath(shot.name).parent) for shot in shots]
+        keys: list[Hashable] = [(f, s.width, s.height) for f, s in zip(folders, shots, strict=True)]
+        return keys, ["a camera per folder and image size"] * len(shots)
+    return _automatic_keys(shots)
+
+
+def _automatic_keys(shots: Sequence[Shot]) -> tuple[list[Hashable], list[str]]:
+    keys: list[Hashable] = [shot.name for shot in shots]
+    rules = ["on its own: EXIF does not tell the camera, and the series has other sizes"] * len(shots)
+    series: defaultdict[Hashable, list[int]] = defaultdict(list)
+    templates = Counter(_template(shot) for shot in shots if not _tells_camera(shot.facts))
+    for i, shot in enumerate(shots):
+        if _tells_camera(shot.facts):
+            facts = shot.facts
+            lens = (facts.make, facts.model, facts.lens, facts.serial, facts.focal_mm, facts.focal_35mm)
+            keys[i] = ("exif", *lens, shot.width, shot.height)
+            rules[i] = "EXIF: same make, model, lens, focal length and size"
+            continue
+        folder, ending, stem = template = _template(shot)
+        series[folder, ending, stem if templates[template] >= _SERIES_LENGTH else "", shot.facts.model].append(i)
+    for key, group in series.items():
+        # portrait and landscape frames of one camera are one size
+        sizes = Counter(tuple(sorted((shots[i].width, shots[i].height))) for i in group)
+        size, count = sizes.most_common(1)[0]
+        if count < _SERIES_SHARE * len(group):
+            continue
+        for i in group:
+            if tuple(sorted((shots[i].width, shots[i].height))) == size:
+                keys[i] = ("series", key, shots[i].width, shots[i].height)
+                rules[i] = "no EXIF: same folder, file type, manner of naming and size"
+    return keys, rules
+
+
+def _tells_camera(facts: ExifFacts) -> bool:
+    return bool(facts.model) and (facts.focal_mm is not None or facts.focal_35mm is not None)
+
+
+def _template(shot: Shot) -> tuple[str, str, str]:
+    """(folder, file type, name with its numbers blanked)."""
+    path = PurePosixPath(shot.name)
+    return str(path.parent), path.suffix.lower().replace("jpeg", "jpg"), re.sub("[0-9]+", "#", path.stem)

@@ -1,0 +1,426 @@
+"""From a folder, a glob pattern or a list file to the photographs of a run.
+
+Nothing is decoded here: headers and EXIF are read, and every byte once, for the digest. A file that cannot be used is
+skipped with its reason and the rest goes on.
+"""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import os
+import re
+import stat
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from sfmapp.errors import InputError
+from sfmapp.events import Events
+from sfmapp.images.cameras import Shot, group_cameras
+from sfmapp.images.exif import ExifFacts, read_exif
+from sfmapp.images.headers import Header, UnusableImage, read_header
+from sfmapp.images.image_set import ImageOptions, ImageRecord, ImageSet
+from sfmapp.images.pixels import mask_fit
+
+__all__ = ["ImageOptions", "ImageRecord", "ImageSet", "load_images"]
+
+STAGE = "images"
+EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm"})
+# Pictures and videos that people do put into such folders, and that are not read.
+_FOREIGN_PICTURES = {".gif", ".heic", ".heif", ".avif", ".jp2", ".jxl", ".exr", ".hdr", ".psd", ".pbm", ".jfif"}
+_RAW_PICTURES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"}
+_VIDEOS = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm"}
+_THUMBNAIL_FOLDERS = frozenset({"__MACOSX", "@eaDir"})
+# Fewer pixels than this hold no feature: SIFT needs a neighbourhood of about that size.
+_MIN_SIDE_PX = 16
+_MAX_LIST_BYTES = 64 << 20
+_NAMES_SHOWN = 8
+
+
+@dataclass
+class _Found:
+    """What a source holds: the common root, the files to look into, and those known to be of no use."""
+
+    root: Path
+    paths: list[Path] = field(default_factory=list)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """A file that was looked into and found good."""
+
+    record: ImageRecord
+    header: Header
+    facts: ExifFacts
+    num_bytes: int
+    problems: tuple[str, ...]
+
+
+def load_images(
+    source: str | os.PathLike[str], options: ImageOptions, events: Events, *, threads: int | None = None
+) -> tuple[ImageSet, dict[str, Any]]:
+    """List, check and describe the photographs of a source.
+
+    Args:
+        source: a folder (searched recursively; hidden files and folders are left out), a glob pattern (``**`` goes
+            into folders), or a ``.txt`` file with a path per line (relative to the list, or absolute; ``#`` begins a
+            comment).
+        options: what to read and what is known about the cameras.
+        events: told about progress, every file that is skipped, and how cameras were assigned.
+        threads: how many files are read at a time; None: as many as there are processors, 8 at most.
+
+    Returns:
+        The set, which may be empty, and a JSON-able report.
+
+    Raises:
+        InputError: the source or the mask folder does not exist, or no mask fits any image.
+        UsageError: ``camera_params`` with images of several sizes.
+        InterruptedRunError: a stop was asked for.
+    """
+    start = time.monotonic()
+    found = _find(os.fspath(source), options)
+    events.started(STAGE, f"reading {len(found.paths)} files", total=len(found.paths))
+    scans: list[_Scan] = []
+    skipped = list(found.skipped)
+    for outcome in _scan_all(found, options, threads, events):
+        if isinstance(outcome, _Scan):
+            scans.append(outcome)
+        else:
+            skipped.append(outcome)
+    cameras, camera_idx, entries, focal_problems = group_cameras(
+        [Shot(s.record.name, s.record.width, s.record.height, s.facts) for s in scans], options
+    )
+    images = tuple(replace(scan.record, camera_idx=idx) for scan, idx in zip(scans, camera_idx, strict=True))
+    skipped.sort(key=lambda item: _natural(item[0]))
+    image_set = ImageSet(images, tuple(cameras), tuple(skipped))
+    problems = [(scan.record.name, problem) for scan in scans for problem in scan.problems] + focal_problems
+    duplicates = _duplicates(images)
+    _tell(events, image_set, scans, entries, problems, duplicates)
+    if options.mask_path is not None and images and not any(image.mask_path for image in images):
+        name = images[0].name
+        raise InputError(
+            f"no mask in {options.mask_path} fits any image", f"expected for example {options.mask_path}/{name}.png"
+        )
+    report = _report(os.fspath(source), found, image_set, scans, entries, problems, duplicates)
+    report["seconds"] = round(time.monotonic() - start, 3)
+    events.finished(STAGE, f"{len(images)} images, {len(cameras)} cameras, {len(skipped)} files skipped", **report)
+    return image_set, report
+
+
+# ---------------------------------------------------------------------------------------------- what a source holds
+
+
+def _find(source: str, options: ImageOptions) -> _Found:
+    mask_root = Path(options.mask_path).absolute() if options.mask_path is not None else None
+    if mask_root is not None and not mask_root.is_dir():
+        raise InputError(f"mask_path {options.mask_path} is not a folder", "masks are looked for as mask_path/NAME.png")
+    if os.path.isdir(source):
+        found = _find_in_folder(Path(source).absolute(), mask_root)
+    elif os.path.isfile(source):
+        if not source.lower().endswith(".txt"):
+            raise InputError(
+                f"{source} is a single file", "give a folder of images, a glob pattern in quotes, or a .txt list"
+            )
+        found = _find_in_list(Path(source).absolute())
+    elif glob.has_magic(source):
+        found = _find_by_pattern(source, mask_root)
+    else:
+        raise InputError(
+            f"{source} does not exist", "give a folder of images, a glob pattern in quotes, or a .txt list"
+        )
+    found.paths.sort(key=lambda path: _natural(os.path.relpath(path, found.root).replace(os.sep, "/")))
+    if mask_root == found.root:  # photo.jpg.png beside photo.jpg is its mask
+        every = set(found.paths)
+        found.paths = [p for p in found.paths if not (p.suffix.lower() == ".png" and p.with_suffix("") in every)]
+    return found
+
+
+def _natural(name: str) -> tuple[Any, ...]:
+    """Sort key in which ``img9`` comes before ``img10``, and no two names are equal."""
+    parts = re.split("([0-9]+)", name.casefold())
+    return tuple((int(part), "") if i % 2 else (-1, part) for i, part in enumerate(parts)), name
+
+
+def _find_in_folder(root: Path, mask_root: Path | None) -> _Found:
+    found = _Found(root)
+    visited: set[tuple[int, int]] = set()
+    pending = [root]
+    while pending:
+        folder = pending.pop()
+        name = os.path.relpath(folder, root)
+        try:
+            status = os.stat(folder)
+            entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+        except OSError as error:
+            found.skipped.append((_printable(name) + "/", f"folder cannot be read: {error.strerror}"))
+            continue
+        # links to folders are followed, but not in circles
+        if (status.st_dev, status.st_ino) in visited:
+            continue
+        visited.add((status.st_dev, status.st_ino))
+        for entry in entries:
+            if entry.name.startswith(".") or entry.name in _THUMBNAIL_FOLDERS:
+                continue
+            path = Path(entry.path)
+            if entry.is_dir() and path.suffix.lower() not in EXTENSIONS:
+                if path != mask_root:
+                    pending.append(path)
+            else:
+                _take(found, path)
+    return found
+
+
+def _find_by_pattern(pattern: str, mask_root: Path | None) -> _Found:
+    fixed = []
+    for part in Path(pattern).parts:
+        if glob.has_magic(part):
+            break
+        fixed.append(part)
+    found = _Found(Path(*fixed).absolute() if fixed else Path.cwd())
+    for match in sorted(set(glob.glob(pattern, recursive=True))):
+        path = Path(os.path.abspath(match))
+        is_masked = mask_root is not None and mask_root != found.root and mask_root in path.parents
+        if not is_masked and not (path.is_dir() and path.suffix.lower() not in EXTENSIONS):
+            _take(found, path)
+    return found
+
+
+def _take(found: _Found, path: Path) -> None:
+    ending = path.suffix.lower()
+    if ending in EXTENSIONS:
+        found.paths.append(path)
+    elif ending in _FOREIGN_PICTURES | _RAW_PICTURES | _VIDEOS:
+        name = _printable(os.path.relpath(path, found.root))
+        advice = "extract frames from them first" if ending in _VIDEOS else "convert them to JPEG or PNG"
+        found.skipped.append((name, f"{ending} files are not read: {advice}"))
+
+
+def _find_in_list(list_path: Path) -> _Found:
+    try:
+        if list_path.stat().st_size > _MAX_LIST_BYTES:
+            raise InputError(f"{list_path} is too large for a list of images")
+        text = list_path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{list_path} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{list_path} is not a text file in UTF-8", "write one path per line") from error
+    skipped, paths = [], dict[Path, None]()
+    for number, line in enumerate(text.splitlines(), 1):
+        entry = line.strip()
+        if not entry or entry.startswith("#"):
+            continue
+        if "\0" in entry or re.match(r"[a-zA-Z][a-zA-Z0-9+.-]+://", entry):
+            skipped.append((_printable(entry[:200]), f"line {number} of the list is not a path"))
+            continue
+        path = Path(os.path.abspath(list_path.parent / entry))
+        if path in paths:
+            skipped.append((_printable(entry), f"listed twice (line {number} of the list)"))
+        paths[path] = None
+    root = Path(os.path.commonpath([path.parent for path in paths])) if paths else list_path.parent
+    return _Found(root, list(paths), skipped)
+
+
+def _printable(name: str) -> str:
+    """A name that can be printed and written as UTF-8, whatever bytes the file system holds."""
+    name = name.replace(os.sep, "/").encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in name)
+
+
+# ------------------------------------------------------------------------------------------------ looking into files
+
+
+def _scan_all(
+    found: _Found, options: ImageOptions, threads: int | None, events: Events
+) -> Iterator[_Scan | tuple[str, str]]:
+    mask_root = Path(options.mask_path).absolute() if options.mask_path is not None else None
+    pool = ThreadPoolExecutor(threads or min(8, os.cpu_count() or 1))
+    try:
+        for outcome in pool.map(lambda path: _scan(path, found.root, mask_root, options), found.paths):
+            events.advanced(STAGE)
+            yield outcome
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _scan(path: Path, root: Path, mask_root: Path | None, options: ImageOptions) -> _Scan | tuple[str, str]:
+    """Read one file: a scan, or (name, reason) if it cannot be used."""
+    name = os.path.relpath(path, root).replace(os.sep, "/")
+    if name != _printable(name):
+        return _printable(name), "its name is not plain text in UTF-8: rename it"
+    try:
+        data = _read_file(path, options.max_image_bytes)
+        header = read_header(data)
+        _check_size(header, options)
+    except UnusableImage as reason:
+        return name, str(reason)
+    except OSError as error:
+        return name, f"cannot be read: {error.strerror or error}"
+    facts = read_exif(header.exif)
+    is_turned = facts.orientation >= 5
+    record = ImageRecord(
+        name=name,
+        path=path,
+        width=header.height if is_turned else header.width,
+        height=header.width if is_turned else header.height,
+        orientation=facts.orientation,
+        digest=hashlib.blake2b(data, digest_size=16).hexdigest(),
+        has_alpha=header.has_alpha and options.use_alpha,
+        timestamp=facts.timestamp,
+        gps=facts.gps,
+        make=facts.make,
+        model=facts.model,
+    )
+    problems = facts.problems
+    if mask_root is not None:
+        record, mask_problem = _with_mask(record, mask_root)
+        problems += mask_problem
+    return _Scan(record, header, facts, len(data), problems)
+
+
+def _read_file(path: Path, max_bytes: int) -> bytes:
+    status = os.stat(path)
+    if stat.S_ISDIR(status.st_mode):
+        raise UnusableImage("a folder, not a file")
+    if not stat.S_ISREG(status.st_mode):  # opening a pipe would wait for ever
+        raise UnusableImage("not a regular file")
+    with open(path, "rb") as file:
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise UnusableImage(f"larger than max_image_bytes ({max_bytes} bytes)")
+    return data
+
+
+def _check_size(header: Header, options: ImageOptions) -> None:
+    size = f"{header.width}x{header.height}"
+    if header.width * header.height > options.max_pixels:
+        raise UnusableImage(f"{size} is more than max_pixels ({options.max_pixels} pixels)")
+    if min(header.width, header.height) < _MIN_SIDE_PX:
+        raise UnusableImage(f"too small: {size}, at least {_MIN_SIDE_PX} pixels a side are needed")
+
+
+def _with_mask(record: ImageRecord, mask_root: Path) -> tuple[ImageRecord, tuple[str, ...]]:
+    """The record with its mask, or with None and the reason why a mask that is there cannot be used."""
+    stem = os.path.splitext(record.name)[0]
+    for path in (mask_root / f"{record.name}.png", mask_root / f"{stem}.png"):
+        if path == record.path or not path.is_file():
+            continue
+        try:
+            header = read_header(_read_file(path, 1 << 30))
+        except UnusableImage as reason:
+            return record, (f"its mask {path.name} is not used: {reason}",)
+        except OSError as error:
+            return record, (f"its mask {path.name} is not used: {error.strerror}",)
+        size, wanted = f"{header.width}x{header.height}", f"{record.width}x{record.height}"
+        if mask_fit(header, record) is None:
+            return record, (f"its mask is not used: {size} pixels, the image has {wanted}",)
+        masked = replace(record, mask_path=path)
+        if {header.width, header.height} != {record.width, record.height}:
+            return masked, (f"its mask is scaled: {size} pixels, the image has {wanted}",)
+        return masked, ()
+    return record, ()
+
+
+# ------------------------------------------------------------------------------------------------- telling about it
+
+
+def _duplicates(images: Iterable[ImageRecord]) -> list[list[str]]:
+    by_digest: defaultdict[str, list[str]] = defaultdict(list)
+    for image in images:
+        by_digest[image.digest].append(image.name)
+    return [names for names in by_digest.values() if len(names) > 1]
+
+
+def _tell(
+    events: Events,
+    image_set: ImageSet,
+    scans: list[_Scan],
+    entries: list[dict[str, Any]],
+    problems: list[tuple[str, str]],
+    duplicates: list[list[str]],
+) -> None:
+    """One event per kind of thing, with the names in it, so that a thousand bad files do not make a thousand lines."""
+    for reason, names in _by_reason(image_set.skipped).items():
+        events.warned(STAGE, f"skipped {_some(names)}: {reason}", names=names, reason=reason)
+    for problem, names in _by_reason(problems).items():
+        events.warned(STAGE, f"{_some(names)}: {problem}", names=names, reason=problem)
+    for names in duplicates:
+        events.warned(STAGE, f"{_some(names)} are the same file: copies add nothing to a reconstruction", names=names)
+    deep = [scan.record.name for scan in scans if scan.header.bits > 8]
+    if deep:
+        events.decided(STAGE, f"{len(deep)} images of 16 bits are scaled to 8 bits", names=deep)
+    turned = [scan.record.name for scan in scans if scan.record.orientation != 1]
+    if turned:
+        events.decided(STAGE, f"{len(turned)} images are turned upright as EXIF says", names=turned)
+    without = [image.name for image in image_set.images if image.mask_path is None]
+    if 0 < len(without) < len(image_set.images):
+        events.decided(STAGE, f"{len(without)} of {len(image_set.images)} images have no mask", names=without)
+    for entry in entries:
+        events.decided(
+            STAGE,
+            f"camera {entry['camera_idx']}: {entry['num_images']} images, {entry['width']}x{entry['height']}, focal "
+            f"length {entry['focal_px']:.0f} +- {entry['focal_sigma_px']:.0f} px ({entry['focal_reason']})",
+            **entry,
+        )
+    if not image_set.images:
+        events.warned(STAGE, "no usable image found: expected files such as .jpg, .png, .tif, .webp")
+
+
+def _by_reason(items: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    groups: dict[str, list[str]] = {}
+    for name, reason in items:
+        groups.setdefault(reason, []).append(name)
+    return groups
+
+
+def _some(names: list[str]) -> str:
+    rest = len(names) - _NAMES_SHOWN
+    return ", ".join(names[:_NAMES_SHOWN]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def _report(
+    source: str,
+    found: _Found,
+    image_set: ImageSet,
+    scans: list[_Scan],
+    entries: list[dict[str, Any]],
+    problems: list[tuple[str, str]],
+    duplicates: list[list[str]],
+) -> dict[str, Any]:
+    return {
+        "source": _printable(source),
+        "root": _printable(str(found.root)),
+        "num_found": len(scans) + len(image_set.skipped),
+        "num_used": len(scans),
+        "num_skipped": len(image_set.skipped),
+        "num_bytes": sum(scan.num_bytes for scan in scans),
+        "num_with_gps": sum(image.gps is not None for image in image_set.images),
+        "num_with_time": sum(image.timestamp is not None for image in image_set.images),
+        "num_with_mask": sum(image.mask_path is not None for image in image_set.images),
+        "skipped": [{"name": name, "reason": reason} for name, reason in image_set.skipped],
+        "problems": [{"name": name, "problem": problem} for name, problem in problems],
+        "duplicates": duplicates,
+        "cameras": entries,
+        "images": [
+            {
+                "name": image.name,
+                "width": image.width,
+                "height": image.height,
+                "orientation": image.orientation,
+                "camera_idx": image.camera_idx,
+                "digest": image.digest,
+                "mask": None if image.mask_path is None else _printable(str(image.mask_path)),
+                "format": scan.header.format,
+                "kind": scan.header.kind,
+                "bits": scan.header.bits,
+                "timestamp": image.timestamp,
+                "gps": image.gps and list(image.gps),
+            }
+            for image, scan in zip(image_set.images, scans, strict=True)
+        ],
+    }

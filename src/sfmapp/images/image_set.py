@@ -1,0 +1,121 @@
+"""The photographs of a run: where they are, how to hold them up, and which camera took each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from sfmapp.errors import UsageError
+from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel
+
+CameraSharing = Literal["auto", "all", "per_folder", "per_image"]
+
+
+@dataclass(frozen=True)
+class ImageOptions:
+    """What to read and what is known about the cameras.
+
+    Attributes:
+        camera_model: lens model of all cameras, one of :class:`CameraModel` or its name.
+        camera_params: parameters of ``camera_model`` in COLMAP's order, in pixels after orientation; they describe one
+            camera, so all images must have one size. None: from EXIF or a default.
+        focal_px: focal length in pixels of all images; None: from EXIF or a default.
+        fix_intrinsics: keep the cameras as they are read; nothing about them is refined.
+        camera_sharing: which images share a camera. ``auto``: those that EXIF or their names and sizes show to be of
+            one camera and one zoom; ``all``, ``per_folder``: whatever has the same size; ``per_image``: none.
+        mask_path: folder of masks, ``NAME.png`` for the image ``NAME`` (COLMAP's naming, as in ``a/b.jpg.png``) or the
+            same name with ``.png`` for its ending; black is ignored. None: no masks.
+        use_alpha: transparent parts of images with an alpha channel are ignored, like a mask.
+        max_image_bytes: larger files are skipped.
+        max_pixels: images with more pixels are skipped, by what their headers say.
+    """
+
+    camera_model: CameraModel = CameraModel.SIMPLE_RADIAL
+    camera_params: tuple[float, ...] | None = None
+    focal_px: float | None = None
+    fix_intrinsics: bool = False
+    camera_sharing: CameraSharing = "auto"
+    mask_path: str | None = None
+    use_alpha: bool = True
+    max_image_bytes: int = 1 << 30
+    max_pixels: int = 250_000_000
+
+    def __post_init__(self) -> None:
+        model = self.camera_model
+        if isinstance(model, str):
+            if model not in CameraModel.__members__:
+                raise UsageError(f"camera_model is {model!r}", f"one of {', '.join(CameraModel.__members__)}")
+            object.__setattr__(self, "camera_model", CameraModel[model])
+        if self.camera_sharing not in get_args(CameraSharing):
+            raise UsageError(
+                f"camera_sharing is {self.camera_sharing!r}", f"one of {', '.join(get_args(CameraSharing))}"
+            )
+        if self.focal_px is not None and not 0.0 < self.focal_px < float("inf"):
+            raise UsageError(f"focal_px is {self.focal_px:g}, expected a positive number of pixels")
+        if self.camera_params is not None:
+            self._check_params(tuple(float(value) for value in self.camera_params))
+        if self.max_image_bytes <= 0 or self.max_pixels <= 0:
+            raise UsageError("max_image_bytes and max_pixels must be positive")
+
+    def _check_params(self, params: tuple[float, ...]) -> None:
+        object.__setattr__(self, "camera_params", params)
+        names = PARAM_NAMES[self.camera_model]
+        if len(params) != len(names):
+            raise UsageError(
+                f"camera_params has {len(params)} numbers, {self.camera_model.name} takes {len(names)}",
+                f"give {', '.join(names)}",
+            )
+        if self.focal_px is not None:
+            raise UsageError("camera_params and focal_px both give a focal length", "leave one of them out")
+        focals = [value for name, value in zip(names, params, strict=True) if name in ("f", "fx", "fy")]
+        if not all(abs(value) < float("inf") for value in params) or min(focals) <= 0.0:
+            raise UsageError("camera_params must be finite numbers, focal lengths positive")
+
+
+@dataclass(frozen=True)
+class ImageRecord:
+    """One usable photograph.
+
+    Attributes:
+        name: posix path relative to the common root, unique; the image's name in every output.
+        path: absolute path of the file.
+        width, height: in pixels, after orientation.
+        orientation: EXIF orientation 1 to 8 that the readers in ``pixels`` apply.
+        camera_idx: index into the cameras of the :class:`ImageSet`.
+        digest: hex BLAKE2b (16 bytes) of the file's bytes.
+        has_alpha: the file has an alpha channel that may serve as a mask.
+        mask_path: its mask, None for none.
+        timestamp: when it was taken, seconds since 1970 (a clock without a zone is read as UTC), None where unknown.
+        gps: latitude and longitude in degrees and altitude in metres (None where unknown), None where unknown.
+        make, model: of the camera, empty where unknown.
+    """
+
+    name: str
+    path: Path
+    width: int
+    height: int
+    orientation: int = 1
+    camera_idx: int = 0
+    digest: str = ""
+    has_alpha: bool = False
+    mask_path: Path | None = None
+    timestamp: float | None = None
+    gps: tuple[float, float, float | None] | None = None
+    make: str = ""
+    model: str = ""
+
+
+@dataclass(frozen=True)
+class ImageSet:
+    """The photographs of a run, in natural order of their names.
+
+    Attributes:
+        images: the usable ones.
+        cameras: what ``camera_idx`` of the images points to, in order of first use.
+        skipped: (name, reason) of the files that are not used.
+    """
+
+    images: tuple[ImageRecord, ...]
+    cameras: tuple[Camera, ...]
+    skipped: tuple[tuple[str, str], ...] = ()

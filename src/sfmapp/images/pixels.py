@@ -1,0 +1,228 @@
+"""Pixels of a photograph, upright and 8 bits deep, whatever the file holds.
+
+Grey is OpenCV's, 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601) of the 8-bit colours, rounded; :func:`read_gray` and
+:func:`read_picture` give the same bytes. Values deeper than 8 bits are scaled, never clipped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.errors import InputError
+from sfmapp.images.headers import Header, UnusableImage, read_header
+from sfmapp.images.image_set import ImageRecord
+from sfmapp.images.tags import byte_order, first_directory
+
+Pixels = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """All that one decoding of a file gives.
+
+    Attributes:
+        rgb: (H, W, 3) uint8.
+        gray: (H, W) uint8.
+        mask: (H, W) bool, True where the picture may be used; None for everywhere. Mask file and alpha combined.
+    """
+
+    rgb: Pixels
+    gray: Pixels
+    mask: NDArray[np.bool_] | None
+
+
+def read_picture(record: ImageRecord) -> Picture:
+    """Colour, grey and mask of a photograph, upright, from one decoding.
+
+    Raises:
+        InputError: the file is gone, was changed since it was listed, or cannot be decoded.
+    """
+    stored, alpha = _decode(record)
+    stored, alpha = _upright(stored, record.orientation), _upright(alpha, record.orientation)
+    import cv2
+
+    if stored.ndim == 2:
+        gray, rgb = stored, cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB)
+    else:
+        gray, rgb = cv2.cvtColor(stored, cv2.COLOR_RGB2GRAY), stored
+    return Picture(rgb, gray, _combine(_read_mask_file(record), _alpha_mask(alpha)))
+
+
+def read_rgb(record: ImageRecord) -> Pixels:
+    """(H, W, 3) uint8 colours of a photograph, upright. Raises InputError as :func:`read_picture` does."""
+    import cv2
+
+    stored = _upright(_decode(record)[0], record.orientation)
+    return cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB) if stored.ndim == 2 else stored
+
+
+def read_gray(record: ImageRecord) -> Pixels:
+    """(H, W) uint8 grey values of a photograph, upright. Raises InputError as :func:`read_picture` does."""
+    import cv2
+
+    stored = _upright(_decode(record)[0], record.orientation)
+    return stored if stored.ndim == 2 else cv2.cvtColor(stored, cv2.COLOR_RGB2GRAY)
+
+
+def read_rgb_and_gray(record: ImageRecord) -> tuple[Pixels, Pixels]:
+    """(H, W, 3) and (H, W) uint8 from one decoding. Raises InputError as :func:`read_picture` does."""
+    picture = read_picture(record)
+    return picture.rgb, picture.gray
+
+
+def read_mask(record: ImageRecord) -> NDArray[np.bool_] | None:
+    """(H, W) bool, True where the picture may be used, from its mask file and its alpha channel; None for everywhere.
+
+    Raises:
+        InputError: the image or its mask cannot be read.
+    """
+    alpha = _upright(_decode(record)[1], record.orientation) if record.has_alpha else None
+    return _combine(_read_mask_file(record), _alpha_mask(alpha))
+
+
+def _decode(record: ImageRecord) -> tuple[Pixels, Pixels | None]:
+    """((H, W) or (H, W, 3) RGB, alpha (H, W) or None) uint8 as stored, not yet upright."""
+    data = _read_bytes(record)
+    try:
+        header = read_header(data)
+    except UnusableImage as reason:
+        raise InputError(f"{record.name}: {reason}") from reason
+    size = (header.width, header.height)
+    expected = (record.height, record.width) if record.orientation >= 5 else (record.width, record.height)
+    # also the guard against a header that was swapped for one that claims gigapixels
+    if size != expected:
+        raise InputError(f"{record.name} was changed while in use: {size[0]}x{size[1]} pixels, was {expected}")
+    raw = decode_bytes(data, header)
+    if raw is None or raw.shape[:2] != size[::-1]:
+        raise InputError(
+            f"{record.name} cannot be decoded: its data are damaged", "copy it again from its source, or leave it out"
+        )
+    pixels = to_8_bits(raw)
+    if pixels.ndim == 3 and pixels.shape[2] == 4:
+        return np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3])
+    return pixels, None
+
+
+def _read_bytes(record: ImageRecord) -> bytes:
+    try:
+        return record.path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{record.name} cannot be read: {error.strerror or error}") from error
+
+
+def decode_bytes(data: bytes, header: Header) -> NDArray[Any] | None:
+    """(H, W), (H, W, 3) RGB or (H, W, 4) RGBA uint8 or uint16 as stored in the file; None if it cannot be decoded."""
+    import cv2
+
+    if header.format == "tiff":
+        data = _without_orientation(data)
+    # IMREAD_UNCHANGED keeps depth, grey and alpha, but does not convert CMYK
+    is_plain = header.kind in ("rgb", "palette", "cmyk") and header.bits <= 8 and not header.has_alpha
+    flags = cv2.IMREAD_COLOR_RGB if is_plain else cv2.IMREAD_UNCHANGED
+    try:
+        raw = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    except (cv2.error, MemoryError):
+        return None
+    if raw is None or raw.dtype not in (np.uint8, np.uint16):
+        return None
+    if is_plain or raw.ndim == 2:
+        return raw
+    if raw.shape[2] == 1:
+        return raw[..., 0]
+    return cv2.cvtColor(raw, cv2.COLOR_BGRA2RGBA if raw.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+
+
+def _without_orientation(data: bytes) -> bytes:
+    """The same TIFF with orientation 1: OpenCV turns TIFFs whatever it is told."""
+    place = first_directory(data).value_offset.get(274)
+    if place is None:
+        return data
+    one = b"\1\0" if byte_order(data) == "<" else b"\0\1"
+    return data[:place] + one + data[place + 2 :]
+
+
+def to_8_bits(raw: NDArray[Any]) -> Pixels:
+    """uint16 values scaled to uint8 with rounding; uint8 as it is.
+
+    Cameras write 10, 12 and 14 bits into 16: the smallest of these depths that holds the largest value is taken as
+    white, so that such pictures do not come out black.
+    """
+    if raw.dtype == np.uint8:
+        return raw
+    color = raw[..., :3] if raw.ndim == 3 else raw
+    largest = int(color.max(initial=0))
+    white = next(value for bits in (8, 10, 12, 14, 16) if largest <= (value := (1 << bits) - 1))
+    table = ((np.arange(65536, dtype=np.int64) * 510 + white) // (2 * white)).clip(0, 255).astype(np.uint8)
+    scaled = table[raw]
+    if raw.ndim == 3 and raw.shape[2] == 4:
+        scaled[..., 3] = raw[..., 3] >> 8
+    return scaled
+
+
+def _upright(pixels: Any, orientation: int) -> Any:
+    """Undo an EXIF orientation (CIPA DC-008, tag 274): where row 0 and column 0 of the file belong."""
+    if pixels is None or orientation == 1:
+        return pixels
+    if orientation >= 5:
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    return np.ascontiguousarray(pixels)
+
+
+def _alpha_mask(alpha: Pixels | None) -> NDArray[np.bool_] | None:
+    """More than half opaque; None where the channel says the same everywhere, as it does in most files."""
+    if alpha is None:
+        return None
+    mask = alpha > 127
+    return None if mask.all() or not mask.any() else mask
+
+
+def _read_mask_file(record: ImageRecord) -> NDArray[np.bool_] | None:
+    if record.mask_path is None:
+        return None
+    import cv2
+
+    try:
+        data = record.mask_path.read_bytes()
+        header = read_header(data)
+    except OSError as error:
+        raise InputError(f"mask of {record.name} cannot be read: {error.strerror or error}") from error
+    except UnusableImage as reason:
+        raise InputError(f"mask of {record.name}: {reason}") from reason
+    fit = mask_fit(header, record)
+    raw = decode_bytes(data, header) if fit is not None else None
+    if raw is None:
+        raise InputError(f"mask {record.mask_path} of {record.name} cannot be decoded or has another shape")
+    mask = (raw[..., :3].any(axis=2) if raw.ndim == 3 else raw > 0).astype(np.uint8)
+    if fit == "stored":
+        mask = _upright(mask, record.orientation)
+    if mask.shape != (record.height, record.width):
+        mask = cv2.resize(mask, (record.width, record.height), interpolation=cv2.INTER_NEAREST)
+    return mask.astype(bool)
+
+
+def mask_fit(header: Header, record: ImageRecord) -> str | None:
+    """How a mask lies on its image: ``upright``, ``stored`` (turned like the file), or None if it does not fit.
+
+    A mask of another size fits if its shape is the same to a pixel: it was made for a smaller or larger version.
+    """
+    for fit, width, height in (("upright", record.width, record.height), ("stored", record.height, record.width)):
+        if fit == "stored" and record.orientation < 5:
+            break
+        scale = max(header.width / width, header.height / height)
+        if abs(header.width - width * scale) <= 1.0 and abs(header.height - height * scale) <= 1.0:
+            return fit
+    return None
+
+
+def _combine(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    if a is None or b is None:
+        return b if a is None else a
+    return a & b
