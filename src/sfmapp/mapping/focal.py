@@ -1,50 +1,44 @@
-"""A first focal length from fundamental matrices, where neither the user nor EXIF knows one.
+"""A first focal length from pairs of images, where neither the user nor EXIF knows one.
 
-For the right focal, E = K^T F K has two equal singular values. Their relative difference, summed robustly over many
-pairs, is searched along one dimension (Mendonca and Cipolla, "A simple technique for self-calibration", CVPR 1999).
-One pair says little, and nothing where the optical axes meet; hundreds together with a wide prior are a good start
-for the adjustment, which does the rest.
+Each pair with its fundamental matrix has, for a trial focal length, a best relative pose; what its matches lose
+against the best trial is the pair's evidence. Summed over many pairs with a wide prior this is a profile likelihood in
+one unknown (cf. Sturm et al., "Focal length calibration from two views", ECCV 2005, which reads it off one F). Unlike the
+asymmetry of the singular values of K^T F K (Mendonca and Cipolla, CVPR 1999) it is flat, not misleading, where the
+optical axes meet or the motion is planar, as on a turntable.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.scene.camera import Camera
+from sfmapp.geometry import epipolar
+from sfmapp.scene.camera import Camera, pixels_to_normalized
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
+from sfmapp.scene.tracks import Tracks
 
-# Multiples of max(width, height): 130 to 11 degrees of view across the longer side.
-FOCAL_RATIOS = np.geomspace(0.25, 5.0, 121)
+# Multiples of max(width, height): 120 to 14 degrees of view across the longer side, in steps of 1.38; around the best
+# of them steps of 1.08, about what the first adjustment needs.
+COARSE_RATIOS = np.geomspace(0.3, 4.0, 9)
+FINE_STEPS = np.geomspace(1 / 1.26, 1.26, 7)
 # Log-normal prior around the default 1.2 max(w, h): one sigma reaches from 0.66 to 2.2, phone wide to short tele.
 PRIOR_RATIO, PRIOR_LOG_SIGMA = 1.2, 0.6
-# Relative difference of the singular values that noise alone makes, and where a pair counts as an outlier.
-NOISE, OUTLIER = 0.05, 3.0
-
-
-def essential_asymmetry(fundamental: NDArray[np.float64], ratios: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P, K) relative differences (s1 - s2) / s1 of the singular values of E = K^T F K.
-
-    Args:
-        fundamental: (P, 3, 3) float64, for pixels with the origin at the principal point, in units of the longer side.
-        ratios: (K,) focal lengths in the same unit.
-    """
-    diagonal = np.stack([ratios, ratios, np.ones_like(ratios)], -1)
-    essential = diagonal[None, :, :, None] * fundamental[:, None] * diagonal[None, :, None, :]
-    singular = np.linalg.svd(essential, compute_uv=False)
-    return (singular[..., 0] - singular[..., 1]) / np.maximum(singular[..., 0], 1e-300)
+# Bounds on the work: the strongest pairs, and an even sample of their matches.
+MAX_PAIRS, MAX_MATCHES = 20, 150
 
 
 def estimate_focal_ratio(
-    cameras: list[Camera], image_camera_idx: NDArray[np.int32], correspondences: Correspondences
+    cameras: list[Camera], image_camera_idx: NDArray[np.int32], correspondences: Correspondences, tracks: Tracks
 ) -> tuple[float | None, dict[str, Any]]:
     """The focal length as a multiple of max(width, height) that the pairs of default cameras agree on.
 
     Args:
         cameras, image_camera_idx: of the images; only cameras whose focal_source is ``default`` take part.
         correspondences: verified pairs with fundamental matrices.
+        tracks: the observations behind them.
 
     Returns:
         The ratio, or None where the pairs do not prefer one clearly to the default, and the decision's numbers.
@@ -52,33 +46,80 @@ def estimate_focal_ratio(
     unknown = np.array([c.focal_source == "default" and not c.is_fixed for c in cameras], bool)
     pairs = np.flatnonzero(
         unknown[image_camera_idx[correspondences.pair_image_idx]].all(axis=1)
-        & (correspondences.config == TwoViewConfig.UNCALIBRATED)
+        & np.isin(correspondences.config, (TwoViewConfig.UNCALIBRATED, TwoViewConfig.CALIBRATED))
         & np.isfinite(correspondences.fundamental[:, 0, 0])
     )
-    # the best supported pairs are enough, and bound the time on large sets
-    pairs = pairs[np.argsort(-correspondences.num_inliers[pairs], kind="stable")][:500]
+    pairs = pairs[np.argsort(-correspondences.num_inliers[pairs], kind="stable")][:MAX_PAIRS]
     if len(pairs) == 0:
         return None, {"num_pairs": 0}
-    centred = np.empty((len(pairs), 3, 3))
-    for n, p in enumerate(pairs):
-        first, second = (cameras[image_camera_idx[i]] for i in correspondences.pair_image_idx[p])
-        centred[n] = _pixels_from_ratio(second).T @ correspondences.fundamental[p] @ _pixels_from_ratio(first)
-    asymmetry = essential_asymmetry(centred, FOCAL_RATIOS)
-    cost = np.minimum(asymmetry / NOISE, OUTLIER) ** 2
-    # more matches make a better F; the square root keeps one strong pair from drowning the rest
-    weight = np.sqrt(correspondences.num_inliers[pairs])
-    total = (weight / weight.mean()) @ cost + (np.log(FOCAL_RATIOS / PRIOR_RATIO) / PRIOR_LOG_SIGMA) ** 2
-    best = int(np.argmin(total))
-    at_default = float(np.interp(PRIOR_RATIO, FOCAL_RATIOS, total))
-    data = {
-        "num_pairs": len(pairs), "ratio": float(FOCAL_RATIOS[best]), "cost": float(total[best]),
-        "cost_at_default": at_default,
-    }  # fmt: skip
-    # half the cost is a log-likelihood: 9 less is three standard deviations away from the default
-    return (float(FOCAL_RATIOS[best]) if at_default - total[best] > 9.0 else None), data
+    samples = [_sample(cameras, image_camera_idx, correspondences, tracks, int(pair)) for pair in pairs]
+    coarse = _total_loss(COARSE_RATIOS, samples)
+    fine_ratios = COARSE_RATIOS[np.argmin(coarse)] * FINE_STEPS
+    fine = _total_loss(fine_ratios, samples)
+    ratio, least = float(fine_ratios[np.argmin(fine)]), float(fine.min())
+    at_default = float(_total_loss(np.array([PRIOR_RATIO]), samples)[0])
+    data = {"num_pairs": len(pairs), "ratio": ratio, "loss": least, "loss_at_default": at_default}
+    # a log-likelihood ratio of 4.5 is three standard deviations
+    return (ratio if at_default - least > 4.5 else None), data
 
 
-def _pixels_from_ratio(camera: Camera) -> NDArray[np.float64]:
-    """(3, 3) matrix from coordinates centred and scaled by the longer side to pixels."""
-    size = float(max(camera.width, camera.height))
-    return np.array([[size, 0.0, camera.canonical[2]], [0.0, size, camera.canonical[3]], [0.0, 0.0, 1.0]])
+def matched_pixels(
+    tracks: Tracks, correspondences: Correspondences, pair_idx: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(K, 2) pixels of the verified matches of a pair in both images, as far as tracks hold them together."""
+    matches = correspondences.matches_of_pair(pair_idx)
+    sides = []
+    for side in range(2):
+        obs = tracks.observations_of_image(correspondences.pair_image_idx[pair_idx, side])
+        features = tracks.obs_feature_idx[obs]
+        obs_of_feature = np.full(1 + max(features.max(initial=0), matches[:, side].max(initial=0)), -1)
+        obs_of_feature[features] = obs
+        sides.append(obs_of_feature[matches[:, side]])
+    tracked = (sides[0] >= 0) & (sides[1] >= 0)
+    first, second = sides[0][tracked], sides[1][tracked]
+    together = tracks.obs_track_idx[first] == tracks.obs_track_idx[second]
+    return tracks.obs_xy[first[together]], tracks.obs_xy[second[together]]
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """A pair as the search needs it: its F, its cameras and some of its matched pixels."""
+
+    fundamental: NDArray[np.float64]
+    cameras: tuple[Camera, Camera]
+    pixels: tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def _sample(
+    cameras: list[Camera],
+    image_camera_idx: NDArray[np.int32],
+    correspondences: Correspondences,
+    tracks: Tracks,
+    pair_idx: int,
+) -> _Sample:
+    first, second = (cameras[image_camera_idx[i]] for i in correspondences.pair_image_idx[pair_idx])
+    xy1, xy2 = matched_pixels(tracks, correspondences, pair_idx)
+    step = max(1, len(xy1) // MAX_MATCHES)
+    return _Sample(correspondences.fundamental[pair_idx], (first, second), (xy1[::step], xy2[::step]))
+
+
+def _total_loss(ratios: NDArray[np.float64], samples: list[_Sample]) -> NDArray[np.float64]:
+    """(K,) negative log of posterior for each trial ratio, up to a constant."""
+    prior = 0.5 * (np.log(ratios / PRIOR_RATIO) / PRIOR_LOG_SIGMA) ** 2
+    return prior + sum((_pair_loss(ratios, sample) for sample in samples), np.zeros(len(ratios)))
+
+
+def _pair_loss(ratios: NDArray[np.float64], sample: _Sample) -> NDArray[np.float64]:
+    """(K,) robust negative log-likelihood of the pair's matches for each trial focal length."""
+    loss = np.empty(len(ratios))
+    for k, ratio in enumerate(ratios):
+        trial = [c.with_focal(ratio * max(c.width, c.height)) for c in sample.cameras]
+        focal = 0.5 * (trial[0].focal + trial[1].focal)
+        x1, x2 = (pixels_to_normalized(c, xy) for c, xy in zip(trial, sample.pixels, strict=True))
+        essential = epipolar.essential_from_fundamental(sample.fundamental, trial[0].k_matrix, trial[1].k_matrix)
+        pose, _, _ = epipolar.choose_in_front(epipolar.decompose_essential(essential), x1, x2)
+        # keypoints are good to about a pixel; a smaller scale would call model errors such as distortion evidence
+        pose = epipolar.refine_relative_pose(pose, x1, x2, 1.0 / focal, max_iterations=4)
+        squared = epipolar.sampson_errors(epipolar.essential_from_pose(pose), x1, x2) * focal**2
+        loss[k] = np.log1p(squared).sum()
+    return loss

@@ -30,6 +30,7 @@ from sfmapp.mapping.tracks import build_tracks, track_colors
 from sfmapp.scene.camera import Camera
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.tracks import Tracks
 
 STAGE = "mapping"
 
@@ -64,7 +65,7 @@ def map_images(
     image_camera_idx = np.array([record.camera_idx for record in image_set.images], np.int32)
     tracks, track_report = build_tracks(correspondences, features)
     events.decided(STAGE, f"{track_report['num_tracks']} tracks", **track_report)
-    cameras, focal_report = _first_cameras(image_set.cameras, image_camera_idx, correspondences, options, events)
+    cameras, focal_report = _first_cameras(image_set.cameras, image_camera_idx, correspondences, tracks, options, events)
     attempts: dict[int, Registration] = {}
     initial_reports: list[dict[str, Any]] = []
     models: list[Reconstruction] = []
@@ -121,6 +122,7 @@ def _first_cameras(
     cameras: Sequence[Camera],
     image_camera_idx: NDArray[np.int32],
     correspondences: Correspondences,
+    tracks: Tracks,
     options: MappingOptions,
     events: Events,
 ) -> tuple[list[Camera], dict[str, Any]]:
@@ -128,7 +130,7 @@ def _first_cameras(
     cameras = list(cameras)
     if not options.estimate_focal:
         return cameras, {}
-    ratio, data = estimate_focal_ratio(cameras, image_camera_idx, correspondences)
+    ratio, data = estimate_focal_ratio(cameras, image_camera_idx, correspondences, tracks)
     if ratio is None:
         return cameras, data
     events.decided(STAGE, f"first focal length {ratio:.2f} x the longer side, from {data['num_pairs']} pairs", **data)
@@ -323,7 +325,7 @@ class Mapper:
         return np.flatnonzero(self.free & ~self.reconstruction.is_registered)
 
     def _known_cameras(self) -> NDArray[np.bool_]:
-        """(C,) cameras that the adjustment has refined: those with at least three registered images... or any."""
+        """(C,) bool: cameras with a registered image, which the adjustment has refined."""
         counts = np.bincount(
             self.reconstruction.image_camera_idx[self.reconstruction.is_registered],
             minlength=len(self.reconstruction.cameras),

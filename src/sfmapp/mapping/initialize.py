@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import epipolar, rigid3
+from sfmapp.mapping.focal import matched_pixels
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.scene.camera import pixels_to_normalized
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
@@ -99,36 +100,29 @@ def _examine(
     if config not in _STARTABLE:
         reason = f"{config.name.lower()}: the pair shows no depth"
         return InitialPair((first, second), num_matches, 0, 0.0, nothing, reason)
-    xy1, xy2 = matched_pixels(reconstruction, correspondences, pair_idx)
+    xy1, xy2 = matched_pixels(reconstruction.tracks, correspondences, pair_idx)
     cameras = [reconstruction.cameras[reconstruction.image_camera_idx[i]] for i in (first, second)]
     x1, x2 = (pixels_to_normalized(c, xy) for c, xy in zip(cameras, (xy1, xy2), strict=True))
-    max_error = options.max_reprojection_error_px / (0.5 * (cameras[0].focal + cameras[1].focal))
-    pose = epipolar.estimate_relative_pose(x1, x2, max_error)
-    if pose is None:
-        return InitialPair((first, second), num_matches, 0, 0.0, nothing, "no essential matrix")
-    median = float(np.degrees(np.median(pose.angles_rad))) if len(pose.angles_rad) else 0.0
-    return InitialPair((first, second), num_matches, len(pose.angles_rad), median, pose.cam2_from_cam1)
-
-
-def matched_pixels(
-    reconstruction: Reconstruction, correspondences: Correspondences, pair_idx: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(K, 2) pixels of the verified matches of a pair in both images, as far as their tracks kept them together."""
-    tracks = reconstruction.tracks
-    sides = []
-    for side in range(2):
-        image_idx = correspondences.pair_image_idx[pair_idx, side]
-        obs = tracks.observations_of_image(image_idx)
-        size = 1 + max(
-            int(tracks.obs_feature_idx[obs].max(initial=0)), int(correspondences.matches_of_pair(pair_idx)[:, side].max())
+    valid = ~(np.isnan(x1) | np.isnan(x2)).any(axis=1)
+    x1, x2 = x1[valid], x2[valid]
+    focal = 0.5 * (cameras[0].focal + cameras[1].focal)
+    candidates = [correspondences.cam2_from_cam1[pair_idx]]
+    if np.isfinite(correspondences.fundamental[pair_idx]).all() and config != TwoViewConfig.PLANAR:
+        essential = epipolar.essential_from_fundamental(
+            correspondences.fundamental[pair_idx], cameras[0].k_matrix, cameras[1].k_matrix
         )
-        obs_of_feature = np.full(size, -1)
-        obs_of_feature[tracks.obs_feature_idx[obs]] = obs
-        sides.append(obs_of_feature[correspondences.matches_of_pair(pair_idx)[:, side]])
-    kept = (sides[0] >= 0) & (sides[1] >= 0)
-    first, second = sides[0][kept], sides[1][kept]
-    together = tracks.obs_track_idx[first] == tracks.obs_track_idx[second]
-    return tracks.obs_xy[first[together]], tracks.obs_xy[second[together]]
+        candidates.extend(epipolar.decompose_essential(essential))
+    poses = np.array([pose for pose in candidates if np.isfinite(pose).all()])
+    if len(poses) == 0 or len(x1) < options.min_pose_inliers:
+        return InitialPair((first, second), num_matches, 0, 0.0, nothing, "no relative pose")
+    pose, _, _ = epipolar.choose_in_front(poses, x1, x2)
+    pose = epipolar.refine_relative_pose(pose, x1, x2, 1.0 / focal)
+    depths, angles = epipolar.ray_depths(pose, x1, x2)
+    squared = epipolar.sampson_errors(epipolar.essential_from_pose(pose), x1, x2) * focal**2
+    good = (depths > 0).all(axis=1) & (squared <= options.max_reprojection_error_px**2)
+    median = float(np.degrees(np.median(angles[good]))) if good.any() else 0.0
+    good &= angles >= np.radians(options.min_triangulation_angle_deg)
+    return InitialPair((first, second), num_matches, int(good.sum()), median, pose)
 
 
 def initialize_from_pair(reconstruction: Reconstruction, pair: InitialPair) -> None:
