@@ -23,7 +23,15 @@ from sfmapp.scene.correspondences import Correspondences
 if TYPE_CHECKING:
     from sfmapp.images.folder import ImageSet
 
-__all__ = ["MatchedPair", "MatchingOptions", "compile_kernels", "match_images", "match_pair"]
+__all__ = [
+    "MatchedPair",
+    "MatchingOptions",
+    "compile_kernels",
+    "join_pairs",
+    "match_images",
+    "match_pair",
+    "split_pairs",
+]
 
 _STAGE = "matching"
 
@@ -99,7 +107,7 @@ def match_images(
     results = [done[p] for p in pairs]
     report = _report(pairs, results, num_known, time.monotonic() - start)
     events.finished(_STAGE, f"{report['num_verified_pairs']} of {len(pairs)} pairs verified", **report)
-    return _assemble(pair_image_idx, results), report
+    return join_pairs(pair_image_idx, results), report
 
 
 def match_pair(
@@ -125,7 +133,8 @@ def match_pair(
     return MatchedPair(matches, len(putative), geometry, time.thread_time() - start)
 
 
-def _assemble(pair_image_idx: NDArray[np.int32], results: Sequence[MatchedPair]) -> Correspondences:
+def join_pairs(pair_image_idx: NDArray[np.int32], results: Sequence[MatchedPair]) -> Correspondences:
+    """Pairs that are done, in the order of pair_image_idx (P, 2), as flat arrays."""
     geometries = [r.geometry for r in results]
 
     def stack(name: str, shape: tuple[int, ...], dtype: Any) -> Any:
@@ -148,6 +157,23 @@ def _assemble(pair_image_idx: NDArray[np.int32], results: Sequence[MatchedPair])
         num_inliers_e=stack("num_inliers_e", (), np.int32),
         num_inliers_h=stack("num_inliers_h", (), np.int32),
     )
+
+
+def split_pairs(correspondences: Correspondences) -> list[MatchedPair]:
+    """The inverse of :func:`join_pairs`."""
+    c = correspondences
+    return [
+        MatchedPair(
+            c.matches_of_pair(p),
+            int(c.num_putative[p]),
+            TwoViewGeometry(
+                TwoViewConfig(c.config[p]), np.empty(0, bool), c.fundamental[p], c.essential[p], c.homography[p],
+                c.cam2_from_cam1[p], float(c.median_angle_deg[p]),
+                int(c.num_inliers_f[p]), int(c.num_inliers_e[p]), int(c.num_inliers_h[p]),
+            ),
+        )
+        for p in range(c.num_pairs)
+    ]  # fmt: skip
 
 
 def _report(
