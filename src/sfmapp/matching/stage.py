@@ -18,7 +18,7 @@ from sfmapp.matching import descriptors
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.two_view import TwoViewGeometry, verify_pair
 from sfmapp.scene.camera import Camera
-from sfmapp.scene.correspondences import Correspondences
+from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 
 if TYPE_CHECKING:
     from sfmapp.images.folder import ImageSet
