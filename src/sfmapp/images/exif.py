@@ -19,7 +19,7 @@ _MM_PER_UNIT = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0, 5.0: 0.001}
 
 # A focal length outside these multiples of the long side (160 and 4 degrees of view) is not taken from EXIF.
 _MIN_FOCAL, _MAX_FOCAL = 0.18, 15.0
-_MAX_FOCAL_MM = 10_000.0
+_FOCAL_MM = (0.1, 10_000.0)
 
 # Relative standard deviations of the priors.
 #   35 mm equivalent: makers round it, some to marketing numbers, and lenses breathe as they focus; on phones and
@@ -112,29 +112,32 @@ def read_exif(exif: bytes) -> ExifFacts:
         problems.append(f"EXIF orientation {orientation:g} is not 1 to 8")
         orientation = None
     unit_mm = _MM_PER_UNIT.get(photo.number(41488) or 2.0)
-    resolution = _positive(photo, 41486, "FocalPlaneXResolution", problems, math.inf)
+    resolution = _believable(photo, 41486, "FocalPlaneXResolution", 1e-3, 1e9, problems)
     width, height = photo.number(40962), photo.number(40963)
+    has_size = width is not None and height is not None and 1 <= width < 1e6 and 1 <= height < 1e6
     return ExifFacts(
         make=first.text(271),
         model=first.text(272),
         lens=photo.text(42036),
         serial=photo.text(42033),
         orientation=int(orientation or 1),
-        focal_mm=_positive(photo, 37386, "FocalLength", problems, _MAX_FOCAL_MM),
-        focal_35mm=_positive(photo, 41989, "FocalLengthIn35mmFilm", problems, _MAX_FOCAL_MM),
+        focal_mm=_believable(photo, 37386, "FocalLength", *_FOCAL_MM, problems),
+        focal_35mm=_believable(photo, 41989, "FocalLengthIn35mmFilm", *_FOCAL_MM, problems),
         focal_plane_px_per_mm=resolution / unit_mm if resolution and unit_mm else None,
-        camera_size=(int(width), int(height)) if width and height and width > 0 and height > 0 else None,
+        camera_size=(int(width or 0), int(height or 0)) if has_size else None,
         timestamp=_timestamp(photo),
         gps=_position(gps, problems) if gps is not EMPTY else None,
         problems=tuple(problems),
     )
 
 
-def _positive(directory: Directory, tag: int, name: str, problems: list[str], limit: float) -> float | None:
+def _believable(
+    directory: Directory, tag: int, name: str, low: float, high: float, problems: list[str]
+) -> float | None:
     value = directory.number(tag)
     if value is None:
         return None
-    if not (math.isfinite(value) and 0.0 < value < limit):
+    if not low <= value <= high:  # nor is NaN, which is what a zero denominator gives
         problems.append(f"EXIF {name} is {value:g}")
         return None
     return value

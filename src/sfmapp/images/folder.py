@@ -132,7 +132,8 @@ def _find(source: str, options: ImageOptions) -> _Found:
         found = _find_by_pattern(source, mask_root)
     else:
         raise InputError(
-            f"{source} does not exist", "give a folder of images, a glob pattern in quotes, or a .txt list"
+            f"image source {source!r} does not exist",
+            "give a folder of images, a glob pattern in quotes, or a .txt list",
         )
     found.paths.sort(key=lambda path: _natural(os.path.relpath(path, found.root).replace(os.sep, "/")))
     if mask_root == found.root:  # photo.jpg.png beside photo.jpg is its mask
@@ -150,9 +151,10 @@ def _natural(name: str) -> tuple[Any, ...]:
 def _find_in_folder(root: Path, mask_root: Path | None) -> _Found:
     found = _Found(root)
     visited: set[tuple[int, int]] = set()
-    pending = [root]
-    while pending:
-        folder = pending.pop()
+    pending, links = [root], list[Path]()
+    while pending or links:
+        # a folder goes by its own name rather than by that of a link to it
+        folder = pending.pop() if pending else links.pop(0)
         name = os.path.relpath(folder, root)
         try:
             status = os.stat(folder)
@@ -160,7 +162,7 @@ def _find_in_folder(root: Path, mask_root: Path | None) -> _Found:
         except OSError as error:
             found.skipped.append((_printable(name) + "/", f"folder cannot be read: {error.strerror}"))
             continue
-        # links to folders are followed, but not in circles
+        # links are followed, but not in circles
         if (status.st_dev, status.st_ino) in visited:
             continue
         visited.add((status.st_dev, status.st_ino))
@@ -168,9 +170,9 @@ def _find_in_folder(root: Path, mask_root: Path | None) -> _Found:
             if entry.name.startswith(".") or entry.name in _THUMBNAIL_FOLDERS:
                 continue
             path = Path(entry.path)
-            if entry.is_dir() and path.suffix.lower() not in EXTENSIONS:
+            if os.path.isdir(path) and path.suffix.lower() not in EXTENSIONS:
                 if path != mask_root:
-                    pending.append(path)
+                    (links if entry.is_symlink() else pending).append(path)
             else:
                 _take(found, path)
     return found
@@ -186,8 +188,10 @@ def _find_by_pattern(pattern: str, mask_root: Path | None) -> _Found:
     for match in sorted(set(glob.glob(pattern, recursive=True))):
         path = Path(os.path.abspath(match))
         is_masked = mask_root is not None and mask_root != found.root and mask_root in path.parents
-        if not is_masked and not (path.is_dir() and path.suffix.lower() not in EXTENSIONS):
+        if not is_masked and not (os.path.isdir(path) and path.suffix.lower() not in EXTENSIONS):
             _take(found, path)
+    if not found.paths and not found.skipped:
+        raise InputError(f"the pattern {pattern} matches no image", "put it in quotes, and check it with ls")
     return found
 
 
@@ -259,6 +263,8 @@ def _scan(path: Path, root: Path, mask_root: Path | None, options: ImageOptions)
         _check_size(header, options)
     except UnusableImage as reason:
         return name, str(reason)
+    except FileNotFoundError:
+        return name, "a link to a file that does not exist" if path.is_symlink() else "no such file"
     except OSError as error:
         return name, f"cannot be read: {error.strerror or error}"
     facts = read_exif(header.exif)
@@ -308,7 +314,7 @@ def _with_mask(record: ImageRecord, mask_root: Path) -> tuple[ImageRecord, tuple
     """The record with its mask, or with None and the reason why a mask that is there cannot be used."""
     stem = os.path.splitext(record.name)[0]
     for path in (mask_root / f"{record.name}.png", mask_root / f"{stem}.png"):
-        if path == record.path or not path.is_file():
+        if path == record.path or not os.path.isfile(path):
             continue
         try:
             header = read_header(_read_file(path, 1 << 30))

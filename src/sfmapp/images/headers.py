@@ -122,9 +122,9 @@ def _read_jpeg(data: bytes) -> Header:
         position += 2 + length
     if frame is None:
         raise UnusableImage("broken header")
-    # Inside a scan every FF of the data is followed by 00, so the first FF D9 is the end of the picture. Whatever
-    # stands behind it (a second picture, a video, padding) is of no interest.
-    if data.find(b"\xff\xd9", position) < 0:
+    # Inside a scan every FF of the data is followed by 00, so FF D9 is the end of the picture. Whatever stands behind
+    # it (a second picture, a video, padding) is of no interest. Most files end with it: no need to search those.
+    if not data.endswith(b"\xff\xd9") and data.find(b"\xff\xd9", position) < 0:
         raise UnusableImage("truncated: the end of the picture is missing")
     bits, height, width, num_channels = frame
     if bits != 8:
@@ -185,9 +185,13 @@ def _read_tiff(data: bytes) -> Header:
         raise UnusableImage("floating-point or signed values, which are not read: convert it to 16 bits")
     if kind is None or any(value not in (1, 2, 4, 8, 16) for value in bits):
         raise UnusableImage("a TIFF of an unsupported kind: convert it to RGB with 8 or 16 bits")
+    if kind == "cmyk" and max(bits) > 8:
+        raise UnusableImage("a CMYK TIFF of 16 bits, which is not read: convert it to RGB")
     _check_tiff_data(data, first)
     _check_single_page(data, first)
-    return Header("tiff", int(width), int(height), int(bits[0]), kind, bool(first.numbers(338)), data)
+    return Header(
+        "tiff", int(width), int(height), int(bits[0]), kind, kind != "cmyk" and bool(first.numbers(338)), data
+    )
 
 
 def _check_tiff_data(data: bytes, first: Directory) -> None:

@@ -43,35 +43,24 @@ def read_picture(record: ImageRecord) -> Picture:
     """
     stored, alpha = _decode(record)
     stored, alpha = _upright(stored, record.orientation), _upright(alpha, record.orientation)
-    import cv2
-
-    if stored.ndim == 2:
-        gray, rgb = stored, cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB)
-    else:
-        gray, rgb = cv2.cvtColor(stored, cv2.COLOR_RGB2GRAY), stored
-    return Picture(rgb, gray, _combine(_read_mask_file(record), _alpha_mask(alpha)))
+    mask = _alpha_mask(alpha) if record.has_alpha else None
+    return Picture(_as_rgb(stored), _as_gray(stored), _combine(_read_mask_file(record), mask))
 
 
 def read_rgb(record: ImageRecord) -> Pixels:
     """(H, W, 3) uint8 colours of a photograph, upright. Raises InputError as :func:`read_picture` does."""
-    import cv2
-
-    stored = _upright(_decode(record)[0], record.orientation)
-    return cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB) if stored.ndim == 2 else stored
+    return _as_rgb(_upright(_decode(record)[0], record.orientation))
 
 
 def read_gray(record: ImageRecord) -> Pixels:
     """(H, W) uint8 grey values of a photograph, upright. Raises InputError as :func:`read_picture` does."""
-    import cv2
-
-    stored = _upright(_decode(record)[0], record.orientation)
-    return stored if stored.ndim == 2 else cv2.cvtColor(stored, cv2.COLOR_RGB2GRAY)
+    return _as_gray(_upright(_decode(record)[0], record.orientation))
 
 
 def read_rgb_and_gray(record: ImageRecord) -> tuple[Pixels, Pixels]:
     """(H, W, 3) and (H, W) uint8 from one decoding. Raises InputError as :func:`read_picture` does."""
-    picture = read_picture(record)
-    return picture.rgb, picture.gray
+    stored = _upright(_decode(record)[0], record.orientation)
+    return _as_rgb(stored), _as_gray(stored)
 
 
 def read_mask(record: ImageRecord) -> NDArray[np.bool_] | None:
@@ -82,6 +71,18 @@ def read_mask(record: ImageRecord) -> NDArray[np.bool_] | None:
     """
     alpha = _upright(_decode(record)[1], record.orientation) if record.has_alpha else None
     return _combine(_read_mask_file(record), _alpha_mask(alpha))
+
+
+def _as_rgb(pixels: Pixels) -> Pixels:
+    import cv2
+
+    return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB) if pixels.ndim == 2 else pixels
+
+
+def _as_gray(pixels: Pixels) -> Pixels:
+    import cv2
+
+    return pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
 
 
 def _decode(record: ImageRecord) -> tuple[Pixels, Pixels | None]:
@@ -95,7 +96,9 @@ def _decode(record: ImageRecord) -> tuple[Pixels, Pixels | None]:
     expected = (record.height, record.width) if record.orientation >= 5 else (record.width, record.height)
     # also the guard against a header that was swapped for one that claims gigapixels
     if size != expected:
-        raise InputError(f"{record.name} was changed while in use: {size[0]}x{size[1]} pixels, was {expected}")
+        raise InputError(
+            f"{record.name} was changed while in use: {size[0]}x{size[1]} pixels, was {expected[0]}x{expected[1]}"
+        )
     raw = decode_bytes(data, header)
     if raw is None or raw.shape[:2] != size[::-1]:
         raise InputError(
@@ -213,6 +216,8 @@ def mask_fit(header: Header, record: ImageRecord) -> str | None:
 
     A mask of another size fits if its shape is the same to a pixel: it was made for a smaller or larger version.
     """
+    if min(header.width, header.height) < 16:  # too coarse for its shape to mean anything
+        return None
     for fit, width, height in (("upright", record.width, record.height), ("stored", record.height, record.width)):
         if fit == "stored" and record.orientation < 5:
             break
