@@ -52,7 +52,7 @@ def run_measured(
         command: program and arguments; no shell is involved.
         log: file that receives the error stream of the child.
         env: environment, None for the parent's own.
-        on_line: called with each line of the child's output, in this thread.
+        on_line: called with each complete line of the child's output, in this thread.
         on_tick: called about fifty times a second; if it raises, the child is killed and the exception passes on.
     """
     own_peak_mb = _maxrss_mb(resource.getrusage(resource.RUSAGE_SELF))

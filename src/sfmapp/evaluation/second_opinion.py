@@ -33,6 +33,12 @@ class SecondOpinionOptions:
     camera_model: str = "SIMPLE_RADIAL"
     """COLMAP's name of the camera model (pycolmap's default)."""
 
+    fix_intrinsics: bool = False
+    """Keep the cameras at their initial parameters."""
+
+    mask_root: str | None = None
+    """Folder of masks, NAME.png for the photograph NAME, black is ignored; None for none."""
+
     max_image_size_px: int | None = None
     """Longer side that photographs are reduced to before extraction; None for pycolmap's default (3200 for SIFT)."""
 
@@ -41,6 +47,19 @@ class SecondOpinionOptions:
 
     seed: int = 0
     """Seed of all its random sampling. With several threads pycolmap is not reproducible even so."""
+
+
+@dataclass(frozen=True)
+class CameraGroup:
+    """Photographs that share a camera.
+
+    Attributes:
+        names: of the photographs.
+        params: initial parameters in COLMAP's order, taken for a good prior; None: from EXIF or pycolmap's default.
+    """
+
+    names: tuple[str, ...]
+    params: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -82,39 +101,46 @@ def ask_second_opinion(
     output: Path,
     options: SecondOpinionOptions | None = None,
     *,
-    camera_groups: Sequence[Sequence[str]] | None = None,
+    camera_groups: Sequence[CameraGroup] | None = None,
+    fingerprint: str = "",
     events: Events | None = None,
 ) -> SecondOpinion:
     """Reconstruct photographs with pycolmap in a child process and measure it.
 
+    An answer that lies in the output folder already is given again if the same was asked with the same fingerprint;
+    an answer to another question is replaced.
+
     Args:
         image_root: folder that the names are relative to.
         image_names: photographs to use, with forward slashes.
-        output: folder for the database, the models, the request, the answer and the log; made if missing, must not
-            hold a database already.
+        output: folder of this function's own for the database, the models, the request, the answer and the log.
         options: None for the defaults.
-        camera_groups: lists of names that share one camera each; None lets ``options.camera_mode`` decide.
+        camera_groups: which photographs share a camera, all of them; None lets ``options.camera_mode`` decide.
+        fingerprint: changes whenever a photograph does, such as a hash of them all; empty: never give an old answer.
         events: progress and cancellation.
 
     Raises:
-        InputError: the image folder is missing, or the output folder is in use.
+        InputError: the image folder is missing.
         SfmError: pycolmap failed or crashed; the message holds the end of its log.
     """
     options, events = options or SecondOpinionOptions(), events or Events()
     if not image_root.is_dir():
         raise InputError(f"{image_root}: no such folder of photographs")
-    output.mkdir(parents=True, exist_ok=True)
-    if (output / "database.db").exists():
-        raise InputError(f"{output}: holds a database already", "name another folder or remove this one")
     request = {
         "image_root": str(image_root.resolve()),
         "image_names": list(image_names),
-        "camera_groups": None if camera_groups is None else [list(group) for group in camera_groups],
+        "camera_groups": None if camera_groups is None else [asdict(group) for group in camera_groups],
         "output": str(output.resolve()),
         "options": asdict(options),
+        "fingerprint": fingerprint,
     }
-    request_path, log = output / "request.json", output / "log.txt"
-    request_path.write_text(json.dumps(request, indent=1))
+    request_path, answer_path, log = output / "request.json", output / "answer.json", output / "log.txt"
+    request_text = json.dumps(request, indent=1)
+    if fingerprint and answer_path.is_file() and request_path.is_file() and request_path.read_text() == request_text:
+        return SecondOpinion(**json.loads(answer_path.read_text()))
+    output.mkdir(parents=True, exist_ok=True)
+    _remove_old(output)
+    request_path.write_text(request_text)
     events.started(STAGE, f"pycolmap on {len(image_names)} photographs", total=4)
 
     def on_line(line: str) -> None:
@@ -123,17 +149,25 @@ def ask_second_opinion(
 
     command = [sys.executable, "-P", "-m", "sfmapp.evaluation.second_opinion", str(request_path)]
     usage = run_measured(command, log, on_line=on_line, on_tick=events.raise_if_cancelled)
-    answer_path = output / "answer.json"
-    if usage.exit_code != 0 or not answer_path.is_file():
+    part = output / "answer.part"
+    if usage.exit_code != 0 or not part.is_file():
         tail = "\n".join(log.read_text(errors="replace").splitlines()[-8:])
         raise SfmError(f"pycolmap ended with code {usage.exit_code}; the end of {log}:\n{tail}")
-    answer = json.loads(answer_path.read_text())
+    answer = json.loads(part.read_text())
     # the child reads its own mark as the very last thing, after the parent's last look
     peak_mb = max(usage.peak_memory_mb, answer.pop("high_water_mark_mb"))
     opinion = SecondOpinion(**answer, wall_s=usage.wall_s, cpu_s=usage.cpu_s, peak_memory_mb=peak_mb)
-    answer_path.write_text(json.dumps(asdict(opinion), indent=1))
+    part.write_text(json.dumps(asdict(opinion), indent=1))
+    os.replace(part, answer_path)
     events.finished(STAGE, f"pycolmap registered {opinion.num_registered} of {opinion.num_images}", **asdict(opinion))
     return opinion
+
+
+def _remove_old(output: Path) -> None:
+    """Take away the files of an earlier opinion, and nothing else."""
+    names = ("answer.json", "answer.part", "database.db", "database.db-shm", "database.db-wal", "log.txt")
+    for path in [*(output / name for name in names), *output.glob("sparse/*/*.bin"), *output.glob("sparse/*/*.ini")]:
+        path.unlink(missing_ok=True)
 
 
 def _reconstruct(request: dict[str, Any]) -> dict[str, Any]:
@@ -180,13 +214,17 @@ def _extract(pycolmap: Any, request: dict[str, Any], options: SecondOpinionOptio
     reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
     reader.camera_model = options.camera_model
     extraction.use_gpu = False
+    if options.mask_root is not None:
+        reader.mask_path = options.mask_root
     if options.max_image_size_px is not None:
         extraction.max_image_size = options.max_image_size_px
     if options.num_threads is not None:
         extraction.num_threads = options.num_threads
     pycolmap.Database.open(database).close()  # an empty one: import_images wants the file to exist
     for group in request["camera_groups"] or ():
-        pycolmap.import_images(database, request["image_root"], pycolmap.CameraMode.SINGLE, group, reader)
+        reader.camera_params = ", ".join(map(repr, group["params"] or ()))
+        pycolmap.import_images(database, request["image_root"], pycolmap.CameraMode.SINGLE, group["names"], reader)
+    reader.camera_params = ""
     mode = pycolmap.CameraMode.__members__[options.camera_mode.upper()]
     pycolmap.extract_features(
         database, request["image_root"], request["image_names"], mode, reader, extraction, pycolmap.Device.cpu
@@ -209,6 +247,9 @@ def _map(pycolmap: Any, options: SecondOpinionOptions, database: Path, image_roo
     mapping.random_seed = options.seed
     if options.num_threads is not None:
         mapping.num_threads = options.num_threads
+    if options.fix_intrinsics:
+        mapping.ba_refine_focal_length = mapping.ba_refine_extra_params = False
+        mapping.mapper.abs_pose_refine_focal_length = mapping.mapper.abs_pose_refine_extra_params = False
     return dict(pycolmap.incremental_mapping(database, image_root, models, mapping))
 
 
@@ -229,10 +270,8 @@ def _summary(model: Any) -> dict[str, float | int]:
 def _main(request_path: Path) -> None:
     request = json.loads(request_path.read_text())
     answer = _reconstruct(request)
-    path = Path(request["output"]) / "answer.json"
-    beside = path.with_suffix(".part")
-    beside.write_text(json.dumps(answer | {"high_water_mark_mb": high_water_mark_mb()}, indent=1))
-    os.replace(beside, path)
+    part = Path(request["output"]) / "answer.part"
+    part.write_text(json.dumps(answer | {"high_water_mark_mb": high_water_mark_mb()}, indent=1))
 
 
 if __name__ == "__main__":
