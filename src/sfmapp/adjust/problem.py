@@ -1,0 +1,225 @@
+"""What takes part in one adjustment, gathered from a reconstruction into flat arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.geometry import rigid3
+from sfmapp.scene.camera import PARAM_NAMES, Camera, canonical_from_params
+from sfmapp.scene.reconstruction import Reconstruction
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class FreeIntrinsics:
+    """Which parameters of the cameras may change, as the kernels want them.
+
+    Attributes:
+        params: for each local camera, (Q,) positions in ``Camera.params``; empty where the camera is constant.
+        ptr: (C + 1,) int64; slot, column: for camera c in ``ptr[c]:ptr[c + 1]`` the canonical slot of each derivative and
+            the column of the block that it belongs to.
+    """
+
+    params: list[NDArray[np.int64]]
+    ptr: NDArray[np.int64]
+    slot: NDArray[np.int64]
+    column: NDArray[np.int64]
+
+
+@dataclass
+class Problem:
+    """Flat arrays over local images (I), cameras (C), points (P) and observations (O), and the blocks (B) of unknowns.
+
+    The state is ``poses``, ``canonical`` and ``xyz``. Blocks are numbered images first, then cameras of their own.
+    """
+
+    image_idx: NDArray[np.int64]
+    camera_idx: NDArray[np.int64]
+    track_idx: NDArray[np.int64]
+    poses: Array
+    canonical: Array
+    xyz: Array
+    is_constant: Mask
+    point_ptr: NDArray[np.int64]
+    obs_image: NDArray[np.int32]
+    obs_xy: Array
+    image_camera: NDArray[np.int32]
+    image_block: NDArray[np.int32]
+    camera_block: NDArray[np.int32]
+    block_dim: NDArray[np.int64]
+    fisheye: Mask
+    free: FreeIntrinsics
+
+    @property
+    def num_blocks(self) -> int:
+        return len(self.block_dim)
+
+    @property
+    def num_observations(self) -> int:
+        return len(self.obs_image)
+
+
+def free_params(camera: Camera, focal: bool, distortion: bool, principal_point: bool) -> NDArray[np.int64]:
+    """(Q,) positions of the parameters of a camera that may change; none if the user has fixed it."""
+    if camera.is_fixed:
+        return np.zeros(0, np.int64)
+    wanted = [
+        focal if name[0] == "f" else principal_point if name[0] == "c" else distortion
+        for name in PARAM_NAMES[camera.model]
+    ]
+    return np.flatnonzero(wanted)
+
+
+def make_problem(
+    reconstruction: Reconstruction,
+    *,
+    refine: tuple[bool, bool, bool],
+    variable_images: Mask | None = None,
+    variable_cameras: Mask | None = None,
+    points: Mask | None = None,
+    constant_points: Mask | None = None,
+    extra_images: Sequence[int] = (),
+    extra_cameras: Sequence[int] = (),
+    merge: bool = True,
+) -> Problem:
+    """Gather the observations of the points that take part; see ``adjust_bundle`` for the masks.
+
+    Args:
+        refine: may focal lengths, distortion, principal points change.
+        extra_images, extra_cameras: take part even without observations (gtsam factors mention them).
+        merge: give a camera with one image and at most two free parameters a place in the block of its image.
+    """
+    tracks = reconstruction.tracks
+    registered = reconstruction.is_registered
+    varies = registered if variable_images is None else registered & np.asarray(variable_images, bool)
+    if points is None:
+        if variable_images is None:
+            selected = np.flatnonzero(reconstruction.is_triangulated)
+        else:
+            selected = _tracks_of_images(np.flatnonzero(varies), tracks.image_ptr, tracks.image_obs,
+                                         tracks.obs_track_idx, tracks.num_tracks)  # fmt: skip
+    else:
+        selected = np.flatnonzero(points)
+    is_constant = np.zeros(len(selected), bool) if constant_points is None else np.asarray(constant_points)[selected]
+    kept, point_ptr, obs_image, obs_xy, image_used = _gather(
+        selected, is_constant, tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy, reconstruction.obs_is_inlier,
+        np.isfinite(reconstruction.cam_from_world[:, 0]), reconstruction.point_xyz,
+    )  # fmt: skip
+    image_used[[i for i in extra_images if registered[i]]] = True
+    image_idx = np.flatnonzero(image_used)
+    image_of = np.full(len(registered), -1, np.int32)
+    image_of[image_idx] = np.arange(len(image_idx))
+    camera_idx = np.unique(np.concatenate([reconstruction.image_camera_idx[image_idx], extra_cameras]).astype(np.int64))
+    image_camera = np.searchsorted(camera_idx, reconstruction.image_camera_idx[image_idx]).astype(np.int32)
+    cameras = [reconstruction.cameras[c] for c in camera_idx]
+    params = [free_params(camera, *refine) for camera in cameras]
+    if variable_cameras is not None:
+        params = [p if variable_cameras[c] else p[:0] for p, c in zip(params, camera_idx, strict=True)]
+    image_block, camera_block, block_dim = _number_blocks(varies[image_idx], image_camera, params, merge)
+    poses = reconstruction.cam_from_world[image_idx]
+    return Problem(
+        image_idx, camera_idx, selected[kept], poses,
+        np.array([c.canonical for c in cameras]).reshape(-1, 8), reconstruction.point_xyz[selected[kept]],
+        is_constant[kept], point_ptr, image_of[obs_image], obs_xy, image_camera, image_block, camera_block, block_dim,
+        np.array([c.is_fisheye for c in cameras], bool), _free_columns(cameras, params, camera_block, len(image_block[image_block >= 0])),
+    )  # fmt: skip
+
+
+def pose_rows(poses: Array) -> Array:
+    """(I, 12) rotation row by row and translation of poses (I, 7)."""
+    return np.concatenate([rigid3.rotation_matrix(poses).reshape(-1, 9), poses[:, 4:]], 1)
+
+
+def _number_blocks(
+    varies: Mask, image_camera: NDArray[np.int32], params: list[NDArray[np.int64]], merge: bool
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
+    """Blocks of images and cameras, and their numbers of rows."""
+    num_images = int(varies.sum())
+    image_block = np.full(len(varies), -1, np.int32)
+    image_block[varies] = np.arange(num_images)
+    camera_block = np.full(len(params), -1, np.int32)
+    dims = [6] * num_images
+    uses = np.bincount(image_camera[varies], minlength=len(params))
+    only = np.full(len(params), -1, np.int64)
+    only[image_camera[varies]] = image_block[varies]
+    for c, free in enumerate(params):
+        if len(free) == 0:
+            continue
+        if merge and uses[c] == 1 and len(free) <= 2:
+            camera_block[c] = only[c]
+            dims[only[c]] += len(free)
+        else:
+            camera_block[c] = len(dims)
+            dims.append(len(free))
+    return image_block, camera_block, np.array(dims, np.int64)
+
+
+def _free_columns(
+    cameras: list[Camera], params: list[NDArray[np.int64]], camera_block: NDArray[np.int32], num_image_blocks: int
+) -> FreeIntrinsics:
+    ptr, slots, columns = [0], [], []
+    for c, camera in enumerate(cameras):
+        first = 6 if 0 <= camera_block[c] < num_image_blocks else 0
+        spread = canonical_from_params(camera.model)
+        for n, param in enumerate(params[c]):
+            for slot in np.flatnonzero(spread[:, param]):
+                slots.append(slot)
+                columns.append(first + n)
+        ptr.append(len(slots))
+    return FreeIntrinsics(params, np.array(ptr, np.int64), np.array(slots, np.int64), np.array(columns, np.int64))
+
+
+@numba.njit(cache=True, nogil=True)
+def _tracks_of_images(images, image_ptr, image_obs, obs_track_idx, num_tracks):  # type: ignore[no-untyped-def]
+    """Ascending tracks that some of the images observe."""
+    seen = np.zeros(num_tracks, np.bool_)
+    for i in images:
+        for k in range(image_ptr[i], image_ptr[i + 1]):
+            seen[obs_track_idx[image_obs[k]]] = True
+    return np.flatnonzero(seen)
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(selected, is_constant, track_ptr, obs_image_idx, obs_xy, is_inlier, registered, xyz):  # type: ignore[no-untyped-def]
+    """Points that are kept, as positions in ``selected``, and their observations.
+
+    An observation counts if it is an inlier of a registered image with finite pixels, a point if it is triangulated and
+    has two of them (one, if it is constant).
+    """
+    total = 0
+    for t in selected:
+        total += track_ptr[t + 1] - track_ptr[t]
+    kept = np.empty(selected.shape[0], np.int64)
+    ptr = np.zeros(selected.shape[0] + 1, np.int64)
+    image = np.empty(total, np.int32)
+    xy = np.empty((total, 2))
+    used = np.zeros(registered.shape[0], np.bool_)
+    num_kept = n = 0
+    for s in range(selected.shape[0]):
+        t = selected[s]
+        if not np.isfinite(xyz[t, 0] + xyz[t, 1] + xyz[t, 2]):
+            continue
+        start = n
+        for o in range(track_ptr[t], track_ptr[t + 1]):
+            i = obs_image_idx[o]
+            if is_inlier[o] and registered[i] and np.isfinite(obs_xy[o, 0] + obs_xy[o, 1]):
+                image[n] = i
+                xy[n, 0] = obs_xy[o, 0]
+                xy[n, 1] = obs_xy[o, 1]
+                n += 1
+        if n - start < (1 if is_constant[s] else 2):
+            n = start
+            continue
+        for o in range(start, n):
+            used[image[o]] = True
+        kept[num_kept] = s
+        num_kept += 1
+        ptr[num_kept] = n
+    return kept[:num_kept].copy(), ptr[: num_kept + 1].copy(), image[:n].copy(), xy[:n].copy(), used

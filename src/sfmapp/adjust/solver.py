@@ -1,0 +1,373 @@
+"""Bundle adjustment: points eliminated by our kernels, cameras solved densely or by gtsam, damped by Levenberg-Marquardt."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.adjust import kernels
+from sfmapp.adjust.linear import aligned_zeros, assemble, factorize_tiles, hash_tiles, solve_tiles
+from sfmapp.adjust.problem import Problem, make_problem, pose_rows
+from sfmapp.events import Events
+from sfmapp.scene.camera import PARAM_NAMES, Camera
+from sfmapp.scene.reconstruction import Reconstruction
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Loss = Literal["trivial", "huber", "cauchy"]
+LOSS_IDS: dict[str, int] = {"trivial": kernels.TRIVIAL, "huber": kernels.HUBER, "cauchy": kernels.CAUCHY}
+
+# Up to this many blocks the tiles of all pairs fit a cache and the dense factor beats gtsam's sparse one.
+_MAX_DENSE_BLOCKS = 160
+# Work worth a chunk of its own, and the most memory that the chunks' private sums may take together.
+_CHUNK_OBSERVATIONS, _MAX_CHUNKS, _CHUNK_BYTES = 16384, 8, 1 << 28
+
+
+@dataclass(frozen=True)
+class AdjustOptions:
+    """How a bundle adjustment is done. Lengths are in pixels; the noise of an observation counts as one pixel."""
+
+    loss: Loss = "trivial"  # robust loss on the length of each residual; huber and cauchy as in Ceres and gtsam
+    loss_scale_px: float = 1.0  # residual length at which the loss begins to bend
+    max_iterations: int = 50  # Levenberg-Marquardt steps, rejected ones included
+    relative_cost_tolerance: float = 1e-6  # stop when an accepted step lowers the cost by less than this share
+    step_tolerance: float = 1e-9  # stop when points and cameras move by less than this share of their distances
+    initial_damping: float = 1e-4  # first share of the diagonal that is added to it; Ceres' 1 / trust region radius
+    refine_focal: bool = True  # focal lengths may change
+    refine_distortion: bool = True  # distortion coefficients may change
+    refine_principal_point: bool = False  # principal points may change
+    principal_point_sigma_px: float | None = None  # prior around the a priori principal point; None for no prior
+    distortion_sigma: float | None = None  # prior of each coefficient around its a priori value; None for no prior
+    backend: Literal["schur", "gtsam"] = "schur"  # schur: our kernels; gtsam: one factor per observation, the reference
+
+    @property
+    def refine(self) -> tuple[bool, bool, bool]:
+        """Focal lengths, distortion, principal points."""
+        return self.refine_focal, self.refine_distortion, self.refine_principal_point
+
+
+@dataclass(frozen=True)
+class AdjustReport:
+    """What an adjustment did.
+
+    Attributes:
+        termination: ``converged``, ``iterations`` (limit reached), ``stalled`` (no damping gives a better state) or
+            ``nothing`` (no unknowns or no observations).
+        num_iterations, num_rejected: steps tried, and those of them that were refused.
+        initial_cost, final_cost: half the sum of the losses, priors and extra factors included; square pixels.
+        num_images, num_cameras, num_points, num_observations: what took part; images and cameras only if they vary.
+        solver: ``dense``, ``sparse`` or ``gtsam``.
+        time_s: wall clock.
+    """
+
+    termination: str
+    num_iterations: int = 0
+    num_rejected: int = 0
+    initial_cost: float = 0.0
+    final_cost: float = 0.0
+    num_images: int = 0
+    num_cameras: int = 0
+    num_points: int = 0
+    num_observations: int = 0
+    solver: str = "dense"
+    time_s: float = 0.0
+
+
+def adjust_bundle(
+    reconstruction: Reconstruction,
+    options: AdjustOptions = AdjustOptions(),
+    *,
+    variable_images: Mask | None = None,
+    variable_cameras: Mask | None = None,
+    points: Mask | None = None,
+    constant_points: Mask | None = None,
+    prior_cameras: Sequence[Camera] | None = None,
+    extra_factors: Any = None,
+    threads: int = 1,
+    events: Events | None = None,
+) -> AdjustReport:
+    """Minimise the reprojection errors of the inlier observations, in place, over poses, intrinsics and points.
+
+    The gauge is left free unless something holds it (a constant image, a constant point, extra factors): the damping
+    picks the nearest solution. The state is never worse than it was given.
+
+    Args:
+        reconstruction: poses, points and cameras are replaced; whatever is constant keeps its bits.
+        variable_images: (I,) bool, which poses may change; None for all registered ones.
+        variable_cameras: (C,) bool, which intrinsics may change, beside ``options.refine_*``; cameras with ``is_fixed``
+            never do. None for all.
+        points: (T,) bool, which points take part and vary; None for those that a variable image observes.
+        constant_points: (T,) bool, which of the points take part without moving.
+        prior_cameras: (C,) cameras as they were known beforehand: focal lengths with ``focal_sigma``, principal points
+            and distortion with the sigmas of the options are Gaussian priors around their parameters. None for no priors.
+        extra_factors: gtsam.NonlinearFactorGraph over ``X(i)`` (Pose3 world_from_cam of image i) and ``K(c)`` (Vector of
+            the free parameters of camera c, in the order of ``Camera.params``), or None. Factors on constant images
+            or cameras only add to the cost.
+        threads: at most this many; the result does not depend on it.
+        events: asked for cancellation at every step.
+
+    Raises:
+        InterruptedRunError: on cancellation; the reconstruction then holds the best state so far.
+    """
+    start = time.perf_counter()
+    if options.backend == "gtsam":
+        from sfmapp.adjust.reference import adjust_with_gtsam
+
+        return adjust_with_gtsam(
+            reconstruction, options, variable_images=variable_images, variable_cameras=variable_cameras, points=points,
+            constant_points=constant_points, prior_cameras=prior_cameras, extra_factors=extra_factors, events=events,
+        )  # fmt: skip
+    extras = None
+    if extra_factors is not None and extra_factors.size() > 0:
+        from sfmapp.adjust.factors import ExtraFactors
+
+        extras = ExtraFactors(extra_factors)
+    problem = make_problem(
+        reconstruction, refine=options.refine, variable_images=variable_images, variable_cameras=variable_cameras,
+        points=points, constant_points=constant_points, extra_images=extras.images if extras else (),
+        extra_cameras=extras.cameras if extras else (),
+    )  # fmt: skip
+    priors = IntrinsicPriors(problem, prior_cameras, options)
+    engine = Engine(problem, options, priors, extras)
+    with ThreadPoolExecutor(max(1, min(threads, engine.num_chunks))) as pool:
+        run = map if threads <= 1 or engine.num_chunks == 1 else pool.map
+        try:
+            outcome = _minimize(engine, options, run, events)
+        finally:
+            write_back(problem, reconstruction)
+    return AdjustReport(
+        **outcome, num_images=int((problem.image_block >= 0).sum()), num_cameras=int((problem.camera_block >= 0).sum()),
+        num_points=len(problem.track_idx), num_observations=problem.num_observations, solver=engine.solver,
+        time_s=time.perf_counter() - start,
+    )  # fmt: skip
+
+
+def write_back(problem: Problem, reconstruction: Reconstruction) -> None:
+    """Put the state of a problem into its reconstruction; what was constant is not touched."""
+    moved = problem.image_block >= 0
+    reconstruction.cam_from_world[problem.image_idx[moved]] = problem.poses[moved]
+    free = ~problem.is_constant
+    reconstruction.point_xyz[problem.track_idx[free]] = problem.xyz[free]
+    for c, camera_idx in enumerate(problem.camera_idx):
+        if problem.camera_block[c] >= 0:
+            camera = reconstruction.cameras[camera_idx]
+            reconstruction.cameras[camera_idx] = camera.with_params(free_values(problem, c, camera.params)[0])
+
+
+def free_values(problem: Problem, camera: int, params: Array) -> tuple[Array, Array]:
+    """All parameters of a local camera with the problem's values in the free places, and (Q,) the free ones alone."""
+    free, out = problem.free, np.array(params)
+    begin, end = free.ptr[camera], free.ptr[camera + 1]
+    columns = free.column[begin:end]
+    values = np.zeros(len(free.params[camera]))
+    values[columns - columns.min(initial=8)] = problem.canonical[camera, free.slot[begin:end]]
+    out[free.params[camera]] = values
+    return out, values
+
+
+class IntrinsicPriors:
+    """Independent Gaussians on free intrinsics: what gtsam's PriorFactorVector would add, without its import."""
+
+    def __init__(self, problem: Problem, cameras: Sequence[Camera] | None, options: AdjustOptions) -> None:
+        rows = []
+        for c, camera_idx in enumerate(problem.camera_idx if cameras is not None else ()):
+            assert cameras is not None
+            camera = cameras[camera_idx]
+            first = 6 if problem.camera_block[c] < (problem.image_block >= 0).sum() else 0
+            for n, param in enumerate(problem.free.params[c]):
+                sigma = self._sigma(PARAM_NAMES[camera.model][param], camera, options)
+                if sigma is not None:
+                    slots = problem.free.slot[problem.free.ptr[c] : problem.free.ptr[c + 1]]
+                    columns = problem.free.column[problem.free.ptr[c] : problem.free.ptr[c + 1]]
+                    slot = slots[np.flatnonzero(columns == first + n)[0]]
+                    rows.append((c, slot, problem.camera_block[c] * 8 + first + n, camera.params[param], sigma))
+        table = np.array(rows, np.float64).reshape(-1, 5)
+        self.camera, self.slot, self.index = (table[:, k].astype(np.int64) for k in range(3))
+        self.mean, self.weight = table[:, 3], 1.0 / table[:, 4] ** 2
+
+    @staticmethod
+    def _sigma(name: str, camera: Camera, options: AdjustOptions) -> float | None:
+        if name[0] == "f":
+            return camera.focal_sigma
+        return options.principal_point_sigma_px if name[0] == "c" else options.distortion_sigma
+
+    def cost(self, canonical: Array) -> float:
+        error = canonical[self.camera, self.slot] - self.mean
+        return float(0.5 * (self.weight * error * error).sum())
+
+    def add(self, canonical: Array, own: Array, gradient: Array) -> None:
+        """Add weight and gradient to the blocks' own tiles (B * 64,) and to the gradient (B * 8,)."""
+        own[self.index // 8 * 64 + self.index % 8 * 9] += self.weight
+        gradient[self.index] += self.weight * (canonical[self.camera, self.slot] - self.mean)
+
+
+class Engine:
+    """The arrays of one problem and the four things to do with them: linearise, solve, try, accept."""
+
+    def __init__(self, problem: Problem, options: AdjustOptions, priors: IntrinsicPriors, extras: Any = None) -> None:
+        p = problem
+        self.problem, self.priors, self.extras = p, priors, extras
+        self.loss, self.scale2 = LOSS_IDS[options.loss], options.loss_scale_px**2
+        blocks, images = p.num_blocks, len(p.image_idx)
+        self.solver = "dense" if blocks <= _MAX_DENSE_BLOCKS else "sparse"
+        empty = np.zeros(0, np.int64)
+        self.hash_keys, self.hash_values, self.num_tiles = empty, empty, blocks * blocks
+        if self.solver == "sparse":
+            diagonal = np.arange(blocks) * (blocks + 1)
+            self.hash_keys, self.hash_values, self.num_tiles = hash_tiles(
+                p.point_ptr, p.obs_image, p.image_camera, p.image_block, p.camera_block, blocks, diagonal
+            )
+        fitting = max(1, _CHUNK_BYTES // max(1, self.num_tiles * 512))
+        self.num_chunks = int(np.clip(p.num_observations // _CHUNK_OBSERVATIONS, 1, min(_MAX_CHUNKS, fitting)))
+        shares = np.linspace(0, p.num_observations, self.num_chunks + 1)
+        self.limits = np.searchsorted(p.point_ptr, shares)
+        self.limits[0], self.limits[-1] = 0, len(p.track_idx)
+        chunks = self.num_chunks
+        self.tiles = aligned_zeros(chunks, self.num_tiles * 64)
+        self.own, self.cross = aligned_zeros(chunks, blocks * 64), aligned_zeros(chunks, images * 64)
+        self.gradient = aligned_zeros(chunks, 2, blocks * 8)
+        self.inverse = aligned_zeros(blocks * 64)
+        self.diagonal = np.ones(blocks * 8)
+        self.factor = np.zeros((len(p.track_idx), 12))
+        self.sums = np.zeros((chunks, 4))
+        self.rows = pose_rows(p.poses)
+        self.new_poses, self.new_rows = np.empty_like(p.poses), np.empty_like(self.rows)
+        self.new_canonical, self.new_xyz = np.empty_like(p.canonical), np.empty_like(p.xyz)
+        self.damping = 0.0
+
+    def linearize(self, damping: float, run: Callable[..., Any]) -> float:
+        """Reduced system at the current state with damped points; returns the cost of the state."""
+        p, self.damping = self.problem, damping
+
+        def chunk(k: int) -> float:
+            cost: float = kernels.reduce_points(
+                self.limits[k], self.limits[k + 1], p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, self.rows,
+                p.image_camera, p.image_block, p.canonical, p.fisheye, p.camera_block, p.free.ptr, p.free.slot,
+                p.free.column, p.block_dim, self.loss, self.scale2, damping, self.hash_keys, self.hash_values,
+                self.tiles[k], self.own[k], self.cross[k], self.gradient[k], self.factor,
+            )  # fmt: skip
+            return cost
+
+        cost = sum(run(chunk, range(self.num_chunks)))
+        own, gradient = np.zeros(p.num_blocks * 64), np.zeros(p.num_blocks * 8)
+        self.priors.add(p.canonical, own, gradient)
+        if self.extras is not None:
+            self.extras.linearize(p)
+            self.extras.add_diagonal(own, gradient)
+        assemble(
+            self.tiles, self.own, self.cross, self.gradient, p.image_block, p.image_camera, p.camera_block, p.block_dim,
+            self.hash_keys, self.hash_values, own, gradient, self.diagonal,
+        )  # fmt: skip
+        return cost + self.other_cost(p.poses, p.canonical)
+
+    def other_cost(self, poses: Array, canonical: Array) -> float:
+        """Cost of priors and extra factors."""
+        cost = self.priors.cost(canonical)
+        return cost + self.extras.cost(self.problem, poses, canonical) if self.extras is not None else cost
+
+    def solve(self) -> Array | None:
+        """Step of the blocks (B * 8,), or None where the damped system is not positive definite."""
+        p, blocks = self.problem, self.problem.num_blocks
+        step = -(self.gradient[0, 0] + self.gradient[0, 1])
+        if self.solver == "sparse":
+            from sfmapp.adjust.factors import solve_sparse
+
+            return solve_sparse(self, step)
+        tiles = self.tiles[0]
+        if self.extras is not None:
+            self.extras.add_pairs(tiles, blocks)
+        place = (np.arange(blocks) * (blocks + 1))[:, None] * 64 + np.arange(8) * 9
+        used = np.arange(8) < p.block_dim[:, None]
+        tiles[place[used]] += self.damping * self.diagonal.reshape(-1, 8)[used]
+        if not factorize_tiles(tiles, blocks, self.inverse):
+            return None
+        solve_tiles(tiles, blocks, self.inverse, step)
+        return step if np.isfinite(step).all() else None
+
+    def attempt(self, step: Array, run: Callable[..., Any]) -> tuple[float, float, float]:
+        """Try a step: cost of the new state, predicted decrease, and the move as a share of the distances."""
+        p = self.problem
+        moved, length = kernels.retract(
+            p.poses, p.image_block, p.canonical, p.camera_block, p.free.ptr, p.free.slot, p.free.column, step,
+            self.new_poses, self.new_rows, self.new_canonical,
+        )  # fmt: skip
+
+        def chunk(k: int) -> None:
+            kernels.substitute_points(
+                self.limits[k], self.limits[k + 1], p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, self.rows,
+                p.image_camera, p.image_block, p.canonical, p.fisheye, p.camera_block, p.free.ptr, p.free.slot,
+                p.free.column, p.block_dim, self.loss, self.scale2, self.factor, step, self.new_rows,
+                self.new_canonical, self.new_xyz, self.sums[k],
+            )  # fmt: skip
+
+        list(run(chunk, range(self.num_chunks)))
+        cost, decrease, point_moved, point_length = (float(v) for v in self.sums.sum(0))
+        decrease += 0.5 * float(step @ (self.damping * self.diagonal * step - self.gradient[0, 0]))
+        share = np.sqrt((moved + point_moved) / max(length + point_length, 1e-300))
+        return cost + self.other_cost(self.new_poses, self.new_canonical), decrease, float(share)
+
+    def accept(self) -> None:
+        """Make the state that was tried the current one."""
+        p = self.problem
+        p.poses, self.new_poses = self.new_poses, p.poses
+        p.canonical, self.new_canonical = self.new_canonical, p.canonical
+        p.xyz, self.new_xyz = self.new_xyz, p.xyz
+        self.rows, self.new_rows = self.new_rows, self.rows
+
+
+def _minimize(engine: Engine, options: AdjustOptions, run: Callable[..., Any], events: Events | None) -> dict[str, Any]:
+    """Levenberg-Marquardt with the damping rule of Nielsen (1999), as Ceres has it. Returns fields of the report."""
+    problem = engine.problem
+    if problem.num_observations == 0 and engine.extras is None:
+        return {"termination": "nothing"}
+    damping, growth, tolerance = options.initial_damping, 2.0, options.relative_cost_tolerance
+    first = cost = engine.linearize(damping, run)
+    termination, iterations, rejected = "iterations", 0, 0
+    if not np.isfinite(cost):
+        return {"termination": "stalled", "initial_cost": cost, "final_cost": cost}
+    while iterations < options.max_iterations:
+        if events is not None:
+            events.raise_if_cancelled()
+        iterations += 1
+        step = engine.solve()
+        if step is not None:
+            new_cost, predicted, share = engine.attempt(step, run)
+            if share <= options.step_tolerance or predicted <= 1e-3 * tolerance * cost:
+                # nothing left to gain that would show; take it if it is a gain at all
+                if new_cost < cost:
+                    engine.accept()
+                    cost = new_cost
+                termination = "converged"
+                break
+            gain = (cost - new_cost) / predicted
+            if new_cost < cost and gain > 1e-3:
+                engine.accept()
+                decrease, cost = cost - new_cost, new_cost
+                if decrease <= tolerance * (cost + decrease):
+                    termination = "converged"
+                    break
+                damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-10)
+                growth = 2.0
+                if iterations < options.max_iterations:
+                    engine.linearize(damping, run)
+                continue
+            if abs(cost - new_cost) <= tolerance * cost:
+                termination = "converged"
+                break
+        rejected += 1
+        damping *= growth
+        growth *= 2.0
+        if damping > 1e16:
+            termination = "stalled"
+            break
+        engine.linearize(damping, run)
+    return {
+        "termination": termination, "num_iterations": iterations, "num_rejected": rejected, "initial_cost": first,
+        "final_cost": cost,
+    }  # fmt: skip
