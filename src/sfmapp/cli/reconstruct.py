@@ -31,9 +31,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "reconstruct", help="photographs to cameras and points", epilog=EXAMPLES, formatter_class=raw,
         description="Reconstruct cameras and points from photographs.",
     )  # fmt: skip
-    parser.add_argument(
-        "images", metavar="IMAGES", nargs="?", help="a folder, a glob in quotes, or a .txt list"
-    )
+    parser.add_argument("images", metavar="IMAGES", nargs="?", help="a folder, a glob in quotes, or a .txt list")
     parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="folder of the results, made if need be")
     parser.add_argument("--list-options", action="store_true", help="list every stage.option and its default")
     _add_option_flags(parser)
@@ -114,10 +112,11 @@ def _demo(args: argparse.Namespace) -> int:
         return 0
     if not args.quiet:
         _print_summary(args.output, report)
+    center, rotation = errors["center_error"], errors["rotation_error_deg"]
     print(
-        f"against the truth: centres {errors['median_center_error']:.2g} m median, {errors['max_center_error']:.2g} m worst"
-        f" ({100 * errors['median_center_error_of_size']:.3f} % of the scene's size);"
-        f" rotations {errors['median_rotation_error_deg']:.2g} deg median, {errors['max_rotation_error_deg']:.2g} worst"
+        f"against the truth: camera centres off by {1000 * center['mean']:.2f} mm on average,"
+        f" {1000 * center['max']:.2f} mm at worst; rotations by {rotation['mean']:.4f} and {rotation['max']:.4f}"
+        f" degrees ({errors['num_compared']} of {errors['num_reference_images']} images, {errors['scene_size']:.1f} m apart)"
     )
     return 0
 

@@ -8,8 +8,8 @@ import difflib
 import enum
 import inspect
 import itertools
-import json
 import math
+import os
 import textwrap
 import tomllib
 import types
@@ -22,10 +22,10 @@ from typing import Any
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.errors import SfmError, UsageError
 from sfmapp.features.extract import FeatureOptions
-from sfmapp.images.folder import ImageOptions
+from sfmapp.images.image_set import ImageOptions
 from sfmapp.mapping.options import MappingOptions
+from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.pairs import PairOptions
-from sfmapp.matching.stage import MatchingOptions
 from sfmapp.pipelines import resources
 
 LIST_ADVICE = "sfmapp reconstruct --list-options shows every option with its default"
@@ -80,14 +80,17 @@ def options_from_dict(values: Mapping[str, Any]) -> Options:
     return _build(Options, values, "")
 
 
+def with_absolute_paths(options: Options) -> Options:
+    """The same options, good in any working directory."""
+    masks = options.images.mask_path
+    if masks is None:
+        return options
+    return dataclasses.replace(options, images=dataclasses.replace(options.images, mask_path=os.path.abspath(masks)))
+
+
 def options_to_dict(options: Any) -> dict[str, Any]:
     """Nested plain values of an options class, JSON-able: enums as names, tuples as lists."""
     return {f.name: _plain(getattr(options, f.name)) for f in dataclasses.fields(options)}
-
-
-def canonical_json(value: Any) -> str:
-    """The one spelling of plain values that hashes are made of."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
 
 
 def read_preset(name_or_path: str) -> dict[str, Any]:
@@ -138,15 +141,21 @@ def _rows(options: Any) -> list[tuple[str, Any, Any, str]]:
 
 
 def field_comments(options_class: type) -> dict[str, str]:
-    """One line about each field: the string under it, or its entry in the class's ``Attributes:`` section."""
+    """What is said about each field: in the string under it, the comment above it, or the class's ``Attributes:``."""
     comments = {f.name: "" for f in dataclasses.fields(options_class)}
-    body = ast.parse(textwrap.dedent(inspect.getsource(options_class))).body[0]
+    source = textwrap.dedent(inspect.getsource(options_class))
+    lines = [line.strip() for line in source.splitlines()]
+    body = ast.parse(source).body[0]
     assert isinstance(body, ast.ClassDef)
-    for statement, following in itertools.pairwise(body.body):
-        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
-            match following:
-                case ast.Expr(value=ast.Constant(value=str(text))):
-                    comments[statement.target.id] = " ".join(text.split())
+    for statement, following in itertools.zip_longest(body.body, body.body[1:]):
+        if not isinstance(statement, ast.AnnAssign) or not isinstance(statement.target, ast.Name):
+            continue
+        match following:
+            case ast.Expr(value=ast.Constant(value=str(text))):
+                comments[statement.target.id] = " ".join(text.split())
+            case _:
+                above = itertools.takewhile(lambda line: line.startswith("#"), lines[statement.lineno - 2 :: -1])
+                comments[statement.target.id] = " ".join(line.lstrip("# ") for line in [*above][::-1])
     _, _, section = inspect.cleandoc(options_class.__doc__ or "").partition("Attributes:\n")
     for entry in textwrap.dedent(section).split("\n\n")[0].replace("\n    ", " ").splitlines():
         names, _, text = entry.partition(":")

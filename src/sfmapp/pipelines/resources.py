@@ -42,6 +42,4 @@ def sample_folder() -> Path:
         folder = root / "data" / "courtyard"
         if (folder / "images").is_dir():
             return folder
-    raise InputError(
-        f"the bundled sample is not in {ROOTS[0]}", "install sfmapp again"
-    )
+    raise InputError(f"the bundled sample is not in {ROOTS[0]}", "install sfmapp again")

@@ -1,9 +1,9 @@
 """The workspace: the folder that a run writes, and the memory of what in it is still good.
 
-``run.json`` holds the effective options, the versions, the seed, the digests of the inputs and one key per stage: a hash
-of the stage's inputs, its options and its source code. A stage whose key is unchanged and which is marked done is not
-run again. The manifest is written before a stage begins to overwrite anything and after it has ended, so that a run may
-be cut off anywhere.
+``run.json`` holds the effective options, the versions, the seed, the digests of the inputs and one key per stage: a
+hash of the stage's inputs, its options and its source code. A stage whose key is unchanged and which is marked done is
+not run again. The manifest is written before a stage begins to overwrite anything and after it has ended, so that a run
+may be cut off anywhere.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, Any
 
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.atomic import replaced_file
-from sfmapp.pipelines.options import canonical_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -53,6 +52,10 @@ class Workspace:
     @property
     def log(self) -> Path:
         return self.folder / "log.jsonl"
+
+    @property
+    def recording(self) -> Path:
+        return self.folder / "recording.rrd"
 
     def model(self, idx: int = 0) -> Path:
         """Folder of a model; 0 is the largest."""
@@ -151,6 +154,11 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise InputError(f"{folder} is not a workspace of sfmapp", "give the OUT of an earlier sfmapp reconstruct")
     return manifest
+
+
+def canonical_json(value: Any) -> str:
+    """The one spelling of plain values that hashes are made of."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
 
 
 def stage_key(packages: Sequence[str], options: Any, *inputs: Any) -> str:

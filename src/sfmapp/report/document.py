@@ -17,6 +17,16 @@ if TYPE_CHECKING:
     from sfmapp.scene.reconstruction import Reconstruction
 
 FORMAT = "sfmapp report 1"
+FUNNEL_STEPS = (
+    "features",
+    "candidate_pairs",
+    "verified_pairs",
+    "putative_matches",
+    "verified_matches",
+    "correspondences_2d3d",
+    "pose_inliers",
+    "observations",
+)
 # fewer keypoints than this leave too few matches for any pair, whatever the other image holds
 FEW_FEATURES = 100
 
@@ -68,6 +78,14 @@ def funnel_of_images(
     return rows
 
 
+def funnel_without_matches(names: Sequence[str], reason: str) -> list[dict[str, Any]]:
+    """The rows of a run that ended before any image was matched."""
+    nothing = dict.fromkeys(FUNNEL_STEPS)
+    row = {"is_registered": False, "model": None, "funnel": nothing}
+    failure = {"failed_at": "images", "reason": reason, "remedy": "Add photographs of the same thing."}
+    return [{"name": name, **row, **failure} for name in names]
+
+
 def explain_failure(funnel: Mapping[str, Any], reason: str, options: MappingOptions) -> dict[str, str]:
     """Where an image fell out of the funnel: ``failed_at``, the ``reason`` with its threshold, and a ``remedy``."""
     if funnel["features"] < FEW_FEATURES:
@@ -100,7 +118,7 @@ def explain_failure(funnel: Mapping[str, Any], reason: str, options: MappingOpti
     return {
         "failed_at": "pose",
         "reason": reason or f"fewer than {needed} points agree with one pose",
-        "remedy": "Repeated structure, moving things or a wrong focal length: mask what moves, or give the focal length.",
+        "remedy": "Repeated structure, moving things or a wrong focal length: mask what moves, or give the focal.",
     }
 
 

@@ -123,9 +123,10 @@ def _usage(report: Mapping[str, Any]) -> str:
     head = [("t", "stage"), ("", "wall s"), ("", "CPU s"), ("", "peak MB so far"), ("t", "")]
     rows = []
     for name, entry in [*report["usage"].items(), ("whole run", report["run"])]:
-        note = "kept from an earlier run" if entry.get("is_reused") else ""
-        wall, cpu = f"{entry['wall_s']:.2f}", f"{entry['cpu_s']:.2f}"
-        rows.append([("t", name), ("", wall), ("", cpu), ("", f"{entry['peak_memory_mb']:.0f}"), ("t dim", note)])
+        peak = f"{entry['peak_memory_mb']:.0f}" if "peak_memory_mb" in entry else None
+        note = "in the background of the others" if peak is None else ""
+        numbers = [("", f"{entry['wall_s']:.2f}"), ("", f"{entry['cpu_s']:.2f}"), ("", peak)]
+        rows.append([("t", name), *numbers, ("t dim", note)])
     return _table(head, rows)
 
 

@@ -1,0 +1,17 @@
+"""The bundled sample: a result on it against the cameras that rendered it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sfmapp.evaluation.poses import evaluate_poses
+from sfmapp.formats.colmap import read_model
+from sfmapp.formats.truth import read_truth
+
+
+def compare_with_truth(output: Path, sample: Path) -> dict[str, Any]:
+    """Errors of ``output/sparse/0`` in metres and degrees; see :meth:`PoseErrors.summary`."""
+    model, _ = read_model(output / "sparse" / "0")
+    truth = read_truth(sample / "cameras.json")
+    return evaluate_poses(model.image_names, model.cam_from_world, truth.names, truth.cam_from_world).summary()

@@ -1,0 +1,70 @@
+"""Compile the numba kernels in the background while the first images are read, and say so if it takes long.
+
+The first run on a machine compiles them, tens of CPU seconds; later ones load them from numba's cache.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Any
+
+from sfmapp.errors import InterruptedRunError
+from sfmapp.events import Events
+
+STAGE = "kernels"
+# in the order in which a run needs them
+MODULES = ("sfmapp.matching.stage", "sfmapp.mapping.incremental")
+
+
+@contextmanager
+def kernels_compiling(events: Events, usage: dict[str, dict[str, Any]]) -> Iterator[None]:
+    """Compile all kernels in a thread beside the block; adds what it took to ``usage``."""
+    thread = threading.Thread(target=_compile, args=(events, usage), name=STAGE, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        thread.join()
+
+
+def _compile(events: Events, usage: dict[str, dict[str, Any]]) -> None:
+    from numba.core import event as numba_event
+
+    wall, cpu = time.monotonic(), time.thread_time()
+    listener = _listener(events)
+    numba_event.register("numba:compile", listener)
+    try:
+        for name in MODULES:
+            import_module(name).compile_kernels()
+            events.raise_if_cancelled()
+    except InterruptedRunError:
+        pass  # the block hears of it at its own next step
+    finally:
+        numba_event.unregister("numba:compile", listener)
+    took = {"wall_s": round(time.monotonic() - wall, 4), "cpu_s": round(time.thread_time() - cpu, 4)}
+    if listener.num_compiled:
+        events.finished(STAGE, f"{listener.num_compiled} kernels compiled, once", **took)
+    usage[STAGE] = took | {"num_compiled": listener.num_compiled}
+
+
+def _listener(events: Events) -> Any:
+    from numba.core.event import Event, Listener
+
+    class Compilations(Listener):  # type: ignore[misc]
+        """Tells of compilations; a kernel that comes from the cache is none."""
+
+        num_compiled = 0
+
+        def on_start(self, event: Event) -> None:
+            if not self.num_compiled:
+                events.started(STAGE, "compiling kernels, once")
+            self.num_compiled += 1
+
+        def on_end(self, event: Event) -> None:
+            events.advanced(STAGE)
+
+    return Compilations()

@@ -1,0 +1,54 @@
+"""What each stage of a reconstruction depends on, as hashes. A stage whose key is unchanged need not run again."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from sfmapp.pipelines.options import Options, options_to_dict
+from sfmapp.pipelines.workspace import stage_key
+
+if TYPE_CHECKING:
+    from sfmapp.images.image_set import ImageRecord, ImageSet
+
+
+@dataclass(frozen=True)
+class StageKeys:
+    """Keys of the stages, and of what each image brings to its features.
+
+    Attributes:
+        inputs: by image name; features of an image hold as long as its entry and ``features`` do.
+        features, pairs, matching, mapping: keys of the stages. Threads and ``min_registered`` are in none of them.
+    """
+
+    inputs: dict[str, str]
+    features: str
+    pairs: str
+    matching: str
+    mapping: str
+
+
+def stage_keys(options: Options, image_set: ImageSet) -> StageKeys:
+    """Keys of all stages for these photographs and options."""
+    plain = options_to_dict(options)
+    inputs = {record.name: _input_key(record) for record in image_set.images}
+    features = stage_key(("features", "images"), plain["features"])
+    images = [features, list(inputs.items()), options.seed]
+    lenses = [[camera.model.name, camera.width, camera.height, camera.params.tolist()] for camera in image_set.cameras]
+    priors = [[camera.focal_sigma, camera.focal_source, camera.is_fixed] for camera in image_set.cameras]
+    whose = [record.camera_idx for record in image_set.images]
+    places = [[record.timestamp, record.gps] for record in image_set.images]
+    pairs = stage_key(("matching",), plain["pairs"], images, places)
+    matching = stage_key(("matching", "geometry", "scene"), plain["matching"], images, lenses, whose)
+    mapped: tuple[Any, ...] = (plain["adjust"], pairs, matching, priors)
+    mapping = stage_key(("mapping", "adjust", "geometry", "scene"), plain["mapping"], *mapped)
+    return StageKeys(inputs, features, pairs, matching, mapping)
+
+
+def _input_key(record: ImageRecord) -> str:
+    """Digest of an image's file and of whatever masks it."""
+    key = record.digest + ("+alpha" if record.has_alpha else "")
+    if record.mask_path is None:
+        return key
+    return f"{key}+mask:{hashlib.blake2b(record.mask_path.read_bytes(), digest_size=16).hexdigest()}"

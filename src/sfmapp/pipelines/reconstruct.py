@@ -1,0 +1,153 @@
+"""Photographs to a sparse model: the main job, on a page.
+
+:func:`reconstruct` opens the workspace and sees to it that every end is a clean one; :func:`_run` is the job.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import sfmapp
+from sfmapp.errors import NoReconstructionError, TooFewImagesError
+from sfmapp.events import Events
+from sfmapp.features.extract import extract_features
+from sfmapp.formats.colmap import read_model
+from sfmapp.images.folder import load_images
+from sfmapp.matching.pairs import select_pairs
+from sfmapp.matching.stage import match_images
+from sfmapp.pipelines import results
+from sfmapp.pipelines.kernels import kernels_compiling
+from sfmapp.pipelines.keys import StageKeys, stage_keys
+from sfmapp.pipelines.listeners import DecisionLog, EventLog
+from sfmapp.pipelines.options import Options, with_absolute_paths
+from sfmapp.pipelines.run import Run
+from sfmapp.pipelines.store import Store
+from sfmapp.pipelines.usage import Stopwatch
+from sfmapp.pipelines.workspace import open_workspace
+
+if TYPE_CHECKING:
+    from sfmapp.images.image_set import ImageSet
+    from sfmapp.scene.reconstruction import Reconstruction
+
+
+class RunResult(NamedTuple):
+    """The largest model, and the report of the run as in ``report.json``."""
+
+    reconstruction: Reconstruction
+    report: dict[str, Any]
+
+
+def reconstruct(
+    images: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    options: Options | None = None,
+    *,
+    events: Events | None = None,
+    record: bool = True,
+    watch: Stopwatch | None = None,
+) -> RunResult:
+    """Reconstruct cameras and points from photographs.
+
+    What an earlier run in the same output folder has done is used where it still holds.
+
+    Args:
+        images: a folder, a glob pattern or a ``.txt`` list of files.
+        output: folder of the results: new, empty, or of an earlier run.
+        options: of all stages; see :func:`sfmapp.load_options`.
+        events: listens in, and can ask the run to stop.
+        record: write ``recording.rrd``, which replays the run.
+        watch: started earlier, if more is to be counted in the report than this call.
+
+    Returns:
+        The largest model as it is read back from ``sparse/0`` (registered images, triangulated points), and the report.
+
+    Raises:
+        UsageError: the output folder holds something else, or another run is at work in it.
+        InputError: the photographs do not exist or cannot be read.
+        NoReconstructionError: they hold no reconstruction; the report is written.
+        TooFewImagesError: fewer images than ``options.min_registered``; everything is written.
+        InterruptedRunError: ``events`` was asked to stop; the same call resumes.
+    """
+    from threadpoolctl import threadpool_limits
+
+    source, options, events = os.fspath(images), with_absolute_paths(options or Options()), events or Events()
+    threads = options.threads or len(os.sched_getaffinity(0))
+    with (
+        open_workspace(Path(output)) as workspace,
+        EventLog(workspace.log, source=source, version=sfmapp.__version__) as event_log,
+        # our workers use the cores; sums must not depend on how many the linear algebra beneath them would use
+        threadpool_limits(1, "blas"),
+    ):
+        decisions = DecisionLog()
+        for listener in (event_log, decisions):
+            events.subscribe(listener)
+        run = Run(source, workspace, options, events, watch or Stopwatch(), decisions, threads, record)
+        report = _run(run)
+        model, _ = read_model(workspace.model())
+    found = report["models"][0]["num_registered"]
+    if options.min_registered is not None and found < options.min_registered:
+        raise TooFewImagesError(
+            f"{found} images are registered, {options.min_registered} were asked for",
+            f"{output}/report.html tells for every image why",
+        )
+    return RunResult(model, report)
+
+
+def _run(run: Run) -> dict[str, Any]:
+    """The job: photographs, what still holds of an earlier run, models, and the report of it all."""
+    with run.stage("images"):
+        run.image_set, run.stages["images"] = load_images(
+            run.source, run.options.images, run.events, threads=run.threads
+        )
+    keys = stage_keys(run.options, run.image_set)
+    if report := results.earlier_report(run, keys):
+        return report
+    results.note_inputs(run, keys)
+    try:
+        models = _reconstruct(run, run.image_set, keys)
+    except NoReconstructionError as failure:
+        results.write_results(run, keys, [], failure)
+        raise
+    return results.write_results(run, keys, models)
+
+
+def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconstruction]:
+    """From photographs to models, the largest first."""
+    from sfmapp.mapping.incremental import map_images
+
+    options, events, threads = run.options, run.events, run.threads
+    if len(image_set.images) < 2:
+        raise _too_few_photographs(image_set)
+    with kernels_compiling(events, run.usage), Store(run.workspace.database, image_set, keys) as store:
+        with run.stage("features", keys.features):
+            run.features, run.stages["features"] = extract_features(
+                image_set, options.features, threads=threads, events=events,
+                known=store.known_features(), on_features=store.put_features,
+            )  # fmt: skip
+        with run.stage("pairs", keys.pairs):
+            pairs, run.stages["pairs"] = select_pairs(
+                image_set, run.features, options.pairs, seed=options.seed, threads=threads, events=events
+            )
+        with run.stage("matching", keys.matching):
+            run.correspondences, run.stages["matching"] = match_images(
+                image_set, run.features, pairs, options.matching, seed=options.seed, threads=threads, events=events,
+                known=store.known_pairs(pairs), on_pair=store.put_pair,
+            )  # fmt: skip
+            store.flush()
+    with run.stage("mapping"):
+        models, run.stages["mapping"] = map_images(
+            image_set, run.features, run.correspondences, options.mapping,
+            adjust_options=options.adjust, threads=threads, events=events,
+        )  # fmt: skip
+    return models
+
+
+def _too_few_photographs(image_set: ImageSet) -> NoReconstructionError:
+    images = image_set.images
+    found = f"only one usable photograph, {images[0].name}" if images else "no usable photograph"
+    skipped = f" ({len(image_set.skipped)} files could not be used)" if image_set.skipped else ""
+    return NoReconstructionError(
+        f"{found}{skipped}", "give at least two photographs of the same thing from different places"
+    )

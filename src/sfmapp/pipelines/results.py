@@ -1,0 +1,135 @@
+"""The end of a run: models, report and manifest; and the beginning of one that finds everything done."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import sfmapp
+from sfmapp.errors import NoReconstructionError
+from sfmapp.pipelines.options import options_to_dict
+from sfmapp.pipelines.workspace import plain_number, recorded_versions
+from sfmapp.report.document import FORMAT, camera_rows, funnel_of_images, funnel_without_matches, make_checks
+from sfmapp.report.html import render_html
+
+if TYPE_CHECKING:
+    from sfmapp.pipelines.keys import StageKeys
+    from sfmapp.pipelines.run import Run
+    from sfmapp.scene.reconstruction import Reconstruction
+
+MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
+
+
+def earlier_report(run: Run, keys: StageKeys) -> dict[str, Any] | None:
+    """The report of an earlier run, if all that this run would write is there and still holds.
+
+    Raises:
+        NoReconstructionError: the earlier run ended so, and nothing has changed.
+    """
+    workspace = run.workspace
+    report = workspace.read_json("report.json")
+    if not workspace.is_current("mapping", keys.mapping) or not report or report.get("format") != FORMAT:
+        return None
+    recorded = not run.should_record or workspace.recording.is_file() or workspace.manifest.get("recording") == "failed"
+    if not recorded or not (workspace.folder / "report.html").is_file():
+        return None
+    outcome = report["outcome"]
+    if outcome["exit_code"] == NoReconstructionError.exit_code:
+        raise NoReconstructionError(f"{outcome['message']} (as before: nothing has changed)", outcome["advice"])
+    models = [workspace.model(idx) for idx in range(len(report["models"]))]
+    if not all((model / name).is_file() for model in models for name in MODEL_FILES):
+        return None
+    report["run"] |= {"is_up_to_date": True, **run.watch.read()}
+    return report
+
+
+def note_inputs(run: Run, keys: StageKeys) -> None:
+    """Write down what this run works on and how, before it begins."""
+    run.workspace.manifest |= {
+        # absolute, so that the workspace can be looked at from anywhere
+        "source": os.path.abspath(run.source),
+        "seed": run.options.seed,
+        "options": options_to_dict(run.options),
+        "versions": {"sfmapp": sfmapp.__version__, **recorded_versions()},
+        "inputs": keys.inputs,
+    }
+    run.workspace.save()
+
+
+def write_results(
+    run: Run, keys: StageKeys, models: Sequence[Reconstruction], failure: NoReconstructionError | None = None
+) -> dict[str, Any]:
+    """Write the models, the recording and the report, in this order; returns the report."""
+    workspace, manifest = run.workspace, run.workspace.manifest
+    if failure is not None and hasattr(failure, "report"):
+        run.stages["mapping"] = failure.report
+    workspace.begin("mapping", keys.mapping)
+    with run.stage("output"):
+        workspace.write_models(models, [features.keypoints for features in run.features])
+    report = _make_report(run, models, failure)
+    workspace.write_text("report.html", render_html(report, models[0] if models else None))
+    report["run"] |= run.watch.read()  # the last measurement that can still be written down
+    workspace.write_text("report.json", _report_text(report))
+    workspace.finish("mapping", run.usage.get("mapping", {}))
+    manifest["usage"] = run.usage
+    workspace.save()
+    return report
+
+
+def _make_report(run: Run, models: Sequence[Reconstruction], failure: NoReconstructionError | None) -> dict[str, Any]:
+    assert run.image_set is not None
+    summaries = [model.summary() for model in models]
+    images, cameras = _image_rows(run, failure), camera_rows(run.image_set, models[0] if models else None)
+    return {
+        "format": FORMAT,
+        "outcome": {
+            "exit_code": failure.exit_code if failure else 0,
+            "message": str(failure) if failure else "",
+            "advice": failure.advice if failure else None,
+        },
+        "run": _run_facts(run) | run.watch.read(),
+        "models": summaries,
+        "checks": make_checks(summaries[0], len(models), images, cameras) if models else [],
+        "images": images,
+        "skipped": [{"name": name, "reason": reason} for name, reason in run.image_set.skipped],
+        "cameras": cameras,
+        "usage": run.usage,
+        "warnings": run.log.warnings,
+        "decisions": run.log.decisions,
+        "stages": run.stages,
+    }
+
+
+def _image_rows(run: Run, failure: NoReconstructionError | None) -> list[dict[str, Any]]:
+    assert run.image_set is not None
+    names = [record.name for record in run.image_set.images]
+    if run.correspondences is None:
+        return funnel_without_matches(names, str(failure))
+    mapping = run.stages.get("mapping") or {}
+    return funnel_of_images(names, run.features, run.correspondences, mapping.get("images", []), run.options.mapping)
+
+
+def _run_facts(run: Run) -> dict[str, Any]:
+    return {
+        "source": run.source,
+        "seed": run.options.seed,
+        "threads": run.threads,
+        "options": options_to_dict(run.options),
+        "versions": run.workspace.manifest["versions"],
+        "started": run.started.isoformat(timespec="seconds"),
+        "is_up_to_date": False,
+    }
+
+
+def _report_text(report: Mapping[str, Any]) -> str:
+    """JSON with a line for each entry of the outermost objects and lists: readable, and written in one go."""
+    parts = []
+    for key, value in report.items():
+        if isinstance(value, list) and value:
+            text = "[\n  " + ",\n  ".join(json.dumps(entry, default=plain_number) for entry in value) + "\n ]"
+        else:
+            text = json.dumps(value, default=plain_number)
+        parts.append(f" {json.dumps(key)}: {text}")
+    return "{\n" + ",\n".join(parts) + "\n}\n"
