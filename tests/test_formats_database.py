@@ -19,10 +19,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sfmapp.errors import InputError
-from sfmapp.features.features import Features
 from sfmapp.formats.database import Database
 from sfmapp.scene.camera import Camera, CameraModel
 from sfmapp.scene.correspondences import Correspondences
+from sfmapp.scene.features import Features
 from sfmapp.scene.synthetic import SyntheticScene, make_scene, synthetic_camera, true_correspondences
 
 

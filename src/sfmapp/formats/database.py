@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
-from sfmapp.features.features import Features
 from sfmapp.formats.colmap_model import checked_camera
 from sfmapp.scene.camera import Camera
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
+from sfmapp.scene.features import Features
 
 _VERSION = 4020100
 """COLMAP 4.2.1's own mark, in the pragma user_version: an older one would make it migrate the file."""
