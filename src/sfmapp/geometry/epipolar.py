@@ -174,7 +174,7 @@ def choose_in_front(poses: Array, xn1: Array, xn2: Array) -> tuple[Array, NDArra
 def _pose_normal_equations(
     r: Array, t: Array, xn1: Array, xn2: Array, scale2: float, tangent: Array, h: Array, g: Array
 ) -> float:
-    """Gauss-Newton system (5, 5) of the Cauchy-weighted Sampson error for exp(w) R and t + tangent b; returns the cost."""
+    """Gauss-Newton system (5, 5) of the Cauchy-weighted Sampson error for exp(w) R, t + tangent b; returns the cost."""
     e = np.empty((3, 3))
     for k in range(3):
         e[0, k] = t[1] * r[2, k] - t[2] * r[1, k]

@@ -1,51 +1,16 @@
-"""Nearest neighbours among descriptors, checked from both sides.
-
-SIFT descriptors are compared by their dot products in whole numbers: exact, so the same on every machine and in every
-order, and a vector instruction that multiplies 16-bit numbers and adds pairs beats a float matrix product that would
-have to be written to memory and read again.
-"""
+"""Nearest neighbours among descriptors, checked from both sides."""
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from sfmapp.matching.products import largest_products
 
 # RootSIFT times 512 has a squared norm of 512^2, up to rounding
 _SIFT_NORM2 = 512 * 512
 
-Descriptors = NDArray[np.int16]
 Indices = NDArray[np.int32]
-
-
-@numba.njit(cache=True, nogil=True)
-def _scan_products(
-    a: Descriptors, b: Descriptors, best1: Indices, second1: Indices, arg1: Indices,
-    best2: Indices, second2: Indices, arg2: Indices,
-) -> None:  # fmt: skip
-    """Two largest dot products of every row of a over b and of every row of b over a; the first of equals wins."""
-    dims = a.shape[1]
-    for i in range(a.shape[0]):
-        best, second, arg = best1[i], second1[i], arg1[i]
-        for j in range(b.shape[0]):
-            total = np.int32(0)
-            for k in range(dims):  # every sum is cast back: numba would widen to 64 bits and halve the speed
-                total = np.int32(total + np.int32(np.int32(a[i, k]) * np.int32(b[j, k])))
-            if total > second:
-                if total > best:
-                    second = best
-                    best = total
-                    arg = j
-                else:
-                    second = total
-            if total > second2[j]:
-                if total > best2[j]:
-                    second2[j] = best2[j]
-                    best2[j] = total
-                    arg2[j] = i
-                else:
-                    second2[j] = total
-        best1[i], second1[i], arg1[i] = best, second, arg
 
 
 def match_sift(
@@ -61,11 +26,7 @@ def match_sift(
     Returns:
         (K, 2) int32 positions in both, ascending; no position occurs twice.
     """
-    a, b = descriptors1.astype(np.int16), descriptors2.astype(np.int16)
-    n, m = len(a), len(b)
-    best1, second1, arg1 = (np.full(n, fill, np.int32) for fill in (0, 0, -1))
-    best2, second2, arg2 = (np.full(m, fill, np.int32) for fill in (0, 0, -1))
-    _scan_products(a, b, best1, second1, arg1, best2, second2, arg2)
+    best1, second1, arg1, best2, second2, arg2 = largest_products(descriptors1, descriptors2)
     good1 = (arg1 >= 0) & _passes(best1, second1, max_ratio, max_distance)
     good2 = (arg2 >= 0) & _passes(best2, second2, max_ratio, max_distance)
     rows = np.flatnonzero(good1)

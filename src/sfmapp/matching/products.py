@@ -1,0 +1,177 @@
+"""The two largest dot products of every descriptor of one image with those of another.
+
+SIFT descriptors are whole numbers, so their products are exact: the same on every machine and in every order of
+summation. A processor multiplies 16-bit numbers and adds neighbouring pairs in one instruction (pmaddwd, vpdpwssd,
+smlal): twice the rate of floats, and nothing is written to memory. Numba's own loops do not find that instruction, so
+the innermost tile is written in LLVM's portable language, in the one pattern that every back end knows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+Ints = NDArray[np.int32]
+
+DIMS = 128
+LANES = 16  # descriptors that share a vector of 32-bit sums
+ROWS, GROUPS = 4, 2  # descriptors of image 1, and groups of LANES of image 2, in a tile: 8 vectors of sums
+_GROUPS_IN_CACHE = 16  # 256 descriptors of image 2, 64 kB, stay in the cache while image 1 passes by
+
+_I16, _I32, _I64 = ir.IntType(16), ir.IntType(32), ir.IntType(64)
+_SUMS = ir.VectorType(_I32, LANES)
+_PRODUCTS = ir.VectorType(_I32, 2 * LANES)
+_PAIRS = ir.VectorType(_I16, 2 * LANES)
+
+
+def _int64(value: int) -> ir.Constant:
+    return ir.Constant(_I64, value)
+
+
+def _load(builder: ir.IRBuilder, pointer: Any, offset: Any, kind: ir.Type, align: int) -> Any:
+    value = builder.load(builder.bitcast(builder.gep(pointer, [offset]), kind.as_pointer()))
+    value.align = align
+    return value
+
+
+def _broadcast(builder: ir.IRBuilder, value: Any) -> Any:
+    undefined = ir.Constant(_SUMS, ir.Undefined)
+    return builder.shuffle_vector(
+        builder.insert_element(undefined, value, ir.Constant(_I32, 0)), undefined, ir.Constant(_SUMS, None)
+    )
+
+
+def _add_pairs(builder: ir.IRBuilder, products: Any) -> Any:
+    undefined = ir.Constant(_PRODUCTS, ir.Undefined)
+    halves = [ir.Constant(_SUMS, [2 * lane + odd for lane in range(LANES)]) for odd in (0, 1)]
+    return builder.add(*(builder.shuffle_vector(products, undefined, half) for half in halves))
+
+
+@intrinsic
+def _tile(
+    typing_context: Any, a: Any, packed: Any, sums: Any, masks: Any, second1: Any, second2: Any, row: Any, group: Any
+) -> tuple[Any, Callable[..., Any]]:
+    """Products of rows ``row..row + ROWS`` of a with groups ``group..group + GROUPS`` of packed.
+
+    They go to sums (ROWS, GROUPS * LANES) int32; masks (ROWS,) uint32 gets a bit for each product that exceeds the
+    second best of its row (second1) or of its column (second2), which after a while is rare.
+    """
+
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
+        def pointer(k: int, kind: ir.Type) -> Any:
+            data = context.make_array(signature.args[k])(context, builder, args[k]).data
+            return builder.bitcast(data, kind.as_pointer())
+
+        p_a, p_packed = pointer(0, _I16), pointer(1, _I16)
+        p_sums, p_masks, p_second1, p_second2 = (pointer(k, _I32) for k in (2, 3, 4, 5))
+        row, group = args[6], args[7]
+        zero = ir.Constant(_SUMS, None)
+        totals = [[cgutils.alloca_once_value(builder, zero) for _ in range(GROUPS)] for _ in range(ROWS)]
+        for slot in (slot for line in totals for slot in line):  # alloca_once initialises at the function's entry only
+            builder.store(zero, slot)
+        with cgutils.for_range(builder, _int64(DIMS // 2)) as loop:
+            columns = []
+            for g in range(GROUPS):
+                start = builder.mul(builder.add(group, _int64(g)), _int64(DIMS * LANES))
+                offset = builder.add(start, builder.mul(loop.index, _int64(2 * LANES)))
+                columns.append(builder.sext(_load(builder, p_packed, offset, _PAIRS, 2), _PRODUCTS))
+            for r in range(ROWS):
+                start = builder.mul(builder.add(row, _int64(r)), _int64(DIMS))
+                pair = _load(builder, p_a, builder.add(start, builder.mul(loop.index, _int64(2))), _I32, 2)
+                line = builder.sext(builder.bitcast(_broadcast(builder, pair), _PAIRS), _PRODUCTS)
+                for g in range(GROUPS):
+                    products = builder.mul(line, columns[g], flags=("nsw",))
+                    total = builder.add(builder.load(totals[r][g]), _add_pairs(builder, products))
+                    builder.store(total, totals[r][g])
+        for r in range(ROWS):
+            bound1 = _broadcast(builder, _load(builder, p_second1, builder.add(row, _int64(r)), _I32, 4))
+            mask = ir.Constant(_I32, 0)
+            for g in range(GROUPS):
+                total = builder.load(totals[r][g])
+                target = builder.gep(p_sums, [_int64((r * GROUPS + g) * LANES)])
+                builder.store(total, builder.bitcast(target, _SUMS.as_pointer())).align = 4
+                column = builder.mul(builder.add(group, _int64(g)), _int64(LANES))
+                bound2 = _load(builder, p_second2, column, _SUMS, 4)
+                above = builder.or_(builder.icmp_signed(">", total, bound1), builder.icmp_signed(">", total, bound2))
+                bits = builder.zext(builder.bitcast(above, ir.IntType(LANES)), _I32)
+                mask = builder.or_(mask, builder.shl(bits, ir.Constant(_I32, LANES * g)))
+            builder.store(mask, builder.gep(p_masks, [_int64(r)]))
+        return context.get_dummy_value()
+
+    return types.void(a, packed, sums, masks, second1, second2, row, group), codegen
+
+
+@numba.njit(cache=True, nogil=True)
+def _pack_rows(descriptors: NDArray[np.uint8], out: NDArray[np.int16]) -> None:
+    for i in range(descriptors.shape[0]):
+        for k in range(DIMS):
+            out[i, k] = descriptors[i, k]
+
+
+@numba.njit(cache=True, nogil=True)
+def _pack_groups(descriptors: NDArray[np.uint8], out: NDArray[np.int16]) -> None:
+    for i in range(descriptors.shape[0]):
+        g, lane = i // LANES, i % LANES
+        for k in range(DIMS // 2):
+            out[g, k, lane, 0] = descriptors[i, 2 * k]
+            out[g, k, lane, 1] = descriptors[i, 2 * k + 1]
+
+
+@numba.njit(cache=True, nogil=True)
+def _scan(
+    a: NDArray[np.int16], packed: NDArray[np.int16], best1: Ints, second1: Ints, arg1: Ints,
+    best2: Ints, second2: Ints, arg2: Ints, sums: Ints, masks: NDArray[np.uint32],
+) -> None:  # fmt: skip
+    for block in range(0, packed.shape[0], _GROUPS_IN_CACHE):
+        for row in range(0, a.shape[0], ROWS):
+            for group in range(block, min(block + _GROUPS_IN_CACHE, packed.shape[0]), GROUPS):
+                _tile(a, packed, sums, masks, second1, second2, row, group)
+                for r in range(ROWS):
+                    if masks[r] == 0:
+                        continue
+                    i = row + r
+                    for q in range(GROUPS * LANES):
+                        if (masks[r] >> np.uint32(q)) & np.uint32(1) == 0:
+                            continue
+                        j, total = group * LANES + q, sums[r, q]
+                        if total > best1[i]:
+                            second1[i], best1[i], arg1[i] = best1[i], total, j
+                        elif total > second1[i]:
+                            second1[i] = total
+                        if total > best2[j]:
+                            second2[j], best2[j], arg2[j] = best2[j], total, i
+                        elif total > second2[j]:
+                            second2[j] = total
+
+
+def largest_products(
+    descriptors1: NDArray[np.uint8], descriptors2: NDArray[np.uint8]
+) -> tuple[Ints, Ints, Ints, Ints, Ints, Ints]:
+    """Best partner by dot product, in both directions; the first of equals wins.
+
+    Args:
+        descriptors1, descriptors2: (N, 128) and (M, 128) uint8.
+
+    Returns:
+        best, second, arg: (N,) int32 largest and second largest product of each row with the rows of the other image
+        (0 if there is none) and the position of the best (-1 if no product is positive); then the same (M,) the other
+        way.
+    """
+    n, m = len(descriptors1), len(descriptors2)
+    num_rows, num_groups = -(-n // ROWS) * ROWS, -(-m // (LANES * GROUPS)) * GROUPS
+    a, packed = np.zeros((num_rows, DIMS), np.int16), np.zeros((num_groups, DIMS // 2, LANES, 2), np.int16)
+    _pack_rows(np.ascontiguousarray(descriptors1), a)
+    _pack_groups(np.ascontiguousarray(descriptors2), packed)
+    best1, second1, arg1 = (np.full(num_rows, fill, np.int32) for fill in (0, 0, -1))
+    best2, second2, arg2 = (np.full(num_groups * LANES, fill, np.int32) for fill in (0, 0, -1))
+    sums, masks = np.empty((ROWS, GROUPS * LANES), np.int32), np.empty(ROWS, np.uint32)
+    _scan(a, packed, best1, second1, arg1, best2, second2, arg2, sums, masks)
+    return best1[:n], second1[:n], arg1[:n], best2[:m], second2[:m], arg2[:m]
