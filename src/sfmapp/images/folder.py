@@ -6,16 +6,14 @@ skipped with its reason and the rest goes on.
 
 from __future__ import annotations
 
-import glob
 import hashlib
 import os
-import re
 import stat
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,29 +24,14 @@ from sfmapp.images.exif import ExifFacts, read_exif
 from sfmapp.images.headers import Header, UnusableImage, read_header
 from sfmapp.images.image_set import ImageOptions, ImageRecord, ImageSet
 from sfmapp.images.pixels import mask_fit
+from sfmapp.images.sources import Found, find_images, natural_key, printable
 
 __all__ = ["ImageOptions", "ImageRecord", "ImageSet", "load_images"]
 
 STAGE = "images"
-EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm"})
-# Pictures and videos that people do put into such folders, and that are not read.
-_FOREIGN_PICTURES = {".gif", ".heic", ".heif", ".avif", ".jp2", ".jxl", ".exr", ".hdr", ".psd", ".pbm", ".jfif"}
-_RAW_PICTURES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"}
-_VIDEOS = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm"}
-_THUMBNAIL_FOLDERS = frozenset({"__MACOSX", "@eaDir"})
 # Fewer pixels than this hold no feature: SIFT needs a neighbourhood of about that size.
 _MIN_SIDE_PX = 16
-_MAX_LIST_BYTES = 64 << 20
 _NAMES_SHOWN = 8
-
-
-@dataclass
-class _Found:
-    """What a source holds: the common root, the files to look into, and those known to be of no use."""
-
-    root: Path
-    paths: list[Path] = field(default_factory=list)
-    skipped: list[tuple[str, str]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -84,7 +67,7 @@ def load_images(
         InterruptedRunError: a stop was asked for.
     """
     start = time.monotonic()
-    found = _find(os.fspath(source), options)
+    found = find_images(os.fspath(source), options.mask_path)
     events.started(STAGE, f"reading {len(found.paths)} files", total=len(found.paths))
     scans: list[_Scan] = []
     skipped = list(found.skipped)
@@ -97,7 +80,7 @@ def load_images(
         [Shot(s.record.name, s.record.width, s.record.height, s.facts) for s in scans], options
     )
     images = tuple(replace(scan.record, camera_idx=idx) for scan, idx in zip(scans, camera_idx, strict=True))
-    skipped.sort(key=lambda item: _natural(item[0]))
+    skipped.sort(key=lambda item: natural_key(item[0]))
     image_set = ImageSet(images, tuple(cameras), tuple(skipped))
     problems = [(scan.record.name, problem) for scan in scans for problem in scan.problems] + focal_problems
     duplicates = _duplicates(images)
@@ -113,134 +96,11 @@ def load_images(
     return image_set, report
 
 
-# ---------------------------------------------------------------------------------------------- what a source holds
-
-
-def _find(source: str, options: ImageOptions) -> _Found:
-    mask_root = Path(options.mask_path).absolute() if options.mask_path is not None else None
-    if mask_root is not None and not mask_root.is_dir():
-        raise InputError(f"mask_path {options.mask_path} is not a folder", "masks are looked for as mask_path/NAME.png")
-    if os.path.isdir(source):
-        found = _find_in_folder(Path(source).absolute(), mask_root)
-    elif os.path.isfile(source):
-        if not source.lower().endswith(".txt"):
-            raise InputError(
-                f"{source} is a single file", "give a folder of images, a glob pattern in quotes, or a .txt list"
-            )
-        found = _find_in_list(Path(source).absolute())
-    elif glob.has_magic(source):
-        found = _find_by_pattern(source, mask_root)
-    else:
-        raise InputError(
-            f"image source {source!r} does not exist",
-            "give a folder of images, a glob pattern in quotes, or a .txt list",
-        )
-    found.paths.sort(key=lambda path: _natural(os.path.relpath(path, found.root).replace(os.sep, "/")))
-    if mask_root == found.root:  # photo.jpg.png beside photo.jpg is its mask
-        every = set(found.paths)
-        found.paths = [p for p in found.paths if not (p.suffix.lower() == ".png" and p.with_suffix("") in every)]
-    return found
-
-
-def _natural(name: str) -> tuple[Any, ...]:
-    """Sort key in which ``img9`` comes before ``img10``, and no two names are equal."""
-    parts = re.split("([0-9]+)", name.casefold())
-    return tuple((int(part), "") if i % 2 else (-1, part) for i, part in enumerate(parts)), name
-
-
-def _find_in_folder(root: Path, mask_root: Path | None) -> _Found:
-    found = _Found(root)
-    visited: set[tuple[int, int]] = set()
-    pending, links = [root], list[Path]()
-    while pending or links:
-        # a folder goes by its own name rather than by that of a link to it
-        folder = pending.pop() if pending else links.pop(0)
-        name = os.path.relpath(folder, root)
-        try:
-            status = os.stat(folder)
-            entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
-        except OSError as error:
-            found.skipped.append((_printable(name) + "/", f"folder cannot be read: {error.strerror}"))
-            continue
-        # links are followed, but not in circles
-        if (status.st_dev, status.st_ino) in visited:
-            continue
-        visited.add((status.st_dev, status.st_ino))
-        for entry in entries:
-            if entry.name.startswith(".") or entry.name in _THUMBNAIL_FOLDERS:
-                continue
-            path = Path(entry.path)
-            if os.path.isdir(path) and path.suffix.lower() not in EXTENSIONS:
-                if path != mask_root:
-                    (links if entry.is_symlink() else pending).append(path)
-            else:
-                _take(found, path)
-    return found
-
-
-def _find_by_pattern(pattern: str, mask_root: Path | None) -> _Found:
-    fixed = []
-    for part in Path(pattern).parts:
-        if glob.has_magic(part):
-            break
-        fixed.append(part)
-    found = _Found(Path(*fixed).absolute() if fixed else Path.cwd())
-    for match in sorted(set(glob.glob(pattern, recursive=True))):
-        path = Path(os.path.abspath(match))
-        is_masked = mask_root is not None and mask_root != found.root and mask_root in path.parents
-        if not is_masked and not (os.path.isdir(path) and path.suffix.lower() not in EXTENSIONS):
-            _take(found, path)
-    if not found.paths and not found.skipped:
-        raise InputError(f"the pattern {pattern} matches no image", "put it in quotes, and check it with ls")
-    return found
-
-
-def _take(found: _Found, path: Path) -> None:
-    ending = path.suffix.lower()
-    if ending in EXTENSIONS:
-        found.paths.append(path)
-    elif ending in _FOREIGN_PICTURES | _RAW_PICTURES | _VIDEOS:
-        name = _printable(os.path.relpath(path, found.root))
-        advice = "extract frames from them first" if ending in _VIDEOS else "convert them to JPEG or PNG"
-        found.skipped.append((name, f"{ending} files are not read: {advice}"))
-
-
-def _find_in_list(list_path: Path) -> _Found:
-    try:
-        if list_path.stat().st_size > _MAX_LIST_BYTES:
-            raise InputError(f"{list_path} is too large for a list of images")
-        text = list_path.read_bytes().decode("utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{list_path} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{list_path} is not a text file in UTF-8", "write one path per line") from error
-    skipped, paths = [], dict[Path, None]()
-    for number, line in enumerate(text.splitlines(), 1):
-        entry = line.strip()
-        if not entry or entry.startswith("#"):
-            continue
-        if "\0" in entry or re.match(r"[a-zA-Z][a-zA-Z0-9+.-]+://", entry):
-            skipped.append((_printable(entry[:200]), f"line {number} of the list is not a path"))
-            continue
-        path = Path(os.path.abspath(list_path.parent / entry))
-        if path in paths:
-            skipped.append((_printable(entry), f"listed twice (line {number} of the list)"))
-        paths[path] = None
-    root = Path(os.path.commonpath([path.parent for path in paths])) if paths else list_path.parent
-    return _Found(root, list(paths), skipped)
-
-
-def _printable(name: str) -> str:
-    """A name that can be printed and written as UTF-8, whatever bytes the file system holds."""
-    name = name.replace(os.sep, "/").encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in name)
-
-
 # ------------------------------------------------------------------------------------------------ looking into files
 
 
 def _scan_all(
-    found: _Found, options: ImageOptions, threads: int | None, events: Events
+    found: Found, options: ImageOptions, threads: int | None, events: Events
 ) -> Iterator[_Scan | tuple[str, str]]:
     mask_root = Path(options.mask_path).absolute() if options.mask_path is not None else None
     pool = ThreadPoolExecutor(threads or min(8, os.cpu_count() or 1))
@@ -255,8 +115,8 @@ def _scan_all(
 def _scan(path: Path, root: Path, mask_root: Path | None, options: ImageOptions) -> _Scan | tuple[str, str]:
     """Read one file: a scan, or (name, reason) if it cannot be used."""
     name = os.path.relpath(path, root).replace(os.sep, "/")
-    if name != _printable(name):
-        return _printable(name), "its name is not plain text in UTF-8: rename it"
+    if name != printable(name):
+        return printable(name), "its name is not plain text in UTF-8: rename it"
     try:
         data = _read_file(path, options.max_image_bytes)
         header = read_header(data)
@@ -391,7 +251,7 @@ def _some(names: list[str]) -> str:
 
 def _report(
     source: str,
-    found: _Found,
+    found: Found,
     image_set: ImageSet,
     scans: list[_Scan],
     entries: list[dict[str, Any]],
@@ -399,8 +259,8 @@ def _report(
     duplicates: list[list[str]],
 ) -> dict[str, Any]:
     return {
-        "source": _printable(source),
-        "root": _printable(str(found.root)),
+        "source": printable(source),
+        "root": printable(str(found.root)),
         "num_found": len(scans) + len(image_set.skipped),
         "num_used": len(scans),
         "num_skipped": len(image_set.skipped),
@@ -420,7 +280,7 @@ def _report(
                 "orientation": image.orientation,
                 "camera_idx": image.camera_idx,
                 "digest": image.digest,
-                "mask": None if image.mask_path is None else _printable(str(image.mask_path)),
+                "mask": None if image.mask_path is None else printable(str(image.mask_path)),
                 "format": scan.header.format,
                 "kind": scan.header.kind,
                 "bits": scan.header.bits,

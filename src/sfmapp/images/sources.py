@@ -1,0 +1,158 @@
+"""Where photographs come from: folders, glob patterns and list files, and names for what is in them."""
+
+from __future__ import annotations
+
+import glob
+import os
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sfmapp.errors import InputError
+
+EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm"})
+# Pictures and videos that people do put into such folders, and that are not read.
+_FOREIGN_PICTURES = {".gif", ".heic", ".heif", ".avif", ".jp2", ".jxl", ".exr", ".hdr", ".psd", ".pbm", ".jfif"}
+_RAW_PICTURES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"}
+_VIDEOS = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm"}
+_THUMBNAIL_FOLDERS = frozenset({"__MACOSX", "@eaDir"})
+_MAX_LIST_BYTES = 64 << 20
+
+
+@dataclass
+class Found:
+    """What a source holds: the common root, the files to look into, and those known to be of no use."""
+
+    root: Path
+    paths: list[Path] = field(default_factory=list)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
+
+
+def find_images(source: str, mask_path: str | None = None) -> Found:
+    """List the files of a folder, a glob pattern or a list file, in natural order of their names.
+
+    Args:
+        source: see :func:`sfmapp.images.folder.load_images`.
+        mask_path: folder of masks, which are no images even if they lie inside the source; None for none.
+
+    Raises:
+        InputError: the source or the mask folder does not exist, or the list cannot be read.
+    """
+    mask_root = Path(mask_path).absolute() if mask_path is not None else None
+    if mask_root is not None and not mask_root.is_dir():
+        raise InputError(f"mask_path {mask_path} is not a folder", "masks are looked for as mask_path/NAME.png")
+    if os.path.isdir(source):
+        found = _find_in_folder(Path(source).absolute(), mask_root)
+    elif os.path.isfile(source):
+        if not source.lower().endswith(".txt"):
+            raise InputError(
+                f"{source} is a single file", "give a folder of images, a glob pattern in quotes, or a .txt list"
+            )
+        found = _find_in_list(Path(source).absolute())
+    elif glob.has_magic(source):
+        found = _find_by_pattern(source, mask_root)
+    else:
+        raise InputError(
+            f"image source {source!r} does not exist",
+            "give a folder of images, a glob pattern in quotes, or a .txt list",
+        )
+    found.paths.sort(key=lambda path: natural_key(os.path.relpath(path, found.root).replace(os.sep, "/")))
+    if mask_root == found.root:  # photo.jpg.png beside photo.jpg is its mask
+        every = set(found.paths)
+        found.paths = [p for p in found.paths if not (p.suffix.lower() == ".png" and p.with_suffix("") in every)]
+    return found
+
+
+def natural_key(name: str) -> tuple[Any, ...]:
+    """Sort key in which ``img9`` comes before ``img10`` and a folder's files stay together; no two names are equal."""
+    parts = re.split("([0-9]+)", name.casefold().replace("/", "\0"))
+    return tuple((int(part), "") if i % 2 else (-1, part) for i, part in enumerate(parts)), name
+
+
+def _find_in_folder(root: Path, mask_root: Path | None) -> Found:
+    found = Found(root)
+    visited: set[tuple[int, int]] = set()
+    pending, links = [root], list[Path]()
+    while pending or links:
+        # a folder goes by its own name rather than by that of a link to it
+        folder = pending.pop() if pending else links.pop(0)
+        name = os.path.relpath(folder, root)
+        try:
+            status = os.stat(folder)
+            entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+        except OSError as error:
+            found.skipped.append((printable(name) + "/", f"folder cannot be read: {error.strerror}"))
+            continue
+        # links are followed, but not in circles
+        if (status.st_dev, status.st_ino) in visited:
+            continue
+        visited.add((status.st_dev, status.st_ino))
+        for entry in entries:
+            if entry.name.startswith(".") or entry.name in _THUMBNAIL_FOLDERS:
+                continue
+            path = Path(entry.path)
+            if os.path.isdir(path) and path.suffix.lower() not in EXTENSIONS:
+                if path != mask_root:
+                    (links if entry.is_symlink() else pending).append(path)
+            else:
+                _take(found, path)
+    return found
+
+
+def _find_by_pattern(pattern: str, mask_root: Path | None) -> Found:
+    fixed = []
+    for part in Path(pattern).parts:
+        if glob.has_magic(part):
+            break
+        fixed.append(part)
+    found = Found(Path(*fixed).absolute() if fixed else Path.cwd())
+    for match in sorted(set(glob.glob(pattern, recursive=True))):
+        path = Path(os.path.abspath(match))
+        is_masked = mask_root is not None and mask_root != found.root and mask_root in path.parents
+        if not is_masked and not (os.path.isdir(path) and path.suffix.lower() not in EXTENSIONS):
+            _take(found, path)
+    if not found.paths and not found.skipped:
+        raise InputError(f"the pattern {pattern} matches no image", "put it in quotes, and check it with ls")
+    return found
+
+
+def _take(found: Found, path: Path) -> None:
+    ending = path.suffix.lower()
+    if ending in EXTENSIONS:
+        found.paths.append(path)
+    elif ending in _FOREIGN_PICTURES | _RAW_PICTURES | _VIDEOS:
+        name = printable(os.path.relpath(path, found.root))
+        advice = "extract frames from them first" if ending in _VIDEOS else "convert them to JPEG or PNG"
+        found.skipped.append((name, f"{ending} files are not read: {advice}"))
+
+
+def _find_in_list(list_path: Path) -> Found:
+    try:
+        if list_path.stat().st_size > _MAX_LIST_BYTES:
+            raise InputError(f"{list_path} is too large for a list of images")
+        text = list_path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{list_path} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{list_path} is not a text file in UTF-8", "write one path per line") from error
+    skipped, paths = [], dict[Path, None]()
+    for number, line in enumerate(text.splitlines(), 1):
+        entry = line.strip()
+        if not entry or entry.startswith("#"):
+            continue
+        if "\0" in entry or re.match(r"[a-zA-Z][a-zA-Z0-9+.-]+://", entry):
+            skipped.append((printable(entry[:200]), f"line {number} of the list is not a path"))
+            continue
+        path = Path(os.path.abspath(list_path.parent / entry))
+        if path in paths:
+            skipped.append((printable(entry), f"listed twice (line {number} of the list)"))
+        paths[path] = None
+    root = Path(os.path.commonpath([path.parent for path in paths])) if paths else list_path.parent
+    return Found(root, list(paths), skipped)
+
+
+def printable(name: str) -> str:
+    """A name that can be printed and written as UTF-8, whatever bytes the file system holds."""
+    name = name.replace(os.sep, "/").encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in name)
