@@ -17,12 +17,12 @@ class ImageOptions:
     """What to read and what is known about the cameras.
 
     Attributes:
-        camera_model: lens model of all cameras, one of :class:`CameraModel` or its name.
+        camera_model: lens model of all cameras.
         camera_params: parameters of ``camera_model`` in COLMAP's order, in pixels after orientation; they describe one
             camera, so all images must have one size. None: from EXIF or a default.
         focal_px: focal length in pixels of all images; None: from EXIF or a default.
         fix_intrinsics: keep the cameras as they are read; nothing about them is refined.
-        camera_sharing: which images share a camera. ``auto``: those that EXIF or their names and sizes show to be of
+        camera_sharing: which images share a camera. auto: those that EXIF or their names and sizes show to be of
             one camera and one zoom; ``all``, ``per_folder``: whatever has the same size; ``per_image``: none.
         mask_path: folder of masks, ``NAME.png`` for the image ``NAME`` (COLMAP's naming, as in ``a/b.jpg.png``) or the
             same name with ``.png`` for its ending; black is ignored. None: no masks.
