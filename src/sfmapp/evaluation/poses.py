@@ -98,13 +98,13 @@ def evaluate_poses(
             numbers of the others; else plain least squares over all common images, the custom in the literature.
     """
     poses, reference = _as_poses(cam_from_world), _as_poses(reference_cam_from_world)
-    has_reference = np.isfinite(reference).all(1)
+    has_reference = _has_pose(reference)
     reference = reference[has_reference]
     kept_names = tuple(np.array(reference_names, object)[has_reference])
     index = match_names(names, kept_names)
     estimate = np.full_like(reference, np.nan)
     estimate[index >= 0] = poses[index[index >= 0]]
-    is_common = np.isfinite(estimate).all(1)
+    is_common = _has_pose(estimate)
     estimate[~is_common] = np.nan
 
     center_error, rotation_error = np.full(len(reference), np.nan), np.full(len(reference), np.nan)
@@ -161,7 +161,7 @@ def pair_errors_deg(cam_from_world: ArrayLike, reference_cam_from_world: ArrayLi
     rotation, truth_rotation = rigid3.rotation_matrix(poses), rigid3.rotation_matrix(reference)
     center, truth_center = rigid3.center(poses), rigid3.center(reference)
     no_baseline = _NO_BASELINE * scene_size(reference)
-    registered = np.isfinite(poses).all(1)
+    registered = _has_pose(poses)
     estimate_size = scene_size(poses[registered])
     rows = [np.zeros(0)]
     for i in range(len(poses) - 1):  # row by row: N^2 matrices at once would be gigabytes for thousands of images
@@ -225,6 +225,10 @@ def _unique(key_of: dict[int, str]) -> dict[str, int]:
 
 def _as_poses(poses: ArrayLike) -> Array:
     return np.asarray(poses, np.float64).reshape(-1, 7)
+
+
+def _has_pose(poses: Array) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(poses).all(1), np.bool_)
 
 
 def _angle_between_deg(a: Array, b: Array) -> Array:
