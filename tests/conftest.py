@@ -20,6 +20,18 @@ def data_root() -> Path:
 
 
 @pytest.fixture(scope="session")
+def photos(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of seven neighbouring photographs of the sample at half size: a real job of about two seconds."""
+    from PIL import Image
+
+    folder = tmp_path_factory.mktemp("photos")
+    for path in sorted((sample / "images").iterdir())[:7]:
+        with Image.open(path) as image:
+            image.reduce(2).save(folder / f"{path.stem}.png")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def sample() -> Path:
     """Folder of the bundled sample, with images/ and cameras.json."""
     from sfmapp.errors import InputError

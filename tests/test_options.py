@@ -138,7 +138,7 @@ def test_every_option_is_listed_with_its_meaning() -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
-    """All three ways to document a field.
+    """All four ways to document a field.
 
     Attributes:
         first, second: a length,
@@ -152,14 +152,16 @@ class Sample:
     third: int = 3
     fourth: int = 4
     """The fourth."""
-    fifth: Any = 5
+    fifth: Any = 5  # the fifth
+    sixth: Any = 6
 
 
-def test_comments_are_read_from_all_three_places() -> None:
+def test_comments_are_read_from_all_four_places() -> None:
     assert field_comments(Sample) == {
         "first": "a length, over two lines.",
         "second": "a length, over two lines.",
         "third": "the third of them",
         "fourth": "The fourth.",
-        "fifth": "",
+        "fifth": "the fifth",
+        "sixth": "",
     }

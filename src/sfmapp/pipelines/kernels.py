@@ -43,6 +43,8 @@ def _compile(events: Events, usage: dict[str, dict[str, Any]]) -> None:
             events.raise_if_cancelled()
     except InterruptedRunError:
         pass  # the block hears of it at its own next step
+    except Exception as error:  # whoever calls the kernel next meets the same error, where it belongs
+        events.warned(STAGE, f"compiling ahead failed: {type(error).__name__}: {error}")
     finally:
         numba_event.unregister("numba:compile", listener)
     took = {"wall_s": round(time.monotonic() - wall, 4), "cpu_s": round(time.thread_time() - cpu, 4)}

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.solver import AdjustOptions
 from sfmapp.errors import SfmError, UsageError
 from sfmapp.features.extract import FeatureOptions
 from sfmapp.images.image_set import ImageOptions
@@ -141,7 +141,7 @@ def _rows(options: Any) -> list[tuple[str, Any, Any, str]]:
 
 
 def field_comments(options_class: type) -> dict[str, str]:
-    """What is said about each field: in the string under it, the comment above it, or the class's ``Attributes:``."""
+    """What is said about each field: in the string under it, a comment above or beside it, or ``Attributes:``."""
     comments = {f.name: "" for f in dataclasses.fields(options_class)}
     source = textwrap.dedent(inspect.getsource(options_class))
     lines = [line.strip() for line in source.splitlines()]
@@ -154,8 +154,11 @@ def field_comments(options_class: type) -> dict[str, str]:
             case ast.Expr(value=ast.Constant(value=str(text))):
                 comments[statement.target.id] = " ".join(text.split())
             case _:
+                _, beside, text = lines[(statement.end_lineno or 1) - 1].partition("  # ")
                 above = itertools.takewhile(lambda line: line.startswith("#"), lines[statement.lineno - 2 :: -1])
-                comments[statement.target.id] = " ".join(line.lstrip("# ") for line in [*above][::-1])
+                comments[statement.target.id] = (
+                    text if beside else " ".join(line[1:].strip() for line in [*above][::-1])
+                )
     _, _, section = inspect.cleandoc(options_class.__doc__ or "").partition("Attributes:\n")
     for entry in textwrap.dedent(section).split("\n\n")[0].replace("\n    ", " ").splitlines():
         names, _, text = entry.partition(":")
