@@ -72,10 +72,13 @@ class Frame:
     camera_image_ids: list[tuple[int, int]]
 
 
-def checked_camera(path: Path, camera_id: int, model: int | str, width: int, height: int, params: object) -> Camera:
+def checked_camera(
+    path: Path, camera_id: int | str, model: int | str, width: int, height: int, params: object
+) -> Camera:
     """A camera as a file states it, or an InputError that says what is wrong with it.
 
     Args:
+        camera_id: whatever tells this camera from the others in the file.
         model: COLMAP's id or name.
         params: the sequence of its parameters, in COLMAP's order.
     """

@@ -1,0 +1,176 @@
+"""nerfstudio's transforms.json: world_from_cam matrices with OpenGL's camera axes (x right, y up, z backward).
+
+Its pixel rule is the house's (top-left pixel centre at 0.5, 0.5): its own conversion from COLMAP takes cx and cy over
+as they are. That conversion also turns the world (``applied_transform``), because COLMAP's worlds tend to have y down and
+nerfstudio wants z up; files written here do the same and look alike.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.errors import InputError
+from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.colmap_model import checked_camera
+from sfmapp.formats.ply import read_ply, write_ply
+from sfmapp.formats.text_input import finite_array, nearest_rotation, read_json_object
+from sfmapp.geometry import rigid3
+from sfmapp.scene.camera import Camera, CameraModel
+from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.tracks import make_tracks
+
+_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
+_APPLIED = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # (x, y, z) to (x, z, -y)
+_DISTORTION = {CameraModel.OPENCV: ("k1", "k2", "p1", "p2"), CameraModel.OPENCV_FISHEYE: ("k1", "k2", "k3", "k4")}
+_ALIASES = {"PINHOLE": "OPENCV", "SIMPLE_PINHOLE": "OPENCV", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
+POINTS_NAME = "sparse_pc.ply"
+
+
+def write_nerfstudio(path: str | Path, reconstruction: Reconstruction, image_folder: str = "images") -> None:
+    """Write transforms.json and, beside it, the points as ``sparse_pc.ply``. Observations are not part of the format.
+
+    Args:
+        path: the JSON file.
+        reconstruction: every camera model can be held; only registered images are written.
+        image_folder: where the images lie, seen from the JSON file.
+    """
+    path = Path(path)
+    registered = reconstruction.registered_idx
+    intrinsics = [_intrinsics(camera) for camera in reconstruction.cameras]
+    used = sorted({int(i) for i in reconstruction.image_camera_idx[registered]})
+    shared = intrinsics[used[0]] if len(used) == 1 else {}
+    world_from_cam = rigid3.inverse(reconstruction.cam_from_world)
+    frames = []
+    for image in registered.tolist():
+        matrix = np.eye(4)
+        matrix[:3, :3] = _APPLIED @ rigid3.rotation_matrix(world_from_cam[image]) @ _OPENGL_FROM_OPENCV
+        matrix[:3, 3] = _APPLIED @ world_from_cam[image, 4:]
+        own = {} if shared else intrinsics[reconstruction.image_camera_idx[image]]
+        name = PurePosixPath(image_folder) / reconstruction.image_names[image]
+        frames.append({"file_path": str(name), "transform_matrix": matrix.tolist(), **own})
+    points = np.flatnonzero(reconstruction.is_triangulated)
+    applied = np.concatenate([_APPLIED, np.zeros((3, 1))], 1).tolist()
+    document = {**shared, "applied_transform": applied, "ply_file_path": POINTS_NAME, "frames": frames}
+    write_ply(
+        path.with_name(POINTS_NAME), reconstruction.point_xyz[points] @ _APPLIED.T, reconstruction.point_rgb[points]
+    )
+    with replaced_file(path) as beside:
+        beside.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+
+
+def _intrinsics(camera: Camera) -> dict[str, Any]:
+    model = CameraModel.OPENCV_FISHEYE if camera.is_fisheye else CameraModel.OPENCV
+    fx, fy, cx, cy, *distortion = camera.canonical.tolist()
+    size = {"camera_model": model.name, "w": camera.width, "h": camera.height}
+    return size | {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy} | dict(zip(_DISTORTION[model], distortion, strict=True))
+
+
+def read_nerfstudio(path: str | Path) -> Reconstruction:
+    """Read poses, cameras (equal ones shared) and, where the file names them, points without observations.
+
+    Names are the ``file_path`` entries as they stand; the applied transform is undone.
+
+    Raises:
+        InputError: the file is not JSON of this form, a matrix is not rigid, a camera is not one of ours, or two
+            frames name the same file.
+    """
+    path = Path(path)
+    document = read_json_object(path)
+    frames = document.get("frames")
+    if not isinstance(frames, list):
+        raise InputError(f"{path}: expected a list of frames, found {type(frames).__name__}")
+    rotation, shift = _applied(path, document)
+    cameras: dict[tuple, int] = {}
+    camera_list: list[Camera] = []
+    names, camera_idx, poses = [], [], []
+    for position, frame in enumerate(frames):
+        place = f"{path}: frame {position}"
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
+            raise InputError(f"{place}: expected an object with file_path")
+        camera = _camera(path, place, {**document, **frame})
+        key = (camera.model, camera.width, camera.height, *camera.params.tolist())
+        if key not in cameras:
+            cameras[key] = len(camera_list)
+            camera_list.append(camera)
+        camera_idx.append(cameras[key])
+        names.append(frame["file_path"].removeprefix("./"))
+        poses.append(_pose(place, frame.get("transform_matrix"), rotation, shift))
+    if len(set(names)) < len(names):
+        raise InputError(
+            f"{path}: expected every file_path once, found {sorted(n for n in names if names.count(n) > 1)[0]!r} twice"
+        )
+    xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    if document.get("ply_file_path") is not None:
+        xyz, rgb = read_ply(_inside(path, document["ply_file_path"]))
+        xyz = (xyz - shift) @ rotation
+    none = np.zeros(0, np.int64)
+    tracks = make_tracks(len(names), len(xyz), none, none, none, np.zeros((0, 2)))
+    poses_array = np.array(poses, np.float64).reshape(-1, 7)
+    return Reconstruction(
+        camera_list, names, np.array(camera_idx, np.int32), poses_array, tracks, xyz, np.zeros(0, bool), rgb
+    )
+
+
+def _inside(path: Path, name: Any) -> Path:
+    """A file that JSON from outside names has to lie beside it."""
+    if not isinstance(name, str) or PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+        raise InputError(f"{path}: expected ply_file_path to lie beside the file, found {str(name)[:80]!r}")
+    return path.parent / name
+
+
+def _applied(path: Path, document: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation (3, 3) and shift (3,) that turned the original world into that of the file."""
+    value = document.get("applied_transform")
+    if value is None:
+        return np.eye(3), np.zeros(3)
+    rows = value[:3] if isinstance(value, list) else value
+    matrix = finite_array(f"{path}: applied_transform", rows, (3, 4))
+    return nearest_rotation(f"{path}: applied_transform", matrix[:, :3], 1e-6), matrix[:, 3]
+
+
+def _pose(place: str, value: Any, rotation: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(7,) cam_from_world of a transform_matrix."""
+    rows = value[:3] if isinstance(value, list) and len(value) == 4 else value
+    matrix = finite_array(f"{place}: transform_matrix", rows, (3, 4))
+    world_from_cam = rotation.T @ nearest_rotation(f"{place}: transform_matrix", matrix[:, :3]) @ _OPENGL_FROM_OPENCV
+    return rigid3.inverse(rigid3.from_matrix(world_from_cam, rotation.T @ (matrix[:, 3] - shift)))
+
+
+def _camera(path: Path, place: str, entries: Mapping[str, Any]) -> Camera:
+    """The camera of a frame from its own entries and the shared ones."""
+    name = entries.get("camera_model", "OPENCV")
+    name = _ALIASES.get(name, name) if isinstance(name, str) else str(name)
+    if name not in ("OPENCV", "OPENCV_FISHEYE"):
+        raise InputError(f"{place}: expected camera_model OPENCV or OPENCV_FISHEYE, found {name[:40]!r}")
+
+    def number(key: str, default: float | None = None) -> float:
+        if key not in entries and default is not None:
+            return default
+        if key not in entries:
+            raise InputError(f"{place}: expected {key}, found none here or at the top of the file")
+        return float(finite_array(f"{place}: {key}", entries[key], ()))
+
+    width, height = number("w"), number("h")
+    if width % 1 or height % 1:
+        raise InputError(f"{place}: expected a whole number of pixels, found {width} x {height}")
+    if "fl_x" not in entries and "camera_angle_x" in entries:  # the form of the synthetic NeRF scenes
+        angle = number("camera_angle_x")
+        if not 0 < angle < math.pi:
+            raise InputError(f"{place}: expected camera_angle_x from 0 to pi, found {angle}")
+        fx = width / 2 / math.tan(angle / 2)
+    else:
+        fx = number("fl_x")
+    names = _DISTORTION[CameraModel[name]]
+    for extra in ("k3", "k4", "k5", "k6"):
+        if extra not in names and number(extra, 0.0) != 0.0:
+            raise InputError(f"{place}: expected no {extra} in a camera of model {name}, found {entries[extra]}")
+    center = (number("cx", width / 2), number("cy", height / 2))
+    params = [fx, number("fl_y", fx), *center, *(number(key, 0.0) for key in names)]
+    return checked_camera(path, entries.get("file_path", ""), name, int(width), int(height), params)

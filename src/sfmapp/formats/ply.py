@@ -1,0 +1,98 @@
+"""Point clouds as PLY (Turk, "The PLY polygon file format", 1994), binary little-endian."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.errors import InputError
+from sfmapp.formats.atomic import replaced_file
+
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4", "float": "<f4",
+    "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4",
+    "float32": "<f4", "float64": "<f8",
+}  # fmt: skip
+_LARGEST_HEADER_BYTES = 65536
+
+
+def write_ply(path: str | Path, xyz: NDArray[np.floating], rgb: NDArray[np.uint8]) -> None:
+    """Write coloured points.
+
+    Coordinates are ``float``, which every viewer reads, unless that rounds them by more than a millionth of the extent
+    of the cloud (points far from their origin, as georeferenced ones are): then they are ``double``.
+
+    Args:
+        xyz: (N, 3) finite.
+        rgb: (N, 3) uint8.
+    """
+    xyz = np.asarray(xyz, np.float64).reshape(-1, 3)
+    kind = "float"
+    with np.errstate(over="ignore"):
+        if len(xyz) and np.abs(xyz.astype(np.float32) - xyz).max() > 1e-6 * np.ptp(xyz, axis=0).max():
+            kind = "double"
+    data = np.empty(len(xyz), [("xyz", _TYPES[kind], 3), ("rgb", "u1", 3)])
+    data["xyz"], data["rgb"] = xyz, rgb
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}"]
+    lines += [f"property {kind} {axis}" for axis in "xyz"]
+    lines += [f"property uchar {color}" for color in ("red", "green", "blue")]
+    with replaced_file(Path(path)) as beside, beside.open("wb") as file:
+        file.write("\n".join([*lines, "end_header", ""]).encode())
+        file.write(data.tobytes())
+
+
+def read_ply(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Read points (N, 3) float64 and colours (N, 3) uint8, black where there are none.
+
+    The vertices have to come first; other properties of theirs and other elements (faces) are passed over.
+
+    Raises:
+        InputError: the file is missing, not binary little-endian, truncated, or its coordinates are not finite.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    count, fields, start = _header(path, data)
+    names = [name for name, _ in fields]
+    if len(set(names)) < len(names) or not {"x", "y", "z"} <= set(names):
+        raise InputError(f"{path}: expected vertices with x, y and z, found {', '.join(names) or 'none'}")
+    dtype = np.dtype(fields)
+    if count * dtype.itemsize > len(data) - start:
+        raise InputError(
+            f"{path}: truncated: expected {count} vertices of {dtype.itemsize} bytes, found {len(data) - start} bytes"
+        )
+    vertices = np.frombuffer(data, dtype, count, start)
+    xyz = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], 1)
+    if not np.isfinite(xyz).all():
+        raise InputError(f"{path}: expected finite coordinates, found NaN or infinity")
+    colors = ("red", "green", "blue")
+    if all(color in names and dtype[color] == np.uint8 for color in colors):
+        return xyz, np.stack([vertices[color] for color in colors], 1)
+    return xyz, np.zeros((count, 3), np.uint8)
+
+
+def _header(path: Path, data: bytes) -> tuple[int, list[tuple[str, str]], int]:
+    """Number of vertices, their fields as numpy takes them, and where they begin."""
+    end = data.find(b"end_header\n", 0, _LARGEST_HEADER_BYTES)
+    if not data.startswith(b"ply\n") or end < 0:
+        raise InputError(f"{path}: expected a PLY header, found {data[:16]!r}")
+    lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()[1:]]
+    lines = [words for words in lines if words and words[0] not in ("comment", "obj_info")]
+    if lines[:1] != [["format", "binary_little_endian", "1.0"]]:
+        raise InputError(f"{path}: expected binary little-endian PLY, found {' '.join((lines or [[]])[0])!r}")
+    if len(lines) < 2 or lines[1][:2] != ["element", "vertex"] or len(lines[1]) != 3 or not lines[1][2].isdecimal():
+        raise InputError(f"{path}: expected the vertices as the first element of the header")
+    fields = []
+    for words in lines[2:]:
+        if words[0] == "element":
+            break
+        if len(words) != 3 or words[0] != "property" or words[1] not in _TYPES:
+            raise InputError(f"{path}: expected plain properties of the vertices, found {' '.join(words)!r}")
+        fields.append((words[2], _TYPES[words[1]]))
+    if len(lines[1][2]) > 18:
+        raise InputError(f"{path}: expected a possible number of vertices, found {lines[1][2][:40]}")
+    return int(lines[1][2]), fields, end + len(b"end_header\n")

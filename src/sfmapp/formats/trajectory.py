@@ -1,0 +1,56 @@
+"""Trajectories as text: one pose per line, ``timestamp tx ty tz qx qy qz qw``, world_from_cam (Sturm et al., "A
+benchmark for the evaluation of RGB-D SLAM systems", IROS 2012)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sfmapp.errors import InputError
+from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.text_input import finite_array, read_limited_text
+from sfmapp.geometry import rigid3
+
+
+def write_tum(path: str | Path, timestamps_s: ArrayLike, cam_from_world: NDArray[np.float64]) -> None:
+    """Write the poses that are there.
+
+    Args:
+        timestamps_s: (N,) seconds.
+        cam_from_world: (N, 7), NaN where unregistered: such poses are left out.
+    """
+    times = np.asarray(timestamps_s, np.float64)
+    kept = np.isfinite(cam_from_world).all(1)
+    world_from_cam = rigid3.inverse(cam_from_world[kept])
+    rows = np.concatenate([times[kept, None], world_from_cam[:, 4:], world_from_cam[:, :4]], 1)
+    lines = ["# timestamp tx ty tz qx qy qz qw", *(" ".join(map(repr, row)) for row in rows.tolist()), ""]
+    with replaced_file(Path(path)) as beside:
+        beside.write_text("\n".join(lines), encoding="utf-8")
+
+
+def read_tum(path: str | Path) -> tuple[list[str], NDArray[np.float64]]:
+    """Read timestamps as they are written, for names come as timestamps too, and cam_from_world (N, 7) float64.
+
+    Raises:
+        InputError: a line does not hold eight finite numbers and a quaternion of unit length.
+    """
+    path = Path(path)
+    names, rows = [], []
+    for number, line in enumerate(read_limited_text(path).splitlines(), 1):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        place = f"{path}:{number}"
+        try:
+            rows.append(finite_array(place, [float(field) for field in fields], (8,)))
+        except ValueError:
+            raise InputError(f"{place}: expected 8 finite numbers, found {line[:80]!r}") from None
+        if abs(np.linalg.norm(rows[-1][4:]) - 1) > 1e-2:  # six digits are customary, three occur
+            raise InputError(f"{place}: expected a quaternion of unit length, found {fields[4:]}")
+        names.append(fields[0])
+    table = np.array(rows, np.float64).reshape(-1, 8)
+    norm = np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
+    unit = np.where(np.abs(norm - 1) > 1e-12, table[:, 4:] / np.where(norm > 0, norm, 1), table[:, 4:])
+    return names, rigid3.inverse(np.concatenate([unit, table[:, 1:4]], 1))

@@ -1,0 +1,181 @@
+"""A model in another program's format, read back and compared before anybody relies on it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.errors import InputError, NoReconstructionError, UsageError
+from sfmapp.formats.colmap import has_model, read_model, write_model, write_model_text
+from sfmapp.pipelines.workspace import read_manifest
+from sfmapp.scene.reconstruction import Reconstruction
+
+
+@dataclass(frozen=True)
+class _Source:
+    """The model to export: where it lies, and where its images do, if that is known."""
+
+    folder: Path
+    model: Reconstruction
+    keypoints: list[NDArray[np.float64]]
+    image_folder: Path | None
+
+
+@dataclass(frozen=True)
+class _Copy:
+    """What was read back: the model with our images and points in our order, and the files it came from."""
+
+    model: Reconstruction
+    files: list[Path]
+    reader: str
+
+
+def export_model(output: str | os.PathLike[str], target: str, path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Write a model in another format, read it back and re-project every inlier with what was read.
+
+    Args:
+        output: the workspace of a run, of which the largest model is taken, or the folder of a COLMAP model.
+        target: one of ``EXPORTS``.
+        path: where to write: a folder for COLMAP's formats, a file or folder for the others.
+
+    Returns:
+        JSON-able: ``format``, ``files``, ``reader`` (what read it back), ``num_images``, ``num_points``,
+        ``num_observations``, ``max_px`` (worst difference of a reprojection, in pixels) and ``max_coordinate`` (worst
+        difference of a coordinate of a point, in units of the world).
+
+    Raises:
+        UsageError: an unknown format, a camera or name that it cannot hold, or the model's own folder as the target.
+        NoReconstructionError: the workspace holds no model.
+        InputError: there is no model, nothing can be written, or what was read back is not what was written.
+    """
+    if target not in EXPORTS:
+        raise UsageError(f"unknown export format {target!r}, expected one of {', '.join(EXPORTS)}")
+    source = _source(Path(output))
+    copy = EXPORTS[target](source, Path(path))
+    ours, theirs = source.model, copy.model
+    same_names = len(theirs.image_names) == len(ours.image_names) and all(
+        theirs_name.endswith(name) for theirs_name, name in zip(theirs.image_names, ours.image_names, strict=True)
+    )
+    if not same_names or theirs.point_xyz.shape != ours.point_xyz.shape:
+        raise InputError(
+            f"{path}: expected to read back {len(ours.image_names)} images and {len(ours.point_xyz)} points, found "
+            f"{len(theirs.image_names)} and {len(theirs.point_xyz)}"
+        )
+    return {
+        "format": target,
+        "files": [os.fspath(file) for file in copy.files],
+        "reader": copy.reader,
+        "num_images": len(ours.image_names),
+        "num_points": int(ours.is_triangulated.sum()),
+        "num_observations": int(ours.obs_is_inlier.sum()),
+        "max_px": _worst_px(ours, theirs),
+        "max_coordinate": float(np.abs(theirs.point_xyz - ours.point_xyz).max(initial=0.0)),
+    }
+
+
+def _source(output: Path) -> _Source:
+    image_folder = None
+    folder = output
+    if (output / "run.json").is_file():
+        image_source = Path(str(read_manifest(output).get("source") or ""))
+        image_folder = image_source if image_source.is_dir() and str(image_source) != "." else None
+        folder = output / "sparse" / "0"
+        if not has_model(folder):
+            raise NoReconstructionError(f"{output} holds no model to export", "run sfmapp reconstruct first")
+    elif not has_model(output) and has_model(output / "sparse" / "0"):
+        folder = output / "sparse" / "0"
+    model, keypoints = read_model(folder)
+    return _Source(folder, model, keypoints, image_folder)
+
+
+def _worst_px(ours: Reconstruction, theirs: Reconstruction) -> float:
+    """Worst difference over all inliers: of the pixel where their cameras see their points, and of the residual."""
+    with_theirs = ours.copy()
+    with_theirs.cameras, with_theirs.image_camera_idx = theirs.cameras, theirs.image_camera_idx
+    with_theirs.cam_from_world, with_theirs.point_xyz = theirs.cam_from_world, theirs.point_xyz
+    residuals = ours.residuals_px()
+    differences = [with_theirs.residuals_px() - residuals]
+    if theirs.tracks.num_observations:  # the format holds pixels as well
+        if theirs.tracks.num_observations != len(residuals):
+            raise InputError(
+                f"expected to read back {len(residuals)} observations, found {theirs.tracks.num_observations}"
+            )
+        differences.append(theirs.residuals_px() - residuals)
+    worst = 0.0
+    for difference in differences:
+        # behind a camera in both is no difference, in one of them it is
+        both_missing = np.isnan(with_theirs.residuals_px()) & np.isnan(residuals)
+        lengths = np.linalg.norm(np.where(both_missing, 0.0, difference), axis=1)
+        worst = max(worst, float(np.where(np.isnan(lengths), np.inf, lengths).max(initial=0.0)))
+    return worst
+
+
+def _export_colmap(
+    write: Callable[[Path, Reconstruction, list[NDArray[np.float64]]], None], ending: str
+) -> Callable[[_Source, Path], _Copy]:
+    def export(source: _Source, path: Path) -> _Copy:
+        from sfmapp.formats.pycolmap_reader import read_with_pycolmap
+
+        if path.exists() and path.resolve() == source.folder.resolve():
+            raise UsageError(f"{path} is the model itself", "choose another folder to export to")
+        write(path, source.model, source.keypoints)
+        ours = read_model(path)[0]
+        copy = read_with_pycolmap(path)
+        # pycolmap vouches for cameras, poses and points, our reader adds the observations
+        copy.tracks, copy.obs_is_inlier = ours.tracks, ours.obs_is_inlier
+        stems = ("cameras", "frames", "images", "points3D", "rigs")
+        return _Copy(copy, [path / f"{stem}.{ending}" for stem in stems], "pycolmap")
+
+    return export
+
+
+def _export_ply(source: _Source, path: Path) -> _Copy:
+    from sfmapp.formats.ply import read_ply, write_ply
+
+    file = _file_in(path, ".ply", "points.ply")
+    points = np.flatnonzero(source.model.is_triangulated)
+    write_ply(file, source.model.point_xyz[points], source.model.point_rgb[points])
+    copy = source.model.copy()
+    copy.point_xyz[points], copy.point_rgb[points] = read_ply(file)
+    return _Copy(copy, [file], "sfmapp")
+
+
+def _export_bundler(source: _Source, path: Path) -> _Copy:
+    from sfmapp.formats.bundler import list_path, read_bundler, write_bundler
+
+    file = _file_in(path, ".out", "bundle.out")
+    write_bundler(file, source.model)
+    cameras = source.model.cameras
+    sizes = [(cameras[i].width, cameras[i].height) for i in source.model.image_camera_idx]
+    return _Copy(read_bundler(file, np.array(sizes).reshape(-1, 2)), [file, list_path(file)], "sfmapp")
+
+
+def _export_nerfstudio(source: _Source, path: Path) -> _Copy:
+    from sfmapp.formats.nerfstudio import POINTS_NAME, read_nerfstudio, write_nerfstudio
+
+    file = _file_in(path, ".json", "transforms.json")
+    images = "images"
+    if source.image_folder is not None:
+        images = Path(os.path.relpath(source.image_folder.resolve(), file.resolve().parent)).as_posix()
+    write_nerfstudio(file, source.model, images)
+    return _Copy(read_nerfstudio(file), [file, file.with_name(POINTS_NAME)], "sfmapp")
+
+
+def _file_in(path: Path, ending: str, name: str) -> Path:
+    """The path itself if it has the format's ending, else a file of the usual name in the folder that it names."""
+    return path if path.suffix.lower() == ending and not path.is_dir() else path / name
+
+
+EXPORTS: dict[str, Callable[[_Source, Path], _Copy]] = {
+    "colmap-bin": _export_colmap(write_model, "bin"),
+    "colmap-text": _export_colmap(write_model_text, "txt"),
+    "ply": _export_ply,
+    "bundler": _export_bundler,
+    "nerfstudio": _export_nerfstudio,
+}
