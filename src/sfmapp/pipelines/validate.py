@@ -129,7 +129,9 @@ def _photographs(manifest: dict[str, Any], events: Events) -> tuple[ImageSet, Im
 
 def _changed_photographs(manifest: dict[str, Any], image_set: ImageSet) -> list[str]:
     """A note if these are not the files that our run saw."""
-    seen = manifest.get("inputs", {})
+    seen = manifest.get("inputs")
+    if not seen:
+        return []
     # a key is the digest of the file, and what masks it
     changed = [image.name for image in image_set.images if not str(seen.get(image.name, "")).startswith(image.digest)]
     changed += sorted(set(seen) - {image.name for image in image_set.images})
