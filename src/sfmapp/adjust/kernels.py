@@ -1,10 +1,10 @@
 """Kernels of the adjustment: linearise, eliminate the points, substitute back.
 
 Layout. An unknown block is a row of up to eight numbers: the six of a pose (rotation, then translation, of
-``x_cam <- exp(w) x_cam + v``), followed by at most two intrinsics where a camera takes part through one image only; or the
-free intrinsics of a camera that several images share. Blocks meet in 8 x 8 tiles. Points are never blocks: they are
+``x_cam <- exp(w) x_cam + v``), followed by at most two intrinsics where a camera takes part through one image only; or
+the free intrinsics of a camera that several images share. Blocks meet in 8 x 8 tiles. Points are never blocks: they are
 eliminated one by one (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 1999, section 6.1) from the factor
-``L L^T`` of their damped 3 x 3 normal matrix: with Z = W L^-T the reduced system loses Z_a Z_b^T for each pair of blocks.
+``L L^T`` of their damped 3 x 3 normal matrix: with Z = W L^-T the reduced system loses Z_a Z_b^T per pair of blocks.
 
 Nothing is kept per observation. Points come in chunks whose number depends on the problem alone; each chunk has its own
 sums, which are added in order, so the result does not depend on the number of threads.
@@ -27,42 +27,50 @@ TRIVIAL, HUBER, CAUCHY = 0, 1, 2
 _POSE, _CANON, _INTR, _POINT, _RES, _SCRATCH = 0, 16, 32, 48, 64, 80
 # Smallest depth that counts as in front of the camera, relative to the distance.
 _MIN_COS = 1e-6
-# The weight along the residual of a robust loss stays above this share of the weight across it (see _weigh).
-_MIN_RADIAL = 0.25
 
 
 @numba.njit(cache=True, nogil=True)
-def robust_cost(loss: int, scale2: float, s: float) -> float:
-    """rho(s) of a squared residual s; the cost is half of it. Equal to s below a small fraction of scale2."""
-    if loss == 0:
-        return s
-    if loss == 1:
-        return s if s <= scale2 else 2.0 * math.sqrt(s * scale2) - scale2
-    return scale2 * math.log1p(s / scale2)
+def robust_weight(loss: int, scale2: float, s: float) -> float:
+    """rho'(s), the weight of a squared residual s (Holland and Welsch 1977).
 
-
-@numba.njit(cache=True, nogil=True)
-def _weigh(loss, scale2, s):  # type: ignore[no-untyped-def]
-    """Weights (across, along) the residual: rho' and rho' + 2 s rho'', the curvature of the loss, kept positive.
-
-    The second is Triggs's correction; both Huber and Cauchy have rho'' < 0, where it vanishes or turns negative, so it is
-    held at a share of the first. Levenberg-Marquardt then takes Newton-like steps instead of reweighting in small ones.
+    Triggs's second-order term is left out, as in Ceres for these losses: it was measured to cost more steps than it saves.
     """
+    if loss == 0:
+        return 1.0
     if loss == 1:
-        if s <= scale2:
-            return 1.0, 1.0
-        first = math.sqrt(scale2 / s)
-        return first, _MIN_RADIAL * first
-    q = 1.0 / (1.0 + s / scale2)
-    return q, q * max(_MIN_RADIAL, (1.0 - s / scale2) * q)
+        return 1.0 if s <= scale2 else math.sqrt(scale2 / s)
+    return scale2 / (scale2 + s)
 
 
 @numba.njit(cache=True, nogil=True)
-def linearize(pose, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, J):  # type: ignore[no-untyped-def]
-    """Weighted Jacobians and residual of one observation into the scratch row J; returns rho.
+def add_loss(loss, scale2, s, total, product):  # type: ignore[no-untyped-def]
+    """Add rho(s) to a sum that starts as (0, 1); returns the new (total, product), see :func:`total_loss`.
 
-    pose: 12 numbers, R row by row and t. c: canonical intrinsics. Behind the camera the Jacobians are zero and the residual
-    counts as twice the focal length, gtsam's choice, so that a point gains nothing by slipping there.
+    A sum of logarithms is the logarithm of a product: Cauchy's loss costs a multiplication.
+    """
+    if loss == 0:
+        return total + s, product
+    if loss == 1:
+        return total + (s if s <= scale2 else 2.0 * math.sqrt(s * scale2) - scale2), product
+    product *= 1.0 + s / scale2
+    if product > 1e200:
+        return total + scale2 * math.log(product), 1.0
+    return total, product
+
+
+@numba.njit(cache=True, nogil=True)
+def total_loss(scale2: float, total: float, product: float) -> float:
+    """The cost, half of the sum of rho, of a sum by :func:`add_loss`."""
+    return 0.5 * (total + scale2 * math.log(product))
+
+
+@numba.njit(cache=True, nogil=True)
+def linearize(pose, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, intrinsics, J):  # type: ignore[no-untyped-def]
+    """Weighted Jacobians and residual of one observation into the scratch row J; returns the squared residual.
+
+    pose: 12 numbers, R row by row and t. c: canonical intrinsics, whose derivatives are wanted if ``intrinsics``. Behind
+    the camera the Jacobians are zero and both residuals count as twice the focal length, gtsam's choice, so that a point
+    gains nothing by slipping there.
     """
     px = pose[0] * x0 + pose[1] * x1 + pose[2] * x2 + pose[9]
     py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]
@@ -70,7 +78,7 @@ def linearize(pose, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, J):  # type: i
     if not pz > _MIN_COS * (abs(px) + abs(py)):
         for i in range(_SCRATCH):
             J[i] = 0.0
-        return robust_cost(loss, scale2, 8.0 * c[0] * c[0])
+        return 8.0 * c[0] * c[0]
     iz = 1.0 / pz
     u = px * iz
     v = py * iz
@@ -110,31 +118,13 @@ def linearize(pose, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, J):  # type: i
         d = radial + v * v * slope + 2.0 * c[7] * u + 6.0 * c[6] * v
     e0 = fx * ud + c[2] - xo
     e1 = fy * vd + c[3] - yo
-    # w is the square root of the 2 x 2 weight: w^T w J-weights, residual scaled so that the gradient is exact
-    w00, w01, w11 = 1.0, 0.0, 1.0
-    f0, f1 = e0, e1
-    rho = e0 * e0 + e1 * e1
-    if loss != 0:
-        s2 = rho
-        across, along = _weigh(loss, scale2, s2)
-        rho = robust_cost(loss, scale2, s2)
-        wa = math.sqrt(across)
-        wl = math.sqrt(along)
-        w00 = w11 = wa
-        if wa != wl:
-            share = (wl - wa) / s2
-            w00 += share * e0 * e0
-            w01 = share * e0 * e1
-            w11 += share * e1 * e1
-        f0 = across / wl * e0
-        f1 = across / wl * e1
-    J[_RES] = f0
-    J[_RES + 8] = f1
-    d00, d01, d10, d11 = fx * a, fx * b, fy * b, fy * d
-    g00 = (w00 * d00 + w01 * d10) * iz
-    g01 = (w00 * d01 + w01 * d11) * iz
-    g10 = (w01 * d00 + w11 * d10) * iz
-    g11 = (w01 * d01 + w11 * d11) * iz
+    s2 = e0 * e0 + e1 * e1
+    w = math.sqrt(robust_weight(loss, scale2, s2))
+    J[_RES] = w * e0
+    J[_RES + 8] = w * e1
+    fx *= w
+    fy *= w
+    g00, g01, g10, g11 = fx * a * iz, fx * b * iz, fy * b * iz, fy * d * iz
     g02 = -(g00 * u + g01 * v)
     g12 = -(g10 * u + g11 * v)
     J[0] = py * g02 - pz * g01
@@ -155,25 +145,15 @@ def linearize(pose, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, J):  # type: i
     J[_POINT + 8] = g10 * pose[0] + g11 * pose[3] + g12 * pose[6]
     J[_POINT + 9] = g10 * pose[1] + g11 * pose[4] + g12 * pose[7]
     J[_POINT + 10] = g10 * pose[2] + g11 * pose[5] + g12 * pose[8]
-    # canonical intrinsics: fx, fy, cx, cy, d0..d3
-    J[_CANON] = w00 * ud
-    J[_CANON + 8] = w01 * ud
-    J[_CANON + 1] = w01 * vd
-    J[_CANON + 9] = w11 * vd
-    J[_CANON + 2] = w00
-    J[_CANON + 10] = w01
-    J[_CANON + 3] = w01
-    J[_CANON + 11] = w11
-    x00, x01, x10, x11 = w00 * fx, w01 * fy, w01 * fx, w11 * fy
-    J[_CANON + 4] = x00 * k0u + x01 * k0v
-    J[_CANON + 12] = x10 * k0u + x11 * k0v
-    J[_CANON + 5] = x00 * k1u + x01 * k1v
-    J[_CANON + 13] = x10 * k1u + x11 * k1v
-    J[_CANON + 6] = x00 * k2u + x01 * k2v
-    J[_CANON + 14] = x10 * k2u + x11 * k2v
-    J[_CANON + 7] = x00 * k3u + x01 * k3v
-    J[_CANON + 15] = x10 * k3u + x11 * k3v
-    return rho
+    if intrinsics:  # fx, fy, cx, cy, d0..d3
+        J[_CANON], J[_CANON + 9] = w * ud, w * vd
+        J[_CANON + 2] = J[_CANON + 11] = w
+        J[_CANON + 1] = J[_CANON + 3] = J[_CANON + 8] = J[_CANON + 10] = 0.0
+        J[_CANON + 4], J[_CANON + 12] = fx * k0u, fy * k0v
+        J[_CANON + 5], J[_CANON + 13] = fx * k1u, fy * k1v
+        J[_CANON + 6], J[_CANON + 14] = fx * k2u, fy * k2v
+        J[_CANON + 7], J[_CANON + 15] = fx * k3u, fy * k3v
+    return s2
 
 
 @numba.njit(cache=True, nogil=True)
@@ -212,8 +192,8 @@ def reduce_points(
         intrinsics: (C, 8) canonical; camera_block: (C,) block that holds the free intrinsics, -1 where constant;
             free_ptr, free_slot, free_column: for camera c, canonical slot and column in the block.
         block_dim: (B,) rows in use of each block.
-        hash_keys, hash_values: tile of block pair a <= b under key a B + b; empty if every pair a B + b is tile a B + b.
-        tiles: (N * 64,) out: sum of -Z_a Z_b^T. own: (B * 64,) out: J^T J of each block with itself, before elimination.
+        hash_keys, hash_values: tile of block pair a <= b under key a B + b; empty if that number is the tile's as well.
+        tiles: (N * 64,) out: sum of -Z_a Z_b^T. own: (B * 64,) out: J^T J of each block with itself, not eliminated.
         cross: (I * 64,) out: J_pose^T J_intrinsics of images whose camera has a block of its own.
         gradient: (2, B * 8) out: J^T r before elimination, and what elimination adds to it.
         point_factor: (P, 12) out: L^-1 (l00 l10 l11 l20 l21 l22), gradient, damped diagonal increment; all zero for a
@@ -235,7 +215,7 @@ def reduce_points(
         longest = max(longest, point_ptr[p + 1] - point_ptr[p])
     W = np.zeros(min(2 * longest, num_blocks + 1) * 24)
     blocks = np.zeros(min(2 * longest, num_blocks + 1), np.int64)
-    cost = 0.0
+    cost, product = 0.0, 1.0
     for p in range(first, last):
         x0, x1, x2 = xyz[p, 0], xyz[p, 1], xyz[p, 2]
         moves = not is_constant[p]
@@ -244,9 +224,11 @@ def reduce_points(
         for o in range(point_ptr[p], point_ptr[p + 1]):
             i = obs_image[o]
             c = image_camera[i]
-            cost += linearize(
-                poses[i], intrinsics[c], fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2, J
+            other = camera_block[c]
+            s2 = linearize(
+                poses[i], intrinsics[c], fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2, other >= 0, J
             )
+            cost, product = add_loss(loss, scale2, s2, cost, product)
             if moves:
                 a0, a1, a2 = J[_POINT], J[_POINT + 1], J[_POINT + 2]
                 b0, b1, b2 = J[_POINT + 8], J[_POINT + 9], J[_POINT + 10]
@@ -261,7 +243,6 @@ def reduce_points(
                 g1 += a1 * r0 + b1 * r1
                 g2 += a2 * r0 + b2 * r1
             block = image_block[i]
-            other = camera_block[c]
             if block >= 0:
                 if other == block:
                     J[6] = J[7] = J[14] = J[15] = 0.0
@@ -347,7 +328,7 @@ def reduce_points(
                     if not dense:
                         tile = find_slot(hash_keys, hash_values, tile)
                     subtract3(tiles, tile * 64, W, m * 24, W, n * 24, block_dim[b])
-    return 0.5 * cost
+    return total_loss(scale2, cost, product)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -364,7 +345,8 @@ def substitute_points(
         sums: (4,) out: cost, predicted decrease of the points' share, squared step and squared length of the points.
     """
     J = np.zeros(_SCRATCH)
-    cost = decrease = moved = length = 0.0
+    cost, product = 0.0, 1.0
+    decrease = moved = length = 0.0
     for p in range(first, last):
         x0, x1, x2 = xyz[p, 0], xyz[p, 1], xyz[p, 2]
         factor = point_factor[p]
@@ -377,7 +359,10 @@ def substitute_points(
                 other = camera_block[c]
                 if block < 0 and other < 0:
                     continue
-                linearize(poses[i], intrinsics[c], fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2, J)
+                linearize(
+                    poses[i], intrinsics[c], fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2,
+                    other >= 0, J,
+                )  # fmt: skip
                 e0 = e1 = 0.0
                 if block >= 0:
                     for k in range(6):
@@ -416,13 +401,15 @@ def substitute_points(
             px = pose[0] * x0 + pose[1] * x1 + pose[2] * x2 + pose[9]
             py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]
             if pz > _MIN_COS * (abs(px) + abs(py)):
-                u, v = distort(fisheye[c], new_intrinsics[c], px / pz, py / pz)
+                iz = 1.0 / pz
+                u, v = distort(fisheye[c], new_intrinsics[c], px * iz, py * iz)
                 u -= obs_xy[o, 0]
                 v -= obs_xy[o, 1]
-                cost += robust_cost(loss, scale2, u * u + v * v)
+                s2 = u * u + v * v
             else:
-                cost += robust_cost(loss, scale2, 8.0 * new_intrinsics[c, 0] ** 2)
-    sums[0], sums[1], sums[2], sums[3] = 0.5 * cost, 0.5 * decrease, moved, length
+                s2 = 8.0 * new_intrinsics[c, 0] ** 2
+            cost, product = add_loss(loss, scale2, s2, cost, product)
+    sums[0], sums[1], sums[2], sums[3] = total_loss(scale2, cost, product), 0.5 * decrease, moved, length
 
 
 @numba.njit(cache=True, nogil=True)
@@ -430,10 +417,10 @@ def retract(
     poses, image_block, canonical, camera_block, free_ptr, free_slot, free_column, step, new_poses, new_rows,
     new_canonical,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Apply a step of the blocks: ``x_cam <- exp(w) x_cam + v`` on poses (I, 7), sums on canonical intrinsics (C, 8).
+    """Apply a step of the blocks: ``x_cam <- exp(w) x_cam + v`` on poses (I, 7), sums on canonical rows (C, 8).
 
-    Constant poses and cameras keep their bits. Also fills new_rows (I, 12). Returns the squared translation step and the
-    squared length of the translations that move.
+    Constant poses and cameras keep their bits. Also fills new_rows (I, 12). Returns the squared translation step and
+    the squared length of the translations that move.
     """
     moved = length = 0.0
     for i in range(poses.shape[0]):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +27,8 @@ def assemble(
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Sum the chunks, in order, into the first: tiles (K, N * 64) and own, cross, gradient likewise.
 
-    Adds extra_own (B * 64,) and extra_gradient (B * 8,), what priors say about single blocks; fills diagonal (B * 8,) with
-    the diagonal before elimination, on which the damping is based, and puts ``own`` and ``cross`` into the tiles.
+    Adds extra_own (B * 64,) and extra_gradient (B * 8,), what priors say about single blocks; fills diagonal (B * 8,)
+    with the diagonal before elimination, on which the damping is based, and puts ``own`` and ``cross`` into the tiles.
     """
     num_blocks = block_dim.shape[0]
     for k in range(1, tiles.shape[0]):

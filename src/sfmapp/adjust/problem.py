@@ -23,8 +23,8 @@ class FreeIntrinsics:
 
     Attributes:
         params: for each local camera, (Q,) positions in ``Camera.params``; empty where the camera is constant.
-        ptr: (C + 1,) int64; slot, column: for camera c in ``ptr[c]:ptr[c + 1]`` the canonical slot of each derivative and
-            the column of the block that it belongs to.
+        ptr: (C + 1,) int64; slot, column: for camera c in ``ptr[c]:ptr[c + 1]`` the canonical slot of each derivative
+            and the column of the block that it belongs to.
     """
 
     params: list[NDArray[np.int64]]
@@ -123,13 +123,24 @@ def make_problem(
     if variable_cameras is not None:
         params = [p if variable_cameras[c] else p[:0] for p, c in zip(params, camera_idx, strict=True)]
     image_block, camera_block, block_dim = _number_blocks(varies[image_idx], image_camera, params, merge)
-    poses = reconstruction.cam_from_world[image_idx]
     return Problem(
-        image_idx, camera_idx, selected[kept], poses,
-        np.array([c.canonical for c in cameras]).reshape(-1, 8), reconstruction.point_xyz[selected[kept]],
-        is_constant[kept], point_ptr, image_of[obs_image], obs_xy, image_camera, image_block, camera_block, block_dim,
-        np.array([c.is_fisheye for c in cameras], bool), _free_columns(cameras, params, camera_block, len(image_block[image_block >= 0])),
-    )  # fmt: skip
+        image_idx=image_idx,
+        camera_idx=camera_idx,
+        track_idx=selected[kept],
+        poses=reconstruction.cam_from_world[image_idx],
+        canonical=np.array([camera.canonical for camera in cameras]).reshape(-1, 8),
+        xyz=reconstruction.point_xyz[selected[kept]],
+        is_constant=is_constant[kept],
+        point_ptr=point_ptr,
+        obs_image=image_of[obs_image],
+        obs_xy=obs_xy,
+        image_camera=image_camera,
+        image_block=image_block,
+        camera_block=camera_block,
+        block_dim=block_dim,
+        fisheye=np.array([camera.is_fisheye for camera in cameras], bool),
+        free=_free_columns(cameras, params, camera_block, int((image_block >= 0).sum())),
+    )
 
 
 def pose_rows(poses: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Bundle adjustment: points eliminated by our kernels, cameras solved densely or by gtsam, damped by Levenberg-Marquardt."""
+"""Bundle adjustment: points eliminated by our kernels, cameras solved in tiles or by gtsam, Levenberg-Marquardt around."""
 
 from __future__ import annotations
 
@@ -104,10 +104,10 @@ def adjust_bundle(
             never do. None for all.
         points: (T,) bool, which points take part and vary; None for those that a variable image observes.
         constant_points: (T,) bool, which of the points take part without moving.
-        prior_cameras: (C,) cameras as they were known beforehand: focal lengths with ``focal_sigma``, principal points
-            and distortion with the sigmas of the options are Gaussian priors around their parameters. None for no priors.
-        extra_factors: gtsam.NonlinearFactorGraph over ``X(i)`` (Pose3 world_from_cam of image i) and ``K(c)`` (Vector of
-            the free parameters of camera c, in the order of ``Camera.params``), or None. Factors on constant images
+        prior_cameras: (C,) cameras as they were known beforehand: Gaussian priors around their parameters, with
+            ``focal_sigma`` for focal lengths and the options' sigmas for the rest. None for no priors.
+        extra_factors: gtsam.NonlinearFactorGraph over ``X(i)`` (Pose3 world_from_cam of image i) and ``K(c)`` (Vector
+            of the free parameters of camera c, in the order of ``Camera.params``), or None. Factors on constant images
             or cameras only add to the cost.
         threads: at most this many; the result does not depend on it.
         events: asked for cancellation at every step.
