@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.options import AdjustOptions
-from sfmapp.adjust.solver import adjust_bundle
+from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.features.features import Features
@@ -24,6 +23,7 @@ from sfmapp.images.folder import ImageSet
 from sfmapp.mapping import structure
 from sfmapp.mapping.focal import estimate_focal_ratio
 from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_initial_pairs
+from sfmapp.mapping.merge import find_merge, merge
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
 from sfmapp.mapping.tracks import build_tracks, track_colors
@@ -69,29 +69,28 @@ def map_images(
     attempts: dict[int, Registration] = {}
     initial_reports: list[dict[str, Any]] = []
     models: list[Reconstruction] = []
-    free = np.ones(len(names), bool)
+    seeds = np.ones(len(names), bool)
     events.started(STAGE, "mapping", total=len(names))
     with ThreadPoolExecutor(threads) as pool:
-        while free.sum() >= 2:
-            empty = Reconstruction.empty(cameras, names, image_camera_idx, tracks)
-            mapper = Mapper(empty, correspondences, options, adjust_options, events, pool, free, attempts)
-            tried = mapper.start()
-            initial_reports.append({"model": len(models), "pairs": tried})
-            if mapper.reconstruction.is_registered.sum() < 2:
+        while seeds.sum() >= 2:
+            model = Reconstruction.empty(cameras, names, image_camera_idx, tracks)
+            mapper = Mapper(model, correspondences, options, adjust_options, events, pool, seeds, attempts)
+            initial_reports.append({"pairs": mapper.start()})
+            registered = model.is_registered
+            if not registered.any():
                 break
             mapper.grow()
             mapper.finish()
-            registered = mapper.reconstruction.is_registered
+            registered = model.is_registered
+            seeds &= ~registered
             if registered.sum() < min(options.min_model_images, len(names)):
                 events.decided(STAGE, f"model dropped: it has only {int(registered.sum())} images")
-                free &= ~registered
                 continue
-            mapper.reconstruction.point_rgb = track_colors(tracks, features)
-            models.append(mapper.reconstruction)
-            free &= ~registered
+            model.point_rgb = track_colors(tracks, features)
+            models.append(model)
             if not options.multiple_models:
                 break
-    models.sort(key=lambda model: -int(model.is_registered.sum()))
+        models = _merge_models(_without_parts(models), correspondences, options, adjust_options, events, pool)
     report = {
         "tracks": track_report,
         "focal": focal_report,
@@ -103,6 +102,49 @@ def map_images(
     if not models:
         raise no_reconstruction(report)
     return models, report
+
+
+def _without_parts(models: list[Reconstruction]) -> list[Reconstruction]:
+    """The models, largest first, without those whose images a larger one holds all.
+
+    A model may grow into images of an earlier one, as it may see more of the points that they need.
+    """
+    kept: list[Reconstruction] = []
+    for model in sorted(models, key=lambda model: -int(model.is_registered.sum())):
+        if not any((larger.is_registered | ~model.is_registered).all() for larger in kept):
+            kept.append(model)
+    return kept
+
+
+def _merge_models(
+    models: list[Reconstruction],
+    correspondences: Correspondences,
+    options: MappingOptions,
+    adjust_options: AdjustOptions,
+    events: Events,
+    pool: Executor,
+) -> list[Reconstruction]:
+    """Join smaller models to larger ones where shared images and points tell how they lie to each other."""
+    merged: list[Reconstruction] = []
+    for source in models:
+        for n, target in enumerate(merged):
+            found = find_merge(target, source)
+            if found is None:
+                continue
+            scale, target_from_source, votes = found
+            union = merge(target, source, scale, target_from_source)
+            mapper = Mapper(union, correspondences, options, adjust_options, events, pool, union.is_registered, {})
+            mapper.adjust_globally()
+            mapper.grow()
+            mapper.finish()
+            new = union.is_registered & ~target.is_registered
+            if mapper.is_supported(new):
+                events.decided(STAGE, f"merged two models by {votes} common points: {int(new.sum())} images more")
+                merged[n] = union
+                break
+        else:
+            merged.append(source)
+    return merged
 
 
 def no_reconstruction(report: dict[str, Any]) -> NoReconstructionError:
@@ -147,10 +189,16 @@ class Mapper:
     adjust_options: AdjustOptions
     events: Events
     pool: Executor
-    free: NDArray[np.bool_]
+    seeds: NDArray[np.bool_]
     attempts: dict[int, Registration]
     failed_with: dict[int, int] = field(default_factory=dict)
     size_at_global: tuple[int, int] = (0, 0)
+    prior_cameras: list[Camera] = field(init=False)
+    max_error_px: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.max_error_px = self.options.max_reprojection_error_px
+        self.prior_cameras = list(self.reconstruction.cameras)
 
     # ------------------------------------------------------------------ start
 
@@ -158,7 +206,7 @@ class Mapper:
         """Register the first two images; returns the pairs that were tried, each with the reason it was rejected."""
         options = self.options
         tried: list[dict[str, Any]] = []
-        ranked = rank_initial_pairs(self.reconstruction, self.correspondences, self.free, options)
+        ranked = rank_initial_pairs(self.reconstruction, self.correspondences, self.seeds, options)
         inliers, angle = options.min_initial_inliers, options.min_initial_angle_deg
         while True:
             for pair in ranked:
@@ -247,6 +295,7 @@ class Mapper:
             camera_idx = self.reconstruction.image_camera_idx[result.image_idx]
             camera = self.reconstruction.cameras[camera_idx]
             self.reconstruction.cameras[camera_idx] = camera.with_focal(camera.focal * result.focal_scale)
+            self.prior_cameras[camera_idx] = self.reconstruction.cameras[camera_idx]
         return True
 
     def triangulate_images(self, images: list[int]) -> None:
@@ -255,9 +304,9 @@ class Mapper:
         seen = np.unique(np.concatenate([tracks.obs_track_idx[tracks.observations_of_image(i)] for i in images]))
         seen = seen.astype(np.int64)
         exists = self.reconstruction.is_triangulated[seen]
-        structure.filter_observations(self.reconstruction, self.options, self.pool, seen[exists])
+        structure.filter_observations(self.reconstruction, self.options, self.pool, seen[exists], self.max_error_px)
         missing = seen[~self.reconstruction.is_triangulated[seen]]
-        structure.triangulate(self.reconstruction, missing, self.options, self.pool)
+        structure.triangulate(self.reconstruction, missing, self.options, self.pool, self.max_error_px)
 
     # ----------------------------------------------------------------- adjust
 
@@ -272,7 +321,7 @@ class Mapper:
 
     def adjust_around(self, images: list[int]) -> None:
         """Adjust new images, the registered ones that share most points with them, and those points."""
-        variable = np.zeros(len(self.free), bool)
+        variable = np.zeros(len(self.reconstruction.image_names), bool)
         variable[images] = True
         variable[self._covisible_images(images)] = True
         reconstruction, tracks = self.reconstruction, self.reconstruction.tracks
@@ -287,34 +336,73 @@ class Mapper:
         points[seen] = True
         adjust_bundle(
             reconstruction, replace(self.adjust_options, max_iterations=15, relative_cost_tolerance=1e-4),
-            variable_images=variable, variable_cameras=cameras, points=points,
+            variable_images=variable, variable_cameras=cameras, points=points, prior_cameras=self.prior_cameras,
         )  # fmt: skip
-        structure.filter_observations(reconstruction, self.options, self.pool, seen)
+        structure.filter_observations(reconstruction, self.options, self.pool, seen, self.max_error_px)
 
     def adjust_globally(self, final: bool = False) -> None:
         """Adjust everything, filter, and triangulate again what was lost or has become possible."""
         reconstruction = self.reconstruction
-        two = int(reconstruction.is_registered.sum()) < 3
         options = self.adjust_options
         if not final:
-            options = replace(options, max_iterations=25, relative_cost_tolerance=1e-4, refine_principal_point=False)
-        if two:  # two views cannot tell the lens from the scene
-            options = replace(options, refine_focal=False, refine_distortion=False, refine_principal_point=False)
-        adjust_bundle(reconstruction, options)
-        structure.filter_observations(reconstruction, self.options, self.pool)
-        missing = np.flatnonzero(~reconstruction.is_triangulated)
-        structure.triangulate(reconstruction, missing, self.options, self.pool)
+            options = replace(options, max_iterations=25, relative_cost_tolerance=1e-4)
+        if reconstruction.is_registered.sum() < 3:  # two views cannot tell the lens from the scene
+            options = replace(options, refine_focal=False, refine_distortion=False)
+        adjust_bundle(reconstruction, options, prior_cameras=self.prior_cameras)
+        self._settle_points()
         self.size_at_global = self._size()
 
     def finish(self) -> None:
-        """Adjust until the set of inliers settles."""
-        for _ in range(5):
+        """Adjust until the set of inliers settles; cameras with several images refine their principal point too.
+
+        The damping starts low: the map is at its minimum already, and what is still to be found lies in directions in
+        which the cost is almost flat, such as principal point against rotation.
+        """
+        options = replace(self.adjust_options, initial_damping=1e-7, relative_cost_tolerance=1e-7)
+        for _ in range(6):
             before = self.reconstruction.obs_is_inlier.copy()
-            self.adjust_globally(final=True)
+            adjust_bundle(self.reconstruction, options, prior_cameras=self.prior_cameras)
+            self._refine_principal_points(options)
+            self._settle_points()
             changed = int((before != self.reconstruction.obs_is_inlier).sum())
-            self.events.decided(STAGE, f"final adjustment changed {changed} observations", **self.reconstruction.summary())
+            summary = self.reconstruction.summary()
+            self.events.decided(STAGE, f"final adjustment: {changed} observations changed sides", **summary)
             if changed <= 1e-3 * before.sum():
                 return
+
+    def _refine_principal_points(self, options: AdjustOptions) -> None:
+        """Adjust everything with free principal points, for the cameras that MappingOptions names."""
+        reconstruction, mode = self.reconstruction, self.options.refine_principal_point
+        registered = reconstruction.image_camera_idx[reconstruction.is_registered]
+        chosen = np.bincount(registered, minlength=len(reconstruction.cameras)) >= 3
+        chosen &= [mode == "always" or c.focal_source == "default" for c in reconstruction.cameras]
+        if mode == "never" or not chosen.any():
+            return
+        size = max(max(c.width, c.height) for c, s in zip(reconstruction.cameras, chosen, strict=True) if s)
+        # the adjustment counts residuals in pixels; the prior is weighed against them at their true noise
+        noise_px = max(structure.residual_scale_px(reconstruction), 0.1)
+        options = replace(
+            options, refine_principal_point=True,
+            principal_point_sigma_px=self.options.principal_point_sigma * size / noise_px,
+        )  # fmt: skip
+        adjust_bundle(reconstruction, options, variable_cameras=chosen, prior_cameras=self.prior_cameras)
+
+    def _settle_points(self) -> None:
+        """Measure the noise; filter accordingly, and triangulate again what was lost or has become possible."""
+        scale = structure.residual_scale_px(self.reconstruction)
+        # one pixel is about what the best detectors reach on blurred or distorted images: never filter below it
+        lower, upper = min(1.0, self.options.max_reprojection_error_px), self.options.max_reprojection_error_px
+        if np.isfinite(scale):
+            self.max_error_px = float(np.clip(self.options.max_reprojection_error_sigmas * scale, lower, upper))
+        structure.filter_observations(self.reconstruction, self.options, self.pool, None, self.max_error_px)
+        missing = np.flatnonzero(~self.reconstruction.is_triangulated)
+        structure.triangulate(self.reconstruction, missing, self.options, self.pool, self.max_error_px)
+
+    def is_supported(self, images: NDArray[np.bool_]) -> bool:
+        """True if each of the given images (I,) still observes enough points after an adjustment."""
+        tracks, used = self.reconstruction.tracks, self.reconstruction.obs_is_inlier
+        counts = np.bincount(tracks.obs_image_idx[used], minlength=tracks.num_images)
+        return bool((counts[images] >= self.options.min_pose_inliers).all())
 
     # ---------------------------------------------------------------- helpers
 
@@ -322,7 +410,7 @@ class Mapper:
         return int(self.reconstruction.is_registered.sum()), int(self.reconstruction.is_triangulated.sum())
 
     def _candidates(self) -> NDArray[np.int64]:
-        return np.flatnonzero(self.free & ~self.reconstruction.is_registered)
+        return np.flatnonzero(~self.reconstruction.is_registered)
 
     def _known_cameras(self) -> NDArray[np.bool_]:
         """(C,) bool: cameras with a registered image, which the adjustment has refined."""
@@ -340,7 +428,7 @@ class Mapper:
             obs = tracks.observations_of_image(i)
             is_seen[tracks.obs_track_idx[obs[used[obs]]]] = True
         shared = np.bincount(
-            tracks.obs_image_idx[used & is_seen[tracks.obs_track_idx]], minlength=len(self.free)
+            tracks.obs_image_idx[used & is_seen[tracks.obs_track_idx]], minlength=len(self.reconstruction.image_names)
         ).astype(np.int64)
         shared[images] = 0
         order = np.argsort(-shared, kind="stable")[: max(1, self.options.local_window - len(images))]

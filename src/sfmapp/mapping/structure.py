@@ -18,10 +18,14 @@ CHUNK = 4096
 
 
 def triangulate(
-    reconstruction: Reconstruction, tracks: NDArray[np.int64], options: MappingOptions, pool: Executor
+    reconstruction: Reconstruction,
+    tracks: NDArray[np.int64],
+    options: MappingOptions,
+    pool: Executor,
+    max_error_px: float | None = None,
 ) -> int:
     """Triangulate the given tracks afresh from the registered images, in place; returns how many succeeded."""
-    return _over_chunks(triangulation.triangulate_tracks, reconstruction, tracks, options, pool)
+    return _over_chunks(triangulation.triangulate_tracks, reconstruction, tracks, options, pool, max_error_px)
 
 
 def filter_observations(

@@ -56,8 +56,6 @@ class Camera:
         focal_sigma: standard deviation of the focal prior in pixels; None if the focal is not known a priori at all.
         focal_source: where the focal prior comes from: ``user``, ``exif_35mm``, ``exif_sensor``, ``default`` or ``file``.
         is_fixed: the user has said that the parameters may not change.
-        focal_prior: mean of the focal prior in pixels; the focal of ``params`` at construction unless given. Refining
-            the parameters leaves it where it was.
     """
 
     model: CameraModel
@@ -67,7 +65,6 @@ class Camera:
     focal_sigma: float | None = None
     focal_source: str = "default"
     is_fixed: bool = False
-    focal_prior: float | None = None
 
     def __post_init__(self) -> None:
         params = np.array(self.params, np.float64)
@@ -75,8 +72,6 @@ class Camera:
             raise ValueError(f"{self.model.name} has {len(PARAM_NAMES[self.model])} parameters, got {params.shape}")
         params.setflags(write=False)
         object.__setattr__(self, "params", params)
-        if self.focal_prior is None:
-            object.__setattr__(self, "focal_prior", self.focal)
 
     @property
     def focal(self) -> float:
@@ -99,13 +94,13 @@ class Camera:
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def with_params(self, params: ArrayLike) -> Camera:
-        """The same camera with other parameters and the same prior."""
+        """The same camera with other parameters."""
         return replace(self, params=np.asarray(params, np.float64))
 
     def with_focal(self, focal: float) -> Camera:
-        """The same camera with another mean focal length in pixels, which becomes the mean of its prior as well."""
+        """The same camera with another mean focal length in pixels; the aspect ratio stays."""
         is_focal = np.array([name in ("f", "fx", "fy") for name in PARAM_NAMES[self.model]])
-        return replace(self, params=np.where(is_focal, self.params * focal / self.focal, self.params), focal_prior=focal)
+        return replace(self, params=np.where(is_focal, self.params * focal / self.focal, self.params))
 
 
 def canonical_from_params(model: CameraModel) -> Array:

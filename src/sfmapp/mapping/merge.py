@@ -1,0 +1,92 @@
+"""Joining two models that share images or points: the similarity between them, and the union in one world.
+
+Tracks are the same in all models, so a track that is triangulated in two of them is a 3D-3D correspondence, and an image
+registered in both gives rotation and position at once; what is left is the scale, which the common points vote on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.geometry import rigid3
+from sfmapp.scene.reconstruction import Reconstruction
+
+# Common points that must agree on the scale. Chance agreement of this many within the tolerance is out of the question.
+MIN_COMMON_POINTS = 8
+# Depths of points near the edge of a model are good to a few per cent.
+SCALE_TOLERANCE = 0.05
+
+
+def similarity_through_image(
+    target: Reconstruction, source: Reconstruction, image_idx: int
+) -> tuple[float, NDArray[np.float64], int] | None:
+    """Scale and pose of the source's world in the target's, from an image that both have.
+
+    Args:
+        target, source: models over the same tracks.
+        image_idx: registered in both.
+
+    Returns:
+        scale and ``target_from_source`` (7,), with ``x_target = R (scale x_source) + t``, and the number of common points
+        that agree on the scale; None if fewer than MIN_COMMON_POINTS do.
+    """
+    common = np.flatnonzero(target.is_triangulated & source.is_triangulated)
+    if len(common) < MIN_COMMON_POINTS:
+        return None
+    in_target = rigid3.apply(target.cam_from_world[image_idx], target.point_xyz[common])
+    in_source = rigid3.apply(source.cam_from_world[image_idx], source.point_xyz[common])
+    in_front = (in_target[:, 2] > 0) & (in_source[:, 2] > 0)
+    ratios = np.linalg.norm(in_target[in_front], axis=1) / np.linalg.norm(in_source[in_front], axis=1)
+    if len(ratios) < MIN_COMMON_POINTS:
+        return None
+    # the ratio that most others agree with, then the median of those
+    agreeing = (np.abs(np.log(ratios[:, None] / ratios[None, :])) < SCALE_TOLERANCE).sum(1)
+    near = np.abs(np.log(ratios / ratios[np.argmax(agreeing)])) < SCALE_TOLERANCE
+    # directions count too: a common point must lie in the same direction from the shared image
+    cosine = (in_target[in_front] * in_source[in_front]).sum(1) / (
+        np.linalg.norm(in_target[in_front], axis=1) * np.linalg.norm(in_source[in_front], axis=1)
+    )
+    near &= cosine > np.cos(SCALE_TOLERANCE)
+    if near.sum() < MIN_COMMON_POINTS:
+        return None
+    scale = float(np.median(ratios[near]))
+    scaled = source.cam_from_world[image_idx].copy()
+    scaled[4:] *= scale
+    return scale, rigid3.compose(rigid3.inverse(target.cam_from_world[image_idx]), scaled), int(near.sum())
+
+
+def merge(
+    target: Reconstruction, source: Reconstruction, scale: float, target_from_source: NDArray[np.float64]
+) -> Reconstruction:
+    """A copy of the target with the images, points and observations that only the source has.
+
+    Args:
+        target, source: models over the same tracks.
+        scale, target_from_source: as returned by :func:`similarity_through_image`.
+    """
+    out = target.copy()
+    new = np.flatnonzero(source.is_registered & ~target.is_registered)
+    scaled = source.cam_from_world[new].copy()
+    scaled[:, 4:] *= scale
+    out.cam_from_world[new] = rigid3.compose(scaled, rigid3.inverse(target_from_source))
+    points = np.flatnonzero(source.is_triangulated & ~target.is_triangulated)
+    out.point_xyz[points] = rigid3.apply(target_from_source, scale * source.point_xyz[points])
+    is_new = np.zeros(len(out.point_xyz), bool)
+    is_new[points] = True
+    taken = is_new[out.tracks.obs_track_idx]
+    out.obs_is_inlier[taken] = source.obs_is_inlier[taken]
+    out.point_rgb[points] = source.point_rgb[points]
+    # cameras that the target has not met come as the source refined them
+    known = np.isin(np.arange(len(out.cameras)), target.image_camera_idx[target.is_registered])
+    for camera_idx in np.unique(source.image_camera_idx[new]):
+        if not known[camera_idx]:
+            out.cameras[camera_idx] = source.cameras[camera_idx]
+    return out
+
+
+def find_merge(target: Reconstruction, source: Reconstruction) -> tuple[float, NDArray[np.float64], int] | None:
+    """The similarity between two models through the shared image that most common points agree with, or None."""
+    shared = np.flatnonzero(target.is_registered & source.is_registered)
+    found = [similarity_through_image(target, source, int(i)) for i in shared]
+    return max((f for f in found if f is not None), key=lambda f: f[2], default=None)

@@ -1,0 +1,177 @@
+"""The incremental loop on synthetic scenes with known truth."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.errors import NoReconstructionError
+from sfmapp.events import Events
+from sfmapp.features.features import Features
+from sfmapp.geometry import rigid3
+from sfmapp.mapping.incremental import map_images
+from sfmapp.mapping.options import MappingOptions
+from sfmapp.scene.camera import CameraModel, simple_camera
+from sfmapp.scene.correspondences import TwoViewConfig
+from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.synthetic import SyntheticScene, make_scene, true_correspondences
+
+
+def inputs(scene: SyntheticScene, focal_ratio: float | None = 1.2):
+    """Image set, features and matches of a scene; cameras know no more than a default focal, or everything (None)."""
+    cameras = []
+    for camera in scene.truth.cameras:
+        guess = simple_camera(camera.model, camera.width, camera.height, (focal_ratio or 1) * camera.width)
+        cameras.append(camera if focal_ratio is None else guess)
+    records = [
+        SimpleNamespace(name=name, camera_idx=int(c))
+        for name, c in zip(scene.truth.image_names, scene.truth.image_camera_idx, strict=True)
+    ]
+    features = []
+    for i in range(len(records)):
+        xy = scene.keypoints(i)
+        keypoints = np.concatenate([xy, np.ones_like(xy)], 1).astype(np.float32)
+        features.append(Features(keypoints, np.zeros((len(xy), 128), np.uint8), np.full((len(xy), 3), 7, np.uint8)))
+    return SimpleNamespace(images=records, cameras=tuple(cameras), skipped=()), features, true_correspondences(scene)
+
+
+def reconstruct(scene: SyntheticScene, focal_ratio: float | None = 1.2, threads: int = 1, **options):
+    image_set, features, found = inputs(scene, focal_ratio)
+    return map_images(
+        image_set, features, found, MappingOptions(**options), adjust_options=AdjustOptions(), threads=threads,
+        events=Events(),
+    )  # fmt: skip
+
+
+def center_errors(model: Reconstruction, truth: Reconstruction) -> np.ndarray:
+    """Distances of the centres after a similarity fit, as a share of the scene's size."""
+    common = model.is_registered
+    a, b = model.centers[common], truth.centers[common]
+    a0, b0 = a - a.mean(0), b - b.mean(0)
+    u, s, vt = np.linalg.svd(b0.T @ a0)
+    d = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
+    scale = (s * np.diag(d)).sum() / (a0**2).sum()
+    return np.linalg.norm(scale * a0 @ (u @ d @ vt).T - b0, axis=1) / np.sqrt((b0**2).sum(1).mean())
+
+
+@pytest.mark.parametrize("layout", ["ring", "grid"])
+def test_every_image_is_registered_and_errors_have_the_size_of_the_noise(layout):
+    scene = make_scene(1, 14, 1500, layout=layout, sigma_px=0.5)
+    models, report = reconstruct(scene)
+    assert len(models) == 1
+    assert models[0].is_registered.all()
+    error = center_errors(models[0], scene.truth)
+    # half a pixel over a focal of 900 is 5.6e-4; hundreds of points average it, the free intrinsics take some back
+    assert 1e-5 < np.median(error) < 3e-3
+    rms = models[0].summary()["rms_reprojection_error_px"]
+    assert 0.5 < rms < 0.5 * np.sqrt(2) * 1.03  # fitted parameters can only take away
+    assert [entry["model"] for entry in report["images"]] == [0] * 14
+
+
+def test_exact_observations_give_the_exact_scene():
+    scene = make_scene(2, 10, 800, sigma_px=0.0)
+    models, _ = reconstruct(scene, focal_ratio=None)
+    assert models[0].is_registered.all()
+    assert center_errors(models[0], scene.truth).max() < 1e-5
+    assert models[0].summary()["rms_reprojection_error_px"] < 1e-4
+
+
+def test_wrong_observations_are_left_out():
+    # a random observation is not matched by the true correspondences, but what is mapped must not suffer
+    scene = make_scene(3, 12, 1200, sigma_px=0.5, outlier_ratio=0.2)
+    models, _ = reconstruct(scene)
+    assert models[0].is_registered.all()
+    assert np.median(center_errors(models[0], scene.truth)) < 4e-3
+
+
+def test_same_bytes_on_any_number_of_threads():
+    scene = make_scene(4, 10, 800)
+    one, two = reconstruct(scene, threads=1)[0][0], reconstruct(scene, threads=2)[0][0]
+    assert one.cam_from_world.tobytes() == two.cam_from_world.tobytes()
+    assert one.point_xyz.tobytes() == two.point_xyz.tobytes()
+    assert one.obs_is_inlier.tobytes() == two.obs_is_inlier.tobytes()
+
+
+@pytest.mark.parametrize("ratio", [0.7, 2.0])
+def test_unknown_focal_length_is_found(ratio):
+    camera = simple_camera(CameraModel.SIMPLE_RADIAL, 1000, 750, ratio * 1000)
+    scene = make_scene(5, 9, 1500, camera, layout="grid", sigma_px=0.5)
+    models, report = reconstruct(scene)
+    assert models[0].is_registered.all()
+    assert models[0].cameras[0].focal == pytest.approx(ratio * 1000, rel=0.03)
+    assert report["focal"]["num_pairs"] > 0
+
+
+def test_one_camera_per_image():
+    cameras = [simple_camera(CameraModel.SIMPLE_RADIAL, 1000, 750, f) for f in np.linspace(700, 1500, 12)]
+    scene = make_scene(6, 12, 1500, cameras, sigma_px=0.5)
+    models, _ = reconstruct(scene)
+    assert models[0].is_registered.all()
+    focal = np.array([c.focal for c in models[0].cameras])
+    np.testing.assert_allclose(focal, np.linspace(700, 1500, 12), rtol=0.05)
+
+
+def test_a_scene_in_two_parts_makes_two_models():
+    scene = make_scene(7, 16, 1500, sigma_px=0.3)
+    image_set, features, found = inputs(scene)
+    first = np.arange(16) < 9
+    across = first[found.pair_image_idx[:, 0]] != first[found.pair_image_idx[:, 1]]
+    keep = np.flatnonzero(~across)
+    counts = found.num_inliers[keep]
+    from dataclasses import fields, replace
+
+    per_pair = {
+        f.name: getattr(found, f.name)[keep] for f in fields(found) if f.name not in ("pair_ptr", "matches")
+    }
+    parted = replace(
+        found, **per_pair, pair_ptr=np.concatenate([[0], np.cumsum(counts)]),
+        matches=np.concatenate([found.matches_of_pair(p) for p in keep]),
+    )  # fmt: skip
+    models, report = map_images(
+        image_set, features, parted, MappingOptions(), adjust_options=AdjustOptions(), threads=1, events=Events()
+    )
+    assert [int(m.is_registered.sum()) for m in models] == [9, 7]
+    assert [entry["model"] for entry in report["images"]] == [0] * 9 + [1] * 7
+
+
+@pytest.mark.parametrize(
+    "config", [TwoViewConfig.PANORAMIC, TwoViewConfig.PLANAR_OR_PANORAMIC, TwoViewConfig.WATERMARK]
+)
+def test_pairs_without_depth_start_nothing(config):
+    scene = make_scene(8, 5, 400)
+    image_set, features, found = inputs(scene)
+    found.config[:] = config
+    with pytest.raises(NoReconstructionError, match="no initial pair") as caught:
+        map_images(
+            image_set, features, found, MappingOptions(), adjust_options=AdjustOptions(), threads=1, events=Events()
+        )
+    assert caught.value.report["images"][0]["reason"]
+    assert caught.value.advice
+
+
+def test_no_matches_is_a_clear_answer():
+    scene = make_scene(9, 3, 100)
+    image_set, features, found = inputs(scene)
+    found.config[:] = TwoViewConfig.UNDEFINED
+    with pytest.raises(NoReconstructionError, match="no two images share"):
+        map_images(
+            image_set, features, found, MappingOptions(min_pose_inliers=10_000), adjust_options=AdjustOptions(),
+            threads=1, events=Events(),
+        )  # fmt: skip
+
+
+def test_an_image_that_cannot_be_registered_is_explained():
+    scene = make_scene(10, 8, 600, sigma_px=0.3)
+    image_set, features, found = inputs(scene)
+    touching = (found.pair_image_idx == 7).any(1)
+    found.config[touching] = TwoViewConfig.UNDEFINED
+    models, report = map_images(
+        image_set, features, found, MappingOptions(), adjust_options=AdjustOptions(), threads=1, events=Events()
+    )
+    assert int(models[0].is_registered.sum()) == 7
+    assert "verified matches" in report["images"][7]["reason"] or "points of the map" in report["images"][7]["reason"]
+    angle = rigid3.rotation_angle_deg(rigid3.rotation_matrix(models[0].cam_from_world[:7]))
+    assert np.isfinite(angle).all()
