@@ -100,20 +100,22 @@ def _worst_px(ours: Reconstruction, theirs: Reconstruction) -> float:
     with_theirs.cameras, with_theirs.image_camera_idx = theirs.cameras, theirs.image_camera_idx
     with_theirs.cam_from_world, with_theirs.point_xyz = theirs.cam_from_world, theirs.point_xyz
     residuals = ours.residuals_px()
-    differences = [with_theirs.residuals_px() - residuals]
+    worst = _largest_difference(with_theirs.residuals_px(), residuals)
     if theirs.tracks.num_observations:  # the format holds pixels as well
-        if theirs.tracks.num_observations != len(residuals):
-            raise InputError(
-                f"expected to read back {len(residuals)} observations, found {theirs.tracks.num_observations}"
-            )
-        differences.append(theirs.residuals_px() - residuals)
-    worst = 0.0
-    for difference in differences:
-        # behind a camera in both is no difference, in one of them it is
-        both_missing = np.isnan(with_theirs.residuals_px()) & np.isnan(residuals)
-        lengths = np.linalg.norm(np.where(both_missing, 0.0, difference), axis=1)
-        worst = max(worst, float(np.where(np.isnan(lengths), np.inf, lengths).max(initial=0.0)))
+        found = theirs.residuals_px()
+        if len(found) != len(residuals):
+            raise InputError(f"expected to read back {len(residuals)} observations, found {len(found)}")
+        worst = max(worst, _largest_difference(found, residuals))
     return worst
+
+
+def _largest_difference(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Of vectors (O, 2); behind a camera (NaN) in both is no difference, in one of them an infinite one."""
+    missing = np.isnan(a).any(1), np.isnan(b).any(1)
+    lengths = np.linalg.norm(a - b, axis=1)
+    lengths[missing[0] & missing[1]] = 0.0
+    lengths[missing[0] != missing[1]] = np.inf
+    return float(lengths.max(initial=0.0))
 
 
 def _export_colmap(

@@ -1,0 +1,97 @@
+"""Export: every format is read back and re-projected."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sfmapp.errors import InputError, NoReconstructionError, UsageError
+from sfmapp.formats import ply
+from sfmapp.formats.colmap import read_model, write_model
+from sfmapp.formats.nerfstudio import read_nerfstudio
+from sfmapp.pipelines.export import EXPORTS, export_model
+from sfmapp.scene.camera import CameraModel
+from sfmapp.scene.synthetic import synthetic_camera
+from test_formats_exchange import centered_camera, scene
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Path:
+    """A workspace as far as export knows one: the photographs, a manifest and a model."""
+    (tmp_path / "photos").mkdir()
+    folder = tmp_path / "out"
+    write_model(folder / "sparse" / "0", scene([centered_camera(), centered_camera(700.0)]))
+    manifest = {"format": "sfmapp workspace 1", "source": str(tmp_path / "photos"), "stages": {}, "inputs": {}}
+    (folder / "run.json").write_text(json.dumps(manifest))
+    return folder
+
+
+@pytest.mark.parametrize("target", list(EXPORTS))
+def test_every_format_is_read_back(workspace: Path, tmp_path: Path, target: str) -> None:
+    report = export_model(workspace, target, tmp_path / "copy")
+    model = read_model(workspace / "sparse" / "0")[0]
+    assert report["format"] == target
+    assert report["num_images"] == 4
+    assert report["num_points"] == model.tracks.num_tracks
+    assert report["num_observations"] == model.tracks.num_observations
+    # numbers are written in full but for the points of ply, which are float32
+    assert report["max_px"] < (1e-3 if target in ("ply", "nerfstudio") else 1e-7)
+    assert report["max_coordinate"] < 1e-6 * np.ptp(model.point_xyz, axis=0).max()
+    assert all(Path(file).is_file() for file in report["files"])
+    json.dumps(report)
+
+
+def test_images_are_found_from_transforms_json(workspace: Path, tmp_path: Path) -> None:
+    for path in (tmp_path / "nerf", tmp_path / "nerf" / "deep" / "mine.json"):
+        (file, _) = export_model(workspace, "nerfstudio", path)["files"]
+        for name in read_nerfstudio(file).image_names:
+            assert (Path(file).parent / name).resolve().parent == (tmp_path / "photos").resolve()
+
+
+def test_a_model_folder_will_do(workspace: Path, tmp_path: Path) -> None:
+    report = export_model(workspace / "sparse" / "0", "ply", tmp_path / "cloud.ply")
+    assert report["files"] == [str(tmp_path / "cloud.ply")]
+    (workspace / "run.json").unlink()
+    assert export_model(workspace, "colmap-text", tmp_path / "text")["reader"] == "pycolmap"
+    assert export_model(tmp_path / "text", "colmap-bin", tmp_path / "bin")["max_px"] < 1e-9
+
+
+@pytest.mark.parametrize("model", list(CameraModel))
+def test_every_camera_model_goes_to_nerfstudio_and_colmap(tmp_path: Path, model: CameraModel) -> None:
+    write_model(tmp_path / "m", scene([synthetic_camera(model)]))
+    for target in ("nerfstudio", "colmap-text"):
+        assert export_model(tmp_path / "m", target, tmp_path / target)["max_px"] < 1e-3
+
+
+def test_a_wrong_copy_is_noticed(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    right = ply.write_ply
+
+    def shifted(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
+        right(path, xyz + np.array([0.01, 0, 0]), rgb)
+
+    monkeypatch.setattr(ply, "write_ply", shifted)
+    report = export_model(workspace, "ply", tmp_path / "p.ply")
+    assert report["max_coordinate"] == pytest.approx(0.01, rel=1e-3)
+    assert report["max_px"] > 0.5
+    monkeypatch.setattr(ply, "write_ply", lambda path, xyz, rgb: right(path, xyz[1:], rgb[1:]))
+    with pytest.raises((InputError, ValueError)):
+        export_model(workspace, "ply", tmp_path / "p.ply")
+
+
+def test_refusals(workspace: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="unknown export format 'obj'"):
+        export_model(workspace, "obj", tmp_path / "x")
+    with pytest.raises(UsageError, match="the model itself"):
+        export_model(workspace, "colmap-bin", workspace / "sparse" / "0")
+    write_model(tmp_path / "m", scene([synthetic_camera(CameraModel.OPENCV)]))
+    with pytest.raises(UsageError, match="tangential"):
+        export_model(tmp_path / "m", "bundler", tmp_path / "b")
+    with pytest.raises(InputError, match="COLMAP model"):
+        export_model(tmp_path / "absent", "ply", tmp_path / "x.ply")
+    shutil.rmtree(workspace / "sparse")
+    with pytest.raises(NoReconstructionError, match="holds no model"):
+        export_model(workspace, "ply", tmp_path / "x.ply")
