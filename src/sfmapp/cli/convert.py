@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sfmapp.cli.common import add_output_flags, print_json
 
-FORMATS = ("colmap", "colmap-text", "ply", "bundler", "nerfstudio")
+FORMATS = ("colmap-bin", "colmap-text", "ply", "bundler", "nerfstudio")
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -24,9 +24,9 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _export(args: argparse.Namespace) -> int:
-    from sfmapp.pipelines.export import export
+    from sfmapp.pipelines.export import export_model
 
-    result = export(args.output, args.to, args.path)
+    result = export_model(args.output, args.to, args.path)
     if args.json:
         print_json({"exit_code": 0, **result})
     else:
