@@ -57,7 +57,7 @@ def test_a_model_folder_will_do(workspace: Path, tmp_path: Path) -> None:
     assert report["files"] == [str(tmp_path / "cloud.ply")]
     (workspace / "run.json").unlink()
     assert export_model(workspace, "colmap-text", tmp_path / "text")["reader"] == "pycolmap"
-    assert export_model(tmp_path / "text", "colmap", tmp_path / "bin")["max_px"] < 1e-9
+    assert export_model(tmp_path / "text", "colmap-bin", tmp_path / "bin")["max_px"] < 1e-9
 
 
 @pytest.mark.parametrize("model", list(CameraModel))
@@ -86,7 +86,7 @@ def test_refusals(workspace: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="unknown export format 'obj'"):
         export_model(workspace, "obj", tmp_path / "x")
     with pytest.raises(UsageError, match="the model itself"):
-        export_model(workspace, "colmap", workspace / "sparse" / "0")
+        export_model(workspace, "colmap-bin", workspace / "sparse" / "0")
     write_model(tmp_path / "m", scene([synthetic_camera(CameraModel.OPENCV)]))
     with pytest.raises(UsageError, match="tangential"):
         export_model(tmp_path / "m", "bundler", tmp_path / "b")

@@ -175,7 +175,7 @@ def _file_in(path: Path, ending: str, name: str) -> Path:
 
 
 EXPORTS: dict[str, Callable[[_Source, Path], _Copy]] = {
-    "colmap": _export_colmap(write_model, "bin"),
+    "colmap-bin": _export_colmap(write_model, "bin"),
     "colmap-text": _export_colmap(write_model_text, "txt"),
     "ply": _export_ply,
     "bundler": _export_bundler,
