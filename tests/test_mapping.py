@@ -98,7 +98,7 @@ def test_same_bytes_on_any_number_of_threads():
 @pytest.mark.parametrize("ratio", [0.7, 2.0])
 def test_unknown_focal_length_is_found(ratio):
     camera = simple_camera(CameraModel.SIMPLE_RADIAL, 1000, 750, ratio * 1000)
-    scene = make_scene(5, 9, 1500, camera, layout="grid", sigma_px=0.5)
+    scene = make_scene(5, 10, 1500, camera, layout="grid" if ratio < 1 else "ring", sigma_px=0.5)
     models, report = reconstruct(scene)
     assert models[0].is_registered.all()
     assert models[0].cameras[0].focal == pytest.approx(ratio * 1000, rel=0.03)

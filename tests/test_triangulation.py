@@ -86,11 +86,3 @@ def test_classification_drops_and_restores():
     np.testing.assert_array_equal(
         away.obs_is_inlier[kept[away.tracks.obs_track_idx]], model.obs_is_inlier[kept[model.tracks.obs_track_idx]]
     )
-
-
-def test_widest_angle_of_a_right_triangle():
-    centers = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    angles = triangulation.widest_angles(
-        np.array([0]), np.array([0, 2]), np.array([0, 1], np.int32), np.ones(2, bool), centers, np.zeros((1, 3))
-    )
-    assert angles[0] == pytest.approx(math.pi / 2)

@@ -301,26 +301,3 @@ def classify_observations(
         for o in range(track_ptr[t], track_ptr[t + 1]):
             obs_is_inlier[o] = False
     return dropped
-
-
-@numba.njit(cache=True, nogil=True)
-def widest_angles(
-    tracks: Ints, track_ptr: Ints, obs_image_idx: Int32s, obs_is_inlier: Bools, image_centers: Array, point_xyz: Array
-) -> Array:
-    """(K,) radians: widest angle under which the inlier observations of each track see its point."""
-    longest = 2
-    for t in tracks:
-        longest = max(longest, track_ptr[t + 1] - track_ptr[t])
-    centers = np.empty((longest, 3))
-    used = np.ones(longest, np.bool_)
-    out = np.empty(len(tracks))
-    for n in range(len(tracks)):
-        t = tracks[n]
-        k = 0
-        for o in range(track_ptr[t], track_ptr[t + 1]):
-            if obs_is_inlier[o]:
-                for a in range(3):
-                    centers[k, a] = image_centers[obs_image_idx[o], a]
-                k += 1
-        out[n] = math.acos(max(-1.0, min(1.0, _min_cosine(point_xyz[t], centers, used, k, -2.0))))
-    return out

@@ -475,3 +475,26 @@ def _image_reports(
             entry["reason"] = "shares too few verified matches with any model"
         reports.append(entry)
     return reports
+
+
+def compile_kernels() -> None:
+    """Compile the kernels of mapping and adjustment, or load them from numba's cache: one round on a tiny scene."""
+    from sfmapp.geometry import epipolar
+    from sfmapp.scene.synthetic import make_scene, true_correspondences
+
+    scene = make_scene(0, 3, 24)
+    model, options = scene.observed, MappingOptions()
+    features = [
+        Features(np.zeros((len(scene.keypoints(i)), 4), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.uint8))
+        for i in range(3)
+    ]
+    build_tracks(true_correspondences(scene, min_matches=1), features)
+    with ThreadPoolExecutor(1) as pool:
+        structure.triangulate(model, np.arange(24), options, pool)
+        structure.filter_observations(model, options, pool)
+    rank_next_images(model, np.arange(3))
+    epipolar.compile_kernels()
+    for variable in (True, False):
+        images = np.array([variable, variable, True])
+        adjust_bundle(model, AdjustOptions(max_iterations=1), variable_images=images)
+    model.residuals_px()
