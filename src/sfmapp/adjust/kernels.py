@@ -33,7 +33,7 @@ _MIN_COS = 1e-6
 def robust_weight(loss: int, scale2: float, s: float) -> float:
     """rho'(s), the weight of a squared residual s (Holland and Welsch 1977).
 
-    Triggs's second-order term is left out, as in Ceres for these losses: it was measured to cost more steps than it saves.
+    Triggs's second-order term is left out, as in Ceres for these losses: measured, it costs more steps than it saves.
     """
     if loss == 0:
         return 1.0
@@ -68,9 +68,9 @@ def total_loss(scale2: float, total: float, product: float) -> float:
 def linearize(pose, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, intrinsics, J):  # type: ignore[no-untyped-def]
     """Weighted Jacobians and residual of one observation into the scratch row J; returns the squared residual.
 
-    pose: 12 numbers, R row by row and t. c: canonical intrinsics, whose derivatives are wanted if ``intrinsics``. Behind
-    the camera the Jacobians are zero and both residuals count as twice the focal length, gtsam's choice, so that a point
-    gains nothing by slipping there.
+    pose: 12 numbers, R row by row and t. c: canonical intrinsics, whose derivatives are wanted if ``intrinsics``.
+    Behind the camera the Jacobians are zero and both residuals count as twice the focal length, gtsam's choice, so that
+    a point gains nothing by slipping there.
     """
     px = pose[0] * x0 + pose[1] * x1 + pose[2] * x2 + pose[9]
     py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]

@@ -148,6 +148,15 @@ def pose_rows(poses: Array) -> Array:
     return np.concatenate([rigid3.rotation_matrix(poses).reshape(-1, 9), poses[:, 4:]], 1)
 
 
+def free_values(problem: Problem, canonical: Array, camera: int) -> Array:
+    """(Q,) values of the free parameters of a local camera."""
+    free = problem.free
+    begin, end = free.ptr[camera], free.ptr[camera + 1]
+    columns, values = free.column[begin:end], np.zeros(len(free.params[camera]))
+    values[columns - columns.min(initial=8)] = canonical[camera, free.slot[begin:end]]
+    return values
+
+
 def _number_blocks(
     varies: Mask, image_camera: NDArray[np.int32], params: list[NDArray[np.int64]], merge: bool
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:

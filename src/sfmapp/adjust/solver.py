@@ -1,4 +1,4 @@
-"""Bundle adjustment: points eliminated by our kernels, cameras solved in tiles or by gtsam, Levenberg-Marquardt around."""
+"""Bundle adjustment: our kernels eliminate the points, dense tiles or gtsam solve for the cameras, damped steps."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust import kernels
+from sfmapp.adjust.kernels import find_slot
 from sfmapp.adjust.linear import aligned_zeros, assemble, factorize_tiles, hash_tiles, solve_tiles
-from sfmapp.adjust.problem import Problem, make_problem, pose_rows
+from sfmapp.adjust.problem import Problem, free_values, make_problem, pose_rows
 from sfmapp.events import Events
 from sfmapp.scene.camera import PARAM_NAMES, Camera
 from sfmapp.scene.reconstruction import Reconstruction
@@ -23,7 +24,7 @@ Mask = NDArray[np.bool_]
 Loss = Literal["trivial", "huber", "cauchy"]
 LOSS_IDS: dict[str, int] = {"trivial": kernels.TRIVIAL, "huber": kernels.HUBER, "cauchy": kernels.CAUCHY}
 
-# Up to this many blocks the tiles of all pairs fit a cache and the dense factor beats gtsam's sparse one.
+# Up to this many blocks the dense tile factor beats gtsam's sparse one.
 _MAX_DENSE_BLOCKS = 160
 # Work worth a chunk of its own, and the most memory that the chunks' private sums may take together.
 _CHUNK_OBSERVATIONS, _MAX_CHUNKS, _CHUNK_BYTES = 16384, 8, 1 << 28
@@ -133,8 +134,9 @@ def adjust_bundle(
         points=points, constant_points=constant_points, extra_images=extras.images if extras else (),
         extra_cameras=extras.cameras if extras else (),
     )  # fmt: skip
-    priors = IntrinsicPriors(problem, prior_cameras, options)
-    engine = Engine(problem, options, priors, extras)
+    if extras is not None:
+        extras.attach(problem)
+    engine = Engine(problem, options, IntrinsicPriors(problem, prior_cameras, options), extras)
     with ThreadPoolExecutor(max(1, min(threads, engine.num_chunks))) as pool:
         run = map if threads <= 1 or engine.num_chunks == 1 else pool.map
         try:
@@ -157,18 +159,9 @@ def write_back(problem: Problem, reconstruction: Reconstruction) -> None:
     for c, camera_idx in enumerate(problem.camera_idx):
         if problem.camera_block[c] >= 0:
             camera = reconstruction.cameras[camera_idx]
-            reconstruction.cameras[camera_idx] = camera.with_params(free_values(problem, c, camera.params)[0])
-
-
-def free_values(problem: Problem, camera: int, params: Array) -> tuple[Array, Array]:
-    """All parameters of a local camera with the problem's values in the free places, and (Q,) the free ones alone."""
-    free, out = problem.free, np.array(params)
-    begin, end = free.ptr[camera], free.ptr[camera + 1]
-    columns = free.column[begin:end]
-    values = np.zeros(len(free.params[camera]))
-    values[columns - columns.min(initial=8)] = problem.canonical[camera, free.slot[begin:end]]
-    out[free.params[camera]] = values
-    return out, values
+            params = np.array(camera.params)
+            params[problem.free.params[c]] = free_values(problem, problem.canonical, c)
+            reconstruction.cameras[camera_idx] = camera.with_params(params)
 
 
 class IntrinsicPriors:
@@ -219,10 +212,16 @@ class Engine:
         empty = np.zeros(0, np.int64)
         self.hash_keys, self.hash_values, self.num_tiles = empty, empty, blocks * blocks
         if self.solver == "sparse":
-            diagonal = np.arange(blocks) * (blocks + 1)
+            from sfmapp.adjust.factors import SparseSystem
+
+            pairs = np.arange(blocks) * (blocks + 1)
+            if extras is not None:
+                pairs = np.concatenate([pairs, extras.pairs])
             self.hash_keys, self.hash_values, self.num_tiles = hash_tiles(
-                p.point_ptr, p.obs_image, p.image_camera, p.image_block, p.camera_block, blocks, diagonal
+                p.point_ptr, p.obs_image, p.image_camera, p.image_block, p.camera_block, blocks, pairs
             )
+            used = self.hash_keys >= 0
+            self.sparse = SparseSystem(p, self.hash_keys[used], self.hash_values[used])
         fitting = max(1, _CHUNK_BYTES // max(1, self.num_tiles * 512))
         self.num_chunks = int(np.clip(p.num_observations // _CHUNK_OBSERVATIONS, 1, min(_MAX_CHUNKS, fitting)))
         shares = np.linspace(0, p.num_observations, self.num_chunks + 1)
@@ -258,8 +257,7 @@ class Engine:
         own, gradient = np.zeros(p.num_blocks * 64), np.zeros(p.num_blocks * 8)
         self.priors.add(p.canonical, own, gradient)
         if self.extras is not None:
-            self.extras.linearize(p)
-            self.extras.add_diagonal(own, gradient)
+            self.extras.linearize(own, gradient)
         assemble(
             self.tiles, self.own, self.cross, self.gradient, p.image_block, p.image_camera, p.camera_block, p.block_dim,
             self.hash_keys, self.hash_values, own, gradient, self.diagonal,
@@ -269,26 +267,29 @@ class Engine:
     def other_cost(self, poses: Array, canonical: Array) -> float:
         """Cost of priors and extra factors."""
         cost = self.priors.cost(canonical)
-        return cost + self.extras.cost(self.problem, poses, canonical) if self.extras is not None else cost
+        return cost + self.extras.cost(poses, canonical) if self.extras is not None else cost
 
     def solve(self) -> Array | None:
         """Step of the blocks (B * 8,), or None where the damped system is not positive definite."""
-        p, blocks = self.problem, self.problem.num_blocks
+        p, blocks, tiles = self.problem, self.problem.num_blocks, self.tiles[0]
         step = -(self.gradient[0, 0] + self.gradient[0, 1])
-        if self.solver == "sparse":
-            from sfmapp.adjust.factors import solve_sparse
-
-            return solve_sparse(self, step)
-        tiles = self.tiles[0]
         if self.extras is not None:
-            self.extras.add_pairs(tiles, blocks)
-        place = (np.arange(blocks) * (blocks + 1))[:, None] * 64 + np.arange(8) * 9
+            self.extras.add_pairs(tiles, self.tile_numbers(self.extras.pairs))
+        place = self.tile_numbers(np.arange(blocks) * (blocks + 1))[:, None] * 64 + np.arange(8) * 9
         used = np.arange(8) < p.block_dim[:, None]
         tiles[place[used]] += self.damping * self.diagonal.reshape(-1, 8)[used]
+        if self.solver == "sparse":
+            return self.sparse.solve(tiles.reshape(-1, 8, 8), step)
         if not factorize_tiles(tiles, blocks, self.inverse):
             return None
         solve_tiles(tiles, blocks, self.inverse, step)
         return step if np.isfinite(step).all() else None
+
+    def tile_numbers(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Tiles of block pairs a B + b."""
+        if self.solver == "dense":
+            return keys
+        return np.array([find_slot(self.hash_keys, self.hash_values, key) for key in keys], np.int64)
 
     def attempt(self, step: Array, run: Callable[..., Any]) -> tuple[float, float, float]:
         """Try a step: cost of the new state, predicted decrease, and the move as a share of the distances."""
