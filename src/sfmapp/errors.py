@@ -6,6 +6,8 @@ exit code. A message names the file or option, what was expected and what was fo
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class SfmError(Exception):
     """Base of all expected failures.
@@ -35,9 +37,14 @@ class InputError(SfmError):
 
 
 class NoReconstructionError(SfmError):
-    """The photographs were read but hold no reconstruction. The report is still written."""
+    """The photographs were read but hold no reconstruction. The report is still written.
+
+    Attributes:
+        report: of the stage that found no way, as it would have returned it; None if none was reached.
+    """
 
     exit_code = 4
+    report: dict[str, Any] | None = None
 
 
 class TooFewImagesError(SfmError):

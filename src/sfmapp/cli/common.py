@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from sfmapp.events import Events
 
 
-def add_output_flags(parser: argparse.ArgumentParser) -> None:
-    """Flags on how much is said, and in which form."""
+def add_output_flags(parser: argparse.ArgumentParser, *, has_log: bool = False) -> None:
+    """Flags on how much is said, and in which form. ``has_log``: the command writes ``OUT/log.jsonl``."""
+    parser.set_defaults(has_log=has_log)
     group = parser.add_argument_group("output")
     loudness = group.add_mutually_exclusive_group()
     loudness.add_argument("-q", "--quiet", action="store_true", help="say only what went wrong")

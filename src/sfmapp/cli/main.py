@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if args.verbose:
             raise
         message = " ".join(f"{type(error).__name__}: {error}".split())
-        where = "the traceback is in log.jsonl of OUT; -v shows it" if hasattr(args, "output") else "-v shows where"
+        where = "the traceback is in OUT/log.jsonl; -v shows it" if args.has_log else "-v shows where"
         return _fail(args, f"a bug in sfmapp: {message}", f"please report it ({where})", BUG)
 
 

@@ -35,7 +35,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="folder of the results, made if need be")
     parser.add_argument("--list-options", action="store_true", help="list every stage.option and its default")
     _add_option_flags(parser)
-    add_output_flags(parser)
+    add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_reconstruct, parser=parser)
 
     parser = commands.add_parser(
@@ -44,7 +44,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )  # fmt: skip
     parser.add_argument("-o", "--output", metavar="OUT", type=Path, default=Path("demo"), help="default: demo")
     _add_option_flags(parser)
-    add_output_flags(parser)
+    add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_demo, parser=parser)
 
 
@@ -113,10 +113,11 @@ def _demo(args: argparse.Namespace) -> int:
     if not args.quiet:
         _print_summary(args.output, report)
     center, rotation = errors["center_error"], errors["rotation_error_deg"]
+    whose = f"{errors['num_compared']} of {errors['num_reference_images']} images, {errors['scene_size']:.1f} m apart"
     print(
         f"against the truth: camera centres off by {1000 * center['mean']:.2f} mm on average,"
         f" {1000 * center['max']:.2f} mm at worst; rotations by {rotation['mean']:.4f} and {rotation['max']:.4f}"
-        f" degrees ({errors['num_compared']} of {errors['num_reference_images']} images, {errors['scene_size']:.1f} m apart)"
+        f" degrees ({whose})"
     )
     return 0
 

@@ -56,7 +56,7 @@ def _compile(events: Events, usage: dict[str, dict[str, Any]]) -> None:
 def _listener(events: Events) -> Any:
     from numba.core.event import Event, Listener
 
-    class Compilations(Listener):  # type: ignore[misc]
+    class Compilations(Listener):
         """Tells of compilations; a kernel that comes from the cache is none."""
 
         num_compiled = 0

@@ -26,6 +26,7 @@ from sfmapp.pipelines.run import Run
 from sfmapp.pipelines.store import Store
 from sfmapp.pipelines.usage import Stopwatch
 from sfmapp.pipelines.workspace import open_workspace
+from sfmapp.viewer.listener import RecordingListener
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet
@@ -80,10 +81,11 @@ def reconstruct(
         # our workers use the cores; sums must not depend on how many the linear algebra beneath them would use
         threadpool_limits(1, "blas"),
     ):
-        decisions = DecisionLog()
-        for listener in (event_log, decisions):
-            events.subscribe(listener)
-        run = Run(source, workspace, options, events, watch or Stopwatch(), decisions, threads, record)
+        decisions, recorder = DecisionLog(), RecordingListener() if record else None
+        for listener in (event_log, decisions, recorder):
+            if listener is not None:
+                events.subscribe(listener)
+        run = Run(source, workspace, options, events, watch or Stopwatch(), decisions, threads, recorder)
         report = _run(run)
         model, _ = read_model(workspace.model())
     found = report["models"][0]["num_registered"]

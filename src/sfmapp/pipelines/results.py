@@ -7,6 +7,8 @@ import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 import sfmapp
 from sfmapp.errors import NoReconstructionError
 from sfmapp.pipelines.options import options_to_dict
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
     from sfmapp.pipelines.run import Run
     from sfmapp.scene.reconstruction import Reconstruction
 
+# what the manifest says of a recording
+WRITTEN, FAILED, NO_MODEL, NOT_WANTED = "written", "failed", "no model", "not wanted"
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 
 
@@ -32,8 +36,8 @@ def earlier_report(run: Run, keys: StageKeys) -> dict[str, Any] | None:
     report = workspace.read_json("report.json")
     if not workspace.is_current("mapping", keys.mapping) or not report or report.get("format") != FORMAT:
         return None
-    recorded = not run.should_record or workspace.recording.is_file() or workspace.manifest.get("recording") == "failed"
-    if not recorded or not (workspace.folder / "report.html").is_file():
+    has_recording = workspace.recording.is_file() or workspace.manifest.get("recording") in (NO_MODEL, FAILED)
+    if (run.recorder is not None and not has_recording) or not (workspace.folder / "report.html").is_file():
         return None
     outcome = report["outcome"]
     if outcome["exit_code"] == NoReconstructionError.exit_code:
@@ -63,11 +67,13 @@ def write_results(
 ) -> dict[str, Any]:
     """Write the models, the recording and the report, in this order; returns the report."""
     workspace, manifest = run.workspace, run.workspace.manifest
-    if failure is not None and hasattr(failure, "report"):
+    if failure is not None and failure.report is not None:
         run.stages["mapping"] = failure.report
     workspace.begin("mapping", keys.mapping)
     with run.stage("output"):
-        workspace.write_models(models, [features.keypoints for features in run.features])
+        workspace.write_models(models, [features.keypoints[:, :2].astype(np.float64) for features in run.features])
+    with run.stage("recording"):
+        manifest["recording"] = _record(run, models)
     report = _make_report(run, models, failure)
     workspace.write_text("report.html", render_html(report, models[0] if models else None))
     report["run"] |= run.watch.read()  # the last measurement that can still be written down
@@ -76,6 +82,26 @@ def write_results(
     manifest["usage"] = run.usage
     workspace.save()
     return report
+
+
+def _record(run: Run, models: Sequence[Reconstruction]) -> str:
+    """Write the recording, or take away one that shows other results; a failure is a warning. Returns its state."""
+    path = run.workspace.recording
+    if run.recorder is None or not models or run.image_set is None:
+        path.unlink(missing_ok=True)
+        return NO_MODEL if run.recorder is not None else NOT_WANTED
+    from sfmapp.viewer.recording import write_recording
+
+    seen = run.recorder
+    outcome = write_recording(
+        path, run.image_set, run.features, models, seen.steps, seen.messages,
+        title=os.path.basename(os.path.abspath(run.source)), threads=run.threads,
+    )  # fmt: skip
+    if not outcome.problem:
+        return WRITTEN
+    path.unlink(missing_ok=True)
+    run.events.warned("recording", f"no recording: {outcome.problem}")
+    return FAILED
 
 
 def _make_report(run: Run, models: Sequence[Reconstruction], failure: NoReconstructionError | None) -> dict[str, Any]:

@@ -13,11 +13,12 @@ from sfmapp.pipelines.listeners import DecisionLog
 from sfmapp.pipelines.options import Options
 from sfmapp.pipelines.usage import Stopwatch
 from sfmapp.pipelines.workspace import Workspace
+from sfmapp.viewer.listener import RecordingListener
 
 if TYPE_CHECKING:
-    from sfmapp.features.features import Features
     from sfmapp.images.image_set import ImageSet
     from sfmapp.scene.correspondences import Correspondences
+    from sfmapp.scene.features import Features
 
 
 @dataclass
@@ -27,7 +28,7 @@ class Run:
     Attributes:
         source: what the user gave as images.
         threads: workers.
-        should_record: a recording is wanted.
+        recorder: watches the run for a recording; None if none is wanted.
         usage: wall and CPU seconds and peak memory of each stage, by name.
         stages: the report of each stage, by name.
         image_set, features, correspondences: results so far.
@@ -40,7 +41,7 @@ class Run:
     watch: Stopwatch
     log: DecisionLog
     threads: int
-    should_record: bool
+    recorder: RecordingListener | None
     usage: dict[str, dict[str, Any]] = field(default_factory=dict)
     stages: dict[str, Any] = field(default_factory=dict)
     image_set: ImageSet | None = None

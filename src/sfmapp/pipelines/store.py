@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.features.features import Features
 from sfmapp.formats.database import Database
 from sfmapp.matching.stage import MatchedPair, join_pairs, split_pairs
 from sfmapp.pipelines.keys import StageKeys
+from sfmapp.scene.features import Features
 
 if TYPE_CHECKING:
     from pathlib import Path

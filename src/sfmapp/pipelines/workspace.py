@@ -98,7 +98,7 @@ class Workspace:
         return _read_json(self.folder / name)
 
     def write_models(
-        self, models: Sequence[Reconstruction], keypoints: list[NDArray[np.floating]] | None = None
+        self, models: Sequence[Reconstruction], keypoints: list[NDArray[np.float64]] | None = None
     ) -> None:
         """Write ``sparse/0``, ``sparse/1`` and so on, and take away what an earlier run left behind them.
 

@@ -10,10 +10,10 @@ import numpy as np
 from sfmapp.scene.camera import PARAM_NAMES, Camera
 
 if TYPE_CHECKING:
-    from sfmapp.features.features import Features
     from sfmapp.images.folder import ImageSet
     from sfmapp.mapping.options import MappingOptions
     from sfmapp.scene.correspondences import Correspondences
+    from sfmapp.scene.features import Features
     from sfmapp.scene.reconstruction import Reconstruction
 
 FORMAT = "sfmapp report 1"
