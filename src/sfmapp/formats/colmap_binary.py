@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,8 @@ def write_binary(folder: Path, model: ColmapModel) -> None:
     (folder / "cameras.bin").write_bytes(_cameras_bytes(model))
     (folder / "rigs.bin").write_bytes(_rigs_bytes(model))
     (folder / "frames.bin").write_bytes(_frames_bytes(model))
-    (folder / "images.bin").write_bytes(_images_bytes(model))
+    with (folder / "images.bin").open("wb") as file:
+        file.writelines(_images_bytes(model))
     (folder / "points3D.bin").write_bytes(_points_bytes(model))
 
 
@@ -80,16 +82,16 @@ def _frames_bytes(model: ColmapModel) -> bytes:
     return struct.pack("<Q", len(frames)) + frames.tobytes()
 
 
-def _images_bytes(model: ColmapModel) -> bytes:
-    parts = [struct.pack("<Q", len(model.image_ids))]
+def _images_bytes(model: ColmapModel) -> Iterator[bytes]:
+    """Piece by piece: with the keypoints of thousands of images this is the one large file."""
+    yield struct.pack("<Q", len(model.image_ids))
     poses = poses_wxyz(model.cam_from_world)
     for i, name in enumerate(model.image_names):
         points = np.empty(len(model.points2d_xy[i]), _POINT2D)
         points["xy"], points["point_id"] = model.points2d_xy[i], model.points2d_point_ids[i]
-        parts.append(struct.pack("<I7dI", model.image_ids[i], *poses[i], model.image_camera_ids[i]))
-        parts.append(name.encode() + b"\0" + struct.pack("<Q", len(points)))
-        parts.append(points.tobytes())
-    return b"".join(parts)
+        yield struct.pack("<I7dI", model.image_ids[i], *poses[i], model.image_camera_ids[i])
+        yield name.encode() + b"\0" + struct.pack("<Q", len(points))
+        yield points.tobytes()
 
 
 def _points_bytes(model: ColmapModel) -> bytes:
