@@ -111,6 +111,15 @@ def sampson_errors(matrix: Array, xy1: Array, xy2: Array) -> Array:
     return out
 
 
+def sampson_weights(fundamental: Array, xy1: Array, xy2: Array) -> Array:
+    """(N,) weights, largest 1, that turn algebraic residuals of F into Sampson's; for fundamental_from_points."""
+    line2 = xy1 @ fundamental[:2, :2].T + fundamental[:2, 2]
+    line1 = xy2 @ fundamental[:2, :2] + fundamental[2, :2]
+    denominator = (line2**2).sum(1) + (line1**2).sum(1)
+    weights = 1.0 / np.maximum(denominator, max(1e-12 * float(denominator.max()), 1e-300))
+    return weights / weights.max()
+
+
 @numba.njit(cache=True, nogil=True)
 def _ray_depths(rotation: Array, t: Array, xn1: Array, xn2: Array, depths: Array, angles: Array) -> None:
     for i in range(xn1.shape[0]):

@@ -27,15 +27,15 @@ def match_sift(
         (K, 2) int32 positions in both, ascending; no position occurs twice.
     """
     best1, second1, arg1, best2, second2, arg2 = largest_products(descriptors1, descriptors2)
-    good1 = (arg1 >= 0) & _passes(best1, second1, max_ratio, max_distance)
-    good2 = (arg2 >= 0) & _passes(best2, second2, max_ratio, max_distance)
+    good1 = (arg1 >= 0) & passes_ratio(best1, second1, max_ratio, max_distance)
+    good2 = (arg2 >= 0) & passes_ratio(best2, second2, max_ratio, max_distance)
     rows = np.flatnonzero(good1)
     columns = arg1[rows]
     keep = good2[columns] & (arg2[columns] == rows)
     return np.stack([rows[keep], columns[keep]], 1).astype(np.int32)
 
 
-def _passes(best: Indices, second: Indices, max_ratio: float, max_distance: float) -> NDArray[np.bool_]:
+def passes_ratio(best: Indices, second: Indices, max_ratio: float, max_distance: float) -> NDArray[np.bool_]:
     d_best = np.sqrt(np.maximum(2.0 - best * (2.0 / _SIFT_NORM2), 0.0))
     d_second = np.sqrt(np.maximum(2.0 - second * (2.0 / _SIFT_NORM2), 0.0))
     return (d_best < max_ratio * d_second) & (d_best <= max_distance)

@@ -17,6 +17,9 @@ class MatchingOptions:
     max_ratio: float = 0.8
     # Largest distance of a match.
     max_distance: float = 0.7
+    # Features of each image, largest first, whose matches guide those of all others along the epipolar lines. Images
+    # with fewer than twice as many, and pairs on which these do not agree, are matched in full.
+    coarse_features: int = 1536
     # Inlier threshold on pixels in the full-size image. None: 0.2 % of the image diagonal, within 2 to 8 px.
     max_error_px: float | None = None
     # Fewest verified matches of a pair that counts.

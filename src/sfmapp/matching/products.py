@@ -13,7 +13,7 @@ from typing import Any
 
 import numba
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
+from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -56,7 +56,7 @@ def _add_pairs(builder: ir.IRBuilder, products: Any) -> Any:
 
 
 @intrinsic
-def _tile(
+def tile(
     typing_context: Any, a: Any, packed: Any, sums: Any, masks: Any, second1: Any, second2: Any, row: Any, group: Any
 ) -> tuple[Any, Callable[..., Any]]:
     """Products of rows ``row..row + ROWS`` of a with groups ``group..group + GROUPS`` of packed.
@@ -110,13 +110,6 @@ def _tile(
 
 
 @numba.njit(cache=True, nogil=True)
-def _pack_rows(descriptors: NDArray[np.uint8], out: NDArray[np.int16]) -> None:
-    for i in range(descriptors.shape[0]):
-        for k in range(DIMS):
-            out[i, k] = descriptors[i, k]
-
-
-@numba.njit(cache=True, nogil=True)
 def _pack_groups(descriptors: NDArray[np.uint8], out: NDArray[np.int16]) -> None:
     for i in range(descriptors.shape[0]):
         g, lane = i // LANES, i % LANES
@@ -133,23 +126,44 @@ def _scan(
     for block in range(0, packed.shape[0], _GROUPS_IN_CACHE):
         for row in range(0, a.shape[0], ROWS):
             for group in range(block, min(block + _GROUPS_IN_CACHE, packed.shape[0]), GROUPS):
-                _tile(a, packed, sums, masks, second1, second2, row, group)
+                tile(a, packed, sums, masks, second1, second2, row, group)
                 for r in range(ROWS):
-                    if masks[r] == 0:
-                        continue
-                    i = row + r
-                    for q in range(GROUPS * LANES):
-                        if (masks[r] >> np.uint32(q)) & np.uint32(1) == 0:
-                            continue
-                        j, total = group * LANES + q, sums[r, q]
-                        if total > best1[i]:
-                            second1[i], best1[i], arg1[i] = best1[i], total, j
-                        elif total > second1[i]:
-                            second1[i] = total
-                        if total > best2[j]:
-                            second2[j], best2[j], arg2[j] = best2[j], total, i
-                        elif total > second2[j]:
-                            second2[j] = total
+                    if masks[r] != 0:
+                        for q in range(GROUPS * LANES):
+                            if (masks[r] >> np.uint32(q)) & np.uint32(1):
+                                i, j = row + r, group * LANES + q
+                                keep_two_largest(best1, second1, arg1, i, j, sums[r, q])
+                                keep_two_largest(best2, second2, arg2, j, i, sums[r, q])
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def keep_two_largest(best: Ints, second: Ints, arg: Ints, i: int, j: int, value: int) -> None:
+    """Enter value, from partner j, into the two largest of i."""
+    if value > best[i]:
+        second[i] = best[i]
+        best[i] = value
+        arg[i] = j
+    elif value > second[i]:
+        second[i] = value
+
+
+def pack_rows(descriptors: NDArray[np.uint8]) -> NDArray[np.int16]:
+    """(N', 128) int16, N' the next multiple of ROWS, zeros at the end: how the tile reads image 1."""
+    out = np.zeros((-(-len(descriptors) // ROWS) * ROWS, DIMS), np.int16)
+    out[: len(descriptors)] = descriptors
+    return out
+
+
+def pack_groups(descriptors: NDArray[np.uint8]) -> NDArray[np.int16]:
+    """(G, 64, LANES, 2) int16, G the next multiple of GROUPS, zeros at the end: how the tile reads image 2."""
+    out = np.zeros((-(-len(descriptors) // (LANES * GROUPS)) * GROUPS, DIMS // 2, LANES, 2), np.int16)
+    _pack_groups(np.ascontiguousarray(descriptors), out)
+    return out
+
+
+def scratch() -> tuple[Ints, NDArray[np.uint32]]:
+    """The arrays that a tile writes its sums and masks to."""
+    return np.empty((ROWS, GROUPS * LANES), np.int32), np.empty(ROWS, np.uint32)
 
 
 def largest_products(
@@ -166,12 +180,48 @@ def largest_products(
         way.
     """
     n, m = len(descriptors1), len(descriptors2)
-    num_rows, num_groups = -(-n // ROWS) * ROWS, -(-m // (LANES * GROUPS)) * GROUPS
-    a, packed = np.zeros((num_rows, DIMS), np.int16), np.zeros((num_groups, DIMS // 2, LANES, 2), np.int16)
-    _pack_rows(np.ascontiguousarray(descriptors1), a)
-    _pack_groups(np.ascontiguousarray(descriptors2), packed)
-    best1, second1, arg1 = (np.full(num_rows, fill, np.int32) for fill in (0, 0, -1))
-    best2, second2, arg2 = (np.full(num_groups * LANES, fill, np.int32) for fill in (0, 0, -1))
-    sums, masks = np.empty((ROWS, GROUPS * LANES), np.int32), np.empty(ROWS, np.uint32)
-    _scan(a, packed, best1, second1, arg1, best2, second2, arg2, sums, masks)
+    a, packed = pack_rows(descriptors1), pack_groups(descriptors2)
+    best1, second1, arg1 = (np.full(len(a), fill, np.int32) for fill in (0, 0, -1))
+    best2, second2, arg2 = (np.full(len(packed) * LANES, fill, np.int32) for fill in (0, 0, -1))
+    _scan(a, packed, best1, second1, arg1, best2, second2, arg2, *scratch())
     return best1[:n], second1[:n], arg1[:n], best2[:m], second2[:m], arg2[:m]
+
+
+@numba.njit(cache=True, nogil=True)
+def _scan_background(
+    a: NDArray[np.int16], packed: NDArray[np.int16], xy: NDArray[np.float64], sample: NDArray[np.int64],
+    radius: NDArray[np.float64], best: Ints, unbounded: Ints, sums: Ints, masks: NDArray[np.uint32],
+) -> None:  # fmt: skip
+    for row in range(0, a.shape[0], ROWS):
+        for group in range(0, packed.shape[0], GROUPS):
+            tile(a, packed, sums, masks, best, unbounded, row, group)
+            for r in range(ROWS):
+                if masks[r] == 0:
+                    continue
+                i = row + r
+                for q in range(GROUPS * LANES):
+                    if (masks[r] >> np.uint32(q)) & np.uint32(1) and sums[r, q] > best[i]:
+                        j = sample[group * LANES + q]
+                        dx, dy = xy[i, 0] - xy[j, 0], xy[i, 1] - xy[j, 1]
+                        if dx * dx + dy * dy > radius[i] * radius[i]:
+                            best[i] = sums[r, q]
+
+
+def background_products(
+    descriptors: NDArray[np.uint8], xy: NDArray[np.float64], radius: NDArray[np.float64], sample_size: int
+) -> Ints:
+    """How like each feature some unrelated one looks: the largest product with a sample of its own image.
+
+    Args:
+        descriptors: (N, 128) uint8.
+        xy: (N, 2) pixels.
+        radius: (N,) pixels around each feature in which the others show the same thing and do not count.
+        sample_size: features at equal steps through the image's list, so from all scales.
+    """
+    n = len(descriptors)
+    sample = np.unique(np.linspace(0, max(n - 1, 0), min(n, sample_size)).astype(np.int64))
+    a, packed = pack_rows(descriptors), pack_groups(descriptors[sample])
+    best = np.zeros(len(a), np.int32)
+    unbounded = np.full(len(packed) * LANES, np.iinfo(np.int32).max, np.int32)
+    _scan_background(a, packed, xy, sample, radius, best, unbounded, *scratch())
+    return best[:n]

@@ -12,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Events
-from sfmapp.features.features import Features
 from sfmapp.geometry import epipolar
-from sfmapp.matching import descriptors
+from sfmapp.matching import guided
+from sfmapp.matching.coarse_to_fine import is_guidable, match_features
 from sfmapp.matching.options import MatchingOptions
-from sfmapp.matching.two_view import TwoViewGeometry, verify_pair
+from sfmapp.matching.products import Ints
+from sfmapp.matching.two_view import Ransac, TwoViewGeometry, error_threshold_px, verify_pair
 from sfmapp.scene.camera import Camera
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
+from sfmapp.scene.features import Features
 
 if TYPE_CHECKING:
     from sfmapp.images.folder import ImageSet
@@ -44,12 +46,16 @@ class MatchedPair:
         matches: (K, 2) int32 verified matches.
         num_putative: matches before verification.
         geometry: the two-view geometry; its ``is_inlier`` is dropped for the matches above.
+        num_coarse: matches among the largest features that were to guide the others, None if there was no need.
+        is_guided: they did.
         cpu_s: processor seconds of the thread that did it.
     """
 
     matches: NDArray[np.int32]
     num_putative: int
     geometry: TwoViewGeometry
+    num_coarse: int | None = None
+    is_guided: bool = False
     cpu_s: float = 0.0
 
 
@@ -89,12 +95,19 @@ def match_images(
     if num_known:
         events.advanced(_STAGE, num_known)
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        futures: dict[Future[MatchedPair], tuple[int, int]] = {
-            pool.submit(match_pair, features[i], features[j], cameras[i], cameras[j], options, (seed, i, j)): (i, j)
-            for i, j in pairs
-            if (i, j) not in done
-        }
+        to_do = [pair for pair in pairs if pair not in done]
+        guidable = sorted({i for pair in to_do for i in pair if is_guidable(features[i], options)})
         try:
+            backgrounds = dict(
+                zip(guidable, pool.map(lambda i: guided.background_of(features[i]), guidable), strict=True)
+            )
+            futures: dict[Future[MatchedPair], tuple[int, int]] = {
+                pool.submit(
+                    match_pair, (features[i], features[j]), (backgrounds.get(i), backgrounds.get(j)),
+                    (cameras[i], cameras[j]), options, (seed, i, j),
+                ): (i, j)
+                for i, j in to_do
+            }  # fmt: skip
             for future in as_completed(futures):
                 i, j = futures[future]
                 done[i, j] = future.result()
@@ -111,26 +124,31 @@ def match_images(
 
 
 def match_pair(
-    features1: Features,
-    features2: Features,
-    camera1: Camera,
-    camera2: Camera,
+    features: tuple[Features, Features],
+    backgrounds: tuple[Ints | None, Ints | None],
+    cameras: tuple[Camera, Camera],
     options: MatchingOptions,
     seed: tuple[int, int, int],
 ) -> MatchedPair:
     """Match and verify one pair; seed is the run's seed and the positions of the two images."""
     start = time.thread_time()
-    is_binary = features1.descriptors.shape[1] != 128
-    match = descriptors.match_binary if is_binary else descriptors.match_sift
-    putative = match(features1.descriptors, features2.descriptors, options.max_ratio, options.max_distance)
-    xy1 = np.ascontiguousarray(features1.keypoints[putative[:, 0], :2], np.float64)
-    xy2 = np.ascontiguousarray(features2.keypoints[putative[:, 1], :2], np.float64)
     # 31 bits: OpenCV's state is a signed int
-    state = int(np.random.SeedSequence(seed).generate_state(1)[0]) & 0x7FFFFFFF
-    geometry = verify_pair(xy1, xy2, camera1, camera2, options, seed=state)
-    matches = np.ascontiguousarray(putative[geometry.is_inlier])
+    ransac = Ransac(options.max_ransac_trials, int(np.random.SeedSequence(seed).generate_state(1)[0]) & 0x7FFFFFFF)
+    putative = match_features(features, backgrounds, error_threshold_px(*cameras, options), options, ransac)
+    xy1, xy2 = (
+        np.ascontiguousarray(f.keypoints[putative.matches[:, side], :2], np.float64) for side, f in enumerate(features)
+    )
+    geometry = verify_pair(xy1, xy2, *cameras, options, ransac, fundamental=putative.fundamental)
+    matches = np.ascontiguousarray(putative.matches[geometry.is_inlier])
     geometry.is_inlier = np.empty(0, bool)
-    return MatchedPair(matches, len(putative), geometry, time.thread_time() - start)
+    return MatchedPair(
+        matches,
+        len(putative.matches),
+        geometry,
+        putative.num_coarse,
+        putative.fundamental is not None,
+        time.thread_time() - start,
+    )
 
 
 def join_pairs(pair_image_idx: NDArray[np.int32], results: Sequence[MatchedPair]) -> Correspondences:
@@ -192,6 +210,8 @@ def _report(
             {
                 "image_idx": pair,
                 "config": result.geometry.config.name,
+                "num_coarse": result.num_coarse,
+                "is_guided": result.is_guided,
                 "num_putative": result.num_putative,
                 "num_verified": len(result.matches),
                 "num_inliers_f": result.geometry.num_inliers_f,
@@ -210,5 +230,4 @@ def _report(
 def compile_kernels() -> None:
     """Compile the kernels that this package uses, or load them from numba's cache."""
     epipolar.compile_kernels()
-    tiny = np.arange(4 * 128, dtype=np.uint8).reshape(4, 128)
-    descriptors.match_sift(tiny, tiny, 0.8, 0.7)
+    guided.compile_kernels()

@@ -1,0 +1,101 @@
+"""Putative matches of a pair: in full, or guided by those of the largest features."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.matching.descriptors import match_binary, match_sift
+from sfmapp.matching.guided import GuidedImage, change_of_shape, match_guided
+from sfmapp.matching.options import MatchingOptions
+from sfmapp.matching.products import DIMS, Ints
+from sfmapp.matching.two_view import Ransac, find_fundamental, is_significant, polish_fundamental
+from sfmapp.scene.features import Features
+
+# The coarse epipolar lines are off by more than the noise of the matches that they rest on.
+_BAND_PER_THRESHOLD = 2.0
+# Of the matches that the coarse ones promise, in proportion to the number of features, so many must be found.
+_MIN_KEPT_PROMISE = 0.5
+
+
+@dataclass(frozen=True)
+class Putative:
+    """Matches before verification.
+
+    Attributes:
+        matches: (K, 2) int32 positions in both images; no position occurs twice.
+        fundamental: (3, 3) that guided them, None if they were matched in full.
+        num_coarse: matches among the largest features, None if they were not tried first.
+    """
+
+    matches: NDArray[np.int32]
+    fundamental: NDArray[np.float64] | None = None
+    num_coarse: int | None = None
+
+
+def is_guidable(features: Features, options: MatchingOptions) -> bool:
+    """Whether an image has so many SIFT features that guided matching pays."""
+    return features.descriptors.shape[1] == DIMS and len(features) >= 2 * options.coarse_features
+
+
+def match_features(
+    features: tuple[Features, Features],
+    backgrounds: tuple[Ints | None, Ints | None],
+    threshold_px: float,
+    options: MatchingOptions,
+    ransac: Ransac,
+) -> Putative:
+    """Match all features of two images.
+
+    Args:
+        backgrounds: from ``background_of``; the pair is matched in full unless both are there.
+        threshold_px: what counts as fitting the coarse epipolar geometry.
+    """
+    first, second = (f.descriptors for f in features)
+    if first.shape[1] != DIMS:
+        return Putative(match_binary(first, second, options.max_ratio, options.max_distance))
+    num_coarse = None
+    if backgrounds[0] is not None and backgrounds[1] is not None:
+        images = GuidedImage.of(features[0], backgrounds[0]), GuidedImage.of(features[1], backgrounds[1])
+        found = _match_coarse_to_fine(*images, threshold_px, options, ransac)
+        if found.fundamental is not None:
+            return found
+        num_coarse = found.num_coarse
+    return Putative(match_sift(first, second, options.max_ratio, options.max_distance), None, num_coarse)
+
+
+def _match_coarse_to_fine(
+    image1: GuidedImage, image2: GuidedImage, threshold_px: float, options: MatchingOptions, ransac: Ransac
+) -> Putative:
+    """Guided matches, or, without a fundamental matrix, the coarse ones where these are not to be trusted."""
+    size, limits = options.coarse_features, (options.max_ratio, options.max_distance)
+    coarse = match_sift(image1.descriptors[:size], image2.descriptors[:size], *limits)
+    doubtful = Putative(coarse, None, len(coarse))
+    if len(coarse) < max(options.min_inliers, 8):
+        return doubtful
+    xy1, xy2 = _points(image1, image2, coarse)
+    fundamental = find_fundamental(xy1, xy2, threshold_px, ransac)
+    if fundamental is None:
+        return doubtful
+    fundamental, inlier = polish_fundamental(fundamental, xy1, xy2, threshold_px)
+    extent = tuple(np.ptp(image2.shape[:, :2], axis=0))
+    if inlier.sum() < options.min_inliers or not is_significant(inlier, threshold_px, extent):
+        return doubtful
+    change = change_of_shape(image1, image2, coarse[inlier])
+    guided = match_guided(image1, image2, fundamental, _BAND_PER_THRESHOLD * threshold_px, change, *limits)
+    fundamental, guided_inlier = polish_fundamental(fundamental, *_points(image1, image2, guided), threshold_px)
+    promise = inlier.sum() * min(len(image1.descriptors), len(image2.descriptors)) / size
+    if guided_inlier.sum() < _MIN_KEPT_PROMISE * promise:
+        return doubtful
+    return Putative(guided, fundamental, len(coarse))
+
+
+def _points(
+    image1: GuidedImage, image2: GuidedImage, matches: NDArray[np.int32]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return (
+        np.ascontiguousarray(image1.shape[matches[:, 0], :2]),
+        np.ascontiguousarray(image2.shape[matches[:, 1], :2]),
+    )

@@ -1,0 +1,244 @@
+"""Matching along epipolar lines: the whole of two images for the price of a thin band.
+
+All lines of an epipolar geometry pass through the epipole, so one number tells them apart: the angle within the pencil
+of lines. Sorted by it, the features of one image that lie near the line of a feature of the other are neighbours in
+memory, and the products of a few rows with a short run of columns are all that is needed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.matching.descriptors import passes_ratio
+from sfmapp.matching.products import (
+    DIMS,
+    GROUPS,
+    LANES,
+    ROWS,
+    Ints,
+    background_products,
+    keep_two_largest,
+    largest_products,
+    pack_groups,
+    pack_rows,
+    scratch,
+    tile,
+)
+from sfmapp.scene.features import Features
+
+Array = NDArray[np.float64]
+
+# A feature whose epipolar angle is uncertain by more than this (radians) is compared with all, not sorted in.
+_MAX_HALF_ANGLE = 0.1
+# Features of one image that stand for all that a feature could be mistaken for.
+_BACKGROUND_SAMPLE = 2048
+
+
+@dataclass(frozen=True)
+class GuidedImage:
+    """What guided matching reads of an image.
+
+    Attributes:
+        descriptors: (N, 128) uint8.
+        shape: (N, 4) float64 x, y in pixels, log2 of the scale, orientation in radians.
+        background: (N,) int32 from :func:`background_of`.
+    """
+
+    descriptors: NDArray[np.uint8]
+    shape: Array
+    background: Ints
+
+    @classmethod
+    def of(cls, features: Features, background: Ints) -> GuidedImage:
+        shape = features.keypoints.astype(np.float64)
+        shape[:, 2] = np.log2(np.maximum(shape[:, 2], 1e-3))
+        return cls(features.descriptors, shape, background)
+
+
+def background_of(features: Features) -> Ints:
+    """(N,) int32 largest product of each feature with a sample of those elsewhere in the same image.
+
+    The ratio test needs a second best from all over an image. Within a band there are a hundred times fewer, and nearly
+    all that it lets through stays, since it also fits the epipolar geometry. A feature's likeness to its own image is
+    known before any pair is, and serves all of them. Three sigmas away a neighbour shows something else.
+    """
+    keypoints = features.keypoints.astype(np.float64)
+    xy = np.ascontiguousarray(keypoints[:, :2])
+    return background_products(features.descriptors, xy, 3.0 * keypoints[:, 2], _BACKGROUND_SAMPLE)
+
+
+def change_of_shape(image1: GuidedImage, image2: GuidedImage, matches: NDArray[np.int32]) -> Array:
+    """How scale and orientation change between two images, from some sure matches (K, 2), K > 0.
+
+    Returns:
+        (4,) least and largest log2 of the scale ratio, centre and half width of the rotation in radians: what 96 % of
+        the matches do, widened by half an octave and a quarter of the angle.
+    """
+    change = image2.shape[matches[:, 1], 2:] - image1.shape[matches[:, 0], 2:]
+    low, high = np.quantile(change[:, 0], [0.02, 0.98])
+    centre = math.atan2(float(np.sin(change[:, 1]).sum()), float(np.cos(change[:, 1]).sum()))
+    spread = np.abs((change[:, 1] - centre + math.pi) % (2 * math.pi) - math.pi)
+    half_width = max(1.25 * float(np.quantile(spread, 0.96)), math.radians(30))
+    return np.array([low - 0.5, high + 0.5, centre, half_width])
+
+
+def match_guided(
+    image1: GuidedImage,
+    image2: GuidedImage,
+    fundamental: Array,
+    band_px: float,
+    change: Array,
+    max_ratio: float,
+    max_distance: float,
+) -> NDArray[np.int32]:
+    """Mutual nearest neighbours within a band around the epipolar lines.
+
+    Args:
+        fundamental: (3, 3) with x2^T F x1 = 0.
+        band_px: largest distance of a feature of image 2 from the line of its partner.
+        change: (4,) from :func:`change_of_shape`.
+        max_ratio, max_distance: see MatchingOptions. The second best is that of the band or of the background,
+            whichever is nearer.
+
+    Returns:
+        (K, 2) int32 positions in both, ascending in the first; no position occurs twice.
+    """
+    rows, columns = _sort_into_pencil(image1, image2, fundamental, band_px)
+    row_of, column_of = rows.order, columns.order
+    a, packed = pack_rows(image1.descriptors[row_of]), pack_groups(image2.descriptors[column_of])
+    best1, best2 = np.zeros(len(a), np.int32), np.zeros(len(packed) * LANES, np.int32)
+    best1[: len(row_of)], best2[: len(column_of)] = image1.background[row_of], image2.background[column_of]
+    second1, arg1 = best1.copy(), np.full(len(best1), -1, np.int32)
+    second2, arg2 = best2.copy(), np.full(len(best2), -1, np.int32)
+    _scan_band(
+        a, packed, rows.lines, image1.shape[row_of], image2.shape[column_of], band_px, change,
+        rows.low, rows.high, columns.angle,
+        best1, second1, arg1, best2, second2, arg2, *scratch(),
+    )  # fmt: skip
+    good1 = (arg1 >= 0) & passes_ratio(best1, second1, max_ratio, max_distance)
+    good2 = (arg2 >= 0) & passes_ratio(best2, second2, max_ratio, max_distance)
+    r = np.flatnonzero(good1)
+    c = arg1[r]
+    keep = good2[c] & (arg2[c] == r)
+    matches = np.stack([row_of[r[keep]], column_of[c[keep]]], 1).astype(np.int32)
+    return matches[np.argsort(matches[:, 0])]
+
+
+@dataclass(frozen=True)
+class _Rows:
+    order: NDArray[np.int64]  # (N,) features of image 1 by epipolar angle
+    lines: Array  # (N, 3) their lines in image 2, unit normals
+    low: Array  # (N,) smallest and largest angle of what can lie in the band
+    high: Array
+
+
+@dataclass(frozen=True)
+class _Columns:
+    order: NDArray[np.int64]  # (M,) features of image 2 by angle, then those near the epipole
+    angle: Array  # (F,) angles of the first of them, ascending in 0 to pi
+
+
+def _sort_into_pencil(
+    image1: GuidedImage, image2: GuidedImage, fundamental: Array, band_px: float
+) -> tuple[_Rows, _Columns]:
+    """Angles of both images' features in the pencil of epipolar lines of image 2.
+
+    In coordinates that centre and scale image 2, the lines through the epipole e are cos(a) p + sin(a) q for two
+    orthonormal p, q. Feature x2 has angle a2 with l(a2) . x2 = 0, and l(a) . x2 = r sin(a - a2), r = |(p.x2, q.x2)|,
+    so x2 is within the band of l(a) if r |sin(a - a2)| <= band |normal of l(a)|.
+    """
+    xy2 = image2.shape[:, :2]
+    center = xy2.mean(0) if len(xy2) else np.zeros(2)
+    size = max(float(np.abs(xy2 - center).max()), 1.0) if len(xy2) else 1.0
+    pixels_from_normalized = np.array([[size, 0.0, center[0]], [0.0, size, center[1]], [0.0, 0.0, 1.0]])
+    f = pixels_from_normalized.T @ fundamental
+    epipole = np.linalg.svd(f)[0][:, 2]
+    p, q = np.linalg.svd(epipole[None])[2][1:]
+    lines = np.concatenate([image1.shape[:, :2], np.ones((len(image1.shape), 1))], 1) @ f.T
+    lines /= np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), 1e-300)
+    angle1 = np.arctan2(lines @ q, lines @ p) % math.pi
+    points = np.concatenate([(xy2 - center) / size, np.ones((len(xy2), 1))], 1)
+    px, qx = points @ p, points @ q
+    angle2, r = np.arctan2(-px, qx) % math.pi, np.hypot(px, qx)
+    half = band_px / size * np.linalg.norm(lines[:, :2], axis=1)
+    is_near = r * math.sin(_MAX_HALF_ANGLE) < half.max(initial=0.0)
+    far = np.flatnonzero(~is_near)
+    far = far[np.argsort(angle2[far], kind="stable")]
+    half_angle = np.arcsin(np.minimum(half / r[far].min(initial=np.inf), 1.0)) if len(far) else np.zeros(len(half))
+    columns = _Columns(np.concatenate([far, np.flatnonzero(is_near)]), angle2[far])
+    order = np.argsort(angle1, kind="stable")
+    to_pixels = np.linalg.inv(pixels_from_normalized)
+    lines = (lines @ to_pixels)[order]
+    lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-300)
+    return _Rows(order, lines, (angle1 - half_angle)[order], (angle1 + half_angle)[order]), columns
+
+
+@numba.njit(cache=True, nogil=True)
+def _scan_run(
+    a: NDArray[np.int16], packed: NDArray[np.int16], lines: Array, shape1: Array, shape2: Array, band: float,
+    change: Array, row: int, first: int, last: int, best1: Ints, second1: Ints, arg1: Ints,
+    best2: Ints, second2: Ints, arg2: Ints, sums: Ints, masks: NDArray[np.uint32],
+) -> None:  # fmt: skip
+    """Products of ROWS rows with the columns first to last; what lies outside the band is dropped afterwards."""
+    width = LANES * GROUPS
+    for group in range(first // width * GROUPS, (last + width - 1) // width * GROUPS, GROUPS):
+        tile(a, packed, sums, masks, second1, second2, row, group)
+        for r in range(ROWS):
+            if masks[r] == 0:
+                continue
+            i = row + r
+            for q in range(max(first - group * LANES, 0), min(last - group * LANES, width)):
+                j = group * LANES + q
+                if (masks[r] >> np.uint32(q)) & np.uint32(1) == 0:
+                    continue
+                if abs(lines[i, 0] * shape2[j, 0] + lines[i, 1] * shape2[j, 1] + lines[i, 2]) > band:
+                    continue
+                log_scale = shape2[j, 2] - shape1[i, 2]
+                if log_scale < change[0] or log_scale > change[1]:
+                    continue
+                turn = shape2[j, 3] - shape1[i, 3] - change[2]
+                if abs(turn - 2.0 * math.pi * math.floor(turn / (2.0 * math.pi) + 0.5)) > change[3]:
+                    continue
+                keep_two_largest(best1, second1, arg1, i, j, sums[r, q])
+                keep_two_largest(best2, second2, arg2, j, i, sums[r, q])
+
+
+@numba.njit(cache=True, nogil=True)
+def _scan_band(
+    a: NDArray[np.int16], packed: NDArray[np.int16], lines: Array, shape1: Array, shape2: Array, band: float,
+    change: Array, low: Array, high: Array, angle2: Array, best1: Ints, second1: Ints, arg1: Ints,
+    best2: Ints, second2: Ints, arg2: Ints, sums: Ints, masks: NDArray[np.uint32],
+) -> None:  # fmt: skip
+    num_rows, num_far, num_all = low.shape[0], angle2.shape[0], shape2.shape[0]
+    for row in range(0, num_rows, ROWS):
+        smallest, largest = low[row], high[row]
+        for i in range(row + 1, min(row + ROWS, num_rows)):
+            smallest, largest = min(smallest, low[i]), max(largest, high[i])
+        # angles are modulo pi: a run that leaves 0 to pi goes on at the other end
+        starts = (np.searchsorted(angle2, smallest), np.searchsorted(angle2, smallest + math.pi), 0, num_far)
+        ends = (
+            np.searchsorted(angle2, largest, side="right"), num_far,
+            np.searchsorted(angle2, largest - math.pi, side="right"), num_all,
+        )  # fmt: skip
+        if largest - smallest >= math.pi:
+            starts, ends = (0, 0, 0, num_far), (num_far, 0, 0, num_all)
+        for run in range(4):
+            if starts[run] < ends[run]:
+                _scan_run(a, packed, lines, shape1, shape2, band, change, row, starts[run], ends[run],
+                          best1, second1, arg1, best2, second2, arg2, sums, masks)  # fmt: skip
+
+
+def compile_kernels() -> None:
+    """Compile the kernels that matching uses, or load them from numba's cache."""
+    tiny = np.arange(4 * DIMS, dtype=np.uint8).reshape(4, DIMS)
+    largest_products(tiny, tiny)
+    keypoints = np.array([[0.0, 0.0, 1.0, 0.0], [5.0, 1.0, 1.0, 0.0], [2.0, 4.0, 1.0, 0.0], [3.0, 7.0, 1.0, 0.0]])
+    features = Features(keypoints.astype(np.float32), tiny, np.zeros((4, 3), np.uint8))
+    image = GuidedImage.of(features, background_of(features))
+    sideways = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    match_guided(image, image, sideways, 1.0, np.array([-1.0, 1.0, 0.0, 1.0]), 0.8, 0.7)
