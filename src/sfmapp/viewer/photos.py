@@ -1,0 +1,103 @@
+"""Photographs for a screen: upright, small, as JPEG bytes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sfmapp.images.headers import UnusableImage, read_header
+from sfmapp.images.pixels import decode_bytes, to_8_bits
+
+# EXIF orientation: (swap rows and columns, then flip rows, then flip columns)
+_TURNS = {
+    1: (False, False, False), 2: (False, False, True), 3: (False, True, True), 4: (False, True, False),
+    5: (True, False, False), 6: (True, False, True), 7: (True, True, True), 8: (True, True, False),
+}  # fmt: skip
+# A JPEG this small goes in as it is: encoding it again would cost time and quality.
+_KEEP_BYTES = 400_000
+_QUALITY = 82
+_THUMBNAIL_QUALITY = 75
+
+
+@dataclass(frozen=True)
+class ScreenPhoto:
+    """A photograph and its thumbnail as JPEG bytes, and their sizes (width, height)."""
+
+    photo: bytes
+    size: tuple[int, int]
+    thumbnail: bytes
+    thumbnail_size: tuple[int, int]
+
+
+def load_screen_photo(path: Path, orientation: int, max_side_px: int, thumbnail_px: int) -> ScreenPhoto | None:
+    """Read and shrink a photograph; large JPEGs are decoded at a half, a quarter or an eighth right away.
+
+    None if it cannot be read: a recording with a photograph missing is better than none.
+    """
+    try:
+        data = path.read_bytes()
+        header = read_header(data)
+    except (OSError, UnusableImage):
+        return None
+    is_jpeg = header.format == "jpeg"
+    if is_jpeg:
+        pixels = _decode_jpeg(data, max(header.width, header.height) / max_side_px)
+    else:
+        raw = decode_bytes(data, header)
+        pixels = None if raw is None else _as_bgr(to_8_bits(raw))
+    if pixels is None:
+        return None
+    swap, flip_rows, flip_columns = _TURNS.get(orientation, _TURNS[1])
+    pixels = pixels.swapaxes(0, 1) if swap else pixels
+    pixels = np.ascontiguousarray(pixels[:: -1 if flip_rows else 1, :: -1 if flip_columns else 1])
+    is_fit = is_jpeg and orientation == 1 and max(pixels.shape[:2]) <= max_side_px and len(data) <= _KEEP_BYTES
+    # a reduced decode may have made it fit: the file itself has not changed
+    is_fit = is_fit and (header.height, header.width) == pixels.shape[:2]
+    pixels = _shrink(pixels, max_side_px)
+    photo = data if is_fit else _jpeg(pixels, _QUALITY)
+    thumbnail = _shrink(pixels, thumbnail_px)
+    return ScreenPhoto(photo, pixels.shape[1::-1], _jpeg(thumbnail, _THUMBNAIL_QUALITY), thumbnail.shape[1::-1])
+
+
+def _decode_jpeg(data: bytes, shrink: float) -> Any:
+    """(H, W, 3) BGR uint8 as stored, reduced by the largest power of two below shrink; None if it is damaged."""
+    import cv2
+
+    flag = cv2.IMREAD_COLOR
+    for factor, reduced in (
+        (2, cv2.IMREAD_REDUCED_COLOR_2),
+        (4, cv2.IMREAD_REDUCED_COLOR_4),
+        (8, cv2.IMREAD_REDUCED_COLOR_8),
+    ):
+        flag = reduced if shrink >= factor else flag
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flag | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        return None
+
+
+def _as_bgr(pixels: Any) -> Any:
+    import cv2
+
+    if pixels.ndim == 2:
+        return cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR)
+    return cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGR if pixels.shape[2] == 4 else cv2.COLOR_RGB2BGR)
+
+
+def _shrink(pixels: Any, max_side_px: int) -> Any:
+    import cv2
+
+    scale = max_side_px / max(pixels.shape[:2])
+    if scale >= 1:
+        return pixels
+    size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+
+
+def _jpeg(pixels: Any, quality: int) -> bytes:
+    import cv2
+
+    return bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])

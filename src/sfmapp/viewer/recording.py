@@ -1,0 +1,85 @@
+"""From the results of a run to ``recording.rrd``."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.viewer.listener import Message, RecordingListener, Step
+from sfmapp.viewer.replay import make_replay
+
+if TYPE_CHECKING:
+    from sfmapp.images.image_set import ImageSet
+    from sfmapp.scene.features import Features
+    from sfmapp.scene.reconstruction import Reconstruction
+
+__all__ = ["Message", "RecordingListener", "RecordingReport", "Step", "write_recording"]
+
+
+@dataclass(frozen=True)
+class RecordingReport:
+    """What came of a recording.
+
+    Attributes:
+        path: where it is, None if it could not be written.
+        num_bytes: its size.
+        seconds: wall time.
+        problem: why there is none, empty if all went well.
+    """
+
+    path: Path | None
+    num_bytes: int
+    seconds: float
+    problem: str
+
+
+def write_recording(
+    path: Path, image_set: ImageSet, features: Sequence[Features], reconstructions: Sequence[Reconstruction],
+    steps: Sequence[Step] = (), messages: Sequence[Message] = (), *, title: str = "",
+    up: NDArray[np.float64] | None = None, threads: int = 1, timeout_s: float = 600.0,
+) -> RecordingReport:  # fmt: skip
+    """Write a recording that replays a run, in a child process; never raises for what happens there.
+
+    Args:
+        path: the file, replaced when the new one is whole.
+        image_set, features: the I photographs and their keypoints.
+        reconstructions: final models, largest first; may be empty.
+        steps, messages: of the :class:`RecordingListener` that watched; without them the final model appears at once.
+        title: shown in the viewer, such as the name of the image folder.
+        up: (3,) direction in the world that is up (aligned worlds: z); None: judged from the cameras.
+        threads: photographs read at a time.
+        timeout_s: the child is stopped after this long.
+    """
+    start = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
+        make_replay(image_set, features, reconstructions, steps, messages, title=title, up=up).save(Path(name))
+        problem = _draw(Path(name), path.absolute(), threads, timeout_s)
+    size = path.stat().st_size if not problem else 0
+    return RecordingReport(None if problem else path, size, time.monotonic() - start, problem)
+
+
+def _draw(folder: Path, path: Path, threads: int, timeout_s: float) -> str:
+    """Run the child; returns what went wrong, empty for nothing."""
+    command = [sys.executable, "-m", "sfmapp.viewer.record_process", str(folder.absolute()), str(path), str(threads)]
+    try:
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+            timeout=timeout_s, check=False,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return f"not finished after {timeout_s:g} s"
+    except OSError as error:
+        return f"the process did not start: {error.strerror}"
+    if done.returncode == 0 and path.is_file():
+        return ""
+    lines = done.stderr.decode(errors="replace").strip().splitlines()
+    return f"exit code {done.returncode}: {lines[-1] if lines else 'no message'}"

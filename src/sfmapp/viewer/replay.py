@@ -1,0 +1,306 @@
+"""All that a recording shows, as plain arrays: made from the results of a run, drawn by another process.
+
+Everything stands in the frame of the final model. What the run saw on its way (other gauges, other scales) is carried
+over by a similarity fitted to the cameras, so that nothing jumps when it is played.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.geometry import rigid3, similarity
+
+if TYPE_CHECKING:
+    from sfmapp.images.image_set import ImageSet
+    from sfmapp.scene.features import Features
+    from sfmapp.scene.reconstruction import Reconstruction
+    from sfmapp.viewer.listener import Message, Step
+
+Float32 = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+# Points of the final models that are drawn; beyond this a viewer slows down and a person sees no more.
+MAX_FINAL_POINTS = 300_000
+# Keypoints that found no place in the model are drawn for comparison only: the coarsest of each image.
+MAX_LOOSE_KEYPOINTS = 2000
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A run, ready to be drawn. S steps, I images, M models (largest first), P pose and C cloud snapshots.
+
+    Attributes:
+        title: shown on the recording.
+        image_names, image_paths: of the I images.
+        image_size: (I, 2) int64 width and height, upright; image_orientation: (I,) int64, EXIF.
+        image_model: (I,) int64, model that holds the image, -1 for none; image_step: (I,) int64, step at which it was
+            registered, -1 for never.
+        image_intrinsics: (I, 4) float32 fx, fy, cx, cy in pixels.
+        model_cam_from_world: (M, I, 7) float32, NaN where the image is not in the model.
+        model_ptr: (M + 1,) int64; the points of model m are ``model_xyz[model_ptr[m]:model_ptr[m + 1]]``, coloured
+            model_rgb.
+        step: (S,) int64 ascending; step_registered, step_points: (S,) int64; step_error_px: (S,) float32.
+        pose_step, pose_model: (P,) int64, and pose_cam_from_world: (P, I, 7) float32 as they were at that step.
+        cloud_step, cloud_model: (C,) int64, cloud_ptr: (C + 1,) int64, cloud_xyz: (N, 3) float32, cloud_rgb:
+            (N, 3) uint8.
+        obs_ptr: (I + 1,) int64, obs_xy and obs_residual: (O, 2) float32, where the points of the final model were seen,
+            and projected minus observed, in pixels.
+        keypoint_ptr: (I + 1,) int64, keypoint_xy: (K, 2) float32, keypoints of no point.
+        messages: (step, level, text) of what was decided.
+        up: (3,) float64, the direction that is drawn upwards.
+    """
+
+    title: str
+    image_names: list[str]
+    image_paths: list[str]
+    image_size: Ints
+    image_orientation: Ints
+    image_model: Ints
+    image_step: Ints
+    image_intrinsics: Float32
+    model_cam_from_world: Float32
+    model_ptr: Ints
+    model_xyz: Float32
+    model_rgb: NDArray[np.uint8]
+    step: Ints
+    step_registered: Ints
+    step_points: Ints
+    step_error_px: Float32
+    pose_step: Ints
+    pose_model: Ints
+    pose_cam_from_world: Float32
+    cloud_step: Ints
+    cloud_model: Ints
+    cloud_ptr: Ints
+    cloud_xyz: Float32
+    cloud_rgb: NDArray[np.uint8]
+    obs_ptr: Ints
+    obs_xy: Float32
+    obs_residual: Float32
+    keypoint_ptr: Ints
+    keypoint_xy: Float32
+    messages: list[tuple[int, str, str]]
+    up: NDArray[np.float64]
+
+    def save(self, folder: Path) -> None:
+        """Write ``replay.npz`` and ``replay.json``."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+        np.savez(folder / "replay.npz", **arrays)
+        text = {name: value for name, value in values.items() if name not in arrays}
+        (folder / "replay.json").write_text(json.dumps(text), encoding="utf-8")
+
+    @staticmethod
+    def load(folder: Path) -> Replay:
+        """Read what :meth:`save` wrote."""
+        values: dict[str, Any] = json.loads((folder / "replay.json").read_text(encoding="utf-8"))
+        with np.load(folder / "replay.npz", allow_pickle=False) as arrays:
+            values.update({name: arrays[name] for name in arrays.files})
+        values["messages"] = [(int(step), level, text) for step, level, text in values["messages"]]
+        return Replay(**values)
+
+
+def make_replay(
+    image_set: ImageSet,
+    features: Sequence[Features],
+    reconstructions: Sequence[Reconstruction],
+    steps: Sequence[Step],
+    messages: Sequence[Message] = (),
+    *,
+    title: str = "",
+    up: NDArray[np.float64] | None = None,
+) -> Replay:
+    """Put the results of a run and its steps together.
+
+    Args:
+        image_set, features: the photographs and their keypoints, I of each.
+        reconstructions: final models, largest first; may be empty.
+        steps, messages: what a :class:`~sfmapp.viewer.listener.RecordingListener` gathered; may be empty.
+        title: shown on the recording.
+        up: (3,) direction in the world that is up; None: judged from the cameras of each model.
+    """
+    num_images = len(image_set.images)
+    final_poses = np.array([r.cam_from_world for r in reconstructions], np.float64).reshape(-1, num_images, 7)
+    final_step = steps[-1].step + 1 if steps else 0
+    model_of = [_model_of_step(s.cam_from_world, final_poses) for s in steps]
+    moved = [_to_final_frame(s, final_poses, m) for s, m in zip(steps, model_of, strict=True)]
+    image_model = np.full(num_images, -1, np.int64)
+    for m in reversed(range(len(reconstructions))):
+        image_model[~np.isnan(final_poses[m, :, 0])] = m
+    summary = reconstructions[0].summary() if reconstructions else {}
+    shown_messages = [(m.step, m.level, m.text) for m in messages]
+    if reconstructions:
+        shown_messages.append((final_step, "INFO", _final_text(reconstructions)))
+    kept = [k for k, pose in enumerate(moved) if pose is not None]
+    model_xyz = [r.point_xyz[r.is_triangulated] for r in reconstructions]
+    model_rgb = [r.point_rgb[r.is_triangulated] for r in reconstructions]
+    strides = [max(1, -(-len(xyz) // MAX_FINAL_POINTS)) for xyz in model_xyz]
+    return Replay(
+        title=title,
+        image_names=[record.name for record in image_set.images],
+        image_paths=[str(record.path) for record in image_set.images],
+        image_size=np.array([(r.width, r.height) for r in image_set.images], np.int64).reshape(-1, 2),
+        image_orientation=np.array([r.orientation for r in image_set.images], np.int64),
+        image_model=image_model,
+        image_step=_registration_steps(steps, model_of, image_model, final_step),
+        image_intrinsics=_intrinsics(reconstructions, image_model),
+        model_cam_from_world=final_poses.astype(np.float32),
+        model_ptr=_offsets([len(xyz[::n]) for xyz, n in zip(model_xyz, strides, strict=True)]),
+        model_xyz=_join([xyz[::n] for xyz, n in zip(model_xyz, strides, strict=True)], 3, np.float32),
+        model_rgb=_join([rgb[::n] for rgb, n in zip(model_rgb, strides, strict=True)], 3, np.uint8),
+        step=np.array([s.step for s in steps] + [final_step], np.int64),
+        step_registered=np.array([s.num_registered for s in steps] + [summary.get("num_registered", 0)], np.int64),
+        step_points=np.array([s.num_points for s in steps] + [summary.get("num_points", 0)], np.int64),
+        step_error_px=np.array(
+            [s.mean_error_px for s in steps] + [summary.get("mean_reprojection_error_px", np.nan)], np.float32
+        ),
+        pose_step=np.array([steps[k].step for k in kept], np.int64),
+        pose_model=np.array([model_of[k] for k in kept], np.int64),
+        pose_cam_from_world=np.array([moved[k][0] for k in kept], np.float32).reshape(-1, num_images, 7),  # type: ignore[index]
+        **_clouds([(steps[k], model_of[k], moved[k][1]) for k in kept], reconstructions),  # type: ignore[index]
+        **_observations(features, reconstructions, image_model),
+        messages=shown_messages,
+        up=np.asarray(up, np.float64) if up is not None else up_direction(final_poses[0] if len(final_poses) else None),
+    )  # fmt: skip
+
+
+def up_direction(cam_from_world: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """(3,) unit vector that was probably up when the photographs (I, 7), NaN allowed, were taken.
+
+    People hold cameras level: up is the direction most nearly perpendicular to the horizontal axes of all images
+    (Szeliski, "Image alignment and stitching", 2006, section 5), on the side of their tops. Where the cameras all look
+    the same way, or were held both upright and across, the mean of the tops has to do.
+    """
+    if cam_from_world is None:
+        return np.array([0.0, -1.0, 0.0])
+    rotation = rigid3.rotation_matrix(cam_from_world[~np.isnan(cam_from_world[:, 0])])
+    mean = -rotation[:, 1].sum(0)
+    top = mean / np.linalg.norm(mean) if np.linalg.norm(mean) > 1e-6 else np.array([0.0, -1.0, 0.0])
+    values, vectors = np.linalg.eigh(rotation[:, 0].T @ rotation[:, 0] / max(1, len(rotation)))
+    level = vectors[:, 0] * (1.0 if vectors[:, 0] @ top >= 0 else -1.0)
+    # the plane of the horizontal axes is known once they turn by some 15 degrees: sin(15 deg)^2 = 0.07
+    is_clear = values[1] > 0.07 and values[1] > 4 * values[0]
+    return level if is_clear and level @ top > np.cos(np.radians(30)) else top
+
+
+# ------------------------------------------------------------------------------------------------ into the final frame
+
+
+def _model_of_step(cam_from_world: Float32 | None, final_poses: NDArray[np.float64]) -> int:
+    """The final model that a step worked on: the one that shares most images with it; -1 for none."""
+    if cam_from_world is None or not len(final_poses):
+        return -1
+    shared = (~np.isnan(cam_from_world[None, :, 0]) & ~np.isnan(final_poses[:, :, 0])).sum(1)
+    return int(shared.argmax()) if shared.max() >= 2 else -1
+
+
+def _to_final_frame(
+    step: Step, final_poses: NDArray[np.float64], model: int
+) -> tuple[NDArray[np.float64], Float32 | None] | None:
+    """Poses (I, 7) and points of a step in the frame of its final model; None where the two cannot be joined."""
+    if model < 0 or step.cam_from_world is None:
+        return None
+    poses = step.cam_from_world.astype(np.float64)
+    present = ~np.isnan(poses[:, 0])
+    common = present & ~np.isnan(final_poses[model, :, 0])
+    try:
+        final_from_step = similarity.align_poses(poses[common], final_poses[model, common]).b_from_a
+    except ValueError:
+        return None
+    poses[present] = similarity.transform_poses(final_from_step, poses[present])
+    xyz = None if step.point_xyz is None else similarity.apply(final_from_step, step.point_xyz).astype(np.float32)
+    return poses, xyz
+
+
+def _registration_steps(steps: Sequence[Step], model_of: Sequence[int], image_model: Ints, final_step: int) -> Ints:
+    """(I,) step from which an image belongs to its final model; -1 where it is in none."""
+    out = np.full(len(image_model), -1, np.int64)
+    out[image_model >= 0] = final_step
+    for step, model in reversed(list(zip(steps, model_of, strict=True))):
+        if model >= 0:
+            for image_idx in step.image_idx:
+                if image_model[image_idx] == model:
+                    out[image_idx] = step.step
+    return out
+
+
+# ------------------------------------------------------------------------------------------------ arrays of the parts
+
+
+def _offsets(counts: Sequence[int]) -> Ints:
+    return np.concatenate([[0], np.cumsum(np.asarray(counts, np.int64))]).astype(np.int64)
+
+
+def _join(parts: Sequence[NDArray[Any]], width: int, dtype: Any) -> NDArray[Any]:
+    return np.concatenate([np.zeros((0, width), dtype), *(np.asarray(p, dtype) for p in parts)])
+
+
+def _clouds(
+    snapshots: Sequence[tuple[Step, int, Float32 | None]], reconstructions: Sequence[Reconstruction]
+) -> dict[str, Any]:
+    with_points = [(step, model, xyz) for step, model, xyz in snapshots if xyz is not None]
+    colors = []
+    for step, model, _ in with_points:
+        rgb = reconstructions[model].point_rgb[step.point_track_idx]
+        # points that did not last have no colour: grey
+        colors.append(np.where(rgb.any(1, keepdims=True), rgb, np.uint8(128)))
+    return {
+        "cloud_step": np.array([step.step for step, _, _ in with_points], np.int64),
+        "cloud_model": np.array([model for _, model, _ in with_points], np.int64),
+        "cloud_ptr": _offsets([len(xyz) for _, _, xyz in with_points]),
+        "cloud_xyz": _join([xyz for _, _, xyz in with_points], 3, np.float32),
+        "cloud_rgb": _join(colors, 3, np.uint8),
+    }
+
+
+def _observations(
+    features: Sequence[Features], reconstructions: Sequence[Reconstruction], image_model: Ints
+) -> dict[str, Any]:
+    residuals = [r.residuals_px() for r in reconstructions]
+    seen_xy, seen_residual, loose_xy = [], [], []
+    for image_idx, (feature, model) in enumerate(zip(features, image_model, strict=True)):
+        is_loose = np.ones(len(feature), bool)
+        xy, residual = np.zeros((0, 2)), np.zeros((0, 2))
+        if model >= 0:
+            tracks = reconstructions[model].tracks
+            obs = tracks.observations_of_image(image_idx)
+            obs = obs[reconstructions[model].obs_is_inlier[obs]]
+            is_loose[tracks.obs_feature_idx[obs]] = False
+            xy, residual = tracks.obs_xy[obs], residuals[model][obs]
+        seen_xy.append(xy)
+        seen_residual.append(residual)
+        loose_xy.append(feature.keypoints[is_loose][:MAX_LOOSE_KEYPOINTS, :2])
+    return {
+        "obs_ptr": _offsets([len(xy) for xy in seen_xy]),
+        "obs_xy": _join(seen_xy, 2, np.float32),
+        "obs_residual": _join(seen_residual, 2, np.float32),
+        "keypoint_ptr": _offsets([len(xy) for xy in loose_xy]),
+        "keypoint_xy": _join(loose_xy, 2, np.float32),
+    }
+
+
+def _intrinsics(reconstructions: Sequence[Reconstruction], image_model: Ints) -> Float32:
+    out = np.full((len(image_model), 4), np.nan, np.float32)
+    for image_idx in np.flatnonzero(image_model >= 0):
+        reconstruction = reconstructions[image_model[image_idx]]
+        out[image_idx] = reconstruction.cameras[reconstruction.image_camera_idx[image_idx]].canonical[:4]
+    return out
+
+
+def _final_text(reconstructions: Sequence[Reconstruction]) -> str:
+    texts = []
+    for m, reconstruction in enumerate(reconstructions):
+        s = reconstruction.summary()
+        texts.append(
+            f"model {m}: {s['num_registered']} of {s['num_images']} images, {s['num_points']} points, "
+            f"{s['mean_reprojection_error_px']:.2f} px"
+        )
+    return "final " + "; ".join(texts)

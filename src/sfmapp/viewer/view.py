@@ -1,0 +1,112 @@
+"""Opens a recording: in a window where there is a screen, else for a browser on this machine."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from urllib.parse import quote
+
+from sfmapp.errors import InputError, SfmError
+
+HOST = "127.0.0.1"
+WEB_PORT, DATA_PORT = 9090, 9876
+
+# A viewer that ends sooner than this with an error never opened its window.
+_NEVER_OPENED_S = 10.0
+
+
+def view(
+    recording: Path, *, serve: bool | None = None, web_port: int = WEB_PORT, tell: Callable[[str], None] | None = None
+) -> None:
+    """Show a recording and wait until the viewer is closed, or the server stopped with Ctrl-C.
+
+    Nothing is reachable from other machines either way. Over ssh: ``ssh -L 9090:127.0.0.1:9090 -L
+    9876:127.0.0.1:9876 MACHINE`` there, then the address that is told here.
+
+    Args:
+        recording: a ``.rrd`` file.
+        serve: for a browser instead of in a window; None: if there is no screen, or no window could be opened on it.
+        web_port: where to serve it; another free one is taken if it is in use.
+        tell: given a line on how to reach it.
+
+    Raises:
+        InputError: the file does not exist.
+        SfmError: the viewer failed.
+    """
+    if not recording.is_file():
+        raise InputError(f"{recording} does not exist")
+    if serve is None:
+        serve = not has_screen()
+        if not serve and _open_window(recording):
+            return
+    elif not serve:
+        if not _open_window(recording):
+            raise SfmError("rerun could not open a window", "look at it in a browser: serve it")
+        return
+    web_port, data_port = free_port(web_port), free_port(DATA_PORT)
+    if tell is not None:
+        tell(f"serving {recording} at {server_url(web_port, data_port)} for browsers on this machine; Ctrl-C ends it")
+    code = _run(server_command(recording, web_port, data_port))
+    if code not in (0, -signal.SIGINT, 130):
+        raise SfmError(f"rerun ended with code {code}", f"try: rerun {recording}")
+
+
+def has_screen() -> bool:
+    """Whether a window can probably be opened."""
+    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def window_command(recording: Path) -> list[str]:
+    """The native viewer. It, too, listens for data: on this machine only, on any free port."""
+    return [*_RERUN, "--bind", HOST, "--port", "auto", str(recording)]
+
+
+def server_command(recording: Path, web_port: int, data_port: int) -> list[str]:
+    """The web viewer and the data it fetches, each on a port of this machine only."""
+    ports = ["--web-viewer-port", str(web_port), "--port", str(data_port)]
+    return [*_RERUN, "--serve-web", "--bind", HOST, *ports, str(recording)]
+
+
+def server_url(web_port: int, data_port: int) -> str:
+    """What to open in a browser."""
+    return f"http://{HOST}:{web_port}/?url=" + quote(f"rerun+http://{HOST}:{data_port}/proxy", safe="")
+
+
+def free_port(preferred: int) -> int:
+    """The preferred port of this machine if nothing listens there, else any other."""
+    for port in (preferred, 0):
+        with socket.socket() as probe:
+            # as servers do: a port that was in use a moment ago is free
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((HOST, port))
+            except OSError:
+                continue
+            return int(probe.getsockname()[1])
+    raise SfmError(f"no free port on {HOST}")
+
+
+_RERUN = (sys.executable, "-m", "rerun_cli")
+
+
+def _open_window(recording: Path) -> bool:
+    """Show it in a window until that is closed; False if there was none."""
+    start = time.monotonic()
+    code = _run(window_command(recording))
+    return code in (0, -signal.SIGINT, 130) or time.monotonic() - start > _NEVER_OPENED_S
+
+
+def _run(command: Sequence[str]) -> int:
+    """Run to the end; Ctrl-C reaches the child as well, and is its business."""
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    while True:
+        try:
+            return process.wait()
+        except KeyboardInterrupt:
+            process.terminate()
