@@ -53,7 +53,8 @@ def render_html(report: Mapping[str, Any], model: Reconstruction | None) -> str:
     if model is not None:
         note = "Points and cameras of the largest model; each triangle opens where its camera looks."
         body.append(f'<h2>From above</h2>{top_view_svg(model)}<p class="dim">{note}</p>')
-    body.append("<h2>Images</h2>" + _images(report["images"]) + _skipped(report["skipped"]))
+    body.append(_failed(report["images"]) + _skipped(report["skipped"]))
+    body.append("<h2>Images</h2>" + _images(report["images"]))
     body.append("<h2>Cameras</h2>" + _cameras(report["cameras"]))
     body.append("<h2>Time and memory</h2>" + _usage(report))
     body.append(_log("Warnings", report["warnings"]) + _log("Decisions", report["decisions"]))
@@ -84,14 +85,25 @@ def _checks(checks: Iterable[Mapping[str, str]]) -> str:
 
 
 def _images(images: Iterable[Mapping[str, Any]]) -> str:
-    head = [("t", "image"), ("", "model"), *(("", label) for _, label in FUNNEL), ("t", "why not, and what helps")]
+    head = [("t", "image"), ("", "model"), *(("", label) for _, label in FUNNEL)]
     rows = []
     for image in images:
         light = "green" if image["is_registered"] else "red"
-        why = "" if image["is_registered"] else f"{image['failed_at']}: {image['reason']}. {image['remedy']}"
         counts = [("", image["funnel"][key]) for key, _ in FUNNEL]
-        rows.append([(f"t {light}", image["name"]), ("", image["model"]), *counts, ("w", why)])
+        rows.append([(f"t {light}", image["name"]), ("", image["model"]), *counts])
     return _table(head, rows)
+
+
+def _failed(images: Iterable[Mapping[str, Any]]) -> str:
+    rows = [
+        [("t red", image["name"]), ("t", image["failed_at"]), ("w", image["reason"]), ("w", image["remedy"])]
+        for image in images
+        if not image["is_registered"]
+    ]
+    if not rows:
+        return ""
+    head = [("t", "image"), ("t", "failed at"), ("t", "why"), ("t", "what helps")]
+    return "<h2>Images in no model</h2>" + _table(head, rows)
 
 
 def _skipped(skipped: Sequence[Mapping[str, str]]) -> str:
