@@ -60,6 +60,14 @@ def test_a_model_folder_will_do(workspace: Path, tmp_path: Path) -> None:
     assert export_model(tmp_path / "text", "colmap-bin", tmp_path / "bin")["max_px"] < 1e-9
 
 
+def test_bundler_says_where_its_pixels_begin(workspace: Path, tmp_path: Path) -> None:
+    assert export_model(workspace, "bundler", tmp_path / "a")["notes"] == []
+    write_model(tmp_path / "m", scene([synthetic_camera(CameraModel.SIMPLE_RADIAL)]))
+    report = export_model(tmp_path / "m", "bundler", tmp_path / "b")
+    assert report["max_px"] < 1e-7
+    assert "up to 5.00 px off the centre" in report["notes"][0]
+
+
 @pytest.mark.parametrize("model", list(CameraModel))
 def test_every_camera_model_goes_to_nerfstudio_and_colmap(tmp_path: Path, model: CameraModel) -> None:
     write_model(tmp_path / "m", scene([synthetic_camera(model)]))

@@ -1,7 +1,8 @@
 """Bundler's output, version 0.3 (Snavely, "Bundler v0.4 user's manual", 2010).
 
-Its cameras look down their negative z axis with y up, its pixels are counted from the centre of the image with y up,
-and its lens is a focal length and two radial coefficients.
+Its cameras look down their negative z axis with y up, its pixels are counted from the principal point with y up, and
+its lens is a focal length and two radial coefficients. It does not say where the principal point lies in the image:
+most programs take the centre.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.text_input import nearest_rotation, read_limited_text
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import Camera, CameraModel, simple_camera
+from sfmapp.scene.camera import Camera, CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
 
@@ -30,8 +31,8 @@ def write_bundler(path: str | Path, reconstruction: Reconstruction) -> None:
     """Write the registered images, the points and their inliers; beside them, as COLMAP does, names: ``NAME.list.txt``.
 
     Raises:
-        UsageError: a camera has what the format cannot hold: tangential or fisheye distortion, two focal lengths, a
-            principal point off the centre of the image; or an image name holds white space.
+        UsageError: a camera has what the format cannot hold: tangential or fisheye distortion, two focal lengths; or
+            an image name holds white space.
     """
     path = Path(path)
     registered = reconstruction.registered_idx
@@ -61,8 +62,7 @@ def list_path(path: Path) -> Path:
 
 
 def _refuse_loss(camera: Camera, idx: int) -> None:
-    fx, fy, cx, cy, _, _, p1, p2 = camera.canonical
-    off_center = (cx - camera.width / 2, cy - camera.height / 2)
+    fx, fy, _, _, _, _, p1, p2 = camera.canonical
     lost = []
     if camera.is_fisheye:
         lost.append("fisheye projection")
@@ -70,8 +70,6 @@ def _refuse_loss(camera: Camera, idx: int) -> None:
         lost.append(f"tangential distortion p1 = {p1:.3g}, p2 = {p2:.3g}")
     if fx != fy:
         lost.append(f"separate focal lengths fx = {fx:.2f}, fy = {fy:.2f}")
-    if max(map(abs, off_center)) > 1e-9 * max(camera.width, camera.height):
-        lost.append(f"principal point {off_center[0]:+.2f}, {off_center[1]:+.2f} px off the centre")
     if lost:
         raise UsageError(
             f"Bundler's format cannot hold camera {idx} ({camera.model.name}): it would lose its {' and '.join(lost)}",
@@ -100,7 +98,9 @@ def _text(values: Array | list[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def read_bundler(path: str | Path, image_sizes: NDArray[np.integer] | None = None) -> Reconstruction:
+def read_bundler(
+    path: str | Path, image_sizes: NDArray[np.integer] | None = None, principal_points: Array | None = None
+) -> Reconstruction:
     """Read cameras, points and observations; names come from ``NAME.list.txt`` or ``list.txt`` beside it.
 
     Images share a camera (RADIAL) where their numbers are equal. A focal length of zero is Bundler's sign for an image
@@ -109,6 +109,7 @@ def read_bundler(path: str | Path, image_sizes: NDArray[np.integer] | None = Non
     Args:
         image_sizes: (I, 2) width and height in pixels, which the format does not hold. None: the smallest image around
             the centre that holds all observations, so that pixels are right up to a shift.
+        principal_points: (I, 2) pixels; None: the centre of each image.
 
     Raises:
         InputError: another version, truncated, not finite, indices out of range, or names that do not fit.
@@ -138,8 +139,9 @@ def read_bundler(path: str | Path, image_sizes: NDArray[np.integer] | None = Non
             f"{path}: expected views of {num_images} cameras, found {views[np.argmax(wrong), :2].tolist()}"
         )
     sizes = _image_sizes(path, image_sizes, num_images, views)
-    camera_list, camera_idx, poses = _read_cameras(path, cameras, sizes)
-    xy = views[:, 2:] * [1, -1] + sizes[image] / 2
+    centers = sizes / 2 if principal_points is None else np.asarray(principal_points, np.float64).reshape(-1, 2)
+    camera_list, camera_idx, poses = _read_cameras(path, cameras, sizes, centers)
+    xy = views[:, 2:] * [1, -1] + centers[image]
     tracks = make_tracks(num_images, num_points, obs_point, image, feature, xy)
     inliers = np.isfinite(poses[tracks.obs_image_idx, 0])
     return Reconstruction(camera_list, _names(path, num_images), camera_idx, poses, tracks, xyz, inliers, rgb)
@@ -183,7 +185,9 @@ def _read_points(
     return heads[:, :3].copy(), rgb.astype(np.uint8), obs_point, np.concatenate([*views, np.zeros((0, 4))])
 
 
-def _read_cameras(path: Path, rows: Array, sizes: Array) -> tuple[list[Camera], NDArray[np.int32], Array]:
+def _read_cameras(
+    path: Path, rows: Array, sizes: Array, centers: Array
+) -> tuple[list[Camera], NDArray[np.int32], Array]:
     """Cameras, the camera of each image, and poses (I, 7), NaN where unregistered."""
     cameras: list[Camera] = []
     known: dict[tuple, int] = {}
@@ -192,13 +196,14 @@ def _read_cameras(path: Path, rows: Array, sizes: Array) -> tuple[list[Camera], 
     for i, row in enumerate(rows):
         place = f"{path}: camera {i}"
         width, height = (int(side) for side in sizes[i])
-        key = (width, height, *row[:3])
+        key = (width, height, *centers[i], *row[:3])
         if row[0] < 0:
             raise InputError(f"{place}: expected a positive focal length, found {row[0]}")
         if key not in known:
             known[key] = len(cameras)
-            camera = simple_camera(CameraModel.RADIAL, width, height, row[0] or 1.2 * max(width, height), source="file")
-            cameras.append(camera.with_params([*camera.params[:3], *row[1:3]]))
+            focal = row[0] or 1.2 * max(width, height)
+            params = np.array([focal, *centers[i], *row[1:3]])
+            cameras.append(Camera(CameraModel.RADIAL, width, height, params, focal_source="file"))
         camera_idx[i] = known[key]
         if row[0] > 0:
             rotation = nearest_rotation(place, row[3:12].reshape(3, 3))

@@ -16,6 +16,8 @@ from sfmapp.formats.colmap import has_model, read_model, write_model, write_mode
 from sfmapp.pipelines.workspace import read_manifest
 from sfmapp.scene.reconstruction import Reconstruction
 
+_NOTICEABLE_PX = 0.1  # below the noise of a keypoint
+
 
 @dataclass(frozen=True)
 class _Source:
@@ -34,6 +36,7 @@ class _Copy:
     model: Reconstruction
     files: list[Path]
     reader: str
+    notes: tuple[str, ...] = ()
 
 
 def export_model(output: str | os.PathLike[str], target: str, path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -46,8 +49,9 @@ def export_model(output: str | os.PathLike[str], target: str, path: str | os.Pat
 
     Returns:
         JSON-able: ``format``, ``files``, ``reader`` (what read it back), ``num_images``, ``num_points``,
-        ``num_observations``, ``max_px`` (worst difference of a reprojection, in pixels) and ``max_coordinate`` (worst
-        difference of a coordinate of a point, in units of the world).
+        ``num_observations``, ``max_px`` (worst difference of a reprojection, in pixels), ``max_coordinate`` (worst
+        difference of a coordinate of a point, in units of the world) and ``notes``, what a user of the files has to
+        know.
 
     Raises:
         UsageError: an unknown format, a camera or name that it cannot hold, or the model's own folder as the target.
@@ -76,6 +80,7 @@ def export_model(output: str | os.PathLike[str], target: str, path: str | os.Pat
         "num_observations": int(ours.obs_is_inlier.sum()),
         "max_px": _worst_px(ours, theirs),
         "max_coordinate": float(np.abs(theirs.point_xyz - ours.point_xyz).max(initial=0.0)),
+        "notes": list(copy.notes),
     }
 
 
@@ -153,9 +158,18 @@ def _export_bundler(source: _Source, path: Path) -> _Copy:
 
     file = _file_in(path, ".out", "bundle.out")
     write_bundler(file, source.model)
-    cameras = source.model.cameras
-    sizes = [(cameras[i].width, cameras[i].height) for i in source.model.image_camera_idx]
-    return _Copy(read_bundler(file, np.array(sizes).reshape(-1, 2)), [file, list_path(file)], "sfmapp")
+    cameras = [source.model.cameras[i] for i in source.model.image_camera_idx]
+    sizes = np.array([(camera.width, camera.height) for camera in cameras]).reshape(-1, 2)
+    principal_points = np.array([camera.canonical[2:4] for camera in cameras]).reshape(-1, 2)
+    off_center = np.linalg.norm(principal_points - sizes / 2, axis=1).max(initial=0.0)
+    notes: tuple[str, ...] = ()
+    if off_center > _NOTICEABLE_PX:
+        notes = (
+            f"pixels are counted from the principal point, up to {off_center:.2f} px off the centre of the image: the "
+            "geometry is exact, but a program that takes the centre for it sees the photographs shifted by as much",
+        )
+    copy = read_bundler(file, sizes, principal_points)
+    return _Copy(copy, [file, list_path(file)], "sfmapp", notes)
 
 
 def _export_nerfstudio(source: _Source, path: Path) -> _Copy:
