@@ -1,7 +1,7 @@
 """Global adjustment of a model from a perturbed start: sfmapp against pycolmap's Ceres.
 
-Both get the same state, observations, loss, free parameters (focal length and distortion, not the principal point), stop
-rule (relative decrease of the cost) and one thread, both leave the gauge free, both run warm in this process, in
+Both get the same state, observations, loss, free parameters (focal length and distortion, not the principal point),
+stop rule (relative decrease of the cost) and one thread, both leave the gauge free, both run warm in this process, in
 turns. CPU seconds are those of the whole call, set-up included; costs come from one neutral function.
 
     python benchmarks/bundle_adjustment.py MODEL_FOLDER ...        COLMAP models (cameras.bin, images.bin, points3D.bin)

@@ -178,11 +178,11 @@ def find_slot(keys, values, key):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def reduce_points(
+def reduce_points(  # type: ignore[no-untyped-def]
     first, last, point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_camera, image_block, intrinsics, fisheye,
     camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, damping, hash_keys, hash_values,
     tiles, own, cross, gradient, point_factor,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """Linearise points first..last and eliminate them; returns the cost of their observations.
 
     Args:
@@ -332,11 +332,11 @@ def reduce_points(
 
 
 @numba.njit(cache=True, nogil=True)
-def substitute_points(
+def substitute_points(  # type: ignore[no-untyped-def]
     first, last, point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_camera, image_block, intrinsics, fisheye,
     camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, point_factor, step, new_poses,
     new_intrinsics, new_xyz, sums,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """Steps of points first..last after those of the blocks, and the cost of the state that results.
 
     Args (beyond those of :func:`reduce_points`):
@@ -413,10 +413,10 @@ def substitute_points(
 
 
 @numba.njit(cache=True, nogil=True)
-def retract(
+def retract(  # type: ignore[no-untyped-def]
     poses, image_block, canonical, camera_block, free_ptr, free_slot, free_column, step, new_poses, new_rows,
     new_canonical,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """Apply a step of the blocks: ``x_cam <- exp(w) x_cam + v`` on poses (I, 7), sums on canonical rows (C, 8).
 
     Constant poses and cameras keep their bits. Also fills new_rows (I, 12). Returns the squared translation step and

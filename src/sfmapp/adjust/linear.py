@@ -21,10 +21,10 @@ def aligned_zeros(*shape: int) -> Array:
 
 
 @numba.njit(cache=True, nogil=True)
-def assemble(
+def assemble(  # type: ignore[no-untyped-def]
     tiles, own, cross, gradient, image_block, image_camera, camera_block, block_dim, hash_keys, hash_values, extra_own,
     extra_gradient, diagonal,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """Sum the chunks, in order, into the first: tiles (K, N * 64) and own, cross, gradient likewise.
 
     Adds extra_own (B * 64,) and extra_gradient (B * 8,), what priors say about single blocks; fills diagonal (B * 8,)
@@ -159,52 +159,6 @@ def solve_tiles(tiles, num_blocks, inverse, x):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def hash_tiles(point_ptr, obs_image, image_camera, image_block, camera_block, num_blocks, pairs):  # type: ignore[no-untyped-def]
-    """Which pairs of blocks a <= b meet in a point: an open hash table of keys a B + b and tile numbers.
-
-    Returns (keys, values, count); pairs (M,) int64 are keys to hold besides.
-    """
-    size = 1024
-    keys = np.full(size, -1, np.int64)
-    values = np.zeros(size, np.int64)
-    count = 0
-    longest = 1
-    for p in range(point_ptr.shape[0] - 1):
-        longest = max(longest, point_ptr[p + 1] - point_ptr[p])
-    blocks = np.zeros(2 * longest, np.int64)
-    for p in range(-1, point_ptr.shape[0] - 1):
-        found = 0
-        if p >= 0:
-            for o in range(point_ptr[p], point_ptr[p + 1]):
-                for block in (image_block[obs_image[o]], camera_block[image_camera[obs_image[o]]]):
-                    if block >= 0:
-                        blocks[found] = block
-                        found += 1
-        total = found * found if p >= 0 else pairs.shape[0]
-        for n in range(total):
-            if p < 0:
-                key = pairs[n]
-            else:
-                a, b = blocks[n // found], blocks[n % found]
-                if a > b:
-                    continue
-                key = a * num_blocks + b
-            if find_slot(keys, values, key) >= 0:
-                continue
-            if 2 * count >= size:
-                old_keys, old_values = keys, values
-                size *= 4
-                keys = np.full(size, -1, np.int64)
-                values = np.zeros(size, np.int64)
-                for m in range(old_keys.shape[0]):
-                    if old_keys[m] >= 0:
-                        _insert(keys, values, old_keys[m], old_values[m])
-            _insert(keys, values, key, count)
-            count += 1
-    return keys, values, count
-
-
-@numba.njit(cache=True, nogil=True)
 def _insert(keys, values, key, value):  # type: ignore[no-untyped-def]
     mask = keys.shape[0] - 1
     h = ((key * 0x9E3779B97F4A7C) >> 20) & mask
@@ -212,3 +166,52 @@ def _insert(keys, values, key, value):  # type: ignore[no-untyped-def]
         h = (h + 1) & mask
     keys[h] = key
     values[h] = value
+
+
+@numba.njit(cache=True, nogil=True)
+def _hold(keys, values, count, key):  # type: ignore[no-untyped-def]
+    """Make sure that a key is in the table; returns the table, four times as large where it was half full."""
+    if find_slot(keys, values, key) >= 0:
+        return keys, values, count
+    if 2 * count >= keys.shape[0]:
+        old_keys, old_values = keys, values
+        keys = np.full(4 * old_keys.shape[0], -1, np.int64)
+        values = np.zeros(4 * old_keys.shape[0], np.int64)
+        for m in range(old_keys.shape[0]):
+            if old_keys[m] >= 0:
+                _insert(keys, values, old_keys[m], old_values[m])
+    _insert(keys, values, key, count)
+    return keys, values, count + 1
+
+
+@numba.njit(cache=True, nogil=True)
+def hash_tiles(point_ptr, obs_image, image_camera, image_block, camera_block, num_blocks, pairs):  # type: ignore[no-untyped-def]
+    """Which pairs of blocks a <= b meet in a point: an open hash table of keys a B + b and tile numbers.
+
+    Returns (keys, values, count); pairs (M,) int64 are keys to hold besides.
+    """
+    keys, values, count = np.full(1024, -1, np.int64), np.zeros(1024, np.int64), 0
+    longest = 1
+    for p in range(point_ptr.shape[0] - 1):
+        longest = max(longest, point_ptr[p + 1] - point_ptr[p])
+    blocks = np.zeros(2 * longest, np.int64)
+    for key in pairs:
+        keys, values, count = _hold(keys, values, count, key)
+    for p in range(point_ptr.shape[0] - 1):
+        found = 0
+        for o in range(point_ptr[p], point_ptr[p + 1]):
+            i = obs_image[o]
+            block, other = image_block[i], camera_block[image_camera[i]]
+            if block >= 0:
+                blocks[found] = block
+                found += 1
+            # neighbours in a track often share the camera
+            if other >= 0 and other != block and (found == 0 or blocks[found - 1] != other):
+                blocks[found] = other
+                found += 1
+        for n in range(found):
+            for m in range(found):
+                key = blocks[n] * num_blocks + blocks[m]
+                if blocks[n] <= blocks[m] and find_slot(keys, values, key) < 0:
+                    keys, values, count = _hold(keys, values, count, key)
+    return keys, values, count

@@ -27,7 +27,7 @@ LOSS_IDS: dict[str, int] = {"trivial": kernels.TRIVIAL, "huber": kernels.HUBER, 
 # Up to this many blocks the dense tile factor beats gtsam's sparse one.
 _MAX_DENSE_BLOCKS = 160
 # Work worth a chunk of its own, and the most memory that the chunks' private sums may take together.
-_CHUNK_OBSERVATIONS, _MAX_CHUNKS, _CHUNK_BYTES = 16384, 8, 1 << 28
+_CHUNK_OBSERVATIONS, _MAX_CHUNKS, _CHUNK_BYTES = 16384, 8, 1 << 26
 
 
 @dataclass(frozen=True)
