@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 PLAIN_PERIOD_S = 5.0
+# the stage that runs beside the others, and only now and then: a person has to be told
+BACKGROUND = "kernels"
 
 
 class Listener(Protocol):
@@ -61,7 +63,7 @@ class PlainLines:
             return
         elif event.kind == "started":
             # a step inside a stage, such as one of many adjustments, is worth a line only to the curious
-            if self._is_verbose or not self._started:
+            if self._is_verbose or not self._started or event.stage == BACKGROUND:
                 _say(f"{event.stage}: {event.message or 'begins'}")
             self._started[event.stage] = event.time_s
         elif event.kind == "advanced":
@@ -71,7 +73,7 @@ class PlainLines:
                 _say(f"  {event.message}")
         elif event.kind == "finished":
             took = event.time_s - self._started.pop(event.stage, event.time_s)
-            if self._is_verbose or not self._started:
+            if self._is_verbose or not self._started or event.stage == BACKGROUND:
                 _say(f"{event.stage}: {event.message or 'done'} ({took:.1f} s)")
 
     def close(self) -> None:
