@@ -93,10 +93,10 @@ class RecordingListener:
             )
         )
         self._thin(lambda s: s.point_xyz is not None, MAX_CLOUDS, point_track_idx=None, point_xyz=None)
+        # clouds are drawn among the cameras of their step, so those keep their poses
         self._thin(
-            lambda s: s.cam_from_world is not None, MAX_POSES,
-            cam_from_world=None, point_track_idx=None, point_xyz=None,
-        )  # fmt: skip
+            lambda s: s.cam_from_world is not None and s.point_xyz is None, MAX_POSES - MAX_CLOUDS, cam_from_world=None
+        )
 
     def _sample(self, point_xyz: Any) -> tuple[NDArray[np.int32] | None, NDArray[np.float32] | None]:
         """Up to MAX_CLOUD_POINTS points that exist, the same ones every time as far as they do."""

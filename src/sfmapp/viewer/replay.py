@@ -94,7 +94,7 @@ class Replay:
         """Write ``replay.npz`` and ``replay.json``."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-        np.savez(folder / "replay.npz", **arrays)
+        np.savez(folder / "replay.npz", **arrays)  # type: ignore[arg-type]
         text = {name: value for name, value in values.items() if name not in arrays}
         (folder / "replay.json").write_text(json.dumps(text), encoding="utf-8")
 

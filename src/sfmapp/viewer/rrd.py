@@ -46,10 +46,12 @@ _MODEL_COLORS = (_BLUE, (90, 200, 120), (200, 120, 220), (220, 200, 80))
 def write_rrd(replay: Replay, path: Path, threads: int = 1) -> None:
     """Write a recording with its blueprint. The file appears whole or not at all."""
     beside = path.with_name(f".{path.name}.part")
-    recording = rr.RecordingStream(APPLICATION, recording_id=replay.title or None)
+    recording = rr.RecordingStream(APPLICATION)
     try:
         stage = _Stage(replay)
-        recording.save(beside, default_blueprint=_blueprint(replay, stage))
+        recording.save(beside)
+        # active, so that a layout that somebody kept for another scene does not look past this one
+        recording.send_blueprint(_blueprint(replay, stage), make_active=True, make_default=True)
         if replay.title:
             recording.send_recording_name(replay.title)
         photos = _load_photos(replay, threads)
@@ -89,11 +91,12 @@ class _Stage:
         edge = boxes[0][1][0]
         for m in range(1, num_models):
             low, high = boxes[m]
-            self.scale[m] = np.linalg.norm(boxes[0][1] - boxes[0][0]) / max(np.linalg.norm(high - low), 1e-12) * 0.6
+            size, first_size = np.linalg.norm(high - low), np.linalg.norm(boxes[0][1] - boxes[0][0])
+            self.scale[m] = 0.6 * first_size / size if size > 0 else 1.0
             gap = 0.3 * (boxes[0][1][0] - boxes[0][0][0])
             self.shift[m] = np.array([edge + gap, boxes[0][0][1], boxes[0][0][2]]) - self.scale[m] * low
             edge += gap + self.scale[m] * (high[0] - low[0])
-        self._place_eye(replay, boxes[0])
+        self._place_eye(replay)
 
     def _look_at_model(self, replay: Replay, m: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Box of a model's cameras and of its points without the tails."""
@@ -104,7 +107,7 @@ class _Stage:
             centers = np.concatenate([centers, np.percentile(xyz, [3, 97], axis=0)])
         return centers.min(0), centers.max(0)
 
-    def _place_eye(self, replay: Replay, box: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
+    def _place_eye(self, replay: Replay) -> None:
         poses = replay.model_cam_from_world[0].astype(np.float64)
         poses = poses[~np.isnan(poses[:, 0])]
         centers = rigid3.center(poses) @ self.rotation.T
@@ -177,10 +180,8 @@ def _draw_world(
         turn = stage.scale[m] * stage.rotation
         recording.log(root, rr.Transform3D(translation=stage.shift[m], mat3x3=turn), static=True)
         _draw_points(recording, replay, m, f"{root}/points")
-        for image_idx in np.flatnonzero(~np.isnan(replay.model_cam_from_world[m, :, 0])):
-            if replay.image_model[image_idx] == m:
-                length = stage.frustum / stage.scale[m]
-                _draw_camera(recording, replay, m, int(image_idx), length, photos[image_idx])
+        for image_idx in np.flatnonzero(replay.image_model == m).tolist():
+            _draw_camera(recording, replay, m, image_idx, stage.frustum / stage.scale[m], photos[image_idx])
 
 
 def _draw_points(recording: rr.RecordingStream, replay: Replay, m: int, path: str) -> None:
@@ -337,7 +338,7 @@ def _residual_colors(length_px: NDArray[np.float32]) -> NDArray[np.uint32]:
 def _packed(rgb: Sequence[tuple[int, int, int]] | NDArray[np.uint8]) -> NDArray[np.uint32]:
     """Colours as rerun stores them, 0xRRGGBBAA."""
     c = np.asarray(rgb, np.uint32).reshape(-1, 3)
-    return (c[:, 0] << 24) | (c[:, 1] << 16) | (c[:, 2] << 8) | 255
+    return ((c[:, 0] << 24) | (c[:, 1] << 16) | (c[:, 2] << 8) | 255).astype(np.uint32)
 
 
 # ---------------------------------------------------------------- numbers and words
