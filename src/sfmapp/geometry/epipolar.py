@@ -180,6 +180,19 @@ def choose_in_front(poses: Array, xn1: Array, xn2: Array) -> tuple[Array, NDArra
 
 
 @numba.njit(cache=True, nogil=True)
+def _tangent_plane(t: Array, out: Array) -> None:
+    """Orthonormal basis (3, 2) of the plane that touches the unit sphere at t."""
+    x, y, z = abs(t[0]), abs(t[1]), abs(t[2])
+    k = 0 if x <= y and x <= z else (1 if y <= z else 2)
+    i, j = (k + 1) % 3, (k + 2) % 3
+    norm = math.sqrt(t[i] * t[i] + t[j] * t[j])
+    out[k, 0], out[i, 0], out[j, 0] = 0.0, -t[j] / norm, t[i] / norm
+    for m in range(3):
+        n, p = (m + 1) % 3, (m + 2) % 3
+        out[m, 1] = t[n] * out[p, 0] - t[p] * out[n, 0]
+
+
+@numba.njit(cache=True, nogil=True)
 def _pose_normal_equations(
     r: Array, t: Array, xn1: Array, xn2: Array, scale2: float, tangent: Array, h: Array, g: Array
 ) -> float:
@@ -208,29 +221,101 @@ def _pose_normal_equations(
         ratio = residual * residual / scale2
         weight = 1.0 / (1.0 + ratio)
         cost += math.log1p(ratio)
-        # the numerator is b2 . (t x a1) with a1 = R x1, b2 = x2; Sampson's denominator is held still, as is usual
+        # the numerator is x2 . (t x R x1) = (R x1) . (x2 x t); Sampson's denominator is held still, as is usual
         p0 = r[0, 0] * x + r[0, 1] * y + r[0, 2]
         p1 = r[1, 0] * x + r[1, 1] * y + r[1, 2]
         p2 = r[2, 0] * x + r[2, 1] * y + r[2, 2]
-        q0, q1, q2 = v * t[2] - t[1], t[0] - u * t[2], u * t[1] - v * t[0]  # b2 x t
+        q0, q1, q2 = v * t[2] - t[1], t[0] - u * t[2], u * t[1] - v * t[0]  # x2 x t
         jacobian[0] = (p1 * q2 - p2 * q1) * s
         jacobian[1] = (p2 * q0 - p0 * q2) * s
         jacobian[2] = (p0 * q1 - p1 * q0) * s
-        m0, m1, m2 = p1 - p2 * v, p2 * u - p0, p0 * v - p1 * u  # a1 x b2
+        m0, m1, m2 = p1 - p2 * v, p2 * u - p0, p0 * v - p1 * u  # R x1 x x2
         jacobian[3] = (m0 * tangent[0, 0] + m1 * tangent[1, 0] + m2 * tangent[2, 0]) * s
         jacobian[4] = (m0 * tangent[0, 1] + m1 * tangent[1, 1] + m2 * tangent[2, 1]) * s
         for k in range(5):
             g[k] += weight * jacobian[k] * residual
-            for m in range(k, 5):
+            for m in range(k + 1):
                 h[k, m] += weight * jacobian[k] * jacobian[m]
-    for k in range(5):
-        for m in range(k):
-            h[k, m] = h[m, k]
     return cost
 
 
+@numba.njit(cache=True, nogil=True)
+def _solve_damped(h: Array, g: Array, damping: float, factor: Array, step: Array) -> bool:
+    """Cholesky solution of (H + damping diag(H)) step = -g from the lower triangle of H; False if it is singular."""
+    n = g.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            total = h[i, j] * (1.0 + damping) if i == j else h[i, j]
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i == j:
+                if total <= 1e-15 * h[i, i] or total <= 0.0:
+                    return False
+                factor[i, i] = math.sqrt(total)
+            else:
+                factor[i, j] = total / factor[j, j]
+    for i in range(n):
+        total = -g[i]
+        for k in range(i):
+            total -= factor[i, k] * step[k]
+        step[i] = total / factor[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            step[i] -= factor[k, i] * step[k]
+        step[i] /= factor[i, i]
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _move_pose(r: Array, t: Array, tangent: Array, step: Array, new_r: Array, new_t: Array) -> None:
+    """exp(w) R by Rodrigues' formula column by column, and t moved in its tangent plane and back to the sphere."""
+    wx, wy, wz = step[0], step[1], step[2]
+    angle = math.sqrt(wx * wx + wy * wy + wz * wz)
+    a = math.sin(angle) / angle if angle > 1e-9 else 1.0
+    b = 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2 if angle > 1e-9 else 0.5
+    for k in range(3):
+        x, y, z = r[0, k], r[1, k], r[2, k]
+        cx, cy, cz = wy * z - wz * y, wz * x - wx * z, wx * y - wy * x
+        new_r[0, k] = x + a * cx + b * (wy * cz - wz * cy)
+        new_r[1, k] = y + a * cy + b * (wz * cx - wx * cz)
+        new_r[2, k] = z + a * cz + b * (wx * cy - wy * cx)
+    norm = 0.0
+    for k in range(3):
+        new_t[k] = t[k] + tangent[k, 0] * step[3] + tangent[k, 1] * step[4]
+        norm += new_t[k] * new_t[k]
+    new_t /= math.sqrt(norm)
+
+
+@numba.njit(cache=True, nogil=True)
+def _refine_pose(r: Array, t: Array, xn1: Array, xn2: Array, scale2: float, max_iterations: int) -> None:
+    """Levenberg-Marquardt; r and t are changed in place."""
+    h, g, factor, step = np.empty((5, 5)), np.empty(5), np.empty((5, 5)), np.empty(5)
+    new_h, new_g, new_r, new_t = np.empty((5, 5)), np.empty(5), np.empty((3, 3)), np.empty(3)
+    tangent, new_tangent = np.empty((3, 2)), np.empty((3, 2))
+    _tangent_plane(t, tangent)
+    cost = _pose_normal_equations(r, t, xn1, xn2, scale2, tangent, h, g)
+    damping = 1e-4
+    for _ in range(max_iterations):
+        new_cost = math.inf
+        if _solve_damped(h, g, damping, factor, step):
+            _move_pose(r, t, tangent, step, new_r, new_t)
+            _tangent_plane(new_t, new_tangent)
+            new_cost = _pose_normal_equations(new_r, new_t, xn1, xn2, scale2, new_tangent, new_h, new_g)
+        if not new_cost < cost:
+            damping *= 10.0
+            if damping > 1e3:
+                return
+            continue
+        has_converged = cost - new_cost < 1e-6 * cost
+        r[:], t[:], tangent[:], h[:], g[:] = new_r, new_t, new_tangent, new_h, new_g
+        cost = new_cost
+        damping = max(damping * 0.1, 1e-9)
+        if has_converged:
+            return
+
+
 def refine_relative_pose(
-    cam2_from_cam1: ArrayLike, xn1: Array, xn2: Array, scale: float, max_iterations: int = 10
+    cam2_from_cam1: ArrayLike, xn1: Array, xn2: Array, scale: float, max_iterations: int = 20
 ) -> Array:
     """Levenberg-Marquardt on the Cauchy-weighted Sampson error over the five degrees of freedom of a relative pose.
 
@@ -243,42 +328,9 @@ def refine_relative_pose(
         (7,) pose with unit translation; its cost is never above that of the start.
     """
     pose = np.asarray(cam2_from_cam1, np.float64)
-    r, t = rigid3.rotation_matrix(pose), pose[4:] / np.linalg.norm(pose[4:])
-    a, b = _contiguous(xn1, xn2)
-    h, g = np.empty((5, 5)), np.empty(5)
-    damping = 1e-4
-    tangent = _tangent_of(t)
-    cost = _pose_normal_equations(r, t, a, b, scale * scale, tangent, h, g)
-    for _ in range(max_iterations):
-        try:
-            step = -np.linalg.solve(h + damping * np.diag(np.diag(h)) + 1e-15 * np.trace(h) * np.eye(5), g)
-        except np.linalg.LinAlgError:
-            break
-        new_r = np.ascontiguousarray(rigid3.exp_so3(step[:3]) @ r)
-        new_t = t + tangent @ step[3:]
-        new_t /= np.linalg.norm(new_t)
-        new_tangent, new_h, new_g = _tangent_of(new_t), np.empty((5, 5)), np.empty(5)
-        new_cost = _pose_normal_equations(new_r, new_t, a, b, scale * scale, new_tangent, new_h, new_g)
-        if not new_cost < cost:
-            damping *= 10.0
-            if damping > 1e3:
-                break
-            continue
-        converged = cost - new_cost < 1e-8 * cost
-        r, t, tangent, h, g, cost = new_r, new_t, new_tangent, new_h, new_g, new_cost
-        damping = max(damping * 0.1, 1e-9)
-        if converged:
-            break
+    r, t = np.ascontiguousarray(rigid3.rotation_matrix(pose)), pose[4:] / np.linalg.norm(pose[4:])
+    _refine_pose(r, t, *_contiguous(xn1, xn2), scale * scale, max_iterations)
     return rigid3.from_matrix(r, t)
-
-
-def _tangent_of(t: Array) -> Array:
-    """(3, 2) orthonormal basis of the plane that touches the sphere at t."""
-    helper = np.zeros(3)
-    helper[np.argmin(np.abs(t))] = 1.0
-    first = np.cross(t, helper)
-    first /= np.linalg.norm(first)
-    return np.ascontiguousarray(np.stack([first, np.cross(t, first)], 1))
 
 
 def _contiguous(*arrays: ArrayLike) -> tuple[Array, ...]:

@@ -57,7 +57,7 @@ class GuidedImage:
     def of(cls, features: Features, background: Ints) -> GuidedImage:
         shape = features.keypoints.astype(np.float64)
         shape[:, 2] = np.log2(np.maximum(shape[:, 2], 1e-3))
-        return cls(features.descriptors, shape, background)
+        return cls(np.ascontiguousarray(features.descriptors), shape, background)
 
 
 def background_of(features: Features) -> Ints:
@@ -110,7 +110,7 @@ def match_guided(
     """
     rows, columns = _sort_into_pencil(image1, image2, fundamental, band_px)
     row_of, column_of = rows.order, columns.order
-    a, packed = pack_rows(image1.descriptors[row_of]), pack_groups(image2.descriptors[column_of])
+    a, packed = pack_rows(image1.descriptors, row_of), pack_groups(image2.descriptors, column_of)
     best1, best2 = np.zeros(len(a), np.int32), np.zeros(len(packed) * LANES, np.int32)
     best1[: len(row_of)], best2[: len(column_of)] = image1.background[row_of], image2.background[column_of]
     second1, arg1 = best1.copy(), np.full(len(best1), -1, np.int32)

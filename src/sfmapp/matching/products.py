@@ -110,15 +110,6 @@ def tile(
 
 
 @numba.njit(cache=True, nogil=True)
-def _pack_groups(descriptors: NDArray[np.uint8], out: NDArray[np.int16]) -> None:
-    for i in range(descriptors.shape[0]):
-        g, lane = i // LANES, i % LANES
-        for k in range(DIMS // 2):
-            out[g, k, lane, 0] = descriptors[i, 2 * k]
-            out[g, k, lane, 1] = descriptors[i, 2 * k + 1]
-
-
-@numba.njit(cache=True, nogil=True)
 def _scan(
     a: NDArray[np.int16], packed: NDArray[np.int16], best1: Ints, second1: Ints, arg1: Ints,
     best2: Ints, second2: Ints, arg2: Ints, sums: Ints, masks: NDArray[np.uint32],
@@ -147,17 +138,26 @@ def keep_two_largest(best: Ints, second: Ints, arg: Ints, i: int, j: int, value:
         second[i] = value
 
 
-def pack_rows(descriptors: NDArray[np.uint8]) -> NDArray[np.int16]:
-    """(N', 128) int16, N' the next multiple of ROWS, zeros at the end: how the tile reads image 1."""
-    out = np.zeros((-(-len(descriptors) // ROWS) * ROWS, DIMS), np.int16)
-    out[: len(descriptors)] = descriptors
+@numba.njit(cache=True, nogil=True)
+def pack_rows(descriptors: NDArray[np.uint8], order: NDArray[np.int64]) -> NDArray[np.int16]:
+    """The rows ``order`` (N,) as the tile reads image 1: (N', 128) int16, N' a multiple of ROWS, zeros at the end."""
+    out = np.zeros(((len(order) + ROWS - 1) // ROWS * ROWS, DIMS), np.int16)
+    for i in range(len(order)):
+        source, target = descriptors[order[i]], out[i]
+        for k in range(DIMS):
+            target[k] = source[k]
     return out
 
 
-def pack_groups(descriptors: NDArray[np.uint8]) -> NDArray[np.int16]:
-    """(G, 64, LANES, 2) int16, G the next multiple of GROUPS, zeros at the end: how the tile reads image 2."""
-    out = np.zeros((-(-len(descriptors) // (LANES * GROUPS)) * GROUPS, DIMS // 2, LANES, 2), np.int16)
-    _pack_groups(np.ascontiguousarray(descriptors), out)
+@numba.njit(cache=True, nogil=True)
+def pack_groups(descriptors: NDArray[np.uint8], order: NDArray[np.int64]) -> NDArray[np.int16]:
+    """The rows ``order`` (M,) as the tile reads image 2: (G, 64, LANES, 2) int16, G a multiple of GROUPS."""
+    width = LANES * GROUPS
+    out = np.zeros(((len(order) + width - 1) // width * GROUPS, DIMS // 2, LANES, 2), np.int16)
+    for i in range(len(order)):
+        source, target, lane = descriptors[order[i]], out[i // LANES], i % LANES
+        for k in range(DIMS // 2):
+            target[k, lane, 0], target[k, lane, 1] = source[2 * k], source[2 * k + 1]
     return out
 
 
@@ -180,7 +180,8 @@ def largest_products(
         way.
     """
     n, m = len(descriptors1), len(descriptors2)
-    a, packed = pack_rows(descriptors1), pack_groups(descriptors2)
+    a = pack_rows(np.ascontiguousarray(descriptors1), np.arange(n))
+    packed = pack_groups(np.ascontiguousarray(descriptors2), np.arange(m))
     best1, second1, arg1 = (np.full(len(a), fill, np.int32) for fill in (0, 0, -1))
     best2, second2, arg2 = (np.full(len(packed) * LANES, fill, np.int32) for fill in (0, 0, -1))
     _scan(a, packed, best1, second1, arg1, best2, second2, arg2, *scratch())
@@ -220,7 +221,8 @@ def background_products(
     """
     n = len(descriptors)
     sample = np.unique(np.linspace(0, max(n - 1, 0), min(n, sample_size)).astype(np.int64))
-    a, packed = pack_rows(descriptors), pack_groups(descriptors[sample])
+    descriptors = np.ascontiguousarray(descriptors)
+    a, packed = pack_rows(descriptors, np.arange(n)), pack_groups(descriptors, sample)
     best = np.zeros(len(a), np.int32)
     unbounded = np.full(len(packed) * LANES, np.iinfo(np.int32).max, np.int32)
     _scan_background(a, packed, xy, sample, radius, best, unbounded, *scratch())

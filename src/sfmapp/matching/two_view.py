@@ -25,6 +25,8 @@ Mask = NDArray[np.bool_]
 # border, moved all alike, and at least seven in ten of all.
 _WATERMARK_BORDER_SHARE = 0.1
 _WATERMARK_MIN_SHARE = 0.7
+# With so many inliers among the matches there is nothing left that a second search could find.
+_CLEAN_SHARE = 0.9
 
 
 def _no_matrix() -> Array:
@@ -138,9 +140,7 @@ def verify_pair(
     if _is_watermark(xy1, xy2, result.is_inlier, camera1, camera2, threshold):
         result.config = TwoViewConfig.WATERMARK
     if np.isfinite(result.cam2_from_cam1).all() and result.config != TwoViewConfig.PANORAMIC:
-        depths, angles = epipolar.ray_depths(
-            result.cam2_from_cam1, poses.xn1[result.is_inlier], poses.xn2[result.is_inlier]
-        )
+        depths, angles = epipolar.ray_depths(result.cam2_from_cam1, *poses.subset(result.is_inlier))
         in_front = (depths > 0).all(1)
         result.median_angle_deg = float(np.degrees(np.median(angles[in_front]))) if in_front.any() else 0.0
     return result
@@ -268,15 +268,20 @@ class _RelativePoses:
         return self.xn1[idx], self.xn2[idx]
 
     def best(self, groups: list[Array], a: Array, b: Array) -> Array:
-        """Refine the best of each group of poses (K, 7), then take the one of least truncated squared error."""
+        """Refine the best of each group of poses (K, 7), then take the one of least truncated squared error.
+
+        With few points, wrong poses exist that come within the inlier threshold of all of them. Half of it tells them
+        from the right one, and so do the points that they put behind a camera.
+        """
+        bound = 0.5 * self.scale
 
         def cost(pose: Array) -> float:
             depths, _ = epipolar.ray_depths(pose, a, b)
             error = epipolar.sampson_errors(epipolar.essential_from_pose(pose), a, b)
-            return float(np.where((depths > 0).all(1), np.minimum(error, self.scale**2), self.scale**2).sum())
+            return float(np.where((depths > 0).all(1), np.minimum(error, bound**2), bound**2).sum())
 
-        started = [epipolar.choose_in_front(group, a, b)[0] for group in groups if len(group)]
-        refined = [epipolar.refine_relative_pose(pose, a, b, 0.5 * self.scale) for pose in started]
+        started = [epipolar.choose_in_front(group, a, b)[0] for group in groups]
+        refined = [epipolar.refine_relative_pose(pose, a, b, 0.5 * bound) for pose in started]
         return min(refined, key=cost)
 
 
@@ -290,8 +295,11 @@ def _estimate_pose(
 ) -> None:
     """Relative pose and E from all that can suggest one: F, a search for E, the homography of a plane."""
     mask = inliers.f if inliers.f.any() else inliers.h
-    a, b = poses.subset(mask)
-    if len(a) < 8:
+    everything = poses.subset(np.ones(len(mask), bool))
+    searched = [poses.subset(mask)]
+    if is_calibrated and mask.mean() < _CLEAN_SHARE:  # F has more freedom and may have gone astray with it
+        searched.append(everything)
+    if len(searched[0][0]) < 8:
         return
     groups = []
     if inliers.f.any():
@@ -299,12 +307,14 @@ def _estimate_pose(
             epipolar.essential_from_fundamental(result.fundamental, poses.k1, poses.k2)))  # fmt: skip
     if inliers.h.sum() > 0.5 * mask.sum():  # a plane leaves F undetermined, and with it the pose that F suggests
         groups.append(homography.poses_from_homography(result.homography, poses.k1, poses.k2))
-    essential = _find_essential(a, b, poses.scale, ransac)
-    if essential is not None:
-        groups.append(epipolar.decompose_essential(essential))
-    if not any(len(group) for group in groups):
+    for a, b in searched:
+        essential = _find_essential(a, b, 0.5 * poses.scale, ransac)
+        if essential is not None:
+            groups.append(epipolar.decompose_essential(essential))
+    groups = [group for group in groups if len(group)]
+    if not groups:
         return
-    result.cam2_from_cam1 = poses.best(groups, a, b)
+    result.cam2_from_cam1 = poses.best(groups, *(everything if is_calibrated else searched[0]))
     result.essential = epipolar.essential_from_pose(result.cam2_from_cam1)
     inliers.e = epipolar.sampson_errors(result.essential, poses.xn1, poses.xn2) < poses.scale**2
 
