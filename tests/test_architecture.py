@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -94,6 +95,22 @@ def test_library_does_not_print_exit_or_configure_logging(path: Path) -> None:
 def test_every_room_has_a_floor() -> None:
     rooms = {path.parent.name for path in SOURCE.glob("*/__init__.py")} | {"events", "errors"}
     assert rooms == set(LEVEL)
+
+
+@pytest.mark.parametrize("job", ["demo", "test"])
+def test_the_readme_names_the_commands_that_set_all_up(job: str) -> None:
+    checkout = Path(__file__).resolve().parent.parent
+    assert f"python3 get_started.py {job}\n" in (checkout / "README.md").read_text(encoding="utf-8")
+    assert f'"{job}":' in (checkout / "get_started.py").read_text(encoding="utf-8")
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    checkout = Path(__file__).resolve().parent.parent
+    project = tomllib.loads((checkout / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["version"] == sfmapp.__version__
+    for requirement in project["dependencies"]:
+        assert ">=" in requirement, requirement
+        assert "<" in requirement, requirement
 
 
 def test_help_is_fast_and_light() -> None:
