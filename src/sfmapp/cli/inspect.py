@@ -15,6 +15,8 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="Open OUT/recording.rrd in rerun's viewer; serve it on 127.0.0.1 where there is no display.",
     )  # fmt: skip
     parser.add_argument("output", metavar="OUT", type=Path, help="folder of a run")
+    parser.add_argument("--serve", action="store_true", help="for a browser on this machine, even if there is a screen")
+    parser.add_argument("--port", metavar="N", type=int, default=9090, help="where to serve; default: 9090")
     add_output_flags(parser)
     parser.set_defaults(run=_view)
 
@@ -37,7 +39,7 @@ def _view(args: argparse.Namespace) -> int:
     recording = args.output / "recording.rrd"
     if not recording.is_file():
         raise InputError(f"{recording} does not exist", "run sfmapp reconstruct again without --no-recording")
-    view(recording)
+    view(recording, serve=args.serve or None, web_port=args.port, tell=lambda line: print(line, flush=True))
     return 0
 
 
