@@ -155,6 +155,8 @@ def test_up_is_found_from_level_cameras_however_they_are_held(up: tuple[float, f
     poses[0] = rigid3.compose(quarter, poses[0])  # one portrait among them
     assert up_direction(poses) @ truth > np.cos(np.radians(25))
     assert up_direction(ring(truth)) @ truth > np.cos(np.radians(0.1))
+    lying = rigid3.compose(np.tile(quarter, (NUM_IMAGES, 1)), ring(truth))
+    assert up_direction(lying) @ truth > np.cos(np.radians(0.1))
 
 
 def test_up_of_cameras_side_by_side_is_the_top_of_the_images() -> None:
