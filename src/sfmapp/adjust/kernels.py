@@ -20,7 +20,8 @@ import numpy as np
 from sfmapp.adjust.lanes import add2, assign3, subtract3
 from sfmapp.scene.camera import distort
 
-TRIVIAL, HUBER, CAUCHY = 0, 1, 2
+# The numbers by which kernels know the losses.
+LOSS_IDS: dict[str, int] = {"trivial": 0, "huber": 1, "cauchy": 2}
 
 # Offsets in the scratch row of one observation: two rows each of pose (and merged intrinsics), canonical or free
 # intrinsics and point, and the residual.
@@ -65,12 +66,12 @@ def total_loss(scale2: float, total: float, product: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def linearize(pose, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, intrinsics, J):  # type: ignore[no-untyped-def]
+def linearize(pose, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, penalty, intrinsics, J):  # type: ignore[no-untyped-def]
     """Weighted Jacobians and residual of one observation into the scratch row J; returns the squared residual.
 
     pose: 12 numbers, R row by row and t. c: canonical intrinsics, whose derivatives are wanted if ``intrinsics``.
-    Behind the camera the Jacobians are zero and both residuals count as twice the focal length, gtsam's choice, so that
-    a point gains nothing by slipping there.
+    Behind the camera the Jacobians are zero and the squared residual is ``penalty``, so that a point gains nothing by
+    slipping there.
     """
     px = pose[0] * x0 + pose[1] * x1 + pose[2] * x2 + pose[9]
     py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]
@@ -78,7 +79,7 @@ def linearize(pose, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, intrinsics, J)
     if not pz > _MIN_COS * (abs(px) + abs(py)):
         for i in range(_SCRATCH):
             J[i] = 0.0
-        return 8.0 * c[0] * c[0]
+        return penalty
     iz = 1.0 / pz
     u = px * iz
     v = py * iz
@@ -180,7 +181,7 @@ def find_slot(keys, values, key):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def reduce_points(  # type: ignore[no-untyped-def]
     first, last, point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_camera, image_block, intrinsics, fisheye,
-    camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, damping, hash_keys, hash_values,
+    penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, damping, hash_keys, hash_values,
     tiles, own, cross, gradient, point_factor,
 ):  # fmt: skip
     """Linearise points first..last and eliminate them; returns the cost of their observations.
@@ -189,8 +190,9 @@ def reduce_points(  # type: ignore[no-untyped-def]
         point_ptr, obs_image, obs_xy, xyz: observations sorted by point; images are positions in ``poses``.
         is_constant: (P,) points that do not move.
         poses: (I, 12); image_camera: (I,); image_block: (I,) block of a pose, -1 where it is constant.
-        intrinsics: (C, 8) canonical; camera_block: (C,) block that holds the free intrinsics, -1 where constant;
-            free_ptr, free_slot, free_column: for camera c, canonical slot and column in the block.
+        intrinsics: (C, 8) canonical; penalty: (C,) squared residual of what is behind.
+        camera_block: (C,) block that holds the free intrinsics, -1 where constant; free_ptr, free_slot, free_column:
+            for camera c, canonical slot and column in the block.
         block_dim: (B,) rows in use of each block.
         hash_keys, hash_values: tile of block pair a <= b under key a B + b; empty if that number is the tile's as well.
         tiles: (N * 64,) out: sum of -Z_a Z_b^T. own: (B * 64,) out: J^T J of each block with itself, not eliminated.
@@ -226,7 +228,19 @@ def reduce_points(  # type: ignore[no-untyped-def]
             c = image_camera[i]
             other = camera_block[c]
             s2 = linearize(
-                poses[i], intrinsics[c], fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2, other >= 0, J
+                poses[i],
+                intrinsics[c],
+                fisheye[c],
+                x0,
+                x1,
+                x2,
+                obs_xy[o, 0],
+                obs_xy[o, 1],
+                loss,
+                scale2,
+                penalty[c],
+                other >= 0,
+                J,
             )
             cost, product = add_loss(loss, scale2, s2, cost, product)
             if moves:
@@ -334,7 +348,7 @@ def reduce_points(  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def substitute_points(  # type: ignore[no-untyped-def]
     first, last, point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_camera, image_block, intrinsics, fisheye,
-    camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, point_factor, step, new_poses,
+    penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, point_factor, step, new_poses,
     new_intrinsics, new_xyz, sums,
 ):  # fmt: skip
     """Steps of points first..last after those of the blocks, and the cost of the state that results.
@@ -342,11 +356,11 @@ def substitute_points(  # type: ignore[no-untyped-def]
     Args (beyond those of :func:`reduce_points`):
         step: (B * 8,) solution of the reduced system. new_poses, new_intrinsics: the state after it.
         new_xyz: (P, 3) out.
-        sums: (4,) out: cost, predicted decrease of the points' share, squared step and squared length of the points.
+        sums: (2,) out: cost, and the points' share of the predicted decrease.
     """
     J = np.zeros(_SCRATCH)
     cost, product = 0.0, 1.0
-    decrease = moved = length = 0.0
+    decrease = 0.0
     for p in range(first, last):
         x0, x1, x2 = xyz[p, 0], xyz[p, 1], xyz[p, 2]
         factor = point_factor[p]
@@ -361,7 +375,7 @@ def substitute_points(  # type: ignore[no-untyped-def]
                     continue
                 linearize(
                     poses[i], intrinsics[c], fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2,
-                    other >= 0, J,
+                    penalty[c], other >= 0, J,
                 )  # fmt: skip
                 e0 = e1 = 0.0
                 if block >= 0:
@@ -387,8 +401,6 @@ def substitute_points(  # type: ignore[no-untyped-def]
             decrease += s0 * (factor[9] * s0 - factor[6])
             decrease += s1 * (factor[10] * s1 - factor[7])
             decrease += s2 * (factor[11] * s2 - factor[8])
-            moved += s0 * s0 + s1 * s1 + s2 * s2
-            length += x0 * x0 + x1 * x1 + x2 * x2
             x0 += s0
             x1 += s1
             x2 += s2
@@ -407,9 +419,9 @@ def substitute_points(  # type: ignore[no-untyped-def]
                 v -= obs_xy[o, 1]
                 s2 = u * u + v * v
             else:
-                s2 = 8.0 * new_intrinsics[c, 0] ** 2
+                s2 = penalty[c]
             cost, product = add_loss(loss, scale2, s2, cost, product)
-    sums[0], sums[1], sums[2], sums[3] = total_loss(scale2, cost, product), 0.5 * decrease, moved, length
+    sums[0], sums[1] = total_loss(scale2, cost, product), 0.5 * decrease
 
 
 @numba.njit(cache=True, nogil=True)
@@ -419,10 +431,8 @@ def retract(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Apply a step of the blocks: ``x_cam <- exp(w) x_cam + v`` on poses (I, 7), sums on canonical rows (C, 8).
 
-    Constant poses and cameras keep their bits. Also fills new_rows (I, 12). Returns the squared translation step and
-    the squared length of the translations that move.
+    Constant poses and cameras keep their bits. Also fills new_rows (I, 12).
     """
-    moved = length = 0.0
     for i in range(poses.shape[0]):
         block = image_block[i]
         x, y, z, w = poses[i, 0], poses[i, 1], poses[i, 2], poses[i, 3]
@@ -448,8 +458,6 @@ def retract(  # type: ignore[no-untyped-def]
             # t <- exp(w) t + v: rotate t by the quaternion (a, b, c, e)
             c0, c1, c2 = 2.0 * (b * t2 - c * t1), 2.0 * (c * t0 - a * t2), 2.0 * (a * t1 - b * t0)
             v0, v1, v2 = step[block * 8 + 3], step[block * 8 + 4], step[block * 8 + 5]
-            moved += v0 * v0 + v1 * v1 + v2 * v2
-            length += t0 * t0 + t1 * t1 + t2 * t2
             t0, t1, t2 = (
                 t0 + e * c0 + b * c2 - c * c1 + v0,
                 t1 + e * c1 + c * c0 - a * c2 + v1,
@@ -472,4 +480,3 @@ def retract(  # type: ignore[no-untyped-def]
     for k in range(canonical.shape[0]):
         for n in range(free_ptr[k], free_ptr[k + 1]):
             new_canonical[k, free_slot[n]] += step[camera_block[k] * 8 + free_column[n]]
-    return moved, length

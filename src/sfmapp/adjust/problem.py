@@ -55,6 +55,7 @@ class Problem:
     camera_block: NDArray[np.int32]
     block_dim: NDArray[np.int64]
     fisheye: Mask
+    penalty: Array
     free: FreeIntrinsics
 
     @property
@@ -112,11 +113,12 @@ def make_problem(
         selected, is_constant, tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy, reconstruction.obs_is_inlier,
         np.isfinite(reconstruction.cam_from_world[:, 0]), reconstruction.point_xyz,
     )  # fmt: skip
-    image_used[[i for i in extra_images if registered[i]]] = True
+    image_used[[i for i in extra_images if i < len(registered) and registered[i]]] = True
     image_idx = np.flatnonzero(image_used)
+    known_cameras = [c for c in extra_cameras if c < len(reconstruction.cameras)]
     image_of = np.full(len(registered), -1, np.int32)
     image_of[image_idx] = np.arange(len(image_idx))
-    camera_idx = np.unique(np.concatenate([reconstruction.image_camera_idx[image_idx], extra_cameras]).astype(np.int64))
+    camera_idx = np.unique(np.concatenate([reconstruction.image_camera_idx[image_idx], known_cameras]).astype(np.int64))
     image_camera = np.searchsorted(camera_idx, reconstruction.image_camera_idx[image_idx]).astype(np.int32)
     cameras = [reconstruction.cameras[c] for c in camera_idx]
     params = [free_params(camera, *refine) for camera in cameras]
@@ -139,6 +141,8 @@ def make_problem(
         camera_block=camera_block,
         block_dim=block_dim,
         fisheye=np.array([camera.is_fisheye for camera in cameras], bool),
+        # a point behind the camera misses by the image's diagonal
+        penalty=np.array([float(camera.width**2 + camera.height**2) for camera in cameras]),
         free=_free_columns(cameras, params, camera_block, int((image_block >= 0).sum())),
     )
 

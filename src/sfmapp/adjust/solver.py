@@ -22,7 +22,6 @@ from sfmapp.scene.reconstruction import Reconstruction
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Loss = Literal["trivial", "huber", "cauchy"]
-LOSS_IDS: dict[str, int] = {"trivial": kernels.TRIVIAL, "huber": kernels.HUBER, "cauchy": kernels.CAUCHY}
 
 # Up to this many blocks the dense tile factor beats gtsam's sparse one.
 _MAX_DENSE_BLOCKS = 160
@@ -38,7 +37,6 @@ class AdjustOptions:
     loss_scale_px: float = 1.0  # residual length at which the loss begins to bend
     max_iterations: int = 50  # Levenberg-Marquardt steps, rejected ones included
     relative_cost_tolerance: float = 1e-6  # stop when an accepted step lowers the cost by less than this share
-    step_tolerance: float = 1e-9  # stop when points and cameras move by less than this share of their distances
     initial_damping: float = 1e-4  # first share of the diagonal that is added to it; Ceres' 1 / trust region radius
     refine_focal: bool = True  # focal lengths may change
     refine_distortion: bool = True  # distortion coefficients may change
@@ -150,6 +148,21 @@ def adjust_bundle(
     )  # fmt: skip
 
 
+def compile_kernels() -> None:
+    """Compile, or load from the cache, every kernel of this package, by running each on next to nothing."""
+    from sfmapp.adjust.pose import refine_pose
+    from sfmapp.scene.synthetic import make_scene
+
+    scene = make_scene(0, 3, 8)
+    model, empty = scene.observed.copy(), np.zeros(0, np.int64)
+    adjust_bundle(model, AdjustOptions(max_iterations=2), variable_images=np.array([True, True, False]))
+    camera, tracks = model.cameras[0], model.tracks
+    refine_pose(camera.canonical, camera.is_fisheye, model.cam_from_world[0], model.point_xyz, tracks.obs_xy[:8])
+    no_images = np.zeros(0, np.int32)
+    keys, values, _ = hash_tiles(np.zeros(1, np.int64), no_images, no_images, no_images, no_images, 1, empty)
+    find_slot(keys, values, 0)
+
+
 def write_back(problem: Problem, reconstruction: Reconstruction) -> None:
     """Put the state of a problem into its reconstruction; what was constant is not touched."""
     moved = problem.image_block >= 0
@@ -206,7 +219,7 @@ class Engine:
     def __init__(self, problem: Problem, options: AdjustOptions, priors: IntrinsicPriors, extras: Any = None) -> None:
         p = problem
         self.problem, self.priors, self.extras = p, priors, extras
-        self.loss, self.scale2 = LOSS_IDS[options.loss], options.loss_scale_px**2
+        self.loss, self.scale2 = kernels.LOSS_IDS[options.loss], options.loss_scale_px**2
         blocks, images = p.num_blocks, len(p.image_idx)
         self.solver = "dense" if blocks <= _MAX_DENSE_BLOCKS else "sparse"
         empty = np.zeros(0, np.int64)
@@ -234,7 +247,7 @@ class Engine:
         self.inverse = aligned_zeros(blocks * 64)
         self.diagonal = np.ones(blocks * 8)
         self.factor = np.zeros((len(p.track_idx), 12))
-        self.sums = np.zeros((chunks, 4))
+        self.sums = np.zeros((chunks, 2))
         self.rows = pose_rows(p.poses)
         self.new_poses, self.new_rows = np.empty_like(p.poses), np.empty_like(self.rows)
         self.new_canonical, self.new_xyz = np.empty_like(p.canonical), np.empty_like(p.xyz)
@@ -247,9 +260,9 @@ class Engine:
         def chunk(k: int) -> float:
             cost: float = kernels.reduce_points(
                 self.limits[k], self.limits[k + 1], p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, self.rows,
-                p.image_camera, p.image_block, p.canonical, p.fisheye, p.camera_block, p.free.ptr, p.free.slot,
-                p.free.column, p.block_dim, self.loss, self.scale2, damping, self.hash_keys, self.hash_values,
-                self.tiles[k], self.own[k], self.cross[k], self.gradient[k], self.factor,
+                p.image_camera, p.image_block, p.canonical, p.fisheye, p.penalty, p.camera_block, p.free.ptr,
+                p.free.slot, p.free.column, p.block_dim, self.loss, self.scale2, damping, self.hash_keys,
+                self.hash_values, self.tiles[k], self.own[k], self.cross[k], self.gradient[k], self.factor,
             )  # fmt: skip
             return cost
 
@@ -291,10 +304,10 @@ class Engine:
             return keys
         return np.array([find_slot(self.hash_keys, self.hash_values, key) for key in keys], np.int64)
 
-    def attempt(self, step: Array, run: Callable[..., Any]) -> tuple[float, float, float]:
-        """Try a step: cost of the new state, predicted decrease, and the move as a share of the distances."""
+    def attempt(self, step: Array, run: Callable[..., Any]) -> tuple[float, float]:
+        """Try a step: cost of the new state, and the decrease that the quadratic model predicts."""
         p = self.problem
-        moved, length = kernels.retract(
+        kernels.retract(
             p.poses, p.image_block, p.canonical, p.camera_block, p.free.ptr, p.free.slot, p.free.column, step,
             self.new_poses, self.new_rows, self.new_canonical,
         )  # fmt: skip
@@ -302,16 +315,15 @@ class Engine:
         def chunk(k: int) -> None:
             kernels.substitute_points(
                 self.limits[k], self.limits[k + 1], p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, self.rows,
-                p.image_camera, p.image_block, p.canonical, p.fisheye, p.camera_block, p.free.ptr, p.free.slot,
-                p.free.column, p.block_dim, self.loss, self.scale2, self.factor, step, self.new_rows,
+                p.image_camera, p.image_block, p.canonical, p.fisheye, p.penalty, p.camera_block, p.free.ptr,
+                p.free.slot, p.free.column, p.block_dim, self.loss, self.scale2, self.factor, step, self.new_rows,
                 self.new_canonical, self.new_xyz, self.sums[k],
             )  # fmt: skip
 
         list(run(chunk, range(self.num_chunks)))
-        cost, decrease, point_moved, point_length = (float(v) for v in self.sums.sum(0))
+        cost, decrease = float(self.sums[:, 0].sum()), float(self.sums[:, 1].sum())
         decrease += 0.5 * float(step @ (self.damping * self.diagonal * step - self.gradient[0, 0]))
-        share = np.sqrt((moved + point_moved) / max(length + point_length, 1e-300))
-        return cost + self.other_cost(self.new_poses, self.new_canonical), decrease, float(share)
+        return cost + self.other_cost(self.new_poses, self.new_canonical), decrease
 
     def accept(self) -> None:
         """Make the state that was tried the current one."""
@@ -338,8 +350,8 @@ def _minimize(engine: Engine, options: AdjustOptions, run: Callable[..., Any], e
         iterations += 1
         step = engine.solve()
         if step is not None:
-            new_cost, predicted, share = engine.attempt(step, run)
-            if share <= options.step_tolerance or predicted <= 1e-3 * tolerance * cost:
+            new_cost, predicted = engine.attempt(step, run)
+            if predicted <= 1e-3 * tolerance * cost:
                 # nothing left to gain that would show; take it if it is a gain at all
                 if new_cost < cost:
                     engine.accept()

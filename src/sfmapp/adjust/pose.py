@@ -1,0 +1,215 @@
+"""Motion-only adjustment: one camera against points that stay where they are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sfmapp.adjust.kernels import LOSS_IDS, add_loss, linearize, retract, total_loss
+from sfmapp.adjust.lanes import add2
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RefinedPose:
+    """A pose, perhaps with its focal length, and how well the points hold it.
+
+    Attributes:
+        cam_from_world: (7,) quaternion x y z w and translation.
+        canonical: (8,) intrinsics; changed in the focal lengths alone, and only if they were free.
+        covariance: (6, 6), or (7, 7) with the focal length in pixels last, over rotation (radians) and translation of
+            ``x_cam <- exp(w) x_cam + v``, scaled by the inliers' residuals; infinite where the points do not hold it.
+        is_inlier: (N,) bool: in front of the camera with a residual below the threshold.
+        cost: half the sum of the losses, square pixels.
+        num_iterations: steps tried.
+    """
+
+    cam_from_world: Array
+    canonical: Array
+    covariance: Array
+    is_inlier: NDArray[np.bool_]
+    cost: float
+    num_iterations: int
+
+
+def refine_pose(
+    canonical: ArrayLike,
+    fisheye: bool,
+    cam_from_world: ArrayLike,
+    xyz: ArrayLike,
+    xy: ArrayLike,
+    *,
+    loss: str = "cauchy",
+    scale_px: float = 1.0,
+    inlier_px: float = 4.0,
+    refine_focal: bool = False,
+    focal_sigma_px: float | None = None,
+    max_iterations: int = 30,
+    relative_cost_tolerance: float = 1e-6,
+) -> RefinedPose:
+    """Minimise the robust reprojection error of known points over one pose, from a start such as PnP gives.
+
+    Args:
+        canonical: (8,) intrinsics. fisheye: their kind.
+        cam_from_world: (7,) start.
+        xyz: (N, 3) world. xy: (N, 2) pixels.
+        loss, scale_px: as in ``AdjustOptions``.
+        inlier_px: longest residual of an inlier.
+        refine_focal: the focal lengths are free, with a common change; focal_sigma_px: Gaussian prior around the
+            start, None for none.
+    """
+    state = np.array(cam_from_world, np.float64)
+    row = np.array(canonical, np.float64)
+    points, pixels = np.ascontiguousarray(xyz, np.float64), np.ascontiguousarray(xy, np.float64)
+    information, residuals2 = np.zeros((8, 8)), np.empty(len(points))
+    weight = 0.0 if focal_sigma_px is None else 1.0 / focal_sigma_px**2
+    size = 7 if refine_focal else 6
+    cost, iterations = _refine(
+        row, fisheye, state, points, pixels, LOSS_IDS[loss], scale_px**2, size, weight, max_iterations,
+        relative_cost_tolerance, information, residuals2,
+    )  # fmt: skip
+    is_inlier = residuals2 <= inlier_px**2
+    dof = 2 * int(is_inlier.sum()) - size
+    covariance = np.full((size, size), np.inf)
+    if dof > 0:
+        try:
+            inverse = np.linalg.inv(information[:size, :size])
+            covariance = 0.5 * (inverse + inverse.T) * residuals2[is_inlier].sum() / dof
+        except np.linalg.LinAlgError:
+            pass
+    return RefinedPose(state, row, covariance, is_inlier, cost, iterations)
+
+
+@numba.njit(cache=True, nogil=True)
+def _normal_equations(c, fisheye, row, xyz, xy, loss, scale2, size, penalty, J, information, gradient, residuals2):  # type: ignore[no-untyped-def]
+    """Fill information (64,), gradient (8,) and the squared residuals (N,), infinite behind; returns the cost."""
+    information[:] = 0.0
+    gradient[:] = 0.0
+    total, product = 0.0, 1.0
+    for n in range(xyz.shape[0]):
+        s2 = linearize(
+            row, c, fisheye, xyz[n, 0], xyz[n, 1], xyz[n, 2], xy[n, 0], xy[n, 1], loss, scale2, -1.0, size > 6, J
+        )
+        residuals2[n] = s2
+        if s2 < 0.0:
+            residuals2[n] = math.inf
+            s2 = penalty
+        total, product = add_loss(loss, scale2, s2, total, product)
+        J[7] = J[15] = 0.0
+        J[6] = J[16] + J[17] if size > 6 else 0.0
+        J[14] = J[24] + J[25] if size > 6 else 0.0
+        add2(information, 0, J, 0, J, 0, 8)
+        add2(gradient, 0, J, 64, J, 0, 1)
+    return total_loss(scale2, total, product)
+
+
+@numba.njit(cache=True, nogil=True)
+def _damped_step(information, gradient, damping, size, step):  # type: ignore[no-untyped-def]
+    """Solve (H + damping diag H) step = -gradient by Cholesky; False where that is not positive definite."""
+    L = np.zeros((8, 8))
+    for i in range(size):
+        for j in range(i + 1):
+            total = information[8 * i + j]
+            if i == j:
+                total *= 1.0 + damping
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j:
+                if not total > 1e-14 * information[9 * i]:
+                    return False
+                L[i, i] = math.sqrt(total)
+            else:
+                L[i, j] = total / L[j, j]
+    for i in range(size):
+        total = -gradient[i]
+        for k in range(i):
+            total -= L[i, k] * step[k]
+        step[i] = total / L[i, i]
+    for i in range(size - 1, -1, -1):
+        total = step[i]
+        for k in range(i + 1, size):
+            total -= L[k, i] * step[k]
+        step[i] = total / L[i, i]
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _refine(  # type: ignore[no-untyped-def]
+    c, fisheye, state, xyz, xy, loss, scale2, size, prior_weight, max_iterations, tolerance, information, residuals2
+):
+    J = np.zeros(80)
+    block, camera_block = np.zeros(1, np.int32), np.full(1, 0 if size > 6 else -1, np.int32)
+    free_ptr = np.array([0, 2 if size > 6 else 0])
+    free_slot, free_column = np.array([0, 1]), np.array([6, 6])
+    poses, new_poses = state.reshape(1, 7), np.empty((1, 7))
+    rows, new_rows = np.empty((1, 12)), np.empty((1, 12))
+    canonical, new_canonical = c.reshape(1, 8), np.empty((1, 8))
+    step = np.zeros(8)
+    retract(
+        poses, np.full(1, -1, np.int32), canonical, camera_block, free_ptr, free_slot, free_column, step, new_poses,
+        rows, new_canonical,
+    )  # fmt: skip
+    focal = c[0]
+    penalty = 8.0 * focal * focal  # gtsam's choice for points behind the camera
+    H, g, new_H, new_g = np.zeros(64), np.zeros(8), np.zeros(64), np.zeros(8)
+    new_residuals2 = np.empty(xyz.shape[0])
+    cost = _normal_equations(canonical[0], fisheye, rows[0], xyz, xy, loss, scale2, size, penalty, J, H, g, residuals2)
+    H[54] += prior_weight
+    damping, growth, iterations = 1e-4, 2.0, 0
+    while iterations < max_iterations and damping < 1e12:
+        iterations += 1
+        if not _damped_step(H, g, damping, size, step):
+            damping *= growth
+            growth *= 2.0
+            continue
+        retract(
+            poses, block, canonical, camera_block, free_ptr, free_slot, free_column, step, new_poses, new_rows,
+            new_canonical,
+        )  # fmt: skip
+        new_cost = _normal_equations(
+            new_canonical[0],
+            fisheye,
+            new_rows[0],
+            xyz,
+            xy,
+            loss,
+            scale2,
+            size,
+            penalty,
+            J,
+            new_H,
+            new_g,
+            new_residuals2,
+        )
+        away = new_canonical[0, 0] - focal
+        new_cost += 0.5 * prior_weight * away * away
+        new_g[6] += prior_weight * away
+        new_H[54] += prior_weight
+        decrease = cost - new_cost
+        if decrease > 0.0:
+            predicted = 0.0
+            for k in range(size):
+                predicted += 0.5 * step[k] * (damping * H[9 * k] * step[k] - g[k])
+            poses[:], canonical[:], rows[:] = new_poses, new_canonical, new_rows
+            H[:], g[:], residuals2[:] = new_H, new_g, new_residuals2
+            done = decrease <= tolerance * cost
+            cost = new_cost
+            gain = decrease / predicted if predicted > 0.0 else 0.0
+            damping = max(1e-10, damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3))
+            growth = 2.0
+            if done:
+                break
+        else:
+            if -decrease <= tolerance * cost:
+                break
+            damping *= growth
+            growth *= 2.0
+    for i in range(8):
+        for j in range(8):
+            information[i, j] = H[8 * i + j]
+    return cost, iterations
