@@ -193,26 +193,43 @@ def _tangent_plane(t: Array, out: Array) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
+def _essential_and_slopes(r: Array, t: Array, tangent: Array, e: Array) -> None:
+    """E = [t]x R in e[0] and its derivatives along exp(w) R and t + tangent b in e[1:], (6, 3, 3)."""
+    for k in range(3):
+        for m in range(6):
+            # column k of R, turned about axis m - 1 for the three of w; then crossed with t or a tangent
+            x, y, z = r[0, k], r[1, k], r[2, k]
+            if m == 1:
+                x, y, z = 0.0, -z, y
+            elif m == 2:
+                x, y, z = z, 0.0, -x
+            elif m == 3:
+                x, y, z = -y, x, 0.0
+            tx, ty, tz = t[0], t[1], t[2]
+            if m > 3:
+                tx, ty, tz = tangent[0, m - 4], tangent[1, m - 4], tangent[2, m - 4]
+            e[m, 0, k] = ty * z - tz * y
+            e[m, 1, k] = tz * x - tx * z
+            e[m, 2, k] = tx * y - ty * x
+
+
+@numba.njit(cache=True, nogil=True)
 def _pose_normal_equations(
     r: Array, t: Array, xn1: Array, xn2: Array, scale2: float, tangent: Array, h: Array, g: Array
 ) -> float:
-    """Gauss-Newton system (5, 5) of the Cauchy-weighted Sampson error for exp(w) R, t + tangent b; returns the cost."""
-    e = np.empty((3, 3))
-    for k in range(3):
-        e[0, k] = t[1] * r[2, k] - t[2] * r[1, k]
-        e[1, k] = t[2] * r[0, k] - t[0] * r[2, k]
-        e[2, k] = t[0] * r[1, k] - t[1] * r[0, k]
-    jacobian = np.empty(5)
+    """Gauss-Newton system (5, 5), lower triangle, of the Cauchy-weighted Sampson error; returns the cost."""
+    e, jacobian = np.empty((6, 3, 3)), np.empty(5)
+    _essential_and_slopes(r, t, tangent, e)
     h[:] = 0.0
     g[:] = 0.0
     cost = 0.0
     for i in range(xn1.shape[0]):
         x, y, u, v = xn1[i, 0], xn1[i, 1], xn2[i, 0], xn2[i, 1]
-        a = e[0, 0] * x + e[0, 1] * y + e[0, 2]
-        b = e[1, 0] * x + e[1, 1] * y + e[1, 2]
-        c = e[2, 0] * x + e[2, 1] * y + e[2, 2]
-        d = e[0, 0] * u + e[1, 0] * v + e[2, 0]
-        f = e[0, 1] * u + e[1, 1] * v + e[2, 1]
+        a = e[0, 0, 0] * x + e[0, 0, 1] * y + e[0, 0, 2]
+        b = e[0, 1, 0] * x + e[0, 1, 1] * y + e[0, 1, 2]
+        c = e[0, 2, 0] * x + e[0, 2, 1] * y + e[0, 2, 2]
+        d = e[0, 0, 0] * u + e[0, 1, 0] * v + e[0, 2, 0]
+        f = e[0, 0, 1] * u + e[0, 1, 1] * v + e[0, 2, 1]
         s2 = a * a + b * b + d * d + f * f
         if s2 <= 0.0:
             continue
@@ -221,17 +238,14 @@ def _pose_normal_equations(
         ratio = residual * residual / scale2
         weight = 1.0 / (1.0 + ratio)
         cost += math.log1p(ratio)
-        # the numerator is x2 . (t x R x1) = (R x1) . (x2 x t); Sampson's denominator is held still, as is usual
-        p0 = r[0, 0] * x + r[0, 1] * y + r[0, 2]
-        p1 = r[1, 0] * x + r[1, 1] * y + r[1, 2]
-        p2 = r[2, 0] * x + r[2, 1] * y + r[2, 2]
-        q0, q1, q2 = v * t[2] - t[1], t[0] - u * t[2], u * t[1] - v * t[0]  # x2 x t
-        jacobian[0] = (p1 * q2 - p2 * q1) * s
-        jacobian[1] = (p2 * q0 - p0 * q2) * s
-        jacobian[2] = (p0 * q1 - p1 * q0) * s
-        m0, m1, m2 = p1 - p2 * v, p2 * u - p0, p0 * v - p1 * u  # R x1 x x2
-        jacobian[3] = (m0 * tangent[0, 0] + m1 * tangent[1, 0] + m2 * tangent[2, 0]) * s
-        jacobian[4] = (m0 * tangent[0, 1] + m1 * tangent[1, 1] + m2 * tangent[2, 1]) * s
+        for k in range(5):
+            m = k + 1
+            da = e[m, 0, 0] * x + e[m, 0, 1] * y + e[m, 0, 2]
+            db = e[m, 1, 0] * x + e[m, 1, 1] * y + e[m, 1, 2]
+            dc = e[m, 2, 0] * x + e[m, 2, 1] * y + e[m, 2, 2]
+            dd = e[m, 0, 0] * u + e[m, 1, 0] * v + e[m, 2, 0]
+            df = e[m, 0, 1] * u + e[m, 1, 1] * v + e[m, 2, 1]
+            jacobian[k] = s * (u * da + v * db + dc - residual * s * (a * da + b * db + d * dd + f * df))
         for k in range(5):
             g[k] += weight * jacobian[k] * residual
             for m in range(k + 1):

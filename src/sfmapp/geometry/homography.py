@@ -1,7 +1,6 @@
 """Plane-induced and rotation-only maps between two views.
 
-``x2 ~ H x1`` for homogeneous pixels (N, 2) float64. HZ stands for Hartley and Zisserman, "Multiple View Geometry",
-2004.
+``x2 ~ H x1`` for homogeneous pixels (N, 2) float64.
 """
 
 from __future__ import annotations
@@ -10,31 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
-from sfmapp.geometry.epipolar import normalizing_transform
 
 Array = NDArray[np.float64]
-
-
-def homography_from_points(xy1: Array, xy2: Array, weights: Array | None = None) -> Array:
-    """Normalised direct linear transform (HZ algorithm 4.2): H (3, 3) of unit norm and non-negative determinant.
-
-    Args:
-        xy1, xy2: (N, 2) corresponding pixels, N >= 4.
-        weights: (N,) factor on the squared algebraic residual of each.
-    """
-    if len(xy1) < 4:
-        raise ValueError(f"a homography takes at least 4 points, got {len(xy1)}")
-    t1, t2 = normalizing_transform(xy1, weights), normalizing_transform(xy2, weights)
-    a = np.concatenate([xy1 * t1[0, 0] + t1[:2, 2], np.ones((len(xy1), 1))], 1)
-    b = xy2 * t2[0, 0] + t2[:2, 2]
-    zero = np.zeros_like(a)
-    design = np.concatenate(
-        [np.concatenate([a, zero, -b[:, :1] * a], 1), np.concatenate([zero, a, -b[:, 1:] * a], 1)], 0
-    )
-    weighted = design if weights is None else design * np.concatenate([weights, weights])[:, None]
-    h = np.linalg.eigh(design.T @ weighted)[1][:, 0].reshape(3, 3)
-    h = np.linalg.inv(t2) @ h @ t1
-    return h / (np.linalg.norm(h) * (-1.0 if np.linalg.det(h) < 0 else 1.0))
 
 
 def transfer_errors(homography: Array, xy1: Array, xy2: Array) -> Array:
@@ -43,8 +19,8 @@ def transfer_errors(homography: Array, xy1: Array, xy2: Array) -> Array:
     Taking the larger of the two keeps a zoom from making one direction look harmless. Infinite at and beyond the
     horizon of either map and for a singular H.
     """
-    determinant = np.linalg.det(homography)
-    if not np.isfinite(determinant) or abs(determinant) < 1e-14 * np.linalg.norm(homography) ** 3:
+    determinant = np.linalg.det(homography) if np.isfinite(homography).all() else 0.0
+    if abs(determinant) < 1e-14 * np.linalg.norm(homography) ** 3:
         return np.full(len(xy1), np.inf)
     h = homography * np.sign(determinant)
     return np.maximum(_one_way(h, xy1, xy2), _one_way(np.linalg.inv(h), xy2, xy1))
