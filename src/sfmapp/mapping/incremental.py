@@ -33,6 +33,9 @@ from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import Tracks
 
 STAGE = "mapping"
+# Share of the observations of an image that must hold once all is adjusted, where they are few. Those of a right pose are
+# verified matches and nearly all hold; those of a mirrored or repeated part of the scene are torn between two poses.
+MIN_AGREEMENT = 2 / 3
 
 
 def map_images(
@@ -281,7 +284,12 @@ class Mapper:
         camera_idx = self.reconstruction.image_camera_idx[image_idx]
         camera = self.reconstruction.cameras[camera_idx]
         search_focal = camera.focal_source == "default" and not camera.is_fixed and not known_cameras[camera_idx]
-        return register_image(self.reconstruction, image_idx, self.options, search_focal=search_focal)
+        # the map's own tolerance with room for its drift
+        max_error_px = min(3.0 * self.max_error_px, self.options.max_pose_error_px)
+        return register_image(
+            self.reconstruction, image_idx, self.options, search_focal=search_focal,
+            max_error_px=self.options.max_pose_error_px if search_focal else max_error_px,
+        )  # fmt: skip
 
     def _accept(self, result: Registration) -> bool:
         self.attempts[result.image_idx] = result
@@ -397,6 +405,27 @@ class Mapper:
         structure.filter_observations(self.reconstruction, self.options, self.pool, None, self.max_error_px)
         missing = np.flatnonzero(~self.reconstruction.is_triangulated)
         structure.triangulate(self.reconstruction, missing, self.options, self.pool, self.max_error_px)
+        self._drop_weak_images()
+
+    def _drop_weak_images(self) -> None:
+        """Take back images that lost their support, or that much of the map contradicts; points that need them go too."""
+        reconstruction, least = self.reconstruction, self.options.min_pose_inliers
+        tracks, used = reconstruction.tracks, reconstruction.obs_is_inlier
+        counts = np.bincount(tracks.obs_image_idx[used], minlength=tracks.num_images)
+        sees = reconstruction.is_triangulated[tracks.obs_track_idx]
+        visible = np.bincount(tracks.obs_image_idx[sees], minlength=tracks.num_images)
+        weak = (counts < least) | ((counts < 4 * least) & (counts < MIN_AGREEMENT * visible))
+        dropped = np.flatnonzero(reconstruction.is_registered & weak)
+        # a model of two or three images stands or falls as a whole, with its points
+        if len(dropped) == 0 or reconstruction.is_registered.sum() - len(dropped) < 3:
+            return
+        reconstruction.cam_from_world[dropped] = np.nan
+        structure.filter_observations(reconstruction, self.options, self.pool, None, self.max_error_px)
+        for i in dropped.tolist():
+            reason = f"{counts[i]} of {visible[i]} observations hold after the adjustment: too few to trust the pose"
+            self.attempts[i] = Registration(i, int(visible[i]), int(counts[i]), None, reason=reason)
+            self.failed_with[i] = int(visible[i])
+            self.events.decided(STAGE, f"took back {reconstruction.image_names[i]}: {reason}")
 
     def is_supported(self, images: NDArray[np.bool_]) -> bool:
         """True if each of the given images (I,) still observes enough points after an adjustment."""

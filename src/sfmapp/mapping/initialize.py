@@ -22,6 +22,10 @@ MAX_RANKED = 60
 # Beyond this median angle a wider baseline does not make a better start (COLMAP's 16 degrees).
 ENOUGH_ANGLE_DEG = 16.0
 
+# Share of the matches inside a group of images that rotations explain if it turns on the spot; the rest are mismatches
+# and pairs that are too small to be told.
+MIN_ROTATION_SHARE = 0.8
+
 
 @dataclass(frozen=True)
 class InitialPair:
@@ -85,12 +89,44 @@ def rank_initial_pairs(
     startable = np.isin(correspondences.config[pairs], _STARTABLE)
     promise = inliers * (1.0 + np.minimum(angles, ENOUGH_ANGLE_DEG)) * np.where(startable, 1.0, 1e-6)
     pairs = pairs[np.argsort(-promise, kind="stable")][:MAX_RANKED]
-    ranked = [_examine(reconstruction, correspondences, int(p), options) for p in pairs]
+    place = single_places(correspondences, len(reconstruction.image_names))
+    ranked = [_examine(reconstruction, correspondences, int(p), place, options) for p in pairs]
     return sorted(ranked, key=lambda pair: -pair.score)
 
 
+def single_places(correspondences: Correspondences, num_images: int) -> NDArray[np.int64]:
+    """(I,) int64 groups of images taken from one place, -1 for images that moved.
+
+    Rotation-only pairs link images; a group counts if nearly all matches inside it are rotations. Neighbouring frames of a
+    slow video are linked as well, but pairs further apart inside their group show parallax.
+    """
+    parent = np.arange(num_images)
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = int(parent[i])
+        return i
+
+    is_rotation = correspondences.config == TwoViewConfig.PANORAMIC
+    for i, j in correspondences.pair_image_idx[is_rotation]:
+        parent[root(int(i))] = root(int(j))
+    group = np.array([root(i) for i in range(num_images)], np.int64)
+    inside = group[correspondences.pair_image_idx]
+    same = inside[:, 0] == inside[:, 1]
+    inliers = correspondences.num_inliers * same
+    everything = np.bincount(inside[:, 0], weights=inliers, minlength=num_images)
+    rotations = np.bincount(inside[:, 0], weights=inliers * is_rotation, minlength=num_images)
+    still = (rotations > 0) & (rotations >= MIN_ROTATION_SHARE * everything)
+    return np.where(still[group], group, -1)
+
+
 def _examine(
-    reconstruction: Reconstruction, correspondences: Correspondences, pair_idx: int, options: MappingOptions
+    reconstruction: Reconstruction,
+    correspondences: Correspondences,
+    pair_idx: int,
+    place: NDArray[np.int64],
+    options: MappingOptions,
 ) -> InitialPair:
     """Relative pose of a pair with the cameras as they are now, and what it would give."""
     first, second = (int(i) for i in correspondences.pair_image_idx[pair_idx])
@@ -99,6 +135,9 @@ def _examine(
     config = TwoViewConfig(int(correspondences.config[pair_idx]))
     if config not in _STARTABLE:
         reason = f"{config.name.lower()}: the pair shows no depth"
+        return InitialPair((first, second), num_matches, 0, 0.0, nothing, reason)
+    if place[first] == place[second] >= 0:
+        reason = "both images belong to a group that turns on the spot: its pairs are rotations without a baseline"
         return InitialPair((first, second), num_matches, 0, 0.0, nothing, reason)
     xy1, xy2 = matched_pixels(reconstruction.tracks, correspondences, pair_idx)
     cameras = [reconstruction.cameras[reconstruction.image_camera_idx[i]] for i in (first, second)]

@@ -14,12 +14,13 @@ class MappingOptions:
     """Verified matches an initial pair should have; halved step by step, with a note, if no pair reaches it."""
     min_initial_angle_deg: float = 8.0
     """Median triangulation angle an initial pair should have; halved with the inliers if no pair reaches it."""
-    min_pose_inliers: int = 20
-    """2D-3D correspondences that must agree with the pose of a new image."""
-    min_pose_inlier_ratio: float = 0.2
-    """Share of the 2D-3D correspondences that must agree with the pose of a new image."""
+    min_pose_inliers: int = 15
+    """2D-3D correspondences that must agree with the pose of an image, when it is registered and ever after."""
+    min_pose_inlier_ratio: float = 0.5
+    """Share of the 2D-3D correspondences that must agree with the pose of a new image. They are verified matches: a low
+    share means that others, consistent as well, contradict it. Half of it will do with twice min_pose_inliers."""
     max_pose_error_px: float = 8.0
-    """Reprojection error of an inlier while a pose is searched; wide, as the map is not yet adjusted to the image."""
+    """Largest reprojection error of an inlier while a pose is searched: the map is not yet adjusted to the image."""
     max_reprojection_error_px: float = 4.0
     """Largest reprojection error of an observation that supports its point, whatever the noise."""
     max_reprojection_error_sigmas: float = 6.0

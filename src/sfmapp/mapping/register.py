@@ -101,7 +101,7 @@ def rank_next_images(
 
 
 def register_image(
-    reconstruction: Reconstruction, image_idx: int, options: MappingOptions, *, search_focal: bool
+    reconstruction: Reconstruction, image_idx: int, options: MappingOptions, *, max_error_px: float, search_focal: bool
 ) -> Registration:
     """Pose of an image from the points that it sees; the reconstruction is not changed.
 
@@ -109,6 +109,7 @@ def register_image(
         reconstruction: the map so far.
         image_idx: an unregistered image.
         options: thresholds.
+        max_error_px: largest reprojection error of an inlier.
         search_focal: try other focal lengths too, as nothing is known about this camera yet.
     """
     tracks = reconstruction.tracks
@@ -122,14 +123,21 @@ def register_image(
     camera = reconstruction.cameras[reconstruction.image_camera_idx[image_idx]]
     xyz = reconstruction.point_xyz[tracks.obs_track_idx[obs]]
     normalized = pixels_to_normalized(camera, tracks.obs_xy[obs])
-    max_error = options.max_pose_error_px / camera.focal
+    max_error = max_error_px / camera.focal
     if search_focal:
         found = resection.estimate_pose_and_focal(xyz, normalized, max_error, FOCAL_SCALES)
     else:
         found = resection.estimate_pose(xyz, normalized, max_error)
     num_inliers = found.num_inliers if found is not None else 0
-    needed = max(options.min_pose_inliers, int(np.ceil(options.min_pose_inlier_ratio * len(obs))))
+    needed = _needed_inliers(len(obs), options)
     if found is None or num_inliers < needed:
         reason = f"{num_inliers} of {len(obs)} points agree with one pose, at least {needed} are needed"
         return Registration(image_idx, len(obs), num_inliers, None, reason=reason)
     return Registration(image_idx, len(obs), num_inliers, found.cam_from_world, found.focal_scale)
+
+
+def _needed_inliers(num_correspondences: int, options: MappingOptions) -> int:
+    """Fewer than twice the least number of inliers must be a clear majority."""
+    least, ratio = options.min_pose_inliers, options.min_pose_inlier_ratio
+    clear = max(least, int(np.ceil(ratio * num_correspondences)))
+    return min(clear, max(2 * least, int(np.ceil(0.5 * ratio * num_correspondences))))
