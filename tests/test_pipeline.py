@@ -17,6 +17,7 @@ from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError
 from sfmapp.events import Event, Events
 from sfmapp.pipelines.options import Options, load_options
 from sfmapp.pipelines.reconstruct import RunResult, reconstruct
+from sfmapp.viewer.recording import RecordingReport
 
 MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 
@@ -264,6 +265,40 @@ def test_the_python_interface_is_the_documented_one(photos: Path, copy: Path) ->
     assert isinstance(reconstruction, sfmapp.Reconstruction)
     assert reconstruction.cam_from_world.shape == (7, 7)
     assert report["models"][0]["num_registered"] == 7
+
+
+# ---------------------------------------------------------------------------------------------------------- recording
+
+
+def test_a_recording_is_made_when_it_is_wanted_and_missing(photos: Path, copy: Path, finished: Path) -> None:
+    for is_up_to_date in (False, True):
+        counter = Counter()
+        report = reconstruct(photos, copy, events=Events(counter)).report
+        assert report["run"]["is_up_to_date"] == is_up_to_date
+        assert report["warnings"] == []
+        assert (copy / "recording.rrd").read_bytes()[:4] == b"RRF2"
+    assert model_bytes(copy) == model_bytes(finished)
+
+
+@pytest.mark.parametrize("is_cancelled", [False, True])
+def test_a_recording_that_fails_is_a_warning(
+    photos: Path, copy: Path, monkeypatch: pytest.MonkeyPatch, is_cancelled: bool
+) -> None:
+    events = Events()
+
+    def fail(*_: object, **__: object) -> RecordingReport:
+        if is_cancelled:  # a terminal sends Ctrl-C to the child too
+            events.cancel()
+        return RecordingReport(None, 0, 0.0, "exit code 1: broken")
+
+    monkeypatch.setattr("sfmapp.viewer.recording.write_recording", fail)
+    if is_cancelled:
+        with pytest.raises(InterruptedRunError):
+            reconstruct(photos, copy, events=events)
+        return
+    report = reconstruct(photos, copy, events=events).report
+    assert [warning["message"] for warning in report["warnings"]] == ["no recording: exit code 1: broken"]
+    assert reconstruct(photos, copy).report["run"]["is_up_to_date"]
 
 
 # ------------------------------------------------------------------------------------------------- no reconstruction

@@ -100,6 +100,7 @@ def _record(run: Run, models: Sequence[Reconstruction]) -> str:
     if not outcome.problem:
         return WRITTEN
     path.unlink(missing_ok=True)
+    run.events.raise_if_cancelled()  # a Ctrl-C in a terminal reaches the child as well
     run.events.warned("recording", f"no recording: {outcome.problem}")
     return FAILED
 
