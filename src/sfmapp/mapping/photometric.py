@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from sfmapp.events import Events
 from sfmapp.features.features import Features
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.lens import distort
 from sfmapp.images.pixels import read_gray
-from sfmapp.scene.camera import distort
 from sfmapp.scene.reconstruction import Reconstruction
 
 if TYPE_CHECKING:

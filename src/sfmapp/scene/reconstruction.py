@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import Camera, distort
+from sfmapp.geometry.lens import distort
+from sfmapp.scene.camera import Camera
 from sfmapp.scene.tracks import Tracks
 
 
