@@ -6,6 +6,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# the first example of a kernel may have to compile it; the same examples every time
+settings.register_profile("sfmapp", deadline=None, derandomize=True)
+settings.load_profile("sfmapp")
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 
