@@ -18,7 +18,7 @@ from sfmapp.scene.reconstruction import Reconstruction
 # Configurations that a model can start from; a plane needs known intrinsics, which its reason says.
 _STARTABLE = (TwoViewConfig.CALIBRATED, TwoViewConfig.UNCALIBRATED, TwoViewConfig.PLANAR, TwoViewConfig.MULTIPLE)
 # Ranking looks closely at this many of the pairs with most matches: enough to choose from, bounded on large sets.
-MAX_RANKED = 60
+MAX_RANKED = 30
 # Beyond this median angle a wider baseline does not make a better start (COLMAP's 16 degrees).
 ENOUGH_ANGLE_DEG = 16.0
 
