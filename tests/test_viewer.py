@@ -121,8 +121,10 @@ def test_replay_brings_every_step_into_the_final_frame(job: tuple[ImageSet, list
     image_set, features, model = job
     listener = replayed(model)
     replay = make_replay(image_set, features, [model], listener.steps, listener.messages, title="t")
-    assert replay.step.tolist() == [0, 1, 2, 3, 4]
-    assert replay.image_step.tolist() == [0, 0, 1, 2, 3, -1, -1]
+    # the first two join together and take two times, the final model one more
+    assert replay.step.tolist() == [1, 2, 3, 4, 5]
+    assert replay.image_step.tolist() == [0, 1, 2, 3, 4, -1, -1]
+    assert [step for step, _, _ in replay.messages] == [1, 2, 3, 4, 4, 5]
     for k, count in enumerate((2, 3, 4, 5)):
         np.testing.assert_allclose(
             rigid3.rotation_matrix(replay.pose_cam_from_world[k, :count]),
@@ -133,6 +135,28 @@ def test_replay_brings_every_step_into_the_final_frame(job: tuple[ImageSet, list
         np.testing.assert_allclose(xyz, expected, atol=2e-3)
     np.testing.assert_allclose(replay.obs_residual, np.tile([0.3, 0.4], (5 * NUM_POINTS, 1)), atol=1e-5)
     assert np.diff(replay.keypoint_ptr).tolist() == [5] * 5 + [NUM_POINTS + 5] * 2
+
+
+def test_steps_of_a_long_run_still_know_their_images(job: tuple[ImageSet, list[Features], Reconstruction]) -> None:
+    image_set, features, model = job
+    steps = replayed(model).steps
+    thinned = replace(steps[2], cam_from_world=None, point_xyz=None, point_track_idx=None)
+    replay = make_replay(image_set, features, [model], [*steps[:2], thinned, *steps[3:]])
+    assert replay.image_step.tolist() == [0, 1, 2, 3, 4, -1, -1]
+    assert replay.pose_step.tolist() == replay.cloud_step.tolist() == [1, 2, 4]
+
+
+def test_an_attempt_that_came_to_nothing_leaves_no_cameras(
+    job: tuple[ImageSet, list[Features], Reconstruction],
+) -> None:
+    image_set, features, model = job
+    steps = replayed(model).steps
+    poses = np.full((NUM_IMAGES, 7), np.nan, np.float32)
+    poses[[5, 6]] = [0, 0, 0, 1, 0, 0, 0]
+    lost = replace(steps[0], image_idx=(5, 6), cam_from_world=poses)
+    replay = make_replay(image_set, features, [model], [lost, *(replace(s, step=s.step + 1) for s in steps)])
+    assert replay.image_step.tolist() == [2, 3, 4, 5, 6, -1, -1]
+    assert replay.pose_model.tolist() == [0] * 4
 
 
 def test_replay_survives_the_way_to_the_other_process(

@@ -47,7 +47,8 @@ class Replay:
         model_cam_from_world: (M, I, 7) float32, NaN where the image is not in the model.
         model_ptr: (M + 1,) int64; the points of model m are ``model_xyz[model_ptr[m]:model_ptr[m + 1]]``, coloured
             model_rgb.
-        step: (S,) int64 ascending; step_registered, step_points: (S,) int64; step_error_px: (S,) float32.
+        step: (S,) int64 ascending, a time for each image that was registered and each other change of the map;
+            step_registered, step_points: (S,) int64; step_error_px: (S,) float32.
         pose_step, pose_model: (P,) int64, and pose_cam_from_world: (P, I, 7) float32 as they were at that step.
         cloud_step, cloud_model: (C,) int64, cloud_ptr: (C + 1,) int64, cloud_xyz: (N, 3) float32, cloud_rgb:
             (N, 3) uint8.
@@ -129,20 +130,9 @@ def make_replay(
     """
     num_images = len(image_set.images)
     final_poses = np.array([r.cam_from_world for r in reconstructions], np.float64).reshape(-1, num_images, 7)
-    final_step = steps[-1].step + 1 if steps else 0
-    model_of = [_model_of_step(s.cam_from_world, final_poses) for s in steps]
-    moved = [_to_final_frame(s, final_poses, m) for s, m in zip(steps, model_of, strict=True)]
     image_model = np.full(num_images, -1, np.int64)
     for m in reversed(range(len(reconstructions))):
         image_model[~np.isnan(final_poses[m, :, 0])] = m
-    summary = reconstructions[0].summary() if reconstructions else {}
-    shown_messages = [(m.step, m.level, m.text) for m in messages]
-    if reconstructions:
-        shown_messages.append((final_step, "INFO", _final_text(reconstructions)))
-    kept = [k for k, pose in enumerate(moved) if pose is not None]
-    model_xyz = [r.point_xyz[r.is_triangulated] for r in reconstructions]
-    model_rgb = [r.point_rgb[r.is_triangulated] for r in reconstructions]
-    strides = [max(1, -(-len(xyz) // MAX_FINAL_POINTS)) for xyz in model_xyz]
     return Replay(
         title=title,
         image_names=[record.name for record in image_set.images],
@@ -150,26 +140,13 @@ def make_replay(
         image_size=np.array([(r.width, r.height) for r in image_set.images], np.int64).reshape(-1, 2),
         image_orientation=np.array([r.orientation for r in image_set.images], np.int64),
         image_model=image_model,
-        image_step=_registration_steps(steps, model_of, image_model, final_step),
         image_intrinsics=_intrinsics(reconstructions, image_model),
         model_cam_from_world=final_poses.astype(np.float32),
-        model_ptr=_offsets([len(xyz[::n]) for xyz, n in zip(model_xyz, strides, strict=True)]),
-        model_xyz=_join([xyz[::n] for xyz, n in zip(model_xyz, strides, strict=True)], 3, np.float32),
-        model_rgb=_join([rgb[::n] for rgb, n in zip(model_rgb, strides, strict=True)], 3, np.uint8),
-        step=np.array([s.step for s in steps] + [final_step], np.int64),
-        step_registered=np.array([s.num_registered for s in steps] + [summary.get("num_registered", 0)], np.int64),
-        step_points=np.array([s.num_points for s in steps] + [summary.get("num_points", 0)], np.int64),
-        step_error_px=np.array(
-            [s.mean_error_px for s in steps] + [summary.get("mean_reprojection_error_px", np.nan)], np.float32
-        ),
-        pose_step=np.array([steps[k].step for k in kept], np.int64),
-        pose_model=np.array([model_of[k] for k in kept], np.int64),
-        pose_cam_from_world=np.array([moved[k][0] for k in kept], np.float32).reshape(-1, num_images, 7),  # type: ignore[index]
-        **_clouds([(steps[k], model_of[k], moved[k][1]) for k in kept], reconstructions),  # type: ignore[index]
+        **_final_points(reconstructions),
+        **_history(steps, messages, reconstructions, final_poses, image_model),
         **_observations(features, reconstructions, image_model),
-        messages=shown_messages,
         up=np.asarray(up, np.float64) if up is not None else up_direction(final_poses[0] if len(final_poses) else None),
-    )  # fmt: skip
+    )
 
 
 def up_direction(cam_from_world: NDArray[np.float64] | None) -> NDArray[np.float64]:
@@ -209,12 +186,16 @@ def _principal_axes(axes: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDA
 # ------------------------------------------------------------------------------------------------ into the final frame
 
 
-def _model_of_step(cam_from_world: Float32 | None, final_poses: NDArray[np.float64]) -> int:
-    """The final model that a step worked on: the one that shares most images with it; -1 for none."""
-    if cam_from_world is None or not len(final_poses):
-        return -1
-    shared = (~np.isnan(cam_from_world[None, :, 0]) & ~np.isnan(final_poses[:, :, 0])).sum(1)
-    return int(shared.argmax()) if shared.max() >= 2 else -1
+def _models_of_steps(steps: Sequence[Step], final_poses: NDArray[np.float64]) -> list[int]:
+    """The final model that each step worked on: the one that shares most images with it; -1 for none."""
+    models: list[int] = []
+    for step in steps:
+        if step.cam_from_world is None or not len(final_poses):  # thinned out: the same as the step before
+            models.append(models[-1] if models else -1)
+            continue
+        shared = (~np.isnan(step.cam_from_world[None, :, 0]) & ~np.isnan(final_poses[:, :, 0])).sum(1)
+        models.append(int(shared.argmax()) if shared.max() >= 2 else -1)
+    return models
 
 
 def _to_final_frame(
@@ -235,19 +216,67 @@ def _to_final_frame(
     return poses, xyz
 
 
-def _registration_steps(steps: Sequence[Step], model_of: Sequence[int], image_model: Ints, final_step: int) -> Ints:
-    """(I,) step from which an image belongs to its final model; -1 where it is in none."""
-    out = np.full(len(image_model), -1, np.int64)
-    out[image_model >= 0] = final_step
-    for step, model in reversed(list(zip(steps, model_of, strict=True))):
-        if model >= 0:
-            for image_idx in step.image_idx:
-                if image_model[image_idx] == model:
-                    out[image_idx] = step.step
-    return out
-
-
 # ------------------------------------------------------------------------------------------------ arrays of the parts
+
+
+def _history(
+    steps: Sequence[Step], messages: Sequence[Message], reconstructions: Sequence[Reconstruction],
+    final_poses: NDArray[np.float64], image_model: Ints,
+) -> dict[str, Any]:  # fmt: skip
+    """All that has a place in time: numbers, poses, points, registrations, messages."""
+    # images that were registered together follow each other, so that each is seen
+    ends = np.cumsum([max(1, len(s.image_idx)) for s in steps]).astype(np.int64) - 1
+    end_of = dict(zip([s.step for s in steps], ends.tolist(), strict=True))
+    final_step = int(ends[-1]) + 1 if steps else 0
+    model_of = _models_of_steps(steps, final_poses)
+    image_step = np.where(image_model >= 0, final_step, -1)
+    for s, end, m in reversed(list(zip(steps, ends, model_of, strict=True))):
+        for place, image_idx in enumerate(s.image_idx):
+            if image_model[image_idx] == m >= 0:
+                image_step[image_idx] = end - len(s.image_idx) + 1 + place
+    moved = [_to_final_frame(s, final_poses, m) for s, m in zip(steps, model_of, strict=True)]
+    kept = [(k, *pose) for k, pose in enumerate(moved) if pose is not None]
+    clouds = [(k, xyz) for k, _, xyz in kept if xyz is not None]
+    summary = reconstructions[0].summary() if reconstructions else {}
+    texts = [(end_of.get(m.step, 0), m.level, m.text) for m in messages]
+    if reconstructions:
+        texts.append((final_step, "INFO", _final_text(reconstructions)))
+    return {
+        "image_step": image_step.astype(np.int64),
+        "step": np.append(ends, final_step).astype(np.int64),
+        "step_registered": np.array([s.num_registered for s in steps] + [summary.get("num_registered", 0)], np.int64),
+        "step_points": np.array([s.num_points for s in steps] + [summary.get("num_points", 0)], np.int64),
+        "step_error_px": np.array(
+            [s.mean_error_px for s in steps] + [summary.get("mean_reprojection_error_px", np.nan)], np.float32
+        ),
+        "pose_step": np.array([ends[k] for k, _, _ in kept], np.int64),
+        "pose_model": np.array([model_of[k] for k, _, _ in kept], np.int64),
+        "pose_cam_from_world": np.array([p for _, p, _ in kept], np.float32).reshape(-1, len(image_model), 7),
+        "cloud_step": np.array([ends[k] for k, _ in clouds], np.int64),
+        "cloud_model": np.array([model_of[k] for k, _ in clouds], np.int64),
+        "cloud_ptr": _offsets([len(xyz) for _, xyz in clouds]),
+        "cloud_xyz": _join([xyz for _, xyz in clouds], 3, np.float32),
+        "cloud_rgb": _join([_colors(reconstructions[model_of[k]], steps[k]) for k, _ in clouds], 3, np.uint8),
+        "messages": texts,
+    }
+
+
+def _colors(reconstruction: Reconstruction, step: Step) -> NDArray[np.uint8]:
+    """(K, 3) colours of the points of a step; points that did not last have none and are grey."""
+    rgb = reconstruction.point_rgb[step.point_track_idx]
+    return np.where(rgb.any(1, keepdims=True), rgb, np.uint8(128))
+
+
+def _final_points(reconstructions: Sequence[Reconstruction]) -> dict[str, Any]:
+    shown = []
+    for r in reconstructions:
+        track_idx = np.flatnonzero(r.is_triangulated)
+        shown.append(track_idx[:: max(1, -(-len(track_idx) // MAX_FINAL_POINTS))])
+    return {
+        "model_ptr": _offsets([len(track_idx) for track_idx in shown]),
+        "model_xyz": _join([r.point_xyz[k] for r, k in zip(reconstructions, shown, strict=True)], 3, np.float32),
+        "model_rgb": _join([r.point_rgb[k] for r, k in zip(reconstructions, shown, strict=True)], 3, np.uint8),
+    }
 
 
 def _offsets(counts: Sequence[int]) -> Ints:
@@ -256,24 +285,6 @@ def _offsets(counts: Sequence[int]) -> Ints:
 
 def _join(parts: Sequence[NDArray[Any]], width: int, dtype: Any) -> NDArray[Any]:
     return np.concatenate([np.zeros((0, width), dtype), *(np.asarray(p, dtype) for p in parts)])
-
-
-def _clouds(
-    snapshots: Sequence[tuple[Step, int, Float32 | None]], reconstructions: Sequence[Reconstruction]
-) -> dict[str, Any]:
-    with_points = [(step, model, xyz) for step, model, xyz in snapshots if xyz is not None]
-    colors = []
-    for step, model, _ in with_points:
-        rgb = reconstructions[model].point_rgb[step.point_track_idx]
-        # points that did not last have no colour: grey
-        colors.append(np.where(rgb.any(1, keepdims=True), rgb, np.uint8(128)))
-    return {
-        "cloud_step": np.array([step.step for step, _, _ in with_points], np.int64),
-        "cloud_model": np.array([model for _, model, _ in with_points], np.int64),
-        "cloud_ptr": _offsets([len(xyz) for _, _, xyz in with_points]),
-        "cloud_xyz": _join([xyz for _, _, xyz in with_points], 3, np.float32),
-        "cloud_rgb": _join(colors, 3, np.uint8),
-    }
 
 
 def _observations(

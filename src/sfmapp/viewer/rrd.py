@@ -192,7 +192,7 @@ def _draw_points(recording: rr.RecordingStream, replay: Replay, m: int, path: st
     rgb = np.concatenate([*(replay.cloud_rgb[s] for s in spans), replay.model_rgb[spans_final]])
     counts = [s.stop - s.start for s in [*spans, spans_final]]
     steps = np.append(replay.cloud_step[mine], replay.step[-1])
-    recording.log(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(2.0)), static=True)
+    recording.log(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.8)), static=True)
     columns = rr.Points3D.columns(positions=xyz, colors=_packed(rgb)).partition(counts)
     recording.send_columns(path, [rr.TimeColumn(TIMELINE, sequence=steps)], columns)
 
@@ -209,10 +209,10 @@ def _draw_camera(
     size = replay.image_size[image_idx].astype(np.float64)
     shown = np.array(photo.thumbnail_size, np.float64) if photo else size
     fx, fy, cx, cy = replay.image_intrinsics[image_idx].astype(np.float64) * np.tile(shown / size, 2)
-    # newly registered cameras stand out for one step
-    begin = [steps[0]] if steps[0] == replay.step[-1] else [steps[0], _next_step(replay, steps[0])]
-    colors = (
-        [_ORANGE, _MODEL_COLORS[m % len(_MODEL_COLORS)]] if len(begin) == 2 else [_MODEL_COLORS[m % len(_MODEL_COLORS)]]
+    # newly registered cameras stand out until the next time
+    color = _MODEL_COLORS[m % len(_MODEL_COLORS)]
+    begin, colors = (
+        ([steps[0], steps[0] + 1], [_ORANGE, color]) if steps[0] < replay.step[-1] else ([steps[0]], [color])
     )
     repeat = len(begin)
     pinhole = rr.Pinhole.columns(
@@ -236,12 +236,9 @@ def _camera_path(replay: Replay, m: int, image_idx: int) -> tuple[NDArray[np.int
     poses = np.concatenate(
         [replay.pose_cam_from_world[rows, image_idx], replay.model_cam_from_world[m, image_idx][None]]
     )
+    steps[0] = replay.image_step[image_idx]
     is_new = np.append(True, (poses[1:] != poses[:-1]).any(1))
     return steps[is_new], poses[is_new].astype(np.float64)
-
-
-def _next_step(replay: Replay, step: int) -> int:
-    return int(replay.step[np.searchsorted(replay.step, step, side="right")])
 
 
 # ---------------------------------------------------------------- photographs
@@ -375,7 +372,7 @@ def _blueprint(replay: Replay, stage: _Stage) -> rrb.Blueprint:
         columns=rrb.TextLogColumns(text_log_columns=["loglevel", "body"]),
     )  # fmt: skip
     # it opens playing, for some eight seconds, and stays at the end
-    speed = rrb.TimePanel(timeline=TIMELINE, state="collapsed", fps=float(np.clip(len(replay.step) / 8, 1, 30)))
+    speed = rrb.TimePanel(timeline=TIMELINE, state="collapsed", fps=float(np.clip((replay.step[-1] + 1) / 8, 1, 30)))
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(world, rrb.Vertical(photo, about, row_shares=[5, 1]), column_shares=[3, 2]),
