@@ -319,7 +319,7 @@ def test_the_demo_prints_its_error_against_the_truth(sample: Path, tmp_path: Pat
     done = command("demo", "-o", tmp_path / "demo", "--json", "--min-registered", num_images)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
-    assert result["truth"]["num_compared"] == num_images
+    assert result["truth"]["num_common"] == num_images
     # a tenth of a pixel of noise at the sample's distances and 150 points per view and more
     assert result["truth"]["center_error_share"]["max"] < 2e-3
     assert result["truth"]["rotation_error_deg"]["max"] < 0.1

@@ -113,7 +113,7 @@ def _demo(args: argparse.Namespace) -> int:
     if not args.quiet:
         _print_summary(args.output, report)
     center, rotation = errors["center_error"], errors["rotation_error_deg"]
-    whose = f"{errors['num_compared']} of {errors['num_reference_images']} images, {errors['scene_size']:.1f} m apart"
+    whose = f"{errors['num_common']} of {errors['num_reference_images']} images, {errors['scene_size']:.1f} m apart"
     print(
         f"against the truth: camera centres off by {1000 * center['mean']:.2f} mm on average,"
         f" {1000 * center['max']:.2f} mm at worst; rotations by {rotation['mean']:.4f} and {rotation['max']:.4f}"
