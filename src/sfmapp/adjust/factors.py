@@ -59,11 +59,11 @@ class ExtraFactors:
                 self._place[K(int(camera))] = problem.camera_block[c] * 8 + columns
                 self._cameras.append((K(int(camera)), c))
                 self._sign[K(int(camera))] = 1.0
-        self._known = gtsam.NonlinearFactorGraph()
+        self.known = gtsam.NonlinearFactorGraph()
         for n in range(self._graph.size()):
             if set(self._graph.at(n).keys()) <= self._place.keys():
-                self._known.push_back(self._graph.at(n))
-        places = [self._indices(self._known.at(n).keys()) for n in range(self._known.size())]
+                self.known.push_back(self._graph.at(n))
+        places = [self._indices(self.known.at(n).keys()) for n in range(self.known.size())]
         pairs = [np.stack(np.meshgrid(p, p, indexing="ij"), -1).reshape(-1, 2) for p in places]
         self._row, self._column = np.concatenate([*pairs, np.zeros((0, 2), np.int64)]).T
         self._single = np.concatenate([*places, np.zeros(0, np.int64)])
@@ -90,13 +90,13 @@ class ExtraFactors:
     def cost(self, poses: Array, canonical: Array) -> float:
         """gtsam's error, half the squared whitened residuals; infinite where a factor cannot be evaluated."""
         try:
-            return float(self._known.error(self._values(poses, canonical)))
+            return float(self.known.error(self._values(poses, canonical)))
         except RuntimeError:
             return float("inf")
 
     def linearize(self, own: Array, gradient: Array) -> None:
         """Linearise at the problem's state; adds what concerns single blocks to own (B * 64,) and gradient (B * 8,)."""
-        linear = self._known.linearize(self._values(self._problem.poses, self._problem.canonical))
+        linear = self.known.linearize(self._values(self._problem.poses, self._problem.canonical))
         matrices, vectors = [], []
         for n in range(linear.size()):
             factor = linear.at(n)
