@@ -16,6 +16,9 @@ from sfmapp.scene.features import Features
 
 # The coarse epipolar lines are off by more than the noise of the matches that they rest on.
 _BAND_PER_THRESHOLD = 2.0
+# Guided matches fit the lines that they were sought along, so they are no evidence for them. Repeated structure offers
+# several geometries, each with its share of the matches: unless one has most of them, all are looked at together.
+_MIN_COARSE_SHARE = 0.5
 # Of the matches that the coarse ones promise, in proportion to the number of features, so many must be found.
 _MIN_KEPT_PROMISE = 0.5
 
@@ -81,7 +84,9 @@ def _match_coarse_to_fine(
         return doubtful
     fundamental, inlier = polish_fundamental(fundamental, xy1, xy2, threshold_px)
     extent = tuple(np.ptp(image2.shape[:, :2], axis=0))
-    if inlier.sum() < options.min_inliers or not is_significant(inlier, threshold_px, extent):
+    if inlier.sum() < max(options.min_inliers, _MIN_COARSE_SHARE * len(coarse)):
+        return doubtful
+    if not is_significant(inlier, threshold_px, extent):
         return doubtful
     change = change_of_shape(image1, image2, coarse[inlier])
     guided = match_guided(image1, image2, fundamental, _BAND_PER_THRESHOLD * threshold_px, change, *limits)

@@ -23,7 +23,7 @@ from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.features import Features
 
 if TYPE_CHECKING:
-    from sfmapp.images.folder import ImageSet
+    from sfmapp.images.image_set import ImageSet
 
 __all__ = [
     "MatchedPair",

@@ -129,6 +129,8 @@ def verify_pair(
     poses = _RelativePoses(xy1, xy2, camera1, camera2, threshold)
     is_calibrated = camera1.focal_source != "default" and camera2.focal_source != "default"
     _estimate_pose(result, inliers, poses, is_calibrated, ransac, options)
+    if not is_significant(inliers.e, threshold, (camera2.width, camera2.height)):
+        inliers.e[:] = False
     result.num_inliers_f, result.num_inliers_e, result.num_inliers_h = (
         int(mask.sum()) for mask in (inliers.f, inliers.e, inliers.h)
     )
@@ -136,7 +138,7 @@ def verify_pair(
     if result.config == TwoViewConfig.DEGENERATE:
         result.essential, result.cam2_from_cam1 = _no_matrix(), np.full(7, np.nan)
         return result
-    _tell_planar_apart(result, poses, is_calibrated)
+    _tell_planar_apart(result, inliers.h, poses, is_calibrated)
     if _is_watermark(xy1, xy2, result.is_inlier, camera1, camera2, threshold):
         result.config = TwoViewConfig.WATERMARK
     if np.isfinite(result.cam2_from_cam1).all() and result.config != TwoViewConfig.PANORAMIC:
@@ -334,31 +336,38 @@ def _is_watermark(xy1: Array, xy2: Array, inlier: Mask, camera1: Camera, camera2
     return bool(moved_alike.sum() >= _WATERMARK_MIN_SHARE * num_inliers)
 
 
-def _tell_planar_apart(result: TwoViewGeometry, poses: _RelativePoses, is_calibrated: bool) -> None:
-    """Decide PLANAR or PANORAMIC: does a rotation alone explain nine in ten of the matches?
+def _tell_planar_apart(result: TwoViewGeometry, inlier_h: Mask, poses: _RelativePoses, is_calibrated: bool) -> None:
+    """Decide PLANAR or PANORAMIC: does a rotation alone explain nine in ten of what a homography does?
 
-    The focal need not be known: a pure rotation shows itself at one focal or another. A guess of 1.2 times the larger
-    side is right within a factor of two for nearly all lenses, a focal from EXIF within 30 %.
+    If so, there is no parallax, and what no homography explains is wrong even if an epipolar line passes by. The focal
+    need not be known: a pure rotation shows itself at one focal or another. A guess of 1.2 times the larger side is right
+    within a factor of two for nearly all lenses, a focal from EXIF within 30 %.
     """
     if result.config != TwoViewConfig.PLANAR_OR_PANORAMIC:
         return
     result.config = TwoViewConfig.PLANAR
-    a, b = poses.subset(result.is_inlier)
-    reach = math.log(1.3 if is_calibrated else 2.0)
-    for factor in np.exp(np.linspace(-reach, reach, 9)[np.argsort(np.abs(np.linspace(-1, 1, 9)), kind="stable")]):
-        rotation = _rotation_only(a / factor, b / factor, poses.scale / factor)
-        if rotation is not None:
-            result.config = TwoViewConfig.PANORAMIC
+    a, b = poses.subset(inlier_h)
+    few = slice(None, None, max(len(a) // 200, 1))
+    log_focal, reach = 0.0, math.log(1.3 if is_calibrated else 2.0)
+    for _ in range(3):  # a grid within a grid leaves 2 % of focal, then 0.5 %
+        rotation, errors = _rotation_only(a, b, poses.scale, log_focal)
+        if (errors < 1.0).mean() > 0.9:
+            result.config, result.is_inlier = TwoViewConfig.PANORAMIC, inlier_h
             result.cam2_from_cam1 = rigid3.from_matrix(rotation, np.zeros(3))
             result.essential, result.median_angle_deg = _no_matrix(), 0.0
             return
+        trials = log_focal + reach * np.linspace(-1.0, 1.0, 9)
+        costs = [np.minimum(_rotation_only(a[few], b[few], poses.scale, trial)[1], 1.0).sum() for trial in trials]
+        log_focal = float(trials[np.argmin(costs)])
+        reach *= 0.25
 
 
-def _rotation_only(xn1: Array, xn2: Array, scale: float) -> Array | None:
-    """The rotation that explains nine in ten points, if there is one."""
-    weights = np.ones(len(xn1))
+def _rotation_only(xn1: Array, xn2: Array, scale: float, log_focal: float) -> tuple[Array, Array]:
+    """The rotation that fits best at a multiple of the focal, and (N,) squared errors in units of scale."""
+    factor = math.exp(-log_focal)
+    weights, a, b, bound = np.ones(len(xn1)), xn1 * factor, xn2 * factor, (scale * factor) ** 2
     for _ in range(3):
-        rotation = homography.rotation_from_rays(xn1, xn2, weights)
-        error = homography.transfer_errors(rotation, xn1, xn2)
-        weights = 1.0 / (1.0 + np.minimum(error, 1e12) / scale**2)
-    return rotation if (error < scale**2).mean() > 0.9 else None
+        rotation = homography.rotation_from_rays(a, b, weights)
+        error = np.minimum(homography.transfer_errors(rotation, a, b) / bound, 1e12)
+        weights = 1.0 / (1.0 + error)
+    return rotation, error
