@@ -30,7 +30,10 @@ class ExtraFactors:
 
     Attributes:
         images, cameras: positions of all that the graph mentions.
+        weight: factor on cost and information of the whole graph.
     """
+
+    weight = 1.0
 
     def __init__(self, graph: Any) -> None:
         self._graph = graph
@@ -90,7 +93,7 @@ class ExtraFactors:
     def cost(self, poses: Array, canonical: Array) -> float:
         """gtsam's error, half the squared whitened residuals; infinite where a factor cannot be evaluated."""
         try:
-            return float(self.known.error(self._values(poses, canonical)))
+            return self.weight * float(self.known.error(self._values(poses, canonical)))
         except RuntimeError:
             return float("inf")
 
@@ -102,7 +105,7 @@ class ExtraFactors:
             factor = linear.at(n)
             keys = list(factor.keys())
             sign = np.concatenate([np.full(len(self._place[key]), self._sign[key]) for key in keys])
-            information = factor.augmentedInformation()
+            information = self.weight * factor.augmentedInformation()
             matrices.append((information[:-1, :-1] * np.outer(sign, sign)).ravel())
             vectors.append(-information[:-1, -1] * sign)
         self._value = np.concatenate([*matrices, np.zeros(0)])[self._kept]

@@ -1,0 +1,360 @@
+"""How well an adjusted reconstruction is determined: covariances of poses, intrinsics and points.
+
+The information is that of the adjustment at its minimum, undamped: reprojections divided by the variance of the noise,
+priors and gtsam factors as they are. What the observations cannot tell, in a free network the seven degrees of a
+similarity, is taken out by inner constraints (Triggs et al. 1999, section 9): among all equivalent reconstructions the
+errors are those of the one whose poses lie nearest to the truth, in the sum of ``|v|^2 + s^2 |w|^2`` over the images,
+where w and v are rotation and translation errors and s is the rms distance of the centres from their mean. Compare
+with a known truth by :func:`errors_in_gauge`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.adjust.kernels import linearize, robust_weight
+from sfmapp.adjust.problem import Problem, make_problem
+from sfmapp.adjust.solver import AdjustOptions, Engine, IntrinsicPriors
+from sfmapp.geometry import rigid3
+from sfmapp.scene.camera import Camera
+from sfmapp.scene.reconstruction import Reconstruction
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_DEFAULTS = AdjustOptions()
+
+# A similarity is undetermined where its information is below this share of what it would be, were all else known.
+_NULL = 1e-9
+
+
+@dataclass(frozen=True)
+class Covariances:
+    """Marginal covariances of what varied.
+
+    Attributes:
+        image_idx: (n,) images; poses: (n, 6, 6) over rotation w (radians) and translation v of
+            ``x_cam <- exp(w) x_cam + v``.
+        camera_idx: (m,) cameras; free_params: m arrays (Q,), positions in ``Camera.params``; intrinsics: m arrays
+            (Q, Q) over these.
+        track_idx: (p,) points; points: (p, 3, 3) in the world; infinite for a point without depth.
+        sigma_px: the noise of one coordinate of an observation, estimated or as given.
+        num_gauge: degrees of freedom that only the inner constraints hold: 7 in a free network.
+        is_determined: False if more than that is undetermined; all covariances are infinite then.
+    """
+
+    image_idx: NDArray[np.int64]
+    poses: Array
+    camera_idx: NDArray[np.int64]
+    free_params: list[NDArray[np.int64]]
+    intrinsics: list[Array]
+    track_idx: NDArray[np.int64]
+    points: Array
+    sigma_px: float
+    num_gauge: int
+    is_determined: bool
+
+
+def estimate_covariances(
+    reconstruction: Reconstruction,
+    options: AdjustOptions = _DEFAULTS,
+    *,
+    sigma_px: float | None = None,
+    variable_images: Mask | None = None,
+    variable_cameras: Mask | None = None,
+    points: Mask | None = None,
+    constant_points: Mask | None = None,
+    prior_cameras: Sequence[Camera] | None = None,
+    extra_factors: Any = None,
+) -> Covariances:
+    """Covariances at the minimum that ``adjust_bundle`` found with the same arguments.
+
+    Args:
+        sigma_px: noise of one pixel coordinate; None to estimate it from the (robustly weighted) residuals.
+
+    Memory is that of two dense matrices over all unknowns of cameras and poses.
+    """
+    extras = None
+    if extra_factors is not None and extra_factors.size() > 0:
+        from sfmapp.adjust.factors import ExtraFactors
+
+        extras = ExtraFactors(extra_factors)
+    problem = make_problem(
+        reconstruction, refine=options.refine, variable_images=variable_images, variable_cameras=variable_cameras,
+        points=points, constant_points=constant_points, extra_images=extras.images if extras else (),
+        extra_cameras=extras.cameras if extras else (),
+    )  # fmt: skip
+    if extras is not None:
+        extras.attach(problem)
+    engine = Engine(problem, options, IntrinsicPriors(problem, prior_cameras, options), extras)
+    used = (np.arange(8) < problem.block_dim[:, None]).ravel()
+    variance = sigma_px**2 if sigma_px is not None else _variance(engine, int(used.sum()))
+    # everything below is in units of that noise, which makes the priors weaker or stronger
+    engine.priors.weight *= variance
+    if extras is not None:
+        extras.weight = variance
+    engine.linearize(0.0, map)
+    information = _reduced_matrix(engine)[np.ix_(used, used)]
+    scale = engine.diagonal[used]
+    basis, constraint = _gauge(problem, used, information, scale)
+    covariance = _constrained_inverse(information, scale, basis, constraint)
+    determined = covariance is not None
+    full = np.zeros((len(used), len(used)))
+    full[np.ix_(used, used)] = covariance if covariance is not None else np.inf
+    return _collect(engine, full * variance, variance, len(basis), determined)
+
+
+def _variance(engine: Engine, num_unknowns: int) -> float:
+    """Variance of a pixel coordinate from weighted residuals and degrees of freedom."""
+    p = engine.problem
+    total = _weighted_squares(
+        p.point_ptr, p.obs_image, p.obs_xy, p.xyz, engine.rows, p.image_camera, p.canonical, p.fisheye, p.penalty,
+        engine.loss, engine.scale2,
+    )  # fmt: skip
+    free_gauge = 7 if (p.image_block >= 0).all() and not p.is_constant.any() and engine.extras is None else 0
+    dof = 2 * p.num_observations - 3 * int((~p.is_constant).sum()) - num_unknowns + free_gauge
+    return total / dof if dof > 0 else np.inf
+
+
+def _reduced_matrix(engine: Engine) -> Array:
+    """The undamped reduced system as a full (B * 8, B * 8) matrix."""
+    blocks, tiles = engine.problem.num_blocks, engine.tiles[0]
+    if engine.extras is not None:
+        engine.extras.add_pairs(tiles, engine.tile_numbers(engine.extras.pairs))
+    if engine.solver == "dense":
+        keys = np.arange(blocks * blocks)
+        numbers = keys
+    else:
+        held = engine.hash_keys >= 0
+        keys, numbers = engine.hash_keys[held], engine.hash_values[held]
+    a, b = np.divmod(keys, blocks)
+    upper = a <= b
+    matrix = np.zeros((blocks, blocks, 8, 8))
+    matrix[a[upper], b[upper]] = tiles.reshape(-1, 8, 8)[numbers[upper]]
+    full = matrix.transpose(0, 2, 1, 3).reshape(blocks * 8, blocks * 8)
+    above = np.triu(full)
+    return above + np.triu(full, 1).T
+
+
+def similarity_basis(poses: Array) -> tuple[Array, Array]:
+    """What infinitesimal similarities of the world do to poses (I, 7), and the constraint of the nearest one.
+
+    Returns basis (7, I * 6), rows for turns, shifts and scale about the mean centre, all of the size of the scene, and
+    constraint (7, I * 6), whose product with the errors vanishes in the gauge of this module.
+    """
+    rotation, centers = rigid3.rotation_matrix(poses), rigid3.center(poses)
+    mean = centers.mean(0)
+    size = max(float(np.sqrt(((centers - mean) ** 2).sum(1).mean())), 1e-12)
+    t = np.einsum("nij,j->ni", rotation, mean) + poses[:, 4:]
+    basis = np.zeros((7, len(poses), 6))
+    basis[:3, :, :3] = -rotation.transpose(2, 0, 1)
+    basis[:3, :, 3:] = -(rigid3.skew(t) @ rotation).transpose(2, 0, 1)
+    basis[3:6, :, 3:] = -size * rotation.transpose(2, 0, 1)
+    basis[6, :, 3:] = t
+    weight = np.repeat([size * size, 1.0], 3)
+    return basis.reshape(7, -1), (basis * weight).reshape(7, -1)
+
+
+def _gauge(problem: Problem, used: Mask, information: Array, scale: Array) -> tuple[Array, Array]:
+    """Directions (k, N) that the information leaves open among the similarities, and their constraints (k, N)."""
+    images = np.flatnonzero(problem.image_block >= 0)
+    if len(images) == 0:
+        return np.zeros((0, len(scale))), np.zeros((0, len(scale)))
+    place = (problem.image_block[images][:, None] * 8 + np.arange(6)).ravel()
+    wide, constraint = np.zeros((7, len(used))), np.zeros((7, len(used)))
+    wide[:, place], constraint[:, place] = similarity_basis(problem.poses[images])
+    basis, constraint = wide[:, used], constraint[:, used]
+    norm = np.sqrt((basis**2 * scale).sum(1))
+    norm[norm == 0] = 1.0
+    basis, constraint = basis / norm[:, None], constraint / norm[:, None]
+    values, vectors = np.linalg.eigh(basis @ information @ basis.T)
+    open_ = vectors[:, values < _NULL].T
+    return open_ @ basis, open_ @ constraint
+
+
+def _constrained_inverse(information: Array, scale: Array, basis: Array, constraint: Array) -> Array | None:
+    """Inverse of the information where ``constraint x = 0``, given that ``information basis^T = 0``."""
+    root = 1.0 / np.sqrt(scale)
+    matrix = information * np.outer(root, root)
+    held = constraint * root
+    held /= np.linalg.norm(held, axis=1, keepdims=True) + 1e-300
+    try:
+        factor = np.linalg.inv(np.linalg.cholesky(matrix + held.T @ held))
+        inverse = factor.T @ factor
+        if len(basis):
+            open_ = basis / root
+            projection = np.eye(len(scale)) - open_.T @ np.linalg.solve(held @ open_.T, held)
+            inverse = projection @ inverse @ projection.T
+    except np.linalg.LinAlgError:
+        return None
+    return inverse * np.outer(root, root)
+
+
+def _collect(engine: Engine, covariance: Array, variance: float, num_gauge: int, determined: bool) -> Covariances:
+    p = engine.problem
+    images = np.flatnonzero(p.image_block >= 0)
+    cameras = np.flatnonzero(p.camera_block >= 0)
+    at = [p.image_block[i] * 8 + np.arange(6) for i in images]
+    intrinsics = []
+    for c in cameras:
+        columns = np.unique(p.free.column[p.free.ptr[c] : p.free.ptr[c + 1]])
+        place = p.camera_block[c] * 8 + columns
+        intrinsics.append(covariance[np.ix_(place, place)])
+    points = np.full((len(p.xyz), 3, 3), np.inf)
+    if determined:
+        _point_covariances(
+            p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, engine.rows, p.image_camera, p.image_block,
+            p.canonical, p.fisheye, p.penalty, p.camera_block, p.free.ptr, p.free.slot, p.free.column, p.num_blocks,
+            engine.loss, engine.scale2, engine.factor, covariance, variance, points,
+        )  # fmt: skip
+    return Covariances(
+        image_idx=p.image_idx[images],
+        poses=np.array([covariance[np.ix_(i, i)] for i in at]).reshape(-1, 6, 6),
+        camera_idx=p.camera_idx[cameras],
+        free_params=[p.free.params[c] for c in cameras],
+        intrinsics=intrinsics,
+        track_idx=p.track_idx,
+        points=points,
+        sigma_px=float(np.sqrt(variance)),
+        num_gauge=num_gauge,
+        is_determined=determined,
+    )
+
+
+def errors_in_gauge(
+    estimate: Reconstruction, truth: Reconstruction, covariances: Covariances
+) -> tuple[Array, list[Array], Array]:
+    """Errors of an estimate in the tangents and the gauge of its covariances.
+
+    Where the gauge was free (``num_gauge`` 7) the truth is moved by the similarity that this module's gauge asks for;
+    otherwise both must be in the same frame.
+
+    Returns:
+        poses (n, 6), intrinsics m times (Q,), and points (p, 3).
+    """
+    wanted = truth.copy()
+    images = covariances.image_idx
+    for _ in range(20 if covariances.num_gauge == 7 else 0):
+        basis, constraint = similarity_basis(wanted.cam_from_world[images])
+        error = _pose_errors(estimate, wanted, images).ravel()
+        move: Array = np.linalg.solve(constraint @ basis.T, constraint @ error).astype(np.float64)
+        _apply_similarity(wanted, images, move)
+        if np.abs(move).max() < 1e-14:
+            break
+    intrinsics = [
+        (estimate.cameras[c].params - truth.cameras[c].params)[free]
+        for c, free in zip(covariances.camera_idx, covariances.free_params, strict=True)
+    ]
+    points = estimate.point_xyz[covariances.track_idx] - wanted.point_xyz[covariances.track_idx]
+    return _pose_errors(estimate, wanted, images), intrinsics, points
+
+
+def _pose_errors(estimate: Reconstruction, truth: Reconstruction, images: NDArray[np.int64]) -> Array:
+    """(n, 6) w and v with ``estimate = (exp(w), v) truth``."""
+    delta = rigid3.compose(estimate.cam_from_world[images], rigid3.inverse(truth.cam_from_world[images]))
+    return np.concatenate([rigid3.log_so3(rigid3.rotation_matrix(delta)), delta[:, 4:]], 1)
+
+
+def _apply_similarity(model: Reconstruction, images: NDArray[np.int64], move: Array) -> None:
+    """Turn, shift and scale a model about the mean centre of the images, in the units of :func:`similarity_basis`."""
+    centers = rigid3.center(model.cam_from_world)
+    mean = centers[images].mean(0)
+    size = np.sqrt(((centers[images] - mean) ** 2).sum(1).mean())
+    turn, scale, shift = rigid3.exp_so3(move[:3]), np.exp(move[6]), size * move[3:6]
+    rotation = rigid3.rotation_matrix(model.cam_from_world) @ turn.T
+    moved = scale * (centers - mean) @ turn.T + mean + shift
+    model.cam_from_world[:] = rigid3.from_matrix(rotation, -np.einsum("nij,nj->ni", rotation, moved))
+    model.point_xyz[:] = scale * (model.point_xyz - mean) @ turn.T + mean + shift
+
+
+@numba.njit(cache=True, nogil=True)
+def _weighted_squares(  # type: ignore[no-untyped-def]
+    point_ptr, obs_image, obs_xy, xyz, poses, image_camera, canonical, fisheye, penalty, loss, scale2
+):
+    """Sum of rho'(s) s over all observations."""
+    J = np.zeros(80)
+    total = 0.0
+    for p in range(xyz.shape[0]):
+        for o in range(point_ptr[p], point_ptr[p + 1]):
+            i = obs_image[o]
+            c = image_camera[i]
+            s = linearize(
+                poses[i], canonical[c], fisheye[c], xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss,
+                scale2, penalty[c], False, J,
+            )  # fmt: skip
+            total += robust_weight(loss, scale2, s) * s
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _point_covariances(  # type: ignore[no-untyped-def]
+    point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_camera, image_block, canonical, fisheye, penalty,
+    camera_block, free_ptr, free_slot, free_column, num_blocks, loss, scale2, factor, covariance, variance, out,
+):  # fmt: skip
+    """``V^-1 (variance V + W^T C W) V^-1`` of each point, with V^-1 = L^-T L^-1 from the factor; C in full blocks."""
+    J = np.zeros(80)
+    mark = np.full(num_blocks, -1, np.int64)
+    W = np.zeros((num_blocks * 8, 3))
+    touched = np.zeros(num_blocks, np.int64)
+    M, N = np.zeros((3, 3)), np.zeros((3, 3))
+    for p in range(xyz.shape[0]):
+        if is_constant[p]:
+            out[p] = 0.0
+            continue
+        f = factor[p]
+        if f[0] == 0.0:
+            continue
+        count = 0
+        for o in range(point_ptr[p], point_ptr[p + 1]):
+            i = obs_image[o]
+            c = image_camera[i]
+            linearize(
+                poses[i], canonical[c], fisheye[c], xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss,
+                scale2, penalty[c], True, J,
+            )  # fmt: skip
+            for block in (image_block[i], camera_block[c]):
+                if block >= 0 and mark[block] != p:
+                    mark[block] = p
+                    touched[count] = block
+                    count += 1
+                    W[block * 8 : block * 8 + 8] = 0.0
+            for j in range(3):
+                if image_block[i] >= 0:
+                    for k in range(6):
+                        W[image_block[i] * 8 + k, j] += J[k] * J[48 + j] + J[8 + k] * J[56 + j]
+                if camera_block[c] >= 0:
+                    for n in range(free_ptr[c], free_ptr[c + 1]):
+                        k, slot = camera_block[c] * 8 + free_column[n], 16 + free_slot[n]
+                        W[k, j] += J[slot] * J[48 + j] + J[slot + 8] * J[56 + j]
+        M[:] = 0.0
+        for a in range(count):
+            for b in range(count):
+                for x in range(8):
+                    for y in range(8):
+                        r, s = touched[a] * 8 + x, touched[b] * 8 + y
+                        value = covariance[r, s]
+                        for j in range(3):
+                            for k in range(3):
+                                M[j, k] += W[r, j] * value * W[s, k]
+        # M <- L^-1 M L^-T + variance, then out = L^-T M L^-1
+        L = np.array([[f[0], 0.0, 0.0], [f[1], f[2], 0.0], [f[3], f[4], f[5]]])
+        N[:] = 0.0
+        for j in range(3):
+            for k in range(3):
+                for m in range(3):
+                    for n in range(3):
+                        N[j, k] += L[j, m] * M[m, n] * L[k, n]
+            N[j, j] += variance
+        for j in range(3):
+            for k in range(3):
+                total = 0.0
+                for m in range(3):
+                    for n in range(3):
+                        total += L[m, j] * N[m, n] * L[n, k]
+                out[p, j, k] = total

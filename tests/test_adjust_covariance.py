@@ -1,0 +1,137 @@
+"""The covariances are honest: normalised errors of simulated adjustments have the size that they claim."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sfmapp.adjust.covariance import errors_in_gauge, estimate_covariances
+from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.scene.camera import CameraModel
+from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera
+
+OPTIONS = AdjustOptions(relative_cost_tolerance=1e-10, max_iterations=100)
+
+
+def normalized(errors, covariances):
+    """e^T C^-1 e / dof of each."""
+    return [float(e @ np.linalg.solve(c, e) / len(e)) for e, c in zip(errors, covariances, strict=True)]
+
+
+def nees(seeds, *, layout, cameras, sigma_px=None, noise=0.7, options=OPTIONS, num_images=6, **arguments):
+    """Mean NEES per degree of freedom of poses, intrinsics and points over seeds."""
+    samples: tuple[list, list, list] = ([], [], [])
+    for seed in seeds:
+        scene = make_scene(seed, num_images, 150, cameras, sigma_px=noise, layout=layout)
+        found = scene.observed.copy()
+        adjust_bundle(found, options, **arguments)
+        covariances = estimate_covariances(found, options, sigma_px=sigma_px, **arguments)
+        assert covariances.is_determined
+        poses, intrinsics, points = errors_in_gauge(found, scene.truth, covariances)
+        samples[0].extend(normalized(poses, covariances.poses))
+        samples[1].extend(normalized(intrinsics, covariances.intrinsics))
+        samples[2].extend(normalized(points, covariances.points))
+    return covariances, [float(np.mean(s)) for s in samples]
+
+
+@pytest.mark.parametrize("layout", ["ring", "grid", "forward"])
+def test_nees_with_a_free_gauge(layout):
+    covariances, (poses, intrinsics, points) = nees(range(120), layout=layout, cameras=synthetic_camera())
+    assert covariances.num_gauge == 7
+    assert 0.8 < poses < 1.25
+    assert 0.8 < intrinsics < 1.25
+    assert 0.8 < points < 1.25
+    assert covariances.sigma_px == pytest.approx(0.7, rel=0.15)
+
+
+def test_nees_with_a_camera_per_image_and_known_noise():
+    cameras = [synthetic_camera(CameraModel.SIMPLE_RADIAL, focal=880.0 + 5 * i) for i in range(6)]
+    _, (poses, intrinsics, points) = nees(range(120), layout="ring", cameras=cameras, sigma_px=0.7)
+    assert 0.8 < poses < 1.25
+    assert 0.8 < intrinsics < 1.25
+    assert 0.8 < points < 1.25
+
+
+def test_nees_with_constant_images():
+    """Two constant images hold the whole gauge."""
+    images = np.arange(6) >= 2
+    covariances, (poses, intrinsics, points) = nees(
+        range(120), layout="forward", cameras=synthetic_camera(), variable_images=images
+    )
+    assert covariances.num_gauge == 0
+    assert 0.8 < poses < 1.25
+    assert 0.8 < intrinsics < 1.25
+    assert 0.8 < points < 1.25
+
+
+def test_one_constant_image_leaves_the_scale_open():
+    scene = make_scene(0, 6, 200)
+    found = scene.observed.copy()
+    images = np.arange(6) >= 1
+    adjust_bundle(found, OPTIONS, variable_images=images)
+    assert estimate_covariances(found, OPTIONS, variable_images=images).num_gauge == 1
+
+
+def test_pose_prior_holds_the_gauge_and_counts_in_its_own_units():
+    import gtsam
+    from gtsam.symbol_shorthand import X
+
+    from sfmapp.adjust.factors import gtsam_pose
+
+    scene = make_scene(1, 6, 200, sigma_px=0.4)
+    graph = gtsam.NonlinearFactorGraph()
+    for i in (0, 3):
+        graph.add(
+            gtsam.PriorFactorPose3(
+                X(i), gtsam_pose(scene.truth.cam_from_world[i]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
+            )
+        )
+    found = scene.observed.copy()
+    adjust_bundle(found, OPTIONS, extra_factors=graph)
+    covariances = estimate_covariances(found, OPTIONS, extra_factors=graph)
+    assert covariances.num_gauge == 0
+    # a prior far sharper than the photographs: its own variance comes back
+    ratio = np.sqrt(np.diag(covariances.poses[0])) / 1e-4
+    assert (ratio < 1.02).all()
+    assert ratio.max() > 0.5
+
+
+def test_focal_prior_bounds_the_focal():
+    scene = make_scene(2, 3, 60, layout="grid")
+    from dataclasses import replace
+
+    priors = [replace(scene.truth.cameras[0], focal_sigma=1e-3)]
+    found = scene.observed.copy()
+    adjust_bundle(found, OPTIONS, prior_cameras=priors)
+    covariances = estimate_covariances(found, OPTIONS, prior_cameras=priors)
+    assert np.sqrt(covariances.intrinsics[0][0, 0]) == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_sparse_tiles_give_the_same_covariances(monkeypatch):
+    from sfmapp.adjust import solver
+
+    scene = make_scene(3, 6, 150)
+    found = perturb(scene.observed, rotation_deg=0.05)
+    adjust_bundle(found, OPTIONS)
+    dense = estimate_covariances(found, OPTIONS)
+    monkeypatch.setattr(solver, "_MAX_DENSE_BLOCKS", 0)
+    sparse = estimate_covariances(found, OPTIONS)
+    np.testing.assert_allclose(dense.poses, sparse.poses, rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(dense.points, sparse.points, rtol=1e-4, atol=1e-12)
+
+
+def test_undetermined_is_said():
+    scene = make_scene(4, 4, 100)
+    found = scene.observed.copy()
+    every = np.ones(100, bool)
+    # two images, no common point: their relative pose is anybody's guess
+    seen = np.diff(found.tracks.track_ptr)
+    found.obs_is_inlier[:] = False
+    first = found.tracks.track_ptr[:-1][seen >= 2]
+    found.obs_is_inlier[first] = True
+    found.obs_is_inlier[first + 1] = True
+    found.obs_is_inlier[found.tracks.obs_image_idx == 3] = False
+    keep = np.flatnonzero(np.bincount(found.tracks.obs_track_idx[found.obs_is_inlier], minlength=100) >= 2)[:2]
+    every[:] = False
+    every[keep] = True
+    assert not estimate_covariances(found, sigma_px=1.0, points=every).is_determined
