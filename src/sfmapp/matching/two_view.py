@@ -340,8 +340,8 @@ def _tell_planar_apart(result: TwoViewGeometry, inlier_h: Mask, poses: _Relative
     """Decide PLANAR or PANORAMIC: does a rotation alone explain nine in ten of what a homography does?
 
     If so, there is no parallax, and what no homography explains is wrong even if an epipolar line passes by. The focal
-    need not be known: a pure rotation shows itself at one focal or another. A guess of 1.2 times the larger side is right
-    within a factor of two for nearly all lenses, a focal from EXIF within 30 %.
+    need not be known: a pure rotation shows itself at one focal or another. A guess of 1.2 times the larger side is
+    right within a factor of two for nearly all lenses, a focal from EXIF within 30 %.
     """
     if result.config != TwoViewConfig.PLANAR_OR_PANORAMIC:
         return
