@@ -157,25 +157,54 @@ def _sort_into_pencil(
     size = max(float(np.abs(xy2 - center).max()), 1.0) if len(xy2) else 1.0
     pixels_from_normalized = np.array([[size, 0.0, center[0]], [0.0, size, center[1]], [0.0, 0.0, 1.0]])
     f = pixels_from_normalized.T @ fundamental
-    epipole = np.linalg.svd(f)[0][:, 2]
-    p, q = np.linalg.svd(epipole[None])[2][1:]
-    lines = np.concatenate([image1.shape[:, :2], np.ones((len(image1.shape), 1))], 1) @ f.T
-    lines /= np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), 1e-300)
-    angle1 = np.arctan2(lines @ q, lines @ p) % math.pi
-    points = np.concatenate([(xy2 - center) / size, np.ones((len(xy2), 1))], 1)
-    px, qx = points @ p, points @ q
-    angle2, r = np.arctan2(-px, qx) % math.pi, np.hypot(px, qx)
-    half = band_px / size * np.linalg.norm(lines[:, :2], axis=1)
+    p, q = np.linalg.svd(np.linalg.svd(f)[0][None, :, 2])[2][1:]
+    angle1, half, lines = np.empty(len(image1.shape)), np.empty(len(image1.shape)), np.empty((len(image1.shape), 3))
+    _line_angles(image1.shape, f, np.linalg.inv(pixels_from_normalized), p, q, band_px / size, angle1, half, lines)
+    angle2, r = np.empty(len(xy2)), np.empty(len(xy2))
+    _point_angles(image2.shape, center, size, p, q, angle2, r)
     is_near = r * math.sin(_MAX_HALF_ANGLE) < half.max(initial=0.0)
     far = np.flatnonzero(~is_near)
     far = far[np.argsort(angle2[far], kind="stable")]
-    half_angle = np.arcsin(np.minimum(half / r[far].min(initial=np.inf), 1.0)) if len(far) else np.zeros(len(half))
-    columns = _Columns(np.concatenate([far, np.flatnonzero(is_near)]), angle2[far])
+    half_angle = np.arcsin(np.minimum(half / r[far].min(initial=np.inf), 1.0)) if len(far) else half
     order = np.argsort(angle1, kind="stable")
-    to_pixels = np.linalg.inv(pixels_from_normalized)
-    lines = (lines @ to_pixels)[order]
-    lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-300)
-    return _Rows(order, lines, (angle1 - half_angle)[order], (angle1 + half_angle)[order]), columns
+    rows = _Rows(order, lines[order], (angle1 - half_angle)[order], (angle1 + half_angle)[order])
+    return rows, _Columns(np.concatenate([far, np.flatnonzero(is_near)]), angle2[far])
+
+
+@numba.njit(cache=True, nogil=True)
+def _line_angles(
+    shape1: Array, f: Array, normalized_from_pixels: Array, p: Array, q: Array, band: float,
+    angle: Array, half: Array, lines: Array,
+) -> None:  # fmt: skip
+    """Angle of each line in the pencil, band times the length of its normal there, and the line in pixels."""
+    line = np.empty(3)
+    for i in range(shape1.shape[0]):
+        norm = 0.0
+        for k in range(3):
+            line[k] = f[k, 0] * shape1[i, 0] + f[k, 1] * shape1[i, 1] + f[k, 2]
+            norm += line[k] * line[k]
+        line /= max(math.sqrt(norm), 1e-300)
+        along_p = line[0] * p[0] + line[1] * p[1] + line[2] * p[2]
+        along_q = line[0] * q[0] + line[1] * q[1] + line[2] * q[2]
+        angle[i] = math.atan2(along_q, along_p) % math.pi
+        half[i] = band * math.sqrt(line[0] * line[0] + line[1] * line[1])
+        for k in range(3):
+            lines[i, k] = (
+                line[0] * normalized_from_pixels[0, k]
+                + line[1] * normalized_from_pixels[1, k]
+                + line[2] * normalized_from_pixels[2, k]
+            )
+        lines[i] /= max(math.sqrt(lines[i, 0] * lines[i, 0] + lines[i, 1] * lines[i, 1]), 1e-300)
+
+
+@numba.njit(cache=True, nogil=True)
+def _point_angles(shape2: Array, center: Array, size: float, p: Array, q: Array, angle: Array, r: Array) -> None:
+    """Angle of the line through each point in the pencil, and the point's lever r."""
+    for i in range(shape2.shape[0]):
+        x, y = (shape2[i, 0] - center[0]) / size, (shape2[i, 1] - center[1]) / size
+        along_p, along_q = x * p[0] + y * p[1] + p[2], x * q[0] + y * q[1] + q[2]
+        angle[i] = math.atan2(-along_p, along_q) % math.pi
+        r[i] = math.sqrt(along_p * along_p + along_q * along_q)
 
 
 @numba.njit(cache=True, nogil=True)

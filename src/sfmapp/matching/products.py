@@ -8,6 +8,7 @@ the innermost tile is written in LLVM's portable language, in the one pattern th
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -139,25 +140,58 @@ def keep_two_largest(best: Ints, second: Ints, arg: Ints, i: int, j: int, value:
 
 
 @numba.njit(cache=True, nogil=True)
-def pack_rows(descriptors: NDArray[np.uint8], order: NDArray[np.int64]) -> NDArray[np.int16]:
-    """The rows ``order`` (N,) as the tile reads image 1: (N', 128) int16, N' a multiple of ROWS, zeros at the end."""
-    out = np.zeros(((len(order) + ROWS - 1) // ROWS * ROWS, DIMS), np.int16)
+def _fill_rows(descriptors: NDArray[np.uint8], order: NDArray[np.int64], out: NDArray[np.int16]) -> None:
     for i in range(len(order)):
         source, target = descriptors[order[i]], out[i]
         for k in range(DIMS):
             target[k] = source[k]
-    return out
+    out[len(order) :] = 0
 
 
 @numba.njit(cache=True, nogil=True)
-def pack_groups(descriptors: NDArray[np.uint8], order: NDArray[np.int64]) -> NDArray[np.int16]:
-    """The rows ``order`` (M,) as the tile reads image 2: (G, 64, LANES, 2) int16, G a multiple of GROUPS."""
-    width = LANES * GROUPS
-    out = np.zeros(((len(order) + width - 1) // width * GROUPS, DIMS // 2, LANES, 2), np.int16)
+def _fill_groups(descriptors: NDArray[np.uint8], order: NDArray[np.int64], out: NDArray[np.int16]) -> None:
     for i in range(len(order)):
         source, target, lane = descriptors[order[i]], out[i // LANES], i % LANES
         for k in range(DIMS // 2):
             target[k, lane, 0], target[k, lane, 1] = source[2 * k], source[2 * k + 1]
+    for i in range(len(order), out.shape[0] * LANES):
+        out[i // LANES, :, i % LANES] = 0
+
+
+class _Buffers(threading.local):
+    """Megabytes that every pair needs for a moment: asking the system for them anew costs as much as the matching."""
+
+    def __init__(self) -> None:
+        self.rows, self.groups = np.empty(0, np.int16), np.empty(0, np.int16)
+
+
+_BUFFERS = _Buffers()
+
+
+def pack_rows(descriptors: NDArray[np.uint8], order: NDArray[np.int64]) -> NDArray[np.int16]:
+    """The rows ``order`` (N,) as the tile reads image 1: (N', 128) int16, N' a multiple of ROWS, zeros at the end.
+
+    The result is overwritten by the next call in the same thread.
+    """
+    shape = (-(-len(order) // ROWS) * ROWS, DIMS)
+    if len(_BUFFERS.rows) < shape[0] * DIMS:
+        _BUFFERS.rows = np.empty(shape[0] * DIMS, np.int16)
+    out = _BUFFERS.rows[: shape[0] * DIMS].reshape(shape)
+    _fill_rows(np.ascontiguousarray(descriptors), order, out)
+    return out
+
+
+def pack_groups(descriptors: NDArray[np.uint8], order: NDArray[np.int64]) -> NDArray[np.int16]:
+    """The rows ``order`` (M,) as the tile reads image 2: (G, 64, LANES, 2) int16, G a multiple of GROUPS.
+
+    The result is overwritten by the next call in the same thread.
+    """
+    num_groups = -(-len(order) // (LANES * GROUPS)) * GROUPS
+    size = num_groups * LANES * DIMS
+    if len(_BUFFERS.groups) < size:
+        _BUFFERS.groups = np.empty(size, np.int16)
+    out = _BUFFERS.groups[:size].reshape(num_groups, DIMS // 2, LANES, 2)
+    _fill_groups(np.ascontiguousarray(descriptors), order, out)
     return out
 
 
@@ -180,8 +214,7 @@ def largest_products(
         way.
     """
     n, m = len(descriptors1), len(descriptors2)
-    a = pack_rows(np.ascontiguousarray(descriptors1), np.arange(n))
-    packed = pack_groups(np.ascontiguousarray(descriptors2), np.arange(m))
+    a, packed = pack_rows(descriptors1, np.arange(n)), pack_groups(descriptors2, np.arange(m))
     best1, second1, arg1 = (np.full(len(a), fill, np.int32) for fill in (0, 0, -1))
     best2, second2, arg2 = (np.full(len(packed) * LANES, fill, np.int32) for fill in (0, 0, -1))
     _scan(a, packed, best1, second1, arg1, best2, second2, arg2, *scratch())
@@ -221,7 +254,6 @@ def background_products(
     """
     n = len(descriptors)
     sample = np.unique(np.linspace(0, max(n - 1, 0), min(n, sample_size)).astype(np.int64))
-    descriptors = np.ascontiguousarray(descriptors)
     a, packed = pack_rows(descriptors, np.arange(n)), pack_groups(descriptors, sample)
     best = np.zeros(len(a), np.int32)
     unbounded = np.full(len(packed) * LANES, np.iinfo(np.int32).max, np.int32)
