@@ -195,6 +195,7 @@ class Mapper:
     seeds: NDArray[np.bool_]
     attempts: dict[int, Registration]
     failed_with: dict[int, int] = field(default_factory=dict)
+    times_dropped: dict[int, int] = field(default_factory=dict)
     size_at_global: tuple[int, int] = (0, 0)
     prior_cameras: list[Camera] = field(init=False)
     max_error_px: float = field(init=False)
@@ -299,11 +300,11 @@ class Mapper:
             self.events.decided(STAGE, f"{name}: {result.reason}")
             return False
         self.reconstruction.cam_from_world[result.image_idx] = result.cam_from_world
-        if result.focal_scale != 1.0:
+        if result.focal_px is not None:
             camera_idx = self.reconstruction.image_camera_idx[result.image_idx]
-            camera = self.reconstruction.cameras[camera_idx]
-            self.reconstruction.cameras[camera_idx] = camera.with_focal(camera.focal * result.focal_scale)
-            self.prior_cameras[camera_idx] = self.reconstruction.cameras[camera_idx]
+            camera = self.reconstruction.cameras[camera_idx].with_focal(result.focal_px)
+            self.reconstruction.cameras[camera_idx] = camera
+            self.prior_cameras[camera_idx] = camera
         return True
 
     def triangulate_images(self, images: list[int]) -> None:
@@ -425,6 +426,7 @@ class Mapper:
             reason = f"{counts[i]} of {visible[i]} observations hold after the adjustment: too few to trust the pose"
             self.attempts[i] = Registration(i, int(visible[i]), int(counts[i]), None, reason=reason)
             self.failed_with[i] = int(visible[i])
+            self.times_dropped[i] = self.times_dropped.get(i, 0) + 1
             self.events.decided(STAGE, f"took back {reconstruction.image_names[i]}: {reason}")
 
     def is_supported(self, images: NDArray[np.bool_]) -> bool:
@@ -439,7 +441,9 @@ class Mapper:
         return int(self.reconstruction.is_registered.sum()), int(self.reconstruction.is_triangulated.sum())
 
     def _candidates(self) -> NDArray[np.int64]:
-        return np.flatnonzero(~self.reconstruction.is_registered)
+        """Images that are not registered, without those that had to be taken back twice: or they would come for ever."""
+        hopeless = [i for i, times in self.times_dropped.items() if times >= 2]
+        return np.setdiff1d(np.flatnonzero(~self.reconstruction.is_registered), hopeless)
 
     def _known_cameras(self) -> NDArray[np.bool_]:
         """(C,) bool: cameras with a registered image, which the adjustment has refined."""

@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.adjust.pose import refine_pose
 from sfmapp.geometry import resection
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.scene.camera import pixels_to_normalized
@@ -30,7 +31,7 @@ class Registration:
         num_correspondences: keypoints whose tracks are triangulated.
         num_inliers: how many of them agree with the pose.
         cam_from_world: (7,) float64, or None if the attempt failed.
-        focal_scale: factor on the focal length of the image's camera.
+        focal_px: focal length found for the image's camera, None if it was not searched.
         reason: why it failed, with the numbers; empty if it succeeded.
     """
 
@@ -38,7 +39,7 @@ class Registration:
     num_correspondences: int
     num_inliers: int
     cam_from_world: NDArray[np.float64] | None
-    focal_scale: float = 1.0
+    focal_px: float | None = None
     reason: str = ""
 
 
@@ -128,12 +129,17 @@ def register_image(
         found = resection.estimate_pose_and_focal(xyz, normalized, max_error, FOCAL_SCALES)
     else:
         found = resection.estimate_pose(xyz, normalized, max_error)
-    num_inliers = found.num_inliers if found is not None else 0
     needed = _needed_inliers(len(obs), options)
-    if found is None or num_inliers < needed:
+    if found is None or found.num_inliers < needed:
+        num_inliers = found.num_inliers if found is not None else 0
         reason = f"{num_inliers} of {len(obs)} points agree with one pose, at least {needed} are needed"
         return Registration(image_idx, len(obs), num_inliers, None, reason=reason)
-    return Registration(image_idx, len(obs), num_inliers, found.cam_from_world, found.focal_scale)
+    refined = refine_pose(
+        camera.with_focal(camera.focal * found.focal_scale).canonical, camera.is_fisheye, found.cam_from_world, xyz,
+        tracks.obs_xy[obs], scale_px=0.5 * max_error_px, inlier_px=max_error_px, refine_focal=search_focal,
+    )  # fmt: skip
+    focal_px = float(refined.canonical[:2].mean()) if search_focal else None
+    return Registration(image_idx, len(obs), int(refined.is_inlier.sum()), refined.cam_from_world, focal_px)
 
 
 def _needed_inliers(num_correspondences: int, options: MappingOptions) -> int:
