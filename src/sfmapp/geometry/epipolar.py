@@ -220,8 +220,10 @@ def _pose_normal_equations(
     """Gauss-Newton system (5, 5), lower triangle, of the Cauchy-weighted Sampson error; returns the cost."""
     e, jacobian = np.empty((6, 3, 3)), np.empty(5)
     _essential_and_slopes(r, t, tangent, e)
-    h[:] = 0.0
-    g[:] = 0.0
+    for k in range(5):
+        g[k] = 0.0
+        for m in range(5):
+            h[k, m] = 0.0
     cost = 0.0
     for i in range(xn1.shape[0]):
         x, y, u, v = xn1[i, 0], xn1[i, 1], xn2[i, 0], xn2[i, 1]
@@ -297,35 +299,36 @@ def _move_pose(r: Array, t: Array, tangent: Array, step: Array, new_r: Array, ne
     for k in range(3):
         new_t[k] = t[k] + tangent[k, 0] * step[3] + tangent[k, 1] * step[4]
         norm += new_t[k] * new_t[k]
-    new_t /= math.sqrt(norm)
+    for k in range(3):
+        new_t[k] /= math.sqrt(norm)
 
 
 @numba.njit(cache=True, nogil=True)
-def _refine_pose(r: Array, t: Array, xn1: Array, xn2: Array, scale2: float, max_iterations: int) -> None:
-    """Levenberg-Marquardt; r and t are changed in place."""
-    h, g, factor, step = np.empty((5, 5)), np.empty(5), np.empty((5, 5)), np.empty(5)
-    new_h, new_g, new_r, new_t = np.empty((5, 5)), np.empty(5), np.empty((3, 3)), np.empty(3)
-    tangent, new_tangent = np.empty((3, 2)), np.empty((3, 2))
-    _tangent_plane(t, tangent)
-    cost = _pose_normal_equations(r, t, xn1, xn2, scale2, tangent, h, g)
+def _refine_pose(rotations: Array, ts: Array, xn1: Array, xn2: Array, scale2: float, max_iterations: int) -> int:
+    """Levenberg-Marquardt from rotations[0] and ts[0] of (2, 3, 3) and (2, 3); returns where the result is, 0 or 1."""
+    h, g, factor, step = np.empty((2, 5, 5)), np.empty((2, 5)), np.empty((5, 5)), np.empty(5)
+    tangent = np.empty((2, 3, 2))
+    now = 0
+    _tangent_plane(ts[now], tangent[now])
+    cost = _pose_normal_equations(rotations[now], ts[now], xn1, xn2, scale2, tangent[now], h[now], g[now])
     damping = 1e-4
     for _ in range(max_iterations):
-        new_cost = math.inf
-        if _solve_damped(h, g, damping, factor, step):
-            _move_pose(r, t, tangent, step, new_r, new_t)
-            _tangent_plane(new_t, new_tangent)
-            new_cost = _pose_normal_equations(new_r, new_t, xn1, xn2, scale2, new_tangent, new_h, new_g)
+        new, new_cost = 1 - now, math.inf
+        if _solve_damped(h[now], g[now], damping, factor, step):
+            _move_pose(rotations[now], ts[now], tangent[now], step, rotations[new], ts[new])
+            _tangent_plane(ts[new], tangent[new])
+            new_cost = _pose_normal_equations(rotations[new], ts[new], xn1, xn2, scale2, tangent[new], h[new], g[new])
         if not new_cost < cost:
             damping *= 10.0
             if damping > 1e3:
-                return
+                break
             continue
         has_converged = cost - new_cost < 1e-6 * cost
-        r[:], t[:], tangent[:], h[:], g[:] = new_r, new_t, new_tangent, new_h, new_g
-        cost = new_cost
+        now, cost = new, new_cost
         damping = max(damping * 0.1, 1e-9)
         if has_converged:
-            return
+            break
+    return now
 
 
 def refine_relative_pose(
@@ -342,9 +345,10 @@ def refine_relative_pose(
         (7,) pose with unit translation; its cost is never above that of the start.
     """
     pose = np.asarray(cam2_from_cam1, np.float64)
-    r, t = np.ascontiguousarray(rigid3.rotation_matrix(pose)), pose[4:] / np.linalg.norm(pose[4:])
-    _refine_pose(r, t, *_contiguous(xn1, xn2), scale * scale, max_iterations)
-    return rigid3.from_matrix(r, t)
+    rotations, ts = np.empty((2, 3, 3)), np.empty((2, 3))
+    rotations[0], ts[0] = rigid3.rotation_matrix(pose), pose[4:] / np.linalg.norm(pose[4:])
+    best = _refine_pose(rotations, ts, *_contiguous(xn1, xn2), scale * scale, max_iterations)
+    return rigid3.from_matrix(rotations[best], ts[best])
 
 
 def _contiguous(*arrays: ArrayLike) -> tuple[Array, ...]:

@@ -183,7 +183,8 @@ def _line_angles(
         for k in range(3):
             line[k] = f[k, 0] * shape1[i, 0] + f[k, 1] * shape1[i, 1] + f[k, 2]
             norm += line[k] * line[k]
-        line /= max(math.sqrt(norm), 1e-300)
+        for k in range(3):
+            line[k] /= max(math.sqrt(norm), 1e-300)
         along_p = line[0] * p[0] + line[1] * p[1] + line[2] * p[2]
         along_q = line[0] * q[0] + line[1] * q[1] + line[2] * q[2]
         angle[i] = math.atan2(along_q, along_p) % math.pi
@@ -194,7 +195,9 @@ def _line_angles(
                 + line[1] * normalized_from_pixels[1, k]
                 + line[2] * normalized_from_pixels[2, k]
             )
-        lines[i] /= max(math.sqrt(lines[i, 0] * lines[i, 0] + lines[i, 1] * lines[i, 1]), 1e-300)
+        norm = max(math.sqrt(lines[i, 0] * lines[i, 0] + lines[i, 1] * lines[i, 1]), 1e-300)
+        for k in range(3):
+            lines[i, k] /= norm
 
 
 @numba.njit(cache=True, nogil=True)
@@ -238,6 +241,18 @@ def _scan_run(
 
 
 @numba.njit(cache=True, nogil=True)
+def _first_above(ascending: Array, value: float) -> int:
+    low, high = 0, ascending.shape[0]
+    while low < high:
+        middle = (low + high) // 2
+        if ascending[middle] > value:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@numba.njit(cache=True, nogil=True)
 def _scan_band(
     a: NDArray[np.int16], packed: NDArray[np.int16], lines: Array, shape1: Array, shape2: Array, band: float,
     change: Array, low: Array, high: Array, angle2: Array, best1: Ints, second1: Ints, arg1: Ints,
@@ -249,10 +264,10 @@ def _scan_band(
         for i in range(row + 1, min(row + ROWS, num_rows)):
             smallest, largest = min(smallest, low[i]), max(largest, high[i])
         # angles are modulo pi: a run that leaves 0 to pi goes on at the other end
-        starts = (np.searchsorted(angle2, smallest), np.searchsorted(angle2, smallest + math.pi), 0, num_far)
+        starts = (_first_above(angle2, smallest), _first_above(angle2, smallest + math.pi), 0, num_far)
         ends = (
-            np.searchsorted(angle2, largest, side="right"), num_far,
-            np.searchsorted(angle2, largest - math.pi, side="right"), num_all,
+            _first_above(angle2, largest), num_far,
+            _first_above(angle2, largest - math.pi), num_all,
         )  # fmt: skip
         if largest - smallest >= math.pi:
             starts, ends = (0, 0, 0, num_far), (num_far, 0, 0, num_all)

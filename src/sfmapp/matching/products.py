@@ -145,7 +145,10 @@ def _fill_rows(descriptors: NDArray[np.uint8], order: NDArray[np.int64], out: ND
         source, target = descriptors[order[i]], out[i]
         for k in range(DIMS):
             target[k] = source[k]
-    out[len(order) :] = 0
+    for i in range(len(order), len(out)):
+        target = out[i]
+        for k in range(DIMS):
+            target[k] = 0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -155,7 +158,9 @@ def _fill_groups(descriptors: NDArray[np.uint8], order: NDArray[np.int64], out: 
         for k in range(DIMS // 2):
             target[k, lane, 0], target[k, lane, 1] = source[2 * k], source[2 * k + 1]
     for i in range(len(order), out.shape[0] * LANES):
-        out[i // LANES, :, i % LANES] = 0
+        target, lane = out[i // LANES], i % LANES
+        for k in range(DIMS // 2):
+            target[k, lane, 0], target[k, lane, 1] = 0, 0
 
 
 class _Buffers(threading.local):
