@@ -11,16 +11,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
-from sfmapp.features.features import Features
 from sfmapp.features.orb import extract_orb
-from sfmapp.features.sift import CONTRAST_THRESHOLD, extract_sift
+from sfmapp.features.sift import compile_kernels, extract_sift
+from sfmapp.scene.features import Features
 
 if TYPE_CHECKING:
-    from sfmapp.images.folder import ImageRecord, ImageSet
+    from sfmapp.images.image_set import ImageRecord, ImageSet
+    from sfmapp.images.pixels import Picture
+
+__all__ = ["FeatureOptions", "compile_kernels", "extract_features", "extract_image", "features_from_picture"]
 
 STAGE = "features"
 # fewer keypoints than this and an image will hardly be registered: the report says so
@@ -37,12 +39,12 @@ class FeatureOptions:
     """Keypoints per image, at most; the strongest are kept."""
     max_size_px: int = 3200
     """Larger images are scaled down to this longer side for detection; coordinates stay those of the full image."""
-    contrast_threshold: float = CONTRAST_THRESHOLD
-    """SIFT: least contrast over an octave, grey levels in [0, 1]; lowered for images that would yield few keypoints."""
+    contrast_threshold: float = 0.02 / 9
+    """SIFT: least difference of Gaussians, grey levels in [0, 1]; a third of COLMAP's, so that the budget fills."""
     edge_threshold: float = 10.0
     """SIFT: largest ratio of principal curvatures; larger keeps more keypoints along edges."""
     max_num_orientations: int = 2
-    """SIFT: descriptors at one place, at most."""
+    """SIFT: descriptors at one place, at most; more than one only where the budget has room."""
     memory_mb: int | None = None
     """Memory that all workers together may take; None for half of what is free at the start."""
 
@@ -119,42 +121,32 @@ def extract_features(
 
 def extract_image(record: ImageRecord, options: FeatureOptions) -> tuple[Features, dict[str, Any]]:
     """Features of one image and the line of the report about it; no features if it cannot be read."""
-    from sfmapp.images.pixels import read_mask, read_rgb
+    from sfmapp.images.pixels import read_picture
 
     start = time.thread_time()
     line: dict[str, Any] = {"name": record.name, "num_features": 0, "warnings": []}
     try:
-        rgb = read_rgb(record)
-        usable = read_mask(record)
+        picture = read_picture(record)
     except InputError as error:
         line["warnings"].append(f"{record.name}: no features, {error}")
         return empty_features(options.kind), line
-    features, line["scale"], line["contrast_threshold"] = features_from_pixels(rgb, usable, options)
+    features, line["scale"], line["contrast_threshold"] = features_from_picture(picture, options)
     line["num_features"] = len(features)
     line["cpu_seconds"] = time.thread_time() - start
     if len(features) == 0:
-        line["warnings"].append(f"{record.name}: no features found ({_why_none(rgb, usable)})")
+        line["warnings"].append(f"{record.name}: no features found ({_why_none(picture)})")
     elif len(features) < min(FEW_FEATURES, options.max_num_features):
         line["warnings"].append(f"{record.name}: only {len(features)} features found: too little texture or contrast")
     return features, line
 
 
-def features_from_pixels(
-    rgb: NDArray[np.uint8], usable: NDArray[np.bool_] | None, options: FeatureOptions
-) -> tuple[Features, float, float | None]:
-    """Features of pixels in memory.
-
-    Args:
-        rgb: (H, W, 3) uint8.
-        usable: (H, W) bool, False where nothing may be detected; None for everywhere.
-
-    Returns:
-        The features, the factor that the image was scaled by, and the contrast threshold in use (None for ORB).
-    """
+def features_from_picture(picture: Picture, options: FeatureOptions) -> tuple[Features, float, float | None]:
+    """Features of pixels in memory, the factor that the image was scaled by, and the contrast threshold in use (None
+    for ORB)."""
     import cv2
 
-    height, width = rgb.shape[:2]
-    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    height, width = picture.gray.shape
+    gray, usable = picture.gray, picture.mask
     scale = min(1.0, options.max_size_px / max(height, width))
     if scale < 1.0:
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -180,7 +172,7 @@ def features_from_pixels(
         keypoints[:, 2] *= factor.mean()
     x = np.clip(keypoints[:, 0].astype(np.int64), 0, width - 1)
     y = np.clip(keypoints[:, 1].astype(np.int64), 0, height - 1)
-    return Features(keypoints, descriptors, rgb[y, x]), scale, threshold
+    return Features(keypoints, descriptors, picture.rgb[y, x]), scale, threshold
 
 
 def empty_features(kind: str) -> Features:
@@ -189,13 +181,14 @@ def empty_features(kind: str) -> Features:
     return Features(np.zeros((0, 4), np.float32), np.zeros((0, length), np.uint8), np.zeros((0, 3), np.uint8))
 
 
-def _why_none(rgb: NDArray[np.uint8], usable: NDArray[np.bool_] | None) -> str:
-    if min(rgb.shape[:2]) < 16:
-        return f"it is {rgb.shape[1]} x {rgb.shape[0]} pixels"
-    if usable is not None and not usable.any():
+def _why_none(picture: Picture) -> str:
+    height, width = picture.gray.shape
+    if min(height, width) < 16:
+        return f"it is {width} x {height} pixels"
+    if picture.mask is not None and not picture.mask.any():
         return "the mask covers all of it"
-    if int(rgb.max()) - int(rgb.min()) <= 2:
-        return "all pixels have the same colour"
+    if int(picture.gray.max()) - int(picture.gray.min()) <= 2:
+        return "all pixels have the same brightness"
     return "too little texture or contrast"
 
 
@@ -220,8 +213,9 @@ def _bytes_needed(record: ImageRecord, options: FeatureOptions) -> int:
     """Estimate of the memory that one image takes at the peak of its extraction."""
     pixels = record.width * record.height
     detected = pixels * min(1.0, options.max_size_px / max(record.width, record.height)) ** 2
-    # three channels, grey and mask of the full image; OpenCV keeps the whole pyramid of the doubled image
-    per_pixel = 260 if options.kind == "sift" else 12
+    # three channels, grey and mask of the full image; SIFT: six levels of four times as many float32 pixels and what
+    # is kept of the coarser octaves
+    per_pixel = 112 if options.kind == "sift" else 12
     return int(5 * pixels + per_pixel * detected)
 
 

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import UsageError
 from sfmapp.events import Events
-from sfmapp.features.features import Features
+from sfmapp.scene.features import Features
 
 if TYPE_CHECKING:
-    from sfmapp.images.folder import ImageRecord, ImageSet
+    from sfmapp.images.image_set import ImageRecord, ImageSet
 
 STAGE = "pairs"
 METHODS = ("auto", "exhaustive", "retrieval", "sequential")
@@ -364,7 +364,7 @@ def gps_pairs(records: Sequence[ImageRecord], num_neighbors: int) -> NDArray[np.
 
 
 def _earth_xyz(gps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 3) metres of latitude, longitude (degrees) and altitude (metres, NaN read as 0) on a ball."""
+    """(N, 3) metres of latitude, longitude (degrees) and altitude (metres, unknown is NaN and read as 0) on a ball."""
     latitude, longitude = np.deg2rad(gps[:, 0]), np.deg2rad(gps[:, 1])
     radius = _EARTH_RADIUS_M + np.nan_to_num(gps[:, 2])
     flat = radius * np.cos(latitude)
