@@ -16,7 +16,7 @@ from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.errors import InterruptedRunError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel, project
+from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel, distort, project
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera
 from sfmapp.scene.tracks import make_tracks
@@ -66,25 +66,24 @@ def test_jacobians_equal_central_differences(model, rotation, point, translation
 
     def pixel(delta):
         moved = rigid3.exp_so3(delta[:3]) @ (turn @ (world + delta[6:9]) + t) + delta[3:6]
-        return np.array(
-            kernels.distort(camera.is_fisheye, camera.canonical + spread @ delta[9:], *(moved[:2] / moved[2]))
-        )
+        return np.array(distort(camera.is_fisheye, camera.canonical + spread @ delta[9:], *(moved[:2] / moved[2])))
 
-    pose = pose_rows(rigid3.from_matrix(turn, t)[None])[0]
+    pose, canonical = pose_rows(rigid3.from_matrix(turn, t)[None]), camera.canonical[None]
     scratch = np.zeros(80)
     observed = pixel(np.zeros(17)) - [3.0, -4.0]
     args = (camera.is_fisheye, *world, *observed)
-    s = kernels.linearize(pose, camera.canonical, *args, 0, 1.0, 0.0, True, scratch)
+    s = kernels.linearize(pose, 0, canonical, 0, *args, 0, 1.0, 0.0, True, scratch)
     assert s == pytest.approx(25.0, rel=1e-9)
     rows = scratch.reshape(-1, 2, 8)
-    ours = np.hstack([rows[0][:, :6], rows[3][:, :3], rows[1]])
+    ours = np.hstack([rows[0][:, :6], rows[3][:, :3], scratch[16:32].reshape(8, 2).T])
     steps = np.array([1e-6] * 9 + [1e-3] * 4 + [1e-6] * 4)
     numeric = np.stack([(pixel(h) - pixel(-h)) / (2 * h.max()) for h in np.diag(steps)], 1)
     np.testing.assert_allclose(ours, numeric, atol=2e-5 * np.abs(numeric).max())
     np.testing.assert_allclose(rows[4][:, 0], [3.0, -4.0], atol=1e-9)
+    assert kernels.squared_residual(pose, 0, canonical, 0, *args, 0.0) == pytest.approx(s, rel=1e-12)
     # a robust weight scales residual and Jacobians by the root of rho'
     weighted = np.zeros(80)
-    kernels.linearize(pose, camera.canonical, *args, 2, 4.0, 0.0, True, weighted)
+    kernels.linearize(pose, 0, canonical, 0, *args, 2, 4.0, 0.0, True, weighted)
     np.testing.assert_allclose(weighted, scratch * math.sqrt(4.0 / 29.0), rtol=1e-9, atol=1e-9)
 
 

@@ -123,9 +123,7 @@ def test_a_scene_in_two_parts_makes_two_models():
     counts = found.num_inliers[keep]
     from dataclasses import fields, replace
 
-    per_pair = {
-        f.name: getattr(found, f.name)[keep] for f in fields(found) if f.name not in ("pair_ptr", "matches")
-    }
+    per_pair = {f.name: getattr(found, f.name)[keep] for f in fields(found) if f.name not in ("pair_ptr", "matches")}
     parted = replace(
         found, **per_pair, pair_ptr=np.concatenate([[0], np.cumsum(counts)]),
         matches=np.concatenate([found.matches_of_pair(p) for p in keep]),

@@ -77,14 +77,12 @@ def estimate_pose_and_focal(xyz: Array, normalized: Array, max_error: float, foc
 
     Args:
         xyz, normalized, max_error: as in :func:`estimate_pose`, made with a focal length f0.
-        focal_scales: (K,) factors on f0 to try, the most plausible first; ties go to the earlier one, and the search ends
-            at one that four fifths of the points agree with.
+        focal_scales: (K,) factors on f0 to try, the most plausible first; ties go to the earlier one, and the search
+            ends at one that four fifths of the points agree with.
     """
     best: Resection | None = None
     for scale in focal_scales:
-        found = estimate_pose(
-            xyz, normalized / scale, max_error / scale, confidence=0.99, max_iterations=1000
-        )
+        found = estimate_pose(xyz, normalized / scale, max_error / scale, confidence=0.99, max_iterations=1000)
         if found is not None and (best is None or found.num_inliers > best.num_inliers):
             best = Resection(found.cam_from_world, found.is_inlier, float(scale))
             if found.num_inliers >= 0.8 * len(xyz):

@@ -116,6 +116,86 @@ def _min_cosine(xyz: Array, centers: Array, used: Bools, k: int, enough: float) 
 
 
 @numba.njit(cache=True, nogil=True)
+def _longest(tracks: Ints, track_ptr: Ints) -> int:
+    longest = 2
+    for t in tracks:
+        longest = max(longest, track_ptr[t + 1] - track_ptr[t])
+    return longest
+
+
+@numba.njit(cache=True, nogil=True)
+def _center(rotation: Array, translation: Array, out: Array) -> None:
+    for a in range(3):
+        out[a] = -(rotation[0, a] * translation[0] + rotation[1, a] * translation[1] + rotation[2, a] * translation[2])
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather_rays(
+    t: int,
+    track_ptr: Ints,
+    obs_image_idx: Int32s,
+    obs_xy: Array,
+    rotation: Array,
+    translation: Array,
+    image_camera_idx: Int32s,
+    canonical: Array,
+    fisheye: Bools,
+    obs: Ints,
+    centers: Array,
+    rays: Array,
+) -> int:
+    """Observations of a track in registered images, with their centres and unit rays; returns how many."""
+    k = 0
+    for o in range(track_ptr[t], track_ptr[t + 1]):
+        i = obs_image_idx[o]
+        if math.isnan(translation[i, 0]):
+            continue
+        cam = image_camera_idx[i]
+        x, y = undistort(fisheye[cam], canonical[cam], obs_xy[o, 0], obs_xy[o, 1])
+        if math.isnan(x):
+            continue
+        norm = 1.0 / math.sqrt(x * x + y * y + 1.0)
+        r = rotation[i]
+        for a in range(3):
+            rays[k, a] = (r[0, a] * x + r[1, a] * y + r[2, a]) * norm
+        _center(r, translation[i], centers[k])
+        obs[k] = o
+        k += 1
+    return k
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark_inliers(
+    xyz: Array,
+    obs: Ints,
+    k: int,
+    obs_image_idx: Int32s,
+    obs_xy: Array,
+    rotation: Array,
+    translation: Array,
+    image_camera_idx: Int32s,
+    canonical: Array,
+    fisheye: Bools,
+    limit: float,
+    used: Bools,
+) -> tuple[int, float]:
+    """Mark the observations with a squared error up to the limit; their number, and the truncated cost of all."""
+    inliers = 0
+    cost = 0.0
+    for m in range(k):
+        o = obs[m]
+        i = obs_image_idx[o]
+        cam = image_camera_idx[i]
+        error = _squared_error(
+            xyz, rotation[i], translation[i], fisheye[cam], canonical[cam], obs_xy[o, 0], obs_xy[o, 1]
+        )
+        used[m] = error <= limit
+        inliers += used[m]
+        cost += min(error, limit)
+    return inliers, cost
+
+
+@numba.njit(cache=True, nogil=True)
 def triangulate_tracks(
     tracks: Ints,
     track_ptr: Ints,
@@ -142,99 +222,45 @@ def triangulate_tracks(
         min_angle_rad: smallest angle between two rays of an accepted point.
         point_xyz, obs_is_inlier: written for the given tracks only; NaN and False where triangulation fails.
     """
-    longest = 2
-    for t in tracks:
-        longest = max(longest, track_ptr[t + 1] - track_ptr[t])
+    longest = _longest(tracks, track_ptr)
     obs = np.empty(longest, np.int64)
-    centers = np.empty((longest, 3))
-    rays = np.empty((longest, 3))
-    used = np.empty(longest, np.bool_)
-    best_used = np.empty(longest, np.bool_)
-    xyz = np.empty(3)
-    best_xyz = np.empty(3)
-    max_cosine = math.cos(min_angle_rad)
-    limit = max_error_px * max_error_px
+    centers, rays = np.empty((longest, 3)), np.empty((longest, 3))
+    used, best_used = np.empty(longest, np.bool_), np.empty(longest, np.bool_)
+    xyz, best_xyz = np.empty(3), np.empty(3)
+    max_cosine, limit = math.cos(min_angle_rad), max_error_px * max_error_px
     count = 0
     for t in tracks:
-        k = 0
-        for o in range(track_ptr[t], track_ptr[t + 1]):
-            obs_is_inlier[o] = False
-            i = obs_image_idx[o]
-            if math.isnan(translation[i, 0]):
-                continue
-            cam = image_camera_idx[i]
-            x, y = undistort(fisheye[cam], canonical[cam], obs_xy[o, 0], obs_xy[o, 1])
-            if math.isnan(x):
-                continue
-            norm = 1.0 / math.sqrt(x * x + y * y + 1.0)
-            r = rotation[i]
-            for a in range(3):
-                rays[k, a] = (r[0, a] * x + r[1, a] * y + r[2, a]) * norm
-                centers[k, a] = -(
-                    r[0, a] * translation[i, 0] + r[1, a] * translation[i, 1] + r[2, a] * translation[i, 2]
-                )
-            obs[k] = o
-            k += 1
-        for a in range(3):
-            point_xyz[t, a] = math.nan
-        if k < 2:
-            continue
-        num_pairs = k * (k - 1) // 2
-        stride = max(1, num_pairs // MAX_HYPOTHESES)
-        if stride > 1 and stride % 2 == 0:
-            stride += 1
-        best_count = 1
-        best_cost = math.inf
-        index = 0
+        obs_is_inlier[track_ptr[t] : track_ptr[t + 1]] = False
+        point_xyz[t, :] = math.nan
+        k = _gather_rays(
+            t, track_ptr, obs_image_idx, obs_xy, rotation, translation, image_camera_idx, canonical, fisheye,
+            obs, centers, rays,
+        )  # fmt: skip
+        # an odd stride through the pairs of a long track meets all of its observations
+        stride = max(1, k * (k - 1) // 2 // MAX_HYPOTHESES) | 1
+        best_count, best_cost, index = 1, math.inf, 0
         for i in range(k):
             for j in range(i + 1, k):
                 index += 1
-                if index % stride != 0:
+                if index % stride != 0 or _midpoint(centers[i], rays[i], centers[j], rays[j], xyz) > max_cosine:
                     continue
-                cosine = _midpoint(centers[i], rays[i], centers[j], rays[j], xyz)
-                if cosine > max_cosine:
-                    continue
-                inliers = 0
-                cost = 0.0
-                for m in range(k):
-                    image = obs_image_idx[obs[m]]
-                    cam = image_camera_idx[image]
-                    error = _squared_error(
-                        xyz, rotation[image], translation[image], fisheye[cam], canonical[cam],
-                        obs_xy[obs[m], 0], obs_xy[obs[m], 1],
-                    )  # fmt: skip
-                    used[m] = error <= limit
-                    if used[m]:
-                        inliers += 1
-                        cost += error
-                    else:
-                        cost += limit
-                if inliers > best_count or (inliers == best_count and cost < best_cost and inliers > 1):
+                inliers, cost = _mark_inliers(
+                    xyz, obs, k, obs_image_idx, obs_xy, rotation, translation, image_camera_idx, canonical, fisheye,
+                    limit, used,
+                )  # fmt: skip
+                if inliers > best_count or (inliers == best_count > 1 and cost < best_cost):
                     best_count, best_cost = inliers, cost
-                    for a in range(3):
-                        best_xyz[a] = xyz[a]
-                    for m in range(k):
-                        best_used[m] = used[m]
-        if best_cost == math.inf:
+                    best_xyz[:] = xyz
+                    best_used[:k] = used[:k]
+        if best_count < 2 or (k > 2 and not _refine(best_xyz, centers, rays, best_used, k)):
             continue
-        if k > 2 and not _refine(best_xyz, centers, rays, best_used, k):
-            continue
-        inliers = 0
-        for m in range(k):
-            image = obs_image_idx[obs[m]]
-            cam = image_camera_idx[image]
-            best_used[m] = (
-                _squared_error(
-                    best_xyz, rotation[image], translation[image], fisheye[cam], canonical[cam],
-                    obs_xy[obs[m], 0], obs_xy[obs[m], 1],
-                )
-                <= limit
-            )  # fmt: skip
-            inliers += best_used[m]
+        inliers, _ = _mark_inliers(
+            best_xyz, obs, k, obs_image_idx, obs_xy, rotation, translation, image_camera_idx, canonical, fisheye,
+            limit, best_used,
+        )  # fmt: skip
         if inliers < 2 or _min_cosine(best_xyz, centers, best_used, k, max_cosine) > max_cosine:
             continue
-        for a in range(3):
-            point_xyz[t, a] = best_xyz[a]
+        point_xyz[t] = best_xyz
         for m in range(k):
             obs_is_inlier[obs[m]] = best_used[m]
         count += 1
@@ -262,9 +288,7 @@ def classify_observations(
     Arguments as in :func:`triangulate_tracks`. An observation is an inlier if its image is registered and its
     reprojection error small enough; a point with fewer than two inliers or too small an angle becomes NaN.
     """
-    longest = 2
-    for t in tracks:
-        longest = max(longest, track_ptr[t + 1] - track_ptr[t])
+    longest = _longest(tracks, track_ptr)
     centers = np.empty((longest, 3))
     used = np.empty(longest, np.bool_)
     max_cosine = math.cos(min_angle_rad)
@@ -287,11 +311,7 @@ def classify_observations(
             obs_is_inlier[o] = used[k]
             if used[k]:
                 inliers += 1
-                r = rotation[i]
-                for a in range(3):
-                    centers[k, a] = -(
-                        r[0, a] * translation[i, 0] + r[1, a] * translation[i, 1] + r[2, a] * translation[i, 2]
-                    )
+                _center(rotation[i], translation[i], centers[k])
             k += 1
         if inliers >= 2 and _min_cosine(point_xyz[t], centers, used, k, max_cosine) <= max_cosine:
             continue

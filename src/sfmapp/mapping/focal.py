@@ -2,9 +2,9 @@
 
 Each pair with its fundamental matrix has, for a trial focal length, a best relative pose; what its matches lose
 against the best trial is the pair's evidence. Summed over many pairs with a wide prior this is a profile likelihood in
-one unknown (cf. Sturm et al., "Focal length calibration from two views", ECCV 2005, which reads it off one F). Unlike the
-asymmetry of the singular values of K^T F K (Mendonca and Cipolla, CVPR 1999) it is flat, not misleading, where the
-optical axes meet or the motion is planar, as on a turntable.
+one unknown (cf. Sturm et al., "Focal length calibration from two views", ECCV 2005, which reads it off one F). The
+asymmetry of the singular values of K^T F K (Mendonca and Cipolla, CVPR 1999) misleads where the optical axes meet or
+the motion is planar, as on a turntable; the likelihood is merely flat there.
 """
 
 from __future__ import annotations

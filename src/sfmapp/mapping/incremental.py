@@ -33,8 +33,8 @@ from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import Tracks
 
 STAGE = "mapping"
-# Share of the observations of an image that must hold once all is adjusted, where they are few. Those of a right pose are
-# verified matches and nearly all hold; those of a mirrored or repeated part of the scene are torn between two poses.
+# Share of the observations of an image that must hold once all is adjusted, where they are few. Those of a right pose
+# are verified matches and nearly all hold; those of a mirrored or repeated part are torn between two poses.
 MIN_AGREEMENT = 2 / 3
 
 
@@ -68,7 +68,9 @@ def map_images(
     image_camera_idx = np.array([record.camera_idx for record in image_set.images], np.int32)
     tracks, track_report = build_tracks(correspondences, features)
     events.decided(STAGE, f"{track_report['num_tracks']} tracks", **track_report)
-    cameras, focal_report = _first_cameras(image_set.cameras, image_camera_idx, correspondences, tracks, options, events)
+    cameras, focal_report = _first_cameras(
+        image_set.cameras, image_camera_idx, correspondences, tracks, options, events
+    )
     attempts: dict[int, Registration] = {}
     initial_reports: list[dict[str, Any]] = []
     models: list[Reconstruction] = []
@@ -409,7 +411,7 @@ class Mapper:
         self._drop_weak_images()
 
     def _drop_weak_images(self) -> None:
-        """Take back images that lost their support, or that much of the map contradicts; points that need them go too."""
+        """Take back images that lost their support or that much of the map contradicts, and points that need them."""
         reconstruction, least = self.reconstruction, self.options.min_pose_inliers
         tracks, used = reconstruction.tracks, reconstruction.obs_is_inlier
         counts = np.bincount(tracks.obs_image_idx[used], minlength=tracks.num_images)
@@ -441,7 +443,7 @@ class Mapper:
         return int(self.reconstruction.is_registered.sum()), int(self.reconstruction.is_triangulated.sum())
 
     def _candidates(self) -> NDArray[np.int64]:
-        """Images that are not registered, without those that had to be taken back twice: or they would come for ever."""
+        """Images that are not registered, without those taken back twice: they would come for ever."""
         hopeless = [i for i, times in self.times_dropped.items() if times >= 2]
         return np.setdiff1d(np.flatnonzero(~self.reconstruction.is_registered), hopeless)
 
@@ -518,7 +520,9 @@ def compile_kernels() -> None:
     scene = make_scene(0, 3, 24)
     model, options = scene.observed, MappingOptions()
     features = [
-        Features(np.zeros((len(scene.keypoints(i)), 4), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.uint8))
+        Features(
+            np.zeros((len(scene.keypoints(i)), 4), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.uint8)
+        )
         for i in range(3)
     ]
     build_tracks(true_correspondences(scene, min_matches=1), features)

@@ -97,8 +97,8 @@ def rank_initial_pairs(
 def single_places(correspondences: Correspondences, num_images: int) -> NDArray[np.int64]:
     """(I,) int64 groups of images taken from one place, -1 for images that moved.
 
-    Rotation-only pairs link images; a group counts if nearly all matches inside it are rotations. Neighbouring frames of a
-    slow video are linked as well, but pairs further apart inside their group show parallax.
+    Rotation-only pairs link images; a group counts if nearly all matches inside it are rotations. Neighbouring frames
+    of a slow video are linked as well, but pairs further apart inside their group show parallax.
     """
     parent = np.arange(num_images)
 

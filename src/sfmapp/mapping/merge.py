@@ -1,7 +1,7 @@
 """Joining two models that share images or points: the similarity between them, and the union in one world.
 
-Tracks are the same in all models, so a track that is triangulated in two of them is a 3D-3D correspondence, and an image
-registered in both gives rotation and position at once; what is left is the scale, which the common points vote on.
+Tracks are the same in all models, so a track that is triangulated in two of them is a 3D-3D correspondence, and an
+image registered in both gives rotation and position at once; what is left is the scale: the common points vote on it.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ def similarity_through_image(
         image_idx: registered in both.
 
     Returns:
-        scale and ``target_from_source`` (7,), with ``x_target = R (scale x_source) + t``, and the number of common points
-        that agree on the scale; None if fewer than MIN_COMMON_POINTS do.
+        scale and ``target_from_source`` (7,), with ``x_target = R (scale x_source) + t``, and the number of common
+        points that agree on the scale; None if fewer than MIN_COMMON_POINTS do.
     """
     common = np.flatnonzero(target.is_triangulated & source.is_triangulated)
     if len(common) < MIN_COMMON_POINTS:

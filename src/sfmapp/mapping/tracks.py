@@ -88,7 +88,7 @@ def build_tracks(correspondences: Correspondences, features: Sequence[Features])
     empty = np.zeros((0, 2), np.int64)
     edges = np.concatenate(
         [empty]
-        + [correspondences.matches_of_pair(p) + offset[correspondences.pair_image_idx[p]][None, :] for p in pairs]
+        + [correspondences.matches_of_pair(int(p)) + offset[correspondences.pair_image_idx[p]][None, :] for p in pairs]
     )
     parent = np.arange(len(image_of_node))
     refused = _join(np.ascontiguousarray(edges[:, 0]), np.ascontiguousarray(edges[:, 1]), image_of_node, parent)

@@ -129,8 +129,17 @@ class Reconstruction:
 
 @numba.njit(cache=True, nogil=True)
 def reprojection_residuals(
-    rotation, translation, image_camera_idx, canonical, fisheye, point_xyz, obs_image_idx, obs_track_idx, obs_xy, out
-):  # type: ignore[no-untyped-def]
+    rotation: NDArray[np.float64],
+    translation: NDArray[np.float64],
+    image_camera_idx: NDArray[np.int32],
+    canonical: NDArray[np.float64],
+    fisheye: NDArray[np.bool_],
+    point_xyz: NDArray[np.float64],
+    obs_image_idx: NDArray[np.int32],
+    obs_track_idx: NDArray[np.int32],
+    obs_xy: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
     """Fill out (O, 2) with projected minus observed pixels; NaN for missing images and points and behind the camera."""
     for o in range(obs_image_idx.shape[0]):
         i = obs_image_idx[o]
