@@ -54,7 +54,7 @@ class Camera:
         width, height: image size in pixels.
         params: (P,) float64, in the order of ``PARAM_NAMES[model]``; focal lengths and centres in pixels.
         focal_sigma: standard deviation of the focal prior in pixels; None if the focal is not known a priori at all.
-        focal_source: where the focal prior comes from: ``user``, ``exif_35mm``, ``exif_sensor``, ``default`` or ``file``.
+        focal_source: where the focal prior comes from: ``user``, ``exif_35mm``, ``exif_sensor``, ``default``, ``file``.
         is_fixed: the user has said that the parameters may not change.
     """
 

@@ -1,0 +1,329 @@
+"""One model as it grows: the steps of incremental mapping as verbs."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.events import Events
+from sfmapp.mapping import structure
+from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_initial_pairs
+from sfmapp.mapping.options import MappingOptions
+from sfmapp.mapping.register import Registration, rank_next_images, register_image
+from sfmapp.scene.camera import Camera
+from sfmapp.scene.correspondences import Correspondences
+from sfmapp.scene.reconstruction import Reconstruction
+
+STAGE = "mapping"
+# Share of the observations of an image that must hold once all is adjusted, where they are few. Those of a right pose
+# are verified matches and nearly all hold; those of a mirrored or repeated part are torn between two poses.
+MIN_AGREEMENT = 2 / 3
+
+
+@dataclass
+class Mapper:
+    """Grows one model. Every method is a step of the method and changes ``reconstruction`` in place."""
+
+    reconstruction: Reconstruction
+    correspondences: Correspondences
+    options: MappingOptions
+    adjust_options: AdjustOptions
+    events: Events
+    pool: Executor
+    seeds: NDArray[np.bool_]
+    attempts: dict[int, Registration]
+    failed_with: dict[int, int] = field(default_factory=dict)
+    times_dropped: dict[int, int] = field(default_factory=dict)
+    size_at_global: tuple[int, int] = (0, 0)
+    prior_cameras: list[Camera] = field(init=False)
+    max_error_px: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.max_error_px = self.options.max_reprojection_error_px
+        self.prior_cameras = list(self.reconstruction.cameras)
+
+    # ------------------------------------------------------------------ start
+
+    def start(self) -> list[dict[str, Any]]:
+        """Register the first two images; returns the pairs that were tried, each with the reason it was rejected."""
+        options = self.options
+        tried: list[dict[str, Any]] = []
+        ranked = rank_initial_pairs(self.reconstruction, self.correspondences, self.seeds, options)
+        inliers, angle = options.min_initial_inliers, options.min_initial_angle_deg
+        while True:
+            for pair in ranked:
+                reason = pair.reason or pair.shortfall(inliers, angle)
+                tried.append({**pair.describe(self.reconstruction.image_names), "reason": reason})
+                if not reason and self._start_from(pair):
+                    return tried
+            if inliers <= options.min_pose_inliers and angle < 2 * options.min_triangulation_angle_deg:
+                return tried
+            inliers, angle = max(inliers // 2, options.min_pose_inliers), angle / 2
+            self.events.decided(STAGE, f"no initial pair; relaxing to {inliers} matches and {angle:.1f} degrees")
+
+    def _start_from(self, pair: InitialPair) -> bool:
+        initialize_from_pair(self.reconstruction, pair)
+        self.triangulate_images(list(pair.image_idx))
+        self.adjust_globally()
+        names = [self.reconstruction.image_names[i] for i in pair.image_idx]
+        num_points = int(self.reconstruction.is_triangulated.sum())
+        if num_points < self.options.min_pose_inliers:
+            self._forget(list(pair.image_idx))
+            return False
+        self._decided(f"initial pair {names[0]} - {names[1]}: {num_points} points", list(pair.image_idx))
+        self.events.advanced(STAGE, 2)
+        return True
+
+    def _forget(self, images: list[int]) -> None:
+        self.reconstruction.cam_from_world[images] = np.nan
+        self.reconstruction.point_xyz[:] = np.nan
+        self.reconstruction.obs_is_inlier[:] = False
+
+    # ------------------------------------------------------------------- grow
+
+    def grow(self) -> None:
+        """Register images until none is left or none fits; then once more after everything was adjusted."""
+        while True:
+            while registered := self.register_next_images():
+                self.triangulate_images(registered)
+                if self.is_grown():
+                    self.adjust_globally()
+                else:
+                    self.adjust_around(registered)
+                self._decided(f"registered {self._names(registered)}", registered)
+                self.events.advanced(STAGE, len(registered))
+            if not self._candidates().size or self._size() == self.size_at_global:
+                return
+            # a second chance: the adjusted map may hold more points and better poses
+            self.adjust_globally()
+            self.failed_with.clear()
+
+    def register_next_images(self) -> list[int]:
+        """Register the best next image, and with it others that see as much of the map; returns them.
+
+        Images that failed are tried again once they see half as many points more.
+        """
+        order, scores, counts = rank_next_images(self.reconstruction, self._candidates())
+        worth = [
+            (int(i), int(s))
+            for i, s, n in zip(order, scores, counts, strict=True)
+            if n >= max(self.options.min_pose_inliers, 1.5 * self.failed_with.get(int(i), 0))
+        ]
+        registered: list[int] = []
+        while worth and not registered:
+            # "as much": the map around them is as settled as around the best, and no image hangs on another
+            batch = [i for i, score in worth if score >= 0.75 * worth[0][1]]
+            worth = worth[len(batch) :]
+            known = self._known_cameras()
+            results = self.pool.map(lambda i, known=known: self._attempt(i, known), batch)
+            registered = [result.image_idx for result in results if self._accept(result)]
+        return registered
+
+    def _attempt(self, image_idx: int, known_cameras: NDArray[np.bool_]) -> Registration:
+        camera_idx = self.reconstruction.image_camera_idx[image_idx]
+        camera = self.reconstruction.cameras[camera_idx]
+        search_focal = camera.focal_source == "default" and not camera.is_fixed and not known_cameras[camera_idx]
+        # the map's own tolerance with room for its drift
+        max_error_px = min(3.0 * self.max_error_px, self.options.max_pose_error_px)
+        return register_image(
+            self.reconstruction, image_idx, self.options, search_focal=search_focal,
+            max_error_px=self.options.max_pose_error_px if search_focal else max_error_px,
+        )  # fmt: skip
+
+    def _accept(self, result: Registration) -> bool:
+        self.attempts[result.image_idx] = result
+        name = self.reconstruction.image_names[result.image_idx]
+        if result.cam_from_world is None:
+            self.failed_with[result.image_idx] = result.num_correspondences
+            self.events.decided(STAGE, f"{name}: {result.reason}")
+            return False
+        self.reconstruction.cam_from_world[result.image_idx] = result.cam_from_world
+        if result.focal_px is not None:
+            camera_idx = self.reconstruction.image_camera_idx[result.image_idx]
+            camera = self.reconstruction.cameras[camera_idx].with_focal(result.focal_px)
+            self.reconstruction.cameras[camera_idx] = camera
+            self.prior_cameras[camera_idx] = camera
+        return True
+
+    def triangulate_images(self, images: list[int]) -> None:
+        """Add the observations of newly registered images to their points, and triangulate what they make possible."""
+        tracks = self.reconstruction.tracks
+        seen = np.unique(np.concatenate([tracks.obs_track_idx[tracks.observations_of_image(i)] for i in images]))
+        seen = seen.astype(np.int64)
+        exists = self.reconstruction.is_triangulated[seen]
+        structure.filter_observations(self.reconstruction, self.options, self.pool, seen[exists], self.max_error_px)
+        missing = seen[~self.reconstruction.is_triangulated[seen]]
+        structure.triangulate(self.reconstruction, missing, self.options, self.pool, self.max_error_px)
+
+    # ----------------------------------------------------------------- adjust
+
+    def is_grown(self) -> bool:
+        """True if the model is small enough to be adjusted whole, or has grown enough since it last was."""
+        images, points = self._size()
+        return (
+            images <= 2 * self.options.local_window
+            or images >= self.options.global_growth * self.size_at_global[0]
+            or points >= self.options.global_growth * self.size_at_global[1]
+        )
+
+    def adjust_around(self, images: list[int]) -> None:
+        """Adjust new images, the registered ones that share most points with them, and those points."""
+        variable = np.zeros(len(self.reconstruction.image_names), bool)
+        variable[images] = True
+        variable[self._covisible_images(images)] = True
+        reconstruction, tracks = self.reconstruction, self.reconstruction.tracks
+        # intrinsics vary only where no image outside the window depends on them
+        outside = reconstruction.is_registered & ~variable
+        cameras = np.zeros(len(reconstruction.cameras), bool)
+        cameras[reconstruction.image_camera_idx[variable]] = True
+        cameras[reconstruction.image_camera_idx[outside]] = False
+        seen = np.unique(np.concatenate([tracks.obs_track_idx[tracks.observations_of_image(i)] for i in images]))
+        seen = seen[reconstruction.is_triangulated[seen]].astype(np.int64)
+        points = np.zeros(tracks.num_tracks, bool)
+        points[seen] = True
+        adjust_bundle(
+            reconstruction, replace(self.adjust_options, max_iterations=15, relative_cost_tolerance=1e-4),
+            variable_images=variable, variable_cameras=cameras, points=points, prior_cameras=self.prior_cameras,
+        )  # fmt: skip
+        structure.filter_observations(reconstruction, self.options, self.pool, seen, self.max_error_px)
+
+    def adjust_globally(self, final: bool = False) -> None:
+        """Adjust everything, filter, and triangulate again what was lost or has become possible."""
+        reconstruction = self.reconstruction
+        options = self.adjust_options
+        if not final:
+            options = replace(options, max_iterations=25, relative_cost_tolerance=1e-4)
+        if reconstruction.is_registered.sum() < 3:  # two views cannot tell the lens from the scene
+            options = replace(options, refine_focal=False, refine_distortion=False)
+        adjust_bundle(reconstruction, options, prior_cameras=self.prior_cameras)
+        self._settle_points()
+        self.size_at_global = self._size()
+
+    def finish(self) -> None:
+        """Adjust until the set of inliers settles; cameras with several images refine their principal point too.
+
+        The damping starts low: the map is at its minimum already, and what is still to be found lies in directions in
+        which the cost is almost flat, such as principal point against rotation.
+        """
+        options = replace(self.adjust_options, initial_damping=1e-7, relative_cost_tolerance=1e-7)
+        for _ in range(6):
+            before = self.reconstruction.obs_is_inlier.copy()
+            adjust_bundle(self.reconstruction, options, prior_cameras=self.prior_cameras)
+            self._refine_principal_points(options)
+            self._settle_points()
+            changed = int((before != self.reconstruction.obs_is_inlier).sum())
+            summary = self.reconstruction.summary()
+            self.events.decided(STAGE, f"final adjustment: {changed} observations changed sides", **summary)
+            if changed <= 1e-3 * before.sum():
+                return
+
+    def _refine_principal_points(self, options: AdjustOptions) -> None:
+        """Adjust everything with free principal points, for the cameras that MappingOptions names."""
+        reconstruction, mode = self.reconstruction, self.options.refine_principal_point
+        registered = reconstruction.image_camera_idx[reconstruction.is_registered]
+        chosen = np.bincount(registered, minlength=len(reconstruction.cameras)) >= 3
+        chosen &= [mode == "always" or c.focal_source == "default" for c in reconstruction.cameras]
+        if mode == "never" or not chosen.any():
+            return
+        size = max(max(c.width, c.height) for c, s in zip(reconstruction.cameras, chosen, strict=True) if s)
+        # the adjustment counts residuals in pixels; the prior is weighed against them at their true noise
+        noise_px = max(structure.residual_scale_px(reconstruction), 0.1)
+        options = replace(
+            options, refine_principal_point=True,
+            principal_point_sigma_px=self.options.principal_point_sigma * size / noise_px,
+        )  # fmt: skip
+        adjust_bundle(reconstruction, options, variable_cameras=chosen, prior_cameras=self.prior_cameras)
+
+    def _settle_points(self) -> None:
+        """Measure the noise; filter accordingly, and triangulate again what was lost or has become possible."""
+        scale = structure.residual_scale_px(self.reconstruction)
+        # one pixel is about what the best detectors reach on blurred or distorted images: never filter below it
+        lower, upper = min(1.0, self.options.max_reprojection_error_px), self.options.max_reprojection_error_px
+        if np.isfinite(scale):
+            self.max_error_px = float(np.clip(self.options.max_reprojection_error_sigmas * scale, lower, upper))
+        structure.filter_observations(self.reconstruction, self.options, self.pool, None, self.max_error_px)
+        missing = np.flatnonzero(~self.reconstruction.is_triangulated)
+        structure.triangulate(self.reconstruction, missing, self.options, self.pool, self.max_error_px)
+        self._drop_weak_images()
+
+    def _drop_weak_images(self) -> None:
+        """Take back images that lost their support or that much of the map contradicts, and points that need them."""
+        reconstruction, least = self.reconstruction, self.options.min_pose_inliers
+        tracks, used = reconstruction.tracks, reconstruction.obs_is_inlier
+        counts = np.bincount(tracks.obs_image_idx[used], minlength=tracks.num_images)
+        sees = reconstruction.is_triangulated[tracks.obs_track_idx]
+        visible = np.bincount(tracks.obs_image_idx[sees], minlength=tracks.num_images)
+        weak = (counts < least) | ((counts < 4 * least) & (counts < MIN_AGREEMENT * visible))
+        dropped = np.flatnonzero(reconstruction.is_registered & weak)
+        # a model of two or three images stands or falls as a whole, with its points
+        if len(dropped) == 0 or reconstruction.is_registered.sum() - len(dropped) < 3:
+            return
+        reconstruction.cam_from_world[dropped] = np.nan
+        structure.filter_observations(reconstruction, self.options, self.pool, None, self.max_error_px)
+        for i in dropped.tolist():
+            reason = f"{counts[i]} of {visible[i]} observations hold after the adjustment: too few to trust the pose"
+            self.attempts[i] = Registration(i, int(visible[i]), int(counts[i]), None, reason=reason)
+            self.failed_with[i] = int(visible[i])
+            self.times_dropped[i] = self.times_dropped.get(i, 0) + 1
+            self.events.decided(STAGE, f"took back {reconstruction.image_names[i]}: {reason}")
+
+    def is_supported(self, images: NDArray[np.bool_]) -> bool:
+        """True if each of the given images (I,) still observes enough points after an adjustment."""
+        tracks, used = self.reconstruction.tracks, self.reconstruction.obs_is_inlier
+        counts = np.bincount(tracks.obs_image_idx[used], minlength=tracks.num_images)
+        return bool((counts[images] >= self.options.min_pose_inliers).all())
+
+    # ---------------------------------------------------------------- helpers
+
+    def _size(self) -> tuple[int, int]:
+        return int(self.reconstruction.is_registered.sum()), int(self.reconstruction.is_triangulated.sum())
+
+    def _candidates(self) -> NDArray[np.int64]:
+        """Images that are not registered, without those taken back twice: they would come for ever."""
+        hopeless = [i for i, times in self.times_dropped.items() if times >= 2]
+        return np.setdiff1d(np.flatnonzero(~self.reconstruction.is_registered), hopeless)
+
+    def _known_cameras(self) -> NDArray[np.bool_]:
+        """(C,) bool: cameras with a registered image, which the adjustment has refined."""
+        counts = np.bincount(
+            self.reconstruction.image_camera_idx[self.reconstruction.is_registered],
+            minlength=len(self.reconstruction.cameras),
+        )
+        return counts > 0
+
+    def _covisible_images(self, images: list[int]) -> NDArray[np.int64]:
+        """The registered images that share most points with the given ones, as many as the window holds."""
+        tracks, used = self.reconstruction.tracks, self.reconstruction.obs_is_inlier
+        is_seen = np.zeros(tracks.num_tracks, bool)
+        for i in images:
+            obs = tracks.observations_of_image(i)
+            is_seen[tracks.obs_track_idx[obs[used[obs]]]] = True
+        shared = np.bincount(
+            tracks.obs_image_idx[used & is_seen[tracks.obs_track_idx]], minlength=len(self.reconstruction.image_names)
+        ).astype(np.int64)
+        shared[images] = 0
+        order = np.argsort(-shared, kind="stable")[: max(1, self.options.local_window - len(images))]
+        return order[shared[order] > 0]
+
+    def _names(self, images: list[int]) -> str:
+        return ", ".join(self.reconstruction.image_names[i] for i in images)
+
+    def _decided(self, message: str, images: list[int]) -> None:
+        summary = self.reconstruction.summary()
+        self.events.decided(
+            STAGE, f"{message}; {summary['num_points']} points, {summary['mean_reprojection_error_px']:.2f} px",
+            **summary,
+            snapshot={
+                "image_idx": images,
+                "cam_from_world": self.reconstruction.cam_from_world.copy(),
+                "point_xyz": self.reconstruction.point_xyz.astype(np.float32),
+                "num_registered": summary["num_registered"],
+                "num_points": summary["num_points"],
+                "mean_error_px": summary["mean_reprojection_error_px"],
+            },
+        )  # fmt: skip
