@@ -26,6 +26,7 @@ from sfmapp.viewer.listener import RecordingListener
 from sfmapp.viewer.photos import load_screen_photo
 from sfmapp.viewer.recording import write_recording
 from sfmapp.viewer.replay import Replay, make_replay, up_direction
+from sfmapp.viewer.stage import set_stage
 from sfmapp.viewer.view import free_port, server_command, server_url, view, window_command
 
 NUM_IMAGES, NUM_POINTS = 7, 60
@@ -99,6 +100,7 @@ def replayed(model: Reconstruction) -> RecordingListener:
     listener = RecordingListener()
     events = Events(listener)
     rng = np.random.default_rng(3)
+    events.decided("pairs", "all of them")
     for count in range(2, int(model.is_registered.sum()) + 1):
         turn = rigid3.exp_so3(rng.normal(0, 1, 3))
         gauge = similarity.from_parts(turn, rng.normal(0, 5, 3), float(rng.uniform(0.2, 5)))
@@ -122,9 +124,9 @@ def test_replay_brings_every_step_into_the_final_frame(job: tuple[ImageSet, list
     listener = replayed(model)
     replay = make_replay(image_set, features, [model], listener.steps, listener.messages, title="t")
     # the first two join together and take two times, the final model one more
-    assert replay.step.tolist() == [1, 2, 3, 4, 5]
-    assert replay.image_step.tolist() == [0, 1, 2, 3, 4, -1, -1]
-    assert [step for step, _, _ in replay.messages] == [1, 2, 3, 4, 4, 5]
+    assert replay.step.tolist() == [2, 3, 4, 5, 6]
+    assert replay.image_step.tolist() == [1, 2, 3, 4, 5, -1, -1]
+    assert [step for step, _, _ in replay.messages] == [0, 2, 3, 4, 5, 5, 6]
     for k, count in enumerate((2, 3, 4, 5)):
         np.testing.assert_allclose(
             rigid3.rotation_matrix(replay.pose_cam_from_world[k, :count]),
@@ -142,8 +144,8 @@ def test_steps_of_a_long_run_still_know_their_images(job: tuple[ImageSet, list[F
     steps = replayed(model).steps
     thinned = replace(steps[2], cam_from_world=None, point_xyz=None, point_track_idx=None)
     replay = make_replay(image_set, features, [model], [*steps[:2], thinned, *steps[3:]])
-    assert replay.image_step.tolist() == [0, 1, 2, 3, 4, -1, -1]
-    assert replay.pose_step.tolist() == replay.cloud_step.tolist() == [1, 2, 4]
+    assert replay.image_step.tolist() == [1, 2, 3, 4, 5, -1, -1]
+    assert replay.pose_step.tolist() == replay.cloud_step.tolist() == [2, 3, 5]
 
 
 def test_an_attempt_that_came_to_nothing_leaves_no_cameras(
@@ -155,7 +157,7 @@ def test_an_attempt_that_came_to_nothing_leaves_no_cameras(
     poses[[5, 6]] = [0, 0, 0, 1, 0, 0, 0]
     lost = replace(steps[0], image_idx=(5, 6), cam_from_world=poses)
     replay = make_replay(image_set, features, [model], [lost, *(replace(s, step=s.step + 1) for s in steps)])
-    assert replay.image_step.tolist() == [2, 3, 4, 5, 6, -1, -1]
+    assert replay.image_step.tolist() == [3, 4, 5, 6, 7, -1, -1]
     assert replay.pose_model.tolist() == [0] * 4
 
 
@@ -188,6 +190,37 @@ def test_up_of_cameras_side_by_side_is_the_top_of_the_images() -> None:
     poses = np.array([look_at(np.array([x, -5.0, 0]), np.array([x, 0.0, 0]), up) for x in range(4)])
     np.testing.assert_allclose(up_direction(poses), up, atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(up_direction(np.full((3, 7), np.nan))), 1)
+
+
+def test_the_first_view_shows_all_models_upright(job: tuple[ImageSet, list[Features], Reconstruction]) -> None:
+    image_set, features, model = job
+    gauge = similarity.from_parts(rigid3.exp_so3([0.3, 2, 1]), np.array([5.0, 6, 7]), 30.0)
+    other = replace(
+        model,
+        cam_from_world=np.full_like(model.cam_from_world, np.nan),
+        point_xyz=similarity.apply(gauge, model.point_xyz),
+        obs_is_inlier=np.zeros_like(model.obs_is_inlier),
+    )
+    all_poses = ring(np.array([0.0, 0.0, 1.0]))
+    other.cam_from_world[5:] = similarity.transform_poses(gauge, all_poses[5:])
+    replay = make_replay(image_set, features, [model, other], [], up=np.array([0.0, 0.0, 1.0]))
+    stage = set_stage(replay)
+    np.testing.assert_allclose(stage.rotation, np.eye(3))
+    assert (stage.scale[0], *stage.shift[0]) == (1, 0, 0, 0)
+    # a camera of the opening that the viewer has, at the eye
+    eye_from_world = look_at(stage.eye, stage.target, np.array([0.0, 0.0, 1.0]))
+    shown = []
+    for m, xyz in enumerate((model.point_xyz, other.point_xyz)):
+        centers = rigid3.center(replay.model_cam_from_world[m].astype(np.float64))
+        body = np.concatenate([xyz, centers[~np.isnan(centers[:, 0])]])
+        shown.append(stage.scale[m] * body @ stage.rotation.T + stage.shift[m])
+        seen = rigid3.apply(eye_from_world, shown[m])
+        assert (seen[:, 2] > 0).all()
+        inside = np.abs(seen[:, :2] / seen[:, 2:]) < np.tan(np.radians(27.5)) * np.array([1.3, 1.0])
+        assert inside.mean() > 0.97  # but for the tails of the points
+    size = [np.linalg.norm(np.ptp(body, axis=0)) for body in shown]
+    assert 0.4 < size[1] / size[0] < 0.9
+    assert 0.02 < stage.frustum < 1
 
 
 def test_listener_stays_small_in_a_long_run() -> None:

@@ -45,7 +45,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Message:
-    """A line of the log: the step it belongs to, ``INFO``, ``DEBUG`` or ``WARN``, and its text."""
+    """A line of the log: the step it belongs to (-1: before the first), its level as rerun names it, and its text."""
 
     step: int
     level: str
@@ -70,7 +70,7 @@ class RecordingListener:
         if isinstance(event.data.get("snapshot"), dict):
             self._add(event.data["snapshot"])
         if event.kind in _LEVELS and event.message and len(self.messages) < MAX_MESSAGES:
-            step = self.steps[-1].step if self.steps else 0
+            step = self.steps[-1].step if self.steps else -1
             text = f"[{event.time_s:7.2f} s] {event.stage}: {event.message}"
             self.messages.append(Message(step, _LEVELS[event.kind], text))
 

@@ -47,7 +47,7 @@ class Replay:
         model_cam_from_world: (M, I, 7) float32, NaN where the image is not in the model.
         model_ptr: (M + 1,) int64; the points of model m are ``model_xyz[model_ptr[m]:model_ptr[m + 1]]``, coloured
             model_rgb.
-        step: (S,) int64 ascending, a time for each image that was registered and each other change of the map;
+        step: (S,) int64 ascending from 1, a time for each image that was registered and each other change of the map;
             step_registered, step_points: (S,) int64; step_error_px: (S,) float32.
         pose_step, pose_model: (P,) int64, and pose_cam_from_world: (P, I, 7) float32 as they were at that step.
         cloud_step, cloud_model: (C,) int64, cloud_ptr: (C + 1,) int64, cloud_xyz: (N, 3) float32, cloud_rgb:
@@ -224,10 +224,10 @@ def _history(
     final_poses: NDArray[np.float64], image_model: Ints,
 ) -> dict[str, Any]:  # fmt: skip
     """All that has a place in time: numbers, poses, points, registrations, messages."""
-    # images that were registered together follow each other, so that each is seen
-    ends = np.cumsum([max(1, len(s.image_idx)) for s in steps]).astype(np.int64) - 1
+    # images that were registered together follow each other, so that each is seen; 0 is before the first
+    ends = np.cumsum([max(1, len(s.image_idx)) for s in steps]).astype(np.int64)
     end_of = dict(zip([s.step for s in steps], ends.tolist(), strict=True))
-    final_step = int(ends[-1]) + 1 if steps else 0
+    final_step = int(ends[-1]) + 1 if steps else 1
     model_of = _models_of_steps(steps, final_poses)
     image_step = np.where(image_model >= 0, final_step, -1)
     for s, end, m in reversed(list(zip(steps, ends, model_of, strict=True))):

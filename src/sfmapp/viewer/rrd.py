@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from sfmapp.geometry import rigid3
 from sfmapp.viewer.photos import ScreenPhoto, load_screen_photo
 from sfmapp.viewer.replay import Replay
+from sfmapp.viewer.stage import Stage, set_stage
 
 APPLICATION = "sfmapp"
 TIMELINE = "step"
@@ -39,6 +40,8 @@ RESIDUAL_SCALE = 20
 # Length in pixels at which a residual is drawn wholly red.
 _RED_RESIDUAL_PX = 2.0
 
+# negative: in points of the screen, not in units of the scene
+_LINE_WIDTH = -1.0
 _BLUE, _ORANGE, _GREY = (70, 150, 255), (255, 150, 40), (120, 120, 130)
 _MODEL_COLORS = (_BLUE, (90, 200, 120), (200, 120, 220), (220, 200, 80))
 
@@ -48,7 +51,7 @@ def write_rrd(replay: Replay, path: Path, threads: int = 1) -> None:
     beside = path.with_name(f".{path.name}.part")
     recording = rr.RecordingStream(APPLICATION)
     try:
-        stage = _Stage(replay)
+        stage = set_stage(replay)
         recording.save(beside)
         # active, so that a layout that somebody kept for another scene does not look past this one
         recording.send_blueprint(_blueprint(replay, stage), make_active=True, make_default=True)
@@ -65,126 +68,22 @@ def write_rrd(replay: Replay, path: Path, threads: int = 1) -> None:
         beside.unlink(missing_ok=True)
 
 
-# ---------------------------------------------------------------- where things stand
-
-
-class _Stage:
-    """How the models are placed in the viewer's world (z up), and from where they are looked at.
-
-    Attributes:
-        rotation: (3, 3) viewer from model, which turns up to +z.
-        shift: (M, 3) moves further models beside the first.
-        frustum: length of the frusta in units of the first model; scale: (M,) that brings the models to one size.
-        eye, target: (3,) first view.
-    """
-
-    def __init__(self, replay: Replay) -> None:
-        self.rotation = _turn_to_z(replay.up)
-        num_models = len(replay.model_cam_from_world)
-        self.shift = np.zeros((num_models, 3))
-        self.scale = np.ones(num_models)
-        self.frustum = 0.1
-        self.eye, self.target = np.array([0.0, -3.0, 1.5]), np.zeros(3)
-        if not num_models:
-            return
-        boxes = [self._look_at_model(replay, m) for m in range(num_models)]
-        edge = boxes[0][1][0]
-        for m in range(1, num_models):
-            low, high = boxes[m]
-            size, first_size = np.linalg.norm(high - low), np.linalg.norm(boxes[0][1] - boxes[0][0])
-            self.scale[m] = 0.6 * first_size / size if size > 0 else 1.0
-            gap = 0.3 * (boxes[0][1][0] - boxes[0][0][0])
-            self.shift[m] = np.array([edge + gap, boxes[0][0][1], boxes[0][0][2]]) - self.scale[m] * low
-            edge += gap + self.scale[m] * (high[0] - low[0])
-        self._place_eye(replay)
-
-    def _look_at_model(self, replay: Replay, m: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Box of a model's cameras and of its points without the tails."""
-        poses = replay.model_cam_from_world[m]
-        centers = rigid3.center(poses[~np.isnan(poses[:, 0])].astype(np.float64)) @ self.rotation.T
-        xyz = replay.model_xyz[replay.model_ptr[m] : replay.model_ptr[m + 1]].astype(np.float64) @ self.rotation.T
-        if len(xyz):
-            centers = np.concatenate([centers, np.percentile(xyz, [3, 97], axis=0)])
-        return centers.min(0), centers.max(0)
-
-    def _place_eye(self, replay: Replay) -> None:
-        poses = replay.model_cam_from_world[0].astype(np.float64)
-        poses = poses[~np.isnan(poses[:, 0])]
-        centers = rigid3.center(poses) @ self.rotation.T
-        forward = rigid3.rotation_matrix(poses)[:, 2] @ self.rotation.T
-        xyz = replay.model_xyz[: replay.model_ptr[1]].astype(np.float64) @ self.rotation.T
-        middle = np.median(xyz, axis=0) if len(xyz) else centers.mean(0) + forward.mean(0)
-        depth = float(np.median(np.linalg.norm(centers - middle, axis=1)))
-        apart = np.linalg.norm(centers[:, None] - centers[None], axis=2) + np.where(np.eye(len(centers)), np.inf, 0)
-        nearest = float(np.median(apart.min(1))) if len(centers) > 1 else depth
-        # neighbours should not hide each other, but neither should the frusta of a video be too small to see
-        self.frustum = float(np.clip(0.45 * nearest, 0.04 * depth, 0.12 * depth))
-        heading = forward.mean(0) * np.array([1.0, 1.0, 0.0])
-        is_ring = np.linalg.norm(heading) < 0.2
-        heading = np.array([0.35, 0.94, 0.0]) if is_ring else heading / np.linalg.norm(heading)
-        # from behind and above the cameras; a little aside, so that depth shows
-        aside = np.array([heading[1], -heading[0], 0.0])
-        direction = -heading + 0.35 * aside + np.array([0.0, 0.0, 0.55])
-        direction /= np.linalg.norm(direction)
-        self.eye, self.target = _frame(np.concatenate([centers, _core(xyz)]), direction)
-
-
-def _core(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The points of the box that holds 90 % along each axis."""
-    if not len(xyz):
-        return xyz
-    low, high = np.percentile(xyz, [5, 95], axis=0)
-    return xyz[((xyz >= low) & (xyz <= high)).all(1)]
-
-
-def _frame(
-    points: NDArray[np.float64], direction: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Eye and target (3,) each, the eye in a unit direction from the target, so that points (N, 3) fill the view."""
-    right = np.cross(-direction, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    top = np.cross(right, -direction)
-    # the viewer opens 55 degrees vertically, and the view is about 4:3; a tenth is left as a margin
-    half_height = 0.9 * np.tan(np.radians(55 / 2))
-    half = np.array([1.3 * half_height, half_height])
-    target = points.mean(0)
-    for _ in range(4):  # centre what is seen, step back until all is, and again: perspective shifts the middle
-        offset = points - target
-        across, toward = offset @ np.stack([right, top], 1), offset @ direction
-        distance = float((np.abs(across) / half + toward[:, None]).max())
-        seen = across / np.maximum(distance - toward, 1e-9 * distance)[:, None]
-        middle = 0.5 * (seen.min(0) + seen.max(0)) * distance
-        target = target + middle[0] * right + middle[1] * top
-    return target + distance * direction, target
-
-
-def _turn_to_z(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The smallest rotation (3, 3) that takes a unit vector to +z."""
-    z = np.asarray(up, np.float64) / np.linalg.norm(up)
-    axis = np.cross(z, [0.0, 0.0, 1.0])
-    sine = np.linalg.norm(axis)
-    if sine < 1e-9:
-        return np.eye(3) if z[2] > 0 else np.diag([1.0, -1.0, -1.0])
-    return np.asarray(rigid3.exp_so3(axis / sine * np.arctan2(sine, z[2])))
-
-
 # ---------------------------------------------------------------- three dimensions
 
 
 def _draw_world(
-    recording: rr.RecordingStream, replay: Replay, stage: _Stage, photos: Sequence[ScreenPhoto | None]
+    recording: rr.RecordingStream, replay: Replay, stage: Stage, photos: Sequence[ScreenPhoto | None]
 ) -> None:
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for m in range(len(replay.model_cam_from_world)):
         root = f"world/model{m}"
-        turn = stage.scale[m] * stage.rotation
-        recording.log(root, rr.Transform3D(translation=stage.shift[m], mat3x3=turn), static=True)
-        _draw_points(recording, replay, m, f"{root}/points")
+        recording.log(root, rr.Transform3D(translation=stage.shift[m], mat3x3=stage.rotation), static=True)
+        _draw_points(recording, replay, stage, m, f"{root}/points")
         for image_idx in np.flatnonzero(replay.image_model == m).tolist():
-            _draw_camera(recording, replay, m, image_idx, stage.frustum / stage.scale[m], photos[image_idx])
+            _draw_camera(recording, replay, stage, m, image_idx, photos[image_idx])
 
 
-def _draw_points(recording: rr.RecordingStream, replay: Replay, m: int, path: str) -> None:
+def _draw_points(recording: rr.RecordingStream, replay: Replay, stage: Stage, m: int, path: str) -> None:
     mine = np.flatnonzero(replay.cloud_model == m)
     spans = [slice(replay.cloud_ptr[k], replay.cloud_ptr[k + 1]) for k in mine]
     spans_final = slice(replay.model_ptr[m], replay.model_ptr[m + 1])
@@ -193,33 +92,39 @@ def _draw_points(recording: rr.RecordingStream, replay: Replay, m: int, path: st
     counts = [s.stop - s.start for s in [*spans, spans_final]]
     steps = np.append(replay.cloud_step[mine], replay.step[-1])
     recording.log(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.8)), static=True)
-    columns = rr.Points3D.columns(positions=xyz, colors=_packed(rgb)).partition(counts)
+    columns = rr.Points3D.columns(positions=stage.scale[m] * xyz, colors=_packed(rgb)).partition(counts)
     recording.send_columns(path, [rr.TimeColumn(TIMELINE, sequence=steps)], columns)
 
 
 def _draw_camera(
-    recording: rr.RecordingStream, replay: Replay, m: int, image_idx: int, length: float, photo: ScreenPhoto | None
+    recording: rr.RecordingStream, replay: Replay, stage: Stage, m: int, image_idx: int, photo: ScreenPhoto | None
 ) -> None:
     path = rr.new_entity_path(["world", f"model{m}", "cameras", replay.image_names[image_idx]])
     steps, poses = _camera_path(replay, m, image_idx)
     world_from_cam = rigid3.inverse(poses)
-    recording.log(path, rr.TransformAxes3D(1e-6 * length), static=True)  # the frustum says it all
-    columns = rr.Transform3D.columns(translation=world_from_cam[:, 4:], quaternion=world_from_cam[:, :4])
+    columns = rr.Transform3D.columns(
+        translation=stage.scale[m] * world_from_cam[:, 4:], quaternion=world_from_cam[:, :4]
+    )
     recording.send_columns(path, [rr.TimeColumn(TIMELINE, sequence=steps)], columns)
+    # the frustum says it all; axes of no length are an error to the viewer
+    recording.log(path, rr.TransformAxes3D(1e-6 * stage.frustum), static=True)
     size = replay.image_size[image_idx].astype(np.float64)
     shown = np.array(photo.thumbnail_size, np.float64) if photo else size
     fx, fy, cx, cy = replay.image_intrinsics[image_idx].astype(np.float64) * np.tile(shown / size, 2)
-    # newly registered cameras stand out until the next time
+    # To the viewer a photograph among points without a pinhole is an error, even before the photograph is there. So the
+    # pinhole is there from the beginning, too small to be seen, and stands out when the image joins.
     color = _MODEL_COLORS[m % len(_MODEL_COLORS)]
-    begin, colors = (
-        ([steps[0], steps[0] + 1], [_ORANGE, color]) if steps[0] < replay.step[-1] else ([steps[0]], [color])
+    rows = [(0, 1e-6, 0.0, color), (steps[0], 1.0, _LINE_WIDTH, _ORANGE), (steps[0] + 1, 1.0, _LINE_WIDTH, color)]
+    times, lengths, widths, colors = zip(
+        *(rows if steps[0] < replay.step[-1] else [rows[0], (steps[0], *rows[2][1:])]), strict=True
     )
-    repeat = len(begin)
+    repeat = len(times)
     pinhole = rr.Pinhole.columns(
         image_from_camera=[[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]] * repeat, resolution=[shown] * repeat,
-        camera_xyz=[rr.ViewCoordinates.RDF] * repeat, image_plane_distance=[length] * repeat, color=_packed(colors),
+        camera_xyz=[rr.ViewCoordinates.RDF] * repeat, image_plane_distance=stage.frustum * np.array(lengths),
+        line_width=widths, color=_packed(colors),
     )  # fmt: skip
-    recording.send_columns(path, [rr.TimeColumn(TIMELINE, sequence=begin)], pinhole)
+    recording.send_columns(path, [rr.TimeColumn(TIMELINE, sequence=times)], pinhole)
     if photo:
         image = rr.EncodedImage.columns(blob=[photo.thumbnail], media_type=["image/jpeg"])
         recording.send_columns(path, [rr.TimeColumn(TIMELINE, sequence=steps[:1])], image)
@@ -358,7 +263,7 @@ def _draw_numbers(recording: rr.RecordingStream, replay: Replay) -> None:
         recording.send_columns("log", times, rr.TextLog.columns(text=list(texts), level=list(levels)))
 
 
-def _blueprint(replay: Replay, stage: _Stage) -> rrb.Blueprint:
+def _blueprint(replay: Replay, stage: Stage) -> rrb.Blueprint:
     eye = rrb.EyeControls3D(position=stage.eye, look_target=stage.target, eye_up=(0.0, 0.0, 1.0))
     world = rrb.Spatial3DView(origin="world", name="Cameras and points", eye_controls=eye, line_grid=False)
     photo = rrb.Spatial2DView(origin="photo", name="Newest photograph")
@@ -372,7 +277,7 @@ def _blueprint(replay: Replay, stage: _Stage) -> rrb.Blueprint:
         columns=rrb.TextLogColumns(text_log_columns=["loglevel", "body"]),
     )  # fmt: skip
     # it opens playing, for some eight seconds, and stays at the end
-    speed = rrb.TimePanel(timeline=TIMELINE, state="collapsed", fps=float(np.clip((replay.step[-1] + 1) / 8, 1, 30)))
+    speed = rrb.TimePanel(timeline=TIMELINE, state="collapsed", fps=float(np.clip(replay.step[-1] / 8, 1, 30)))
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(world, rrb.Vertical(photo, about, row_shares=[5, 1]), column_shares=[3, 2]),
