@@ -34,7 +34,7 @@ def test_exact_points_give_the_exact_pose(seed):
 
 @pytest.mark.parametrize("ratio", [0.3, 0.6])
 def test_outliers_are_told_apart(ratio):
-    rng, pose, xyz, x = some_view(9, 400)
+    rng, _, xyz, x = some_view(9, 400)
     sigma = 1e-3
     x = x + rng.normal(0, sigma, x.shape)
     outlier = rng.random(len(x)) < ratio
@@ -62,5 +62,5 @@ def test_too_little_is_no_pose():
     _, _, xyz, x = some_view(1)
     assert resection.estimate_pose(xyz[:3], x[:3], 1e-2) is None
     assert resection.estimate_pose(xyz, np.full_like(x, np.nan), 1e-2) is None
-    line = np.outer(np.linspace(-1, 1, 50), [1.0, 0.5, 0.2]) + [0, 0, 5]
+    line = np.outer(np.linspace(-1, 1, 50), [1.0, 0.5, 0.2]) + np.array([0.0, 0.0, 5.0])
     resection.estimate_pose(line, line[:, :2] / line[:, 2:], 1e-3)  # any answer but a crash

@@ -82,8 +82,9 @@ def map_images(
             mapper.finish()
             registered = model.is_registered
             seeds &= ~registered
-            if registered.sum() < min(options.min_model_images, len(names)):
-                events.decided(STAGE, f"model dropped: it has only {int(registered.sum())} images")
+            num_images, num_points = int(registered.sum()), int(model.is_triangulated.sum())
+            if num_images < min(options.min_model_images, len(names)) or num_points < options.min_pose_inliers:
+                events.decided(STAGE, f"model dropped: {num_images} images, {num_points} points")
                 continue
             model.point_rgb = track_colors(tracks, features)
             models.append(model)
