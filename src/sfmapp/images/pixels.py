@@ -7,15 +7,17 @@ Grey is OpenCV's, 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601) of the 8-bit colour
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
 from sfmapp.images.headers import Header, UnusableImage, read_header
-from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.tags import byte_order, first_directory
+
+if TYPE_CHECKING:
+    from sfmapp.images.image_set import ImageRecord
 
 Pixels = NDArray[np.uint8]
 
