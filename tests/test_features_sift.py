@@ -1,0 +1,249 @@
+"""SIFT against blobs of known place and size, against symmetry, and against pycolmap."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfmapp.features.sift import extract_sift
+
+DEFAULTS = {
+    "max_num_features": 8192,
+    "max_num_orientations": 2,
+    "contrast_threshold": 0.02 / 9,
+    "edge_threshold": 10.0,
+}
+
+
+def sift(gray: np.ndarray, usable: np.ndarray | None = None, **changes: float) -> tuple[np.ndarray, np.ndarray]:
+    keypoints, descriptors, _ = extract_sift(gray, usable, **(DEFAULTS | changes))  # type: ignore[arg-type]
+    return keypoints, descriptors
+
+
+def blobs(xy: np.ndarray, sigma: np.ndarray, size: tuple[int, int], contrast: float = 120.0) -> np.ndarray:
+    """Gaussian blobs at house pixels xy, of either sign, as a uint8 picture; dithered, so that rounding is noise."""
+    y, x = np.mgrid[: size[1], : size[0]] + 0.5
+    picture = np.full(x.shape, 128.0)
+    for n, ((cx, cy), s) in enumerate(zip(xy, sigma, strict=True)):
+        picture += (1 if n % 2 else -1) * contrast * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * s * s))
+    noise = np.random.default_rng(0).random(x.shape)
+    return np.clip(np.floor(picture + noise), 0, 255).astype(np.uint8)
+
+
+def texture(size: tuple[int, int], seed: int = 0) -> np.ndarray:
+    """Smooth noise over all scales."""
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    total = np.zeros(size[::-1], np.float32)
+    for s in (1.0, 2.0, 4.0, 8.0, 16.0):
+        total += s * cv2.GaussianBlur(rng.normal(size=size[::-1]).astype(np.float32), (0, 0), s)
+    return np.clip(128 + 45 * total / total.std(), 0, 255).astype(np.uint8)
+
+
+def nearest(xy: np.ndarray, to: np.ndarray) -> np.ndarray:
+    return np.argmin(((xy[None] - to[:, None]) ** 2).sum(axis=2), axis=1)
+
+
+@given(seed=st.integers(0, 1000), octave=st.sampled_from([0, 1, 2]), layer=st.floats(0.1, 0.9))
+def test_blobs_are_found_where_they_are(seed: int, octave: int, layer: float) -> None:
+    # at whole powers of two a blob lies in the seam of two octaves, and a hair decides whether either holds it
+    sigma = 2.0 ** (octave + layer)
+    grid = np.stack(np.meshgrid(np.arange(4), np.arange(3)), axis=-1).reshape(-1, 2) * 64.0 + 48.0
+    truth = grid + np.random.default_rng(seed).uniform(-0.5, 0.5, grid.shape)
+    keypoints, _ = sift(blobs(truth, np.full(len(truth), sigma), (288, 224)))
+    found = keypoints[nearest(keypoints[:, :2], truth)]
+    error = found[:, :2] - truth
+    assert np.abs(error).max() < 0.03
+    assert np.abs(error.mean(axis=0)).max() < 0.01
+    # the difference of Gaussians peaks where its own width is that of the blob
+    assert np.abs(np.log2(found[:, 2] / sigma)).max() < 0.25
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.125, 0.25, 0.375, 0.5])
+def test_no_bias_towards_the_pixel_grid(shift: float) -> None:
+    """The error is no function of the fraction of the pixel: it would bend every camera the same way."""
+    grid = np.stack(np.meshgrid(np.arange(9), np.arange(9)), axis=-1).reshape(-1, 2) * 28.0 + 24.0
+    truth = grid + shift
+    keypoints, _ = sift(blobs(truth, np.full(len(truth), 1.1), (272, 272)))
+    error = keypoints[nearest(keypoints[:, :2], truth), :2] - truth
+    assert np.abs(error.mean(axis=0)).max() < 0.005
+
+
+def test_quarter_turn_turns_keypoints_and_keeps_descriptors() -> None:
+    picture = texture((300, 260))
+    straight, straight_descriptors = sift(picture)
+    turned, turned_descriptors = sift(np.ascontiguousarray(np.rot90(picture, -1)))
+    # clockwise: (x, y) goes to (height - y, x) in house pixels, without any half pixel
+    expected = np.column_stack([260 - straight[:, 1], straight[:, 0]])
+    at = nearest(turned[:, :2], expected)
+    angle = np.angle(np.exp(1j * (turned[at, 3] - straight[:, 3] - math.pi / 2)))
+    same = (np.abs(turned[at, :2] - expected).max(axis=1) < 0.02) & (np.abs(angle) < 0.05)
+    assert len(straight) > 500
+    assert same.mean() > 0.7
+    distance = np.linalg.norm(straight_descriptors[same].astype(float) - turned_descriptors[at[same]], axis=1) / 512
+    assert np.median(distance) < 0.08
+
+
+def test_budget_order_and_orientations() -> None:
+    picture = texture((400, 300))
+    keypoints, descriptors = sift(picture, max_num_features=500)
+    assert keypoints.shape == (500, 4)
+    assert descriptors.shape == (500, 128)
+    assert descriptors.dtype == np.uint8
+    order = np.lexsort((keypoints[:, 3], keypoints[:, 1], keypoints[:, 0], -keypoints[:, 2]))
+    np.testing.assert_array_equal(order, np.arange(500))
+    # RootSIFT times 512 is as long as 512, but for rounding
+    length = np.linalg.norm(descriptors.astype(float), axis=1)
+    assert length.min() > 500
+    assert length.max() < 524
+    # a full budget holds one orientation per place
+    assert len(np.unique(keypoints[:, :3], axis=0)) == 500
+    everything, _ = sift(picture, max_num_features=100_000)
+    _, counts = np.unique(everything[:, :3], axis=0, return_counts=True)
+    assert counts.max() == 2
+    assert (counts == 2).mean() > 0.03
+    single, _ = sift(picture, max_num_features=100_000, max_num_orientations=1)
+    assert len(single) == len(counts)
+
+
+def test_no_part_of_the_picture_goes_without() -> None:
+    """A busy half may not take the whole budget from a faint one."""
+    picture = texture((400, 400)).astype(float)
+    picture[:, 200:] = 128 + (picture[:, 200:] - 128) * 0.15
+    keypoints, _ = sift(picture.astype(np.uint8), max_num_features=800)
+    share = (keypoints[:, 0] > 200).mean()
+    assert 0.08 < share < 0.4
+
+
+def test_mask_blanks() -> None:
+    picture = texture((300, 200))
+    usable = np.zeros((200, 300), bool)
+    usable[50:150, 100:200] = True
+    keypoints, _ = sift(picture, usable)
+    assert len(keypoints) > 100
+    assert keypoints[:, 0].min() >= 100
+    assert keypoints[:, 0].max() <= 200
+    assert keypoints[:, 1].min() >= 50
+    assert keypoints[:, 1].max() <= 150
+    assert len(sift(picture, np.zeros((200, 300), bool))[0]) == 0
+
+
+def test_dark_pictures_keep_most_keypoints() -> None:
+    picture = texture((400, 300))
+    bright, _ = sift(picture)
+    dark, _ = sift((picture // 12).astype(np.uint8))
+    assert len(dark) > 0.5 * len(bright)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 2), (1, 500), (9, 9), (640, 3), (37, 41)])
+@pytest.mark.parametrize("level", [0, 255])
+def test_nothing_in_constant_or_tiny_pictures(size: tuple[int, int], level: int) -> None:
+    keypoints, descriptors = sift(np.full(size, level, np.uint8))
+    assert keypoints.shape == (0, 4)
+    assert descriptors.shape == (0, 128)
+
+
+def test_noise_and_stripes_survive() -> None:
+    rng = np.random.default_rng(1)
+    assert len(sift(rng.integers(0, 256, (200, 300), np.uint8))[0]) > 500
+    stripes = np.tile((np.arange(300) // 4 % 2 * 255).astype(np.uint8), (200, 1))
+    assert len(sift(stripes)[0]) < 100
+
+
+# --------------------------------------------------------------------------------------- against pycolmap
+
+
+def half_size(path: Path) -> np.ndarray:
+    import cv2
+
+    gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    return cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+
+
+def colmap_sift(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
+    with pytest.warns(DeprecationWarning, match="deprecated"):
+        extractor = pycolmap.Sift(options, pycolmap.Device.cpu)
+    keypoints, descriptors = extractor.extract(np.ascontiguousarray(gray))
+    return keypoints, np.clip(np.rint(512 * descriptors), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", ["fountain-P11/images/0003.jpg", "lund-door/images/DSC_0003.JPG"])
+def test_same_places_as_colmap(data_root: Path, name: str) -> None:
+    from scipy.spatial import cKDTree
+
+    gray = half_size(data_root / name)
+    ours, our_descriptors = sift(gray)
+    theirs, their_descriptors = colmap_sift(gray)
+
+    def key(keypoints: np.ndarray) -> np.ndarray:
+        turn = np.column_stack([np.cos(keypoints[:, 3]), np.sin(keypoints[:, 3])])
+        return np.column_stack([keypoints[:, :2], 2 * np.log2(keypoints[:, 2]), 4 * turn])
+
+    distance, at = cKDTree(key(theirs)).query(key(ours))
+    same = distance < 0.7
+    assert same.mean() > 0.4
+    offset = (ours[:, :2] - theirs[at, :2])[same]
+    assert np.abs(np.median(offset, axis=0)).max() < 0.005
+    assert np.abs(offset.mean(axis=0)).max() < 0.01
+    # the finest levels are blurred otherwise on purpose; the coarser ones are the same
+    assert np.median(np.abs(offset), axis=0).max() < 0.1
+    assert np.median(np.abs(offset[ours[same, 2] > 2.0]), axis=0).max() < 0.05
+    # the layout is COLMAP's: descriptors of either can be matched with those of the other
+    apart = np.linalg.norm(our_descriptors[same].astype(float) - their_descriptors[at[same]], axis=1) / 512
+    assert np.median(apart) < 0.15
+
+
+def true_fundamental(data_root: Path, scene: str, first: int, second: int) -> tuple[list[Path], np.ndarray]:
+    """Files and F (house pixels of the half-size pictures) of two views."""
+    cameras = [json.loads((data_root / scene / "cameras.json").read_text())["cameras"][i] for i in (first, second)]
+    inverse_k, rotation, translation = [], [], []
+    for camera in cameras:
+        k = np.array(camera["K"])
+        k[:2, 2] += 0.5
+        inverse_k.append(np.linalg.inv(np.diag([0.5, 0.5, 1.0]) @ k))
+        rotation.append(np.array(camera["R_w2c"]))
+        translation.append(np.array(camera["t_w2c"]))
+    turn = rotation[1] @ rotation[0].T
+    t = translation[1] - turn @ translation[0]
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    return [data_root / scene / camera["file"] for camera in cameras], inverse_k[1].T @ cross @ turn @ inverse_k[0]
+
+
+def true_matches(features: list[tuple[np.ndarray, np.ndarray]], fundamental: np.ndarray) -> np.ndarray:
+    """Epipolar errors (pixels, below 1.5) of mutual nearest neighbours that pass the ratio test, each place once."""
+    (xy1, d1), (xy2, d2) = ((k[:, :2].astype(float), d.astype(np.float32)) for k, d in features)
+    product = (d1 / np.linalg.norm(d1, axis=1)[:, None]) @ (d2 / np.linalg.norm(d2, axis=1)[:, None]).T
+    best = product.argmax(axis=1)
+    two = -np.partition(-product, 1, axis=1)[:, :2]
+    angle = np.arccos(np.clip(two, -1, 1))
+    good = (product.argmax(axis=0)[best] == np.arange(len(d1))) & (angle[:, 0] < 0.8 * angle[:, 1])
+    p, q = xy1[good], xy2[best[good]]
+    _, once = np.unique(np.round(np.column_stack([p, q]), 2), axis=0, return_index=True)
+    p, q = (np.column_stack([a[once], np.ones(len(once))]) for a in (p, q))
+    l2, l1 = p @ fundamental.T, q @ fundamental
+    error = np.abs((q * l2).sum(axis=1)) / np.sqrt(np.hypot(*l2[:, :2].T) * np.hypot(*l1[:, :2].T))
+    return error[error < 1.5]
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(("scene", "first"), [("fountain-P11", 4), ("herz-jesus-P8", 2)])
+def test_more_true_matches_than_colmap(data_root: Path, scene: str, first: int) -> None:
+    """With no more keypoints than COLMAP found, more true matches, and these no further from their epipolar lines."""
+    files, fundamental = true_fundamental(data_root, scene, first, first + 1)
+    pictures = [half_size(path) for path in files]
+    theirs = [colmap_sift(gray) for gray in pictures]
+    ours = [sift(gray, max_num_features=len(t[0])) for gray, t in zip(pictures, theirs, strict=True)]
+    our_error, their_error = true_matches(ours, fundamental), true_matches(theirs, fundamental)
+    assert len(our_error) > 1.05 * len(their_error)
+    assert np.median(our_error) < 1.03 * np.median(their_error)
