@@ -18,7 +18,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.kernels import linearize, robust_weight
+from sfmapp.adjust.kernels import SCRATCH, linearize, robust_weight
+from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.adjust.problem import Problem, make_problem
 from sfmapp.adjust.solver import AdjustOptions, Engine, IntrinsicPriors
 from sfmapp.geometry import rigid3
@@ -115,7 +116,7 @@ def _variance(engine: Engine, num_unknowns: int) -> float:
     p = engine.problem
     total = _weighted_squares(
         p.point_ptr, p.obs_image, p.obs_xy, p.xyz, engine.rows, p.image_camera, p.canonical, p.fisheye, p.penalty,
-        engine.loss, engine.scale2,
+        engine.loss, engine.scale2, np.zeros(SCRATCH),
     )  # fmt: skip
     free_gauge = 7 if (p.image_block >= 0).all() and not p.is_constant.any() and engine.extras is None else 0
     dof = 2 * p.num_observations - 3 * int((~p.is_constant).sum()) - num_unknowns + free_gauge
@@ -211,7 +212,7 @@ def _collect(engine: Engine, covariance: Array, variance: float, num_gauge: int,
         _point_covariances(
             p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, engine.rows, p.image_camera, p.image_block,
             p.canonical, p.fisheye, p.penalty, p.camera_block, p.free.ptr, p.free.slot, p.free.column, p.num_blocks,
-            engine.loss, engine.scale2, engine.factor, covariance, variance, points,
+            engine.loss, engine.scale2, engine.factor, covariance, variance, np.zeros(SCRATCH), points,
         )  # fmt: skip
     return Covariances(
         image_idx=p.image_idx[images],
@@ -273,32 +274,32 @@ def _apply_similarity(model: Reconstruction, images: NDArray[np.int64], move: Ar
     model.point_xyz[:] = scale * (model.point_xyz - mean) @ turn.T + mean + shift
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _weighted_squares(  # type: ignore[no-untyped-def]
-    point_ptr, obs_image, obs_xy, xyz, poses, image_camera, canonical, fisheye, penalty, loss, scale2
+    point_ptr, obs_image, obs_xy, xyz, poses, image_camera, canonical, fisheye, penalty, loss, scale2, J
 ):
     """Sum of rho'(s) s over all observations."""
-    J = np.zeros(80)
+    scratch, pose, lens = pointer(J), pointer(poses), pointer(canonical)
     total = 0.0
     for p in range(xyz.shape[0]):
         for o in range(point_ptr[p], point_ptr[p + 1]):
             i = obs_image[o]
             c = image_camera[i]
             s = linearize(
-                poses[i], canonical[c], fisheye[c], xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss,
-                scale2, penalty[c], False, J,
+                offset(pose, 12 * i), offset(lens, 8 * c), fisheye[c], xyz[p, 0], xyz[p, 1], xyz[p, 2],
+                obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c], False, scratch,
             )  # fmt: skip
             total += robust_weight(loss, scale2, s) * s
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _point_covariances(  # type: ignore[no-untyped-def]
     point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_camera, image_block, canonical, fisheye, penalty,
-    camera_block, free_ptr, free_slot, free_column, num_blocks, loss, scale2, factor, covariance, variance, out,
+    camera_block, free_ptr, free_slot, free_column, num_blocks, loss, scale2, factor, covariance, variance, J, out,
 ):  # fmt: skip
     """``V^-1 (variance V + W^T C W) V^-1`` of each point, with V^-1 = L^-T L^-1 from the factor; C in full blocks."""
-    J = np.zeros(80)
+    scratch, pose, lens = pointer(J), pointer(poses), pointer(canonical)
     mark = np.full(num_blocks, -1, np.int64)
     W = np.zeros((num_blocks * 8, 3))
     touched = np.zeros(num_blocks, np.int64)
@@ -315,8 +316,8 @@ def _point_covariances(  # type: ignore[no-untyped-def]
             i = obs_image[o]
             c = image_camera[i]
             linearize(
-                poses[i], canonical[c], fisheye[c], xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss,
-                scale2, penalty[c], True, J,
+                offset(pose, 12 * i), offset(lens, 8 * c), fisheye[c], xyz[p, 0], xyz[p, 1], xyz[p, 2],
+                obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c], True, scratch,
             )  # fmt: skip
             for block in (image_block[i], camera_block[c]):
                 if block >= 0 and mark[block] != p:
@@ -330,8 +331,8 @@ def _point_covariances(  # type: ignore[no-untyped-def]
                         W[image_block[i] * 8 + k, j] += J[k] * J[48 + j] + J[8 + k] * J[56 + j]
                 if camera_block[c] >= 0:
                     for n in range(free_ptr[c], free_ptr[c + 1]):
-                        k, slot = camera_block[c] * 8 + free_column[n], 16 + free_slot[n]
-                        W[k, j] += J[slot] * J[48 + j] + J[slot + 8] * J[56 + j]
+                        k, slot = camera_block[c] * 8 + free_column[n], 16 + 2 * free_slot[n]
+                        W[k, j] += J[slot] * J[48 + j] + J[slot + 1] * J[56 + j]
         M[:] = 0.0
         for a in range(count):
             for b in range(count):

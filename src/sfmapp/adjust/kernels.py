@@ -15,22 +15,22 @@ from __future__ import annotations
 import math
 
 import numba
-import numpy as np
 
-from sfmapp.adjust.lanes import add2, assign3, subtract3
-from sfmapp.scene.camera import distort
+from sfmapp.adjust.lanes import add2, assign3, offset, pointer, spread, store8, subtract3
 
 # The numbers by which kernels know the losses.
 LOSS_IDS: dict[str, int] = {"trivial": 0, "huber": 1, "cauchy": 2}
 
-# Offsets in the scratch row of one observation: two rows each of pose (and merged intrinsics), canonical or free
-# intrinsics and point, and the residual.
-_POSE, _CANON, _INTR, _POINT, _RES, _SCRATCH = 0, 16, 32, 48, 64, 80
+# Offsets in the scratch row of one observation: two rows each of pose (and merged intrinsics); canonical intrinsics,
+# interleaved; free intrinsics; and point, with the residual in the fourth place.
+POSE, CANON, INTR, POINT, SCRATCH = 0, 16, 32, 48, 64
+# What one chunk needs besides, in doubles: the scratch row, the point's normal equations and its eliminator.
+_NORMAL, _SMALL, _ZEROS, _FIXED = 64, 88, 112, 128
 # Smallest depth that counts as in front of the camera, relative to the distance.
 _MIN_COS = 1e-6
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def robust_weight(loss: int, scale2: float, s: float) -> float:
     """rho'(s), the weight of a squared residual s (Holland and Welsch 1977).
 
@@ -43,7 +43,7 @@ def robust_weight(loss: int, scale2: float, s: float) -> float:
     return scale2 / (scale2 + s)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def add_loss(loss, scale2, s, total, product):  # type: ignore[no-untyped-def]
     """Add rho(s) to a sum that starts as (0, 1); returns the new (total, product), see :func:`total_loss`.
 
@@ -59,114 +59,127 @@ def add_loss(loss, scale2, s, total, product):  # type: ignore[no-untyped-def]
     return total, product
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def total_loss(scale2: float, total: float, product: float) -> float:
     """The cost, half of the sum of rho, of a sum by :func:`add_loss`."""
     return 0.5 * (total + scale2 * math.log(product))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def linearize(pose, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, penalty, intrinsics, J):  # type: ignore[no-untyped-def]
     """Weighted Jacobians and residual of one observation into the scratch row J; returns the squared residual.
 
-    pose: 12 numbers, R row by row and t. c: canonical intrinsics, whose derivatives are wanted if ``intrinsics``.
-    Behind the camera the Jacobians are zero and the squared residual is ``penalty``, so that a point gains nothing by
-    slipping there.
+    pose, c and J are pointers: to 12 numbers, R row by row and t; to 8 canonical intrinsics, whose derivatives are
+    wanted if ``intrinsics``; and to the scratch row. Behind the camera the Jacobians are zero and the squared residual
+    is ``penalty``, so that a point gains nothing by slipping there.
     """
     px = pose[0] * x0 + pose[1] * x1 + pose[2] * x2 + pose[9]
     py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]
     pz = pose[6] * x0 + pose[7] * x1 + pose[8] * x2 + pose[11]
-    if not pz > _MIN_COS * (abs(px) + abs(py)):
-        for i in range(_SCRATCH):
-            J[i] = 0.0
-        return penalty
-    iz = 1.0 / pz
-    u = px * iz
-    v = py * iz
-    r2 = u * u + v * v
-    fx, fy = c[0], c[1]
-    if fisheye:
-        r = math.sqrt(r2)
-        if r < 1e-8:
-            s, slope, q = 1.0, 2.0 * (c[4] - 1.0 / 3.0), 0.0
-            t2 = r2
+    s2 = penalty
+    if pz > _MIN_COS * (abs(px) + abs(py)):
+        iz = 1.0 / pz
+        u = px * iz
+        v = py * iz
+        r2 = u * u + v * v
+        fx, fy = c[0], c[1]
+        d0, d1, d2, d3 = c[4], c[5], c[6], c[7]
+        if fisheye:
+            r = math.sqrt(r2)
+            if r < 1e-8:
+                s, slope, q = 1.0, 2.0 * (d0 - 1.0 / 3.0), 0.0
+                t2 = r2
+            else:
+                theta = math.atan(r)
+                t2 = theta * theta
+                q = theta * t2 / r
+                s = theta * (1.0 + t2 * (d0 + t2 * (d1 + t2 * (d2 + t2 * d3)))) / r
+                rate = 1.0 + t2 * (3.0 * d0 + t2 * (5.0 * d1 + t2 * (7.0 * d2 + t2 * 9.0 * d3)))
+                slope = (rate / (1.0 + r2) - s) / r2
+            ud, vd = s * u, s * v
+            a = s + u * u * slope
+            b = u * v * slope
+            d = s + v * v * slope
+            k0u, k0v = q * u, q * v
+            k1u, k1v = t2 * k0u, t2 * k0v
+            k2u, k2v = t2 * k1u, t2 * k1v
+            k3u, k3v = t2 * k2u, t2 * k2v
         else:
-            theta = math.atan(r)
-            t2 = theta * theta
-            q = theta * t2 / r
-            s = theta * (1.0 + t2 * (c[4] + t2 * (c[5] + t2 * (c[6] + t2 * c[7])))) / r
-            rate = 1.0 + t2 * (3.0 * c[4] + t2 * (5.0 * c[5] + t2 * (7.0 * c[6] + t2 * 9.0 * c[7])))
-            slope = (rate / (1.0 + r2) - s) / r2
-        ud, vd = s * u, s * v
-        a = s + u * u * slope
-        b = u * v * slope
-        d = s + v * v * slope
-        k0u, k0v = q * u, q * v
-        k1u, k1v = t2 * k0u, t2 * k0v
-        k2u, k2v = t2 * k1u, t2 * k1v
-        k3u, k3v = t2 * k2u, t2 * k2v
+            radial = 1.0 + r2 * (d0 + r2 * d1)
+            slope = 2.0 * (d0 + 2.0 * r2 * d1)
+            k0u, k0v = r2 * u, r2 * v
+            k1u, k1v = r2 * k0u, r2 * k0v
+            k2u, k2v = 2.0 * u * v, r2 + 2.0 * v * v
+            k3u, k3v = r2 + 2.0 * u * u, k2u
+            ud = u * radial + d2 * k2u + d3 * k3u
+            vd = v * radial + d2 * k2v + d3 * k3v
+            a = radial + u * u * slope + 2.0 * d2 * v + 6.0 * d3 * u
+            b = u * v * slope + 2.0 * d2 * u + 2.0 * d3 * v
+            d = radial + v * v * slope + 2.0 * d3 * u + 6.0 * d2 * v
+        e0 = fx * ud + c[2] - xo
+        e1 = fy * vd + c[3] - yo
+        s2 = e0 * e0 + e1 * e1
+        w = math.sqrt(robust_weight(loss, scale2, s2))
+        fx *= w
+        fy *= w
+        g00, g01, g10, g11 = fx * a * iz, fx * b * iz, fy * b * iz, fy * d * iz
+        g02 = -(g00 * u + g01 * v)
+        g12 = -(g10 * u + g11 * v)
+        store8(J, 0, py * g02 - pz * g01, pz * g00 - px * g02, px * g01 - py * g00, g00, g01, g02, 0.0, 0.0)
+        store8(J, 8, py * g12 - pz * g11, pz * g10 - px * g12, px * g11 - py * g10, g10, g11, g12, 0.0, 0.0)
+        p00 = g00 * pose[0] + g01 * pose[3] + g02 * pose[6]
+        p01 = g00 * pose[1] + g01 * pose[4] + g02 * pose[7]
+        p02 = g00 * pose[2] + g01 * pose[5] + g02 * pose[8]
+        p10 = g10 * pose[0] + g11 * pose[3] + g12 * pose[6]
+        p11 = g10 * pose[1] + g11 * pose[4] + g12 * pose[7]
+        p12 = g10 * pose[2] + g11 * pose[5] + g12 * pose[8]
+        store8(J, POINT, p00, p01, p02, w * e0, 0.0, 0.0, 0.0, 0.0)
+        store8(J, POINT + 8, p10, p11, p12, w * e1, 0.0, 0.0, 0.0, 0.0)
+        if intrinsics:  # fx, fy, cx, cy, d0..d3, for each the change of u and v
+            J[CANON], J[CANON + 1], J[CANON + 2], J[CANON + 3] = w * ud, 0.0, 0.0, w * vd
+            J[CANON + 4], J[CANON + 5], J[CANON + 6], J[CANON + 7] = w, 0.0, 0.0, w
+            J[CANON + 8], J[CANON + 9] = fx * k0u, fy * k0v
+            J[CANON + 10], J[CANON + 11] = fx * k1u, fy * k1v
+            J[CANON + 12], J[CANON + 13] = fx * k2u, fy * k2v
+            J[CANON + 14], J[CANON + 15] = fx * k3u, fy * k3v
     else:
-        radial = 1.0 + r2 * (c[4] + r2 * c[5])
-        slope = 2.0 * (c[4] + 2.0 * r2 * c[5])
-        k0u, k0v = r2 * u, r2 * v
-        k1u, k1v = r2 * k0u, r2 * k0v
-        k2u, k2v = 2.0 * u * v, r2 + 2.0 * v * v
-        k3u, k3v = r2 + 2.0 * u * u, k2u
-        ud = u * radial + c[6] * k2u + c[7] * k3u
-        vd = v * radial + c[6] * k2v + c[7] * k3v
-        a = radial + u * u * slope + 2.0 * c[6] * v + 6.0 * c[7] * u
-        b = u * v * slope + 2.0 * c[6] * u + 2.0 * c[7] * v
-        d = radial + v * v * slope + 2.0 * c[7] * u + 6.0 * c[6] * v
-    e0 = fx * ud + c[2] - xo
-    e1 = fy * vd + c[3] - yo
-    s2 = e0 * e0 + e1 * e1
-    w = math.sqrt(robust_weight(loss, scale2, s2))
-    J[_RES] = w * e0
-    J[_RES + 8] = w * e1
-    fx *= w
-    fy *= w
-    g00, g01, g10, g11 = fx * a * iz, fx * b * iz, fy * b * iz, fy * d * iz
-    g02 = -(g00 * u + g01 * v)
-    g12 = -(g10 * u + g11 * v)
-    J[0] = py * g02 - pz * g01
-    J[1] = pz * g00 - px * g02
-    J[2] = px * g01 - py * g00
-    J[3] = g00
-    J[4] = g01
-    J[5] = g02
-    J[8] = py * g12 - pz * g11
-    J[9] = pz * g10 - px * g12
-    J[10] = px * g11 - py * g10
-    J[11] = g10
-    J[12] = g11
-    J[13] = g12
-    J[_POINT] = g00 * pose[0] + g01 * pose[3] + g02 * pose[6]
-    J[_POINT + 1] = g00 * pose[1] + g01 * pose[4] + g02 * pose[7]
-    J[_POINT + 2] = g00 * pose[2] + g01 * pose[5] + g02 * pose[8]
-    J[_POINT + 8] = g10 * pose[0] + g11 * pose[3] + g12 * pose[6]
-    J[_POINT + 9] = g10 * pose[1] + g11 * pose[4] + g12 * pose[7]
-    J[_POINT + 10] = g10 * pose[2] + g11 * pose[5] + g12 * pose[8]
-    if intrinsics:  # fx, fy, cx, cy, d0..d3
-        J[_CANON], J[_CANON + 9] = w * ud, w * vd
-        J[_CANON + 2] = J[_CANON + 11] = w
-        J[_CANON + 1] = J[_CANON + 3] = J[_CANON + 8] = J[_CANON + 10] = 0.0
-        J[_CANON + 4], J[_CANON + 12] = fx * k0u, fy * k0v
-        J[_CANON + 5], J[_CANON + 13] = fx * k1u, fy * k1v
-        J[_CANON + 6], J[_CANON + 14] = fx * k2u, fy * k2v
-        J[_CANON + 7], J[_CANON + 15] = fx * k3u, fy * k3v
+        for n in range(SCRATCH):
+            J[n] = 0.0
     return s2
 
 
-@numba.njit(cache=True, nogil=True)
-def _gather_intrinsics(J, start, count, slots, columns, offset):  # type: ignore[no-untyped-def]
-    """Add the canonical columns that are free to the two rows at ``offset`` of the scratch row."""
-    for n in range(start, start + count):
-        to, source = offset + columns[n], _CANON + slots[n]
-        J[to] += J[source]
-        J[to + 8] += J[source + 8]
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def squared_residual(pose, c, fisheye, x0, x1, x2, xo, yo, penalty):  # type: ignore[no-untyped-def]
+    """The squared residual of one observation, ``penalty`` behind the camera; arguments as in :func:`linearize`."""
+    px = pose[0] * x0 + pose[1] * x1 + pose[2] * x2 + pose[9]
+    py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]
+    pz = pose[6] * x0 + pose[7] * x1 + pose[8] * x2 + pose[11]
+    s2 = penalty
+    if pz > _MIN_COS * (abs(px) + abs(py)):
+        iz = 1.0 / pz
+        u = px * iz
+        v = py * iz
+        r2 = u * u + v * v
+        d0, d1, d2, d3 = c[4], c[5], c[6], c[7]
+        if fisheye:
+            r = math.sqrt(r2)
+            s = 1.0
+            if r >= 1e-8:
+                theta = math.atan(r)
+                t2 = theta * theta
+                s = theta * (1.0 + t2 * (d0 + t2 * (d1 + t2 * (d2 + t2 * d3)))) / r
+            ud, vd = s * u, s * v
+        else:
+            radial = 1.0 + r2 * (d0 + r2 * d1)
+            ud = u * radial + 2.0 * d2 * u * v + d3 * (r2 + 2.0 * u * u)
+            vd = v * radial + d2 * (r2 + 2.0 * v * v) + 2.0 * d3 * u * v
+        e0 = c[0] * ud + c[2] - xo
+        e1 = c[1] * vd + c[3] - yo
+        s2 = e0 * e0 + e1 * e1
+    return s2
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def find_slot(keys, values, key):  # type: ignore[no-untyped-def]
     """Value of a key in an open hash table of power-of-two size with -1 for empty; -1 where absent."""
     mask = keys.shape[0] - 1
@@ -178,11 +191,72 @@ def find_slot(keys, values, key):  # type: ignore[no-untyped-def]
     return values[h]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def scratch_size(first, last, point_ptr, num_blocks, num_free):  # type: ignore[no-untyped-def]
+    """(doubles, integers) of scratch for points first..last."""
+    longest = 1
+    for p in range(first, last):
+        longest = max(longest, point_ptr[p + 1] - point_ptr[p])
+    places = min(2 * longest, num_blocks) + 1
+    return _FIXED + 8 * num_free + 24 * places, 2 * num_blocks + places
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _place(W, where, mark, blocks, p, block, count):  # type: ignore[no-untyped-def]
+    """Give a block its three rows among those of point p, zeroed at first sight; returns how many there are."""
+    if mark[block] != p + 1:
+        mark[block] = p + 1
+        where[block] = count
+        blocks[count] = block
+        for row in range(3):
+            store8(W, count * 24 + 8 * row, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return count + 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _factor_point(normal, damping, factor, small):  # type: ignore[no-untyped-def]
+    """Factor the damped normal equations (3, 8), gradient in the fourth column, of a point.
+
+    Fills its row of ``point_factor`` and the eliminator: L^-T, with L^-1 g in the fourth column. False without depth.
+    """
+    v00, v11, v22 = normal[0], normal[9], normal[18]
+    # a direction without any information keeps a unit diagonal, so that its step is zero
+    d0 = damping * (v00 if v00 > 0.0 else 1.0)
+    d1 = damping * (v11 if v11 > 0.0 else 1.0)
+    d2 = damping * (v22 if v22 > 0.0 else 1.0)
+    v00 += d0
+    v11 += d1
+    v22 += d2
+    i0 = 1.0 / math.sqrt(v00)
+    l10, l20 = normal[1] * i0, normal[2] * i0
+    pivot1 = v11 - l10 * l10
+    i1 = 1.0 / math.sqrt(pivot1)
+    l21 = (normal[10] - l10 * l20) * i1
+    pivot2 = v22 - l20 * l20 - l21 * l21
+    # rounding leaves about 1e-16 of the diagonal in a pivot that should be zero
+    if not (v00 > 0.0 and pivot1 > 1e-15 * v11 and pivot2 > 1e-15 * v22):
+        for k in range(12):
+            factor[k] = 0.0
+        return False
+    i2 = 1.0 / math.sqrt(pivot2)
+    m10 = -l10 * i0 * i1
+    m21 = -l21 * i1 * i2
+    m20 = -(l20 * i0 + l21 * m10) * i2
+    g0, g1, g2 = normal[3], normal[11], normal[19]
+    factor[0], factor[1], factor[2], factor[3], factor[4], factor[5] = i0, m10, i1, m20, m21, i2
+    factor[6], factor[7], factor[8], factor[9], factor[10], factor[11] = g0, g1, g2, d0, d1, d2
+    small[0], small[1], small[2], small[3] = i0, m10, m20, i0 * g0
+    small[8], small[9], small[10], small[11] = 0.0, i1, m21, m10 * g0 + i1 * g1
+    small[16], small[17], small[18], small[19] = 0.0, 0.0, i2, m20 * g0 + m21 * g1 + i2 * g2
+    return True
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def reduce_points(  # type: ignore[no-untyped-def]
     first, last, point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_camera, image_block, intrinsics, fisheye,
     penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, damping, hash_keys, hash_values,
-    tiles, own, cross, gradient, point_factor,
+    tiles, own, cross, gradient, point_factor, scratch, integers,
 ):  # fmt: skip
     """Linearise points first..last and eliminate them; returns the cost of their observations.
 
@@ -197,159 +271,77 @@ def reduce_points(  # type: ignore[no-untyped-def]
         hash_keys, hash_values: tile of block pair a <= b under key a B + b; empty if that number is the tile's as well.
         tiles: (N * 64,) out: sum of -Z_a Z_b^T. own: (B * 64,) out: J^T J of each block with itself, not eliminated.
         cross: (I * 64,) out: J_pose^T J_intrinsics of images whose camera has a block of its own.
-        gradient: (2, B * 8) out: J^T r before elimination, and what elimination adds to it.
+        gradient: (2 * B * 8,) out: J^T r before elimination, and what elimination adds to it.
         point_factor: (P, 12) out: L^-1 (l00 l10 l11 l20 l21 l22), gradient, damped diagonal increment; all zero for a
             point that has no depth at all.
+        scratch, integers: of :func:`scratch_size`, of any content.
     """
     num_blocks = block_dim.shape[0]
-    dense = hash_keys.shape[0] == 0
-    tiles[:] = 0.0
-    own[:] = 0.0
-    cross[:] = 0.0
-    gradient[:] = 0.0
-    plain, eliminated = gradient[0], gradient[1]
-    J = np.zeros(_SCRATCH)
-    small = np.zeros(24)
-    mark = np.full(num_blocks, -1, np.int64)
-    where = np.zeros(num_blocks, np.int64)
-    longest = 1
-    for p in range(first, last):
-        longest = max(longest, point_ptr[p + 1] - point_ptr[p])
-    W = np.zeros(min(2 * longest, num_blocks + 1) * 24)
-    blocks = np.zeros(min(2 * longest, num_blocks + 1), np.int64)
+    tiles[:], own[:], cross[:], gradient[:], scratch[:], integers[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0
+    pose, lens, J = pointer(poses), pointer(intrinsics), pointer(scratch)
+    tile, mark = pointer(tiles), pointer(integers)
+    where, blocks = offset(mark, num_blocks), offset(mark, 2 * num_blocks)
+    normal, small, zeros, units = offset(J, _NORMAL), offset(J, _SMALL), offset(J, _ZEROS), offset(J, _FIXED)
+    W = offset(units, 8 * free_slot.shape[0])
+    for n in range(free_slot.shape[0]):
+        units[n * 8 + free_column[n]] = 1.0
     cost, product = 0.0, 1.0
     for p in range(first, last):
         x0, x1, x2 = xyz[p, 0], xyz[p, 1], xyz[p, 2]
         moves = not is_constant[p]
-        v00 = v01 = v02 = v11 = v12 = v22 = g0 = g1 = g2 = 0.0
         count = 0
+        for row in range(3):
+            store8(normal, 8 * row, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         for o in range(point_ptr[p], point_ptr[p + 1]):
             i = obs_image[o]
             c = image_camera[i]
-            other = camera_block[c]
+            block, other = image_block[i], camera_block[c]
             s2 = linearize(
-                poses[i],
-                intrinsics[c],
-                fisheye[c],
-                x0,
-                x1,
-                x2,
-                obs_xy[o, 0],
-                obs_xy[o, 1],
-                loss,
-                scale2,
-                penalty[c],
-                other >= 0,
-                J,
-            )
+                offset(pose, 12 * i), offset(lens, 8 * c), fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss,
+                scale2, penalty[c], other >= 0, J,
+            )  # fmt: skip
             cost, product = add_loss(loss, scale2, s2, cost, product)
             if moves:
-                a0, a1, a2 = J[_POINT], J[_POINT + 1], J[_POINT + 2]
-                b0, b1, b2 = J[_POINT + 8], J[_POINT + 9], J[_POINT + 10]
-                r0, r1 = J[_RES], J[_RES + 8]
-                v00 += a0 * a0 + b0 * b0
-                v01 += a0 * a1 + b0 * b1
-                v02 += a0 * a2 + b0 * b2
-                v11 += a1 * a1 + b1 * b1
-                v12 += a1 * a2 + b1 * b2
-                v22 += a2 * a2 + b2 * b2
-                g0 += a0 * r0 + b0 * r1
-                g1 += a1 * r0 + b1 * r1
-                g2 += a2 * r0 + b2 * r1
-            block = image_block[i]
+                add2(normal, 0, J, POINT, J, POINT, 3)
             if block >= 0:
                 if other == block:
-                    J[6] = J[7] = J[14] = J[15] = 0.0
-                    _gather_intrinsics(J, free_ptr[c], free_ptr[c + 1] - free_ptr[c], free_slot, free_column, _POSE)
-                    add2(own, block * 64, J, _POSE, J, _POSE, 8)
-                else:
-                    J[6] = J[7] = J[14] = J[15] = 0.0
-                    add2(own, block * 64, J, _POSE, J, _POSE, 6)
-                add2(plain, block * 8, J, _RES, J, _POSE, 1)
+                    spread(J, POSE, J, J, CANON, free_slot, units, free_ptr[c], free_ptr[c + 1])
+                add2(own, block * 64, J, POSE, J, POSE, block_dim[block])
+                add2(gradient, block * 8, J, POINT + 3, J, POSE, 1)
                 if moves:
-                    if mark[block] != p:
-                        mark[block] = p
-                        where[block] = count
-                        blocks[count] = block
-                        W[count * 24 : count * 24 + 24] = 0.0
-                        count += 1
-                    add2(W, where[block] * 24, J, _POINT, J, _POSE, 3)
+                    count = _place(W, where, mark, blocks, p, block, count)
+                    add2(W, where[block] * 24, J, POINT, J, POSE, 3)
             if other >= 0 and other != block:
-                J[_INTR : _INTR + 16] = 0.0
-                _gather_intrinsics(J, free_ptr[c], free_ptr[c + 1] - free_ptr[c], free_slot, free_column, _INTR)
-                add2(own, other * 64, J, _INTR, J, _INTR, block_dim[other])
-                add2(plain, other * 8, J, _RES, J, _INTR, 1)
+                spread(J, INTR, zeros, J, CANON, free_slot, units, free_ptr[c], free_ptr[c + 1])
+                add2(own, other * 64, J, INTR, J, INTR, block_dim[other])
+                add2(gradient, other * 8, J, POINT + 3, J, INTR, 1)
                 if block >= 0:
-                    add2(cross, i * 64, J, _POSE, J, _INTR, 6)
+                    add2(cross, i * 64, J, POSE, J, INTR, 6)
                 if moves:
-                    if mark[other] != p:
-                        mark[other] = p
-                        where[other] = count
-                        blocks[count] = other
-                        W[count * 24 : count * 24 + 24] = 0.0
-                        count += 1
-                    add2(W, where[other] * 24, J, _POINT, J, _INTR, 3)
-        if not moves:
+                    count = _place(W, where, mark, blocks, p, other, count)
+                    add2(W, where[other] * 24, J, POINT, J, INTR, 3)
+        if not moves or not _factor_point(normal, damping, offset(pointer(point_factor), 12 * p), small):
             continue
-        # a direction without any information keeps a unit diagonal, so that its step is zero
-        d0 = damping * (v00 if v00 > 0.0 else 1.0)
-        d1 = damping * (v11 if v11 > 0.0 else 1.0)
-        d2 = damping * (v22 if v22 > 0.0 else 1.0)
-        v00 += d0
-        v11 += d1
-        v22 += d2
-        factor = point_factor[p]
-        pivot1 = v11 - v01 * v01 / v00
-        c12 = v12 - v01 * v02 / v00
-        pivot2 = v22 - v02 * v02 / v00 - c12 * c12 / pivot1
-        # rounding leaves about 1e-16 of the diagonal in a pivot that should be zero
-        if not (pivot1 > 1e-15 * v11 and pivot2 > 1e-15 * v22):
-            factor[:] = 0.0
-            continue
-        i0 = 1.0 / math.sqrt(v00)
-        i1 = 1.0 / math.sqrt(pivot1)
-        i2 = 1.0 / math.sqrt(pivot2)
-        l10 = v01 * i0
-        l20 = v02 * i0
-        l21 = c12 * i1
-        m10 = -l10 * i0 * i1
-        m21 = -l21 * i1 * i2
-        m20 = -(l20 * i0 + l21 * m10) * i2
-        factor[0], factor[1], factor[2], factor[3], factor[4], factor[5] = i0, m10, i1, m20, m21, i2
-        factor[6], factor[7], factor[8] = g0, g1, g2
-        factor[9], factor[10], factor[11] = d0, d1, d2
-        # Z = W L^-T in place; its row of three for the gradient rides along
-        small[0], small[1], small[2] = i0, m10, m20
-        small[9], small[10], small[18] = i1, m21, i2
-        small[4] = i0 * g0
-        small[12] = m10 * g0 + i1 * g1
-        small[20] = m20 * g0 + m21 * g1 + i2 * g2
         for n in range(count):
+            # Z = W L^-T in place
             assign3(W, n * 24, small, 0, W, n * 24, 3)
-            subtract3(eliminated, blocks[n] * 8, small, 4, W, n * 24, 1)
+            subtract3(gradient, (num_blocks + blocks[n]) * 8, small, 3, W, n * 24, 1)
         for n in range(count):
-            a = blocks[n]
             for m in range(n, count):
-                b = blocks[m]
                 # tiles are kept for a <= b only
-                if a <= b:
-                    tile = a * num_blocks + b
-                    if not dense:
-                        tile = find_slot(hash_keys, hash_values, tile)
-                    subtract3(tiles, tile * 64, W, n * 24, W, m * 24, block_dim[a])
-                else:
-                    tile = b * num_blocks + a
-                    if not dense:
-                        tile = find_slot(hash_keys, hash_values, tile)
-                    subtract3(tiles, tile * 64, W, m * 24, W, n * 24, block_dim[b])
+                low, high = (n, m) if blocks[n] <= blocks[m] else (m, n)
+                key = blocks[low] * num_blocks + blocks[high]
+                if hash_keys.shape[0] > 0:
+                    key = find_slot(hash_keys, hash_values, key)
+                subtract3(tile, key * 64, W, low * 24, W, high * 24, block_dim[blocks[low]])
     return total_loss(scale2, cost, product)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def substitute_points(  # type: ignore[no-untyped-def]
     first, last, point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_camera, image_block, intrinsics, fisheye,
     penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, point_factor, step, new_poses,
-    new_intrinsics, new_xyz, sums,
+    new_intrinsics, new_xyz, sums, scratch,
 ):  # fmt: skip
     """Steps of points first..last after those of the blocks, and the cost of the state that results.
 
@@ -358,14 +350,14 @@ def substitute_points(  # type: ignore[no-untyped-def]
         new_xyz: (P, 3) out.
         sums: (2,) out: cost, and the points' share of the predicted decrease.
     """
-    J = np.zeros(_SCRATCH)
+    J, pose, lens = pointer(scratch), pointer(poses), pointer(intrinsics)
+    new_pose, new_lens = pointer(new_poses), pointer(new_intrinsics)
     cost, product = 0.0, 1.0
     decrease = 0.0
     for p in range(first, last):
         x0, x1, x2 = xyz[p, 0], xyz[p, 1], xyz[p, 2]
-        factor = point_factor[p]
-        if not is_constant[p] and factor[0] > 0.0:
-            h0, h1, h2 = factor[6], factor[7], factor[8]
+        if not is_constant[p] and point_factor[p, 0] > 0.0:
+            h0, h1, h2 = point_factor[p, 6], point_factor[p, 7], point_factor[p, 8]
             for o in range(point_ptr[p], point_ptr[p + 1]):
                 i = obs_image[o]
                 c = image_camera[i]
@@ -374,33 +366,33 @@ def substitute_points(  # type: ignore[no-untyped-def]
                 if block < 0 and other < 0:
                     continue
                 linearize(
-                    poses[i], intrinsics[c], fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2,
-                    penalty[c], other >= 0, J,
+                    offset(pose, 12 * i), offset(lens, 8 * c), fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss,
+                    scale2, penalty[c], other >= 0, J,
                 )  # fmt: skip
                 e0 = e1 = 0.0
                 if block >= 0:
                     for k in range(6):
                         d = step[block * 8 + k]
-                        e0 += J[_POSE + k] * d
-                        e1 += J[_POSE + 8 + k] * d
+                        e0 += J[POSE + k] * d
+                        e1 += J[POSE + 8 + k] * d
                 if other >= 0:
                     for n in range(free_ptr[c], free_ptr[c + 1]):
-                        d = step[other * 8 + free_column[n]]
-                        e0 += J[_CANON + free_slot[n]] * d
-                        e1 += J[_CANON + 8 + free_slot[n]] * d
-                h0 += J[_POINT] * e0 + J[_POINT + 8] * e1
-                h1 += J[_POINT + 1] * e0 + J[_POINT + 9] * e1
-                h2 += J[_POINT + 2] * e0 + J[_POINT + 10] * e1
-            y0 = factor[0] * h0
-            y1 = factor[1] * h0 + factor[2] * h1
-            y2 = factor[3] * h0 + factor[4] * h1 + factor[5] * h2
-            s0 = -(factor[0] * y0 + factor[1] * y1 + factor[3] * y2)
-            s1 = -(factor[2] * y1 + factor[4] * y2)
-            s2 = -factor[5] * y2
+                        d, slot = step[other * 8 + free_column[n]], CANON + 2 * free_slot[n]
+                        e0 += J[slot] * d
+                        e1 += J[slot + 1] * d
+                h0 += J[POINT] * e0 + J[POINT + 8] * e1
+                h1 += J[POINT + 1] * e0 + J[POINT + 9] * e1
+                h2 += J[POINT + 2] * e0 + J[POINT + 10] * e1
+            y0 = point_factor[p, 0] * h0
+            y1 = point_factor[p, 1] * h0 + point_factor[p, 2] * h1
+            y2 = point_factor[p, 3] * h0 + point_factor[p, 4] * h1 + point_factor[p, 5] * h2
+            s0 = -(point_factor[p, 0] * y0 + point_factor[p, 1] * y1 + point_factor[p, 3] * y2)
+            s1 = -(point_factor[p, 2] * y1 + point_factor[p, 4] * y2)
+            s2 = -point_factor[p, 5] * y2
             # half of step . (damping step - gradient): what the quadratic model loses, without a second pass
-            decrease += s0 * (factor[9] * s0 - factor[6])
-            decrease += s1 * (factor[10] * s1 - factor[7])
-            decrease += s2 * (factor[11] * s2 - factor[8])
+            decrease += s0 * (point_factor[p, 9] * s0 - point_factor[p, 6])
+            decrease += s1 * (point_factor[p, 10] * s1 - point_factor[p, 7])
+            decrease += s2 * (point_factor[p, 11] * s2 - point_factor[p, 8])
             x0 += s0
             x1 += s1
             x2 += s2
@@ -408,23 +400,15 @@ def substitute_points(  # type: ignore[no-untyped-def]
         for o in range(point_ptr[p], point_ptr[p + 1]):
             i = obs_image[o]
             c = image_camera[i]
-            pose = new_poses[i]
-            pz = pose[6] * x0 + pose[7] * x1 + pose[8] * x2 + pose[11]
-            px = pose[0] * x0 + pose[1] * x1 + pose[2] * x2 + pose[9]
-            py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]
-            if pz > _MIN_COS * (abs(px) + abs(py)):
-                iz = 1.0 / pz
-                u, v = distort(fisheye[c], new_intrinsics[c], px * iz, py * iz)
-                u -= obs_xy[o, 0]
-                v -= obs_xy[o, 1]
-                s2 = u * u + v * v
-            else:
-                s2 = penalty[c]
+            s2 = squared_residual(
+                offset(new_pose, 12 * i), offset(new_lens, 8 * c), fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1],
+                penalty[c],
+            )  # fmt: skip
             cost, product = add_loss(loss, scale2, s2, cost, product)
     sums[0], sums[1] = total_loss(scale2, cost, product), 0.5 * decrease
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def retract(  # type: ignore[no-untyped-def]
     poses, image_block, canonical, camera_block, free_ptr, free_slot, free_column, step, new_poses, new_rows,
     new_canonical,

@@ -20,7 +20,7 @@ def aligned_zeros(*shape: int) -> Array:
     return raw[start : start + size].reshape(shape)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def assemble(  # type: ignore[no-untyped-def]
     tiles, own, cross, gradient, image_block, image_camera, camera_block, block_dim, hash_keys, hash_values, extra_own,
     extra_gradient, diagonal,
@@ -37,7 +37,7 @@ def assemble(  # type: ignore[no-untyped-def]
         cross[0] += cross[k]
         gradient[0] += gradient[k]
     own[0] += extra_own
-    gradient[0, 0] += extra_gradient
+    gradient[0, : num_blocks * 8] += extra_gradient
     for a in range(num_blocks):
         tile = a * num_blocks + a
         if hash_keys.shape[0] > 0:
@@ -61,7 +61,7 @@ def assemble(  # type: ignore[no-untyped-def]
                 tiles[0, tile * 64 + n] += cross[0, i * 64 + n]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def factorize_tiles(tiles, num_blocks, inverse):  # type: ignore[no-untyped-def]
     """Cholesky factor U^T U of the upper tiles (B * B * 64,), in place; inverse (B * 64,) gets the U_kk^-1.
 
@@ -124,7 +124,7 @@ def factorize_tiles(tiles, num_blocks, inverse):  # type: ignore[no-untyped-def]
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def solve_tiles(tiles, num_blocks, inverse, x):  # type: ignore[no-untyped-def]
     """Solve U^T U x = x in place (B * 8,) with the factor of :func:`factorize_tiles`."""
     y = np.empty(8)
@@ -158,7 +158,7 @@ def solve_tiles(tiles, num_blocks, inverse, x):  # type: ignore[no-untyped-def]
             x[8 * k + a] = y[a]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _insert(keys, values, key, value):  # type: ignore[no-untyped-def]
     mask = keys.shape[0] - 1
     h = ((key * 0x9E3779B97F4A7C) >> 20) & mask
@@ -168,7 +168,7 @@ def _insert(keys, values, key, value):  # type: ignore[no-untyped-def]
     values[h] = value
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _hold(keys, values, count, key):  # type: ignore[no-untyped-def]
     """Make sure that a key is in the table; returns the table, four times as large where it was half full."""
     if find_slot(keys, values, key) >= 0:
@@ -184,7 +184,7 @@ def _hold(keys, values, count, key):  # type: ignore[no-untyped-def]
     return keys, values, count + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def hash_tiles(point_ptr, obs_image, image_camera, image_block, camera_block, num_blocks, pairs):  # type: ignore[no-untyped-def]
     """Which pairs of blocks a <= b meet in a point: an open hash table of keys a B + b and tile numbers.
 

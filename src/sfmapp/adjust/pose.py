@@ -9,8 +9,8 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfmapp.adjust.kernels import LOSS_IDS, add_loss, linearize, retract, total_loss
-from sfmapp.adjust.lanes import add2
+from sfmapp.adjust.kernels import LOSS_IDS, POINT, SCRATCH, add_loss, linearize, retract, total_loss
+from sfmapp.adjust.lanes import add2, pointer
 
 Array = NDArray[np.float64]
 
@@ -85,30 +85,33 @@ def refine_pose(
     return RefinedPose(state, row, covariance, is_inlier, cost, iterations)
 
 
-@numba.njit(cache=True, nogil=True)
-def _normal_equations(c, fisheye, row, xyz, xy, loss, scale2, size, penalty, J, information, gradient, residuals2):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _normal_equations(
+    canonical, fisheye, rows, xyz, xy, loss, scale2, size, penalty, J, information, gradient, residuals2
+):  # type: ignore[no-untyped-def]
     """Fill information (64,), gradient (8,) and the squared residuals (N,), infinite behind; returns the cost."""
     information[:] = 0.0
     gradient[:] = 0.0
     total, product = 0.0, 1.0
     for n in range(xyz.shape[0]):
         s2 = linearize(
-            row, c, fisheye, xyz[n, 0], xyz[n, 1], xyz[n, 2], xy[n, 0], xy[n, 1], loss, scale2, -1.0, size > 6, J
-        )
+            pointer(rows), pointer(canonical), fisheye, xyz[n, 0], xyz[n, 1], xyz[n, 2], xy[n, 0], xy[n, 1], loss,
+            scale2, -1.0, size > 6, pointer(J),
+        )  # fmt: skip
         residuals2[n] = s2
         if s2 < 0.0:
             residuals2[n] = math.inf
             s2 = penalty
         total, product = add_loss(loss, scale2, s2, total, product)
         J[7] = J[15] = 0.0
-        J[6] = J[16] + J[17] if size > 6 else 0.0
-        J[14] = J[24] + J[25] if size > 6 else 0.0
+        J[6] = J[16] + J[18] if size > 6 else 0.0
+        J[14] = J[17] + J[19] if size > 6 else 0.0
         add2(information, 0, J, 0, J, 0, 8)
-        add2(gradient, 0, J, 64, J, 0, 1)
+        add2(gradient, 0, J, POINT + 3, J, 0, 1)
     return total_loss(scale2, total, product)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _damped_step(information, gradient, damping, size, step):  # type: ignore[no-untyped-def]
     """Solve (H + damping diag H) step = -gradient by Cholesky; False where that is not positive definite."""
     L = np.zeros((8, 8))
@@ -138,11 +141,11 @@ def _damped_step(information, gradient, damping, size, step):  # type: ignore[no
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _refine(  # type: ignore[no-untyped-def]
     c, fisheye, state, xyz, xy, loss, scale2, size, prior_weight, max_iterations, tolerance, information, residuals2
 ):
-    J = np.zeros(80)
+    J = np.zeros(SCRATCH)
     block, camera_block = np.zeros(1, np.int32), np.full(1, 0 if size > 6 else -1, np.int32)
     free_ptr = np.array([0, 2 if size > 6 else 0])
     free_slot, free_column = np.array([0, 1]), np.array([6, 6])
@@ -158,7 +161,7 @@ def _refine(  # type: ignore[no-untyped-def]
     penalty = 8.0 * focal * focal  # gtsam's choice for points behind the camera
     H, g, new_H, new_g = np.zeros(64), np.zeros(8), np.zeros(64), np.zeros(8)
     new_residuals2 = np.empty(xyz.shape[0])
-    cost = _normal_equations(canonical[0], fisheye, rows[0], xyz, xy, loss, scale2, size, penalty, J, H, g, residuals2)
+    cost = _normal_equations(canonical, fisheye, rows, xyz, xy, loss, scale2, size, penalty, J, H, g, residuals2)
     H[54] += prior_weight
     damping, growth, iterations = 1e-4, 2.0, 0
     while iterations < max_iterations and damping < 1e12:
@@ -172,9 +175,9 @@ def _refine(  # type: ignore[no-untyped-def]
             new_canonical,
         )  # fmt: skip
         new_cost = _normal_equations(
-            new_canonical[0],
+            new_canonical,
             fisheye,
-            new_rows[0],
+            new_rows,
             xyz,
             xy,
             loss,

@@ -200,7 +200,7 @@ def _free_columns(
     return FreeIntrinsics(params, np.array(ptr, np.int64), np.array(slots, np.int64), np.array(columns, np.int64))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _tracks_of_images(images, image_ptr, image_obs, obs_track_idx, num_tracks):  # type: ignore[no-untyped-def]
     """Ascending tracks that some of the images observe."""
     seen = np.zeros(num_tracks, np.bool_)
@@ -210,7 +210,7 @@ def _tracks_of_images(images, image_ptr, image_obs, obs_track_idx, num_tracks): 
     return np.flatnonzero(seen)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _gather(selected, is_constant, track_ptr, obs_image_idx, obs_xy, is_inlier, registered, xyz):  # type: ignore[no-untyped-def]
     """Points that are kept, as positions in ``selected``, and their observations.
 

@@ -243,11 +243,16 @@ class Engine:
         chunks = self.num_chunks
         self.tiles = aligned_zeros(chunks, self.num_tiles * 64)
         self.own, self.cross = aligned_zeros(chunks, blocks * 64), aligned_zeros(chunks, images * 64)
-        self.gradient = aligned_zeros(chunks, 2, blocks * 8)
+        self.gradient = aligned_zeros(chunks, 2 * blocks * 8)
         self.inverse = aligned_zeros(blocks * 64)
         self.diagonal = np.ones(blocks * 8)
         self.factor = np.zeros((len(p.track_idx), 12))
         self.sums = np.zeros((chunks, 2))
+        sizes = [
+            kernels.scratch_size(self.limits[k], self.limits[k + 1], p.point_ptr, blocks, len(p.free.slot))
+            for k in range(chunks)
+        ]
+        self.scratch = [(aligned_zeros(doubles), np.zeros(integers, np.int64)) for doubles, integers in sizes]
         self.rows = pose_rows(p.poses)
         self.new_poses, self.new_rows = np.empty_like(p.poses), np.empty_like(self.rows)
         self.new_canonical, self.new_xyz = np.empty_like(p.canonical), np.empty_like(p.xyz)
@@ -263,6 +268,7 @@ class Engine:
                 p.image_camera, p.image_block, p.canonical, p.fisheye, p.penalty, p.camera_block, p.free.ptr,
                 p.free.slot, p.free.column, p.block_dim, self.loss, self.scale2, damping, self.hash_keys,
                 self.hash_values, self.tiles[k], self.own[k], self.cross[k], self.gradient[k], self.factor,
+                *self.scratch[k],
             )  # fmt: skip
             return cost
 
@@ -285,7 +291,7 @@ class Engine:
     def solve(self) -> Array | None:
         """Step of the blocks (B * 8,), or None where the damped system is not positive definite."""
         p, blocks, tiles = self.problem, self.problem.num_blocks, self.tiles[0]
-        step = -(self.gradient[0, 0] + self.gradient[0, 1])
+        step = -self.gradient[0].reshape(2, -1).sum(0)
         if self.extras is not None:
             self.extras.add_pairs(tiles, self.tile_numbers(self.extras.pairs))
         place = self.tile_numbers(np.arange(blocks) * (blocks + 1))[:, None] * 64 + np.arange(8) * 9
@@ -317,12 +323,12 @@ class Engine:
                 self.limits[k], self.limits[k + 1], p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, self.rows,
                 p.image_camera, p.image_block, p.canonical, p.fisheye, p.penalty, p.camera_block, p.free.ptr,
                 p.free.slot, p.free.column, p.block_dim, self.loss, self.scale2, self.factor, step, self.new_rows,
-                self.new_canonical, self.new_xyz, self.sums[k],
+                self.new_canonical, self.new_xyz, self.sums[k], self.scratch[k][0],
             )  # fmt: skip
 
         list(run(chunk, range(self.num_chunks)))
         cost, decrease = float(self.sums[:, 0].sum()), float(self.sums[:, 1].sum())
-        decrease += 0.5 * float(step @ (self.damping * self.diagonal * step - self.gradient[0, 0]))
+        decrease += 0.5 * float(step @ (self.damping * self.diagonal * step - self.gradient[0, : len(step)]))
         return cost + self.other_cost(self.new_poses, self.new_canonical), decrease
 
     def accept(self) -> None:
