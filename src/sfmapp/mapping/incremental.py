@@ -22,7 +22,7 @@ from sfmapp.images.folder import ImageSet
 from sfmapp.mapping import structure
 from sfmapp.mapping.focal import estimate_focal_ratio
 from sfmapp.mapping.mapper import STAGE, Mapper
-from sfmapp.mapping.merge import find_merge, merge
+from sfmapp.mapping.merge import find_merge, merge, num_linking_points
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images
 from sfmapp.mapping.tracks import build_tracks, track_colors
@@ -138,8 +138,13 @@ def _merge_models(
             mapper.grow()
             mapper.finish()
             new = union.is_registered & ~target.is_registered
-            if mapper.is_supported(new):
-                events.decided(STAGE, f"merged two models by {votes} common points: {int(new.sum())} images more")
+            # images that both models had do not count: they hold the new ones at any scale
+            link = num_linking_points(union, new, target.is_registered & ~source.is_registered)
+            if link >= options.min_pose_inliers:
+                num_new = int(new.sum())
+                events.decided(
+                    STAGE, f"merged two models by {votes} common points: {num_new} images more, {link} links"
+                )
                 merged[n] = union
                 break
         else:

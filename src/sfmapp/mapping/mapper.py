@@ -272,12 +272,6 @@ class Mapper:
             self.times_dropped[i] = self.times_dropped.get(i, 0) + 1
             self.events.decided(STAGE, f"took back {reconstruction.image_names[i]}: {reason}")
 
-    def is_supported(self, images: NDArray[np.bool_]) -> bool:
-        """True if each of the given images (I,) still observes enough points after an adjustment."""
-        tracks, used = self.reconstruction.tracks, self.reconstruction.obs_is_inlier
-        counts = np.bincount(tracks.obs_image_idx[used], minlength=tracks.num_images)
-        return bool((counts[images] >= self.options.min_pose_inliers).all())
-
     # ---------------------------------------------------------------- helpers
 
     def _size(self) -> tuple[int, int]:

@@ -90,3 +90,12 @@ def find_merge(target: Reconstruction, source: Reconstruction) -> tuple[float, N
     shared = np.flatnonzero(target.is_registered & source.is_registered)
     found = [similarity_through_image(target, source, int(i)) for i in shared]
     return max((f for f in found if f is not None), key=lambda f: f[2], default=None)
+
+
+def num_linking_points(union: Reconstruction, new: NDArray[np.bool_], old: NDArray[np.bool_]) -> int:
+    """Points of a union that both a new and an old image (masks, (I,) bool) observe: what holds it together."""
+    used, image, track = union.obs_is_inlier, union.tracks.obs_image_idx, union.tracks.obs_track_idx
+    seen = np.zeros((2, union.tracks.num_tracks), bool)
+    seen[0, track[used & new[image]]] = True
+    seen[1, track[used & old[image]]] = True
+    return int(seen.all(axis=0).sum())
