@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.mapping import structure
 from sfmapp.mapping.merge import find_merge, merge, num_linking_points
+from sfmapp.mapping.options import MappingOptions
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene
 
@@ -42,6 +46,8 @@ def test_a_shared_image_and_common_points_give_the_similarity():
     np.testing.assert_allclose(union.point_xyz[known], truth.point_xyz[known], atol=1e-9)
     assert known.sum() == (target.is_triangulated | source.is_triangulated).sum()
     assert np.linalg.norm(union.residuals_px()[union.obs_is_inlier], axis=1).max() < 1e-6
+    with ThreadPoolExecutor(1) as pool:
+        structure.filter_observations(union, MappingOptions(), pool)
     new = union.is_registered & ~target.is_registered
     assert num_linking_points(union, new, target.is_registered & ~source.is_registered) > 0
 
