@@ -338,6 +338,7 @@ def test_sparse_system_equals_dense_with_any_factors(monkeypatch, per_image):
     reports, states = [], []
     for limit in (160, 0):
         monkeypatch.setattr(solver, "_MAX_DENSE_BLOCKS", limit)
+        monkeypatch.setattr(solver, "_DENSE_SHARE", 2.0)
         found = start_of(scene)
         reports.append(adjust_bundle(found, TIGHT, extra_factors=graph))
         states.append(found)

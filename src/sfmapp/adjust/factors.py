@@ -123,17 +123,14 @@ class ExtraFactors:
 
 
 class SparseSystem:
-    """The reduced system as gtsam Hessian factors, one per tile, eliminated in METIS order."""
+    """The reduced system as gtsam Hessian factors, one per tile (keys a B + b in order), eliminated in METIS order."""
 
-    def __init__(self, problem: Problem, keys: NDArray[np.int64], tile_of: NDArray[np.int64]) -> None:
+    def __init__(self, problem: Problem, keys: NDArray[np.int64]) -> None:
         blocks, first = problem.num_blocks, int((problem.image_block >= 0).sum())
         images = problem.image_idx[problem.image_block >= 0]
         own = np.flatnonzero(problem.camera_block >= first)
         self._keys = [X(int(i)) for i in images] + [K(int(problem.camera_idx[c])) for c in own]
-        order = np.argsort(keys)
-        self._pairs = [
-            (int(k) // blocks, int(k) % blocks, int(t)) for k, t in zip(keys[order], tile_of[order], strict=True)
-        ]
+        self._pairs = list(zip(*(part.tolist() for part in np.divmod(keys, blocks)), range(len(keys)), strict=True))
         self._dims = problem.block_dim.tolist()
         self._ordering: Any = None
 

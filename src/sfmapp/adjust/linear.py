@@ -159,44 +159,12 @@ def solve_tiles(tiles, num_blocks, inverse, x):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _insert(keys, values, key, value):  # type: ignore[no-untyped-def]
-    mask = keys.shape[0] - 1
-    h = ((key * 0x9E3779B97F4A7C) >> 20) & mask
-    while keys[h] >= 0:
-        h = (h + 1) & mask
-    keys[h] = key
-    values[h] = value
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _hold(keys, values, count, key):  # type: ignore[no-untyped-def]
-    """Make sure that a key is in the table; returns the table, four times as large where it was half full."""
-    if find_slot(keys, values, key) >= 0:
-        return keys, values, count
-    if 2 * count >= keys.shape[0]:
-        old_keys, old_values = keys, values
-        keys = np.full(4 * old_keys.shape[0], -1, np.int64)
-        values = np.zeros(4 * old_keys.shape[0], np.int64)
-        for m in range(old_keys.shape[0]):
-            if old_keys[m] >= 0:
-                _insert(keys, values, old_keys[m], old_values[m])
-    _insert(keys, values, key, count)
-    return keys, values, count + 1
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def hash_tiles(point_ptr, obs_image, image_camera, image_block, camera_block, num_blocks, pairs):  # type: ignore[no-untyped-def]
-    """Which pairs of blocks a <= b meet in a point: an open hash table of keys a B + b and tile numbers.
-
-    Returns (keys, values, count); pairs (M,) int64 are keys to hold besides.
-    """
-    keys, values, count = np.full(1024, -1, np.int64), np.zeros(1024, np.int64), 0
+def mark_pairs(point_ptr, obs_image, image_camera, image_block, camera_block, pairs):  # type: ignore[no-untyped-def]
+    """Set pairs[a, b], (B, B) bool, for all blocks a <= b that meet in a point."""
     longest = 1
     for p in range(point_ptr.shape[0] - 1):
         longest = max(longest, point_ptr[p + 1] - point_ptr[p])
     blocks = np.zeros(2 * longest, np.int64)
-    for key in pairs:
-        keys, values, count = _hold(keys, values, count, key)
     for p in range(point_ptr.shape[0] - 1):
         found = 0
         for o in range(point_ptr[p], point_ptr[p + 1]):
@@ -210,8 +178,21 @@ def hash_tiles(point_ptr, obs_image, image_camera, image_block, camera_block, nu
                 blocks[found] = other
                 found += 1
         for n in range(found):
-            for m in range(found):
-                key = blocks[n] * num_blocks + blocks[m]
-                if blocks[n] <= blocks[m] and find_slot(keys, values, key) < 0:
-                    keys, values, count = _hold(keys, values, count, key)
-    return keys, values, count
+            for m in range(n, found):
+                pairs[min(blocks[n], blocks[m]), max(blocks[n], blocks[m])] = True
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def number_keys(keys):  # type: ignore[no-untyped-def]
+    """An open hash table, half full at most, that gives each of the different keys (N,) its position."""
+    size = 16
+    while size < 2 * keys.shape[0] + 1:
+        size *= 2
+    table, values = np.full(size, -1, np.int64), np.zeros(size, np.int64)
+    for n in range(keys.shape[0]):
+        h = ((keys[n] * 0x9E3779B97F4A7C) >> 20) & (size - 1)
+        while table[h] >= 0:
+            h = (h + 1) & (size - 1)
+        table[h] = keys[n]
+        values[h] = n
+    return table, values

@@ -86,9 +86,9 @@ def refine_pose(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _normal_equations(
+def _normal_equations(  # type: ignore[no-untyped-def]
     canonical, fisheye, rows, xyz, xy, loss, scale2, size, penalty, J, information, gradient, residuals2
-):  # type: ignore[no-untyped-def]
+):
     """Fill information (64,), gradient (8,) and the squared residuals (N,), infinite behind; returns the cost."""
     information[:] = 0.0
     gradient[:] = 0.0

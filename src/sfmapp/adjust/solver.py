@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust import kernels
 from sfmapp.adjust.kernels import find_slot
-from sfmapp.adjust.linear import aligned_zeros, assemble, factorize_tiles, hash_tiles, solve_tiles
+from sfmapp.adjust.linear import aligned_zeros, assemble, factorize_tiles, mark_pairs, number_keys, solve_tiles
 from sfmapp.adjust.problem import Problem, free_values, make_problem, pose_rows
 from sfmapp.events import Events
 from sfmapp.scene.camera import PARAM_NAMES, Camera
@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Loss = Literal["trivial", "huber", "cauchy"]
 
-# Up to this many blocks the dense tile factor beats gtsam's sparse one.
-_MAX_DENSE_BLOCKS = 160
+# Up to this many blocks, and above if this share of all pairs meets, the dense tile factor beats gtsam's sparse one.
+_MAX_DENSE_BLOCKS, _DENSE_SHARE = 160, 0.3
 # Work worth a chunk of its own, and the most memory that the chunks' private sums may take together.
 _CHUNK_OBSERVATIONS, _MAX_CHUNKS, _CHUNK_BYTES = 16384, 8, 1 << 26
 
@@ -154,13 +154,13 @@ def compile_kernels() -> None:
     from sfmapp.scene.synthetic import make_scene
 
     scene = make_scene(0, 3, 8)
-    model, empty = scene.observed.copy(), np.zeros(0, np.int64)
+    model = scene.observed.copy()
     adjust_bundle(model, AdjustOptions(max_iterations=2), variable_images=np.array([True, True, False]))
     camera, tracks = model.cameras[0], model.tracks
     refine_pose(camera.canonical, camera.is_fisheye, model.cam_from_world[0], model.point_xyz, tracks.obs_xy[:8])
     no_images = np.zeros(0, np.int32)
-    keys, values, _ = hash_tiles(np.zeros(1, np.int64), no_images, no_images, no_images, no_images, 1, empty)
-    find_slot(keys, values, 0)
+    mark_pairs(np.zeros(1, np.int64), no_images, no_images, no_images, no_images, np.eye(1, dtype=bool))
+    find_slot(*number_keys(np.arange(3)), 0)
 
 
 def write_back(problem: Problem, reconstruction: Reconstruction) -> None:
@@ -221,20 +221,10 @@ class Engine:
         self.problem, self.priors, self.extras = p, priors, extras
         self.loss, self.scale2 = kernels.LOSS_IDS[options.loss], options.loss_scale_px**2
         blocks, images = p.num_blocks, len(p.image_idx)
-        self.solver = "dense" if blocks <= _MAX_DENSE_BLOCKS else "sparse"
         empty = np.zeros(0, np.int64)
-        self.hash_keys, self.hash_values, self.num_tiles = empty, empty, blocks * blocks
-        if self.solver == "sparse":
-            from sfmapp.adjust.factors import SparseSystem
-
-            pairs = np.arange(blocks) * (blocks + 1)
-            if extras is not None:
-                pairs = np.concatenate([pairs, extras.pairs])
-            self.hash_keys, self.hash_values, self.num_tiles = hash_tiles(
-                p.point_ptr, p.obs_image, p.image_camera, p.image_block, p.camera_block, blocks, pairs
-            )
-            used = self.hash_keys >= 0
-            self.sparse = SparseSystem(p, self.hash_keys[used], self.hash_values[used])
+        self.solver, self.hash_keys, self.hash_values, self.num_tiles = "dense", empty, empty, blocks * blocks
+        if blocks > _MAX_DENSE_BLOCKS:
+            self._choose_sparse()
         fitting = max(1, _CHUNK_BYTES // max(1, self.num_tiles * 512))
         self.num_chunks = int(np.clip(p.num_observations // _CHUNK_OBSERVATIONS, 1, min(_MAX_CHUNKS, fitting)))
         shares = np.linspace(0, p.num_observations, self.num_chunks + 1)
@@ -257,6 +247,22 @@ class Engine:
         self.new_poses, self.new_rows = np.empty_like(p.poses), np.empty_like(self.rows)
         self.new_canonical, self.new_xyz = np.empty_like(p.canonical), np.empty_like(p.xyz)
         self.damping = 0.0
+
+    def _choose_sparse(self) -> None:
+        """Keep only the tiles of blocks that meet, and leave their factor to gtsam, unless that is most of them."""
+        from sfmapp.adjust.factors import SparseSystem
+
+        p, blocks = self.problem, self.problem.num_blocks
+        met = np.eye(blocks, dtype=bool)
+        mark_pairs(p.point_ptr, p.obs_image, p.image_camera, p.image_block, p.camera_block, met)
+        if self.extras is not None:
+            met.reshape(-1)[self.extras.pairs] = True
+        keys = np.flatnonzero(met)
+        if 2 * len(keys) > _DENSE_SHARE * blocks * blocks:
+            return
+        self.solver, self.num_tiles = "sparse", len(keys)
+        self.hash_keys, self.hash_values = number_keys(keys)
+        self.sparse = SparseSystem(p, keys)
 
     def linearize(self, damping: float, run: Callable[..., Any]) -> float:
         """Reduced system at the current state with damped points; returns the cost of the state."""
