@@ -94,8 +94,10 @@ def extract_sift(
     angle, place, scale = angle[order], place[order], scale[order]
     descriptors = np.empty((len(place), 128), np.uint8)
     for i, octave in enumerate(octaves):
-        mine = octave_idx[place] == i
-        out = np.empty((int(mine.sum()), 128), np.uint8)
+        # from top to bottom, so that neighbours find each other's pixels in the cache
+        mine = np.flatnonzero(octave_idx[place] == i)
+        mine = mine[np.argsort(place[mine], kind="stable")]
+        out = np.empty((len(mine), 128), np.uint8)
         kernels.describe_all(octave.levels, found[place[mine]], angle[mine], out)
         descriptors[mine] = out
     return np.column_stack([xy[place], scale, angle]).astype(np.float32), descriptors, threshold
@@ -113,36 +115,38 @@ def _detect(gray: NDArray[np.uint8], threshold: float, edge_threshold: float, ma
     import cv2
 
     height, width = gray.shape
-    octaves: list[_Octave] = []
-    if min(height, width) < 2:
-        return octaves
     doubled = (_UPSAMPLING * width, _UPSAMPLING * height)
-    base = cv2.resize(gray.astype(np.float32), doubled, interpolation=cv2.INTER_LINEAR)
-    _blur(base, kernels.SIGMA, base)
+    octaves: list[_Octave] = []
+    if min(doubled) <= 2 * kernels.BORDER + 2:
+        return octaves
+    base = _blurred(cv2.resize(gray.astype(np.float32), doubled, interpolation=cv2.INTER_LINEAR), kernels.SIGMA)
     while min(base.shape) > 2 * kernels.BORDER + 2:
         levels = [base]
         for i in range(1, kernels.NUM_LEVELS):
             before = kernels.SIGMA * 2.0 ** ((i - 1) / kernels.NUM_LAYERS)
-            levels.append(np.empty_like(base))
-            _blur(levels[-2], before * math.sqrt(2.0 ** (2.0 / kernels.NUM_LAYERS) - 1.0), levels[-1])
+            levels.append(_blurred(levels[-1], before * math.sqrt(2.0 ** (2.0 / kernels.NUM_LAYERS) - 1.0)))
         found = _find(tuple(levels), 255.0 * threshold, edge_threshold, _REFINED_BUDGETS * max_num_features)
         octaves.append(_Octave(tuple(levels[1:4]), found, 2.0 ** len(octaves) / _UPSAMPLING))
         base = np.ascontiguousarray(levels[kernels.NUM_LAYERS][::2, ::2])
     return octaves
 
 
-def _blur(source: FloatImage, sigma: float, target: FloatImage) -> None:
-    import cv2
-
-    size = 2 * math.ceil(_TRUNCATION_SIGMAS * sigma) + 1
-    cv2.GaussianBlur(source, (size, size), sigma, dst=target)
+def _blurred(image: FloatImage, sigma: float) -> FloatImage:
+    # the kernel takes the pairs of taps beyond the fourth two at a time
+    reach = 2 * math.ceil(_TRUNCATION_SIGMAS * sigma / 2.0)
+    taps = np.exp(-0.5 * (np.arange(reach + 1) / sigma) ** 2)
+    taps /= taps[0] + 2.0 * taps[1:].sum()
+    line = np.empty(image.shape[1] + 2 * len(taps), np.float32)
+    target = np.empty_like(image)
+    kernels.blur(image, taps.astype(np.float32), line, target)
+    return target
 
 
 def _find(
     levels: tuple[FloatImage, ...], threshold: float, edge_threshold: float, max_refined: int
 ) -> NDArray[np.float64]:
-    """(N, 4) keypoints of an octave: column, row, layer, contrast; threshold and contrast in grey levels."""
-    rows, flags = np.empty((9, kernels.TILE + 2), np.float32), np.empty(kernels.TILE, np.uint8)
+    """(N, 4) keypoints of an octave from top to bottom: column, row, layer, contrast (threshold, too: grey levels)."""
+    rows, flags = np.empty((11, 3, kernels.TILE + 2), np.float32), np.empty(kernels.TILE, np.uint8)
     # the parabola raises the contrast above that of the pixel, so those a little below get their chance
     start = 0.8 * threshold
     capacity = max(256, levels[0].size // 64)
@@ -158,7 +162,7 @@ def _find(
     found = np.empty((len(place), 4))
     kernels.refine_all(levels, np.ascontiguousarray(place), edge_threshold, found)
     found = found[found[:, 3] >= threshold]
-    found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0]))]
+    found = found[np.lexsort((found[:, 2], found[:, 0], found[:, 1]))]
     # two neighbours may have moved to the same place
     is_new = np.ones(len(found), bool)
     is_new[1:] = np.any(found[1:] != found[:-1], axis=1)

@@ -1,4 +1,4 @@
-"""The inner loops of SIFT (Lowe, IJCV 2004): extrema of the scale space, their refinement, orientation, descriptors.
+"""The inner loops of SIFT (Lowe, IJCV 2004): the scale space, its extrema, their refinement, orientation, descriptors.
 
 Pixels here are those of an octave, with the centre of the top-left one at (0, 0). ``gauss`` holds the levels
 0..5 of an octave, (H, W) float32 each; level l has a blur of ``SIGMA * 2 ** (l / 3)`` pixels of the octave.
@@ -21,8 +21,8 @@ BORDER = 5
 # distance of the gradients that orientations and descriptors sample: the levels are so smooth that every second one
 # gives the same matches for a quarter of the time
 STRIDE = 2
-# columns that are scanned together, so that the rows at work stay in the first cache
-TILE = 512
+# columns that are scanned together, so that the rows at work stay in the cache
+TILE = 1024
 _NUM_ORIENTATION_BINS = 36
 # a second orientation must reach this share of the strongest
 _PEAK_RATIO = 0.8
@@ -31,26 +31,115 @@ _CELL_SIGMAS = 3.0
 # squared distances are looked up in a table of the Gaussian, up to where its value is 4e-6
 _EXP_MAX = 12.5
 _EXP_SIZE = 2048
+# gradients of one descriptor at most: the turned square of 5 x 5 cells at the largest scale of an octave
+MAX_SAMPLES = int((5.0 * _CELL_SIGMAS * SIGMA * 2.0 ** (4.0 / 3.0) / STRIDE + 2.0) ** 2 * 1.2)
 _EXP_TABLE = np.exp(-np.arange(_EXP_SIZE + 1) * (_EXP_MAX / _EXP_SIZE)).astype(np.float32)
 
-FloatImages = NDArray[np.float32]
+FloatImage = FloatRow = FloatRows = NDArray[np.float32]
 
 
 @numba.njit(cache=True, nogil=True)
-def _is_extremum(lower: FloatImages, upper: FloatImages, row: int, col: int, value: float) -> bool:
-    """Whether a difference is not exceeded, on its own side of zero, by the nine of the layer upper - lower."""
-    for r in range(row - 1, row + 2):
-        for c in range(col - 1, col + 2):
-            other = upper[r, c] - lower[r, c]
-            if (value > 0.0 and other > value) or (value < 0.0 and other < value):
+def _taps_0_to_4(
+    out: FloatRow, k: FloatRow, m: FloatRow, a1: FloatRow, b1: FloatRow, a2: FloatRow, b2: FloatRow, a3: FloatRow,
+    b3: FloatRow, a4: FloatRow, b4: FloatRow, num: int,
+) -> None:  # fmt: skip
+    k0, k1, k2, k3, k4 = k[0], k[1], k[2], k[3], k[4]
+    for c in range(num):
+        near = k0 * m[c] + k1 * (a1[c] + b1[c]) + k2 * (a2[c] + b2[c])
+        out[c] = near + (k3 * (a3[c] + b3[c]) + k4 * (a4[c] + b4[c]))
+
+
+@numba.njit(cache=True, nogil=True)
+def _two_taps(out: FloatRow, k: FloatRow, a1: FloatRow, b1: FloatRow, a2: FloatRow, b2: FloatRow, num: int) -> None:
+    k1, k2 = k[0], k[1]
+    for c in range(num):
+        out[c] += k1 * (a1[c] + b1[c]) + k2 * (a2[c] + b2[c])
+
+
+@numba.njit(cache=True, nogil=True)
+def blur(source: FloatImage, k: FloatRow, line: FloatRow, target: FloatImage) -> None:
+    """Convolve columns, then rows, with a symmetric kernel; the image is mirrored at the centres of its outer pixels.
+
+    A quarter to a half faster than OpenCV's, and the same to the last bit on any processor, as no multiplication is
+    fused with an addition.
+
+    Args:
+        source: (H, W) float32, H and W at least N.
+        k: (N,) float32, the kernel from its middle outwards; N is odd and at least 5.
+        line: (W + 2 N,) float32, working memory.
+        target: (H, W) float32, filled; not the source.
+    """
+    h, w = source.shape
+    n = k.shape[0] - 1
+    s = source
+    for r in range(h):
+        column = line[n : n + w]
+        up, down = r, 2 * h - 2 - r
+        _taps_0_to_4(
+            column, k, s[r], s[abs(up - 1)], s[min(r + 1, down - 1)], s[abs(up - 2)], s[min(r + 2, down - 2)],
+            s[abs(up - 3)], s[min(r + 3, down - 3)], s[abs(up - 4)], s[min(r + 4, down - 4)], w,
+        )  # fmt: skip
+        for i in range(5, n, 2):
+            _two_taps(
+                column, k[i:], s[abs(up - i)], s[min(r + i, down - i)],
+                s[abs(up - i - 1)], s[min(r + i + 1, down - i - 1)], w,
+            )  # fmt: skip
+        for i in range(1, n + 1):
+            line[n - i] = line[n + i]
+            line[n + w - 1 + i] = line[n + w - 1 - i]
+        _taps_0_to_4(
+            target[r], k, column, line[n - 1 :], line[n + 1 :], line[n - 2 :], line[n + 2 :],
+            line[n - 3 :], line[n + 3 :], line[n - 4 :], line[n + 4 :], w,
+        )  # fmt: skip
+        for i in range(5, n, 2):
+            _two_taps(target[r], k[i:], line[n - i :], line[n + i :], line[n - i - 1 :], line[n + i + 1 :], w)
+
+
+@numba.njit(cache=True, nogil=True)
+def _subtract(upper: FloatRow, lower: FloatRow, out: FloatRow, num: int) -> None:
+    for c in range(num):
+        out[c] = upper[c] - lower[c]
+
+
+@numba.njit(cache=True, nogil=True)
+def _extremes_of_three(row: FloatRow, most: FloatRow, least: FloatRow, num: int) -> None:
+    """Largest and smallest of ``row[c : c + 3]``."""
+    for c in range(num):
+        v0, v1, v2 = row[c], row[c + 1], row[c + 2]
+        big = v0 if v0 > v1 else v1
+        small = v0 if v0 < v1 else v1
+        most[c] = big if big > v2 else v2
+        least[c] = small if small < v2 else v2
+
+
+@numba.njit(cache=True, nogil=True)
+def _flag_extremes(
+    row: FloatRow, most: FloatImage, least: FloatImage, threshold: float, flags: NDArray[np.uint8], num: int
+) -> None:
+    """Flag the values of a row that are the extremes of their 3 x 3 pixels and far enough from zero."""
+    for c in range(num):
+        v = row[c + 1]
+        big = most[0, c] if most[0, c] > most[1, c] else most[1, c]
+        big = big if big > most[2, c] else most[2, c]
+        small = least[0, c] if least[0, c] < least[1, c] else least[1, c]
+        small = small if small < least[2, c] else least[2, c]
+        flags[c] = ((v >= big) & (v > threshold)) | ((v <= small) & (v < -threshold))
+
+
+@numba.njit(cache=True, nogil=True)
+def _exceeds(value: float, rows: FloatImage, col: int) -> bool:
+    """Whether none of the 3 x 3 values of another layer is beyond a value, on its own side of zero."""
+    for i in range(3):
+        for c in range(col, col + 3):
+            if (rows[i, c] > value) if value > 0.0 else (rows[i, c] < value):
                 return False
     return True
 
 
 @numba.njit(cache=True, nogil=True)
 def find_extrema(
-    gauss: tuple[FloatImages, ...], threshold: float, rows: FloatImages, flags: NDArray[np.uint8],
-    place: NDArray[np.int32], value: FloatImages,
+    gauss: tuple[FloatImage, ...], threshold: float, rows: FloatRows, flags: NDArray[np.uint8],
+    place: NDArray[np.int32], value: FloatRow,
 ) -> int:  # fmt: skip
     """Pixels whose difference of Gaussians is the largest or smallest of its 26 neighbours and exceeds the threshold.
 
@@ -59,52 +148,45 @@ def find_extrema(
     Args:
         gauss: the six levels of an octave, (H, W) float32 each.
         threshold: grey levels.
-        rows: (9, 514) float32 and flags: (512,) uint8, working memory.
+        rows: (11, 3, TILE + 2) float32 and flags: (TILE,) uint8, working memory: the last three rows of the five
+            differences, then of the largest and of the smallest of three neighbours in each of the middle ones.
         place: (C, 3) int32 and value: (C,) float32, filled with layer, row, column and absolute difference.
 
     Returns:
         How many there are; those beyond C are counted only.
     """
     height, width = gauss[0].shape
+    g0, g1, g2, g3, g4, g5 = gauss
     low = np.float32(threshold)
+    eights = flags.view(np.uint64)
     count = 0
-    for layer in range(1, NUM_LAYERS + 1):
-        lower, upper = gauss[layer], gauss[layer + 1]
-        for left in range(BORDER, width - BORDER, TILE):
-            n = min(TILE, width - BORDER - left)
-            for r in range(BORDER - 1, height - BORDER + 1):
-                slot = r % 3
-                dog, most, least = rows[slot], rows[3 + slot], rows[6 + slot]
-                a, b = upper[r, left - 1 : left + n + 1], lower[r, left - 1 : left + n + 1]
-                for c in range(n + 2):
-                    dog[c] = a[c] - b[c]
-                for c in range(n):
-                    d0, d1, d2 = dog[c], dog[c + 1], dog[c + 2]
-                    big = d0 if d0 > d1 else d1
-                    small = d0 if d0 < d1 else d1
-                    most[c] = big if big > d2 else d2
-                    least[c] = small if small < d2 else d2
+    for left in range(BORDER, width - BORDER, TILE):
+        n = min(TILE, width - BORDER - left)
+        a, b = left - 1, left + n + 1
+        for r in range(BORDER - 1, height - BORDER + 1):
+            slot, middle = r % 3, (r - 1) % 3
+            _subtract(g1[r, a:b], g0[r, a:b], rows[0, slot], n + 2)
+            _subtract(g2[r, a:b], g1[r, a:b], rows[1, slot], n + 2)
+            _subtract(g3[r, a:b], g2[r, a:b], rows[2, slot], n + 2)
+            _subtract(g4[r, a:b], g3[r, a:b], rows[3, slot], n + 2)
+            _subtract(g5[r, a:b], g4[r, a:b], rows[4, slot], n + 2)
+            for layer in range(1, NUM_LAYERS + 1):
+                most, least = rows[4 + layer], rows[7 + layer]
+                _extremes_of_three(rows[layer, slot], most[slot], least[slot], n)
                 if r < BORDER + 1:
                     continue
-                mid, old = (r - 1) % 3, (r + 1) % 3
-                dog, most_mid, most_old = rows[mid], rows[3 + mid], rows[3 + old]
-                least_mid, least_old = rows[6 + mid], rows[6 + old]
-                for c in range(n):
-                    v = dog[c + 1]
-                    is_most = (v > low) & (v >= most[c]) & (v >= most_mid[c]) & (v >= most_old[c])
-                    is_least = (v < -low) & (v <= least[c]) & (v <= least_mid[c]) & (v <= least_old[c])
-                    flags[c] = is_most | is_least
-                for c in range(n):
-                    if flags[c]:
+                dog = rows[layer, middle]
+                _flag_extremes(dog, most, least, low, flags, n)
+                for e in range((n + 7) // 8):
+                    if eights[e] == 0:
+                        continue
+                    for c in range(8 * e, min(8 * e + 8, n)):
                         v = dog[c + 1]
-                        if not _is_extremum(gauss[layer - 1], gauss[layer], r - 1, left + c, v):
-                            continue
-                        if not _is_extremum(gauss[layer + 1], gauss[layer + 2], r - 1, left + c, v):
-                            continue
-                        if count < place.shape[0]:
-                            place[count, 0], place[count, 1], place[count, 2] = layer, r - 1, left + c
-                            value[count] = abs(v)
-                        count += 1
+                        if flags[c] and _exceeds(v, rows[layer - 1], c) and _exceeds(v, rows[layer + 1], c):
+                            if count < place.shape[0]:
+                                place[count, 0], place[count, 1], place[count, 2] = layer, r - 1, left + c
+                                value[count] = abs(v)
+                            count += 1
     return count
 
 
@@ -141,7 +223,7 @@ def _locate(d: NDArray[np.float64], ds: float, edge_threshold: float, out: NDArr
 
 @numba.njit(cache=True, nogil=True)
 def refine_extremum(
-    gauss: tuple[FloatImages, ...], layer: int, row: int, col: int, edge_threshold: float, out: NDArray[np.float64]
+    gauss: tuple[FloatImage, ...], layer: int, row: int, col: int, edge_threshold: float, out: NDArray[np.float64]
 ) -> bool:
     """Fit a parabola to the 27 differences around a pixel (Brown and Lowe, BMVC 2002), moving on while it lies outside.
 
@@ -198,7 +280,7 @@ def refine_extremum(
 
 @numba.njit(cache=True, nogil=True)
 def refine_all(
-    gauss: tuple[FloatImages, ...], place: NDArray[np.int32], edge_threshold: float, out: NDArray[np.float64]
+    gauss: tuple[FloatImage, ...], place: NDArray[np.int32], edge_threshold: float, out: NDArray[np.float64]
 ) -> None:
     """:func:`refine_extremum` of every place (N, 3); rows of out (N, 4) that fail become NaN."""
     for n in range(place.shape[0]):
@@ -206,25 +288,34 @@ def refine_all(
             out[n, :] = np.nan
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def _angle(y: float, x: float) -> float:
-    """atan2 in [0, 2 pi) to 1e-5 (Abramowitz and Stegun 4.4.49)."""
-    ax, ay = abs(x), abs(y)
-    a = min(ax, ay) / (max(ax, ay) + 1e-30)
-    s = a * a
-    t = a * (0.9998660 + s * (-0.3302995 + s * (0.1801410 + s * (-0.0851330 + s * 0.0208351))))
-    if ay > ax:
-        t = 0.5 * math.pi - t
-    if x < 0.0:
-        t = math.pi - t
-    if y < 0.0:
-        t = 2.0 * math.pi - t
-    return t
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _polar(gx: FloatRow, gy: FloatRow, num: int) -> None:
+    """Replace gradients by their lengths and directions in [0, 2 pi], to 1e-5 (Abramowitz and Stegun 4.4.49).
+
+    Written so that it becomes vector instructions; the check of Python's division would prevent that.
+    """
+    half_pi, pi, two_pi = np.float32(0.5 * math.pi), np.float32(math.pi), np.float32(2.0 * math.pi)
+    zero, tiny = np.float32(0.0), np.float32(1e-30)
+    c1, c3, c5 = np.float32(0.9998660), np.float32(-0.3302995), np.float32(0.1801410)
+    c7, c9 = np.float32(-0.0851330), np.float32(0.0208351)
+    for n in range(num):
+        x, y = gx[n], gy[n]
+        ax, ay = abs(x), abs(y)
+        is_steep = ay > ax
+        less, more = ax if is_steep else ay, ay if is_steep else ax
+        a = less / (more + tiny)
+        s = a * a
+        t = a * (c1 + s * (c3 + s * (c5 + s * (c7 + s * c9))))
+        t = half_pi - t if is_steep else t
+        t = pi - t if x < zero else t
+        t = two_pi - t if y < zero else t
+        gx[n] = np.sqrt(x * x + y * y)
+        gy[n] = t
 
 
 @numba.njit(cache=True, nogil=True)
 def find_orientations(
-    level: FloatImages, x: float, y: float, sigma: float, max_num: int, hist: NDArray[np.float64],
+    level: FloatImage, x: float, y: float, sigma: float, max_num: int, samples: FloatRows, hist: NDArray[np.float64],
     out: NDArray[np.float64],
 ) -> int:  # fmt: skip
     """Peaks of the histogram of gradient directions around a keypoint, strongest first.
@@ -232,7 +323,7 @@ def find_orientations(
     Args:
         level: (H, W) float32, the level of the scale space that the keypoint was found in.
         x, y, sigma: of the keypoint, pixels.
-        hist: (2, 36) float64, working memory.
+        samples: (4, MAX_SAMPLES) float32 and hist: (2, 36) float64, working memory.
         out: (max_num,) float64, filled with angles in radians in [0, 2 pi), from x towards y.
 
     Returns:
@@ -242,26 +333,27 @@ def find_orientations(
     num = _NUM_ORIENTATION_BINS
     window = 1.5 * sigma
     radius = int(3.0 * window)
-    scale = _EXP_SIZE / (_EXP_MAX * 2.0 * window * window)
+    scale = np.float32(_EXP_SIZE / (_EXP_MAX * 2.0 * window * window))
     xi, yi = round(x), round(y)
-    hist[:] = 0.0
+    num_samples = 0
     for r in range(max(1, yi - radius), min(height - 1, yi + radius + 1), STRIDE):
-        dy = r - y
+        dy = np.float32(r - y)
+        before, row, after = level[r - 1], level[r], level[r + 1]
         for c in range(max(1, xi - radius), min(width - 1, xi + radius + 1), STRIDE):
-            dx = c - x
+            dx = np.float32(c - x)
             k = int((dx * dx + dy * dy) * scale)
-            if k >= _EXP_SIZE:
-                continue
-            gx = float(level[r, c + 1]) - float(level[r, c - 1])
-            gy = float(level[r + 1, c]) - float(level[r - 1, c])
-            weight = math.sqrt(gx * gx + gy * gy) * _EXP_TABLE[k]
-            position = _angle(gy, gx) * (num / (2.0 * math.pi))
-            b = int(position)
-            part = position - b
-            b0 = b if b < num else b - num
-            b1 = b0 + 1 if b0 + 1 < num else 0
-            hist[0, b0] += weight * (1.0 - part)
-            hist[0, b1] += weight * part
+            if k < _EXP_SIZE:
+                samples[2, num_samples] = _EXP_TABLE[k] * (row[c + 1] - row[c - 1])
+                samples[3, num_samples] = _EXP_TABLE[k] * (after[c] - before[c])
+                num_samples += 1
+    _polar(samples[2], samples[3], num_samples)
+    hist[:] = 0.0
+    for n in range(num_samples):
+        position = samples[3, n] * (num / (2.0 * math.pi))
+        b = int(position)
+        part = samples[2, n] * (position - b)
+        hist[0, b if b < num else b - num] += samples[2, n] - part
+        hist[0, b + 1 if b + 1 < num else 0] += part
     for turn in range(6):
         source, target = hist[turn % 2], hist[(turn + 1) % 2]
         for b in range(num):
@@ -290,8 +382,36 @@ def find_orientations(
 
 
 @numba.njit(cache=True, nogil=True)
+def _sample_cells(level: FloatImage, x: float, y: float, sigma: float, angle: float, samples: FloatRows) -> int:
+    """Fill samples (4, N) with the place in cells from the corner of the 6 x 6 (u, v) and the gradient (x, y), weighted
+    by a Gaussian with a sigma of two cells; returns how many."""
+    height, width = level.shape
+    cell = _CELL_SIGMAS * sigma
+    cos, sin = np.float32(math.cos(angle) / cell), np.float32(math.sin(angle) / cell)
+    reach = int(2.5 * cell * (abs(math.cos(angle)) + abs(math.sin(angle)))) + 1
+    xi, yi = round(x), round(y)
+    scale = np.float32(_EXP_SIZE / (_EXP_MAX * 8.0))
+    half = np.float32(2.5)
+    num = 0
+    for r in range(max(1, yi - reach), min(height - 1, yi + reach + 1), STRIDE):
+        dy = np.float32(r - y)
+        before, row, after = level[r - 1], level[r], level[r + 1]
+        for c in range(max(1, xi - reach), min(width - 1, xi + reach + 1), STRIDE):
+            dx = np.float32(c - x)
+            u = cos * dx + sin * dy
+            v = cos * dy - sin * dx
+            if abs(u) < half and abs(v) < half:
+                weight = _EXP_TABLE[int((u * u + v * v) * scale)]
+                samples[0, num], samples[1, num] = u + half, v + half
+                samples[2, num] = weight * (row[c + 1] - row[c - 1])
+                samples[3, num] = weight * (after[c] - before[c])
+                num += 1
+    return num
+
+
+@numba.njit(cache=True, nogil=True)
 def describe(
-    level: FloatImages, x: float, y: float, sigma: float, angle: float, hist: NDArray[np.float64],
+    level: FloatImage, x: float, y: float, sigma: float, angle: float, samples: FloatRows, hist: FloatImage,
     out: NDArray[np.uint8],
 ) -> None:  # fmt: skip
     """RootSIFT descriptor: 4 x 4 cells of 8 directions, in the order of COLMAP's.
@@ -299,71 +419,59 @@ def describe(
     Args:
         level: (H, W) float32, the level of the scale space that the keypoint was found in.
         x, y, sigma: of the keypoint, pixels; angle: radians, from x towards y.
-        hist: (6, 6, 8) float64, working memory.
+        samples: (4, MAX_SAMPLES) and hist: (36, 8) float32, working memory.
         out: (128,) uint8, filled.
     """
-    height, width = level.shape
-    cell = _CELL_SIGMAS * sigma
-    cos, sin = math.cos(angle) / cell, math.sin(angle) / cell
-    reach = int(2.5 * cell * (abs(math.cos(angle)) + abs(math.sin(angle)))) + 1
-    xi, yi = round(x), round(y)
-    # Gaussian window with a sigma of two cells
-    scale = _EXP_SIZE / (_EXP_MAX * 8.0)
+    num = _sample_cells(level, x, y, sigma, angle, samples)
+    _polar(samples[2], samples[3], num)
+    to_eighths, start = np.float32(8.0 / (2.0 * math.pi)), np.float32(angle * 8.0 / (2.0 * math.pi) + 8.0)
     hist[:] = 0.0
-    for r in range(max(1, yi - reach), min(height - 1, yi + reach + 1), STRIDE):
-        dy = r - y
-        for c in range(max(1, xi - reach), min(width - 1, xi + reach + 1), STRIDE):
-            dx = c - x
-            u = cos * dx + sin * dy
-            v = cos * dy - sin * dx
-            if not (-2.5 < u < 2.5 and -2.5 < v < 2.5):
-                continue
-            gx = float(level[r, c + 1]) - float(level[r, c - 1])
-            gy = float(level[r + 1, c]) - float(level[r - 1, c])
-            weight = math.sqrt(gx * gx + gy * gy) * _EXP_TABLE[int((u * u + v * v) * scale)]
-            turn = (angle - _angle(gy, gx)) * (8.0 / (2.0 * math.pi)) + 8.0
-            u += 2.5
-            v += 2.5
-            iu, iv, it = int(u), int(v), int(turn)
-            fu, fv, ft = u - iu, v - iv, turn - it
-            t0, t1 = it & 7, (it + 1) & 7
-            w1 = weight * fv
-            w0 = weight - w1
-            w01 = w0 * fu
-            w00 = w0 - w01
-            w11 = w1 * fu
-            w10 = w1 - w11
-            hist[iv, iu, t0] += w00 * (1.0 - ft)
-            hist[iv, iu, t1] += w00 * ft
-            hist[iv, iu + 1, t0] += w01 * (1.0 - ft)
-            hist[iv, iu + 1, t1] += w01 * ft
-            hist[iv + 1, iu, t0] += w10 * (1.0 - ft)
-            hist[iv + 1, iu, t1] += w10 * ft
-            hist[iv + 1, iu + 1, t0] += w11 * (1.0 - ft)
-            hist[iv + 1, iu + 1, t1] += w11 * ft
+    for n in range(num):
+        u, v, weight = samples[0, n], samples[1, n], samples[2, n]
+        turn = start - samples[3, n] * to_eighths
+        iu, iv, it = int(u), int(v), int(turn)
+        fu, fv, ft = u - iu, v - iv, turn - it
+        t0, t1 = it & 7, (it + 1) & 7
+        w1 = weight * fv
+        w0 = weight - w1
+        w01 = w0 * fu
+        w00 = w0 - w01
+        w11 = w1 * fu
+        w10 = w1 - w11
+        k = iv * 6 + iu
+        a, b = w00 * ft, w01 * ft
+        hist[k, t0] += w00 - a
+        hist[k, t1] += a
+        hist[k + 1, t0] += w01 - b
+        hist[k + 1, t1] += b
+        a, b = w10 * ft, w11 * ft
+        hist[k + 6, t0] += w10 - a
+        hist[k + 6, t1] += a
+        hist[k + 7, t0] += w11 - b
+        hist[k + 7, t1] += b
     square = 0.0
     for i in range(1, 5):
         for j in range(1, 5):
             for k in range(8):
-                square += hist[i, j, k] * hist[i, j, k]
+                square += hist[i * 6 + j, k] * hist[i * 6 + j, k]
     # no single gradient may dominate (Lowe, section 6.1)
     limit = 0.2 * math.sqrt(square)
     total = 1e-30
     for i in range(1, 5):
         for j in range(1, 5):
             for k in range(8):
-                hist[i, j, k] = min(hist[i, j, k], limit)
-                total += hist[i, j, k]
+                hist[i * 6 + j, k] = min(hist[i * 6 + j, k], limit)
+                total += hist[i * 6 + j, k]
     for i in range(4):
         for j in range(4):
             for k in range(8):
-                root = 512.0 * math.sqrt(hist[i + 1, j + 1, k] / total)
+                root = 512.0 * math.sqrt(hist[i * 6 + j + 7, k] / total)
                 out[(i * 4 + j) * 8 + k] = min(255, int(root + 0.5))
 
 
 @numba.njit(cache=True, nogil=True)
 def orient_all(
-    levels: tuple[FloatImages, ...], found: NDArray[np.float64], max_num: int, angles: NDArray[np.float64]
+    levels: tuple[FloatImage, ...], found: NDArray[np.float64], max_num: int, angles: NDArray[np.float64]
 ) -> None:
     """Orientations of the keypoints of an octave.
 
@@ -373,16 +481,17 @@ def orient_all(
         angles: (N, max_num) float64, filled, strongest first; NaN where there are fewer.
     """
     hist = np.empty((2, _NUM_ORIENTATION_BINS))
+    samples = np.empty((4, MAX_SAMPLES), np.float32)
     angles[:] = np.nan
     for n in range(found.shape[0]):
         layer = min(max(round(found[n, 2]), 1), NUM_LAYERS)
         sigma = SIGMA * 2.0 ** (found[n, 2] / NUM_LAYERS)
-        find_orientations(levels[layer - 1], found[n, 0], found[n, 1], sigma, max_num, hist, angles[n])
+        find_orientations(levels[layer - 1], found[n, 0], found[n, 1], sigma, max_num, samples, hist, angles[n])
 
 
 @numba.njit(cache=True, nogil=True)
 def describe_all(
-    levels: tuple[FloatImages, ...], found: NDArray[np.float64], angle: NDArray[np.float64], out: NDArray[np.uint8]
+    levels: tuple[FloatImage, ...], found: NDArray[np.float64], angle: NDArray[np.float64], out: NDArray[np.uint8]
 ) -> None:
     """Descriptors of the keypoints of an octave.
 
@@ -391,8 +500,9 @@ def describe_all(
         found: (N, >= 3) float64 column, row, layer; angle: (N,) radians.
         out: (N, 128) uint8, filled.
     """
-    hist = np.empty((6, 6, 8))
+    hist = np.empty((36, 8), np.float32)
+    samples = np.empty((4, MAX_SAMPLES), np.float32)
     for n in range(found.shape[0]):
         layer = min(max(round(found[n, 2]), 1), NUM_LAYERS)
         sigma = SIGMA * 2.0 ** (found[n, 2] / NUM_LAYERS)
-        describe(levels[layer - 1], found[n, 0], found[n, 1], sigma, angle[n], hist, out[n])
+        describe(levels[layer - 1], found[n, 0], found[n, 1], sigma, angle[n], samples, hist, out[n])
