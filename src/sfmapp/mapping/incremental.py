@@ -7,8 +7,8 @@ mapping begins and that the adjustment is cheap enough to be called after every 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -66,42 +66,53 @@ def map_images(
         image_set.cameras, image_camera_idx, correspondences, tracks, options, events
     )
     attempts: dict[int, Registration] = {}
-    initial_reports: list[dict[str, Any]] = []
-    models: list[Reconstruction] = []
-    seeds = np.ones(len(names), bool)
     events.started(STAGE, "mapping", total=len(names))
     with ThreadPoolExecutor(threads) as pool:
-        while seeds.sum() >= 2:
-            model = Reconstruction.empty(cameras, names, image_camera_idx, tracks)
-            mapper = Mapper(model, correspondences, options, adjust_options, events, pool, seeds, attempts)
-            initial_reports.append({"pairs": mapper.start()})
-            registered = model.is_registered
-            if not registered.any():
-                break
-            mapper.grow()
-            mapper.finish()
-            registered = model.is_registered
-            seeds &= ~registered
-            num_images, num_points = int(registered.sum()), int(model.is_triangulated.sum())
-            if num_images < min(options.min_model_images, len(names)) or num_points < options.min_pose_inliers:
-                events.decided(STAGE, f"model dropped: {num_images} images, {num_points} points")
-                continue
+
+        def mapper_of(model: Reconstruction) -> Mapper:
+            return Mapper(model, correspondences, options, adjust_options, events, pool, list(cameras), attempts)
+
+        empty = Reconstruction.empty(cameras, names, image_camera_idx, tracks)
+        models, initial_reports = _grow_models(empty, mapper_of, options, events)
+        models = _merge_models(_without_parts(models), mapper_of, options, events)
+        for model in models:
             model.point_rgb = track_colors(tracks, features)
-            models.append(model)
-            if not options.multiple_models:
-                break
-        models = _merge_models(_without_parts(models), correspondences, options, adjust_options, events, pool)
+        model_reports = [model.summary() | {"uncertainty": mapper_of(model).uncertainty()} for model in models]
     report = {
         "tracks": track_report,
         "focal": focal_report,
         "initial_pairs": initial_reports,
         "images": _image_reports(names, models, attempts),
-        "models": [model.summary() for model in models],
+        "models": model_reports,
     }
     events.finished(STAGE, f"{len(models)} model(s)", num_models=len(models))
     if not models:
         raise no_reconstruction(report)
     return models, report
+
+
+def _grow_models(
+    empty: Reconstruction, mapper_of: Callable[[Reconstruction], Mapper], options: MappingOptions, events: Events
+) -> tuple[list[Reconstruction], list[dict[str, Any]]]:
+    """One model after another, each begun from images that no earlier one holds, and the initial pairs tried."""
+    models: list[Reconstruction] = []
+    initial_reports: list[dict[str, Any]] = []
+    seeds = np.ones(len(empty.image_names), bool)
+    while seeds.sum() >= 2 and (options.multiple_models or not models):
+        model = empty.copy()
+        mapper = mapper_of(model)
+        initial_reports.append({"pairs": mapper.start(seeds)})
+        if not model.is_registered.any():
+            break
+        mapper.grow()
+        mapper.finish()
+        seeds &= ~model.is_registered
+        num_images, num_points = int(model.is_registered.sum()), int(model.is_triangulated.sum())
+        if num_images >= min(options.min_model_images, len(seeds)) and num_points >= options.min_pose_inliers:
+            models.append(model)
+        else:
+            events.decided(STAGE, f"model dropped: {num_images} images, {num_points} points")
+    return models, initial_reports
 
 
 def _without_parts(models: list[Reconstruction]) -> list[Reconstruction]:
@@ -118,11 +129,9 @@ def _without_parts(models: list[Reconstruction]) -> list[Reconstruction]:
 
 def _merge_models(
     models: list[Reconstruction],
-    correspondences: Correspondences,
+    mapper_of: Callable[[Reconstruction], Mapper],
     options: MappingOptions,
-    adjust_options: AdjustOptions,
     events: Events,
-    pool: Executor,
 ) -> list[Reconstruction]:
     """Join smaller models to larger ones where shared images and points tell how they lie to each other."""
     merged: list[Reconstruction] = []
@@ -133,7 +142,7 @@ def _merge_models(
                 continue
             scale, target_from_source, votes = found
             union = merge(target, source, scale, target_from_source)
-            mapper = Mapper(union, correspondences, options, adjust_options, events, pool, union.is_registered, {})
+            mapper = mapper_of(union)
             mapper.adjust_globally()
             mapper.grow()
             mapper.finish()
@@ -142,9 +151,7 @@ def _merge_models(
             link = num_linking_points(union, new, target.is_registered & ~source.is_registered)
             if link >= options.min_pose_inliers:
                 num_new = int(new.sum())
-                events.decided(
-                    STAGE, f"merged two models by {votes} common points: {num_new} images more, {link} links"
-                )
+                events.decided(STAGE, f"merged two models by {votes} common points: {num_new} images more")
                 merged[n] = union
                 break
         else:

@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.adjust.covariance import estimate_covariances
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.events import Events
+from sfmapp.geometry import rigid3
 from sfmapp.mapping import structure
 from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_initial_pairs
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
-from sfmapp.scene.camera import Camera
+from sfmapp.scene.camera import PARAM_NAMES, Camera
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
 
@@ -23,6 +25,8 @@ STAGE = "mapping"
 # Share of the observations of an image that must hold once all is adjusted, where they are few. Those of a right pose
 # are verified matches and nearly all hold; those of a mirrored or repeated part are torn between two poses.
 MIN_AGREEMENT = 2 / 3
+# Uncertainties cost an inverse of eight unknowns per image: half a second and 50 MB for this many.
+MAX_UNCERTAINTY_IMAGES = 200
 
 
 @dataclass
@@ -35,25 +39,23 @@ class Mapper:
     adjust_options: AdjustOptions
     events: Events
     pool: Executor
-    seeds: NDArray[np.bool_]
+    prior_cameras: list[Camera]
     attempts: dict[int, Registration]
     failed_with: dict[int, int] = field(default_factory=dict)
     times_dropped: dict[int, int] = field(default_factory=dict)
     size_at_global: tuple[int, int] = (0, 0)
-    prior_cameras: list[Camera] = field(init=False)
     max_error_px: float = field(init=False)
 
     def __post_init__(self) -> None:
         self.max_error_px = self.options.max_reprojection_error_px
-        self.prior_cameras = list(self.reconstruction.cameras)
 
     # ------------------------------------------------------------------ start
 
-    def start(self) -> list[dict[str, Any]]:
-        """Register the first two images; returns the pairs that were tried, each with the reason it was rejected."""
+    def start(self, seeds: NDArray[np.bool_]) -> list[dict[str, Any]]:
+        """Register two of the seeds (I,) bool; returns the pairs that were tried, each with the reason against it."""
         options = self.options
         tried: list[dict[str, Any]] = []
-        ranked = rank_initial_pairs(self.reconstruction, self.correspondences, self.seeds, options)
+        ranked = rank_initial_pairs(self.reconstruction, self.correspondences, seeds, options)
         inliers, angle = options.min_initial_inliers, options.min_initial_angle_deg
         while True:
             for pair in ranked:
@@ -224,20 +226,70 @@ class Mapper:
 
     def _refine_principal_points(self, options: AdjustOptions) -> None:
         """Adjust everything with free principal points, for the cameras that MappingOptions names."""
+        chosen = self._free_principal_points()
+        if chosen.any():
+            options = self._with_principal_points(options, chosen)
+            adjust_bundle(self.reconstruction, options, variable_cameras=chosen, prior_cameras=self.prior_cameras)
+
+    def _free_principal_points(self) -> NDArray[np.bool_]:
+        """(C,) bool: cameras whose principal point is refined."""
         reconstruction, mode = self.reconstruction, self.options.refine_principal_point
         registered = reconstruction.image_camera_idx[reconstruction.is_registered]
-        chosen = np.bincount(registered, minlength=len(reconstruction.cameras)) >= 3
-        chosen &= [mode == "always" or c.focal_source == "default" for c in reconstruction.cameras]
-        if mode == "never" or not chosen.any():
-            return
-        size = max(max(c.width, c.height) for c, s in zip(reconstruction.cameras, chosen, strict=True) if s)
+        shared = np.bincount(registered, minlength=len(reconstruction.cameras)) >= 3
+        unknown = np.array([mode == "always" or c.focal_source == "default" for c in reconstruction.cameras], bool)
+        return shared & unknown & (mode != "never")
+
+    def _with_principal_points(self, options: AdjustOptions, chosen: NDArray[np.bool_]) -> AdjustOptions:
+        cameras = self.reconstruction.cameras
+        size = max(max(c.width, c.height) for c, is_chosen in zip(cameras, chosen, strict=True) if is_chosen)
         # the adjustment counts residuals in pixels; the prior is weighed against them at their true noise
-        noise_px = max(structure.residual_scale_px(reconstruction), 0.1)
-        options = replace(
-            options, refine_principal_point=True,
-            principal_point_sigma_px=self.options.principal_point_sigma * size / noise_px,
-        )  # fmt: skip
-        adjust_bundle(reconstruction, options, variable_cameras=chosen, prior_cameras=self.prior_cameras)
+        noise_px = max(structure.residual_scale_px(self.reconstruction), 0.1)
+        sigma_px = self.options.principal_point_sigma * size / noise_px
+        return replace(options, refine_principal_point=True, principal_point_sigma_px=sigma_px)
+
+    def uncertainty(self) -> dict[str, Any]:
+        """Standard deviations of the finished model for the report: of parameters, and of centres against its size.
+
+        They follow from the residuals under the model (independent errors, a right lens model) in the gauge of inner
+        constraints: what the photographs can tell, not how far the lens model is off. Empty for large models, as the
+        dense inverse grows with the cube of the images.
+        """
+        reconstruction, options = self.reconstruction, self.adjust_options
+        if reconstruction.is_registered.sum() > MAX_UNCERTAINTY_IMAGES:
+            return {}
+        chosen = self._free_principal_points()
+        if chosen.any():
+            options = self._with_principal_points(options, chosen)
+        found = estimate_covariances(reconstruction, options, prior_cameras=self.prior_cameras)
+        if not found.is_determined:
+            return {}
+        rotation = rigid3.rotation_matrix(reconstruction.cam_from_world[found.image_idx])
+        # c = -R^T t moves by -R^T v; its variance along one axis is a third of the trace
+        center_sigma = np.sqrt(np.trace(found.poses[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
+        angle_sigma = np.degrees(np.sqrt(np.trace(found.poses[:, :3, :3], axis1=1, axis2=2) / 3.0))
+        centers = -np.einsum("nji,nj->ni", rotation, reconstruction.cam_from_world[found.image_idx, 4:])
+        size = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+        parameters = [
+            {
+                "camera": int(c),
+                "sigma": {
+                    PARAM_NAMES[reconstruction.cameras[c].model][k]: float(np.sqrt(variance))
+                    for k, variance in zip(free, np.diag(covariance), strict=True)
+                },
+            }
+            for c, free, covariance in zip(found.camera_idx, found.free_params, found.intrinsics, strict=True)
+        ]
+        return {
+            "noise_px": found.sigma_px,
+            "cameras": parameters,
+            "median_center_sigma_share": float(np.median(center_sigma)) / size,
+            "worst_center_sigma_share": float(center_sigma.max()) / size,
+            "median_rotation_sigma_deg": float(np.median(angle_sigma)),
+            "images": {
+                reconstruction.image_names[i]: {"center_sigma_share": float(c) / size, "rotation_sigma_deg": float(a)}
+                for i, c, a in zip(found.image_idx, center_sigma, angle_sigma, strict=True)
+            },
+        }
 
     def _settle_points(self) -> None:
         """Measure the noise; filter accordingly, and triangulate again what was lost or has become possible."""

@@ -108,7 +108,9 @@ def _record(run: Run, models: Sequence[Reconstruction]) -> str:
 def _make_report(run: Run, models: Sequence[Reconstruction], failure: NoReconstructionError | None) -> dict[str, Any]:
     assert run.image_set is not None
     summaries = [model.summary() for model in models]
-    images, cameras = _image_rows(run, failure), camera_rows(run.image_set, models[0] if models else None)
+    uncertainty = mapped[0]["uncertainty"] if (mapped := run.stages.get("mapping", {}).get("models")) else {}
+    images = _image_rows(run, failure)
+    cameras = camera_rows(run.image_set, models[0] if models else None, uncertainty)
     return {
         "format": FORMAT,
         "outcome": {

@@ -122,8 +122,11 @@ def explain_failure(funnel: Mapping[str, Any], reason: str, options: MappingOpti
     }
 
 
-def camera_rows(image_set: ImageSet, model: Reconstruction | None) -> list[dict[str, Any]]:
-    """Each camera with the parameters that it began with and, if a model holds it, those it ended with."""
+def camera_rows(
+    image_set: ImageSet, model: Reconstruction | None, uncertainty: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """Each camera with the parameters that it began with and, if a model holds it, those it ended with, and sigmas."""
+    sigmas = {entry["camera"]: entry["sigma"] for entry in uncertainty.get("cameras", ())}
     num_images = np.bincount([record.camera_idx for record in image_set.images], minlength=len(image_set.cameras))
     rows = []
     for idx, camera in enumerate(image_set.cameras):
@@ -138,6 +141,7 @@ def camera_rows(image_set: ImageSet, model: Reconstruction | None) -> list[dict[
             "is_fixed": camera.is_fixed,
             "initial": _named_params(camera),
             "refined": None,
+            "sigma": sigmas.get(idx, {}),
         }
         if model is not None and model.is_registered[model.image_camera_idx == idx].any():
             row["refined"] = _named_params(model.cameras[idx])

@@ -122,6 +122,8 @@ def _cameras(cameras: Iterable[Mapping[str, Any]]) -> str:
             text = f"{name} {value:.5g}"
             if name in refined and refined[name] != value:
                 text += f" \N{RIGHTWARDS ARROW} {refined[name]:.5g}"
+            if name in camera["sigma"]:
+                text += f" \N{PLUS-MINUS SIGN} {camera['sigma'][name]:.2g}"
             texts.append(text)
         sigma = camera["focal_sigma_px"]
         prior = camera["focal_source"] + (f" \N{PLUS-MINUS SIGN} {sigma:.0f} px" if sigma else "")
