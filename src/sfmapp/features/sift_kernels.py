@@ -35,13 +35,13 @@ _EXP_SIZE = 2048
 MAX_SAMPLES = int((5.0 * _CELL_SIGMAS * SIGMA * 2.0 ** (4.0 / 3.0) / STRIDE + 2.0) ** 2 * 1.2)
 _EXP_TABLE = np.exp(-np.arange(_EXP_SIZE + 1) * (_EXP_MAX / _EXP_SIZE)).astype(np.float32)
 
-FloatImage = FloatRow = FloatRows = NDArray[np.float32]
+Floats = NDArray[np.float32]
 
 
 @numba.njit(cache=True, nogil=True)
 def _taps_0_to_4(
-    out: FloatRow, k: FloatRow, m: FloatRow, a1: FloatRow, b1: FloatRow, a2: FloatRow, b2: FloatRow, a3: FloatRow,
-    b3: FloatRow, a4: FloatRow, b4: FloatRow, num: int,
+    out: Floats, k: Floats, m: Floats, a1: Floats, b1: Floats, a2: Floats, b2: Floats, a3: Floats,
+    b3: Floats, a4: Floats, b4: Floats, num: int,
 ) -> None:  # fmt: skip
     k0, k1, k2, k3, k4 = k[0], k[1], k[2], k[3], k[4]
     for c in range(num):
@@ -50,14 +50,14 @@ def _taps_0_to_4(
 
 
 @numba.njit(cache=True, nogil=True)
-def _two_taps(out: FloatRow, k: FloatRow, a1: FloatRow, b1: FloatRow, a2: FloatRow, b2: FloatRow, num: int) -> None:
+def _two_taps(out: Floats, k: Floats, a1: Floats, b1: Floats, a2: Floats, b2: Floats, num: int) -> None:
     k1, k2 = k[0], k[1]
     for c in range(num):
         out[c] += k1 * (a1[c] + b1[c]) + k2 * (a2[c] + b2[c])
 
 
 @numba.njit(cache=True, nogil=True)
-def blur(source: FloatImage, k: FloatRow, line: FloatRow, target: FloatImage) -> None:
+def blur(source: Floats, k: Floats, line: Floats, target: Floats) -> None:
     """Convolve columns, then rows, with a symmetric kernel; the image is mirrored at the centres of its outer pixels.
 
     A quarter to a half faster than OpenCV's, and the same to the last bit on any processor, as no multiplication is
@@ -96,13 +96,13 @@ def blur(source: FloatImage, k: FloatRow, line: FloatRow, target: FloatImage) ->
 
 
 @numba.njit(cache=True, nogil=True)
-def _subtract(upper: FloatRow, lower: FloatRow, out: FloatRow, num: int) -> None:
+def _subtract(upper: Floats, lower: Floats, out: Floats, num: int) -> None:
     for c in range(num):
         out[c] = upper[c] - lower[c]
 
 
 @numba.njit(cache=True, nogil=True)
-def _extremes_of_three(row: FloatRow, most: FloatRow, least: FloatRow, num: int) -> None:
+def _extremes_of_three(row: Floats, most: Floats, least: Floats, num: int) -> None:
     """Largest and smallest of ``row[c : c + 3]``."""
     for c in range(num):
         v0, v1, v2 = row[c], row[c + 1], row[c + 2]
@@ -114,7 +114,7 @@ def _extremes_of_three(row: FloatRow, most: FloatRow, least: FloatRow, num: int)
 
 @numba.njit(cache=True, nogil=True)
 def _flag_extremes(
-    row: FloatRow, most: FloatImage, least: FloatImage, threshold: float, flags: NDArray[np.uint8], num: int
+    row: Floats, most: Floats, least: Floats, threshold: float, flags: NDArray[np.uint8], num: int
 ) -> None:
     """Flag the values of a row that are the extremes of their 3 x 3 pixels and far enough from zero."""
     for c in range(num):
@@ -127,7 +127,7 @@ def _flag_extremes(
 
 
 @numba.njit(cache=True, nogil=True)
-def _exceeds(value: float, rows: FloatImage, col: int) -> bool:
+def _exceeds(value: float, rows: Floats, col: int) -> bool:
     """Whether none of the 3 x 3 values of another layer is beyond a value, on its own side of zero."""
     for i in range(3):
         for c in range(col, col + 3):
@@ -138,8 +138,8 @@ def _exceeds(value: float, rows: FloatImage, col: int) -> bool:
 
 @numba.njit(cache=True, nogil=True)
 def find_extrema(
-    gauss: tuple[FloatImage, ...], threshold: float, rows: FloatRows, flags: NDArray[np.uint8],
-    place: NDArray[np.int32], value: FloatRow,
+    gauss: tuple[Floats, ...], threshold: float, rows: Floats, flags: NDArray[np.uint8],
+    place: NDArray[np.int32], value: Floats,
 ) -> int:  # fmt: skip
     """Pixels whose difference of Gaussians is the largest or smallest of its 26 neighbours and exceeds the threshold.
 
@@ -223,7 +223,7 @@ def _locate(d: NDArray[np.float64], ds: float, edge_threshold: float, out: NDArr
 
 @numba.njit(cache=True, nogil=True)
 def refine_extremum(
-    gauss: tuple[FloatImage, ...], layer: int, row: int, col: int, edge_threshold: float, out: NDArray[np.float64]
+    gauss: tuple[Floats, ...], layer: int, row: int, col: int, edge_threshold: float, out: NDArray[np.float64]
 ) -> bool:
     """Fit a parabola to the 27 differences around a pixel (Brown and Lowe, BMVC 2002), moving on while it lies outside.
 
@@ -280,7 +280,7 @@ def refine_extremum(
 
 @numba.njit(cache=True, nogil=True)
 def refine_all(
-    gauss: tuple[FloatImage, ...], place: NDArray[np.int32], edge_threshold: float, out: NDArray[np.float64]
+    gauss: tuple[Floats, ...], place: NDArray[np.int32], edge_threshold: float, out: NDArray[np.float64]
 ) -> None:
     """:func:`refine_extremum` of every place (N, 3); rows of out (N, 4) that fail become NaN."""
     for n in range(place.shape[0]):
@@ -289,7 +289,7 @@ def refine_all(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _polar(gx: FloatRow, gy: FloatRow, num: int) -> None:
+def _polar(gx: Floats, gy: Floats, num: int) -> None:
     """Replace gradients by their lengths and directions in [0, 2 pi], to 1e-5 (Abramowitz and Stegun 4.4.49).
 
     Written so that it becomes vector instructions; the check of Python's division would prevent that.
@@ -315,7 +315,7 @@ def _polar(gx: FloatRow, gy: FloatRow, num: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def find_orientations(
-    level: FloatImage, x: float, y: float, sigma: float, max_num: int, samples: FloatRows, hist: NDArray[np.float64],
+    level: Floats, x: float, y: float, sigma: float, max_num: int, samples: Floats, hist: NDArray[np.float64],
     out: NDArray[np.float64],
 ) -> int:  # fmt: skip
     """Peaks of the histogram of gradient directions around a keypoint, strongest first.
@@ -382,7 +382,7 @@ def find_orientations(
 
 
 @numba.njit(cache=True, nogil=True)
-def _sample_cells(level: FloatImage, x: float, y: float, sigma: float, angle: float, samples: FloatRows) -> int:
+def _sample_cells(level: Floats, x: float, y: float, sigma: float, angle: float, samples: Floats) -> int:
     """Fill samples (4, N) with the place in cells from the corner of the 6 x 6 (u, v) and the gradient (x, y), weighted
     by a Gaussian with a sigma of two cells; returns how many."""
     height, width = level.shape
@@ -411,7 +411,7 @@ def _sample_cells(level: FloatImage, x: float, y: float, sigma: float, angle: fl
 
 @numba.njit(cache=True, nogil=True)
 def describe(
-    level: FloatImage, x: float, y: float, sigma: float, angle: float, samples: FloatRows, hist: FloatImage,
+    level: Floats, x: float, y: float, sigma: float, angle: float, samples: Floats, hist: Floats,
     out: NDArray[np.uint8],
 ) -> None:  # fmt: skip
     """RootSIFT descriptor: 4 x 4 cells of 8 directions, in the order of COLMAP's.
@@ -471,7 +471,7 @@ def describe(
 
 @numba.njit(cache=True, nogil=True)
 def orient_all(
-    levels: tuple[FloatImage, ...], found: NDArray[np.float64], max_num: int, angles: NDArray[np.float64]
+    levels: tuple[Floats, ...], found: NDArray[np.float64], max_num: int, angles: NDArray[np.float64]
 ) -> None:
     """Orientations of the keypoints of an octave.
 
@@ -491,7 +491,7 @@ def orient_all(
 
 @numba.njit(cache=True, nogil=True)
 def describe_all(
-    levels: tuple[FloatImage, ...], found: NDArray[np.float64], angle: NDArray[np.float64], out: NDArray[np.uint8]
+    levels: tuple[Floats, ...], found: NDArray[np.float64], angle: NDArray[np.float64], out: NDArray[np.uint8]
 ) -> None:
     """Descriptors of the keypoints of an octave.
 
