@@ -15,7 +15,7 @@ import numpy as np
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
 from sfmapp.features.orb import extract_orb
-from sfmapp.features.sift import compile_kernels, extract_sift
+from sfmapp.features.sift import Scratch, compile_kernels, extract_sift
 from sfmapp.scene.features import Features
 
 if TYPE_CHECKING:
@@ -91,11 +91,13 @@ def extract_features(
     reports: dict[int, dict[str, Any]] = {}
     start, start_cpu = time.perf_counter(), time.process_time()
     events.started(STAGE, f"{options.kind} on {len(todo)} images", total=len(todo), num_known=len(images) - len(todo))
-    budget = _MemoryBudget(_budget_bytes(options))
+    budget, local = _MemoryBudget(_budget_bytes(options)), threading.local()
 
     def work(i: int) -> tuple[Features, dict[str, Any]]:
         with budget.hold(_bytes_needed(images[i], options)):
-            return extract_image(images[i], options)
+            if not hasattr(local, "scratch"):
+                local.scratch = Scratch()
+            return extract_image(images[i], options, local.scratch)
 
     with _single_threaded_opencv(), ThreadPoolExecutor(max(1, threads)) as pool:
         jobs: dict[Future[tuple[Features, dict[str, Any]]], int] = {pool.submit(work, i): i for i in todo}
@@ -119,7 +121,9 @@ def extract_features(
     return done, report
 
 
-def extract_image(record: ImageRecord, options: FeatureOptions) -> tuple[Features, dict[str, Any]]:
+def extract_image(
+    record: ImageRecord, options: FeatureOptions, scratch: Scratch | None = None
+) -> tuple[Features, dict[str, Any]]:
     """Features of one image and the line of the report about it; no features if it cannot be read."""
     from sfmapp.images.pixels import read_picture
 
@@ -130,7 +134,7 @@ def extract_image(record: ImageRecord, options: FeatureOptions) -> tuple[Feature
     except InputError as error:
         line["warnings"].append(f"{record.name}: no features, {error}")
         return empty_features(options.kind), line
-    features, line["scale"], line["contrast_threshold"] = features_from_picture(picture, options)
+    features, line["scale"], line["contrast_threshold"] = features_from_picture(picture, options, scratch)
     line["num_features"] = len(features)
     line["cpu_seconds"] = time.thread_time() - start
     if len(features) == 0:
@@ -140,7 +144,9 @@ def extract_image(record: ImageRecord, options: FeatureOptions) -> tuple[Feature
     return features, line
 
 
-def features_from_picture(picture: Picture, options: FeatureOptions) -> tuple[Features, float, float | None]:
+def features_from_picture(
+    picture: Picture, options: FeatureOptions, scratch: Scratch | None = None
+) -> tuple[Features, float, float | None]:
     """Features of pixels in memory, the factor that the image was scaled by, and the contrast threshold in use (None
     for ORB)."""
     import cv2
@@ -162,6 +168,7 @@ def features_from_picture(picture: Picture, options: FeatureOptions) -> tuple[Fe
             max_num_orientations=options.max_num_orientations,
             contrast_threshold=options.contrast_threshold,
             edge_threshold=options.edge_threshold,
+            scratch=scratch,
         )
     else:
         keypoints, descriptors = extract_orb(gray, usable, max_num_features=options.max_num_features)

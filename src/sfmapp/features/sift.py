@@ -36,6 +36,34 @@ _ROUNDING_FLOOR = 0.2
 FloatImage = NDArray[np.float32]
 
 
+class Scratch:
+    """Memory for the scale space of one image at a time: taking 150 MB a megapixel and a half anew for every image
+    costs as much time as its descriptors.
+
+    Levels 1 to 3 of the first octave come first, as they are needed to the end. Its other three take as much memory as
+    one and a half times all coarser octaves together, which move in once its extrema are found.
+    """
+
+    def __init__(self) -> None:
+        self._memory = np.empty(0, np.float32)
+        self._end = 0
+
+    def first_octave(self, shape: tuple[int, int]) -> tuple[FloatImage, ...]:
+        """Six levels (H, W) float32 for a new image; what was handed out before is overwritten."""
+        size = shape[0] * shape[1]
+        if len(self._memory) < kernels.NUM_LEVELS * size:
+            self._memory = np.empty(0, np.float32)
+            self._memory = np.empty(kernels.NUM_LEVELS * size, np.float32)
+        self._end = 3 * size
+        images = self._memory[: kernels.NUM_LEVELS * size].reshape(kernels.NUM_LEVELS, *shape)
+        return tuple(images[i] for i in (3, 0, 1, 2, 4, 5))
+
+    def next_octave(self, shape: tuple[int, int]) -> tuple[FloatImage, ...]:
+        """Six levels (H, W) float32, half as large as those before; levels 0, 4 and 5 of the first are overwritten."""
+        start, self._end = self._end, self._end + kernels.NUM_LEVELS * shape[0] * shape[1]
+        return tuple(self._memory[start : self._end].reshape(kernels.NUM_LEVELS, *shape))
+
+
 @dataclass(frozen=True)
 class _Octave:
     """Levels 1 to 3 of an octave, and its keypoints (N, 4) float64: column, row, layer, contrast."""
@@ -59,6 +87,7 @@ def extract_sift(
     max_num_orientations: int,
     contrast_threshold: float,
     edge_threshold: float,
+    scratch: Scratch | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], float]:
     """Detect and describe.
 
@@ -69,13 +98,14 @@ def extract_sift(
         max_num_orientations: descriptors at one place, at most; seconds only where the budget has room.
         contrast_threshold: least difference of Gaussians, for grey levels in [0, 1]; lowered for flat images.
         edge_threshold: largest ratio of the principal curvatures.
+        scratch: memory that the next image in this thread can use again; None: taken anew.
 
     Returns:
         (N, 4) float32 x, y in house pixels, scale in pixels, orientation in radians from x towards y (which points
         down), largest scale first; (N, 128) uint8 descriptors as COLMAP stores them; the contrast threshold in use.
     """
     threshold = _threshold(gray, contrast_threshold)
-    octaves = _detect(gray, threshold, edge_threshold, max_num_features)
+    octaves = _detect(gray, threshold, edge_threshold, max_num_features, scratch or Scratch())
     found = np.concatenate([octave.found for octave in octaves] or [np.zeros((0, 4))])
     xy = np.concatenate([octave.xy() for octave in octaves] or [np.zeros((0, 2))])
     octave_idx = np.repeat(np.arange(len(octaves)), [len(octave.found) for octave in octaves])
@@ -110,36 +140,38 @@ def _threshold(gray: NDArray[np.uint8], contrast_threshold: float) -> float:
     return max(contrast_threshold * min(1.0, span / _FULL_SPAN), min(contrast_threshold, _ROUNDING_FLOOR / 255.0))
 
 
-def _detect(gray: NDArray[np.uint8], threshold: float, edge_threshold: float, max_num_features: int) -> list[_Octave]:
+def _detect(
+    gray: NDArray[np.uint8], threshold: float, edge_threshold: float, max_num_features: int, scratch: Scratch
+) -> list[_Octave]:
     """The octaves of the scale space with their keypoints, finest first."""
     import cv2
 
-    height, width = gray.shape
-    doubled = (_UPSAMPLING * width, _UPSAMPLING * height)
     octaves: list[_Octave] = []
-    if min(doubled) <= 2 * kernels.BORDER + 2:
-        return octaves
-    base = _blurred(cv2.resize(gray.astype(np.float32), doubled, interpolation=cv2.INTER_LINEAR), kernels.SIGMA)
-    while min(base.shape) > 2 * kernels.BORDER + 2:
-        levels = [base]
+    shape = (_UPSAMPLING * gray.shape[0], _UPSAMPLING * gray.shape[1])
+    levels = scratch.first_octave(shape)
+    while min(shape) > 2 * kernels.BORDER + 2:
+        if octaves:
+            levels[0][:] = octaves[-1].levels[-1][::2, ::2]
+        else:
+            cv2.resize(gray.astype(np.float32), shape[::-1], dst=levels[1], interpolation=cv2.INTER_LINEAR)
+            _blur(levels[1], kernels.SIGMA, levels[0])
         for i in range(1, kernels.NUM_LEVELS):
             before = kernels.SIGMA * 2.0 ** ((i - 1) / kernels.NUM_LAYERS)
-            levels.append(_blurred(levels[-1], before * math.sqrt(2.0 ** (2.0 / kernels.NUM_LAYERS) - 1.0)))
-        found = _find(tuple(levels), 255.0 * threshold, edge_threshold, _REFINED_BUDGETS * max_num_features)
-        octaves.append(_Octave(tuple(levels[1:4]), found, 2.0 ** len(octaves) / _UPSAMPLING))
-        base = np.ascontiguousarray(levels[kernels.NUM_LAYERS][::2, ::2])
+            _blur(levels[i - 1], before * math.sqrt(2.0 ** (2.0 / kernels.NUM_LAYERS) - 1.0), levels[i])
+        found = _find(levels, 255.0 * threshold, edge_threshold, _REFINED_BUDGETS * max_num_features)
+        octaves.append(_Octave(levels[1:4], found, 2.0 ** len(octaves) / _UPSAMPLING))
+        shape = ((shape[0] + 1) // 2, (shape[1] + 1) // 2)
+        levels = scratch.next_octave(shape)
     return octaves
 
 
-def _blurred(image: FloatImage, sigma: float) -> FloatImage:
+def _blur(image: FloatImage, sigma: float, target: FloatImage) -> None:
     # the kernel takes the pairs of taps beyond the fourth two at a time
     reach = 2 * math.ceil(_TRUNCATION_SIGMAS * sigma / 2.0)
     taps = np.exp(-0.5 * (np.arange(reach + 1) / sigma) ** 2)
     taps /= taps[0] + 2.0 * taps[1:].sum()
     line = np.empty(image.shape[1] + 2 * len(taps), np.float32)
-    target = np.empty_like(image)
     kernels.blur(image, taps.astype(np.float32), line, target)
-    return target
 
 
 def _find(
