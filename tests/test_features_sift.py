@@ -114,12 +114,12 @@ def test_budget_order_and_orientations() -> None:
 
 
 def test_no_part_of_the_picture_goes_without() -> None:
-    """A busy half may not take the whole budget from a faint one."""
+    """A busy half may not take the whole budget from a faint one, nor the faint one take as much."""
     picture = texture((400, 400)).astype(float)
     picture[:, 200:] = 128 + (picture[:, 200:] - 128) * 0.15
     keypoints, _ = sift(picture.astype(np.uint8), max_num_features=800)
     share = (keypoints[:, 0] > 200).mean()
-    assert 0.08 < share < 0.4
+    assert 0.3 < share < 0.5
 
 
 def test_mask_blanks() -> None:

@@ -87,6 +87,33 @@ def test_wrong_observations_are_left_out():
     assert np.median(center_errors(models[0], scene.truth)) < 4e-3
 
 
+def test_gtsam_as_the_backend_comes_to_the_same():
+    scene = make_scene(11, 8, 300, sigma_px=0.4)
+    image_set, features, found = inputs(scene)
+    models = [
+        map_images(
+            image_set, features, found, MappingOptions(refine_principal_point="never"),
+            adjust_options=AdjustOptions(backend=backend), threads=1, events=Events(),
+        )[0][0]
+        for backend in ("schur", "gtsam")
+    ]  # fmt: skip
+    np.testing.assert_array_equal(models[0].obs_is_inlier, models[1].obs_is_inlier)
+    assert center_errors(models[1], models[0]).max() < 1e-4
+    assert models[1].cameras[0].focal == pytest.approx(models[0].cameras[0].focal, rel=1e-4)
+
+
+def test_uncertainty_has_the_size_of_the_error():
+    ratios = []
+    for seed in range(6):
+        scene = make_scene(20 + seed, 10, 400, sigma_px=0.5)
+        models, report = reconstruct(scene)
+        uncertainty = report["models"][0]["uncertainty"]
+        assert uncertainty["noise_px"] == pytest.approx(0.5, rel=0.15)
+        sigma = uncertainty["cameras"][0]["sigma"]["f"]
+        ratios.append((models[0].cameras[0].focal - scene.truth.cameras[0].focal) / sigma)
+    assert 0.2 < np.sqrt(np.mean(np.square(ratios))) < 2.0  # a chi of 6 degrees of freedom over root 6
+
+
 def test_same_bytes_on_any_number_of_threads():
     scene = make_scene(4, 10, 800)
     one, two = reconstruct(scene, threads=1)[0][0], reconstruct(scene, threads=2)[0][0]

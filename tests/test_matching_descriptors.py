@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +10,8 @@ from hypothesis import strategies as st
 
 from sfmapp.geometry import epipolar, rigid3
 from sfmapp.matching import guided
-from sfmapp.matching.descriptors import match_binary, match_sift
+from sfmapp.matching.binary import match_binary
+from sfmapp.matching.descriptors import match_sift
 from sfmapp.matching.products import background_products, largest_products
 from sfmapp.scene.features import Features
 
@@ -186,3 +188,21 @@ def test_change_of_shape_covers_what_the_matches_do() -> None:
     assert 1.5 < high < 1.9
     assert centre == pytest.approx(3.0, abs=0.05)
     assert half == pytest.approx(np.radians(30))
+
+
+def test_hamming_neighbours_equal_opencv():
+    rng = np.random.default_rng(11)
+    a = rng.integers(0, 256, (300, 32), np.uint8)
+    b = np.concatenate(
+        [a[::2] ^ (rng.random((150, 32)) < 0.1).astype(np.uint8), rng.integers(0, 256, (90, 32), np.uint8)]
+    )
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+
+    def passing(query, train):
+        found = matcher.knnMatch(query, train, k=2)
+        return {m.queryIdx: m.trainIdx for m, n in found if m.distance < 0.8 * n.distance and m.distance <= 0.5 * 256}
+
+    forward, backward = passing(a, b), passing(b, a)
+    expected = sorted((i, j) for i, j in forward.items() if backward.get(j) == i)
+    assert match_binary(a, b, 0.8, 0.5).tolist() == [list(pair) for pair in expected]
+    assert len(expected) > 100

@@ -232,12 +232,13 @@ class Mapper:
             adjust_bundle(self.reconstruction, options, variable_cameras=chosen, prior_cameras=self.prior_cameras)
 
     def _free_principal_points(self) -> NDArray[np.bool_]:
-        """(C,) bool: cameras whose principal point is refined."""
+        """(C,) bool: cameras whose principal point is refined. None by gtsam's backend, whose calibrations with one
+        focal length hold it fixed."""
         reconstruction, mode = self.reconstruction, self.options.refine_principal_point
         registered = reconstruction.image_camera_idx[reconstruction.is_registered]
         shared = np.bincount(registered, minlength=len(reconstruction.cameras)) >= 3
         unknown = np.array([mode == "always" or c.focal_source == "default" for c in reconstruction.cameras], bool)
-        return shared & unknown & (mode != "never")
+        return shared & unknown & (mode != "never" and self.adjust_options.backend == "schur")
 
     def _with_principal_points(self, options: AdjustOptions, chosen: NDArray[np.bool_]) -> AdjustOptions:
         cameras = self.reconstruction.cameras

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.matching.descriptors import match_binary, match_sift
+from sfmapp.matching.binary import match_binary
+from sfmapp.matching.descriptors import match_sift
 from sfmapp.matching.guided import GuidedImage, change_of_shape, match_guided
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.products import DIMS, Ints

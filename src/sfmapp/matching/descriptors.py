@@ -1,4 +1,4 @@
-"""Nearest neighbours among descriptors, checked from both sides."""
+"""Nearest neighbours among SIFT descriptors, checked from both sides."""
 
 from __future__ import annotations
 
@@ -39,32 +39,3 @@ def passes_ratio(best: Indices, second: Indices, max_ratio: float, max_distance:
     d_best = np.sqrt(np.maximum(2.0 - best * (2.0 / _SIFT_NORM2), 0.0))
     d_second = np.sqrt(np.maximum(2.0 - second * (2.0 / _SIFT_NORM2), 0.0))
     return (d_best < max_ratio * d_second) & (d_best <= max_distance)
-
-
-def match_binary(
-    descriptors1: NDArray[np.uint8], descriptors2: NDArray[np.uint8], max_ratio: float, max_distance: float
-) -> Indices:
-    """The same for packed bits (N, B) and (M, B) uint8 under the Hamming distance; max_distance is a share of bits."""
-    import cv2
-
-    if len(descriptors1) == 0 or len(descriptors2) == 0:
-        return np.empty((0, 2), np.int32)
-    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
-    forward = _nearest_binary(matcher, descriptors1, descriptors2, max_ratio, max_distance)
-    backward = _nearest_binary(matcher, descriptors2, descriptors1, max_ratio, max_distance)
-    rows = np.flatnonzero(forward >= 0)
-    keep = backward[forward[rows]] == rows
-    return np.stack([rows[keep], forward[rows[keep]]], 1).astype(np.int32)
-
-
-def _nearest_binary(
-    matcher: object, query: NDArray[np.uint8], train: NDArray[np.uint8], max_ratio: float, max_distance: float
-) -> NDArray[np.int64]:
-    nearest = np.full(len(query), -1, np.int64)
-    limit = max_distance * 8 * query.shape[1]
-    for i, found in enumerate(matcher.knnMatch(query, train, k=2)):  # type: ignore[attr-defined]
-        if not found or found[0].distance > limit:
-            continue
-        if len(found) == 1 or found[0].distance < max_ratio * found[1].distance:
-            nearest[i] = found[0].trainIdx
-    return nearest
