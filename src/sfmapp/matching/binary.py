@@ -15,7 +15,7 @@ Words = NDArray[np.uint64]
 Indices = NDArray[np.int32]
 
 
-@intrinsic  # type: ignore[misc]
+@intrinsic
 def _count_bits(typingctx: Any, word: Any) -> Any:
     """LLVM's population count of a uint64."""
 
