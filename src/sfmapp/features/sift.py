@@ -17,7 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.features import sift_kernels as kernels
+from sfmapp.features import scale_space
+from sfmapp.features.descriptor import describe_all, orient_all
+from sfmapp.features.scale_space import NUM_LAYERS, NUM_LEVELS, SIGMA
 
 # pixels of the first octave in one pixel of the image
 _UPSAMPLING = 2
@@ -26,7 +28,7 @@ _TRUNCATION_SIGMAS = 3.0
 # candidates per octave that are refined, in budgets: about half of them turn out to lie on edges
 _REFINED_BUDGETS = 2
 # share of the budget that is dealt out evenly over a grid of cells, so that no busy patch takes it all
-_SPREAD_SHARE = 0.25
+_SPREAD_SHARE = 0.75
 _SPREAD_CELLS = 8
 # images whose grey levels span less than this get a proportionally lower threshold ...
 _FULL_SPAN = 128.0
@@ -51,17 +53,17 @@ class Scratch:
     def first_octave(self, shape: tuple[int, int]) -> tuple[FloatImage, ...]:
         """Six levels (H, W) float32 for a new image; what was handed out before is overwritten."""
         size = shape[0] * shape[1]
-        if len(self._memory) < kernels.NUM_LEVELS * size:
+        if len(self._memory) < NUM_LEVELS * size:
             self._memory = np.empty(0, np.float32)
-            self._memory = np.empty(kernels.NUM_LEVELS * size, np.float32)
+            self._memory = np.empty(NUM_LEVELS * size, np.float32)
         self._end = 3 * size
-        images = self._memory[: kernels.NUM_LEVELS * size].reshape(kernels.NUM_LEVELS, *shape)
+        images = self._memory[: NUM_LEVELS * size].reshape(NUM_LEVELS, *shape)
         return tuple(images[i] for i in (3, 0, 1, 2, 4, 5))
 
     def next_octave(self, shape: tuple[int, int]) -> tuple[FloatImage, ...]:
         """Six levels (H, W) float32, half as large as those before; levels 0, 4 and 5 of the first are overwritten."""
-        start, self._end = self._end, self._end + kernels.NUM_LEVELS * shape[0] * shape[1]
-        return tuple(self._memory[start : self._end].reshape(kernels.NUM_LEVELS, *shape))
+        start, self._end = self._end, self._end + NUM_LEVELS * shape[0] * shape[1]
+        return tuple(self._memory[start : self._end].reshape(NUM_LEVELS, *shape))
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ def extract_sift(
     order = np.lexsort((place, -found[chosen[place], 3], rank))[:max_num_features]
     rank, place = rank[order], place[order]
     angle, place = angles[place, rank], chosen[place]
-    scale = kernels.SIGMA * 2.0 ** (found[place, 2] / kernels.NUM_LAYERS)
+    scale = SIGMA * 2.0 ** (found[place, 2] / NUM_LAYERS)
     scale *= np.array([octave.step for octave in octaves])[octave_idx[place]] if len(place) else 1.0
     order = np.lexsort((angle, xy[place, 1], xy[place, 0], -scale))
     angle, place, scale = angle[order], place[order], scale[order]
@@ -128,7 +130,7 @@ def extract_sift(
         mine = np.flatnonzero(octave_idx[place] == i)
         mine = mine[np.argsort(place[mine], kind="stable")]
         out = np.empty((len(mine), 128), np.uint8)
-        kernels.describe_all(octave.levels, found[place[mine]], angle[mine], out)
+        describe_all(octave.levels, found[place[mine]], angle[mine], out)
         descriptors[mine] = out
     return np.column_stack([xy[place], scale, angle]).astype(np.float32), descriptors, threshold
 
@@ -149,15 +151,15 @@ def _detect(
     octaves: list[_Octave] = []
     shape = (_UPSAMPLING * gray.shape[0], _UPSAMPLING * gray.shape[1])
     levels = scratch.first_octave(shape)
-    while min(shape) > 2 * kernels.BORDER + 2:
+    while min(shape) > 2 * scale_space.BORDER + 2:
         if octaves:
             levels[0][:] = octaves[-1].levels[-1][::2, ::2]
         else:
             cv2.resize(gray.astype(np.float32), shape[::-1], dst=levels[1], interpolation=cv2.INTER_LINEAR)
-            _blur(levels[1], kernels.SIGMA, levels[0])
-        for i in range(1, kernels.NUM_LEVELS):
-            before = kernels.SIGMA * 2.0 ** ((i - 1) / kernels.NUM_LAYERS)
-            _blur(levels[i - 1], before * math.sqrt(2.0 ** (2.0 / kernels.NUM_LAYERS) - 1.0), levels[i])
+            _blur(levels[1], SIGMA, levels[0])
+        for i in range(1, NUM_LEVELS):
+            before = SIGMA * 2.0 ** ((i - 1) / NUM_LAYERS)
+            _blur(levels[i - 1], before * math.sqrt(2.0 ** (2.0 / NUM_LAYERS) - 1.0), levels[i])
         found = _find(levels, 255.0 * threshold, edge_threshold, _REFINED_BUDGETS * max_num_features)
         octaves.append(_Octave(levels[1:4], found, 2.0 ** len(octaves) / _UPSAMPLING))
         shape = ((shape[0] + 1) // 2, (shape[1] + 1) // 2)
@@ -171,20 +173,20 @@ def _blur(image: FloatImage, sigma: float, target: FloatImage) -> None:
     taps = np.exp(-0.5 * (np.arange(reach + 1) / sigma) ** 2)
     taps /= taps[0] + 2.0 * taps[1:].sum()
     line = np.empty(image.shape[1] + 2 * len(taps), np.float32)
-    kernels.blur(image, taps.astype(np.float32), line, target)
+    scale_space.blur(image, taps.astype(np.float32), line, target)
 
 
 def _find(
     levels: tuple[FloatImage, ...], threshold: float, edge_threshold: float, max_refined: int
 ) -> NDArray[np.float64]:
     """(N, 4) keypoints of an octave from top to bottom: column, row, layer, contrast (threshold, too: grey levels)."""
-    rows, flags = np.empty((11, 3, kernels.TILE + 2), np.float32), np.empty(kernels.TILE, np.uint8)
+    rows, flags = np.empty((11, 3, scale_space.TILE + 2), np.float32), np.empty(scale_space.TILE, np.uint8)
     # the parabola raises the contrast above that of the pixel, so those a little below get their chance
     start = 0.8 * threshold
     capacity = max(256, levels[0].size // 64)
     while True:
         place, value = np.empty((capacity, 3), np.int32), np.empty(capacity, np.float32)
-        count = kernels.find_extrema(levels, start, rows, flags, place, value)
+        count = scale_space.find_extrema(levels, start, rows, flags, place, value)
         if count <= capacity:
             break
         capacity = count
@@ -192,7 +194,7 @@ def _find(
     if count > max_refined:
         place = place[value >= -np.partition(-value, max_refined - 1)[max_refined - 1]]
     found = np.empty((len(place), 4))
-    kernels.refine_all(levels, np.ascontiguousarray(place), edge_threshold, found)
+    scale_space.refine_all(levels, np.ascontiguousarray(place), edge_threshold, found)
     found = found[found[:, 3] >= threshold]
     found = found[np.lexsort((found[:, 2], found[:, 0], found[:, 1]))]
     # two neighbours may have moved to the same place
@@ -229,7 +231,7 @@ def _choose(
 
 def _orient(octave: _Octave, found: NDArray[np.float64], max_num: int) -> NDArray[np.float64]:
     angles = np.empty((len(found), max_num))
-    kernels.orient_all(octave.levels, found, max_num, angles)
+    orient_all(octave.levels, found, max_num, angles)
     return angles
 
 

@@ -108,16 +108,8 @@ def select_pairs(
         pairs = np.column_stack(np.triu_indices(len(usable), 1))
         counts["exhaustive"] = len(pairs)
     else:
-        sources: dict[str, NDArray[np.int64]] = {}
-        records = [images[i] for i in usable]
-        if method in ("auto", "retrieval"):
-            chosen = [features[i] for i in usable]
-            sources["retrieval"] = retrieval_pairs(chosen, options, seed=seed, threads=threads, events=events)
-        if method in ("auto", "sequential"):
-            groups = find_sequences(records) if method == "auto" else sequences_by_folder(records)
-            sources["sequence"] = sequence_pairs(groups, options)
-        if method == "auto":
-            sources["gps"] = gps_pairs(records, options.num_gps_neighbors)
+        records, chosen = [images[i] for i in usable], [features[i] for i in usable]
+        sources = _candidates(records, chosen, method, options, seed=seed, threads=threads, events=events)
         counts = {name: len(found) for name, found in sources.items()}
         pairs = _unique_pairs(np.concatenate(list(sources.values())))
         reason = _reason(options, len(usable), counts)
@@ -135,6 +127,28 @@ def select_pairs(
     events.decided(STAGE, f"{len(result)} of {num_all} pairs: {reason}", **report)
     events.finished(STAGE, f"{len(result)} pairs", **report)
     return result, report
+
+
+def _candidates(
+    records: Sequence[ImageRecord],
+    features: Sequence[Features],
+    method: str,
+    options: PairOptions,
+    *,
+    seed: int,
+    threads: int,
+    events: Events,
+) -> dict[str, NDArray[np.int64]]:
+    """(P, 2) pairs by source: ``retrieval``, ``sequence``, ``gps``, as far as the method asks for them."""
+    sources: dict[str, NDArray[np.int64]] = {}
+    if method in ("auto", "retrieval"):
+        sources["retrieval"] = retrieval_pairs(features, options, seed=seed, threads=threads, events=events)
+    if method in ("auto", "sequential"):
+        groups = find_sequences(records) if method == "auto" else sequences_by_folder(records)
+        sources["sequence"] = sequence_pairs(groups, options)
+    if method == "auto":
+        sources["gps"] = gps_pairs(records, options.num_gps_neighbors)
+    return sources
 
 
 def _exhaustive_reason(options: PairOptions, num_images: int) -> str:
