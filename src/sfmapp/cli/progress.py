@@ -63,7 +63,7 @@ class PlainLines:
             return
         elif event.kind == "started":
             # a step inside a stage, such as one of many adjustments, is worth a line only to the curious
-            if self._is_verbose or not self._started or event.stage == BACKGROUND:
+            if self._is_verbose or self._is_outermost(event.stage):
                 _say(f"{event.stage}: {event.message or 'begins'}")
             self._started[event.stage] = event.time_s
         elif event.kind == "advanced":
@@ -73,11 +73,14 @@ class PlainLines:
                 _say(f"  {event.message}")
         elif event.kind == "finished":
             took = event.time_s - self._started.pop(event.stage, event.time_s)
-            if self._is_verbose or not self._started or event.stage == BACKGROUND:
+            if self._is_verbose or self._is_outermost(event.stage):
                 _say(f"{event.stage}: {event.message or 'done'} ({took:.1f} s)")
 
     def close(self) -> None:
         pass
+
+    def _is_outermost(self, stage: str) -> bool:
+        return stage == BACKGROUND or not self._started.keys() - {BACKGROUND}
 
     def _advance(self, event: Event) -> None:
         now = time.monotonic()
@@ -121,7 +124,7 @@ class Bars:
             self._print(f"  {event.message}", "dim")
         elif event.kind == "finished" and event.stage in self._tasks:
             self._progress.remove_task(self._tasks.pop(event.stage))
-            if self._is_verbose or not self._tasks:
+            if self._is_verbose or event.stage == BACKGROUND or not self._tasks.keys() - {BACKGROUND}:
                 took = event.time_s - self._started[event.stage]
                 self._print(f"{event.stage:<10} {event.message} ({took:.1f} s)")
 

@@ -17,7 +17,7 @@ from sfmapp.events import Events
 
 STAGE = "kernels"
 # in the order in which a run needs them
-MODULES = ("sfmapp.matching.stage", "sfmapp.mapping.incremental")
+MODULES = ("sfmapp.features.extract", "sfmapp.matching.stage", "sfmapp.mapping.incremental")
 
 
 @contextmanager
