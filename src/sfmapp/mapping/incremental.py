@@ -69,8 +69,11 @@ def map_images(
     events.started(STAGE, "mapping", total=len(names))
     with ThreadPoolExecutor(threads) as pool:
 
-        def mapper_of(model: Reconstruction) -> Mapper:
-            return Mapper(model, correspondences, options, adjust_options, events, pool, list(cameras), attempts)
+        def mapper_of(model: Reconstruction, locked: NDArray[np.bool_] | None = None) -> Mapper:
+            locked = np.zeros(len(names), bool) if locked is None else locked
+            return Mapper(
+                model, correspondences, options, adjust_options, events, pool, list(cameras), locked, attempts
+            )
 
         empty = Reconstruction.empty(cameras, names, image_camera_idx, tracks)
         models, initial_reports = _grow_models(empty, mapper_of, options, events)
@@ -92,15 +95,20 @@ def map_images(
 
 
 def _grow_models(
-    empty: Reconstruction, mapper_of: Callable[[Reconstruction], Mapper], options: MappingOptions, events: Events
+    empty: Reconstruction, mapper_of: Callable[..., Mapper], options: MappingOptions, events: Events
 ) -> tuple[list[Reconstruction], list[dict[str, Any]]]:
-    """One model after another, each begun from images that no earlier one holds, and the initial pairs tried."""
+    """One model after another, each begun from images that no earlier one holds, and the initial pairs tried.
+
+    A model may grow into images of earlier, smaller ones: it may see more of the points that they need. But one that
+    holds most of the images is not handed over to what it refused itself, as repeated structure would have it.
+    """
     models: list[Reconstruction] = []
     initial_reports: list[dict[str, Any]] = []
     seeds = np.ones(len(empty.image_names), bool)
+    locked = np.zeros(len(seeds), bool)
     while seeds.sum() >= 2 and (options.multiple_models or not models):
         model = empty.copy()
-        mapper = mapper_of(model)
+        mapper = mapper_of(model, locked)
         initial_reports.append({"pairs": mapper.start(seeds)})
         if not model.is_registered.any():
             break
@@ -110,6 +118,8 @@ def _grow_models(
         num_images, num_points = int(model.is_registered.sum()), int(model.is_triangulated.sum())
         if num_images >= min(options.min_model_images, len(seeds)) and num_points >= options.min_pose_inliers:
             models.append(model)
+            if 2 * num_images > len(seeds):
+                locked = locked | model.is_registered
         else:
             events.decided(STAGE, f"model dropped: {num_images} images, {num_points} points")
     return models, initial_reports
@@ -129,7 +139,7 @@ def _without_parts(models: list[Reconstruction]) -> list[Reconstruction]:
 
 def _merge_models(
     models: list[Reconstruction],
-    mapper_of: Callable[[Reconstruction], Mapper],
+    mapper_of: Callable[..., Mapper],
     options: MappingOptions,
     events: Events,
 ) -> list[Reconstruction]:

@@ -31,7 +31,10 @@ MAX_UNCERTAINTY_IMAGES = 200
 
 @dataclass
 class Mapper:
-    """Grows one model. Every method is a step of the method and changes ``reconstruction`` in place."""
+    """Grows one model. Every method is a step of the method and changes ``reconstruction`` in place.
+
+    ``locked`` (I,) bool are images that this model must not register.
+    """
 
     reconstruction: Reconstruction
     correspondences: Correspondences
@@ -40,6 +43,7 @@ class Mapper:
     events: Events
     pool: Executor
     prior_cameras: list[Camera]
+    locked: NDArray[np.bool_]
     attempts: dict[int, Registration]
     failed_with: dict[int, int] = field(default_factory=dict)
     times_dropped: dict[int, int] = field(default_factory=dict)
@@ -331,9 +335,9 @@ class Mapper:
         return int(self.reconstruction.is_registered.sum()), int(self.reconstruction.is_triangulated.sum())
 
     def _candidates(self) -> NDArray[np.int64]:
-        """Images that are not registered, without those taken back twice: they would come for ever."""
+        """Images that may be registered, without those taken back twice: they would come for ever."""
         hopeless = [i for i, times in self.times_dropped.items() if times >= 2]
-        return np.setdiff1d(np.flatnonzero(~self.reconstruction.is_registered), hopeless)
+        return np.setdiff1d(np.flatnonzero(~self.reconstruction.is_registered & ~self.locked), hopeless)
 
     def _known_cameras(self) -> NDArray[np.bool_]:
         """(C,) bool: cameras with a registered image, which the adjustment has refined."""
