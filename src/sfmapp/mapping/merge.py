@@ -37,12 +37,14 @@ def similarity_through_image(
     in_target = rigid3.apply(target.cam_from_world[image_idx], target.point_xyz[common])
     in_source = rigid3.apply(source.cam_from_world[image_idx], source.point_xyz[common])
     in_front = (in_target[:, 2] > 0) & (in_source[:, 2] > 0)
-    ratios = np.linalg.norm(in_target[in_front], axis=1) / np.linalg.norm(in_source[in_front], axis=1)
+    ratios = np.log(np.linalg.norm(in_target[in_front], axis=1) / np.linalg.norm(in_source[in_front], axis=1))
     if len(ratios) < MIN_COMMON_POINTS:
         return None
     # the ratio that most others agree with, then the median of those
-    agreeing = (np.abs(np.log(ratios[:, None] / ratios[None, :])) < SCALE_TOLERANCE).sum(1)
-    near = np.abs(np.log(ratios / ratios[np.argmax(agreeing)])) < SCALE_TOLERANCE
+    order = np.sort(ratios)
+    ends = np.searchsorted(order, order + SCALE_TOLERANCE, side="right")
+    agreeing = ends - np.searchsorted(order, order - SCALE_TOLERANCE)
+    near = np.abs(ratios - order[np.argmax(agreeing)]) <= SCALE_TOLERANCE
     # directions count too: a common point must lie in the same direction from the shared image
     cosine = (in_target[in_front] * in_source[in_front]).sum(1) / (
         np.linalg.norm(in_target[in_front], axis=1) * np.linalg.norm(in_source[in_front], axis=1)
@@ -50,7 +52,7 @@ def similarity_through_image(
     near &= cosine > np.cos(SCALE_TOLERANCE)
     if near.sum() < MIN_COMMON_POINTS:
         return None
-    scale = float(np.median(ratios[near]))
+    scale = float(np.exp(np.median(ratios[near])))
     scaled = source.cam_from_world[image_idx].copy()
     scaled[4:] *= scale
     return scale, rigid3.compose(rigid3.inverse(target.cam_from_world[image_idx]), scaled), int(near.sum())
