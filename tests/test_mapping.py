@@ -10,12 +10,12 @@ import pytest
 from sfmapp.adjust.solver import AdjustOptions
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
-from sfmapp.features.features import Features
 from sfmapp.geometry import rigid3
 from sfmapp.mapping.incremental import map_images
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.scene.camera import CameraModel, simple_camera
 from sfmapp.scene.correspondences import TwoViewConfig
+from sfmapp.scene.features import Features
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import SyntheticScene, make_scene, true_correspondences
 

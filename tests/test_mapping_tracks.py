@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfmapp.features.features import Features
 from sfmapp.mapping.tracks import build_tracks, track_colors
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
+from sfmapp.scene.features import Features
 
 
 def features_of(num: int) -> Features:

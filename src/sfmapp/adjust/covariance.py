@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.kernels import SCRATCH, linearize, robust_weight
 from sfmapp.adjust.lanes import offset, pointer
-from sfmapp.adjust.problem import Problem, make_problem
-from sfmapp.adjust.solver import AdjustOptions, Engine, IntrinsicPriors
+from sfmapp.adjust.problem import Problem
+from sfmapp.adjust.solver import AdjustOptions, Engine, make_engine
 from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import Camera
 from sfmapp.scene.reconstruction import Reconstruction
@@ -81,19 +81,11 @@ def estimate_covariances(
 
     Memory is that of two dense matrices over all unknowns of cameras and poses.
     """
-    extras = None
-    if extra_factors is not None and extra_factors.size() > 0:
-        from sfmapp.adjust.factors import ExtraFactors
-
-        extras = ExtraFactors(extra_factors)
-    problem = make_problem(
-        reconstruction, refine=options.refine, variable_images=variable_images, variable_cameras=variable_cameras,
-        points=points, constant_points=constant_points, extra_images=extras.images if extras else (),
-        extra_cameras=extras.cameras if extras else (),
+    engine = make_engine(
+        reconstruction, options, variable_images=variable_images, variable_cameras=variable_cameras, points=points,
+        constant_points=constant_points, prior_cameras=prior_cameras, extra_factors=extra_factors,
     )  # fmt: skip
-    if extras is not None:
-        extras.attach(problem)
-    engine = Engine(problem, options, IntrinsicPriors(problem, prior_cameras, options), extras)
+    problem, extras = engine.problem, engine.extras
     used = (np.arange(8) < problem.block_dim[:, None]).ravel()
     variance = sigma_px**2 if sigma_px is not None else _variance(engine, int(used.sum()))
     # everything below is in units of that noise, which makes the priors weaker or stronger

@@ -122,6 +122,36 @@ def adjust_bundle(
             reconstruction, options, variable_images=variable_images, variable_cameras=variable_cameras, points=points,
             constant_points=constant_points, prior_cameras=prior_cameras, extra_factors=extra_factors, events=events,
         )  # fmt: skip
+    engine = make_engine(
+        reconstruction, options, variable_images=variable_images, variable_cameras=variable_cameras, points=points,
+        constant_points=constant_points, prior_cameras=prior_cameras, extra_factors=extra_factors,
+    )  # fmt: skip
+    problem = engine.problem
+    with ThreadPoolExecutor(max(1, min(threads, engine.num_chunks))) as pool:
+        run = map if threads <= 1 or engine.num_chunks == 1 else pool.map
+        try:
+            outcome = _minimize(engine, options, run, events)
+        finally:
+            write_back(problem, reconstruction)
+    return AdjustReport(
+        **outcome, num_images=int((problem.image_block >= 0).sum()), num_cameras=int((problem.camera_block >= 0).sum()),
+        num_points=len(problem.track_idx), num_observations=problem.num_observations, solver=engine.solver,
+        time_s=time.perf_counter() - start,
+    )  # fmt: skip
+
+
+def make_engine(
+    reconstruction: Reconstruction,
+    options: AdjustOptions,
+    *,
+    variable_images: Mask | None,
+    variable_cameras: Mask | None,
+    points: Mask | None,
+    constant_points: Mask | None,
+    prior_cameras: Sequence[Camera] | None,
+    extra_factors: Any,
+) -> Engine:
+    """The engine over a reconstruction's problem, priors and extra factors; arguments as of :func:`adjust_bundle`."""
     extras = None
     if extra_factors is not None and extra_factors.size() > 0:
         from sfmapp.adjust.factors import ExtraFactors
@@ -134,18 +164,7 @@ def adjust_bundle(
     )  # fmt: skip
     if extras is not None:
         extras.attach(problem)
-    engine = Engine(problem, options, IntrinsicPriors(problem, prior_cameras, options), extras)
-    with ThreadPoolExecutor(max(1, min(threads, engine.num_chunks))) as pool:
-        run = map if threads <= 1 or engine.num_chunks == 1 else pool.map
-        try:
-            outcome = _minimize(engine, options, run, events)
-        finally:
-            write_back(problem, reconstruction)
-    return AdjustReport(
-        **outcome, num_images=int((problem.image_block >= 0).sum()), num_cameras=int((problem.camera_block >= 0).sum()),
-        num_points=len(problem.track_idx), num_observations=problem.num_observations, solver=engine.solver,
-        time_s=time.perf_counter() - start,
-    )  # fmt: skip
+    return Engine(problem, options, IntrinsicPriors(problem, prior_cameras, options), extras)
 
 
 def compile_kernels() -> None:

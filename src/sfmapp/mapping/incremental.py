@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.solver import AdjustOptions
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
-from sfmapp.features.features import Features
 from sfmapp.images.folder import ImageSet
 from sfmapp.mapping import structure
 from sfmapp.mapping.focal import estimate_focal_ratio
@@ -28,6 +27,7 @@ from sfmapp.mapping.register import Registration, rank_next_images
 from sfmapp.mapping.tracks import build_tracks, track_colors
 from sfmapp.scene.camera import Camera
 from sfmapp.scene.correspondences import Correspondences
+from sfmapp.scene.features import Features
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import Tracks
 
@@ -150,8 +150,8 @@ def _merge_models(
             found = find_merge(target, source)
             if found is None:
                 continue
-            scale, target_from_source, votes = found
-            union = merge(target, source, scale, target_from_source)
+            target_from_source, votes = found
+            union = merge(target, source, target_from_source)
             mapper = mapper_of(union)
             mapper.adjust_globally()
             mapper.grow()
@@ -227,7 +227,7 @@ def _image_reports(
 
 def compile_kernels() -> None:
     """Compile the kernels of mapping and adjustment, or load them from numba's cache: one round on a tiny scene."""
-    from sfmapp.geometry import epipolar
+    from sfmapp.adjust import solver
     from sfmapp.scene.synthetic import make_scene, true_correspondences
 
     scene = make_scene(0, 3, 24)
@@ -243,8 +243,5 @@ def compile_kernels() -> None:
         structure.triangulate(model, np.arange(24), options, pool)
         structure.filter_observations(model, options, pool)
     rank_next_images(model, np.arange(3))
-    epipolar.compile_kernels()
-    for variable in (True, False):
-        images = np.array([variable, variable, True])
-        adjust_bundle(model, AdjustOptions(max_iterations=1), variable_images=images)
+    solver.compile_kernels()
     model.residuals_px()

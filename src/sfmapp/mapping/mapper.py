@@ -198,12 +198,10 @@ class Mapper:
         )  # fmt: skip
         structure.filter_observations(reconstruction, self.options, self.pool, seen, self.max_error_px)
 
-    def adjust_globally(self, final: bool = False) -> None:
+    def adjust_globally(self) -> None:
         """Adjust everything, filter, and triangulate again what was lost or has become possible."""
         reconstruction = self.reconstruction
-        options = self.adjust_options
-        if not final:
-            options = replace(options, max_iterations=25, relative_cost_tolerance=1e-4)
+        options = replace(self.adjust_options, max_iterations=25, relative_cost_tolerance=1e-4)
         if reconstruction.is_registered.sum() < 3:  # two views cannot tell the lens from the scene
             options = replace(options, refine_focal=False, refine_distortion=False)
         adjust_bundle(reconstruction, options, prior_cameras=self.prior_cameras)

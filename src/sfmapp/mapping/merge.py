@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.geometry import rigid3
+from sfmapp.geometry import rigid3, similarity
 from sfmapp.scene.reconstruction import Reconstruction
 
 # Common points that must agree on the scale. Chance agreement of this many within the tolerance is out of the question.
@@ -20,16 +20,16 @@ SCALE_TOLERANCE = 0.05
 
 def similarity_through_image(
     target: Reconstruction, source: Reconstruction, image_idx: int
-) -> tuple[float, NDArray[np.float64], int] | None:
-    """Scale and pose of the source's world in the target's, from an image that both have.
+) -> tuple[NDArray[np.float64], int] | None:
+    """The similarity between the worlds of two models, from an image that both have.
 
     Args:
         target, source: models over the same tracks.
         image_idx: registered in both.
 
     Returns:
-        scale and ``target_from_source`` (7,), with ``x_target = R (scale x_source) + t``, and the number of common
-        points that agree on the scale; None if fewer than MIN_COMMON_POINTS do.
+        ``target_from_source`` (8,) as in :mod:`sfmapp.geometry.similarity`, and the number of common points that agree
+        on the scale; None if fewer than MIN_COMMON_POINTS do.
     """
     common = np.flatnonzero(target.is_triangulated & source.is_triangulated)
     if len(common) < MIN_COMMON_POINTS:
@@ -53,27 +53,24 @@ def similarity_through_image(
     if near.sum() < MIN_COMMON_POINTS:
         return None
     scale = float(np.exp(np.median(ratios[near])))
-    scaled = source.cam_from_world[image_idx].copy()
-    scaled[4:] *= scale
-    return scale, rigid3.compose(rigid3.inverse(target.cam_from_world[image_idx]), scaled), int(near.sum())
+    # through the frame of the shared image: source to camera, scaled, camera to target
+    target_from_camera = np.append(rigid3.inverse(target.cam_from_world[image_idx]), scale)
+    camera_from_source = np.append(source.cam_from_world[image_idx], 1.0)
+    return similarity.compose(target_from_camera, camera_from_source), int(near.sum())
 
 
-def merge(
-    target: Reconstruction, source: Reconstruction, scale: float, target_from_source: NDArray[np.float64]
-) -> Reconstruction:
+def merge(target: Reconstruction, source: Reconstruction, target_from_source: NDArray[np.float64]) -> Reconstruction:
     """A copy of the target with the images, points and observations that only the source has.
 
     Args:
         target, source: models over the same tracks.
-        scale, target_from_source: as returned by :func:`similarity_through_image`.
+        target_from_source: (8,) as returned by :func:`similarity_through_image`.
     """
     out = target.copy()
     new = np.flatnonzero(source.is_registered & ~target.is_registered)
-    scaled = source.cam_from_world[new].copy()
-    scaled[:, 4:] *= scale
-    out.cam_from_world[new] = rigid3.compose(scaled, rigid3.inverse(target_from_source))
+    out.cam_from_world[new] = similarity.transform_poses(target_from_source, source.cam_from_world[new])
     points = np.flatnonzero(source.is_triangulated & ~target.is_triangulated)
-    out.point_xyz[points] = rigid3.apply(target_from_source, scale * source.point_xyz[points])
+    out.point_xyz[points] = similarity.apply(target_from_source, source.point_xyz[points])
     is_new = np.zeros(len(out.point_xyz), bool)
     is_new[points] = True
     taken = is_new[out.tracks.obs_track_idx]
@@ -87,11 +84,11 @@ def merge(
     return out
 
 
-def find_merge(target: Reconstruction, source: Reconstruction) -> tuple[float, NDArray[np.float64], int] | None:
+def find_merge(target: Reconstruction, source: Reconstruction) -> tuple[NDArray[np.float64], int] | None:
     """The similarity between two models through the shared image that most common points agree with, or None."""
     shared = np.flatnonzero(target.is_registered & source.is_registered)
     found = [similarity_through_image(target, source, int(i)) for i in shared]
-    return max((f for f in found if f is not None), key=lambda f: f[2], default=None)
+    return max((f for f in found if f is not None), key=lambda f: f[1], default=None)
 
 
 def num_linking_points(union: Reconstruction, new: NDArray[np.bool_], old: NDArray[np.bool_]) -> int:

@@ -8,8 +8,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.features.features import Features
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
+from sfmapp.scene.features import Features
 from sfmapp.scene.tracks import Tracks, make_tracks
 
 # Pairs whose matches say nothing about depth or are not of the scene at all.
