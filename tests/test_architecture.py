@@ -21,6 +21,7 @@ FLOORS = (
     ("cli",),
     ("pipelines",),
     ("report", "viewer"),
+    ("odometry",),
     ("mapping",),
     ("adjust",),
     ("matching",),
@@ -36,7 +37,7 @@ FLOORS = (
 LEVEL = {room: level for level, floor in enumerate(FLOORS) for room in floor}
 ALLOWED = {
     "rerun": {"viewer"},
-    "gtsam": {"adjust"},
+    "gtsam": {"adjust", "odometry"},
     "pycolmap": {"formats", "evaluation"},
     "open3d": set(),
     "rich": {"cli"},

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.lens import distort
 from sfmapp.scene.camera import Camera
+from sfmapp.scene.rig import RigImages
 from sfmapp.scene.tracks import Tracks
 
 
@@ -28,6 +29,7 @@ class Reconstruction:
         obs_is_inlier: (O,) bool: the observation supports its point. False wherever the image is unregistered or the
             point not triangulated.
         point_rgb: (T, 3) uint8.
+        rig: which images share a rig's pose; None if every image has a pose of its own.
     """
 
     cameras: list[Camera]
@@ -38,6 +40,7 @@ class Reconstruction:
     point_xyz: NDArray[np.float64]
     obs_is_inlier: NDArray[np.bool_]
     point_rgb: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+    rig: RigImages | None = None
 
     def __post_init__(self) -> None:
         if len(self.point_rgb) != self.tracks.num_tracks:
@@ -59,7 +62,7 @@ class Reconstruction:
         )
 
     def copy(self) -> Reconstruction:
-        """A copy that shares only the tracks and the (immutable) cameras."""
+        """A copy that shares only the tracks, the rig and the (immutable) cameras."""
         return Reconstruction(
             list(self.cameras),
             list(self.image_names),
@@ -69,6 +72,7 @@ class Reconstruction:
             self.point_xyz.copy(),
             self.obs_is_inlier.copy(),
             self.point_rgb.copy(),
+            self.rig,
         )
 
     @property

@@ -1,0 +1,73 @@
+"""What an odometry run hands over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.scene.reconstruction import Reconstruction
+
+Array = NDArray[np.float64]
+
+
+class FrameState(IntEnum):
+    """What became of a frame."""
+
+    WAITING = 0  # seen before a map had begun; has a pose if the map reached back to it
+    TRACKED = 1  # its pose was measured against the map
+    RELOCALIZED = 2  # the first one found again after a loss
+    LOST = 3  # no pose: a gap in the trajectory
+
+
+@dataclass
+class MapResult:
+    """One connected map: keyframes, points, and how sure they are.
+
+    Attributes:
+        reconstruction: images are keyframes (stereo: two images each, tied by ``rig``), named as the frames.
+        keyframe_frame_idx: (K,) int64, the frame that each keyframe is.
+        keyframe_image_idx: (K,) int64, its image (of the first camera) in the reconstruction.
+        covariance: (K, 6, 6) of rotation (radians) and translation of ``x_cam <- exp(w) x_cam + v`` in the map's gauge
+            (see ``gauge``); NaN where it could not be had. None if it was not asked for.
+        gauge: what the covariance holds fixed, in words.
+        scale_source: ``stereo``, ``none`` (arbitrary unit), ``marker``, ``distance``, ``camera_height`` or ``imu``.
+        scale_sigma: relative standard deviation of the unit of length; None for an arbitrary unit.
+    """
+
+    reconstruction: Reconstruction
+    keyframe_frame_idx: NDArray[np.int64]
+    keyframe_image_idx: NDArray[np.int64]
+    covariance: Array | None = None
+    gauge: str = ""
+    scale_source: str = "none"
+    scale_sigma: float | None = None
+
+
+@dataclass
+class OdometryResult:
+    """The trajectory and the maps of a run, over frames (F) in order, the unreadable ones left out.
+
+    Attributes:
+        frame_idx: (F,) int64 as in :class:`~sfmapp.images.sequence.Frame`.
+        frame_names, timestamps_s: F of each.
+        cam_from_world: (F, 7) final poses of the rig's first camera, NaN in gaps. Each in the world of its map.
+        live_cam_from_world: (F, 7) the poses as they were given out at the time of the frame, NaN in gaps.
+        frame_map: (F,) int32 position in ``maps``, -1 in gaps.
+        frame_state: (F,) uint8 of :class:`FrameState`.
+        maps: the largest (most frames) first; each has a world and, without a scale, a unit of its own.
+        report: counts, times and decisions, JSON-able.
+    """
+
+    frame_idx: NDArray[np.int64]
+    frame_names: list[str]
+    timestamps_s: Array
+    cam_from_world: Array
+    live_cam_from_world: Array
+    frame_map: NDArray[np.int32]
+    frame_state: NDArray[np.uint8]
+    maps: list[MapResult]
+    report: dict[str, Any] = field(default_factory=dict)

@@ -1,0 +1,59 @@
+"""What a run shows while it is under way: handed to the listeners as ``snapshot`` of its events."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.odometry.result import FrameState
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FrameSnapshot:
+    """One frame, with every ``advanced`` event of stage ``odometry``. Listeners may keep the arrays: nobody writes them.
+
+    Attributes:
+        frame_idx, name, timestamp_s: which frame.
+        state: what became of it.
+        image: (H, W) uint8, the rig's first camera.
+        xy: (N, 2) float32 tracked points, pixels. is_mapped: (N,) bool, those that the pose was measured with.
+        cam_from_world: (7,) pose as it was given out, NaN without one.
+        map_idx: which map the pose is in, counted from 0 in the order in which they began.
+        time_s: CPU time of tracking, back end not included.
+    """
+
+    frame_idx: int
+    name: str
+    timestamp_s: float
+    state: FrameState
+    image: NDArray[np.uint8]
+    xy: NDArray[np.float32]
+    is_mapped: NDArray[np.bool_]
+    cam_from_world: Array
+    map_idx: int
+    time_s: float
+
+
+@dataclass(frozen=True)
+class MapSnapshot:
+    """What changed in the map, with ``decided`` events: a new keyframe, an adjustment, a loop closed, maps joined.
+
+    Attributes:
+        frame_idx: the frame at which it happened.
+        map_idx: which map; see FrameSnapshot.
+        keyframe_frame_idx: (K,) int64 and keyframe_cam_from_world (K, 7): keyframes that are new or have moved.
+        point_id: (P,) int64 and point_xyz (P, 3): points that are new or have moved.
+        is_complete: these are all of the map's keyframes and points; forget the others.
+    """
+
+    frame_idx: int
+    map_idx: int
+    keyframe_frame_idx: NDArray[np.int64]
+    keyframe_cam_from_world: Array
+    point_id: NDArray[np.int64]
+    point_xyz: Array
+    is_complete: bool = False
