@@ -6,6 +6,7 @@ carries the wish to stop. Stages run with ``Events()`` and no listener just as w
 
 from __future__ import annotations
 
+import copy
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -92,6 +93,18 @@ class Events:
     def cancel(self) -> None:
         """Ask the stages to stop at their next step. Safe in a signal handler."""
         self._cancelled.set()
+
+    @property
+    def is_cancelled(self) -> bool:
+        """A stop was asked for."""
+        return self._cancelled.is_set()
+
+    def deaf(self) -> Events:
+        """The same line to the same listeners without the wish to stop: for a stage that ends by itself, whole, when
+        what it works on ends early."""
+        other = copy.copy(self)
+        other._cancelled = threading.Event()
+        return other
 
     def raise_if_cancelled(self) -> None:
         """Raise InterruptedRunError if :meth:`cancel` was called."""

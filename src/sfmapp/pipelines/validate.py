@@ -19,7 +19,7 @@ from sfmapp.formats.colmap import has_model, read_model
 from sfmapp.formats.truth import Truth, read_truth
 from sfmapp.images.folder import load_images
 from sfmapp.pipelines.options import options_from_dict
-from sfmapp.pipelines.workspace import read_manifest
+from sfmapp.pipelines.workspace import RECONSTRUCT, read_manifest
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageOptions, ImageSet
@@ -82,7 +82,7 @@ def validate(
         InterruptedRunError: ``events`` was asked to stop.
     """
     events, folder = events or Events(), Path(output)
-    manifest = read_manifest(folder)
+    manifest = read_manifest(folder, RECONSTRUCT)
     model_folder = folder / "sparse" / "0"
     if not has_model(model_folder):
         raise NoReconstructionError(f"{folder} holds no model to validate", "run sfmapp reconstruct first")

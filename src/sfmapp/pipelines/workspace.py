@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 FORMAT = "sfmapp workspace 1"
 MANIFEST = "run.json"
+# the commands that write workspaces; manifests of before the second one name none
+RECONSTRUCT, ODOMETRY, REFINE = "reconstruct", "odometry", "refine"
 LOCK = ".lock"
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 _PACKAGE = Path(__file__).resolve().parent.parent
@@ -120,16 +122,19 @@ class Workspace:
 
 
 @contextlib.contextmanager
-def open_workspace(folder: Path) -> Iterator[Workspace]:
-    """Make or open a workspace and lock it until the block ends.
+def open_workspace(folder: Path, command: str = RECONSTRUCT) -> Iterator[Workspace]:
+    """Make or open the workspace of a command and lock it until the block ends.
 
     Raises:
-        UsageError: the folder holds something that is not a workspace, or another run is at work in it.
+        UsageError: the folder holds something that is not a workspace, or the results of another command, or another
+            run is at work in it.
         InputError: it cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        is_new = _manifest_of(folder) is None
+        manifest = _manifest_of(folder)
+        if manifest is not None:
+            _check_command(folder, manifest, command)
         lock = _lock(folder / LOCK)
         lock.__enter__()
     except (NotADirectoryError, FileExistsError) as error:
@@ -138,22 +143,34 @@ def open_workspace(folder: Path) -> Iterator[Workspace]:
         raise InputError(f"{folder} cannot be written: {error.strerror}", "choose another OUT") from error
     with contextlib.ExitStack() as stack:
         stack.push(lock)
-        workspace = Workspace(folder, _manifest_of(folder) or _new_manifest())
-        if is_new:
+        workspace = Workspace(folder, _manifest_of(folder) or _new_manifest(command))
+        if manifest is None:
             workspace.save()
         yield workspace
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of an existing workspace, for commands that only look at one.
+def read_manifest(folder: Path, command: str | None = None) -> dict[str, Any]:
+    """The manifest of an existing workspace, for commands that only look at one; of a certain command if one is given.
 
     Raises:
         InputError: the folder is not a workspace.
+        UsageError: it holds the results of another command.
     """
     manifest = _read_json(folder / MANIFEST) if folder.is_dir() else None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise InputError(f"{folder} is not a workspace of sfmapp", "give the OUT of an earlier sfmapp reconstruct")
+        raise InputError(f"{folder} is not a workspace of sfmapp", "give the OUT of an earlier run")
+    if command is not None:
+        _check_command(folder, manifest, command)
     return manifest
+
+
+def _check_command(folder: Path, manifest: dict[str, Any], command: str) -> None:
+    found = manifest.get("command", RECONSTRUCT)
+    if found != command:
+        raise UsageError(
+            f"{folder} holds the results of sfmapp {found}, not of sfmapp {command}",
+            f"nothing in it was touched; give the folder of a sfmapp {command}, or a new one to write to",
+        )
 
 
 def canonical_json(value: Any) -> str:
@@ -196,8 +213,8 @@ def plain_number(value: Any) -> Any:
     return str(value)
 
 
-def _new_manifest() -> dict[str, Any]:
-    return {"format": FORMAT, "stages": {}, "inputs": {}}
+def _new_manifest(command: str) -> dict[str, Any]:
+    return {"format": FORMAT, "command": command, "stages": {}, "inputs": {}}
 
 
 def _manifest_of(folder: Path) -> dict[str, Any] | None:

@@ -159,28 +159,28 @@ def make_checks(
     share = 100 * summary["num_registered"] / max(1, summary["num_images"])
     features = float(np.median([image["funnel"]["features"] for image in images])) if images else 0.0
     checks = [
-        _check("registered images", share, f"{share:.0f} %", 95, 65, "%"),
-        _check("features per image (median)", features, f"{features:.0f}", 1000, 300),
-        _check(
+        check("registered images", share, f"{share:.0f} %", 95, 65, "%"),
+        check("features per image (median)", features, f"{features:.0f}", 1000, 300),
+        check(
             "observations per image (mean)", summary["mean_observations_per_image"],
             f"{summary['mean_observations_per_image']:.0f}", 500, 100,
         ),
-        _check("track length (mean)", summary["mean_track_length"], f"{summary['mean_track_length']:.2f}", 3, 2.3),
-        _check(
+        check("track length (mean)", summary["mean_track_length"], f"{summary['mean_track_length']:.2f}", 3, 2.3),
+        check(
             "reprojection error (mean)", -summary["mean_reprojection_error_px"],
             f"{summary['mean_reprojection_error_px']:.2f} px", -1, -2, "px",
         ),
-        _check("separate models", -num_models, str(num_models), -1, -2),
+        check("separate models", -num_models, str(num_models), -1, -2),
     ]  # fmt: skip
     for camera in cameras:
         if camera["refined"] and camera["focal_sigma_px"]:
             change = abs(_focal(camera["refined"]) - _focal(camera["initial"])) / camera["focal_sigma_px"]
             name = f"focal length of camera {camera['idx']} against its prior"
-            checks.append(_check(name, -change, f"{change:.1f} sigma", -2, -4, "sigma"))
+            checks.append(check(name, -change, f"{change:.1f} sigma", -2, -4, "sigma"))
     return checks
 
 
-def _check(name: str, value: float, text: str, green: float, amber: float, unit: str = "") -> dict[str, str]:
+def check(name: str, value: float, text: str, green: float, amber: float, unit: str = "") -> dict[str, str]:
     """Green from one bound on, amber from the other; negative bounds are upper bounds."""
     light = "green" if value >= green else "amber" if value >= amber else "red"
     word = "at most" if green < 0 else "at least"
