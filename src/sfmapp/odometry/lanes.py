@@ -1,0 +1,153 @@
+"""Sixteen floats at a time: a numba type for one row of an image patch.
+
+Kernels over patches of up to 16 pixels a side keep each row in one vector and say so in their own code, since LLVM may
+not reorder the sums of a scalar loop and so leaves them scalar. The type is LLVM's portable vector: AVX-512 holds it in
+one register, AVX2 in two, NEON in four. Every multiply-add is one fused, correctly rounded operation and sums are folded
+in a fixed order: the same bits on any machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic, models, register_model
+
+WIDTH = 16
+
+_F32, _I32 = ir.FloatType(), ir.IntType(32)
+_ROW = ir.VectorType(_F32, WIDTH)
+_INTS = ir.VectorType(_I32, WIDTH)
+
+
+class Row(types.Type):  # type: ignore[misc]
+    """Numba's type of a vector of 16 floats."""
+
+    def __init__(self) -> None:
+        super().__init__(name="Row16xFloat32")
+
+
+row = Row()
+
+
+@register_model(Row)
+class _RowModel(models.PrimitiveModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, _ROW)
+
+
+def _splat(builder: Any, scalar: Any) -> Any:
+    empty = ir.Constant(_ROW, ir.Undefined)
+    return builder.shuffle_vector(
+        builder.insert_element(empty, scalar, ir.Constant(_I32, 0)), empty, ir.Constant(_INTS, [0] * WIDTH)
+    )
+
+
+def _place(builder: Any, args: Any, kind: Any) -> Any:
+    return builder.bitcast(builder.gep(args[0], [args[1]]), kind.as_pointer())
+
+
+@intrinsic
+def load(typingctx, base, index):  # type: ignore[no-untyped-def]
+    """``base[index : index + 16]`` of a pointer to float32."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        value = builder.load(_place(builder, args, _ROW))
+        value.align = 4
+        return value
+
+    return row(base, types.intp), codegen
+
+
+@intrinsic
+def load_bytes(typingctx, base, index):  # type: ignore[no-untyped-def]
+    """``base[index : index + 16]`` of a pointer to uint8, as floats."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        value = builder.load(_place(builder, args, ir.VectorType(ir.IntType(8), WIDTH)))
+        value.align = 1
+        return builder.sitofp(builder.zext(value, _INTS), _ROW)
+
+    return row(base, types.intp), codegen
+
+
+@intrinsic
+def store(typingctx, base, index, value):  # type: ignore[no-untyped-def]
+    """``base[index : index + 16] = value`` of a pointer to float32."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        builder.store(args[2], _place(builder, args, _ROW)).align = 4
+        return context.get_dummy_value()
+
+    return types.void(base, types.intp, value), codegen
+
+
+@intrinsic
+def splat(typingctx, scalar):  # type: ignore[no-untyped-def]
+    """The same float32 in all lanes."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return _splat(builder, args[0])
+
+    return row(types.float32), codegen
+
+
+@intrinsic
+def fma(typingctx, a, b, c):  # type: ignore[no-untyped-def]
+    """``a * b + c`` with one rounding."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        kind = ir.FunctionType(_ROW, [_ROW] * 3)
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.fma.v16f32"), args)
+
+    return row(a, b, c), codegen
+
+
+def _binary(operation: str) -> Callable[..., Any]:
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return getattr(builder, operation)(*args)
+
+    return codegen
+
+
+@intrinsic
+def add(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """``a + b``."""
+    return row(a, b), _binary("fadd")
+
+
+@intrinsic
+def subtract(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """``a - b``."""
+    return row(a, b), _binary("fsub")
+
+
+@intrinsic
+def multiply(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """``a * b``."""
+    return row(a, b), _binary("fmul")
+
+
+@intrinsic
+def divide(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """``a / b``."""
+    return row(a, b), _binary("fdiv")
+
+
+@intrinsic
+def total(typingctx, value):  # type: ignore[no-untyped-def]
+    """Sum of the lanes, halves folded onto each other."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        value, width = args[0], WIDTH
+        while width > 1:
+            width //= 2
+            kind = ir.VectorType(_I32, width)
+            halves = [ir.Constant(kind, list(range(first, first + width))) for first in (0, width)]
+            value = builder.fadd(*(builder.shuffle_vector(value, value, half) for half in halves))
+        return builder.extract_element(value, ir.Constant(_I32, 0))
+
+    return types.float32(value), codegen
