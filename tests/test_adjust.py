@@ -52,10 +52,10 @@ def squares(model):
 
 
 @numba.njit
-def observe(pose, canonical, fisheye, x, y, z, u, v, loss, scale2, scratch):
+def observe(pose, mounted, mount, canonical, fisheye, x, y, z, u, v, loss, scale2, scratch):
     """Linearise, and check the squared residual by the kernel that computes nothing else."""
-    p, c, J = pointer(pose), pointer(canonical), pointer(scratch)
-    s = kernels.linearize(p, c, fisheye, x, y, z, u, v, loss, scale2, 0.0, True, J)
+    p, m, c, J = pointer(pose), pointer(mount), pointer(canonical), pointer(scratch)
+    s = kernels.linearize(p, mounted, m, c, fisheye, x, y, z, u, v, loss, scale2, 0.0, True, J)
     if abs(s - kernels.squared_residual(p, c, fisheye, x, y, z, u, v, 0.0)) > 1e-9 * s:
         return np.nan
     return s
@@ -67,23 +67,30 @@ def observe(pose, canonical, fisheye, x, y, z, u, v, loss, scale2, scratch):
     rotation=st.tuples(*[st.floats(-3, 3)] * 3),
     point=st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6), st.floats(0.5, 8.0)),
     translation=st.tuples(*[st.floats(-2, 2)] * 3),
+    mounting=st.none() | st.tuples(*[st.floats(-2, 2)] * 6),
 )
-def test_jacobians_equal_central_differences(model, rotation, point, translation):
+def test_jacobians_equal_central_differences(model, rotation, point, translation, mounting):
     camera = synthetic_camera(model)
     turn = rigid3.exp_so3(np.array(rotation))
     in_cam = np.array([point[0] * point[2], point[1] * point[2], point[2]])
     t = np.array(translation)
-    world = turn.T @ (in_cam - t)
+    mount = rigid3.IDENTITY
+    if mounting is not None:
+        mount = rigid3.from_matrix(rigid3.exp_so3(np.array(mounting[:3])), np.array(mounting[3:]))
+    world = turn.T @ (rigid3.apply(rigid3.inverse(mount), in_cam) - t)
     spread = np.eye(8)
 
     def pixel(delta):
         moved = rigid3.exp_so3(delta[:3]) @ (turn @ (world + delta[6:9]) + t) + delta[3:6]
+        moved = rigid3.apply(mount, moved)
         return np.array(distort(camera.is_fisheye, camera.canonical + spread @ delta[9:], *(moved[:2] / moved[2])))
 
-    pose = pose_rows(rigid3.from_matrix(turn, t)[None])[0]
+    pose, mounts = np.zeros((1, 12)), pose_rows(mount[None])
+    of_image = np.array([0 if mounting is not None else -1], np.int32)
+    kernels.fill_rows(rigid3.from_matrix(turn, t)[None], np.zeros(1, np.int32), of_image, mounts, pose)
     scratch = np.zeros(kernels.SCRATCH)
     observed = pixel(np.zeros(17)) - [3.0, -4.0]
-    args = (pose, camera.canonical, camera.is_fisheye, *world, *observed)
+    args = (pose[0], mounting is not None, mounts[0], camera.canonical, camera.is_fisheye, *world, *observed)
     s = observe(*args, 0, 1.0, scratch)
     assert s == pytest.approx(25.0, rel=1e-9)
     rows = scratch.reshape(-1, 2, 8)

@@ -2,10 +2,11 @@
 
 The information is that of the adjustment at its minimum, undamped: reprojections divided by the variance of the noise,
 priors and gtsam factors as they are. What the observations cannot tell, in a free network the seven degrees of a
-similarity, is taken out by inner constraints (Triggs et al. 1999, section 9): among all equivalent reconstructions the
-errors are those of the one whose poses lie nearest to the truth, in the sum of ``|v|^2 + s^2 |w|^2`` over the images,
-where w and v are rotation and translation errors and s is the rms distance of the centres from their mean. Compare
-with a known truth by :func:`errors_in_gauge`.
+similarity (six where a rig with a baseline measures lengths), is taken out by inner constraints (Triggs et al. 1999,
+section 9): among all equivalent reconstructions the errors are those of the one whose poses lie nearest to the truth,
+in the sum of ``|v|^2 + s^2 |w|^2`` over the poses, where w and v are rotation and translation errors and s is the rms
+distance of the centres from their mean. Compare with a known truth by :func:`errors_in_gauge`. For covariances relative
+to one image or frame hold that constant: with a baseline nothing is then left open, without one the scale.
 """
 
 from __future__ import annotations
@@ -41,12 +42,13 @@ class Covariances:
 
     Attributes:
         image_idx: (n,) images; poses: (n, 6, 6) over rotation w (radians) and translation v of
-            ``x_cam <- exp(w) x_cam + v``.
+            ``x_cam <- exp(w) x_cam + v``; those of a rig's pose at its sensor 0.
         camera_idx: (m,) cameras; free_params: m arrays (Q,), positions in ``Camera.params``; intrinsics: m arrays
             (Q, Q) over these.
         track_idx: (p,) points; points: (p, 3, 3) in the world; infinite for a point without depth.
         sigma_px: the noise of one coordinate of an observation, estimated or as given.
-        num_gauge: degrees of freedom that only the inner constraints hold: 7 in a free network.
+        num_gauge: degrees of freedom that only the inner constraints hold: 7 in a free network, 6 with a baseline, 1
+            (the scale) with one constant image and no baseline.
         is_determined: False if more than that is undetermined; all covariances are infinite then.
     """
 
@@ -107,10 +109,11 @@ def _variance(engine: Engine, num_unknowns: int) -> float:
     """Variance of a pixel coordinate from weighted residuals and degrees of freedom."""
     p = engine.problem
     total = _weighted_squares(
-        p.point_ptr, p.obs_image, p.obs_xy, p.xyz, engine.rows, p.image_camera, p.canonical, p.fisheye, p.penalty,
-        engine.loss, engine.scale2, np.zeros(SCRATCH),
+        p.point_ptr, p.obs_image, p.obs_xy, p.xyz, engine.rows, p.image_mount, p.mounts, p.image_camera, p.canonical,
+        p.fisheye, p.penalty, engine.loss, engine.scale2, np.zeros(SCRATCH),
     )  # fmt: skip
-    free_gauge = 7 if (p.image_block >= 0).all() and not p.is_constant.any() and engine.extras is None else 0
+    is_free = (p.pose_block >= 0).all() and not p.is_constant.any() and engine.extras is None
+    free_gauge = 0 if not is_free else 6 if p.has_baseline else 7
     dof = 2 * p.num_observations - 3 * int((~p.is_constant).sum()) - num_unknowns + free_gauge
     return total / dof if dof > 0 else np.inf
 
@@ -156,13 +159,15 @@ def similarity_basis(poses: Array) -> tuple[Array, Array]:
 
 def _gauge(problem: Problem, used: Mask, information: Array, scale: Array) -> tuple[Array, Array]:
     """Directions (k, N) that the information leaves open among the similarities, and their constraints (k, N)."""
-    images = np.flatnonzero(problem.image_block >= 0)
-    if len(images) == 0:
+    poses = np.flatnonzero(problem.pose_block >= 0)
+    if len(poses) == 0:
         return np.zeros((0, len(scale))), np.zeros((0, len(scale)))
-    place = (problem.image_block[images][:, None] * 8 + np.arange(6)).ravel()
+    place = (problem.pose_block[poses][:, None] * 8 + np.arange(6)).ravel()
     wide, constraint = np.zeros((7, len(used))), np.zeros((7, len(used)))
-    wide[:, place], constraint[:, place] = similarity_basis(problem.poses[images])
-    basis, constraint = wide[:, used], constraint[:, used]
+    wide[:, place], constraint[:, place] = similarity_basis(problem.poses[poses])
+    # on a long way a short baseline says so little of the scale that it would pass for nothing
+    freedoms = 6 if problem.has_baseline else 7
+    basis, constraint = wide[:freedoms, used], constraint[:freedoms, used]
     norm = np.sqrt((basis**2 * scale).sum(1))
     norm[norm == 0] = 1.0
     basis, constraint = basis / norm[:, None], constraint / norm[:, None]
@@ -193,7 +198,6 @@ def _collect(engine: Engine, covariance: Array, variance: float, num_gauge: int,
     p = engine.problem
     images = np.flatnonzero(p.image_block >= 0)
     cameras = np.flatnonzero(p.camera_block >= 0)
-    at = [p.image_block[i] * 8 + np.arange(6) for i in images]
     intrinsics = []
     for c in cameras:
         columns = np.unique(p.free.column[p.free.ptr[c] : p.free.ptr[c + 1]])
@@ -202,13 +206,14 @@ def _collect(engine: Engine, covariance: Array, variance: float, num_gauge: int,
     points = np.full((len(p.xyz), 3, 3), np.inf)
     if determined:
         _point_covariances(
-            p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, engine.rows, p.image_camera, p.image_block,
-            p.canonical, p.fisheye, p.penalty, p.camera_block, p.free.ptr, p.free.slot, p.free.column, p.num_blocks,
-            engine.loss, engine.scale2, engine.factor, covariance, variance, np.zeros(SCRATCH), points,
+            p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, engine.rows, p.image_mount, p.mounts,
+            p.image_camera, p.image_block, p.canonical, p.fisheye, p.penalty, p.camera_block, p.free.ptr, p.free.slot,
+            p.free.column, p.num_blocks, engine.loss, engine.scale2, engine.factor, covariance, variance,
+            np.zeros(SCRATCH), points,
         )  # fmt: skip
     return Covariances(
         image_idx=p.image_idx[images],
-        poses=np.array([covariance[np.ix_(i, i)] for i in at]).reshape(-1, 6, 6),
+        poses=_pose_covariances(p, images, covariance),
         camera_idx=p.camera_idx[cameras],
         free_params=[p.free.params[c] for c in cameras],
         intrinsics=intrinsics,
@@ -220,24 +225,41 @@ def _collect(engine: Engine, covariance: Array, variance: float, num_gauge: int,
     )
 
 
+def _pose_covariances(problem: Problem, images: NDArray[np.int64], covariance: Array) -> Array:
+    """(n, 6, 6) of local images; through the adjoint of its mount where an image has not the pose of its block."""
+    at = problem.image_block[images][:, None] * 8 + np.arange(6)
+    out: Array = covariance[at[:, :, None], at[:, None, :]]
+    for n in np.flatnonzero(problem.image_mount[images] >= 0):
+        row = problem.mounts[problem.image_mount[images[n]]]
+        rotation, adjoint = row[:9].reshape(3, 3), np.zeros((6, 6))
+        adjoint[:3, :3] = adjoint[3:, 3:] = rotation
+        adjoint[3:, :3] = rigid3.skew(row[9:]) @ rotation
+        # infinities times zeros are no numbers
+        out[n] = adjoint @ out[n] @ adjoint.T if np.isfinite(out[n]).all() else np.inf
+    return out
+
+
 def errors_in_gauge(
     estimate: Reconstruction, truth: Reconstruction, covariances: Covariances
 ) -> tuple[Array, list[Array], Array]:
     """Errors of an estimate in the tangents and the gauge of its covariances.
 
-    Where the gauge was free (``num_gauge`` 7) the truth is moved by the similarity that this module's gauge asks for;
-    otherwise both must be in the same frame.
+    Where the gauge was free (``num_gauge`` 7 or 6) the truth is moved by the similarity, or rigid motion, that this
+    module's gauge asks for; otherwise both must be in the same frame.
 
     Returns:
         poses (n, 6), intrinsics m times (Q,), and points (p, 3).
     """
     wanted = truth.copy()
     images = covariances.image_idx
-    for _ in range(20 if covariances.num_gauge == 7 else 0):
-        basis, constraint = similarity_basis(wanted.cam_from_world[images])
-        error = _pose_errors(estimate, wanted, images).ravel()
-        move: Array = np.linalg.solve(constraint @ basis.T, constraint @ error).astype(np.float64)
-        _apply_similarity(wanted, images, move)
+    freedoms = covariances.num_gauge
+    reached = estimate.distinct_poses(images)[0]
+    for _ in range(20 if freedoms >= 6 else 0):
+        poses = wanted.distinct_poses(images)[0]
+        basis, constraint = (rows[:freedoms] for rows in similarity_basis(poses))
+        move = np.zeros(7)
+        move[:freedoms] = np.linalg.solve(constraint @ basis.T, constraint @ _pose_errors(reached, poses).ravel())
+        _apply_similarity(wanted, poses, move)
         if np.abs(move).max() < 1e-14:
             break
     intrinsics = [
@@ -245,41 +267,43 @@ def errors_in_gauge(
         for c, free in zip(covariances.camera_idx, covariances.free_params, strict=True)
     ]
     points = estimate.point_xyz[covariances.track_idx] - wanted.point_xyz[covariances.track_idx]
-    return _pose_errors(estimate, wanted, images), intrinsics, points
+    return _pose_errors(estimate.cam_from_world[images], wanted.cam_from_world[images]), intrinsics, points
 
 
-def _pose_errors(estimate: Reconstruction, truth: Reconstruction, images: NDArray[np.int64]) -> Array:
-    """(n, 6) w and v with ``estimate = (exp(w), v) truth``."""
-    delta = rigid3.compose(estimate.cam_from_world[images], rigid3.inverse(truth.cam_from_world[images]))
+def _pose_errors(estimate: Array, truth: Array) -> Array:
+    """(n, 6) w and v with ``estimate = (exp(w), v) truth``, poses (n, 7)."""
+    delta = rigid3.compose(estimate, rigid3.inverse(truth))
     return np.concatenate([rigid3.log_so3(rigid3.rotation_matrix(delta)), delta[:, 4:]], 1)
 
 
-def _apply_similarity(model: Reconstruction, images: NDArray[np.int64], move: Array) -> None:
-    """Turn, shift and scale a model about the mean centre of the images, in the units of :func:`similarity_basis`."""
-    centers = rigid3.center(model.cam_from_world)
-    mean = centers[images].mean(0)
-    size = np.sqrt(((centers[images] - mean) ** 2).sum(1).mean())
+def _apply_similarity(model: Reconstruction, poses: Array, move: Array) -> None:
+    """Turn, shift and scale a model about the mean centre of the poses, in the units of :func:`similarity_basis`."""
+    centers = rigid3.center(poses)
+    mean = centers.mean(0)
+    size = np.sqrt(((centers - mean) ** 2).sum(1).mean())
     turn, scale, shift = rigid3.exp_so3(move[:3]), np.exp(move[6]), size * move[3:6]
     rotation = rigid3.rotation_matrix(model.cam_from_world) @ turn.T
-    moved = scale * (centers - mean) @ turn.T + mean + shift
+    moved = scale * (model.centers - mean) @ turn.T + mean + shift
     model.cam_from_world[:] = rigid3.from_matrix(rotation, -np.einsum("nij,nj->ni", rotation, moved))
     model.point_xyz[:] = scale * (model.point_xyz - mean) @ turn.T + mean + shift
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _weighted_squares(  # type: ignore[no-untyped-def]
-    point_ptr, obs_image, obs_xy, xyz, poses, image_camera, canonical, fisheye, penalty, loss, scale2, J
-):
+    point_ptr, obs_image, obs_xy, xyz, poses, image_mount, mounts, image_camera, canonical, fisheye, penalty, loss,
+    scale2, J,
+):  # fmt: skip
     """Sum of rho'(s) s over all observations."""
-    scratch, pose, lens = pointer(J), pointer(poses), pointer(canonical)
+    scratch, pose, mount, lens = pointer(J), pointer(poses), pointer(mounts), pointer(canonical)
     total = 0.0
     for p in range(xyz.shape[0]):
         for o in range(point_ptr[p], point_ptr[p + 1]):
             i = obs_image[o]
             c = image_camera[i]
             s = linearize(
-                offset(pose, 12 * i), offset(lens, 8 * c), fisheye[c], xyz[p, 0], xyz[p, 1], xyz[p, 2],
-                obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c], False, scratch,
+                offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, 8 * c),
+                fisheye[c], xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
+                False, scratch,
             )  # fmt: skip
             total += robust_weight(loss, scale2, s) * s
     return total
@@ -287,11 +311,12 @@ def _weighted_squares(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _point_covariances(  # type: ignore[no-untyped-def]
-    point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_camera, image_block, canonical, fisheye, penalty,
-    camera_block, free_ptr, free_slot, free_column, num_blocks, loss, scale2, factor, covariance, variance, J, out,
+    point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_mount, mounts, image_camera, image_block, canonical,
+    fisheye, penalty, camera_block, free_ptr, free_slot, free_column, num_blocks, loss, scale2, factor, covariance,
+    variance, J, out,
 ):  # fmt: skip
     """``V^-1 (variance V + W^T C W) V^-1`` of each point, with V^-1 = L^-T L^-1 from the factor; C in full blocks."""
-    scratch, pose, lens = pointer(J), pointer(poses), pointer(canonical)
+    scratch, pose, mount, lens = pointer(J), pointer(poses), pointer(mounts), pointer(canonical)
     mark = np.full(num_blocks, -1, np.int64)
     W = np.zeros((num_blocks * 8, 3))
     touched = np.zeros(num_blocks, np.int64)
@@ -308,8 +333,9 @@ def _point_covariances(  # type: ignore[no-untyped-def]
             i = obs_image[o]
             c = image_camera[i]
             linearize(
-                offset(pose, 12 * i), offset(lens, 8 * c), fisheye[c], xyz[p, 0], xyz[p, 1], xyz[p, 2],
-                obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c], True, scratch,
+                offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, 8 * c),
+                fisheye[c], xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
+                True, scratch,
             )  # fmt: skip
             for block in (image_block[i], camera_block[c]):
                 if block >= 0 and mark[block] != p:

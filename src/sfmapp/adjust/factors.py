@@ -50,13 +50,16 @@ class ExtraFactors:
         self._place: dict[int, NDArray[np.int64]] = {}
         self._sign: dict[int, float] = {}
         self._poses, self._cameras = [], []
-        for n, image in enumerate(problem.image_idx):
-            if image in set(self.images):
-                block = problem.image_block[n]
-                self._place[X(int(image))] = block * 8 + np.arange(6) if block >= 0 else np.full(6, -1)
-                self._poses.append((X(int(image)), n))
-                self._sign[X(int(image))] = -1.0
-        for c, camera in enumerate(problem.camera_idx):
+        for n in np.flatnonzero(np.isin(problem.image_idx, self.images)).tolist():
+            key, block = X(int(problem.image_idx[n])), problem.image_block[n]
+            if problem.image_mount[n] >= 0:
+                raise ValueError(
+                    f"extra factors on a rig must name the image of sensor 0, found X({problem.image_idx[n]})"
+                )
+            self._place[key] = block * 8 + np.arange(6) if block >= 0 else np.full(6, -1)
+            self._poses.append((key, int(problem.image_pose[n])))
+            self._sign[key] = -1.0
+        for c, camera in enumerate(problem.camera_idx.tolist()):
             if camera in set(self.cameras) and problem.camera_block[c] >= 0:
                 columns = np.unique(problem.free.column[problem.free.ptr[c] : problem.free.ptr[c + 1]])
                 self._place[K(int(camera))] = problem.camera_block[c] * 8 + columns
@@ -126,8 +129,8 @@ class SparseSystem:
     """The reduced system as gtsam Hessian factors, one per tile (keys a B + b in order), eliminated in METIS order."""
 
     def __init__(self, problem: Problem, keys: NDArray[np.int64]) -> None:
-        blocks, first = problem.num_blocks, int((problem.image_block >= 0).sum())
-        images = problem.image_idx[problem.image_block >= 0]
+        blocks, first = problem.num_blocks, problem.num_pose_blocks
+        images = problem.image_idx[problem.pose_images[problem.pose_block >= 0]]
         own = np.flatnonzero(problem.camera_block >= first)
         self._keys = [X(int(i)) for i in images] + [K(int(problem.camera_idx[c])) for c in own]
         self._pairs = list(zip(*(part.tolist() for part in np.divmod(keys, blocks)), range(len(keys)), strict=True))

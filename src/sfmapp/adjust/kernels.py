@@ -6,6 +6,9 @@ the free intrinsics of a camera that several images share. Blocks meet in 8 x 8 
 eliminated one by one (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 1999, section 6.1) from the factor
 ``L L^T`` of their damped 3 x 3 normal matrix: with Z = W L^-T the reduced system loses Z_a Z_b^T per pair of blocks.
 
+A pose may be that of a rig which several images share: each has its own row of what the rig's pose and the constant
+mounting of its camera make together, and the derivatives are taken to the rig's frame.
+
 Nothing is kept per observation. Points come in chunks whose number depends on the problem alone; each chunk has its own
 sums, which are added in order, so the result does not depend on the number of threads.
 """
@@ -66,10 +69,13 @@ def total_loss(scale2: float, total: float, product: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def linearize(pose, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, penalty, intrinsics, J):  # type: ignore[no-untyped-def]
+def linearize(  # type: ignore[no-untyped-def]
+    pose, mounted, mount, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, penalty, intrinsics, J
+):
     """Weighted Jacobians and residual of one observation into the scratch row J; returns the squared residual.
 
-    pose, c and J are pointers: to 12 numbers, R row by row and t; to 8 canonical intrinsics, whose derivatives are
+    pose, mount, c and J are pointers: to 12 numbers, R row by row and t, of cam_from_world and, if ``mounted``, of
+    cam_from_rig, the derivatives then being those by the rig's pose; to 8 canonical intrinsics, whose derivatives are
     wanted if ``intrinsics``; and to the scratch row. Behind the camera the Jacobians are zero and the squared residual
     is ``penalty``, so that a point gains nothing by slipping there.
     """
@@ -125,8 +131,6 @@ def linearize(pose, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, penalty, intri
         g00, g01, g10, g11 = fx * a * iz, fx * b * iz, fy * b * iz, fy * d * iz
         g02 = -(g00 * u + g01 * v)
         g12 = -(g10 * u + g11 * v)
-        store8(J, 0, py * g02 - pz * g01, pz * g00 - px * g02, px * g01 - py * g00, g00, g01, g02, 0.0, 0.0)
-        store8(J, 8, py * g12 - pz * g11, pz * g10 - px * g12, px * g11 - py * g10, g10, g11, g12, 0.0, 0.0)
         p00 = g00 * pose[0] + g01 * pose[3] + g02 * pose[6]
         p01 = g00 * pose[1] + g01 * pose[4] + g02 * pose[7]
         p02 = g00 * pose[2] + g01 * pose[5] + g02 * pose[8]
@@ -135,6 +139,25 @@ def linearize(pose, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, penalty, intri
         p12 = g10 * pose[2] + g11 * pose[5] + g12 * pose[8]
         store8(J, POINT, p00, p01, p02, w * e0, 0.0, 0.0, 0.0, 0.0)
         store8(J, POINT + 8, p10, p11, p12, w * e1, 0.0, 0.0, 0.0, 0.0)
+        if mounted:  # the point and the derivatives as the rig has them
+            px, py, pz = px - mount[9], py - mount[10], pz - mount[11]
+            px, py, pz = (
+                mount[0] * px + mount[3] * py + mount[6] * pz,
+                mount[1] * px + mount[4] * py + mount[7] * pz,
+                mount[2] * px + mount[5] * py + mount[8] * pz,
+            )
+            g00, g01, g02 = (
+                g00 * mount[0] + g01 * mount[3] + g02 * mount[6],
+                g00 * mount[1] + g01 * mount[4] + g02 * mount[7],
+                g00 * mount[2] + g01 * mount[5] + g02 * mount[8],
+            )
+            g10, g11, g12 = (
+                g10 * mount[0] + g11 * mount[3] + g12 * mount[6],
+                g10 * mount[1] + g11 * mount[4] + g12 * mount[7],
+                g10 * mount[2] + g11 * mount[5] + g12 * mount[8],
+            )
+        store8(J, POSE, py * g02 - pz * g01, pz * g00 - px * g02, px * g01 - py * g00, g00, g01, g02, 0.0, 0.0)
+        store8(J, POSE + 8, py * g12 - pz * g11, pz * g10 - px * g12, px * g11 - py * g10, g10, g11, g12, 0.0, 0.0)
         if intrinsics:  # fx, fy, cx, cy, d0..d3, for each the change of u and v
             J[CANON], J[CANON + 1], J[CANON + 2], J[CANON + 3] = w * ud, 0.0, 0.0, w * vd
             J[CANON + 4], J[CANON + 5], J[CANON + 6], J[CANON + 7] = w, 0.0, 0.0, w
@@ -254,16 +277,17 @@ def _factor_point(normal, damping, factor, small):  # type: ignore[no-untyped-de
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def reduce_points(  # type: ignore[no-untyped-def]
-    first, last, point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_camera, image_block, intrinsics, fisheye,
-    penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, damping, hash_keys, hash_values,
-    tiles, own, cross, gradient, point_factor, scratch, integers,
+    first, last, point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_mount, mounts, image_camera, image_block,
+    intrinsics, fisheye, penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, damping,
+    hash_keys, hash_values, tiles, own, cross, gradient, point_factor, scratch, integers,
 ):  # fmt: skip
     """Linearise points first..last and eliminate them; returns the cost of their observations.
 
     Args:
         point_ptr, obs_image, obs_xy, xyz: observations sorted by point; images are positions in ``poses``.
         is_constant: (P,) points that do not move.
-        poses: (I, 12); image_camera: (I,); image_block: (I,) block of a pose, -1 where it is constant.
+        poses: (I, 12); image_camera: (I,); image_block: (I,) block of its pose, -1 where that is constant.
+        image_mount: (I,) row in mounts (M, 12), cam_from_rig; -1 where the image's pose is that of its block.
         intrinsics: (C, 8) canonical; penalty: (C,) squared residual of what is behind.
         camera_block: (C,) block that holds the free intrinsics, -1 where constant; free_ptr, free_slot, free_column:
             for camera c, canonical slot and column in the block.
@@ -279,6 +303,7 @@ def reduce_points(  # type: ignore[no-untyped-def]
     num_blocks = block_dim.shape[0]
     tiles[:], own[:], cross[:], gradient[:], scratch[:], integers[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0
     pose, lens, J = pointer(poses), pointer(intrinsics), pointer(scratch)
+    mount = pointer(mounts)
     tile, mark = pointer(tiles), pointer(integers)
     where, blocks = offset(mark, num_blocks), offset(mark, 2 * num_blocks)
     normal, small, zeros, units = offset(J, _NORMAL), offset(J, _SMALL), offset(J, _ZEROS), offset(J, _FIXED)
@@ -297,8 +322,8 @@ def reduce_points(  # type: ignore[no-untyped-def]
             c = image_camera[i]
             block, other = image_block[i], camera_block[c]
             s2 = linearize(
-                offset(pose, 12 * i), offset(lens, 8 * c), fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss,
-                scale2, penalty[c], other >= 0, J,
+                offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, 8 * c),
+                fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c], other >= 0, J,
             )  # fmt: skip
             cost, product = add_loss(loss, scale2, s2, cost, product)
             if moves:
@@ -339,9 +364,9 @@ def reduce_points(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def substitute_points(  # type: ignore[no-untyped-def]
-    first, last, point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_camera, image_block, intrinsics, fisheye,
-    penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, point_factor, step, new_poses,
-    new_intrinsics, new_xyz, sums, scratch,
+    first, last, point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_mount, mounts, image_camera, image_block,
+    intrinsics, fisheye, penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, point_factor,
+    step, new_poses, new_intrinsics, new_xyz, sums, scratch,
 ):  # fmt: skip
     """Steps of points first..last after those of the blocks, and the cost of the state that results.
 
@@ -350,7 +375,7 @@ def substitute_points(  # type: ignore[no-untyped-def]
         new_xyz: (P, 3) out.
         sums: (2,) out: cost, and the points' share of the predicted decrease.
     """
-    J, pose, lens = pointer(scratch), pointer(poses), pointer(intrinsics)
+    J, pose, mount, lens = pointer(scratch), pointer(poses), pointer(mounts), pointer(intrinsics)
     new_pose, new_lens = pointer(new_poses), pointer(new_intrinsics)
     cost, product = 0.0, 1.0
     decrease = 0.0
@@ -366,8 +391,8 @@ def substitute_points(  # type: ignore[no-untyped-def]
                 if block < 0 and other < 0:
                     continue
                 linearize(
-                    offset(pose, 12 * i), offset(lens, 8 * c), fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss,
-                    scale2, penalty[c], other >= 0, J,
+                    offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, 8 * c),
+                    fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c], other >= 0, J,
                 )  # fmt: skip
                 e0 = e1 = 0.0
                 if block >= 0:
@@ -409,16 +434,44 @@ def substitute_points(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def retract(  # type: ignore[no-untyped-def]
-    poses, image_block, canonical, camera_block, free_ptr, free_slot, free_column, step, new_poses, new_rows,
-    new_canonical,
-):  # fmt: skip
-    """Apply a step of the blocks: ``x_cam <- exp(w) x_cam + v`` on poses (I, 7), sums on canonical rows (C, 8).
+def fill_rows(poses, image_pose, image_mount, mounts, rows):  # type: ignore[no-untyped-def]
+    """Fill rows (I, 12), rotation row by row and translation of every image, from poses (Q, 7) and mounts (M, 12)."""
+    for i in range(rows.shape[0]):
+        x, y, z, w = poses[image_pose[i], 0], poses[image_pose[i], 1], poses[image_pose[i], 2], poses[image_pose[i], 3]
+        row = rows[i]
+        row[0] = 1 - 2 * (y * y + z * z)
+        row[1] = 2 * (x * y - z * w)
+        row[2] = 2 * (x * z + y * w)
+        row[3] = 2 * (x * y + z * w)
+        row[4] = 1 - 2 * (x * x + z * z)
+        row[5] = 2 * (y * z - x * w)
+        row[6] = 2 * (x * z - y * w)
+        row[7] = 2 * (y * z + x * w)
+        row[8] = 1 - 2 * (x * x + y * y)
+        row[9:12] = poses[image_pose[i], 4:7]
+        if image_mount[i] >= 0:
+            mount = mounts[image_mount[i]]
+            for k in range(4):
+                # columns of R, then t
+                first, step = (k, 3) if k < 3 else (9, 1)
+                a, b, c = row[first], row[first + step], row[first + 2 * step]
+                for j in range(3):
+                    row[first + step * j] = mount[3 * j] * a + mount[3 * j + 1] * b + mount[3 * j + 2] * c
+            for j in range(3):
+                row[9 + j] += mount[9 + j]
 
-    Constant poses and cameras keep their bits. Also fills new_rows (I, 12).
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def retract(  # type: ignore[no-untyped-def]
+    poses, pose_block, image_pose, image_mount, mounts, canonical, camera_block, free_ptr, free_slot, free_column, step,
+    new_poses, new_rows, new_canonical,
+):  # fmt: skip
+    """Apply a step of the blocks: ``x_cam <- exp(w) x_cam + v`` on poses (Q, 7), sums on canonical rows (C, 8).
+
+    Constant poses and cameras keep their bits. Also fills new_rows (I, 12) by :func:`fill_rows`.
     """
     for i in range(poses.shape[0]):
-        block = image_block[i]
+        block = pose_block[i]
         x, y, z, w = poses[i, 0], poses[i, 1], poses[i, 2], poses[i, 3]
         t0, t1, t2 = poses[i, 4], poses[i, 5], poses[i, 6]
         if block >= 0:
@@ -449,17 +502,7 @@ def retract(  # type: ignore[no-untyped-def]
             )
         new_poses[i, 0], new_poses[i, 1], new_poses[i, 2], new_poses[i, 3] = x, y, z, w
         new_poses[i, 4], new_poses[i, 5], new_poses[i, 6] = t0, t1, t2
-        row = new_rows[i]
-        row[0] = 1 - 2 * (y * y + z * z)
-        row[1] = 2 * (x * y - z * w)
-        row[2] = 2 * (x * z + y * w)
-        row[3] = 2 * (x * y + z * w)
-        row[4] = 1 - 2 * (x * x + z * z)
-        row[5] = 2 * (y * z - x * w)
-        row[6] = 2 * (x * z - y * w)
-        row[7] = 2 * (y * z + x * w)
-        row[8] = 1 - 2 * (x * x + y * y)
-        row[9], row[10], row[11] = t0, t1, t2
+    fill_rows(new_poses, image_pose, image_mount, mounts, new_rows)
     new_canonical[:] = canonical
     for k in range(canonical.shape[0]):
         for n in range(free_ptr[k], free_ptr[k + 1]):

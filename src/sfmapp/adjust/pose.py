@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfmapp.adjust.kernels import LOSS_IDS, POINT, SCRATCH, add_loss, linearize, retract, total_loss
+from sfmapp.adjust.kernels import LOSS_IDS, POINT, SCRATCH, add_loss, fill_rows, linearize, retract, total_loss
 from sfmapp.adjust.lanes import add2, pointer
 
 Array = NDArray[np.float64]
@@ -95,8 +95,8 @@ def _normal_equations(  # type: ignore[no-untyped-def]
     total, product = 0.0, 1.0
     for n in range(xyz.shape[0]):
         s2 = linearize(
-            pointer(rows), pointer(canonical), fisheye, xyz[n, 0], xyz[n, 1], xyz[n, 2], xy[n, 0], xy[n, 1], loss,
-            scale2, -1.0, size > 6, pointer(J),
+            pointer(rows), False, pointer(rows), pointer(canonical), fisheye, xyz[n, 0], xyz[n, 1], xyz[n, 2],
+            xy[n, 0], xy[n, 1], loss, scale2, -1.0, size > 6, pointer(J),
         )  # fmt: skip
         residuals2[n] = s2
         if s2 < 0.0:
@@ -147,16 +147,14 @@ def _refine(  # type: ignore[no-untyped-def]
 ):
     J = np.zeros(SCRATCH)
     block, camera_block = np.zeros(1, np.int32), np.full(1, 0 if size > 6 else -1, np.int32)
+    none, no_mounts = np.full(1, -1, np.int32), np.zeros((0, 12))
     free_ptr = np.array([0, 2 if size > 6 else 0])
     free_slot, free_column = np.array([0, 1]), np.array([6, 6])
     poses, new_poses = state.reshape(1, 7), np.empty((1, 7))
     rows, new_rows = np.empty((1, 12)), np.empty((1, 12))
     canonical, new_canonical = c.reshape(1, 8), np.empty((1, 8))
     step = np.zeros(8)
-    retract(
-        poses, np.full(1, -1, np.int32), canonical, camera_block, free_ptr, free_slot, free_column, step, new_poses,
-        rows, new_canonical,
-    )  # fmt: skip
+    fill_rows(poses, block, none, no_mounts, rows)
     focal = c[0]
     penalty = 8.0 * focal * focal  # gtsam's choice for points behind the camera
     H, g, new_H, new_g = np.zeros(64), np.zeros(8), np.zeros(64), np.zeros(8)
@@ -171,8 +169,8 @@ def _refine(  # type: ignore[no-untyped-def]
             growth *= 2.0
             continue
         retract(
-            poses, block, canonical, camera_block, free_ptr, free_slot, free_column, step, new_poses, new_rows,
-            new_canonical,
+            poses, block, block, none, no_mounts, canonical, camera_block, free_ptr, free_slot, free_column, step,
+            new_poses, new_rows, new_canonical,
         )  # fmt: skip
         new_cost = _normal_equations(
             new_canonical,

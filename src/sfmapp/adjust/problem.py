@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import PARAM_NAMES, Camera, canonical_from_params
 from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.rig import RigImages
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -37,13 +38,19 @@ class FreeIntrinsics:
 class Problem:
     """Flat arrays over local images (I), cameras (C), points (P) and observations (O), and the blocks (B) of unknowns.
 
-    The state is ``poses``, ``canonical`` and ``xyz``. Blocks are numbered images first, then cameras of their own.
+    The state is ``poses``, ``canonical`` and ``xyz``. Poses (Q) are those of single images and of rigs, in the order of
+    their first image: image i has the pose ``image_pose[i]``, and if ``image_mount[i] >= 0`` the constant cam_from_rig
+    ``mounts[image_mount[i]]`` (M, 12) on top. Blocks are numbered poses first, then cameras of their own;
+    ``image_block[i]`` is ``pose_block[image_pose[i]]``, -1 where constant.
     """
 
     image_idx: NDArray[np.int64]
     camera_idx: NDArray[np.int64]
     track_idx: NDArray[np.int64]
     poses: Array
+    image_pose: NDArray[np.int32]
+    image_mount: NDArray[np.int32]
+    mounts: Array
     canonical: Array
     xyz: Array
     is_constant: Mask
@@ -51,6 +58,7 @@ class Problem:
     obs_image: NDArray[np.int32]
     obs_xy: Array
     image_camera: NDArray[np.int32]
+    pose_block: NDArray[np.int32]
     image_block: NDArray[np.int32]
     camera_block: NDArray[np.int32]
     block_dim: NDArray[np.int64]
@@ -61,6 +69,24 @@ class Problem:
     @property
     def num_blocks(self) -> int:
         return len(self.block_dim)
+
+    @property
+    def num_pose_blocks(self) -> int:
+        return int((self.pose_block >= 0).sum())
+
+    @property
+    def pose_images(self) -> NDArray[np.int64]:
+        """(Q,) the first local image of each pose."""
+        return np.unique(self.image_pose, return_index=True)[1]
+
+    @property
+    def has_baseline(self) -> bool:
+        """Images that share a pose were taken from different places: lengths are known."""
+        place, on = np.zeros((len(self.image_idx), 3)), self.image_mount >= 0
+        rows = self.mounts[self.image_mount[on]]
+        place[on] = np.einsum("nji,nj->ni", rows[:, :9].reshape(-1, 3, 3), rows[:, 9:])
+        apart = np.abs(place - place[self.pose_images][self.image_pose]).max(initial=0.0)
+        return bool(apart > 1e-12 * np.abs(place).max(initial=0.0))
 
     @property
     def num_observations(self) -> int:
@@ -95,7 +121,11 @@ def make_problem(
     Args:
         refine: may focal lengths, distortion, principal points change.
         extra_images, extra_cameras: take part even without observations (gtsam factors mention them).
-        merge: give a camera with one image and at most two free parameters a place in the block of its image.
+        merge: give a camera with one image and at most two free parameters a place in the block of its image, unless
+            other images share that.
+
+    Raises:
+        ValueError: of the images that share a rig's pose and take part, some may vary and some not.
     """
     tracks = reconstruction.tracks
     registered = reconstruction.is_registered
@@ -124,12 +154,19 @@ def make_problem(
     params = [free_params(camera, *refine) for camera in cameras]
     if variable_cameras is not None:
         params = [p if variable_cameras[c] else p[:0] for p, c in zip(params, camera_idx, strict=True)]
-    image_block, camera_block, block_dim = _number_blocks(varies[image_idx], image_camera, params, merge)
+    poses, pose_of_image = reconstruction.distinct_poses(image_idx)
+    image_pose = pose_of_image.astype(np.int32)
+    image_mount, mounts = _mounts(reconstruction.rig, image_idx)
+    pose_varies = _varying_poses(varies[image_idx], image_pose, len(poses))
+    pose_block, camera_block, block_dim = _number_blocks(pose_varies, image_pose, image_camera, params, merge)
     return Problem(
         image_idx=image_idx,
         camera_idx=camera_idx,
         track_idx=selected[kept],
-        poses=reconstruction.cam_from_world[image_idx],
+        poses=poses,
+        image_pose=image_pose,
+        image_mount=image_mount,
+        mounts=mounts,
         canonical=np.array([camera.canonical for camera in cameras]).reshape(-1, 8),
         xyz=reconstruction.point_xyz[selected[kept]],
         is_constant=is_constant[kept],
@@ -137,13 +174,14 @@ def make_problem(
         obs_image=image_of[obs_image],
         obs_xy=obs_xy,
         image_camera=image_camera,
-        image_block=image_block,
+        pose_block=pose_block,
+        image_block=pose_block[image_pose],
         camera_block=camera_block,
         block_dim=block_dim,
         fisheye=np.array([camera.is_fisheye for camera in cameras], bool),
         # a point behind the camera misses by the image's diagonal
         penalty=np.array([float(camera.width**2 + camera.height**2) for camera in cameras]),
-        free=_free_columns(cameras, params, camera_block, int((image_block >= 0).sum())),
+        free=_free_columns(cameras, params, camera_block, int(pose_varies.sum())),
     )
 
 
@@ -161,36 +199,59 @@ def free_values(problem: Problem, canonical: Array, camera: int) -> Array:
     return values
 
 
+def _mounts(rig: RigImages | None, image_idx: NDArray[np.int64]) -> tuple[NDArray[np.int32], Array]:
+    """image_mount (I,) and mounts (M, 12) of :class:`Problem`."""
+    if rig is None:
+        return np.full(len(image_idx), -1, np.int32), np.zeros((0, 12))
+    mount = np.where(rig.is_mounted[image_idx], rig.sensor_idx[image_idx], -1)
+    return mount.astype(np.int32), pose_rows(rig.cam_from_rig)
+
+
+def _varying_poses(varies: Mask, image_pose: NDArray[np.int32], num_poses: int) -> Mask:
+    """(Q,) bool from what the images (I,) say, which must agree."""
+    out = np.zeros(num_poses, bool)
+    out[image_pose[varies]] = True
+    if (out[image_pose] != varies).any():
+        raise ValueError("images that share a rig's pose must all vary or all be constant, found both in one frame")
+    return out
+
+
 def _number_blocks(
-    varies: Mask, image_camera: NDArray[np.int32], params: list[NDArray[np.int64]], merge: bool
+    varies: Mask,
+    image_pose: NDArray[np.int32],
+    image_camera: NDArray[np.int32],
+    params: list[NDArray[np.int64]],
+    merge: bool,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-    """Blocks of images and cameras, and their numbers of rows."""
-    num_images = int(varies.sum())
-    image_block = np.full(len(varies), -1, np.int32)
-    image_block[varies] = np.arange(num_images)
+    """Blocks of poses and cameras, and their numbers of rows."""
+    num_poses = int(varies.sum())
+    pose_block = np.full(len(varies), -1, np.int32)
+    pose_block[varies] = np.arange(num_poses)
     camera_block = np.full(len(params), -1, np.int32)
-    dims = [6] * num_images
-    uses = np.bincount(image_camera[varies], minlength=len(params))
+    dims = [6] * num_poses
+    moving = varies[image_pose]
+    uses = np.bincount(image_camera[moving], minlength=len(params))
     only = np.full(len(params), -1, np.int64)
-    only[image_camera[varies]] = image_block[varies]
+    only[image_camera[moving]] = pose_block[image_pose[moving]]
+    shares = np.bincount(pose_block[image_pose[moving]], minlength=num_poses)
     for c, free in enumerate(params):
         if len(free) == 0:
             continue
-        if merge and uses[c] == 1 and len(free) <= 2:
+        if merge and uses[c] == 1 and len(free) <= 2 and shares[only[c]] == 1:
             camera_block[c] = only[c]
             dims[only[c]] += len(free)
         else:
             camera_block[c] = len(dims)
             dims.append(len(free))
-    return image_block, camera_block, np.array(dims, np.int64)
+    return pose_block, camera_block, np.array(dims, np.int64)
 
 
 def _free_columns(
-    cameras: list[Camera], params: list[NDArray[np.int64]], camera_block: NDArray[np.int32], num_image_blocks: int
+    cameras: list[Camera], params: list[NDArray[np.int64]], camera_block: NDArray[np.int32], num_pose_blocks: int
 ) -> FreeIntrinsics:
     ptr, slots, columns = [0], [], []
     for c, camera in enumerate(cameras):
-        first = 6 if 0 <= camera_block[c] < num_image_blocks else 0
+        first = 6 if 0 <= camera_block[c] < num_pose_blocks else 0
         spread = canonical_from_params(camera.model)
         for n, param in enumerate(params[c]):
             for slot in np.flatnonzero(spread[:, param]):

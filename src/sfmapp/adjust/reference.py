@@ -1,7 +1,8 @@
 """The same adjustment as a plain gtsam graph, one factor per observation: slow, short, and written by somebody else.
 
-Poses are ``X(i)`` (world_from_cam), points ``L(p)``, cameras ``C(c)``: Cal3Bundler for models with one focal length,
-Cal3DS2 for those with two, Cal3Fisheye. What is not free, or is in gtsam's model and not in ours, is held by a prior.
+Poses are ``X(q)`` (world_from_cam), points ``L(p)``, cameras ``C(c)``: Cal3Bundler for models with one focal length,
+Cal3DS2 for those with two, Cal3Fisheye. What is not free, or is in gtsam's model and not in ours, is held by a prior;
+so is the place ``V(i)`` of an image on its rig.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import C, K, L, X
+from gtsam.symbol_shorthand import C, K, L, V, X
 from numpy.typing import NDArray
 
 from sfmapp.adjust.factors import ExtraFactors, gtsam_pose
@@ -136,11 +137,18 @@ def reprojection_graph(problem: Problem, lenses: list[Lens], options: AdjustOpti
     if options.loss != "trivial":
         kind = gtsam.noiseModel.mEstimator.Huber if options.loss == "huber" else gtsam.noiseModel.mEstimator.Cauchy
         noise = gtsam.noiseModel.Robust.Create(kind.Create(options.loss_scale_px), noise)
-    for i, pose in enumerate(problem.poses):
-        values.insert(X(i), gtsam_pose(pose))
-        if problem.image_block[i] < 0:
-            held = gtsam.noiseModel.Isotropic.Sigma(6, _HELD)
-            graph.add(gtsam.PriorFactorPose3(X(i), gtsam_pose(pose), held))
+    held = gtsam.noiseModel.Isotropic.Sigma(6, _HELD)
+    for q, pose in enumerate(problem.poses):
+        values.insert(X(q), gtsam_pose(pose))
+        if problem.pose_block[q] < 0:
+            graph.add(gtsam.PriorFactorPose3(X(q), gtsam_pose(pose), held))
+    view = [X(int(q)) for q in problem.image_pose]
+    for i in np.flatnonzero(problem.image_mount >= 0):
+        mount = problem.mounts[problem.image_mount[i]]
+        rig_from_cam = gtsam_pose(rigid3.from_matrix(mount[:9].reshape(3, 3), mount[9:]))
+        values.insert(V(int(i)), values.atPose3(view[i]).compose(rig_from_cam))
+        graph.add(gtsam.BetweenFactorPose3(view[i], V(int(i)), rig_from_cam, held))
+        view[i] = V(int(i))
     for c, lens in enumerate(lenses):
         values.insert(C(c), lens.calibration)
         rows = np.delete(np.eye(len(lens.slots)), lens.free, 0)
@@ -153,7 +161,7 @@ def reprojection_graph(problem: Problem, lenses: list[Lens], options: AdjustOpti
     point = np.repeat(np.arange(len(problem.xyz)), np.diff(problem.point_ptr))
     for o, (i, p) in enumerate(zip(problem.obs_image.tolist(), point.tolist(), strict=True)):
         c = int(problem.image_camera[i])
-        graph.add(lenses[c].factor(problem.obs_xy[o], noise, X(i), L(p), C(c)))
+        graph.add(lenses[c].factor(problem.obs_xy[o], noise, view[i], L(p), C(c)))
     return graph, values
 
 
@@ -184,7 +192,7 @@ def _calibration_of(values: Any, key: int) -> Any:
 def _add_extras(graph: Any, values: Any, problem: Problem, lenses: list[Lens], extras: ExtraFactors) -> None:
     """The caller's factors with their keys made local; K(c) is tied to the calibration C(c)."""
     extras.attach(problem)
-    local_image = {X(int(i)): X(n) for n, i in enumerate(problem.image_idx)}
+    local_image = {X(int(i)): X(int(q)) for i, q in zip(problem.image_idx, problem.image_pose, strict=True)}
     local_camera = {K(int(c)): (K(n), n) for n, c in enumerate(problem.camera_idx)}
     for key in extras.known.keyVector():
         if key in local_camera:
@@ -200,12 +208,13 @@ def _add_extras(graph: Any, values: Any, problem: Problem, lenses: list[Lens], e
 
 
 def _points_first(problem: Problem, values: Any) -> Any:
-    """Elimination order: points, then poses, then intrinsics; gtsam's own COLAMD is several times slower here."""
+    """Points, then images on rigs, then poses, then intrinsics; gtsam's own COLAMD is several times slower here."""
     ordering = gtsam.Ordering()
     points = [L(p) for p in range(len(problem.xyz))]
     for key in points:
         ordering.push_back(key)
-    for key in sorted(set(values.keys()) - set(points), key=lambda k: (gtsam.Symbol(k).chr() != ord("x"), k)):
+    rank = {ord("v"): 0, ord("x"): 1}
+    for key in sorted(set(values.keys()) - set(points), key=lambda k: (rank.get(gtsam.Symbol(k).chr(), 2), k)):
         ordering.push_back(key)
     return ordering
 
@@ -221,9 +230,9 @@ def _parameters(options: AdjustOptions) -> Any:
 
 def _read_back(problem: Problem, lenses: list[Lens], result: Any) -> None:
     """Put gtsam's values into the problem's state."""
-    for i in np.flatnonzero(problem.image_block >= 0):
-        matrix = result.atPose3(X(int(i))).inverse().matrix()
-        problem.poses[i] = rigid3.from_matrix(matrix[:3, :3], matrix[:3, 3])
+    for q in np.flatnonzero(problem.pose_block >= 0):
+        matrix = result.atPose3(X(int(q))).inverse().matrix()
+        problem.poses[q] = rigid3.from_matrix(matrix[:3, :3], matrix[:3, 3])
     for c in np.flatnonzero(problem.camera_block >= 0):
         problem.canonical[c] = lenses[c].canonical_at(_calibration_of(result, C(int(c))), problem.canonical[c])
     for p in np.flatnonzero(~problem.is_constant):

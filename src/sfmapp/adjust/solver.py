@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sfmapp.adjust import kernels
 from sfmapp.adjust.kernels import find_slot
 from sfmapp.adjust.linear import aligned_zeros, assemble, factorize_tiles, mark_pairs, number_keys, solve_tiles
-from sfmapp.adjust.problem import Problem, free_values, make_problem, pose_rows
+from sfmapp.adjust.problem import Problem, free_values, make_problem
 from sfmapp.events import Events
 from sfmapp.scene.camera import PARAM_NAMES, Camera
 from sfmapp.scene.reconstruction import Reconstruction
@@ -98,21 +98,23 @@ def adjust_bundle(
 
     Args:
         reconstruction: poses, points and cameras are replaced; whatever is constant keeps its bits.
-        variable_images: (I,) bool, which poses may change; None for all registered ones.
+        variable_images: (I,) bool, which poses may change; None for all registered ones. Images that share a rig's
+            pose (``reconstruction.rig``) move together: those that take part must all be marked or none.
         variable_cameras: (C,) bool, which intrinsics may change, beside ``options.refine_*``; cameras with ``is_fixed``
             never do. None for all.
         points: (T,) bool, which points take part and vary; None for those that a variable image observes.
         constant_points: (T,) bool, which of the points take part without moving.
         prior_cameras: (C,) cameras as they were known beforehand: Gaussian priors around their parameters, with
             ``focal_sigma`` for focal lengths and the options' sigmas for the rest. None for no priors.
-        extra_factors: gtsam.NonlinearFactorGraph over ``X(i)`` (Pose3 world_from_cam of image i) and ``K(c)`` (Vector
-            of the free parameters of camera c, in the order of ``Camera.params``), or None. Factors on constant images
-            or cameras only add to the cost.
+        extra_factors: gtsam.NonlinearFactorGraph over ``X(i)`` (Pose3 world_from_cam of image i; for a rig's pose,
+            the image of its sensor 0) and ``K(c)`` (Vector of the free parameters of camera c, in the order of
+            ``Camera.params``), or None. Factors on constant images or cameras only add to the cost.
         threads: at most this many; the result does not depend on it.
         events: asked for cancellation at every step.
 
     Raises:
         InterruptedRunError: on cancellation; the reconstruction then holds the best state so far.
+        ValueError: a frame of a rig is marked in part, or a factor is over an image that has not the rig's pose.
     """
     start = time.perf_counter()
     if options.backend == "gtsam":
@@ -184,8 +186,8 @@ def compile_kernels() -> None:
 
 def write_back(problem: Problem, reconstruction: Reconstruction) -> None:
     """Put the state of a problem into its reconstruction; what was constant is not touched."""
-    moved = problem.image_block >= 0
-    reconstruction.cam_from_world[problem.image_idx[moved]] = problem.poses[moved]
+    moved = np.flatnonzero(problem.image_block >= 0)
+    reconstruction.move_images(problem.image_idx[moved], problem.poses[problem.image_pose[moved]])
     free = ~problem.is_constant
     reconstruction.point_xyz[problem.track_idx[free]] = problem.xyz[free]
     for c, camera_idx in enumerate(problem.camera_idx):
@@ -204,7 +206,7 @@ class IntrinsicPriors:
         for c, camera_idx in enumerate(problem.camera_idx if cameras is not None else ()):
             assert cameras is not None
             camera = cameras[camera_idx]
-            first = 6 if problem.camera_block[c] < (problem.image_block >= 0).sum() else 0
+            first = 6 if problem.camera_block[c] < problem.num_pose_blocks else 0
             for n, param in enumerate(problem.free.params[c]):
                 sigma = self._sigma(PARAM_NAMES[camera.model][param], camera, options)
                 if sigma is not None:
@@ -262,7 +264,8 @@ class Engine:
             for k in range(chunks)
         ]
         self.scratch = [(aligned_zeros(doubles), np.zeros(integers, np.int64)) for doubles, integers in sizes]
-        self.rows = pose_rows(p.poses)
+        self.rows = np.empty((images, 12))
+        kernels.fill_rows(p.poses, p.image_pose, p.image_mount, p.mounts, self.rows)
         self.new_poses, self.new_rows = np.empty_like(p.poses), np.empty_like(self.rows)
         self.new_canonical, self.new_xyz = np.empty_like(p.canonical), np.empty_like(p.xyz)
         self.damping = 0.0
@@ -290,10 +293,10 @@ class Engine:
         def chunk(k: int) -> float:
             cost: float = kernels.reduce_points(
                 self.limits[k], self.limits[k + 1], p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, self.rows,
-                p.image_camera, p.image_block, p.canonical, p.fisheye, p.penalty, p.camera_block, p.free.ptr,
-                p.free.slot, p.free.column, p.block_dim, self.loss, self.scale2, damping, self.hash_keys,
-                self.hash_values, self.tiles[k], self.own[k], self.cross[k], self.gradient[k], self.factor,
-                *self.scratch[k],
+                p.image_mount, p.mounts, p.image_camera, p.image_block, p.canonical, p.fisheye, p.penalty,
+                p.camera_block, p.free.ptr, p.free.slot, p.free.column, p.block_dim, self.loss, self.scale2, damping,
+                self.hash_keys, self.hash_values, self.tiles[k], self.own[k], self.cross[k], self.gradient[k],
+                self.factor, *self.scratch[k],
             )  # fmt: skip
             return cost
 
@@ -339,16 +342,16 @@ class Engine:
         """Try a step: cost of the new state, and the decrease that the quadratic model predicts."""
         p = self.problem
         kernels.retract(
-            p.poses, p.image_block, p.canonical, p.camera_block, p.free.ptr, p.free.slot, p.free.column, step,
-            self.new_poses, self.new_rows, self.new_canonical,
+            p.poses, p.pose_block, p.image_pose, p.image_mount, p.mounts, p.canonical, p.camera_block, p.free.ptr,
+            p.free.slot, p.free.column, step, self.new_poses, self.new_rows, self.new_canonical,
         )  # fmt: skip
 
         def chunk(k: int) -> None:
             kernels.substitute_points(
                 self.limits[k], self.limits[k + 1], p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, self.rows,
-                p.image_camera, p.image_block, p.canonical, p.fisheye, p.penalty, p.camera_block, p.free.ptr,
-                p.free.slot, p.free.column, p.block_dim, self.loss, self.scale2, self.factor, step, self.new_rows,
-                self.new_canonical, self.new_xyz, self.sums[k], self.scratch[k][0],
+                p.image_mount, p.mounts, p.image_camera, p.image_block, p.canonical, p.fisheye, p.penalty,
+                p.camera_block, p.free.ptr, p.free.slot, p.free.column, p.block_dim, self.loss, self.scale2,
+                self.factor, step, self.new_rows, self.new_canonical, self.new_xyz, self.sums[k], self.scratch[k][0],
             )  # fmt: skip
 
         list(run(chunk, range(self.num_chunks)))

@@ -102,6 +102,37 @@ class Reconstruction:
             np.array([camera.is_fisheye for camera in self.cameras], bool),
         )
 
+    def distinct_poses(self, image_idx: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Poses (Q, 7) that registered images (N,) do not share, in the order of their first image, and (N,) whose is
+        which: for images on a rig its pose, rig_from_world, for others their own.
+        """
+        poses = self.cam_from_world[image_idx]
+        if self.rig is None:
+            return poses, np.arange(len(image_idx))
+        frame = self.rig.frame_idx[image_idx].astype(np.int64)
+        on_rig = frame >= 0
+        poses[on_rig] = self.rig.rig_from_world(self.cam_from_world)[frame[on_rig]]
+        frame[~on_rig] = frame.max(initial=0) + 1 + np.flatnonzero(~on_rig)
+        _, first, number = np.unique(frame, return_index=True, return_inverse=True)
+        rank = np.argsort(np.argsort(first))
+        return poses[np.sort(first)], rank[number]
+
+    def move_images(self, image_idx: NDArray[np.integer], poses: NDArray[np.float64]) -> None:
+        """Give images (N,) new poses (N, 7): for an image on a rig that of the rig, which moves the whole frame.
+
+        Unregistered images of such a frame stay so.
+        """
+        if self.rig is None:
+            self.cam_from_world[image_idx] = poses
+            return
+        frame = self.rig.frame_idx[image_idx]
+        self.cam_from_world[image_idx[frame < 0]] = poses[frame < 0]
+        rig_from_world = np.full((int(self.rig.frame_idx.max(initial=-1)) + 1, 7), np.nan)
+        rig_from_world[frame[frame >= 0]] = poses[frame >= 0]
+        pose_of = rig_from_world[self.rig.frame_idx]
+        moved = np.flatnonzero((self.rig.frame_idx >= 0) & self.is_registered & ~np.isnan(pose_of[:, 0]))
+        self.cam_from_world[moved] = self.rig.cam_from_world(moved, pose_of[moved])
+
     def residuals_px(self) -> NDArray[np.float64]:
         """(O, 2) projected minus observed pixel; NaN where the image or the point is missing, or behind the camera."""
         canonical, fisheye = self.canonical_cameras()

@@ -7,7 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import Camera
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -46,3 +49,33 @@ class RigImages:
     frame_idx: NDArray[np.int32]
     sensor_idx: NDArray[np.int32]
     cam_from_rig: NDArray[np.float64]
+
+    @property
+    def is_mounted(self) -> NDArray[np.bool_]:
+        """(I,) bool: on a rig, with a pose that differs from the rig's."""
+        moved: NDArray[np.bool_] = (self.cam_from_rig != rigid3.IDENTITY).any(1)
+        return (self.frame_idx >= 0) & moved[self.sensor_idx]
+
+    def rig_from_world(self, cam_from_world: Array) -> Array:
+        """Poses (F, 7) of the rig at each frame from those of the images (I, 7), NaN for unregistered ones.
+
+        The registered image with the lowest sensor speaks for its frame: an exact copy where that is sensor 0. NaN
+        where there is none.
+        """
+        images = np.flatnonzero((self.frame_idx >= 0) & ~np.isnan(cam_from_world[:, 0]))
+        images = images[np.lexsort((self.sensor_idx[images], self.frame_idx[images]))]
+        frames, first = np.unique(self.frame_idx[images], return_index=True)
+        images = images[first]
+        out = np.full((int(self.frame_idx.max(initial=-1)) + 1, 7), np.nan)
+        out[frames] = cam_from_world[images]
+        away = self.is_mounted[images]
+        mount = self.cam_from_rig[self.sensor_idx[images[away]]]
+        out[frames[away]] = rigid3.compose(rigid3.inverse(mount), cam_from_world[images[away]])
+        return out
+
+    def cam_from_world(self, images: NDArray[np.integer], rig_from_world: Array) -> Array:
+        """Poses (N, 7) of images (N,) of the rig from those of the rig (N, 7) when they were taken."""
+        out = np.array(rig_from_world, np.float64)
+        away = self.is_mounted[images]
+        out[away] = rigid3.compose(self.cam_from_rig[self.sensor_idx[images[away]]], out[away])
+        return out

@@ -17,6 +17,7 @@ from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel, pixels_to_normalized, project, simple_camera
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.rig import Rig, RigImages
 from sfmapp.scene.tracks import make_tracks
 
 Array = NDArray[np.float64]
@@ -60,6 +61,14 @@ def synthetic_camera(
     return Camera(model, width, height, params)
 
 
+def synthetic_rig(baseline: float = 0.3, model: CameraModel = CameraModel.PINHOLE) -> Rig:
+    """Two cameras side by side, the right one ``baseline`` away in units of the scene and turned by a few degrees."""
+    turn = rigid3.exp_so3([0.02, -0.04, 0.03])
+    mount = rigid3.from_matrix(turn, turn @ [-baseline, 0.03 * baseline, -0.05 * baseline])
+    cameras = (synthetic_camera(model), synthetic_camera(model, focal=880.0))
+    return Rig(cameras, np.stack([rigid3.IDENTITY, mount]))
+
+
 def make_scene(
     seed: int = 0,
     num_images: int = 10,
@@ -70,6 +79,7 @@ def make_scene(
     outlier_ratio: float = 0.0,
     layout: Layout = "ring",
     detection: float = 0.9,
+    rig: Rig | None = None,
 ) -> SyntheticScene:
     """Draw a scene.
 
@@ -77,21 +87,28 @@ def make_scene(
         seed: same seed, same scene.
         num_images, num_points: every point is seen by at least two images.
         cameras: one for all images, or several, dealt out in turn (as many as images: one each); None for a
-            :func:`synthetic_camera`.
+            :func:`synthetic_camera`, or those of the rig.
         sigma_px: standard deviation of the pixel noise in each coordinate.
         outlier_ratio: share of the observations replaced by a random pixel of the image.
         layout: ``ring`` of inward cameras around an object, ``grid`` of aerial views, or ``forward`` motion down
             a street.
         detection: probability that a visible point is observed.
+        rig: of S cameras, that takes S images at once, with constant places on it: image S k + s is that of sensor s
+            at frame k. ``num_images``, a multiple of S, counts them all. None for images that are on no rig.
 
     The scene is a few units across; the mean distance from camera to point is 3 to 6.
     """
     rng = np.random.default_rng([seed, 0x5CE4E])
     if cameras is None:
-        cameras = synthetic_camera()
+        cameras = rig.cameras if rig is not None else synthetic_camera()
     camera_list = [cameras] if isinstance(cameras, Camera) else list(cameras)
     image_camera_idx = (np.arange(num_images) % len(camera_list)).astype(np.int32)
-    poses = _poses(layout, num_images, rng)
+    mounted = _rig_images(rig, num_images) if rig is not None else None
+    if mounted is None:
+        poses = _poses(layout, num_images, rng)
+    else:
+        frames = _poses(layout, int(mounted.frame_idx[-1]) + 1, rng)
+        poses = mounted.cam_from_world(np.arange(num_images), frames[mounted.frame_idx])
     xyz, visible = _points_and_visibility(layout, num_points, poses, camera_list, image_camera_idx, detection, rng)
     point_idx, image_idx = np.nonzero(visible)
     exact = np.empty((len(point_idx), 2))
@@ -108,6 +125,7 @@ def make_scene(
         tracks = make_tracks(num_images, num_points, point_idx, image_idx, feature_idx, xy)
         names = [f"image{i:04d}.jpg" for i in range(num_images)]
         model = Reconstruction.empty(camera_list, names, image_camera_idx, tracks)
+        model.rig = mounted
         model.cam_from_world[:] = poses
         model.point_xyz[:] = xyz
         model.obs_is_inlier[:] = True
@@ -129,7 +147,8 @@ def perturb(
     """A copy with Gaussian noise on its state.
 
     Args:
-        rotation_deg: standard deviation of each camera's rotation about each axis, degrees; the centre stays.
+        rotation_deg: standard deviation of each camera's rotation about each axis, degrees; the centre stays. A rig
+            moves as one, about the centre of its sensor 0.
         translation_fraction, point_fraction: standard deviation of each coordinate of the centres and of the points, as
             a share of the scene's size (the rms distance of the centres from their mean).
         focal_fraction: standard deviation of each camera's focal lengths, as a share.
@@ -137,12 +156,14 @@ def perturb(
     rng = np.random.default_rng([seed, 0x9E47])
     out = reconstruction.copy()
     registered = out.registered_idx
-    centers = out.centers[registered]
+    poses, pose_of_image = out.distinct_poses(registered)
+    centers = rigid3.center(poses)
     size = np.sqrt(((centers - centers.mean(0)) ** 2).sum(1).mean()) if len(registered) else 0.0
-    turn = rigid3.exp_so3(np.radians(rotation_deg) * rng.normal(size=(len(registered), 3)))
-    rotation = turn @ rigid3.rotation_matrix(out.cam_from_world[registered])
+    turn = rigid3.exp_so3(np.radians(rotation_deg) * rng.normal(size=(len(poses), 3)))
+    rotation = turn @ rigid3.rotation_matrix(poses)
     centers = centers + translation_fraction * size * rng.normal(size=centers.shape)
-    out.cam_from_world[registered] = rigid3.from_matrix(rotation, -np.einsum("nij,nj->ni", rotation, centers))
+    poses = rigid3.from_matrix(rotation, -np.einsum("nij,nj->ni", rotation, centers))
+    out.move_images(registered, poses[pose_of_image])
     out.point_xyz += point_fraction * size * rng.normal(size=out.point_xyz.shape)
     for c, camera in enumerate(out.cameras):
         is_focal = np.array([name.startswith("f") for name in PARAM_NAMES[camera.model]])
@@ -194,6 +215,13 @@ def true_correspondences(scene: SyntheticScene, min_matches: int = 15) -> Corres
         **matrices, cam2_from_cam1=relative, median_angle_deg=angle, num_putative=putative,
         num_inliers_f=found, num_inliers_e=found.copy(), num_inliers_h=np.zeros(num, np.int32),
     )  # fmt: skip
+
+
+def _rig_images(rig: Rig, num_images: int) -> RigImages:
+    frame, sensor = np.divmod(np.arange(num_images, dtype=np.int32), len(rig.cameras))
+    if num_images % len(rig.cameras):
+        raise ValueError(f"expected a multiple of {len(rig.cameras)} images for a rig of so many, got {num_images}")
+    return RigImages(frame, sensor, rig.cam_from_rig)
 
 
 def _unit(v: Array) -> Array:
