@@ -1,10 +1,9 @@
 """Sub-pixel alignment of image patches, coarse to fine, with the exposure free.
 
 Inverse compositional Lucas-Kanade (Baker and Matthews, IJCV 2004): the reference patch T is sampled once per level, and
-its gradients, taken there, serve all iterations. With gain and bias unknown, ``I(x + p) = a T(x) + b``, the least squares
-solution needs nothing of T but its gradients with what T itself and a constant explain of them removed, g~: sums of
-``w g~ I`` over the patch vanish where, and only where, the patch is aligned. An iteration is one pass over the target
-with three sums in it.
+its gradients, taken there, serve all iterations. With gain and bias unknown, ``I(x + p) = a T(x) + b``, the least
+squares solution needs nothing of T but its gradients less what T itself and a constant explain of them, g~: the sums of
+``w g~ I`` over the patch vanish where the patch is aligned. An iteration is one pass over the target with three sums.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ Doubles = NDArray[np.float64]
 
 MAX_HALF_WIDTH = 7  # a row of a patch is one vector
 _CHUNK = 256  # points to a task
-# float32 a point needs: 17 sampled rows of 32, then 15 rows of T, gradient x, y, weight, then 15 rows of w g~x, w g~y, w T~
+# float32 a point needs: 17 sampled rows of 32; 15 rows of T, gradient x, y, weight; 15 rows of w g~x, w g~y, w T~
 _SAMPLES, _ROWS, _SUMS = 0, 17 * 32, 17 * 32 + 15 * 64
 _SCRATCH = _SUMS + 15 * 48
 # last step, in pixels of the level: a tenth of the noise of a good track at the finest, and what the next level makes

@@ -23,35 +23,36 @@ _WINDOW = 2 * _HALF + 1
 _BORDER = 9
 # a corner has to be located to this by its 7 x 7 pixels, given the noise of the sensor
 _MAX_SIGMA_PX = 0.2
-# grey levels; rounding alone makes 0.3, and what compression wipes out of flat areas it puts beside edges
-_MIN_NOISE = 0.6
+# the score this takes, by the square of the noise in grey levels: what noise alone makes, and a difference of two pixels
+# has the variance 2 noise^2 and is twice the gradient
+_FLOOR = 2.0 * _WINDOW**2 + 4.0 * 2.0 / _MAX_SIGMA_PX**2
+# Noise grows with the light, and compression changes its colour, so it is judged by the scores it makes: the lowest
+# tenth at a range of grey are taken for plain surfaces. Noise peaks at three times that score, correlated as compression
+# leaves it at five.
+_ABOVE_PLAIN = 6.0
+# grey levels between which plain surfaces are believed: rounding alone makes 0.3, and what varies by more is texture
+_MIN_NOISE, _MAX_NOISE = 0.6, 3.0
+_SAMPLED = 4  # of so many rows and columns one enters the histogram
+_MIN_SAMPLES = 100
 # of the strongest corner of a cell: what is weaker beside it is as likely its own blur or ringing
 _WEAKEST_IN_CELL = 0.02
 
 
 @numba.njit(cache=True, nogil=True)
-def _noise(data: Bytes, layout: Longs, histogram: Longs) -> float:
-    """Standard deviation of the noise, from the median response of second differences in both directions (Immerkaer)."""
-    start, step, height, width = layout
-    count = 0
-    for r in range(1, height - 1, 3):
-        line = start + r * step
-        for c in range(1, width - 1, 3):
-            p = line + c
-            edges = int(data[p - step]) + int(data[p + step]) + int(data[p - 1]) + int(data[p + 1])
-            corners = int(data[p - step - 1]) + int(data[p - step + 1]) + int(data[p + step - 1])
-            corners += int(data[p + step + 1])
-            histogram[abs(corners - 2 * edges + 4 * int(data[p]))] += 1
-            count += 1
-    below = 0
-    for value in range(histogram.shape[0]):
-        if 2 * (below + histogram[value]) >= count:
-            # the place of the median within its bin, which is one grey level wide and holds half as much at 0
-            share = (0.5 * count - below) / max(histogram[value], 1)
-            median = 0.5 * share if value == 0 else value - 0.5 + share
-            return median / (0.6745 * 6.0)
-        below += histogram[value]
-    return 0.0
+def _count_scores(scores: Floats, grey: Bytes, counts: Longs, num: int) -> None:
+    """Histogram of a row's scores, a quarter of an octave to a bin, for each of 16 ranges of grey."""
+    bits = scores.view(np.int32)
+    for k in range(0, num, _SAMPLED):
+        octave = (bits[k] >> 21) - (127 << 2)
+        counts[grey[k] >> 4, min(max(octave, 0), counts.shape[1] - 1)] += 1
+
+
+def _floors(counts: Longs) -> Floats:
+    """(16,) least score of a corner for each range of grey, from the histogram of scores."""
+    total = counts.sum(axis=1)
+    plain = (np.cumsum(counts, axis=1) * 10 > total[:, None]).argmax(axis=1)
+    floors = np.where(total < _MIN_SAMPLES, 0.0, _ABOVE_PLAIN * 2.0 ** (0.25 * (plain + 0.5)))
+    return np.clip(floors, _FLOOR * _MIN_NOISE**2, _FLOOR * _MAX_NOISE**2).astype(np.float32)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -116,8 +117,13 @@ def _refine(up: Floats, line: Floats, down: Floats, k: int, out: Doubles) -> Non
 
 
 @numba.njit(cache=True, nogil=True)
-def _find_maxima(data: Bytes, layout: Longs, floor: float, xy: Doubles, value: Floats) -> int:
-    """Local maxima of the score above a floor: places, scores, and how many; those beyond the arrays are dropped."""
+def _find_maxima(
+    data: Bytes, layout: Longs, floor: float, counts: Longs, xy: Doubles, value: Floats, grey: Bytes
+) -> int:
+    """Local maxima of the score above a floor: places, scores, greys and how many; those beyond the arrays are dropped.
+
+    counts (16, B) gets the histogram of scores.
+    """
     start, step, height, width = layout
     num = width - 2 * _BORDER + 2  # columns with a score: one more on each side than may hold a corner
     wide = num + _WINDOW - 1
@@ -141,6 +147,8 @@ def _find_maxima(data: Bytes, layout: Longs, floor: float, xy: Doubles, value: F
         if r < first + _WINDOW - 1:
             continue
         _scores(sums, scores[r % 3], num)
+        if r % _SAMPLED == 0:
+            _count_scores(scores[r % 3], data[start + (r - _HALF) * step + _BORDER - 1 :], counts, num)
         if r < first + _WINDOW + 1:
             continue
         up, line, down = scores[(r - 2) % 3], scores[(r - 1) % 3], scores[r % 3]
@@ -153,6 +161,7 @@ def _find_maxima(data: Bytes, layout: Longs, floor: float, xy: Doubles, value: F
                     _refine(up, line, down, c + 1, shift)
                     xy[count, 0], xy[count, 1] = c + _BORDER + 0.5 + shift[0], r - _HALF - 1 + 0.5 + shift[1]
                     value[count] = line[c + 1]
+                    grey[count] = data[start + (r - _HALF - 1) * step + c + _BORDER]
                     count += 1
     return count
 
@@ -225,13 +234,12 @@ def find_corners(
     if max_new < 1 or min(height, width) < 2 * _BORDER + 3:
         return np.empty((0, 2))
     layout = pyramid.layout[0]
-    noise = max(_noise(pyramid.data, layout, np.zeros(4096, np.int64)), _MIN_NOISE)
-    # a difference of two pixels has the variance 2 noise^2 and is twice the gradient
-    floor = (2.0 * _WINDOW**2 + 4.0 * 2.0 / _MAX_SIGMA_PX**2) * noise**2
     capacity = height * width // 16
-    places, value = np.empty((capacity, 2)), np.empty(capacity, np.float32)
-    count = _find_maxima(pyramid.data, layout, floor, places, value)
-    places, value = places[:count], value[:count]
+    places, value, grey = np.empty((capacity, 2)), np.empty(capacity, np.float32), np.empty(capacity, np.uint8)
+    counts = np.zeros((16, 88), np.int64)
+    count = _find_maxima(pyramid.data, layout, _FLOOR * _MIN_NOISE**2, counts, places, value, grey)
+    is_corner = value[:count] >= _floors(counts)[grey[:count] >> 4]
+    places, value = places[:count][is_corner], value[:count][is_corner]
     if mask is not None:
         allowed = np.asarray(mask)[places[:, 1].astype(np.int64), places[:, 0].astype(np.int64)] != 0
         places, value = places[allowed], value[allowed]

@@ -2,8 +2,8 @@
 
 Kernels over patches of up to 16 pixels a side keep each row in one vector and say so in their own code, since LLVM may
 not reorder the sums of a scalar loop and so leaves them scalar. The type is LLVM's portable vector: AVX-512 holds it in
-one register, AVX2 in two, NEON in four. Every multiply-add is one fused, correctly rounded operation and sums are folded
-in a fixed order: the same bits on any machine.
+one register, AVX2 in two, NEON in four. Every multiply-add is one fused, correctly rounded operation and sums are
+folded in a fixed order: the same bits on any machine.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _ROW = ir.VectorType(_F32, WIDTH)
 _INTS = ir.VectorType(_I32, WIDTH)
 
 
-class Row(types.Type):  # type: ignore[misc]
+class Row(types.Type):
     """Numba's type of a vector of 16 floats."""
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ row = Row()
 
 
 @register_model(Row)
-class _RowModel(models.PrimitiveModel):  # type: ignore[misc]
+class _RowModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _ROW)
 
