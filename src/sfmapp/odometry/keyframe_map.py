@@ -51,6 +51,20 @@ class KeyframeMap:
     keyframes: list[Keyframe] = field(default_factory=list)
     point_xyz: Array = field(default_factory=lambda: np.full((1024, 3), np.nan))
     num_points: int = 0
+    _num_observations: NDArray[np.int32] = field(default_factory=lambda: np.zeros(1024, np.int32))
+
+    def append(self, keyframe: Keyframe) -> None:
+        """Add a keyframe."""
+        self.keyframes.append(keyframe)
+        self.count(keyframe.point_id, np.isfinite(keyframe.xy[:, :, 0]).sum(1))
+
+    def count(self, point_id: NDArray[np.int64], observations: NDArray[np.integer]) -> None:
+        """Points (N,), each at most once, are seen so many times more."""
+        self._num_observations[point_id] += observations.astype(np.int32)
+
+    def num_observations(self, point_id: NDArray[np.int64]) -> NDArray[np.int32]:
+        """(N,) how often points are seen, outliers included."""
+        return self._num_observations[point_id]
 
     def new_points(self, count: int) -> NDArray[np.int64]:
         """Ids of so many new points, not triangulated yet."""
@@ -58,6 +72,7 @@ class KeyframeMap:
         if self.num_points > len(self.point_xyz):
             room = np.full((max(self.num_points, 2 * len(self.point_xyz)), 3), np.nan)
             room[: len(self.point_xyz)] = self.point_xyz
+            self._num_observations = np.pad(self._num_observations, (0, len(room) - len(self.point_xyz)))
             self.point_xyz = room
         return np.arange(first, self.num_points)
 

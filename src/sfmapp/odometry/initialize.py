@@ -1,0 +1,157 @@
+"""How a map begins: two views with enough parallax, or one look of a stereo rig."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.geometry import epipolar, rigid3
+from sfmapp.matching.options import MatchingOptions
+from sfmapp.matching.two_view import Ransac, verify_pair
+from sfmapp.odometry.alignment import align_patches
+from sfmapp.odometry.corners import find_corners
+from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.pyramid import Pyramid
+from sfmapp.odometry.small_image import align_small_images
+from sfmapp.scene.camera import Camera, pixels_to_normalized, project
+from sfmapp.scene.correspondences import TwoViewConfig
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# The first view is given up for a newer one when fewer of its corners are left.
+_MIN_LEFT = 0.4
+# Displacement, as a share of the image width, below which two views are not even looked at.
+_MIN_FLOW = 0.01
+# Fewest points of a first map; half of what pose refinement and the keyframe rules are comfortable with.
+_MIN_POINTS = 40
+# A first map needs a median angle that bounds its depth errors to a few percent at a quarter pixel of noise.
+_MIN_MEDIAN_ANGLE_DEG = 0.8
+
+
+@dataclass(frozen=True)
+class TwoViews:
+    """The two views that a map begins with.
+
+    Attributes:
+        first, last: positions among the frames seen since the first view (first is 0).
+        last_from_first: (7,) pose; the median depth of the points in the first view is 1.
+        track: (N,) int64 positions of the corners that have become points. xyz: (N, 3) in the frame of the first view.
+        config: what the pair looks like. median_angle_deg, num_inliers, num_tracks: the numbers behind the decision.
+    """
+
+    last_from_first: Array
+    track: NDArray[np.int64]
+    xyz: Array
+    config: TwoViewConfig
+    median_angle_deg: float
+    num_inliers: int
+    num_tracks: int
+
+
+@dataclass
+class Beginning:
+    """Follows corners from a first view until two views make a map.
+
+    Attributes:
+        first: pyramid of the first view. corners: (N, 2) where they were in it.
+        seen: for every frame since, (N, 2) where the corners are, NaN where they were lost; ``seen[0]`` are the corners.
+        reason: why there is no map yet.
+    """
+
+    camera: Camera
+    options: OdometryOptions
+    seed: int
+    first: Pyramid | None = None
+    corners: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    seen: list[Array] = field(default_factory=list)
+    reason: str = "no frame yet"
+    _previous: Pyramid | None = None
+
+    def restart(self, pyramid: Pyramid) -> None:
+        """Begin anew with this frame as the first view."""
+        height, width = pyramid.shape
+        spacing = 0.5 * np.sqrt(height * width / self.options.max_tracks)
+        self.first = self._previous = pyramid
+        self.corners = find_corners(
+            pyramid, np.zeros((0, 2)), self.options.max_tracks, min_distance_px=float(spacing)
+        )
+        self.seen = [self.corners]
+
+    def add(self, pyramid: Pyramid) -> TwoViews | None:
+        """Follow the corners into the next frame; returns two views as soon as they make a map."""
+        if self.first is None or self._previous is None:
+            self.restart(pyramid)
+            self.reason = "waiting for motion"
+            return None
+        self.seen.append(self._follow(pyramid))
+        self._previous = pyramid
+        left = np.isfinite(self.seen[-1][:, 0])
+        if left.sum() < max(_MIN_POINTS, _MIN_LEFT * len(self.corners)):
+            self.reason = f"{int(left.sum())} of {len(self.corners)} corners are left of the first view"
+            self.restart(pyramid)
+            return None
+        flow = np.linalg.norm(self.seen[-1][left] - self.corners[left], axis=1)
+        if np.median(flow) < _MIN_FLOW * self.camera.width:
+            self.reason = "hardly any motion in the image"
+            return None
+        return self._two_views(np.flatnonzero(left))
+
+    def _follow(self, pyramid: Pyramid) -> Array:
+        """(N, 2) corners in a new frame: found from the last frame, then measured against the first view."""
+        assert self.first is not None
+        assert self._previous is not None
+        xy = np.full_like(self.corners, np.nan)
+        alive = np.flatnonzero(np.isfinite(self.seen[-1][:, 0]))
+        if not len(alive):
+            return xy
+        before = self.seen[-1][alive]
+        guess, rotation = before, align_small_images(self._previous, pyramid, self.camera.focal)
+        if rotation is not None:
+            rays = np.column_stack([pixels_to_normalized(self.camera, before), np.ones(len(before))])
+            turned = project(self.camera, rays @ rotation.T)
+            guess = np.where(np.isfinite(turned), turned, before)
+        step = align_patches(self._previous, before, pyramid, guess, coarsest_level=4)
+        alive, there = alive[step.is_converged], step.xy[step.is_converged]
+        xy[alive] = there
+        anew = align_patches(self.first, self.corners[alive], pyramid, there, coarsest_level=1)
+        # where both agree the first view counts, as its error does not grow from frame to frame
+        better = anew.is_converged & (np.linalg.norm(anew.xy - there, axis=1) < 1.5)
+        xy[alive[better]] = anew.xy[better]
+        return xy
+
+    def _two_views(self, track: NDArray[np.int64]) -> TwoViews | None:
+        xy1, xy2 = self.corners[track], self.seen[-1][track]
+        options = MatchingOptions(max_error_px=max(1.0, 1e-3 * self.camera.width))
+        found = verify_pair(xy1, xy2, self.camera, self.camera, options, Ransac(2000, self.seed))
+        num = int(found.is_inlier.sum())
+        usable = found.config in (TwoViewConfig.CALIBRATED, TwoViewConfig.PLANAR, TwoViewConfig.UNCALIBRATED)
+        if not usable or not np.isfinite(found.cam2_from_cam1).all():
+            self.reason = f"the two views look like {found.config.name}"
+            return None
+        if found.median_angle_deg < _MIN_MEDIAN_ANGLE_DEG or num < max(_MIN_POINTS, 0.5 * len(track)):
+            self.reason = f"{num} of {len(track)} corners agree, {found.median_angle_deg:.2f} deg of parallax"
+            return None
+        xn1, xn2 = (pixels_to_normalized(self.camera, xy[found.is_inlier]) for xy in (xy1, xy2))
+        depths, angles = epipolar.ray_depths(found.cam2_from_cam1, xn1, xn2)
+        good = (depths > 0).all(1) & (np.degrees(angles) > 0.25 * _MIN_MEDIAN_ANGLE_DEG)
+        if good.sum() < _MIN_POINTS:
+            self.reason = f"{int(good.sum())} points with depth"
+            return None
+        unit = 1.0 / float(np.median(depths[good, 0]))
+        pose = found.cam2_from_cam1.copy()
+        pose[4:] *= unit
+        xyz = np.column_stack([xn1, np.ones(len(xn1))]) * (unit * depths[:, :1])
+        return TwoViews(
+            pose, track[found.is_inlier][good], xyz[good], found.config, found.median_angle_deg, num, len(track)
+        )
+
+
+def pose_between(first: Array, last: Array, share: float) -> Array:
+    """The pose (7,) at a share of the way from one pose to another, rotation and centre interpolated."""
+    step = rigid3.rotation_matrix(last) @ rigid3.rotation_matrix(first).T
+    rotation = rigid3.exp_so3(share * rigid3.log_so3(step)) @ rigid3.rotation_matrix(first)
+    center = (1 - share) * rigid3.center(first) + share * rigid3.center(last)
+    return rigid3.from_matrix(rotation, -rotation @ center)

@@ -1,0 +1,239 @@
+"""One connected map while it grows: keyframes, the images of the recent ones, and the adjustment beside."""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.geometry import rigid3
+from sfmapp.geometry.triangulation import triangulate_tracks
+from sfmapp.odometry.active_tracks import ActiveTracks, patch_warp
+from sfmapp.odometry.alignment import align_patches
+from sfmapp.odometry.backend import Backend, Job, choose_window, make_job
+from sfmapp.odometry.corners import find_corners
+from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.pyramid import Pyramid
+from sfmapp.odometry.stereo import match_stereo
+from sfmapp.scene.camera import Camera, pixels_to_normalized, project
+from sfmapp.scene.rig import Rig
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Keyframes whose images are kept: references of patches and places to find lost points again.
+_KEPT_IMAGES = 20
+# A patch that has come to look less alike than that gets the newest keyframe as its reference.
+_MIN_LIKENESS = 0.9
+# Points that are looked for again: how alike and how near the prediction they must be, and the change of scale allowed.
+_FOUND_LIKENESS, _FOUND_PX, _FOUND_SCALE = 0.85, 3.0, 1.5
+# A triangulated point agrees with its observations to that many pixels.
+_TRIANGULATION_PX = 2.0
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame as the map sees it: its images as pyramids, and which frame it is."""
+
+    frame_idx: int
+    timestamp_s: float
+    name: str
+    pyramids: tuple[Pyramid, ...]
+
+
+class LocalMap:
+    """Keyframes, points and the images that points are looked for with."""
+
+    def __init__(self, rig: Rig, options: OdometryOptions, executor: Executor, map_idx: int) -> None:
+        self.rig, self.options, self.map_idx = rig, options, map_idx
+        self.keyframes = KeyframeMap(rig)
+        self.backend = Backend(executor)
+        self.images: dict[int, Pyramid] = {}
+        self.counts = {"points_found_again": 0, "triangulated": 0, "stereo_matches": 0}
+
+    @property
+    def camera(self) -> Camera:
+        return self.rig.cameras[0]
+
+    @property
+    def newest(self) -> int:
+        """Position of the newest keyframe."""
+        return len(self.keyframes.keyframes) - 1
+
+    def pose(self, keyframe: int) -> Array:
+        """(7,) rig_from_world of a keyframe."""
+        return self.keyframes.keyframes[keyframe].rig_from_world
+
+    def poses(self, keyframes: NDArray[np.int64]) -> dict[int, Array]:
+        """Poses of some keyframes."""
+        return {int(k): self.pose(int(k)) for k in np.unique(keyframes)}
+
+    def points_of(self, tracks: ActiveTracks) -> tuple[Array, Mask]:
+        """(N, 3) world points of tracks, guessed where they are not in the map, and (N,) which are in it."""
+        xyz = self.keyframes.point_xyz[tracks.point_id]
+        mapped = np.isfinite(xyz[:, 0])
+        guessed = tracks.subset(~mapped)
+        xyz[~mapped] = guessed.world_points(self.poses(guessed.reference))
+        return xyz, mapped
+
+    def begin(self, view: View, corners: Array) -> ActiveTracks:
+        """Make the first keyframe of a map, at the identity, of corners (N, 2) without depth; returns their tracks."""
+        self.images[0] = view.pyramids[0]
+        tracks = self.start_tracks(corners, 0, ActiveTracks.none())
+        self._append(view, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), tracks)
+        return tracks
+
+    def add_keyframe(self, view: View, pose: Array, tracks: ActiveTracks, frame_number: int) -> ActiveTracks:
+        """Make a keyframe of a tracked view: find lost points again, add corners, triangulate, begin to adjust.
+
+        Args:
+            view: the frame. pose: (7,) its rig_from_world. tracks: what was tracked into it, outliers left out.
+            frame_number: frames processed so far, the clock of the backend.
+
+        Returns:
+            The tracks to follow from here.
+        """
+        pyramid = view.pyramids[0]
+        tracks = tracks.joined(self._find_again(tracks, pyramid, pose))
+        number = self.newest + 1
+        self.images[number] = pyramid
+        tracks = self._renew_references(tracks, number, pose)
+        tracks = tracks.joined(self._new_corners(tracks, pyramid, number))
+        self._append(view, pose, tracks)
+        if self.rig.is_stereo:
+            self._match_stereo(view, tracks)
+        self.backend.finish(self.keyframes)
+        self._adjust(tracks, frame_number)
+        for old in [k for k in self.images if k <= number - _KEPT_IMAGES]:
+            del self.images[old]
+        return tracks
+
+    def _append(self, view: View, pose: Array, tracks: ActiveTracks) -> None:
+        xy = np.full((len(tracks), len(self.rig.cameras), 2), np.nan)
+        xy[:, 0] = tracks.xy
+        seen = np.isfinite(xy[:, :, 0])
+        self.keyframes.append(
+            Keyframe(view.frame_idx, view.timestamp_s, view.name, pose.copy(), tracks.point_id, xy, seen)
+        )
+
+    def _adjust(self, tracks: ActiveTracks, frame_number: int) -> None:
+        """Triangulate what has become triangulable, and begin to adjust the window."""
+        job = make_job(self.keyframes, *choose_window(self.keyframes, self.options))
+        self._triangulate(job, tracks.point_id)
+        self.backend.begin(job, frame_number)
+
+    def _triangulate(self, job: Job, wanted: NDArray[np.int64]) -> None:
+        """Triangulate those of the wanted points (ids) that are not in the map, from the views of a job."""
+        model, tracks = job.model, job.model.tracks
+        new = np.flatnonzero(np.isnan(model.point_xyz[:, 0]) & np.isin(job.point_id, wanted, assume_unique=True))
+        canonical, fisheye = model.canonical_cameras()
+        triangulate_tracks(
+            new, tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy, rigid3.rotation_matrix(model.cam_from_world),
+            model.cam_from_world[:, 4:].copy(), model.image_camera_idx, canonical, fisheye, _TRIANGULATION_PX,
+            math.radians(self.options.min_triangulation_deg), model.point_xyz, model.obs_is_inlier,
+        )  # fmt: skip
+        self.keyframes.point_xyz[job.point_id[new]] = model.point_xyz[new]
+        self.counts["triangulated"] += int(np.isfinite(model.point_xyz[new, 0]).sum())
+
+    def _find_again(self, tracks: ActiveTracks, pyramid: Pyramid, pose: Array) -> ActiveTracks:
+        """Look for points of recent keyframes that are not tracked any more."""
+        known = np.zeros(self.keyframes.num_points, bool)
+        known[tracks.point_id] = True
+        height, width = pyramid.shape
+        taken = np.zeros((height // 4 + 1, width // 4 + 1), bool)
+        taken[(tracks.xy[:, 1] // 4).astype(int), (tracks.xy[:, 0] // 4).astype(int)] = True
+        found = [ActiveTracks.none()]
+        room = self.options.max_tracks // 4
+        for k in sorted(self.images, reverse=True):
+            keyframe = self.keyframes.keyframes[k]
+            xyz = self.keyframes.point_xyz[keyframe.point_id]
+            mine = np.flatnonzero(keyframe.is_inlier[:, 0] & ~known[keyframe.point_id] & np.isfinite(xyz[:, 0]))
+            known[keyframe.point_id[mine]] = True  # the newest keyframe that saw a point has its best picture
+            in_camera, in_reference = rigid3.apply(pose, xyz[mine]), rigid3.apply(keyframe.rig_from_world, xyz[mine])
+            guess = project(self.camera, in_camera)
+            ratio = in_camera[:, 2] / in_reference[:, 2]
+            inside = (
+                (guess > 8).all(1) & (guess[:, 0] < width - 8) & (guess[:, 1] < height - 8)
+                & (ratio < _FOUND_SCALE) & (ratio > 1 / _FOUND_SCALE)
+            )  # fmt: skip  (False for NaN)
+            inside[inside] &= ~taken[(guess[inside, 1] // 4).astype(int), (guess[inside, 0] // 4).astype(int)]
+            if inside.sum() < 4:
+                continue
+            mine, guess, ratio = mine[inside], guess[inside], ratio[inside]
+            ray = in_reference[inside, :2] / in_reference[inside, 2:]
+            warp = patch_warp(rigid3.compose(pose, rigid3.inverse(keyframe.rig_from_world)), ray, ratio)
+            reference_xy = keyframe.xy[mine, 0]
+            aligned = align_patches(self.images[k], reference_xy, pyramid, guess, affine=warp, coarsest_level=1)
+            near = np.linalg.norm(aligned.xy - guess, axis=1) < _FOUND_PX
+            good = aligned.is_converged & near & (aligned.zncc > _FOUND_LIKENESS)
+            found.append(
+                ActiveTracks(
+                    keyframe.point_id[mine], aligned.xy, np.full(len(mine), k), reference_xy, ray,
+                    1 / in_reference[inside, 2], aligned.zncc,
+                ).subset(good)
+            )  # fmt: skip
+            taken[(found[-1].xy[:, 1] // 4).astype(int), (found[-1].xy[:, 0] // 4).astype(int)] = True
+            if sum(map(len, found)) > room:
+                break
+        again = found[0]
+        for more in found[1:]:
+            again = again.joined(more)
+        self.counts["points_found_again"] += len(again)
+        return again
+
+    def _renew_references(self, tracks: ActiveTracks, number: int, pose: Array) -> ActiveTracks:
+        """Give tracks whose patch has changed, or whose reference image will be dropped, the new keyframe."""
+        stale = (tracks.zncc < _MIN_LIKENESS) | (tracks.reference <= number - _KEPT_IMAGES + 1)
+        xyz, _ = self.points_of(tracks)
+        reference, reference_xy = tracks.reference.copy(), tracks.reference_xy.copy()
+        ray, inverse_depth = tracks.reference_ray.copy(), tracks.inverse_depth.copy()
+        reference[stale], reference_xy[stale] = number, tracks.xy[stale]
+        ray[stale] = pixels_to_normalized(self.camera, tracks.xy[stale])
+        inverse_depth[stale] = 1 / np.maximum(rigid3.apply(pose, xyz[stale])[:, 2], 1e-6)
+        return replace(
+            tracks, reference=reference, reference_xy=reference_xy, reference_ray=ray, inverse_depth=inverse_depth
+        )
+
+    def _new_corners(self, tracks: ActiveTracks, pyramid: Pyramid, number: int) -> ActiveTracks:
+        """Corners where there are no tracks; their depth is guessed from their neighbours in the image."""
+        wanted = self.options.max_tracks - len(tracks)
+        if wanted < self.options.max_tracks // 50:
+            return ActiveTracks.none()
+        height, width = pyramid.shape
+        spacing = 0.5 * math.sqrt(height * width / self.options.max_tracks)
+        xy = find_corners(pyramid, tracks.xy, wanted, min_distance_px=spacing)
+        return self.start_tracks(xy, number, tracks)
+
+    def start_tracks(self, xy: Array, number: int, neighbours: ActiveTracks) -> ActiveTracks:
+        """New tracks at corners (N, 2) of a keyframe."""
+        inverse_depth = np.ones(len(xy))
+        depths = self._inverse_depths(neighbours, number)
+        known = np.isfinite(depths)
+        if known.any() and len(xy):
+            squared = ((xy[:, None] - neighbours.xy[known][None]) ** 2).sum(2)
+            inverse_depth = depths[known][np.argmin(squared, 1)]
+        return ActiveTracks(
+            self.keyframes.new_points(len(xy)), xy, np.full(len(xy), number), xy.copy(),
+            pixels_to_normalized(self.camera, xy), inverse_depth, np.ones(len(xy), np.float32),
+        )  # fmt: skip
+
+    def _inverse_depths(self, tracks: ActiveTracks, number: int) -> Array:
+        """(N,) inverse depths of tracks in a keyframe that may not be in the map yet; NaN for unmapped points."""
+        if number > self.newest:
+            return np.where(np.isfinite(self.keyframes.point_xyz[tracks.point_id, 0]), tracks.inverse_depth, np.nan)
+        in_camera = rigid3.apply(self.pose(number), self.keyframes.point_xyz[tracks.point_id])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(in_camera[:, 2] > 0, 1 / in_camera[:, 2], np.nan)
+
+    def _match_stereo(self, view: View, tracks: ActiveTracks) -> None:
+        """Find the tracks of the newest keyframe in the other camera of the rig."""
+        keyframe = self.keyframes.keyframes[-1]
+        xyz, mapped = self.points_of(tracks)
+        depth = np.where(mapped, rigid3.apply(keyframe.rig_from_world, xyz)[:, 2], np.nan)
+        keyframe.xy[:, 1] = match_stereo(self.rig, view.pyramids, tracks.xy, depth)
+        keyframe.is_inlier[:, 1] = np.isfinite(keyframe.xy[:, 1, 0])
+        self.counts["stereo_matches"] += int(keyframe.is_inlier[:, 1].sum())

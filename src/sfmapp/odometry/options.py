@@ -1,0 +1,23 @@
+"""Options of the odometry stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class OdometryOptions:
+    """How a camera is followed through a sequence. Shares and angles where possible, so that no size is assumed."""
+
+    max_tracks: int = 600  # corners followed at a time, spread over the image
+    keyframe_parallax: float = 0.02  # median shift beyond rotation since the last keyframe, share of the image width
+    keyframe_loss: float = 0.75  # a keyframe is due when fewer than this share of its mapped points is still tracked
+    window: int = 10  # keyframes whose poses the local adjustment may change
+    window_anchors: int = 10  # earlier keyframes that take part unchanged, those that share the most points
+    min_triangulation_deg: float = 1.0  # smallest angle between the rays of a new point
+    max_lost_s: float = 1.0  # seconds without relocalisation after which a new map is begun
+    motion: Literal["free", "planar"] = "free"  # planar: a wheeled robot on level ground, for the first two views
+    loops: bool = True  # look for places seen before, close loops and join maps
+    final_adjustment: bool = True  # adjust all keyframes once at the end
+    covariance: bool = True  # covariances of the keyframes, at the end

@@ -1,0 +1,153 @@
+"""From frame to frame: follow the points, measure the pose, and say when a keyframe is due."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.adjust.pose import refine_pose
+from sfmapp.geometry import rigid3
+from sfmapp.geometry.epipolar import essential_from_pose, sampson_errors
+from sfmapp.geometry.resection import estimate_pose
+from sfmapp.odometry.active_tracks import ActiveTracks, follow
+from sfmapp.odometry.local_map import LocalMap
+from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.pyramid import Pyramid
+from sfmapp.odometry.small_image import align_small_images
+from sfmapp.scene.camera import Camera, pixels_to_normalized, project
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Fewest points that a pose is believed to, and their share among the points that were found: a third of what chance
+# would leave in a bad match is still far below.
+MIN_INLIERS, _MIN_INLIER_SHARE = 15, 0.3
+# Points whose residual is longer than that many robust sigmas, within these bounds in pixels, are outliers.
+_OUTLIER_SIGMAS, _OUTLIER_RANGE_PX = 5.0, (1.5, 4.0)
+# A prediction has failed when fewer than this share of the tracks is found with it.
+_MIN_FOUND = 0.5
+# Unmapped tracks farther from their epipolar line than that have slid off their point.
+_MAX_EPIPOLAR_PX = 1.5
+# Levels at which the search begins: near a good prediction, and after a bad one.
+_NEAR_LEVEL, _FAR_LEVEL = 2, 4
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A frame whose pose was measured.
+
+    Attributes:
+        pose: (7,) cam_from_world. covariance: (6, 6) as of ``refine_pose``.
+        tracks: what is followed from here; outliers are gone. is_mapped: (N,) which of them measured the pose.
+        num_found, num_inliers: of the mapped tracks.
+        residual_px: robust standard deviation of the residuals of the inliers.
+    """
+
+    pose: Array
+    covariance: Array
+    tracks: ActiveTracks
+    is_mapped: Mask
+    num_found: int
+    num_inliers: int
+    residual_px: float
+
+
+def track(
+    local: LocalMap, tracks: ActiveTracks, pose: Array, step: Array, previous: Pyramid, pyramid: Pyramid
+) -> Tracked | None:
+    """Measure the pose of a new frame.
+
+    Args:
+        tracks: as they were in the last frame.
+        pose: (7,) cam_from_world of the last frame. step: (7,) predicted pose of the new frame from the last.
+        previous, pyramid: the images of both.
+
+    Returns:
+        None if the pose cannot be measured.
+    """
+    xyz, mapped = local.points_of(tracks)
+    poses = local.poses(tracks.reference)
+    predicted = rigid3.compose(step, pose)
+    followed, found = follow(tracks, xyz, local.camera, predicted, poses, local.images, pyramid, _NEAR_LEVEL)
+    if found.sum() < _MIN_FOUND * len(tracks):
+        rotation = align_small_images(previous, pyramid, local.camera.focal)
+        turn = np.zeros(3) if rotation is None else rigid3.log_so3(rotation)
+        other = rigid3.compose(rigid3.from_matrix(rigid3.exp_so3(turn), np.zeros(3)), pose)
+        again, found_again = follow(tracks, xyz, local.camera, other, poses, local.images, pyramid, _FAR_LEVEL)
+        if found_again.sum() > found.sum():
+            followed, found, predicted = again, found_again, other
+    tracks, xyz, mapped = followed.subset(found), xyz[found], mapped[found]
+    measured = measure_pose(local.camera, predicted, xyz[mapped], tracks.xy[mapped])
+    if measured is None:
+        return None
+    new_pose, covariance, inlier, sigma = measured
+    keep = np.ones(len(tracks), bool)
+    keep[mapped] = inlier
+    keep[~mapped] = _near_epipolar_lines(local, tracks.subset(~mapped), new_pose)
+    return Tracked(
+        new_pose, covariance, tracks.subset(keep), mapped[keep], int(mapped.sum()), int(inlier.sum()), sigma
+    )
+
+
+def measure_pose(camera: Camera, start: Array, xyz: Array, xy: Array) -> tuple[Array, Array, Mask, float] | None:
+    """Robust pose from points in the map: refined from a start, by RANSAC where that finds too few that agree.
+
+    Returns:
+        (7,) cam_from_world, (6, 6) covariance, (N,) inliers, and the robust sigma of their residuals in pixels; or None.
+    """
+    if len(xyz) < MIN_INLIERS:
+        return None
+    canonical, fisheye = camera.canonical, camera.is_fisheye
+    best = refine_pose(canonical, fisheye, start, xyz, xy, inlier_px=_OUTLIER_RANGE_PX[1])
+    if best.is_inlier.sum() < 0.6 * len(xyz):
+        normalized = pixels_to_normalized(camera, xy)
+        sampled = estimate_pose(xyz, normalized, 3.0 / camera.focal, max_iterations=1000)
+        if sampled is not None and sampled.num_inliers >= MIN_INLIERS:
+            other = refine_pose(canonical, fisheye, sampled.cam_from_world, xyz, xy, inlier_px=_OUTLIER_RANGE_PX[1])
+            if other.is_inlier.sum() > best.is_inlier.sum():
+                best = other
+    error = np.linalg.norm(project(camera, rigid3.apply(best.cam_from_world, xyz)) - xy, axis=1)
+    if best.is_inlier.sum() < max(MIN_INLIERS, _MIN_INLIER_SHARE * len(xyz)):
+        return None
+    sigma = float(np.median(error[best.is_inlier])) / 1.1774
+    inlier = error < np.clip(_OUTLIER_SIGMAS * sigma, *_OUTLIER_RANGE_PX)
+    if inlier.sum() < MIN_INLIERS:
+        return None
+    return best.cam_from_world, best.covariance, inlier, sigma
+
+
+def _near_epipolar_lines(local: LocalMap, tracks: ActiveTracks, pose: Array) -> Mask:
+    """(N,) which unmapped tracks are near the epipolar lines of their reference keyframes."""
+    near = np.ones(len(tracks), bool)
+    here = pixels_to_normalized(local.camera, tracks.xy)
+    for keyframe, reference_pose in local.poses(tracks.reference).items():
+        mine = tracks.reference == keyframe
+        relative = rigid3.compose(pose, rigid3.inverse(reference_pose))
+        errors = sampson_errors(essential_from_pose(relative), tracks.reference_ray[mine], here[mine])
+        near[mine] = ~(errors > (_MAX_EPIPOLAR_PX / local.camera.focal) ** 2)
+    return near
+
+
+def keyframe_reason(local: LocalMap, tracked: Tracked, num_mapped_before: int, options: OdometryOptions) -> str | None:
+    """Why this frame should become a keyframe, or None.
+
+    Args:
+        num_mapped_before: mapped tracks right after the last keyframe.
+    """
+    num_mapped = int(tracked.is_mapped.sum())
+    if num_mapped < options.keyframe_loss * num_mapped_before:
+        return f"{num_mapped} of {num_mapped_before} mapped points are left"
+    last = local.keyframes.keyframes[-1]
+    common, here, there = np.intersect1d(tracked.tracks.point_id, last.point_id, True, return_indices=True)
+    if len(common) < 0.6 * len(last.point_id):
+        return f"{len(common)} of {len(last.point_id)} tracks of the last keyframe are left"
+    rays = np.column_stack([pixels_to_normalized(local.camera, last.xy[there, 0]), np.ones(len(common))])
+    turn = rigid3.rotation_matrix(tracked.pose) @ rigid3.rotation_matrix(last.rig_from_world).T
+    still = project(local.camera, rays @ turn.T)
+    shift = np.linalg.norm(still - tracked.tracks.xy[here], axis=1)
+    parallax = float(np.nanmedian(shift)) / local.camera.width
+    if parallax > options.keyframe_parallax:
+        return f"parallax of {100 * parallax:.1f} % of the width"
+    return None
