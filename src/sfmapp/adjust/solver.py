@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -129,10 +130,10 @@ def adjust_bundle(
         constant_points=constant_points, prior_cameras=prior_cameras, extra_factors=extra_factors,
     )  # fmt: skip
     problem = engine.problem
-    with ThreadPoolExecutor(max(1, min(threads, engine.num_chunks))) as pool:
-        run = map if threads <= 1 or engine.num_chunks == 1 else pool.map
+    workers = min(threads, engine.num_chunks)
+    with ThreadPoolExecutor(workers) if workers > 1 else nullcontext() as pool:
         try:
-            outcome = _minimize(engine, options, run, events)
+            outcome = _minimize(engine, options, pool.map if pool is not None else map, events)
         finally:
             write_back(problem, reconstruction)
     return AdjustReport(
