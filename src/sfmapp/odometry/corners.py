@@ -23,12 +23,12 @@ _WINDOW = 2 * _HALF + 1
 _BORDER = 9
 # a corner has to be located to this by its 7 x 7 pixels, given the noise of the sensor
 _MAX_SIGMA_PX = 0.2
-# the score this takes, by the square of the noise in grey levels: what noise alone makes, and a difference of two pixels
-# has the variance 2 noise^2 and is twice the gradient
+# the score this takes, by the square of the noise in grey levels: what noise alone makes, and more; a difference of two
+# pixels has the variance 2 noise^2 and is twice the gradient
 _FLOOR = 2.0 * _WINDOW**2 + 4.0 * 2.0 / _MAX_SIGMA_PX**2
 # Noise grows with the light, and compression changes its colour, so it is judged by the scores it makes: the lowest
-# tenth at a range of grey are taken for plain surfaces. Noise peaks at three times that score, correlated as compression
-# leaves it at five.
+# tenth at a range of grey are taken for plain surfaces. Noise peaks at four times that score, and where compression has
+# correlated it at ten, but there it rarely passes six.
 _ABOVE_PLAIN = 6.0
 # grey levels between which plain surfaces are believed: rounding alone makes 0.3, and what varies by more is texture
 _MIN_NOISE, _MAX_NOISE = 0.6, 3.0
