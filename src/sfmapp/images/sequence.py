@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -9,9 +10,51 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.errors import UsageError
 from sfmapp.scene.rig import Rig
 
 Array = NDArray[np.float64]
+SequenceKind = Literal["kitti", "tum", "euroc", "folder", "video"]
+
+STAGE = "sequence"
+"""Stage of the events that tell of opening and reading a sequence."""
+
+
+@dataclass(frozen=True)
+class SequenceOptions:
+    """What to play of a sequence, and what is known about it that it does not say itself.
+
+    Attributes:
+        camera: ``MODEL,PARAMETER,...`` in COLMAP's order and pixel rule (the centre of the top-left pixel is 0.5), or
+            the path of a calibration file (see :func:`sfmapp.formats.calibration.read_calibration`). None: what lies
+            beside the frames.
+        mono: use the first camera alone, also where there are two.
+        start, stop: first frame and the one behind the last, as positions in the sequence; None: to its end.
+        step: play every step-th frame.
+        reverse: play backwards. Time still ascends: a frame of time t comes at first + last - t, so that the intervals
+            stay what they are; the truth is mirrored with it, and the IMU, whose rates of rotation change sign.
+        fps: frames a second where the sequence holds no times; None: 10 for KITTI, 30 else, with a note.
+        imu: path of IMU measurements in EuRoC's form, ``sensor.yaml`` beside it. None: what the sequence holds.
+        truth: path of a trajectory of TUM, KITTI or EuRoC. None: what the sequence holds.
+    """
+
+    camera: str | None = None
+    mono: bool = False
+    start: int = 0
+    stop: int | None = None
+    step: int = 1
+    reverse: bool = False
+    fps: float | None = None
+    imu: str | None = None
+    truth: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.start < 0 or self.step < 1:
+            raise UsageError(f"start is {self.start} and step is {self.step}", "start counts from 0, step is 1 or more")
+        if self.stop is not None and self.stop <= self.start:
+            raise UsageError(f"stop is {self.stop}, which is not behind start ({self.start})")
+        if self.fps is not None and not (math.isfinite(self.fps) and 1e-3 <= self.fps <= 1e5):
+            raise UsageError(f"fps is {self.fps}", "give the frames per second, such as 30")
 
 
 @dataclass(frozen=True)
@@ -19,9 +62,9 @@ class Frame:
     """All images of one moment.
 
     Attributes:
-        idx: position in the sequence, frames that could not be read counted as well.
+        idx: position among the frames that are played, those that could not be read counted as well.
         name: the file of the first camera relative to the sequence, or ``000123`` in a video.
-        timestamp_s: seconds, ascending.
+        timestamp_s: seconds, strictly ascending.
         images: one (H, W) uint8 grey image for each camera of the rig.
     """
 
@@ -55,25 +98,26 @@ class Imu:
 
 @dataclass(frozen=True)
 class Truth:
-    """Where the rig's first camera truly was: (N,) seconds, and cam_from_world (N, 7) in metres."""
+    """Where the rig's first camera truly was: (N,) ascending seconds, and cam_from_world (N, 7) in metres."""
 
     timestamps_s: Array
     cam_from_world: Array
 
 
 class Sequence(Protocol):
-    """Frames that can be walked through from the start as often as one likes.
+    """Frames that can be walked through from the start as often as one likes (a live stream: once).
 
     Attributes:
         kind: the layout it was recognised as.
         source: what the user gave.
         rig: its cameras; more than one means stereo, in metres.
-        num_frames: how many there are; None where only reading tells.
+        num_frames: how many there are, unreadable ones included (of a video: what its header says); None where only
+            reading tells.
         frames_per_second: nominal rate; None where unknown.
         imu, truth: None where there is none.
     """
 
-    kind: Literal["kitti", "tum", "euroc", "folder", "video"]
+    kind: SequenceKind
     source: str
     rig: Rig
     num_frames: int | None

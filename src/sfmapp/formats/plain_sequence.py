@@ -1,0 +1,140 @@
+"""Sequences that follow no benchmark: a folder of images, or ``left`` and ``right``; and calibrations beside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.errors import InputError
+from sfmapp.events import Events
+from sfmapp.formats.kitti import with_partners
+from sfmapp.formats.sequence_files import (
+    Recording,
+    common_size,
+    frame_names,
+    has_images,
+    list_images,
+    read_rows,
+    times_in_names,
+    times_of_rows,
+    timestamp_of,
+)
+from sfmapp.images.sources import find_images
+
+Array = NDArray[np.float64]
+
+_PAIRS = (
+    ("left", "right"), ("cam0", "cam1"), ("image_left", "image_right"), ("images_left", "images_right"),
+    ("camera_0", "camera_1"), ("image_00", "image_01"), ("cam_left", "cam_right"),
+)  # fmt: skip
+_TIMES = ("times.txt", "timestamps.txt", "timestamp.txt", "data.csv", "times.csv", "timestamps.csv", "rgb.txt")
+_CALIBRATION_STEMS = (
+    "calib", "calibration", "camera", "intrinsics", "camera_info", "camchain", "stereo", "sensor", "ost",
+)  # fmt: skip
+_CALIBRATIONS = (
+    *(stem + ending for stem in _CALIBRATION_STEMS for ending in (".json", ".yaml", ".yml", ".xml", ".txt")),
+    "cameras.txt", "K.txt", "dso/camchain.yaml",
+)  # fmt: skip
+
+
+def find_calibration(*folders: Path) -> Path | None:
+    """The first file in the folders that has a name of a calibration; None if there is none."""
+    for folder in folders:
+        for name in _CALIBRATIONS:
+            if (folder / name).is_file():
+                return folder / name
+        others = sorted(folder.glob("*camchain*.yaml")) if folder.is_dir() else []
+        if others:
+            return others[0]
+    return None
+
+
+def find_pair(folder: Path) -> tuple[Path, Path] | None:
+    """Folders of the left and the right images in a folder; None if there are none."""
+    for names in _PAIRS:
+        left, right = (_folder_of_images(folder / name) for name in names)
+        if left is not None and right is not None:
+            return left, right
+    return None
+
+
+def _folder_of_images(folder: Path) -> Path | None:
+    return next((candidate for candidate in (folder, folder / "data") if has_images(candidate)), None)
+
+
+def read_pair_sequence(root: Path, left: Path, right: Path, events: Events) -> Recording:
+    """Images of two folders, paired by their file names, or in order where the names differ and the counts agree.
+
+    Raises:
+        InputError: no image can be read, or times beside them do not fit.
+    """
+    files, others = list_images(left), list_images(right)
+    frames = with_partners(files, right, events)
+    if frames and len(frames[0]) == 1:
+        if len(files) != len(others):
+            raise InputError(
+                f"{right}: expected images named like those of {left.name}, or as many of them ({len(files)}), found "
+                f"{len(others)} with other names"
+            )
+        frames = list(zip(files, others, strict=True))
+    first = [frame[0] for frame in frames]
+    sizes = (common_size(first, str(left)), common_size([frame[1] for frame in frames], str(right)))
+    times = _times(first, left, left.parent, root)
+    return Recording("folder", root, frame_names(root, first), times, frames, sizes, None)
+
+
+def read_folder_sequence(root: Path, folder: Path) -> Recording:
+    """The images of a folder in natural order of their names; ``root`` is where what belongs to them lies.
+
+    Raises:
+        InputError: no image can be read, or times beside them do not fit.
+    """
+    return _of_files(root, list_images(folder), str(folder), (folder, root))
+
+
+def read_listed_sequence(source: str) -> Recording:
+    """The images of a glob pattern or of a text file that lists them. Raises InputError as a folder does."""
+    found = find_images(source)
+    return _of_files(found.root, found.paths, source, (found.root,))
+
+
+def _of_files(root: Path, files: list[Path], what: str, folders: tuple[Path, ...]) -> Recording:
+    size = common_size(files, what)
+    frames: list[tuple[Path, ...]] = [(path,) for path in files]
+    return Recording("folder", root, frame_names(root, files), _times(files, *folders), frames, (size,), None)
+
+
+def _times(files: list[Path], *folders: Path) -> Array | None:
+    """(N,) seconds from a list beside the images, or from their names; None where neither tells."""
+    for folder in folders:
+        for name in _TIMES:
+            if (folder / name).is_file():
+                return _listed_times(folder / name, files)
+    return times_in_names(files)
+
+
+def _listed_times(path: Path, files: list[Path]) -> Array:
+    """Times of a list that names the files, before or behind the time, or has a line for each of them."""
+    position = {key: i for i, file in reversed(list(enumerate(files))) for key in (file.name, file.stem)}
+    times = np.full(len(files), np.nan)
+    for _, fields in read_rows(path):
+        values = [field for part in fields for field in part.split(",") if field]
+        if len(values) < 2:
+            continue
+        for name, time in ((values[0], values[1]), (values[1], values[0])):
+            i = position.get(name.rsplit("/", 1)[-1])
+            if i is None:
+                continue
+            try:
+                times[i] = timestamp_of(time)
+            except ValueError:
+                raise InputError(f"{path}: expected a time for {name}, found {time[:80]!r}") from None
+            break
+    if np.isnan(times).all():
+        return times_of_rows(path, files)
+    if np.isnan(times).any():
+        missing = files[int(np.argmax(np.isnan(times)))].name
+        raise InputError(f"{path}: expected the times of all {len(files)} images, found none of {missing}")
+    return times

@@ -1,0 +1,357 @@
+"""From what the user points at to a sequence: recognise the layout, find the cameras, put time in order."""
+
+from __future__ import annotations
+
+import glob
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.errors import InputError, UsageError
+from sfmapp.events import Events
+from sfmapp.formats.calibration import Calibration, camera_from_text, read_calibration
+from sfmapp.formats.euroc import find_mav, read_euroc_sequence, read_euroc_truth, read_imu
+from sfmapp.formats.kitti import FRAMES_PER_SECOND as KITTI_FPS
+from sfmapp.formats.kitti import is_kitti, read_kitti, read_kitti_sequence
+from sfmapp.formats.plain_sequence import (
+    find_calibration,
+    find_pair,
+    read_folder_sequence,
+    read_listed_sequence,
+    read_pair_sequence,
+)
+from sfmapp.formats.sequence_files import (
+    Recording,
+    Size,
+    ascending,
+    frame_numbers,
+    has_images,
+    read_rows,
+    rows_of_frames,
+)
+from sfmapp.formats.tum import is_tum, read_tum_sequence, read_tum_truth
+from sfmapp.geometry import rigid3
+from sfmapp.images.exif import focal_prior, read_exif
+from sfmapp.images.frame_reader import FileSequence, read_regular_file, some
+from sfmapp.images.headers import UnusableImage, read_header
+from sfmapp.images.sequence import STAGE, Imu, Sequence, SequenceOptions, Truth
+from sfmapp.images.sources import EXTENSIONS, printable
+from sfmapp.images.video import DEFAULT_FPS, VideoSequence, is_stream, read_video_facts
+from sfmapp.scene.camera import Camera, CameraModel, simple_camera
+from sfmapp.scene.rig import Rig
+
+__all__ = ["MissingCameraError", "SequenceOptions", "open_sequence"]
+
+Array = NDArray[np.float64]
+
+# Files of a sequence that users point at instead of its folder.
+_LISTS = frozenset({"rgb.txt", "data.csv", "times.txt", "timestamps.txt", "calib.txt", "calib.json", "poses.txt"})
+# Where frames lie that do not lie in the folder itself.
+_FRAME_FOLDERS = ("images", "frames", "rgb", "color", "image", "img", "imgs", "data", "input", "undistorted")
+_LAYOUTS = (
+    "a folder with images; image_0 and calib.txt (KITTI); rgb.txt and rgb (TUM); mav0 or cam0/data (EuRoC); "
+    "left and right; or a video"
+)
+HOW_TO_CALIBRATE = (
+    "give --camera PINHOLE,fx,fy,cx,cy or --camera FILE (calib.json, cameras.txt, sensor.yaml, camera_info.yaml, "
+    "OpenCV's yml or xml), to be had by photographing a chessboard (OpenCV's calibrate_camera, Kalibr); or let "
+    "--self-calibrate find the focal length from the first seconds"
+)
+
+
+class MissingCameraError(InputError):
+    """Nothing tells the intrinsics of the camera. ``open_sequence(..., require_camera=False)`` goes on without."""
+
+
+def open_sequence(
+    source: str | Path, options: SequenceOptions, events: Events, *, require_camera: bool = True
+) -> Sequence:
+    """Open a sequence; nothing is decoded yet but the first frame of a video.
+
+    Args:
+        source: a folder of KITTI, TUM or EuRoC, a folder of images, one with ``left`` and ``right``, a glob pattern, a
+            list of images, a video file, a URL, or ``camera:0``.
+        options: what to play of it, and what it does not say itself.
+        events: told what was recognised and assumed, and, while frames are read, what is left out.
+        require_camera: False: where nothing tells the intrinsics, the rig has one SIMPLE_RADIAL camera with a focal
+            length from EXIF or a guess (``focal_source`` is ``default`` or begins with ``exif``).
+
+    Raises:
+        MissingCameraError: nothing tells the intrinsics, and they are required.
+        InputError: no sequence is there, or a file of it is not what it should be.
+        UsageError: options that cannot be obeyed.
+    """
+    text = str(source)
+    path = Path(text)
+    if is_stream(text):
+        return _open_video(text, options, events, require_camera)
+    if not path.exists():
+        if not glob.has_magic(text):
+            raise InputError(f"{printable(text)}: expected a sequence, found nothing", f"a sequence is {_LAYOUTS}")
+        return _sequence(text, read_listed_sequence(text), options, events, require_camera)
+    if path.is_file() and path.name not in _LISTS:
+        if path.suffix.lower() in EXTENSIONS:
+            raise InputError(f"{path}: expected a sequence, found a single image", f"a sequence is {_LAYOUTS}")
+        if path.suffix.lower() == ".txt":
+            return _sequence(text, read_listed_sequence(text), options, events, require_camera)
+        return _open_video(text, options, events, require_camera)
+    folder = (path.parent if path.is_file() else path).absolute()
+    return _sequence(text, _read_layout(folder, events), options, events, require_camera)
+
+
+def _read_layout(folder: Path, events: Events) -> Recording:
+    """What lies in a folder, whichever layout it has."""
+    inside, above = folder.name, folder.parent
+    mav = find_mav(folder)
+    if mav is not None:
+        return read_euroc_sequence(mav, events)
+    if inside == "data" and above.name in ("cam0", "cam1"):
+        return read_euroc_sequence(above.parent, events, above.name)
+    if inside in ("cam0", "cam1") and (folder / "data").is_dir():
+        return read_euroc_sequence(above, events, inside)
+    if is_kitti(folder):
+        return read_kitti_sequence(folder, events)
+    if inside in ("image_0", "image_1", "image_2", "image_3") and has_images(folder):
+        return read_kitti_sequence(above, events, inside)
+    if is_tum(folder) or (inside == "rgb" and is_tum(above)):
+        return read_tum_sequence(folder if is_tum(folder) else above, events)
+    pair = find_pair(folder)
+    if pair is not None:
+        return read_pair_sequence(folder, *pair, events)
+    if has_images(folder):
+        return read_folder_sequence(folder, folder)
+    within = [folder / name for name in _FRAME_FOLDERS if has_images(folder / name)]
+    if not within:
+        within = sorted(path for path in folder.iterdir() if path.is_dir() and has_images(path))
+        if len(within) > 1:
+            names = [printable(path.name) for path in within]
+            raise InputError(f"{folder}: expected one sequence, found folders of images: {some(names)}", "name one")
+    if within:
+        return read_folder_sequence(folder, within[0])
+    found = some(sorted(printable(path.name) for path in folder.iterdir())) or "nothing"
+    raise InputError(f"{folder}: expected a sequence, found {found}", f"a sequence is {_LAYOUTS}")
+
+
+# ---------------------------------------------------------------------------------------------------------- cameras
+
+
+def _calibration(
+    given: str | None, folders: tuple[Path, ...], own: Calibration | None, is_published: bool, sizes: tuple[Size, ...]
+) -> Calibration | None:
+    """The user's calibration, else the layout's own, else a file beside the frames (before a published one)."""
+    if given is not None:
+        if Path(given).is_file():
+            chosen = read_calibration(given, sizes)
+        elif "," not in given and any(c in given for c in "./\\"):
+            raise InputError(f"camera {given}: expected a calibration file, found nothing")
+        else:
+            chosen = Calibration(Rig.single(camera_from_text(given, sizes[0])))
+        # a text gives intrinsics only; where the body is, is still known
+        if chosen.body_from_cam is None and own is not None:
+            chosen = replace(chosen, body_from_cam=own.body_from_cam)
+        return chosen
+    if own is not None and not is_published:
+        return own
+    beside = find_calibration(*folders)
+    return own if beside is None else read_calibration(beside, sizes)
+
+
+def _guessed_camera(size: Size, first: Path | None) -> Camera:
+    """What EXIF or experience says of a camera that nothing else is known of."""
+    exif = b""
+    if first is not None:
+        with suppress(UnusableImage):
+            exif = read_header(read_regular_file(first)).exif
+    prior = focal_prior(read_exif(exif), *size)
+    return simple_camera(CameraModel.SIMPLE_RADIAL, *size, prior.focal_px, prior.sigma_px, prior.source)
+
+
+def _rig(
+    what: str, calibration: Calibration | None, sizes: tuple[Size, ...], first: Path | None, mono: bool, events: Events,
+    require_camera: bool,
+) -> Rig:  # fmt: skip
+    """The cameras that are played: both where both are calibrated and wanted."""
+    if calibration is None:
+        width, height = sizes[0]
+        if require_camera:
+            raise MissingCameraError(
+                f"{what}: expected the intrinsics of its camera ({width}x{height} pixels), found no calibration in it",
+                HOW_TO_CALIBRATE,
+            )
+        camera = _guessed_camera(sizes[0], first)
+        events.decided(
+            STAGE,
+            f"no calibration: a focal length of {camera.focal:.0f} px is assumed to begin with",
+            focal_px=camera.focal, focal_source=camera.focal_source,
+        )  # fmt: skip
+        return Rig.single(camera)
+    for note in calibration.notes:
+        events.decided(STAGE, note)
+    rig = calibration.rig
+    if mono or len(sizes) == 1:
+        return Rig.single(rig.cameras[0])
+    if not rig.is_stereo:
+        events.warned(STAGE, f"{what}: images of two cameras, but no calibration of the pair: the first is used alone")
+    return rig
+
+
+# ------------------------------------------------------------------------------------------------------ what is played
+
+
+def _sequence(
+    source: str, recording: Recording, options: SequenceOptions, events: Events, require_camera: bool
+) -> FileSequence:
+    """The wishes of the user applied to what a layout holds."""
+    first = [frame[0] for frame in recording.paths]
+    folders = (recording.root, first[0].parent, recording.root.parent) if recording.kind != "folder" else (
+        recording.root, first[0].parent
+    )  # fmt: skip
+    calibration = _calibration(options.camera, folders, recording.calibration, recording.kind == "tum", recording.sizes)
+    rig = _rig(source, calibration, recording.sizes, first[0], options.mono, events, require_camera)
+    times, fps = _timestamps(recording, first, options, calibration, events)
+    body_from_cam = calibration.body_from_cam if calibration else None
+    truth = _truth(recording, options.truth, times, first, body_from_cam)
+    imu = recording.imu if options.imu is None else _given_imu(options.imu, body_from_cam)
+    kept = ascending(times)
+    if len(kept) < len(times):
+        lost = np.setdiff1d(np.arange(len(times)), kept)
+        names = [recording.names[i] for i in lost]
+        text = f"{len(names)} of {len(times)} frames are skipped, whose times do not ascend: {some(names)}"
+        events.warned(STAGE, text, names=names)
+    played = kept[options.start : options.stop : options.step]
+    if not len(played):
+        raise InputError(f"{source}: expected frames from {options.start} to {options.stop}, found {len(kept)} in all")
+    if options.reverse:
+        played, times, truth, imu = _mirrored(played, times, truth, imu)
+    if len(played) > 1:
+        fps = 1 / float(np.median(np.diff(times[played])))
+    sequence = FileSequence(
+        recording.kind,
+        source,
+        rig,
+        [recording.names[i] for i in played],
+        times[played],
+        [recording.paths[i][: len(rig.cameras)] for i in played],
+        fps,
+        imu,
+        truth,
+        events,
+    )
+    _tell(sequence, events)
+    return sequence
+
+
+def _timestamps(
+    recording: Recording, first: list[Path], options: SequenceOptions, calibration: Calibration | None, events: Events
+) -> tuple[Array, float | None]:
+    """(N,) seconds of all frames, and the nominal rate where they were made from one."""
+    if recording.timestamps_s is not None:
+        return recording.timestamps_s, None
+    fps, reason = options.fps, "as given"
+    if fps is None and calibration is not None and calibration.frames_per_second is not None:
+        fps, reason = calibration.frames_per_second, "as the calibration says"
+    if fps is None:
+        fps = KITTI_FPS if recording.kind == "kitti" else DEFAULT_FPS
+        reason = "KITTI's rate" if recording.kind == "kitti" else "assumed; --fps changes it"
+    # numbers that are left out are time that went by
+    numbers = frame_numbers(first)
+    numbers = np.arange(len(first)) if numbers is None else numbers - numbers[0]
+    events.decided(STAGE, f"the frames have no times: {fps:g} frames a second ({reason})", frames_per_second=fps)
+    return numbers / fps, fps
+
+
+def _truth(
+    recording: Recording, given: str | None, times: Array, first: list[Path], body_from_cam: Array | None
+) -> Truth | None:
+    by_frame = recording.frame_truth
+    if given is not None:
+        path = Path(given)
+        rows = read_rows(path)
+        fields = rows[min(1, len(rows) - 1)][1] if rows else []
+        if "," in "".join(fields):
+            return read_euroc_truth(path, body_from_cam)
+        if len(fields) != 12:
+            return read_tum_truth(path)
+        poses = read_kitti(path)
+        chosen = rows_of_frames(len(poses), first)
+        if chosen is None:
+            raise InputError(f"{path}: expected a pose for each of {len(first)} frames, found {len(poses)}")
+        by_frame = poses[chosen]
+    if by_frame is None:
+        return recording.truth
+    if body_from_cam is not None:
+        by_frame = rigid3.compose(rigid3.inverse(body_from_cam), by_frame)
+    order = [i for i in ascending(times) if np.isfinite(by_frame[i]).all()]
+    return Truth(times[order], by_frame[order])
+
+
+def _given_imu(given: str, body_from_cam: Array | None) -> Imu:
+    path = Path(given) / "data.csv" if Path(given).is_dir() else Path(given)
+    if body_from_cam is None:
+        raise InputError(
+            f"{path}: expected to know where the IMU sits, found no T_BS or T_cam_imu in the camera's calibration",
+            "give --camera a sensor.yaml of EuRoC or a camchain.yaml of Kalibr, which hold it",
+        )
+    return read_imu(path, body_from_cam)
+
+
+def _mirrored(
+    played: NDArray[np.int64], times: Array, truth: Truth | None, imu: Imu | None
+) -> tuple[NDArray[np.int64], Array, Truth | None, Imu | None]:
+    """Everything backwards in time, on a clock that still ascends: t becomes first + last - t."""
+    total = float(times[played[0]] + times[played[-1]])
+    if truth is not None:
+        truth = Truth(total - truth.timestamps_s[::-1], truth.cam_from_world[::-1].copy())
+    if imu is not None:
+        # a rotation runs the other way round; an acceleration, the second derivative, is what it was
+        back = total - imu.timestamps_s[::-1]
+        imu = replace(imu, timestamps_s=back, gyro=-imu.gyro[::-1], accel=imu.accel[::-1].copy())
+    return played[::-1], total - times, truth, imu
+
+
+def _open_video(source: str, options: SequenceOptions, events: Events, require_camera: bool) -> VideoSequence:
+    if options.reverse:
+        raise UsageError("reverse is not possible with a video", "extract its frames to a folder first")
+    facts = read_video_facts(source)
+    size = (facts.width, facts.height)
+    folders = () if is_stream(source) else (Path(source).absolute().parent,)
+    calibration = _calibration(options.camera, folders, None, False, (size,))
+    rig = _rig(source, calibration, (size,), None, True, events, require_camera)
+    body_from_cam = calibration.body_from_cam if calibration else None
+    imu = _given_imu(options.imu, body_from_cam) if options.imu is not None else None
+    truth = None
+    if options.truth is not None:
+        recording = Recording("video", Path(), [], None, [], (size,), calibration)
+        truth = _truth(recording, options.truth, np.zeros(0), [], body_from_cam)
+    sequence = VideoSequence(source, rig, facts, options, events, imu, truth)
+    _tell(sequence, events)
+    return sequence
+
+
+def _tell(sequence: Sequence, events: Events) -> None:
+    camera = sequence.rig.cameras[0]
+    count = "frames" if sequence.num_frames is None else f"{sequence.num_frames} frames"
+    baseline = float(np.linalg.norm(sequence.rig.cam_from_rig[-1, 4:]))
+    parts = [
+        {"kitti": "KITTI", "tum": "TUM RGB-D", "euroc": "EuRoC", "folder": "images", "video": "video"}[sequence.kind],
+        f"{count} of {camera.width}x{camera.height}",
+        f"stereo, {100 * baseline:.1f} cm apart" if sequence.rig.is_stereo else "one camera",
+        f"{sequence.frames_per_second:.4g} a second" if sequence.frames_per_second else "of unknown rate",
+        f"{camera.model.name}, f {camera.focal:.1f} px",
+    ]
+    parts += ["IMU"] if sequence.imu is not None else []
+    parts += ["truth"] if sequence.truth is not None else []
+    events.decided(
+        STAGE,
+        ", ".join(parts),
+        kind=sequence.kind,
+        num_frames=sequence.num_frames,
+        frames_per_second=sequence.frames_per_second,
+        num_cameras=len(sequence.rig.cameras),
+        baseline_m=baseline if sequence.rig.is_stereo else None,
+        has_imu=sequence.imu is not None,
+        has_truth=sequence.truth is not None,
+    )

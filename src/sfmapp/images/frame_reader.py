@@ -1,0 +1,230 @@
+"""Frames from image files, decoded ahead of whoever walks through them."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.events import Events
+from sfmapp.images.headers import Header, UnusableImage, read_header
+from sfmapp.images.pixels import decode_bytes
+from sfmapp.images.sequence import STAGE, Frame, Imu, SequenceKind, Truth
+from sfmapp.scene.rig import Rig
+
+Pixels = NDArray[np.uint8]
+
+# What may lie decoded at a time. Each frame of a stereo pair of 1241x376 takes a megabyte.
+_FRAMES_AHEAD = 4
+_LARGEST_FILE_BYTES = 1 << 28
+LARGEST_FRAME_PX = 100_000_000
+"""A frame that claims more pixels is not decoded: four of them lie in memory at a time."""
+# Problems told one by one; the summary at the end holds the names of all.
+_PROBLEMS_TOLD = 8
+REPEATED = "repeats the frame before it"
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A frame that is left out: its name and the reason, a phrase that follows it and a colon."""
+
+    name: str
+    reason: str
+
+
+def read_ahead(read_next: Callable[[], Frame | Skipped | None]) -> Iterator[Frame | Skipped]:
+    """What ``read_next`` returns until None, a few calls ahead of the consumer in one thread of its own.
+
+    The calls are made one after another, so that the order and every result are those of a plain loop. If the consumer
+    stops early (or fails), closing the generator waits for the call that is under way and makes no other.
+    """
+    pool = ThreadPoolExecutor(1, "frames")
+    ahead: deque[Future[Frame | Skipped | None]] = deque()
+    try:
+        for _ in range(_FRAMES_AHEAD):
+            ahead.append(pool.submit(read_next))
+        while (item := ahead.popleft().result()) is not None:
+            ahead.append(pool.submit(read_next))
+            yield item
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+class ProblemTeller:
+    """Warns of frames that are left out: once however often the sequence is played."""
+
+    def __init__(self, events: Events) -> None:
+        self._events = events
+        self._told: set[str] = set()
+        self._is_summarised = False
+
+    def frames_without_problems(self, items: Iterator[Frame | Skipped]) -> Iterator[Frame]:
+        """The frames among the items; problems are told in the consumer's thread, in the order of the frames."""
+        problems: list[Skipped] = []
+        num_frames = 0
+        try:
+            for item in items:
+                if isinstance(item, Frame):
+                    num_frames += 1
+                    yield item
+                    continue
+                problems.append(item)
+                if item.reason != REPEATED and item.name not in self._told and len(self._told) < _PROBLEMS_TOLD:
+                    self._told.add(item.name)
+                    self._events.warned(STAGE, f"skipped {item.name}: {item.reason}", name=item.name)
+        finally:
+            items.close()  # type: ignore[attr-defined]  # a generator: ends its thread
+            if problems and not self._is_summarised:
+                self._is_summarised = True
+                self._summarise(problems, num_frames + len(problems))
+
+    def _summarise(self, problems: list[Skipped], num_seen: int) -> None:
+        repeated = [problem.name for problem in problems if problem.reason == REPEATED]
+        broken = [problem.name for problem in problems if problem.reason != REPEATED]
+        if broken:
+            text = f"{len(broken)} of {num_seen} frames could not be used: {some(broken)}"
+            self._events.warned(STAGE, text, names=broken)
+        if repeated:
+            text = f"{len(repeated)} of {num_seen} frames repeat the one before them and were skipped: {some(repeated)}"
+            self._events.warned(STAGE, text, names=repeated)
+
+
+def some(names: list[str]) -> str:
+    """The first few names, and how many more there are."""
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+
+
+def read_regular_file(path: Path) -> bytes:
+    """The bytes of a file. Raises UnusableImage if it is none, too large, or cannot be read."""
+    try:
+        status = os.stat(path)
+        if not stat.S_ISREG(status.st_mode):  # opening a pipe would wait for ever
+            raise UnusableImage("not a regular file")
+        if status.st_size > _LARGEST_FILE_BYTES:
+            raise UnusableImage(f"larger than {_LARGEST_FILE_BYTES} bytes")
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise UnusableImage("no such file") from None
+    except (OSError, ValueError) as error:
+        raise UnusableImage(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
+
+
+def decode_gray(data: bytes, header: Header, white: int) -> tuple[Pixels, int]:
+    """(H, W) uint8 of an image file's bytes as stored (EXIF's orientation is not obeyed), and the new ``white``.
+
+    Args:
+        white: largest value that deeper files of this sequence were found to reach, 255 to begin with. It only grows,
+            so that a sequence of 12 bits in 16 does not change its brightness with what is in view.
+
+    Raises:
+        UnusableImage: the data are damaged.
+    """
+    import cv2
+
+    if header.bits <= 8 and header.format != "tiff" and header.kind != "cmyk":
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        try:
+            gray = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        except (cv2.error, MemoryError):
+            gray = None
+    else:
+        raw = decode_bytes(data, header)
+        if raw is not None and raw.dtype == np.uint16:
+            raw, white = _scaled_to_8_bits(raw, white)
+        gray = raw
+        if raw is not None and raw.ndim == 3:
+            gray = cv2.cvtColor(raw, cv2.COLOR_RGBA2GRAY if raw.shape[2] == 4 else cv2.COLOR_RGB2GRAY)
+    if gray is None or gray.shape != (header.height, header.width):
+        raise UnusableImage("cannot be decoded: its data are damaged")
+    return gray, white
+
+
+def _scaled_to_8_bits(raw: NDArray[np.uint16], white: int) -> tuple[Pixels, int]:
+    """uint16 values as uint8, with rounding, and the smallest white of 8, 10, 12, 14 or 16 bits that holds them all."""
+    largest = max(white, int(raw.max(initial=0)))
+    white = next(value for bits in (8, 10, 12, 14, 16) if largest <= (value := (1 << bits) - 1))
+    table = ((np.arange(white + 1, dtype=np.int64) * 510 + white) // (2 * white)).astype(np.uint8)
+    return table[raw], white
+
+
+class _FileReader:
+    """One walk over files; called from the thread that reads ahead."""
+
+    def __init__(self, sequence: FileSequence) -> None:
+        self._sequence = sequence
+        self._idx = 0
+        self._white = [255] * len(sequence.rig.cameras)
+        self._last_bytes: tuple[bytes, ...] = ()
+        self._last_images: tuple[Pixels, ...] = ()
+
+    def __call__(self) -> Frame | Skipped | None:
+        sequence, idx = self._sequence, self._idx
+        if idx >= len(sequence.paths):
+            return None
+        self._idx += 1
+        name = sequence.names[idx]
+        data: list[bytes] = []
+        images: list[Pixels] = []
+        try:
+            data.extend(map(read_regular_file, sequence.paths[idx]))
+            if tuple(data) == self._last_bytes:
+                return Skipped(name, REPEATED)
+            images.extend(map(self._decode, range(len(data)), data))
+        except UnusableImage as reason:
+            # what was read so far tells which of the files is at fault
+            camera = len(images) if len(data) == len(sequence.paths[idx]) else len(data)
+            beside = f"{sequence.paths[idx][camera].name} of camera {camera}: " if camera else ""
+            return Skipped(name, f"{beside}{reason}")
+        is_repeated = bool(self._last_images) and all(map(np.array_equal, images, self._last_images))
+        self._last_bytes, self._last_images = tuple(data), tuple(images)
+        if is_repeated:
+            return Skipped(name, REPEATED)
+        return Frame(idx, name, float(sequence.timestamps_s[idx]), tuple(images))
+
+    def _decode(self, camera_idx: int, data: bytes) -> Pixels:
+        header, camera = read_header(data), self._sequence.rig.cameras[camera_idx]
+        if (header.width, header.height) != (camera.width, camera.height):
+            raise UnusableImage(
+                f"{header.width}x{header.height} pixels, where the camera has {camera.width}x{camera.height}"
+            )
+        gray, self._white[camera_idx] = decode_gray(data, header, self._white[camera_idx])
+        return gray
+
+
+@dataclass
+class FileSequence:
+    """A :class:`~sfmapp.images.sequence.Sequence` of image files.
+
+    Attributes:
+        names: N names of frames.
+        timestamps_s: (N,) strictly ascending.
+        paths: for each frame, one file for each camera of the rig.
+        events: told about frames that are left out.
+    """
+
+    kind: SequenceKind
+    source: str
+    rig: Rig
+    names: list[str]
+    timestamps_s: NDArray[np.float64]
+    paths: list[tuple[Path, ...]]
+    frames_per_second: float | None
+    imu: Imu | None
+    truth: Truth | None
+    events: Events
+    num_frames: int | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.num_frames = len(self.names)
+        self._teller = ProblemTeller(self.events)
+
+    def frames(self) -> Iterator[Frame]:
+        """See :class:`~sfmapp.images.sequence.Sequence`."""
+        return self._teller.frames_without_problems(read_ahead(_FileReader(self)))
