@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,8 @@ from sfmapp.formats.colmap import has_model, read_model, write_model, write_mode
 from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
-from sfmapp.scene.synthetic import make_scene, synthetic_camera
+from sfmapp.scene.rig import Rig
+from sfmapp.scene.synthetic import make_scene, synthetic_camera, synthetic_rig
 from sfmapp.scene.tracks import make_tracks
 
 DATA = Path(os.environ.get("SFMAPP_DATA", Path(__file__).parents[2] / "shared" / "data"))
@@ -124,7 +126,114 @@ def test_we_read_what_pycolmap_writes(tmp_path: Path, cameras_per_rig: int, form
     if old:
         (tmp_path / f"rigs.{form}").unlink()
         (tmp_path / f"frames.{form}").unlink()
-    assert_same(*read_model(tmp_path), theirs)
+    rec, keypoints = read_model(tmp_path)
+    assert_same(rec, keypoints, theirs)
+    assert (rec.rig is None) == (old or cameras_per_rig == 1)
+
+
+@pytest.mark.parametrize("form", ["bin", "txt"])
+def test_rigs_of_pycolmap_go_round(tmp_path: Path, form: str) -> None:
+    """Two rigs of two cameras: read, written and read again by both."""
+    theirs = theirs_synthetic(2, 2)
+    (theirs.write_binary if form == "bin" else theirs.write_text)(str(tmp_path))
+    rec, keypoints = read_model(tmp_path)
+    assert rec.rig is not None
+    image_ids = sorted(theirs.images)
+    frame_of = {d.id: f for f in theirs.frames.values() for d in f.data_ids}
+    for i, image_id in enumerate(image_ids):
+        frame, image = frame_of[image_id], theirs.images[image_id]
+        together = {image_ids.index(d.id) for d in frame.data_ids}
+        assert set(np.flatnonzero(rec.rig.frame_idx == rec.rig.frame_idx[i])) == together
+        rig, sensor = theirs.rigs[frame.rig_id], image.camera.sensor_id
+        assert (rec.rig.sensor_idx[i] == 0) == rig.is_ref_sensor(sensor)
+        if rec.rig.sensor_idx[i]:
+            mount = rig.sensor_from_rig(sensor)
+            found = rec.rig.cam_from_rig[rec.rig.sensor_idx[i]]
+            np.testing.assert_allclose(found, [*mount.rotation.quat, *mount.translation], atol=1e-15)
+    write_model(tmp_path / "again", rec, keypoints)
+    again = oracle(tmp_path / "again")
+    assert sorted(len(rig.sensor_ids()) for rig in again.rigs.values()) == [2, 2]
+    assert len(again.frames) == len(theirs.frames)
+    back, _ = read_model(tmp_path / "again")
+    assert_same_rig(back, rec)
+
+
+def assert_same_rig(found: Reconstruction, wanted: Reconstruction) -> None:
+    assert found.rig is not None
+    assert wanted.rig is not None
+    np.testing.assert_array_equal(found.rig.frame_idx, wanted.rig.frame_idx)
+    np.testing.assert_array_equal(found.rig.sensor_idx, wanted.rig.sensor_idx)
+    np.testing.assert_array_equal(found.rig.cam_from_rig, wanted.rig.cam_from_rig)
+    np.testing.assert_array_equal(found.cam_from_world, wanted.cam_from_world)
+
+
+@pytest.mark.parametrize("write", [write_model, write_model_text])
+@pytest.mark.parametrize("one_camera", [False, True])
+def test_stereo_is_a_rig_for_pycolmap_and_comes_back(tmp_path: Path, write, one_camera: bool) -> None:
+    """Exact poses of rig, frames and images, also where both sensors are one camera to us."""
+    rig = synthetic_rig(0.4)
+    if one_camera:
+        rig = Rig((rig.cameras[0],) * 2, rig.cam_from_rig)
+    cameras = [rig.cameras[0]] if one_camera else None
+    rec = make_scene(0, 10, 80, cameras, rig=rig).observed
+    write(tmp_path / "m", rec)
+    theirs = oracle(tmp_path / "m")
+    assert len(theirs.cameras) == 2
+    assert list(theirs.rigs) == [1]
+    assert theirs.rigs[1].ref_sensor_id.id == 1
+    ((sensor, mount),) = theirs.rigs[1].non_ref_sensors.items()
+    assert sensor.id == 2
+    np.testing.assert_array_equal([*mount.rotation.quat, *mount.translation], rig.cam_from_rig[1])
+    assert sorted(theirs.frames) == [1, 3, 5, 7, 9]
+    for frame_id, frame in theirs.frames.items():
+        pose = frame.rig_from_world
+        np.testing.assert_array_equal([*pose.rotation.quat, *pose.translation], rec.cam_from_world[frame_id - 1])
+        assert sorted((d.sensor_id.id, d.id) for d in frame.data_ids) == [(1, frame_id), (2, frame_id + 1)]
+    for image_id, image in theirs.images.items():
+        wanted, pose = rec.cam_from_world[image_id - 1], image.cam_from_world()
+        np.testing.assert_allclose(pose.rotation.matrix(), rigid3.rotation_matrix(wanted), atol=1e-14)
+        np.testing.assert_allclose(pose.translation, wanted[4:], atol=1e-13)
+        np.testing.assert_array_equal(image.camera.params, rec.cameras[rec.image_camera_idx[image_id - 1]].params)
+    back, _ = read_model(tmp_path / "m")
+    assert_same_rig(back, rec)
+    np.testing.assert_array_equal(back.residuals_px(), rec.residuals_px())
+
+
+@pytest.mark.parametrize("write", [write_model, write_model_text])
+def test_rigs_with_gaps_and_images_beside_them(tmp_path: Path, write) -> None:
+    """Images missing on either side, images on no rig, and one camera in three roles."""
+    rec = make_scene(1, 12, 150, synthetic_camera(), rig=synthetic_rig(0.4)).observed.copy()
+    assert rec.rig is not None
+    rec.rig = replace(rec.rig, frame_idx=np.array([4, 4, 0, 0, 1, 1, 2, 2, -1, -1, 3, 3], np.int32))
+    rec.rig.sensor_idx[8:10] = 0
+    gone = [3, 4]
+    rec.cam_from_world[gone] = np.nan
+    rec.obs_is_inlier[np.isin(rec.tracks.obs_image_idx, gone)] = False
+    write(tmp_path / "m", rec)
+    theirs = oracle(tmp_path / "m")
+    assert len(theirs.cameras) == 3
+    assert sorted(rig.num_sensors() for rig in theirs.rigs.values()) == [1, 2]
+    assert len(theirs.frames) == 7
+    back, _ = read_model(tmp_path / "m")
+    kept = np.setdiff1d(np.arange(12), gone)
+    assert back.rig is not None
+    assert back.rig.frame_idx.tolist() == [0, 0, 1, 2, 3, 3, -1, -1, 4, 4]
+    np.testing.assert_array_equal(back.rig.sensor_idx, rec.rig.sensor_idx[kept])
+    np.testing.assert_allclose(back.cam_from_world, rec.cam_from_world[kept], atol=1e-14)
+    for image_id, image in theirs.images.items():
+        wanted, pose = rec.cam_from_world[image_id - 1], image.cam_from_world()
+        np.testing.assert_allclose(pose.rotation.matrix(), rigid3.rotation_matrix(wanted), atol=1e-14)
+        np.testing.assert_allclose(pose.translation, wanted[4:], atol=1e-13)
+    # without any image of sensor 0 the next one is the reference
+    rec.cam_from_world[:8:2] = rec.cam_from_world[8:11] = np.nan
+    rec.obs_is_inlier[~rec.is_registered[rec.tracks.obs_image_idx]] = False
+    write(tmp_path / "m", rec)
+    assert [rig.num_sensors() for rig in oracle(tmp_path / "m").rigs.values()] == [1]
+    np.testing.assert_array_equal(read_model(tmp_path / "m")[0].cam_from_world, rec.cam_from_world[[1, 5, 7, 11]])
+    # and one sensor takes one image at a time
+    rec.rig = replace(rec.rig, frame_idx=np.zeros(12, np.int32), sensor_idx=np.ones(12, np.int32))
+    with pytest.raises(ValueError, match="two images of one sensor"):
+        write(tmp_path / "m", rec)
 
 
 @pytest.mark.parametrize("write", [write_model, write_model_text])
@@ -292,6 +401,16 @@ def model_bytes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return model | {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+@pytest.fixture(scope="module")
+def rig_bytes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    folder = tmp_path_factory.mktemp("fuzz") / "rig"
+    rec = make_scene(0, 6, 20, rig=synthetic_rig()).observed
+    write_model(folder, rec)
+    model = {path.name: path.read_bytes() for path in folder.iterdir()}
+    write_model_text(folder, rec)
+    return model | {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
 def lay_out(folder: Path, files: dict[str, bytes], ending: str) -> None:
     for name, data in files.items():
         if name.endswith(ending):
@@ -300,7 +419,10 @@ def lay_out(folder: Path, files: dict[str, bytes], ending: str) -> None:
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_damaged_files_are_refused_or_read(tmp_path: Path, model_bytes: dict[str, bytes], data: st.DataObject) -> None:
+def test_damaged_files_are_refused_or_read(
+    tmp_path: Path, model_bytes: dict[str, bytes], rig_bytes: dict[str, bytes], data: st.DataObject
+) -> None:
+    model_bytes = data.draw(st.sampled_from([model_bytes, rig_bytes]))
     name = data.draw(st.sampled_from(sorted(model_bytes)))
     lay_out(tmp_path, {old.name: b"" for old in tmp_path.iterdir()}, "")
     for old in tmp_path.iterdir():
@@ -319,6 +441,8 @@ def test_damaged_files_are_refused_or_read(tmp_path: Path, model_bytes: dict[str
         return
     rec.residuals_px()
     assert np.isfinite(rec.point_xyz).all()
+    if rec.rig is not None:
+        assert np.isfinite(rec.rig.rig_from_world(rec.cam_from_world)).all()
 
 
 def refuse(folder: Path, model_bytes: dict[str, bytes], name: str, data: bytes, match: str) -> None:

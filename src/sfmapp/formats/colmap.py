@@ -22,8 +22,10 @@ _FILES = frozenset(f"{stem}.{ending}" for stem in _STEMS for ending in ("bin", "
 def write_model(folder: str | Path, reconstruction: Reconstruction, keypoints: Keypoints | None = None) -> None:
     """Write the registered part of a reconstruction as a binary model that COLMAP 3.x and 4.x read.
 
-    The ids of images and cameras are positions plus one, that of a point is the position of its track plus one. The
-    same input gives the same bytes. The folder appears at once; other files that lie in an older one stay.
+    The ids of images and cameras are positions plus one, that of a point is the position of its track plus one; a
+    camera that serves as several sensors of a rig is written once for each. Images that share a rig's pose make one
+    frame, every other image one of its own. The same input gives the same bytes. The folder appears at once; other
+    files that lie in an older one stay.
 
     Args:
         folder: where the five files go.
@@ -34,7 +36,8 @@ def write_model(folder: str | Path, reconstruction: Reconstruction, keypoints: K
 
     Raises:
         InputError: the folder cannot be written.
-        ValueError: a pose or point is infinite, or a keypoint belongs to two points.
+        ValueError: a pose or point is infinite, a keypoint belongs to two points, or a frame of the rig holds two
+            images of one sensor.
     """
     model = model_from_reconstruction(reconstruction, keypoints)
     with replaced_folder(Path(folder), _FILES) as beside:
@@ -60,7 +63,8 @@ def has_model(folder: str | Path) -> bool:
 def read_model(folder: str | Path) -> tuple[Reconstruction, Keypoints]:
     """Read a model, binary (preferred, as COLMAP does) or text, with rigs and frames or without.
 
-    Images, cameras and points stand in ascending order of their ids; every track element is an inlier.
+    Images, cameras and points stand in ascending order of their ids; every track element is an inlier. Images of rigs
+    with several cameras are on the reconstruction's ``rig``.
 
     Returns:
         The reconstruction, and for each image the pixels (N, 2) float64 of its keypoints.

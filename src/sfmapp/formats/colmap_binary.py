@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_model import (
     ColmapModel,
-    Frame,
     Keypoints,
-    Rig,
     checked_camera,
     checked_poses,
-    poses_from_frames,
 )
+from sfmapp.formats.colmap_rigs import Frame, Rig, poses_from_frames
 from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel
 
@@ -42,6 +40,7 @@ def read_binary(folder: Path) -> ColmapModel:
     """Read a binary model, with rigs and frames or without. Raises InputError for anything malformed."""
     camera_ids, cameras = _read_cameras(_Reader(folder / "cameras.bin"))
     image_ids, camera_of, names, poses, xy, point_ids = _read_images(_Reader(folder / "images.bin"))
+    rigs, frames = {}, []
     if (folder / "frames.bin").exists():
         rigs = _read_rigs(_Reader(folder / "rigs.bin"))
         frames = _read_frames(_Reader(folder / "frames.bin"))
@@ -50,7 +49,7 @@ def read_binary(folder: Path) -> ColmapModel:
     return ColmapModel(
         camera_ids, cameras, image_ids, camera_of, names, poses, xy, point_ids,
         points["id"].copy(), points["xyz"].copy(), points["rgb"].copy(), points["error"].copy(),
-        track_ptr, track["image_id"].astype(np.int64), track["point2d_idx"].astype(np.int64),
+        track_ptr, track["image_id"].astype(np.int64), track["point2d_idx"].astype(np.int64), rigs, frames,
     )  # fmt: skip
 
 
@@ -63,23 +62,24 @@ def _cameras_bytes(model: ColmapModel) -> bytes:
 
 
 def _rigs_bytes(model: ColmapModel) -> bytes:
-    """One rig per camera, which it holds alone and whose id it shares."""
-    rigs = [struct.pack("<IIiI", camera_id, 1, _CAMERA, camera_id) for camera_id in model.camera_ids]
-    return struct.pack("<Q", len(rigs)) + b"".join(rigs)
+    parts = [struct.pack("<Q", len(model.rigs))]
+    for rig_id, rig in model.rigs.items():
+        parts.append(struct.pack("<II", rig_id, len(rig.sensor_from_rig)))
+        for n, (camera_id, pose) in enumerate(rig.sensor_from_rig.items()):
+            # the reference, first, has no pose; all others have one
+            parts.append(struct.pack("<iI", _CAMERA, camera_id))
+            if n > 0:
+                parts.append(struct.pack("<B7d", 1, *poses_wxyz(pose[None])[0]))
+    return b"".join(parts)
 
 
 def _frames_bytes(model: ColmapModel) -> bytes:
-    """One frame per image, whose id and pose it shares."""
-    dtype = np.dtype(
-        [("frame_id", "<u4"), ("rig_id", "<u4"), ("pose", "<f8", 7), ("num", "<u4"), ("sensor_type", "<i4"),
-         ("camera_id", "<u4"), ("image_id", "<u8")]
-    )  # fmt: skip
-    frames = np.zeros(len(model.image_ids), dtype)
-    frames["frame_id"] = frames["image_id"] = model.image_ids
-    frames["rig_id"] = frames["camera_id"] = model.image_camera_ids
-    frames["pose"] = poses_wxyz(model.cam_from_world)
-    frames["num"], frames["sensor_type"] = 1, _CAMERA
-    return struct.pack("<Q", len(frames)) + frames.tobytes()
+    parts = [struct.pack("<Q", len(model.frames))]
+    poses = poses_wxyz(np.array([frame.rig_from_world for frame in model.frames]).reshape(-1, 7))
+    for frame, pose in zip(model.frames, poses, strict=True):
+        parts.append(struct.pack("<II7dI", frame.frame_id, frame.rig_id, *pose, len(frame.camera_image_ids)))
+        parts.extend(struct.pack("<iIQ", _CAMERA, *ids) for ids in frame.camera_image_ids)
+    return b"".join(parts)
 
 
 def _images_bytes(model: ColmapModel) -> Iterator[bytes]:
@@ -277,6 +277,7 @@ def _read_frames(reader: _Reader) -> list[Frame]:
             reader.unpack("<iIQ", f"the data of frame {frame_id}")
             for _ in range(reader.count(f"data of frame {frame_id}", 16, "<I"))
         ]
-        frames.append(Frame(rig_id, pose, [(sensor, image) for kind, sensor, image in data if kind == _CAMERA]))
+        images = [(sensor, image) for kind, sensor, image in data if kind == _CAMERA]
+        frames.append(Frame(frame_id, rig_id, pose, images))
     reader.finish()
     return frames

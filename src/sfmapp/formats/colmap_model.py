@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import InputError, UsageError
-from sfmapp.geometry import rigid3
+from sfmapp.formats.colmap_rigs import Frame, Rig, mount_images, rig_images
 from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
@@ -37,6 +37,7 @@ class ColmapModel:
         points2d_xy: I arrays (N, 2) float64, pixels; points2d_point_ids: I arrays (N,) int64, -1 for none.
         point_ids: (P,) int64, with point_xyz (P, 3), point_rgb (P, 3) uint8, point_error_px (P,) or -1.
         track_ptr: (P + 1,) int64 into track_image_ids (O,) int64 and track_point2d_idx (O,) int64.
+        rigs, frames: none where an older file has none.
     """
 
     camera_ids: NDArray[np.int64]
@@ -54,22 +55,8 @@ class ColmapModel:
     track_ptr: NDArray[np.int64]
     track_image_ids: NDArray[np.int64]
     track_point2d_idx: NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Rig:
-    """Cameras mounted together: pose sensor_from_rig (7,) by camera id; the reference camera has the identity."""
-
-    sensor_from_rig: dict[int, NDArray[np.float64]]
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One shot of a rig: where the rig was, and camera id and image id of each photograph."""
-
-    rig_id: int
-    rig_from_world: NDArray[np.float64]
-    camera_image_ids: list[tuple[int, int]]
+    rigs: dict[int, Rig]
+    frames: list[Frame]
 
 
 def checked_camera(
@@ -120,30 +107,11 @@ def checked_poses(
     return poses
 
 
-def poses_from_frames(
-    path: Path, image_ids: NDArray[np.int64], rigs: dict[int, Rig], frames: list[Frame]
-) -> NDArray[np.float64]:
-    """(I, 7) cam_from_world of images from the frames they belong to: where a model has frames, these are its poses."""
-    poses: dict[int, NDArray[np.float64]] = {}
-    for frame in frames:
-        if frame.rig_id not in rigs:
-            raise InputError(f"{path}: a frame names rig {frame.rig_id}, which the rigs file does not hold")
-        sensors = rigs[frame.rig_id].sensor_from_rig
-        for camera_id, image_id in frame.camera_image_ids:
-            if camera_id not in sensors:
-                raise InputError(f"{path}: image {image_id}: camera {camera_id} is not part of rig {frame.rig_id}")
-            sensor_from_rig = sensors[camera_id]
-            is_reference = np.array_equal(sensor_from_rig, rigid3.IDENTITY)
-            pose = frame.rig_from_world
-            poses[image_id] = pose if is_reference else rigid3.compose(sensor_from_rig, pose)
-    missing = [int(image_id) for image_id in image_ids if int(image_id) not in poses]
-    if missing:
-        raise InputError(f"{path}: expected a frame for every image, found none for image {missing[0]}")
-    return np.array([poses[int(image_id)] for image_id in image_ids]).reshape(-1, 7)
-
-
 def model_from_reconstruction(reconstruction: Reconstruction, keypoints: Keypoints | None) -> ColmapModel:
-    """The registered part of a reconstruction in COLMAP's terms: ids are positions plus one."""
+    """The registered part of a reconstruction in COLMAP's terms: ids are positions plus one.
+
+    A camera that serves as several sensors becomes several cameras, the others with ids after the last.
+    """
     tracks = reconstruction.tracks
     registered = reconstruction.registered_idx
     points = np.flatnonzero(reconstruction.is_triangulated)
@@ -176,13 +144,12 @@ def model_from_reconstruction(reconstruction: Reconstruction, keypoints: Keypoin
             raise ValueError(f"{reconstruction.image_names[image]}: a keypoint belongs to two points")
         point_ids.append(ids)
     length = np.bincount(tracks.obs_track_idx[used], minlength=tracks.num_tracks)[points]
-    camera_idx = reconstruction.image_camera_idx[registered].astype(np.int64)
-    camera_used = np.unique(camera_idx)
+    mounted = mount_images(reconstruction, registered)
     return ColmapModel(
-        camera_ids=camera_used + 1,
-        cameras=[reconstruction.cameras[idx] for idx in camera_used],
+        camera_ids=mounted.camera_ids,
+        cameras=[reconstruction.cameras[idx] for idx in mounted.camera_idx],
         image_ids=registered + 1,
-        image_camera_ids=camera_idx + 1,
+        image_camera_ids=mounted.image_camera_ids,
         image_names=[reconstruction.image_names[image] for image in registered],
         cam_from_world=reconstruction.cam_from_world[registered],
         points2d_xy=xy,
@@ -194,6 +161,8 @@ def model_from_reconstruction(reconstruction: Reconstruction, keypoints: Keypoin
         track_ptr=np.concatenate([[0], np.cumsum(length)]),
         track_image_ids=tracks.obs_image_idx[used].astype(np.int64) + 1,
         track_point2d_idx=point2d_idx[used],
+        rigs=mounted.rigs,
+        frames=mounted.frames,
     )
 
 
@@ -243,6 +212,7 @@ def reconstruction_from_model(folder: Path, model: ColmapModel) -> tuple[Reconst
         model.point_xyz[point_order],
         np.ones(tracks.num_observations, bool),
         model.point_rgb[point_order],
+        rig_images(image_ids, model.rigs, model.frames),
     )
     return reconstruction, xy
 

@@ -12,14 +12,12 @@ from sfmapp.errors import InputError
 from sfmapp.formats.colmap_binary import poses_wxyz
 from sfmapp.formats.colmap_model import (
     ColmapModel,
-    Frame,
     Keypoints,
-    Rig,
     checked_camera,
     checked_names,
     checked_poses,
-    poses_from_frames,
 )
+from sfmapp.formats.colmap_rigs import Frame, Rig, poses_from_frames
 from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import Camera
 
@@ -37,11 +35,20 @@ def write_text(folder: Path, model: ColmapModel) -> None:
         f"{camera_id} {camera.model.name} {camera.width} {camera.height} {_numbers(camera.params)}"
         for camera_id, camera in zip(model.camera_ids, model.cameras, strict=True)
     ]
-    rigs = [f"{camera_id} 1 CAMERA {camera_id}" for camera_id in model.camera_ids]
-    frames, images = [], []
+    rigs = []
+    for rig_id, rig in model.rigs.items():
+        reference, *others = rig.sensor_from_rig
+        sensors = [f"{rig_id} {len(rig.sensor_from_rig)} CAMERA {reference}"]
+        sensors += [f"CAMERA {i} 1 {_numbers(poses_wxyz(rig.sensor_from_rig[i][None])[0])}" for i in others]
+        rigs.append(" ".join(sensors))
+    frames = []
+    for frame in model.frames:
+        data = " ".join(f"CAMERA {camera_id} {image_id}" for camera_id, image_id in frame.camera_image_ids)
+        pose = _numbers(poses_wxyz(frame.rig_from_world[None])[0])
+        frames.append(f"{frame.frame_id} {frame.rig_id} {pose} {len(frame.camera_image_ids)} {data}")
+    images = []
     for i, pose in enumerate(poses_wxyz(model.cam_from_world)):
         image_id, camera_id = model.image_ids[i], model.image_camera_ids[i]
-        frames.append(f"{image_id} {camera_id} {_numbers(pose)} 1 CAMERA {camera_id} {image_id}")
         images.append(f"{image_id} {_numbers(pose)} {camera_id} {model.image_names[i]}")
         pairs = zip(model.points2d_xy[i].tolist(), model.points2d_point_ids[i].tolist(), strict=True)
         images.append(" ".join(f"{x!r} {y!r} {point_id}" for (x, y), point_id in pairs))
@@ -71,6 +78,7 @@ def read_text(folder: Path) -> ColmapModel:
     """Read a text model, with rigs and frames or without. Raises InputError for anything malformed."""
     camera_ids, cameras = _read_cameras(folder / "cameras.txt")
     image_ids, camera_of, names, poses, xy, point_ids = _read_images(folder / "images.txt")
+    rigs, frames = {}, []
     if (folder / "frames.txt").exists():
         rigs = _read_rigs(folder / "rigs.txt")
         frames = _read_frames(folder / "frames.txt")
@@ -81,7 +89,8 @@ def read_text(folder: Path) -> ColmapModel:
     return ColmapModel(
         camera_ids, cameras, image_ids, camera_of, names, poses, xy, point_ids,
         table[:, 0].astype(np.int64), table[:, 1:4].copy(), table[:, 4:7].astype(np.uint8), table[:, 7].copy(),
-        np.concatenate([[0], np.cumsum(lengths)]), flat[:, 0].copy(), flat[:, 1].copy(),
+        np.concatenate([[0], np.cumsum(lengths)]), flat[:, 0].copy(), flat[:, 1].copy(), rigs,
+        frames,
     )  # fmt: skip
 
 
@@ -233,5 +242,5 @@ def _read_frames(path: Path) -> list[Frame]:
             sensor_id, data_id = _ints(place, ids, "the data of a frame")
             if kind == "CAMERA":
                 images.append((sensor_id, data_id))
-        frames.append(Frame(rig_id, pose, images))
+        frames.append(Frame(frame_id, rig_id, pose, images))
     return frames
