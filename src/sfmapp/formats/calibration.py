@@ -215,32 +215,32 @@ def read_calibration(path: str | Path, image_sizes: Sequence[Size]) -> Calibrati
     """
     path = Path(path)
     if path.suffix.lower() == ".json":
-        return calibration_from_fields(path, read_json_object(path, _LARGEST_BYTES), image_sizes)
+        return calibration_from_fields(str(path), read_json_object(path, _LARGEST_BYTES), image_sizes)
     text = read_limited_text(path, _LARGEST_BYTES)
     if text.lstrip().startswith("<"):
-        return calibration_from_fields(path, _fields_of_xml(path, text), image_sizes)
+        return calibration_from_fields(str(path), _fields_of_xml(str(path), text), image_sizes)
     rows = [
         line.split() for line in text.replace(",", " ").splitlines() if line.strip() and line.lstrip()[0] not in "#%"
     ]
     if rows and len(rows[0]) >= 5 and rows[0][1] in CameraModel.__members__:
-        return _from_colmap(path, rows[0], image_sizes)
+        return _from_colmap(str(path), rows[0], image_sizes)
     if rows and all(re.fullmatch(r"[-+.\deE]+", field) for row in rows for field in row):
-        return _from_plain_numbers(path, [field for row in rows for field in row], image_sizes)
-    return calibration_from_fields(path, parse_flat_yaml(text, str(path)), image_sizes)
+        return _from_plain_numbers(str(path), [field for row in rows for field in row], image_sizes)
+    return calibration_from_fields(str(path), parse_flat_yaml(text, str(path)), image_sizes)
 
 
-def _from_colmap(path: Path, fields: list[str], image_sizes: Sequence[Size]) -> Calibration:
+def _from_colmap(place: str, fields: list[str], image_sizes: Sequence[Size]) -> Calibration:
     try:
         width, height, params = int(fields[2]), int(fields[3]), [float(field) for field in fields[4:]]
     except ValueError:
         raise InputError(
-            f"{path}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {' '.join(fields)[:80]}"
+            f"{place}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {' '.join(fields)[:80]}"
         ) from None
-    camera = checked_camera(path, fields[0], fields[1], width, height, params)
-    return _of_cameras(path, [replace(camera, focal_sigma=_SIGMA_CALIBRATED * camera.focal)], image_sizes)
+    camera = checked_camera(Path(place), fields[0], fields[1], width, height, params)
+    return _of_cameras(place, [replace(camera, focal_sigma=_SIGMA_CALIBRATED * camera.focal)], image_sizes)
 
 
-def _from_plain_numbers(path: Path, fields: list[str], image_sizes: Sequence[Size]) -> Calibration:
+def _from_plain_numbers(place: str, fields: list[str], image_sizes: Sequence[Size]) -> Calibration:
     try:
         values = [float(field) for field in fields]
     except ValueError:
@@ -249,112 +249,127 @@ def _from_plain_numbers(path: Path, fields: list[str], image_sizes: Sequence[Siz
         values = [values[0], values[4], values[2], values[5]]
     if len(values) not in (4, 8, 9):
         raise InputError(
-            f"{path}: expected fx fy cx cy, with k1 k2 p1 p2 and k3 or without, or a 3 x 3 matrix, found "
+            f"{place}: expected fx fy cx cy, with k1 k2 p1 p2 and k3 or without, or a 3 x 3 matrix, found "
             f"{len(fields)} numbers"
         )
-    camera, note = camera_from_opencv(str(path), image_sizes[0], values[:4], values[4:], False)
-    return _of_cameras(path, [camera], image_sizes, notes=(note,) if note else ())
+    camera, note = camera_from_opencv(place, image_sizes[0], values[:4], values[4:], False)
+    return _of_cameras(place, [camera], image_sizes, notes=(note,) if note else ())
 
 
-def calibration_from_fields(path: Path, fields: dict[str, Any], image_sizes: Sequence[Size]) -> Calibration:
-    """As :func:`read_calibration`, of a JSON-able object; ``path`` begins the messages."""
+def calibration_from_fields(place: str, fields: dict[str, Any], image_sizes: Sequence[Size]) -> Calibration:
+    """As :func:`read_calibration`, of a JSON-able object; ``place`` begins the messages."""
     rate = fields.get("fps", fields.get("rate_hz"))
     fps = float(rate) if isinstance(rate, int | float) and 0 < rate < 1e6 else None
+    # settings of ORB-SLAM
+    for prefix in ("Camera.", "Camera1."):
+        if f"{prefix}fx" in fields:
+            fields = {key.removeprefix(prefix): value for key, value in fields.items()}
     if "P0" in fields:
-        calibration = _from_projections(path, fields, image_sizes, 0)
+        calibration = _from_projections(place, fields, image_sizes, 0)
     elif "M1" in fields or "K1" in fields:
-        calibration = _from_opencv_pair(path, fields, image_sizes)
+        calibration = _from_opencv_pair(place, fields, image_sizes)
     else:
         pair = next((names for names in _PAIR_NAMES if isinstance(fields.get(names[0]), dict)), None)
-        calibration = _from_sections(path, fields, pair, image_sizes) if pair else _from_one(path, fields, image_sizes)
+        calibration = (
+            _from_sections(place, fields, pair, image_sizes) if pair else _from_one(place, fields, image_sizes)
+        )
     return replace(calibration, frames_per_second=fps)
 
 
-def _from_one(path: Path, fields: dict[str, Any], image_sizes: Sequence[Size]) -> Calibration:
-    camera, note = _camera(str(path), fields, image_sizes[0])
+def _from_one(place: str, fields: dict[str, Any], image_sizes: Sequence[Size]) -> Calibration:
+    camera, note = _camera(place, fields, image_sizes[0])
     notes = (note,) if note else ()
     body = None
     if "T_BS" in fields:
-        body = read_pose(f"{path}: T_BS", fields["T_BS"])
+        body = read_pose(f"{place}: T_BS", fields["T_BS"])
     elif "T_cam_imu" in fields:
-        body = rigid3.inverse(read_pose(f"{path}: T_cam_imu", fields["T_cam_imu"]))
+        body = rigid3.inverse(read_pose(f"{place}: T_cam_imu", fields["T_cam_imu"]))
+    right = _beside(place, fields)
+    if right is None:
+        return _of_cameras(place, [camera], image_sizes, body, notes=notes)
+    return _of_cameras(place, [camera, camera], image_sizes, body, [right], notes)
+
+
+def _beside(place: str, fields: dict[str, Any]) -> Array | None:
+    """(7,) pose of the right camera of a rectified pair, from its baseline in metres; None if none is given."""
     baseline = next((fields[name] for name in ("baseline", "baseline_m") if name in fields), None)
     if baseline is None:
-        return _of_cameras(path, [camera], image_sizes, body, notes=notes)
+        return None
     if not isinstance(baseline, int | float) or not 0 < baseline < 1e3:
-        raise InputError(f"{path}: expected a baseline in metres, found {baseline!r}")
-    right = np.array([0.0, 0.0, 0.0, 1.0, -float(baseline), 0.0, 0.0])
-    return _of_cameras(path, [camera, camera], image_sizes, body, [right], notes)
+        raise InputError(f"{place}: expected a baseline in metres, found {baseline!r}")
+    return np.array([0.0, 0.0, 0.0, 1.0, -float(baseline), 0.0, 0.0])
 
 
-def _from_sections(path: Path, fields: dict[str, Any], pair: Sequence[str], image_sizes: Sequence[Size]) -> Calibration:
+def _from_sections(place: str, fields: dict[str, Any], pair: Sequence[str], image_sizes: Sequence[Size]) -> Calibration:
     """``cam0`` and perhaps ``cam1`` as sections: Kalibr's camchain, and whoever writes alike."""
-    cameras, notes, bodies, chain = [], [], [], None
+    cameras, bodies = [], []
+    notes: list[str] = []
+    chain = None
     for position, name in enumerate(pair[: len(image_sizes)]):
         section = fields.get(name)
         if not isinstance(section, dict):
             break
-        one = _from_one(Path(f"{path}: {name}"), section, [image_sizes[position]])
+        one = _from_one(f"{place}: {name}", section, [image_sizes[position]])
         cameras.append(one.rig.cameras[0])
         notes.extend(one.notes)
         bodies.append(one.body_from_cam)
         if "T_cn_cnm1" in section and position == 1:
-            chain = read_pose(f"{path}: {name}: T_cn_cnm1", section["T_cn_cnm1"])
+            chain = read_pose(f"{place}: {name}: T_cn_cnm1", section["T_cn_cnm1"])
     others = []
     if len(cameras) == 2:
         if chain is None and bodies[0] is not None and bodies[1] is not None:
             chain = rigid3.compose(rigid3.inverse(bodies[1]), bodies[0])
-        if chain is None and isinstance(fields.get("baseline"), int | float):
-            chain = np.array([0.0, 0.0, 0.0, 1.0, -float(fields["baseline"]), 0.0, 0.0])
+        if chain is None:
+            chain = _beside(place, fields)
         if chain is None:
             cameras = cameras[:1]
-            notes.append(f"{path}: it does not say where {pair[1]} sits")
+            notes.append(f"{place}: it does not say where {pair[1]} sits")
         else:
             others = [chain]
-    return _of_cameras(path, cameras, image_sizes, bodies[0], others, tuple(notes))
+    return _of_cameras(place, cameras, image_sizes, bodies[0], others, tuple(notes))
 
 
-def _from_opencv_pair(path: Path, fields: dict[str, Any], image_sizes: Sequence[Size]) -> Calibration:
+def _from_opencv_pair(place: str, fields: dict[str, Any], image_sizes: Sequence[Size]) -> Calibration:
     letter = "M" if "M1" in fields else "K"
     cameras: list[Camera] = []
     notes: list[str] = []
     for position in range(min(2, len(image_sizes))):
         names = {"K": fields.get(f"{letter}{position + 1}"), "D": fields.get(f"D{position + 1}", [])}
         shared = {key: value for key, value in fields.items() if "size" in key or "width" in key or "height" in key}
-        camera, note = _camera(f"{path}: {letter}{position + 1}", {**shared, **names}, image_sizes[position])
+        camera, note = _camera(f"{place}: {letter}{position + 1}", {**shared, **names}, image_sizes[position])
         cameras.append(camera)
         notes.extend([note] if note else [])
     others = []
     if len(cameras) == 2:
         if "R" in fields and "T" in fields:
-            rotation = nearest_rotation(f"{path}: R", _numbers(f"{path}: R", fields["R"], (3, 3)))
-            others = [rigid3.from_matrix(rotation, _numbers(f"{path}: T", fields["T"], (3,)))]
+            rotation = nearest_rotation(f"{place}: R", _numbers(f"{place}: R", fields["R"], (3, 3)))
+            others = [rigid3.from_matrix(rotation, _numbers(f"{place}: T", fields["T"], (3,)))]
         else:
             cameras = cameras[:1]
-            notes.append(f"{path}: it does not say where the second camera sits (no R and T)")
-    return _of_cameras(path, cameras, image_sizes, None, others, tuple(notes))
+            notes.append(f"{place}: it does not say where the second camera sits (no R and T)")
+    return _of_cameras(place, cameras, image_sizes, None, others, tuple(notes))
 
 
-def _from_projections(path: Path, fields: dict[str, Any], image_sizes: Sequence[Size], first: int) -> Calibration:
+def _from_projections(place: str, fields: dict[str, Any], image_sizes: Sequence[Size], first: int) -> Calibration:
     """KITTI's P0..P3: projections (3, 4) of points in the frame of camera 0 into rectified images."""
     cameras, positions = [], []
     for position in range(min(2, len(image_sizes))):
         name = f"P{first + position}"
         if name not in fields:
             if position == 0:
-                raise InputError(f"{path}: expected a line '{name}: ' with 12 numbers, found {', '.join(fields)}")
+                raise InputError(f"{place}: expected a line '{name}: ' with 12 numbers, found {', '.join(fields)}")
             break
-        matrix = _numbers(f"{path}: {name}", fields[name], (3, 4))
+        matrix = _numbers(f"{place}: {name}", fields[name], (3, 4))
         if matrix[0, 1] or matrix[1, 0] or matrix[2, :3].tolist() != [0, 0, 1]:
-            raise InputError(f"{path}: {name}: expected K [I | t] with a K without skew, found {matrix.tolist()}")
+            raise InputError(f"{place}: {name}: expected K [I | t] with a K without skew, found {matrix.tolist()}")
         intrinsics = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
-        cameras.append(camera_from_opencv(f"{path}: {name}", image_sizes[position], intrinsics, [], False)[0])
+        cameras.append(camera_from_opencv(f"{place}: {name}", image_sizes[position], intrinsics, [], False)[0])
         positions.append(np.linalg.solve(matrix[:, :3], matrix[:, 3]))
     others = [np.array([0.0, 0.0, 0.0, 1.0, *(position - positions[0])]) for position in positions[1:]]
     if others and not np.linalg.norm(others[0][4:]) > 1e-6:
         cameras, others = cameras[:1], []
     body = np.array([0.0, 0.0, 0.0, 1.0, *-positions[0]])
-    return _of_cameras(path, cameras, image_sizes, body, others)
+    return _of_cameras(place, cameras, image_sizes, body, others)
 
 
 def kitti_calibration(path: Path, image_sizes: Sequence[Size], first: int) -> Calibration:
@@ -364,11 +379,11 @@ def kitti_calibration(path: Path, image_sizes: Sequence[Size], first: int) -> Ca
         InputError: the file cannot be read, or holds no such projections.
     """
     fields = parse_flat_yaml(read_limited_text(path, _LARGEST_BYTES), str(path))
-    return _from_projections(path, fields, image_sizes, first)
+    return _from_projections(str(path), fields, image_sizes, first)
 
 
 def _of_cameras(
-    path: Path,
+    place: str,
     cameras: list[Camera],
     image_sizes: Sequence[Size],
     body_from_cam: Array | None = None,
@@ -376,7 +391,7 @@ def _of_cameras(
     notes: tuple[str, ...] = (),
 ) -> Calibration:
     """Cameras scaled to their images; ``others`` are the poses of those behind the first, in the frame of the first."""
-    fitted = [scaled_to(str(path), camera, size) for camera, size in zip(cameras, image_sizes, strict=False)]
+    fitted = [scaled_to(place, camera, size) for camera, size in zip(cameras, image_sizes, strict=False)]
     poses = np.array([rigid3.IDENTITY, *others])[: len(fitted)]
     notes += tuple(note for _, note in fitted if note)
     return Calibration(Rig(tuple(camera for camera, _ in fitted), poses), body_from_cam, notes=notes)
@@ -426,7 +441,7 @@ def _coefficients(place: str, fields: dict[str, Any]) -> Array:
 
 
 def _size(place: str, fields: dict[str, Any]) -> Size | None:
-    pairs = (("width", "height"), ("image_width", "image_height"), ("Camera.width", "Camera.height"))
+    pairs = (("width", "height"), ("image_width", "image_height"))
     found = next(([fields[w], fields[h]] for w, h in pairs if w in fields and h in fields), None)
     if found is None:
         found = next((fields[key] for key in ("resolution", "image_size", "imageSize", "size") if key in fields), None)
@@ -484,20 +499,20 @@ def _refuse_form(place: str, fields: dict[str, Any]) -> NoReturn:
     )
 
 
-def _fields_of_xml(path: Path, text: str) -> dict[str, Any]:
+def _fields_of_xml(place: str, text: str) -> dict[str, Any]:
     """The nested elements of an XML file as objects. Entities, which can grow without bound, are refused."""
     from xml.etree import ElementTree
 
     if "<!" in re.sub("<!--.*?-->", "", text, flags=re.DOTALL):
-        raise InputError(f"{path}: expected XML without document types and entities")
+        raise InputError(f"{place}: expected XML without document types and entities")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
-        raise InputError(f"{path}: expected XML: {error}") from None
+        raise InputError(f"{place}: expected XML: {error}") from None
 
     def fields_of(element: ElementTree.Element, depth: int) -> Any:
         if depth > 10:
-            raise InputError(f"{path}: expected no more than 10 levels of XML")
+            raise InputError(f"{place}: expected no more than 10 levels of XML")
         if len(element):
             return {child.tag: fields_of(child, depth + 1) for child in element}
         content = (element.text or "").strip()
@@ -508,5 +523,5 @@ def _fields_of_xml(path: Path, text: str) -> dict[str, Any]:
 
     value = fields_of(root, 0)
     if not isinstance(value, dict):
-        raise InputError(f"{path}: expected XML with elements, found text")
+        raise InputError(f"{place}: expected XML with elements, found text")
     return value

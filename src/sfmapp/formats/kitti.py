@@ -21,13 +21,11 @@ from sfmapp.formats.sequence_files import (
     frame_names,
     list_images,
     read_rows,
-    rows_of_frames,
     times_of_rows,
     warn_of_missing,
 )
 from sfmapp.formats.text_input import nearest_rotation
 from sfmapp.geometry import rigid3
-from sfmapp.images.sequence import STAGE
 
 Array = NDArray[np.float64]
 
@@ -109,7 +107,7 @@ def is_kitti(folder: Path) -> bool:
 
 
 def read_kitti_sequence(folder: Path, events: Events, only: str | None = None) -> Recording:
-    """A sequence folder: ``image_0``, ``image_1`` (or ``image_2``, ``image_3``), calib.txt, times.txt and poses.
+    """A sequence folder: ``image_0``, ``image_1`` (or ``image_2``, ``image_3``), calib.txt, times.txt and the poses.
 
     Args:
         only: the one image folder to use, such as ``image_1``; None: the pair, grey before colour.
@@ -132,23 +130,12 @@ def read_kitti_sequence(folder: Path, events: Events, only: str | None = None) -
     if (folder / "calib.txt").is_file():
         calibration = kitti_calibration(folder / "calib.txt", sizes, int(names[0][-1]))
     times = times_of_rows(folder / "times.txt", left) if (folder / "times.txt").is_file() else None
-    return Recording(
-        "kitti", folder, frame_names(folder, left), times, frames, sizes, calibration,
-        frame_truth=_frame_truth(folder, left, events),
-    )  # fmt: skip
-
-
-def _frame_truth(folder: Path, left: list[Path], events: Events) -> Array | None:
-    """(N, 7) of the body, from the poses beside the images or where the benchmark's archive has them."""
     resolved = folder.resolve()
-    for path in (folder / "poses.txt", resolved.parent.parent / "poses" / f"{resolved.name}.txt"):
-        if path.is_file():
-            poses = read_kitti(path)
-            rows = rows_of_frames(len(poses), left)
-            if rows is not None:
-                return poses[rows]
-            events.warned(STAGE, f"{path} is not used: it has {len(poses)} poses for {len(left)} frames")
-    return None
+    truth_paths = (folder / "poses.txt", resolved.parent.parent / "poses" / f"{resolved.name}.txt")
+    names_of_frames = frame_names(folder, left)
+    return Recording(
+        "kitti", folder, names_of_frames, times, frames, sizes, calibration, truth_paths=truth_paths
+    )  # fmt: skip
 
 
 def with_partners(left: list[Path], right_folder: Path, events: Events) -> list[tuple[Path, ...]]:

@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -44,8 +45,9 @@ class Recording:
         paths: for each frame one file, or two of a pair.
         sizes: (width, height) of the images of each camera.
         calibration: None if there is none.
-        imu, truth: None where there is none; poses are of the first camera.
-        frame_truth: (N, 7) poses of the body where they come by frame and not by time, NaN for unknown ones.
+        imu, truth: None where there is none, or where the files that may hold the truth are ``truth_paths``; poses are
+            of the first camera.
+        truth_paths: where a trajectory of the body may lie; the first that is there counts.
     """
 
     kind: SequenceKind
@@ -57,7 +59,7 @@ class Recording:
     calibration: Calibration | None
     imu: Imu | None = None
     truth: Truth | None = None
-    frame_truth: Array | None = None
+    truth_paths: tuple[Path, ...] = ()
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -160,19 +162,31 @@ def timestamp_of(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(text)
-    digits = len(text.strip().lstrip("+-0")) if re.fullmatch(r"\s*\+?\d+\s*", text) else 0
+    digits = len(text.strip().lstrip("+0")) if re.fullmatch(r"\s*\+?\d+\s*", text) else 0
+    if digits > 20:
+        raise ValueError(text)
     # 10 digits of seconds last until the year 2286; each further three are a finer unit
     unit = 1_000_000_000 if digits >= 18 else 1_000_000 if digits >= 15 else 1_000 if digits >= 12 else 1
     return int(text) / unit if digits else value
 
 
 def read_times(path: Path) -> list[float]:
-    """Seconds from the first column of a list of times. Raises InputError for a line that is no time."""
+    """Seconds from the first column of a list of times; ``2011-09-26 13:02:25.964`` is one as well, in UTC.
+
+    Raises:
+        InputError: a line is no time.
+    """
     times = []
     for number, fields in read_rows(path):
         try:
             times.append(timestamp_of(fields[0].split(",")[0]))
+            continue
         except ValueError:
+            pass
+        try:
+            moment = datetime.fromisoformat(" ".join(fields[:2]))
+            times.append(moment.replace(tzinfo=moment.tzinfo or UTC).timestamp())
+        except (ValueError, OverflowError):
             raise InputError(f"{path}:{number}: expected a time, found {' '.join(fields)[:80]!r}") from None
     return times
 

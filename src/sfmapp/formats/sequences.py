@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.errors import InputError, UsageError
+from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.calibration import Calibration, camera_from_text, read_calibration
 from sfmapp.formats.euroc import find_mav, read_euroc_sequence, read_euroc_truth, read_imu
@@ -85,6 +86,15 @@ def open_sequence(
         UsageError: options that cannot be obeyed.
     """
     text = str(source)
+    if "\0" in text:
+        raise InputError(f"{printable(text)}: expected a sequence, found a name that no file can have")
+    try:
+        return _open(text, options, events, require_camera)
+    except OSError as error:
+        raise InputError(f"{printable(text)}: cannot be read: {error}") from error
+
+
+def _open(text: str, options: SequenceOptions, events: Events, require_camera: bool) -> Sequence:
     path = Path(text)
     if is_stream(text):
         return _open_video(text, options, events, require_camera)
@@ -122,7 +132,9 @@ def _read_layout(folder: Path, events: Events) -> Recording:
     if pair is not None:
         return read_pair_sequence(folder, *pair, events)
     if has_images(folder):
-        return read_folder_sequence(folder, folder)
+        # what belongs to a folder called images or left lies beside it
+        is_part = inside in _FRAME_FOLDERS and not has_images(above)
+        return read_folder_sequence(above if is_part else folder, folder)
     within = [folder / name for name in _FRAME_FOLDERS if has_images(folder / name)]
     if not within:
         within = sorted(path for path in folder.iterdir() if path.is_dir() and has_images(path))
@@ -139,11 +151,11 @@ def _read_layout(folder: Path, events: Events) -> Recording:
 
 
 def _calibration(
-    given: str | None, folders: tuple[Path, ...], own: Calibration | None, is_published: bool, sizes: tuple[Size, ...]
+    given: str | None, folders: list[Path], own: Calibration | None, is_published: bool, sizes: tuple[Size, ...]
 ) -> Calibration | None:
     """The user's calibration, else the layout's own, else a file beside the frames (before a published one)."""
     if given is not None:
-        if Path(given).is_file():
+        if os.path.isfile(given):
             chosen = read_calibration(given, sizes)
         elif "," not in given and any(c in given for c in "./\\"):
             raise InputError(f"camera {given}: expected a calibration file, found nothing")
@@ -170,7 +182,7 @@ def _guessed_camera(size: Size, first: Path | None) -> Camera:
 
 
 def _rig(
-    what: str, calibration: Calibration | None, sizes: tuple[Size, ...], first: Path | None, mono: bool, events: Events,
+    what: str, calibration: Calibration | None, sizes: tuple[Size, ...], first: Path | None, events: Events,
     require_camera: bool,
 ) -> Rig:  # fmt: skip
     """The cameras that are played: both where both are calibrated and wanted."""
@@ -190,11 +202,17 @@ def _rig(
         return Rig.single(camera)
     for note in calibration.notes:
         events.decided(STAGE, note)
-    rig = calibration.rig
-    if mono or len(sizes) == 1:
-        return Rig.single(rig.cameras[0])
-    if not rig.is_stereo:
+    rig = calibration.rig if len(sizes) > 1 else Rig.single(calibration.rig.cameras[0])
+    if len(sizes) > 1 and not rig.is_stereo:
         events.warned(STAGE, f"{what}: images of two cameras, but no calibration of the pair: the first is used alone")
+    for camera in rig.cameras:
+        fx, fy, cx, cy = camera.canonical[:4]
+        long_side = max(camera.width, camera.height)
+        # 0.2 is a fisheye lens of the widest kind, 20 a telescope
+        is_odd = not (0.2 * long_side < min(fx, fy) <= max(fx, fy) < 20 * long_side)
+        if is_odd or not (0 < cx < camera.width and 0 < cy < camera.height):
+            text = f"fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g} for {camera.width}x{camera.height} pixels"
+            events.warned(STAGE, f"{what}: the calibration is unlike that of any camera: {text}")
     return rig
 
 
@@ -206,14 +224,13 @@ def _sequence(
 ) -> FileSequence:
     """The wishes of the user applied to what a layout holds."""
     first = [frame[0] for frame in recording.paths]
-    folders = (recording.root, first[0].parent, recording.root.parent) if recording.kind != "folder" else (
-        recording.root, first[0].parent
-    )  # fmt: skip
-    calibration = _calibration(options.camera, folders, recording.calibration, recording.kind == "tum", recording.sizes)
-    rig = _rig(source, calibration, recording.sizes, first[0], options.mono, events, require_camera)
+    folders = [recording.root, first[0].parent, *([recording.root.parent] if recording.kind == "euroc" else [])]
+    sizes = recording.sizes[:1] if options.mono else recording.sizes
+    calibration = _calibration(options.camera, folders, recording.calibration, recording.kind == "tum", sizes)
+    rig = _rig(source, calibration, sizes, first[0], events, require_camera)
     times, fps = _timestamps(recording, first, options, calibration, events)
     body_from_cam = calibration.body_from_cam if calibration else None
-    truth = _truth(recording, options.truth, times, first, body_from_cam)
+    truth = _truth(recording, options.truth, times, first, body_from_cam, events)
     imu = recording.imu if options.imu is None else _given_imu(options.imu, body_from_cam)
     kept = ascending(times)
     if len(kept) < len(times):
@@ -264,28 +281,49 @@ def _timestamps(
 
 
 def _truth(
-    recording: Recording, given: str | None, times: Array, first: list[Path], body_from_cam: Array | None
+    recording: Recording,
+    given: str | None,
+    times: Array,
+    first: list[Path],
+    body_from_cam: Array | None,
+    events: Events,
 ) -> Truth | None:
-    by_frame = recording.frame_truth
+    """The user's trajectory, or the one that lies beside the frames: of that one, nothing wrong stops the run."""
+    truth = recording.truth
+    beside = next((path for path in recording.truth_paths if path.is_file()), None)
     if given is not None:
-        path = Path(given)
-        rows = read_rows(path)
-        fields = rows[min(1, len(rows) - 1)][1] if rows else []
-        if "," in "".join(fields):
-            return read_euroc_truth(path, body_from_cam)
-        if len(fields) != 12:
-            return read_tum_truth(path)
-        poses = read_kitti(path)
-        chosen = rows_of_frames(len(poses), first)
-        if chosen is None:
-            raise InputError(f"{path}: expected a pose for each of {len(first)} frames, found {len(poses)}")
-        by_frame = poses[chosen]
-    if by_frame is None:
-        return recording.truth
+        truth = _read_truth(Path(given), times, first, body_from_cam)
+    elif beside is not None:
+        try:
+            truth = _read_truth(beside, times, first, body_from_cam)
+        except InputError as error:
+            events.warned(STAGE, f"the truth is not used: {error}")
+    if truth is None or not len(truth.timestamps_s):
+        return None
+    if len(times) and not (times.min() <= truth.timestamps_s[-1] and truth.timestamps_s[0] <= times.max()):
+        span = f"{truth.timestamps_s[0]:.3f} to {truth.timestamps_s[-1]:.3f} s"
+        text = f"the truth is of {span}, the frames of {times.min():.3f} to {times.max():.3f} s: they share no time"
+        events.warned(STAGE, text)
+    return truth
+
+
+def _read_truth(path: Path, times: Array, first: list[Path], body_from_cam: Array | None) -> Truth:
+    """A trajectory of the first camera (TUM) or of the body (EuRoC; KITTI, whose body is its camera 0)."""
+    rows = read_rows(path)
+    fields = rows[-1][1] if rows else []
+    if "," in "".join(fields):
+        return read_euroc_truth(path, body_from_cam)
+    if len(fields) != 12:
+        return read_tum_truth(path)
+    poses = read_kitti(path)
+    chosen = rows_of_frames(len(poses), first)
+    if chosen is None:
+        raise InputError(f"{path}: expected a pose for each of {len(first)} frames, found {len(poses)}")
+    poses = poses[chosen]
     if body_from_cam is not None:
-        by_frame = rigid3.compose(rigid3.inverse(body_from_cam), by_frame)
-    order = [i for i in ascending(times) if np.isfinite(by_frame[i]).all()]
-    return Truth(times[order], by_frame[order])
+        poses = rigid3.compose(rigid3.inverse(body_from_cam), poses)
+    order = [i for i in ascending(times) if np.isfinite(poses[i]).all()]
+    return Truth(times[order], poses[order])
 
 
 def _given_imu(given: str, body_from_cam: Array | None) -> Imu:
@@ -313,19 +351,16 @@ def _mirrored(
 
 
 def _open_video(source: str, options: SequenceOptions, events: Events, require_camera: bool) -> VideoSequence:
-    if options.reverse:
-        raise UsageError("reverse is not possible with a video", "extract its frames to a folder first")
     facts = read_video_facts(source)
     size = (facts.width, facts.height)
-    folders = () if is_stream(source) else (Path(source).absolute().parent,)
+    folders = [] if is_stream(source) else [Path(source).absolute().parent]
     calibration = _calibration(options.camera, folders, None, False, (size,))
-    rig = _rig(source, calibration, (size,), None, True, events, require_camera)
+    rig = _rig(source, calibration, (size,), None, events, require_camera)
     body_from_cam = calibration.body_from_cam if calibration else None
     imu = _given_imu(options.imu, body_from_cam) if options.imu is not None else None
     truth = None
     if options.truth is not None:
-        recording = Recording("video", Path(), [], None, [], (size,), calibration)
-        truth = _truth(recording, options.truth, np.zeros(0), [], body_from_cam)
+        truth = _read_truth(Path(options.truth), np.zeros(0), [], body_from_cam)
     sequence = VideoSequence(source, rig, facts, options, events, imu, truth)
     _tell(sequence, events)
     return sequence

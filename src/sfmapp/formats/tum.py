@@ -50,7 +50,7 @@ def read_tum_sequence(folder: Path, events: Events) -> Recording:
     """A sequence folder. Frames that ``rgb.txt`` names and that are not there are left out with a warning.
 
     Raises:
-        InputError: no image can be read, or a line of ``rgb.txt`` or ``groundtruth.txt`` is not what it should be.
+        InputError: no image can be read, or a line of ``rgb.txt`` is not what it should be.
     """
     times: Array | None
     if (folder / "rgb.txt").is_file():
@@ -59,12 +59,10 @@ def read_tum_sequence(folder: Path, events: Events) -> Recording:
         paths = list_images(folder / "rgb")
         times = times_in_names(paths)
     size = common_size(paths, str(folder / "rgb"))
-    truth = None
-    if (folder / "groundtruth.txt").is_file():
-        truth = read_tum_truth(folder / "groundtruth.txt")
     frames: list[tuple[Path, ...]] = [(path,) for path in paths]
     calibration = _published_calibration(folder, size)
-    return Recording("tum", folder, frame_names(folder, paths), times, frames, (size,), calibration, truth=truth)
+    names, truth_paths = frame_names(folder, paths), (folder / "groundtruth.txt",)
+    return Recording("tum", folder, names, times, frames, (size,), calibration, truth_paths=truth_paths)
 
 
 def _read_list(folder: Path, events: Events) -> tuple[Array, list[Path]]:
