@@ -41,8 +41,8 @@ class Covariances:
     """Marginal covariances of what varied.
 
     Attributes:
-        image_idx: (n,) images; poses: (n, 6, 6) over rotation w (radians) and translation v of
-            ``x_cam <- exp(w) x_cam + v``; those of a rig's pose at its sensor 0.
+        image_idx: (n,) images, of a rig's frame all that are registered; poses: (n, 6, 6) over rotation w (radians)
+            and translation v of ``x_cam <- exp(w) x_cam + v``; those of a rig's pose at its sensor 0.
         camera_idx: (m,) cameras; free_params: m arrays (Q,), positions in ``Camera.params``; intrinsics: m arrays
             (Q, Q) over these.
         track_idx: (p,) points; points: (p, 3, 3) in the world; infinite for a point without depth.
@@ -102,7 +102,7 @@ def estimate_covariances(
     determined = covariance is not None
     full = np.zeros((len(used), len(used)))
     full[np.ix_(used, used)] = covariance if covariance is not None else np.inf
-    return _collect(engine, full * variance, variance, len(basis), determined)
+    return _collect(engine, reconstruction, full * variance, variance, len(basis), determined)
 
 
 def _variance(engine: Engine, num_unknowns: int) -> float:
@@ -194,9 +194,16 @@ def _constrained_inverse(information: Array, scale: Array, basis: Array, constra
     return inverse * np.outer(root, root)
 
 
-def _collect(engine: Engine, covariance: Array, variance: float, num_gauge: int, determined: bool) -> Covariances:
+def _collect(
+    engine: Engine,
+    reconstruction: Reconstruction,
+    covariance: Array,
+    variance: float,
+    num_gauge: int,
+    determined: bool,
+) -> Covariances:
     p = engine.problem
-    images = np.flatnonzero(p.image_block >= 0)
+    image_idx, poses = _pose_covariances(reconstruction, p, covariance)
     cameras = np.flatnonzero(p.camera_block >= 0)
     intrinsics = []
     for c in cameras:
@@ -208,12 +215,12 @@ def _collect(engine: Engine, covariance: Array, variance: float, num_gauge: int,
         _point_covariances(
             p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, engine.rows, p.image_mount, p.mounts,
             p.image_camera, p.image_block, p.canonical, p.fisheye, p.penalty, p.camera_block, p.free.ptr, p.free.slot,
-            p.free.column, p.num_blocks, engine.loss, engine.scale2, engine.factor, covariance, variance,
+            p.free.column, p.block_dim, engine.loss, engine.scale2, engine.factor, covariance, variance,
             np.zeros(SCRATCH), points,
         )  # fmt: skip
     return Covariances(
-        image_idx=p.image_idx[images],
-        poses=_pose_covariances(p, images, covariance),
+        image_idx=image_idx,
+        poses=poses,
         camera_idx=p.camera_idx[cameras],
         free_params=[p.free.params[c] for c in cameras],
         intrinsics=intrinsics,
@@ -225,18 +232,32 @@ def _collect(engine: Engine, covariance: Array, variance: float, num_gauge: int,
     )
 
 
-def _pose_covariances(problem: Problem, images: NDArray[np.int64], covariance: Array) -> Array:
-    """(n, 6, 6) of local images; through the adjoint of its mount where an image has not the pose of its block."""
-    at = problem.image_block[images][:, None] * 8 + np.arange(6)
+def _pose_covariances(
+    reconstruction: Reconstruction, problem: Problem, covariance: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """Images (n,) that vary, all of their frames included, and (n, 6, 6): through the adjoint of its place on the rig
+    where an image has not the pose of its block.
+    """
+    rig, moving = reconstruction.rig, problem.image_block >= 0
+    block = np.full(len(reconstruction.image_names), -1)
+    block[problem.image_idx[moving]] = problem.image_block[moving]
+    if rig is not None:
+        of_frame = np.full(int(rig.frame_idx.max(initial=-1)) + 2, -1)  # one more, for images on no rig
+        np.maximum.at(of_frame, rig.frame_idx, block)
+        on_rig = (rig.frame_idx >= 0) & reconstruction.is_registered
+        block[on_rig] = of_frame[rig.frame_idx[on_rig]]
+    images = np.flatnonzero(block >= 0)
+    at = block[images][:, None] * 8 + np.arange(6)
     out: Array = covariance[at[:, :, None], at[:, None, :]]
-    for n in np.flatnonzero(problem.image_mount[images] >= 0):
-        row = problem.mounts[problem.image_mount[images[n]]]
-        rotation, adjoint = row[:9].reshape(3, 3), np.zeros((6, 6))
+    for n in np.flatnonzero(rig.is_mounted[images]) if rig is not None else ():
+        assert rig is not None
+        mount = rig.cam_from_rig[rig.sensor_idx[images[n]]]
+        rotation, adjoint = rigid3.rotation_matrix(mount), np.zeros((6, 6))
         adjoint[:3, :3] = adjoint[3:, 3:] = rotation
-        adjoint[3:, :3] = rigid3.skew(row[9:]) @ rotation
+        adjoint[3:, :3] = rigid3.skew(mount[4:]) @ rotation
         # infinities times zeros are no numbers
         out[n] = adjoint @ out[n] @ adjoint.T if np.isfinite(out[n]).all() else np.inf
-    return out
+    return images, out
 
 
 def errors_in_gauge(
@@ -312,11 +333,12 @@ def _weighted_squares(  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _point_covariances(  # type: ignore[no-untyped-def]
     point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_mount, mounts, image_camera, image_block, canonical,
-    fisheye, penalty, camera_block, free_ptr, free_slot, free_column, num_blocks, loss, scale2, factor, covariance,
+    fisheye, penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, factor, covariance,
     variance, J, out,
 ):  # fmt: skip
     """``V^-1 (variance V + W^T C W) V^-1`` of each point, with V^-1 = L^-T L^-1 from the factor; C in full blocks."""
     scratch, pose, mount, lens = pointer(J), pointer(poses), pointer(mounts), pointer(canonical)
+    num_blocks = block_dim.shape[0]
     mark = np.full(num_blocks, -1, np.int64)
     W = np.zeros((num_blocks * 8, 3))
     touched = np.zeros(num_blocks, np.int64)
@@ -353,14 +375,17 @@ def _point_covariances(  # type: ignore[no-untyped-def]
                         W[k, j] += J[slot] * J[48 + j] + J[slot + 1] * J[56 + j]
         M[:] = 0.0
         for a in range(count):
-            for b in range(count):
-                for x in range(8):
-                    for y in range(8):
-                        r, s = touched[a] * 8 + x, touched[b] * 8 + y
-                        value = covariance[r, s]
-                        for j in range(3):
-                            for k in range(3):
-                                M[j, k] += W[r, j] * value * W[s, k]
+            for r in range(touched[a] * 8, touched[a] * 8 + block_dim[touched[a]]):
+                c0 = c1 = c2 = 0.0
+                for b in range(count):
+                    for s in range(touched[b] * 8, touched[b] * 8 + block_dim[touched[b]]):
+                        c0 += covariance[r, s] * W[s, 0]
+                        c1 += covariance[r, s] * W[s, 1]
+                        c2 += covariance[r, s] * W[s, 2]
+                for j in range(3):
+                    M[j, 0] += W[r, j] * c0
+                    M[j, 1] += W[r, j] * c1
+                    M[j, 2] += W[r, j] * c2
         # M <- L^-1 M L^-T + variance, then out = L^-T M L^-1
         L = np.array([[f[0], 0.0, 0.0], [f[1], f[2], 0.0], [f[3], f[4], f[5]]])
         N[:] = 0.0
