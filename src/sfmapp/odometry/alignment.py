@@ -216,7 +216,9 @@ def prepare_patch(
     source = level
     if is_warped:  # the level on which a step of the target is about a pixel
         size = np.sqrt(abs(warp[0, 0] * warp[1, 1] - warp[0, 1] * warp[1, 0]))
-        source = min(max(level + int(np.rint(np.log2(max(size, 1e-3)))), 0), layouts.shape[0] - 1)
+        if not 1e-3 < size < 1e3:  # or not a number
+            return -1.0
+        source = min(max(level + int(np.rint(np.log2(size))), 0), layouts.shape[0] - 1)
     scale = 0.5**source
     u, v = x * scale, y * scale
     start, step = layouts[source, 0], layouts[source, 1]
