@@ -7,7 +7,6 @@ fast the machine is: where the adjustment is late, tracking waits.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.keyframe_map import KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.scene.reconstruction import Reconstruction
@@ -24,10 +24,12 @@ Mask = NDArray[np.bool_]
 
 # Frames between a keyframe and the moment at which its adjustment counts.
 LAG = 2
-# Residuals beyond so many robust standard deviations (of a Rayleigh length) are outliers, within these bounds in pixels.
+# Residuals beyond so many robust standard deviations are outliers, within these bounds in pixels.
 _OUTLIER_SIGMAS, _OUTLIER_RANGE_PX = 4.0, (1.0, 4.0)
+# Where the loss begins to bend, in sigmas: Cauchy's 95 % efficiency, and no less than this.
+_LOSS_SIGMAS, _MIN_LOSS_PX = 2.0, 0.1
 # Local steps: a window starts close to its minimum, and the next keyframe adjusts it again.
-_WINDOW_STEPS, _GLOBAL_STEPS = 6, 30
+_WINDOW_STEPS = 6
 # Median length of a residual of two unit normal coordinates (Rayleigh).
 _RAYLEIGH_MEDIAN = 1.1774
 
@@ -77,14 +79,14 @@ def make_job(keyframes: KeyframeMap, keyframe_idx: NDArray[np.int64], is_variabl
     return Job(keyframe_idx, is_variable, model, point_id, keyframes.num_observations(point_id) - here)
 
 
-def run_job(job: Job, max_steps: int = _WINDOW_STEPS, robust: bool = True) -> Job:
-    """Adjust, then decide afresh which observations agree; points that keep fewer than two observations are given up."""
+def run_job(job: Job) -> Job:
+    """Adjust, then decide afresh which observations agree; points with fewer than two of them are given up."""
     start = time.thread_time()
     model = job.model
     num_sensors = len(model.image_names) // max(1, len(job.keyframe_idx))
     options = AdjustOptions(
-        loss="huber" if robust else "trivial", loss_scale_px=1.0, max_iterations=max_steps,
-        relative_cost_tolerance=1e-4, refine_focal=False, refine_distortion=False,
+        loss="cauchy", loss_scale_px=max(_MIN_LOSS_PX, _LOSS_SIGMAS * residual_scale_px(model)),
+        max_iterations=_WINDOW_STEPS, relative_cost_tolerance=1e-4, refine_focal=False, refine_distortion=False,
     )  # fmt: skip
     adjust_bundle(model, options, variable_images=np.repeat(job.is_variable, num_sensors))
     classify(model, job.num_elsewhere)
@@ -110,8 +112,9 @@ def take_over(job: Job, keyframes: KeyframeMap) -> None:
     """Put the result of a job into the map. What was added meanwhile stays as it is."""
     num_sensors = len(keyframes.rig.cameras)
     model, tracks = job.model, job.model.tracks
-    for n in np.flatnonzero(job.is_variable):
-        keyframes.keyframes[job.keyframe_idx[n]].rig_from_world = model.cam_from_world[n * num_sensors].copy()
+    moved = np.flatnonzero(job.is_variable)
+    for k, pose in zip(job.keyframe_idx[moved], model.cam_from_world[moved * num_sensors], strict=True):
+        keyframes.keyframes[k].rig_from_world = pose.copy()
     keyframes.point_xyz[job.point_id] = model.point_xyz
     for n, k in enumerate(job.keyframe_idx):
         keyframe = keyframes.keyframes[k]
@@ -145,13 +148,3 @@ class Backend:
         take_over(job, keyframes)
         self.cpu_s += job.cpu_s
         return True
-
-
-def adjust_all(keyframes: KeyframeMap, rounds: int = 2) -> Iterable[Reconstruction]:
-    """Adjust every keyframe and point of a map; yields the model after each round."""
-    everything = np.arange(len(keyframes.keyframes))
-    for _ in range(rounds):
-        job = make_job(keyframes, everything, everything > 0)
-        run_job(job, _GLOBAL_STEPS)
-        take_over(job, keyframes)
-        yield job.model

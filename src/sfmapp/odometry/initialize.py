@@ -57,7 +57,7 @@ class Beginning:
 
     Attributes:
         first: pyramid of the first view. corners: (N, 2) where they were in it.
-        seen: for every frame since, (N, 2) where the corners are, NaN where they were lost; ``seen[0]`` are the corners.
+        seen: for every frame since, (N, 2) where the corners are, NaN where they were lost; first the corners.
         reason: why there is no map yet.
     """
 
@@ -75,9 +75,7 @@ class Beginning:
         height, width = pyramid.shape
         spacing = 0.5 * np.sqrt(height * width / self.options.max_tracks)
         self.first = self._previous = pyramid
-        self.corners = find_corners(
-            pyramid, np.zeros((0, 2)), self.options.max_tracks, min_distance_px=float(spacing)
-        )
+        self.corners = find_corners(pyramid, np.zeros((0, 2)), self.options.max_tracks, min_distance_px=float(spacing))
         self.seen = [self.corners]
 
     def add(self, pyramid: Pyramid) -> TwoViews | None:

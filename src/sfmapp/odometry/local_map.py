@@ -37,11 +37,12 @@ _TRIANGULATION_PX = 2.0
 
 @dataclass(frozen=True)
 class View:
-    """A frame as the map sees it: its images as pyramids, and which frame it is."""
+    """A frame as the map sees it: which one it is, and its images (H, W) uint8, as they are and as pyramids."""
 
     frame_idx: int
     timestamp_s: float
     name: str
+    images: tuple[NDArray[np.uint8], ...]
     pyramids: tuple[Pyramid, ...]
 
 
@@ -86,6 +87,13 @@ class LocalMap:
         tracks = self.start_tracks(corners, 0, ActiveTracks.none())
         self._append(view, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), tracks)
         return tracks
+
+    def tracks_at(self, point_id: NDArray[np.int64], xy: Array, pose: Array) -> ActiveTracks:
+        """Tracks of points (N,), ascending, seen at pixels (N, 2) of a frame that is to become the next keyframe."""
+        depth = rigid3.apply(pose, self.keyframes.point_xyz[point_id])[:, 2]
+        number = np.full(len(point_id), self.newest + 1)
+        ray = pixels_to_normalized(self.camera, xy)
+        return ActiveTracks(point_id, xy, number, xy.copy(), ray, 1 / depth, np.ones(len(xy), np.float32))
 
     def add_keyframe(self, view: View, pose: Array, tracks: ActiveTracks, frame_number: int) -> ActiveTracks:
         """Make a keyframe of a tracked view: find lost points again, add corners, triangulate, begin to adjust.
@@ -157,8 +165,11 @@ class LocalMap:
             guess = project(self.camera, in_camera)
             ratio = in_camera[:, 2] / in_reference[:, 2]
             inside = (
-                (guess > 8).all(1) & (guess[:, 0] < width - 8) & (guess[:, 1] < height - 8)
-                & (ratio < _FOUND_SCALE) & (ratio > 1 / _FOUND_SCALE)
+                (guess > 8).all(1)
+                & (guess[:, 0] < width - 8)
+                & (guess[:, 1] < height - 8)
+                & (ratio < _FOUND_SCALE)
+                & (ratio > 1 / _FOUND_SCALE)
             )  # fmt: skip  (False for NaN)
             inside[inside] &= ~taken[(guess[inside, 1] // 4).astype(int), (guess[inside, 0] // 4).astype(int)]
             if inside.sum() < 4:

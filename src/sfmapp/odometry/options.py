@@ -20,4 +20,5 @@ class OdometryOptions:
     motion: Literal["free", "planar"] = "free"  # planar: a wheeled robot on level ground, for the first two views
     loops: bool = True  # look for places seen before, close loops and join maps
     final_adjustment: bool = True  # adjust all keyframes once at the end
+    refine_camera: bool = True  # there, refine the calibration where the images clearly contradict it
     covariance: bool = True  # covariances of the keyframes, at the end

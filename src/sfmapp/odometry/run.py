@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,42 +13,31 @@ from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Frame, Sequence
 from sfmapp.odometry.active_tracks import ActiveTracks
-from sfmapp.odometry.backend import adjust_all
+from sfmapp.odometry.corners import find_corners
+from sfmapp.odometry.finish import conclude
 from sfmapp.odometry.initialize import Beginning, TwoViews, pose_between
+from sfmapp.odometry.keyframe_map import KeyframeMap
 from sfmapp.odometry.local_map import LocalMap, View
 from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.places import Places
+from sfmapp.odometry.places import View as PlaceView
 from sfmapp.odometry.pyramid import Pyramid, build_pyramid
-from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
+from sfmapp.odometry.records import FrameRecord, gather, measure_again
+from sfmapp.odometry.relocalize import RelocalizeOptions, relocalize
+from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
-from sfmapp.odometry.tracker import keyframe_reason, measure_pose, track
+from sfmapp.odometry.tracker import MIN_INLIERS, keyframe_reason, measure_pose, track
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 STAGE = "odometry"
-_NO_POSE = np.full(7, np.nan)
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-
-
-@dataclass
-class FrameRecord:
-    """What is kept of a frame: its pose relative to a keyframe, so that it moves with the map.
-
-    Attributes:
-        keyframe: position in the map's keyframes; frame_from_keyframe: (7,), NaN without a pose.
-        live: (7,) cam_from_world as it was given out.
-    """
-
-    frame_idx: int
-    name: str
-    timestamp_s: float
-    state: FrameState = FrameState.WAITING
-    map_idx: int = -1
-    keyframe: int = -1
-    frame_from_keyframe: Array = field(default_factory=_NO_POSE.copy)
-    live: Array = field(default_factory=_NO_POSE.copy)
-    num_mapped: int = 0
-    time_s: float = 0.0
+# Fewest points with depth that one look of a rig may begin a map with.
+_MIN_STEREO_POINTS = 40
+# A keyframe is remembered as a place once it shares fewer than this share of its points with the last such.
+_NEW_PLACE = 0.5
+# Frames with fewer corners than that are black, blurred or white: nothing to be found in them.
+_MIN_CORNERS = 40
 
 
 class Odometry:
@@ -58,103 +46,115 @@ class Odometry:
     def __init__(self, sequence: Sequence, options: OdometryOptions, *, seed: int, events: Events) -> None:
         self.rig, self.options, self.seed, self.events = sequence.rig, options, seed, events
         self.executor = ThreadPoolExecutor(1, "adjust")
-        self.maps: list[LocalMap] = []
         self.records: list[FrameRecord] = []
+        self.maps: dict[int, LocalMap] = {}
         self.local: LocalMap | None = None
+        self.places = Places(seed=seed)
+        self.last_place = np.zeros(0, np.int64)
         self.beginning = Beginning(self.rig.cameras[0], options, seed)
         self.waiting: list[tuple[FrameRecord, View]] = []
-        self.tracks = ActiveTracks.none()
-        self.is_mapped = np.zeros(0, bool)
+        self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
         self.pose, self.step = _IDENTITY, _IDENTITY
         self.previous: Pyramid | None = None
         self.num_mapped_at_keyframe = 0
-        self.num_lost = 0
+        self.lost_since: float | None = None
+        self.counts = {"relocalizations": 0, "losses": 0}
 
-    # ------------------------------------------------------------------ one frame
-
-    def process(self, frame: Frame) -> None:
+    def process(self, frame: Frame) -> FrameRecord:
         """Find the pose of the next frame."""
         start = time.thread_time()
         view = View(
-            frame.idx, frame.timestamp_s, frame.name, tuple(build_pyramid(image) for image in frame.images)
-        )  # fmt: skip
+            frame.idx, frame.timestamp_s, frame.name, frame.images, tuple(build_pyramid(i) for i in frame.images)
+        )
         record = FrameRecord(frame.idx, frame.name, frame.timestamp_s)
         self.records.append(record)
-        if self.local is None:
-            self._begin(record, view)
-        else:
+        if self.local is not None and self.lost_since is None:
             self._track(record, view)
+        elif self.maps and self._recover(record, view):
+            pass
+        else:
+            self._begin(record, view)
         self.previous = view.pyramids[0]
         record.time_s = time.thread_time() - start
         snapshot = FrameSnapshot(
-            frame.idx, frame.name, frame.timestamp_s, record.state, frame.images[0],
-            self.tracks.xy.astype(np.float32), self.is_mapped, record.live, record.map_idx, record.time_s,
+            frame.idx, frame.name, frame.timestamp_s, record.state, frame.images[0], self.tracks.xy.astype(np.float32),
+            self.is_mapped, record.live, record.map_idx, record.time_s,
         )  # fmt: skip
         self.events.advanced(STAGE, message=frame.name, snapshot=snapshot)
+        return record
+
+    # ------------------------------------------------------------------ how a map begins
 
     def _begin(self, record: FrameRecord, view: View) -> None:
-        """Look for a first map."""
+        """Look for a first map, or for another one after a loss that lasts."""
+        if self.lost_since is not None:
+            record.state = FrameState.LOST
+            if record.timestamp_s - self.lost_since < self.options.max_lost_s:
+                return
+        self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
         if self.rig.is_stereo:
             self._begin_stereo(record, view)
             return
-        pyramid = view.pyramids[0]
-        views = self.beginning.add(pyramid)
+        views = self.beginning.add(view.pyramids[0])
         if len(self.beginning.seen) == 1:
             self.waiting.clear()  # a new first view: what was before it has no pose
         self.waiting.append((record, view))
-        self.tracks = ActiveTracks.none()
-        self.is_mapped = np.zeros(0, bool)
         if views is not None:
-            self._start_map(views)
+            self._begin_from_two_views(views)
 
     def _begin_stereo(self, record: FrameRecord, view: View) -> None:
         local = self._new_map()
-        self.tracks = local.add_keyframe(view, _IDENTITY, ActiveTracks.none(), len(self.records))
-        _, self.is_mapped = local.points_of(self.tracks)
-        if self.is_mapped.sum() < 40:
-            self.maps.pop().backend.finish(local.keyframes)
-            self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
+        tracks = local.add_keyframe(view, _IDENTITY, ActiveTracks.none(), len(self.records))
+        if local.points_of(tracks)[1].sum() < _MIN_STEREO_POINTS:
+            del self.maps[local.map_idx]
+            local.backend.finish(local.keyframes)
             return
-        self.local, self.pose, self.step = local, _IDENTITY, _IDENTITY
-        self._settle(record, FrameState.TRACKED, _IDENTITY)
-        self._count_mapped()
-        self._tell(local, "a map begins with one look of the rig", num_mapped=self.num_mapped_at_keyframe)
+        self._enter(local, tracks, _IDENTITY)
+        self._settle(record, FrameState.TRACKED, _IDENTITY, is_keyframe=True)
+        self._remember(view)
+        self._tell("a map begins with one look of the rig", num_mapped=self.num_mapped_at_keyframe)
 
-    def _new_map(self) -> LocalMap:
-        self.maps.append(LocalMap(self.rig, self.options, self.executor, len(self.maps)))
-        return self.maps[-1]
-
-    def _start_map(self, views: TwoViews) -> None:
+    def _begin_from_two_views(self, views: TwoViews) -> None:
         """Make a map of two views, and give poses to the frames between them."""
-        local, number = self._new_map(), len(self.records)
-        seen, (first, last) = self.beginning.seen, (self.waiting[0][1], self.waiting[-1][1])
+        local, seen = self._new_map(), self.beginning.seen
+        (first_record, first), (last_record, last) = self.waiting[0], self.waiting[-1]
         corners = local.begin(first, self.beginning.corners)
         local.keyframes.point_xyz[corners.point_id[views.track]] = views.xyz
         tracks = corners.moved(seen[-1]).subset(np.isfinite(seen[-1][:, 0]))
-        self.tracks = local.add_keyframe(last, views.last_from_first, tracks, number)
+        tracks = local.add_keyframe(last, views.last_from_first, tracks, len(self.records))
         local.backend.finish(local.keyframes)
-        self.local, self.pose = local, local.pose(1)
-        self._settle(self.waiting[-1][0], FrameState.TRACKED, self.pose)
+        self._enter(local, tracks, local.pose(1))
+        self._settle(last_record, FrameState.TRACKED, self.pose, is_keyframe=True)
+        self._settle(first_record, FrameState.WAITING, local.pose(0), is_keyframe=True, keyframe=0)
         before = local.pose(0)
-        for n, (record, _) in enumerate(self.waiting[:-1]):
-            share = n / (len(self.waiting) - 1)
-            before = self._pose_between(local, corners.moved(seen[n]), share)
-            self._settle(record, FrameState.WAITING, before, live=False)
+        for n, (record, _) in enumerate(self.waiting[1:-1], 1):
+            start = pose_between(local.pose(0), local.pose(1), n / (len(self.waiting) - 1))
+            xyz = local.keyframes.point_xyz[corners.point_id]
+            usable = np.isfinite(xyz[:, 0]) & np.isfinite(seen[n][:, 0])
+            measured = measure_pose(local.camera, start, xyz[usable], seen[n][usable])
+            before = start if measured is None else measured[0]
+            self._settle(record, FrameState.WAITING, before, keyframe=0, tracks=corners.moved(seen[n]).subset(usable))
         self.step = rigid3.compose(self.pose, rigid3.inverse(before))
-        self._count_mapped()
+        self._remember(last)
         self._tell(
-            local, f"a map begins with two views ({views.config.name.lower()})",
-            median_angle_deg=views.median_angle_deg, num_inliers=views.num_inliers, num_tracks=views.num_tracks,
+            f"a map begins with two views ({views.config.name.lower()})", median_angle_deg=views.median_angle_deg,
+            num_inliers=views.num_inliers, num_tracks=views.num_tracks, num_mapped=self.num_mapped_at_keyframe,
         )  # fmt: skip
         self.waiting.clear()
+        self.beginning = Beginning(self.rig.cameras[0], self.options, self.seed)
 
-    def _pose_between(self, local: LocalMap, tracks: ActiveTracks, share: float) -> Array:
-        """Pose of a frame between the first two keyframes, from the points that were followed through it."""
-        start = pose_between(local.pose(0), local.pose(1), share)
-        xyz = local.keyframes.point_xyz[tracks.point_id]
-        usable = np.isfinite(xyz[:, 0]) & np.isfinite(tracks.xy[:, 0])
-        measured = measure_pose(local.camera, start, xyz[usable], tracks.xy[usable])
-        return start if measured is None else measured[0]
+    def _new_map(self) -> LocalMap:
+        number = max(self.maps, default=-1) + 1
+        self.maps[number] = LocalMap(self.rig, self.options, self.executor, number)
+        return self.maps[number]
+
+    def _enter(self, local: LocalMap, tracks: ActiveTracks, pose: Array) -> None:
+        """Go on from the newest keyframe of a map."""
+        self.local, self.tracks, self.pose, self.step = local, tracks, pose, _IDENTITY
+        self.lost_since = None
+        self._count_mapped()
+
+    # ------------------------------------------------------------------ tracking
 
     def _track(self, record: FrameRecord, view: View) -> None:
         """Measure the pose in the current map; make a keyframe where one is due."""
@@ -168,14 +168,21 @@ class Odometry:
             return
         self.step = rigid3.compose(tracked.pose, rigid3.inverse(self.pose))
         self.pose, self.tracks, self.is_mapped = tracked.pose, tracked.tracks, tracked.is_mapped
-        self.num_lost = 0
         reason = keyframe_reason(local, tracked, self.num_mapped_at_keyframe, self.options)
-        if reason is not None:
-            self._take_over(local, None)
-            self.tracks = local.add_keyframe(view, self.pose, self.tracks, number)
-            self._count_mapped()
-            self._tell(local, reason, num_tracks=len(self.tracks), num_mapped=self.num_mapped_at_keyframe)
-        self._settle(record, FrameState.TRACKED, self.pose)
+        if reason is None:
+            self._settle(record, FrameState.TRACKED, self.pose, tracks=self.tracks.subset(self.is_mapped))
+        else:
+            self._make_keyframe(record, view, FrameState.TRACKED, reason)
+
+    def _make_keyframe(self, record: FrameRecord, view: View, state: FrameState, reason: str) -> None:
+        local = self.local
+        assert local is not None
+        self._take_over(local, None)
+        self.tracks = local.add_keyframe(view, self.pose, self.tracks, len(self.records))
+        self._count_mapped()
+        self._settle(record, state, self.pose, is_keyframe=True)
+        self._remember(view)
+        self._tell(reason, num_tracks=len(self.tracks), num_mapped=self.num_mapped_at_keyframe)
 
     def _take_over(self, local: LocalMap, number: int | None) -> None:
         """Let a finished adjustment count, and carry the current pose along with its keyframe."""
@@ -183,82 +190,121 @@ class Odometry:
         if local.backend.finish(local.keyframes, number):
             self.pose = rigid3.compose(self.pose, rigid3.compose(rigid3.inverse(before), local.pose(local.newest)))
 
-    def _lose(self, record: FrameRecord, local: LocalMap) -> None:
-        record.state, record.map_idx = FrameState.LOST, local.map_idx
-        self.num_lost += 1
-        if self.num_lost == 1:
-            self.events.warned(STAGE, f"{record.name}: tracking is lost", frame_idx=record.frame_idx)
-
     def _count_mapped(self) -> None:
         assert self.local is not None
-        _, self.is_mapped = self.local.points_of(self.tracks)
+        self.is_mapped = self.local.points_of(self.tracks)[1]
         self.num_mapped_at_keyframe = int(self.is_mapped.sum())
 
-    def _settle(self, record: FrameRecord, state: FrameState, pose: Array, live: bool = True) -> None:
-        """Note the pose of a frame relative to the newest keyframe."""
-        assert self.local is not None
-        record.state, record.map_idx, record.keyframe = state, self.local.map_idx, self.local.newest
-        record.frame_from_keyframe = rigid3.compose(pose, rigid3.inverse(self.local.pose(self.local.newest)))
-        record.num_mapped = int(self.is_mapped.sum())
-        if live:
-            record.live = pose.copy()
+    # ------------------------------------------------------------------ loss
 
-    def _tell(self, local: LocalMap, message: str, **data: Any) -> None:
+    def _lose(self, record: FrameRecord, local: LocalMap) -> None:
+        record.state, self.lost_since = FrameState.LOST, record.timestamp_s
+        self.counts["losses"] += 1
+        self.step = _IDENTITY
+        self.beginning = Beginning(self.rig.cameras[0], self.options, self.seed)
+        self.waiting.clear()
+        self.events.warned(STAGE, f"{record.name}: tracking is lost", frame_idx=record.frame_idx, map=local.map_idx)
+
+    def _recover(self, record: FrameRecord, view: View) -> bool:
+        """After a loss: the tracks where they were, or any place of any map that the frame looks like."""
+        local = self.local
+        assert local is not None
+        assert self.previous is not None
+        self._take_over(local, None)
+        if len(self.tracks) >= MIN_INLIERS and not self.waiting:
+            tracked = track(local, self.tracks, self.pose, _IDENTITY, self.previous, view.pyramids[0])
+            if tracked is not None and tracked.num_inliers > 0.5 * tracked.num_found:
+                self.pose, self.tracks, self.lost_since = tracked.pose, tracked.tracks, None
+                self._make_keyframe(record, view, FrameState.RELOCALIZED, "the tracks are found again")
+                return True
+        corners = find_corners(view.pyramids[0], np.zeros((0, 2)), self.options.max_tracks, min_distance_px=5.0)
+        if len(corners) < _MIN_CORNERS or not len(self.places):
+            return False
+        maps = {number: found.keyframes for number, found in self.maps.items()}
+        seen = PlaceView(view.images[0], corners)
+        found = relocalize(maps, self.places, seen, RelocalizeOptions())
+        if found is None:
+            return False
+        self.local, self.lost_since = self.maps[found.map_idx], None
+        self.pose, self.step = found.located.cam_from_world, _IDENTITY
+        self.tracks = self.local.tracks_at(found.located.point_id, corners[found.located.corner_idx], self.pose)
+        self.counts["relocalizations"] += 1
+        self.waiting.clear()
+        self._make_keyframe(record, view, FrameState.RELOCALIZED, f"relocalised at frame {found.frame_idx}")
+        return True
+
+    # ------------------------------------------------------------------ what is noted and told
+
+    def _settle(
+        self,
+        record: FrameRecord,
+        state: FrameState,
+        pose: Array,
+        *,
+        is_keyframe: bool = False,
+        keyframe: int | None = None,
+        tracks: ActiveTracks | None = None,
+    ) -> None:
+        """Note the pose of a frame relative to a keyframe, the newest if none is named."""
+        assert self.local is not None
+        record.state, record.map_idx, record.is_keyframe = state, self.local.map_idx, is_keyframe
+        record.keyframe = self.local.newest if keyframe is None else keyframe
+        record.frame_from_keyframe = rigid3.compose(pose, rigid3.inverse(self.local.pose(record.keyframe)))
+        if state != FrameState.WAITING:
+            record.live = pose.copy()
+        if tracks is not None:
+            record.point_id, record.xy = tracks.point_id.astype(np.int32), tracks.xy.astype(np.float32)
+
+    def _remember(self, view: View) -> None:
+        """Remember the newest keyframe as a place, if it shows something new."""
+        if not self.options.loops:
+            return
+        assert self.local is not None
+        mapped = self.tracks.subset(self.is_mapped)
+        common = np.isin(mapped.point_id, self.last_place, assume_unique=True).sum()
+        if len(mapped) < MIN_INLIERS or common > _NEW_PLACE * len(mapped):
+            return
+        self.last_place = mapped.point_id
+        self.places.add(self.local.map_idx, view.frame_idx, view.images[0], mapped.xy, mapped.point_id)
+
+    def _tell(self, message: str, **data: Any) -> None:
         """Say that the map has changed, with what is new in it."""
+        local = self.local
+        assert local is not None
         keyframes = local.keyframes
         recent = np.arange(max(0, local.newest - self.options.window), local.newest + 1)
         ids = np.unique(np.concatenate([keyframes.keyframes[k].point_id for k in recent]))
         ids = ids[keyframes.is_triangulated(ids)]
         frames = np.array([keyframes.keyframes[k].frame_idx for k in recent], np.int64)
-        snapshot = MapSnapshot(
-            int(frames[-1]), local.map_idx, frames, np.array([local.pose(int(k)) for k in recent]), ids,
-            keyframes.point_xyz[ids],
-        )  # fmt: skip
+        poses = np.array([local.pose(int(k)) for k in recent])
+        snapshot = MapSnapshot(int(frames[-1]), local.map_idx, frames, poses, ids, keyframes.point_xyz[ids])
         self.events.decided(STAGE, message, snapshot=snapshot, frame_idx=int(frames[-1]), keyframe=local.newest, **data)
 
     # ------------------------------------------------------------------ the end
 
     def finish(self) -> OdometryResult:
         """Adjust what there is once more, and gather the result."""
-        for local in self.maps:
+        conclusions, maps = {}, dict[int, KeyframeMap]()
+        for number, local in self.maps.items():
             local.backend.finish(local.keyframes)
-            if self.options.final_adjustment and local.newest > 0:
-                for _ in adjust_all(local.keyframes):
-                    self.events.raise_if_cancelled()
+            maps[number] = local.keyframes
+            self.events.started("adjustment", f"adjusting {local.newest + 1} keyframes together")
+            conclusions[number] = conclude(local.keyframes, self.options, self.events)
+            measure_again(self.records, local.keyframes, number)
+            self.events.finished("adjustment", **conclusions[number].report)
         self.executor.shutdown()
-        return gather(self.records, self.maps)
+        result = gather(self.records, maps, conclusions)
+        result.report = self._report(result)
+        return result
 
-
-def gather(records: list[FrameRecord], maps: list[LocalMap]) -> OdometryResult:
-    """The result of a run, the map with the most frames first."""
-    poses = np.full((len(records), 7), np.nan)
-    frame_map = np.full(len(records), -1, np.int32)
-    for n, record in enumerate(records):
-        if np.isfinite(record.frame_from_keyframe[0]):
-            poses[n] = rigid3.compose(record.frame_from_keyframe, maps[record.map_idx].pose(record.keyframe))
-            frame_map[n] = record.map_idx
-    sizes = [int((frame_map == m).sum()) for m in range(len(maps))]
-    order = sorted(range(len(maps)), key=lambda m: -sizes[m])
-    place = np.full(len(maps) + 1, -1, np.int32)
-    place[order] = np.arange(len(maps))
-    results = []
-    for m in order:
-        keyframes = maps[m].keyframes
-        model, _ = keyframes.reconstruction(np.arange(len(keyframes.keyframes)))
-        step = len(keyframes.rig.cameras)
-        results.append(
-            MapResult(
-                model, np.array([k.frame_idx for k in keyframes.keyframes], np.int64),
-                np.arange(len(keyframes.keyframes), dtype=np.int64) * step,
-                scale_source="stereo" if keyframes.rig.is_stereo else "none",
-                scale_sigma=0.0 if keyframes.rig.is_stereo else None,
-            )
-        )  # fmt: skip
-    return OdometryResult(
-        np.array([r.frame_idx for r in records], np.int64), [r.name for r in records],
-        np.array([r.timestamp_s for r in records]), poses, np.array([r.live for r in records]).reshape(-1, 7),
-        place[frame_map], np.array([r.state for r in records], np.uint8), results,
-    )  # fmt: skip
+    def _report(self, result: OdometryResult) -> dict[str, Any]:
+        tracked = np.isfinite(result.cam_from_world[:, 0])
+        backend = sum(local.backend.cpu_s for local in self.maps.values())
+        return {
+            "num_frames": len(self.records), "num_tracked": int(tracked.sum()), "num_maps": len(result.maps),
+            "num_keyframes": [len(m.keyframe_frame_idx) for m in result.maps],
+            "tracking_cpu_s": sum(record.time_s for record in self.records), "backend_cpu_s": backend, **self.counts,
+        }  # fmt: skip
 
 
 def run_odometry(
@@ -269,7 +315,7 @@ def run_odometry(
     Args:
         sequence: frames and the rig that took them.
         seed: of everything that is drawn.
-        threads: with one, the local adjustment runs beside the tracking all the same; the result does not depend on it.
+        threads: the result does not depend on it.
         events: told of every frame (``advanced`` with a FrameSnapshot) and of every change of the map (``decided`` with
             a MapSnapshot).
 
@@ -281,6 +327,5 @@ def run_odometry(
     events.started(STAGE, total=sequence.num_frames)
     for frame in sequence.frames():
         odometry.process(frame)
-    result = odometry.finish()
-    events.finished(STAGE, **result.report)
-    return result
+    events.finished(STAGE)
+    return odometry.finish()

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FrameSnapshot:
-    """One frame, with every ``advanced`` event of stage ``odometry``. Listeners may keep the arrays: nobody writes them.
+    """One frame, with every ``advanced`` event of stage ``odometry``. Listeners may keep the arrays.
 
     Attributes:
         frame_idx, name, timestamp_s: which frame.

@@ -44,9 +44,9 @@ def match_stereo(rig: Rig, pyramids: tuple[Pyramid, ...], xy: Array, depth: Arra
     out[known[good]] = aligned.xy[good]
     lost = np.flatnonzero(np.isnan(out[:, 0]))
     segments, counts = _candidates(rig, rays[lost])
-    found = search_along_epipolar(pyramids[0], xy[lost], pyramids[1], segments, counts)
-    good = found.is_found & (found.zncc > _MIN_LIKENESS)
-    out[lost[good]] = found.xy[good]
+    there, zncc, is_found = search_along_epipolar(pyramids[0], xy[lost], pyramids[1], segments, counts)
+    good = is_found & (zncc > _MIN_LIKENESS)
+    out[lost[good]] = there[good]
     out[_off_line_px(rig, rays, out) > _MAX_OFF_LINE_PX] = np.nan
     return out
 

@@ -86,16 +86,14 @@ def track(
     keep = np.ones(len(tracks), bool)
     keep[mapped] = inlier
     keep[~mapped] = _near_epipolar_lines(local, tracks.subset(~mapped), new_pose)
-    return Tracked(
-        new_pose, covariance, tracks.subset(keep), mapped[keep], int(mapped.sum()), int(inlier.sum()), sigma
-    )
+    return Tracked(new_pose, covariance, tracks.subset(keep), mapped[keep], int(mapped.sum()), int(inlier.sum()), sigma)
 
 
 def measure_pose(camera: Camera, start: Array, xyz: Array, xy: Array) -> tuple[Array, Array, Mask, float] | None:
     """Robust pose from points in the map: refined from a start, by RANSAC where that finds too few that agree.
 
     Returns:
-        (7,) cam_from_world, (6, 6) covariance, (N,) inliers, and the robust sigma of their residuals in pixels; or None.
+        (7,) cam_from_world, (6, 6) covariance, (N,) inliers and the robust sigma of their residuals in pixels, or None.
     """
     if len(xyz) < MIN_INLIERS:
         return None

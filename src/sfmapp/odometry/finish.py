@@ -1,0 +1,124 @@
+"""The last word on a map: all keyframes adjusted at once, the calibration questioned, and how sure the poses are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.adjust.covariance import estimate_covariances
+from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.events import Events
+from sfmapp.mapping.structure import residual_scale_px
+from sfmapp.odometry.backend import Job, classify, make_job, take_over
+from sfmapp.odometry.keyframe_map import KeyframeMap
+from sfmapp.odometry.options import OdometryOptions
+from sfmapp.scene.camera import Camera, CameraModel
+from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.rig import Rig
+
+Array = NDArray[np.float64]
+
+STAGE = "adjustment"
+# What a calibration is off by: rectification, temperature and a lens model with few terms leave about a percent.
+_FOCAL_SIGMA, _DISTORTION_SIGMA = 0.01, 0.01
+# A changed calibration has to explain this much, in units of the noise, per free parameter. Independent noise alone
+# explains 1; tracks that slide along edges are not independent, so ten times the 3 sigma bound of one parameter.
+_MIN_EVIDENCE = 90.0
+# A map whose poses leave the calibration open must not decide on it: the largest change in sigmas of what was given.
+_MAX_CHANGE_SIGMAS = 4.0
+# Covariances take two dense matrices over all poses.
+_MAX_COVARIANCE_KEYFRAMES = 400
+_MAX_STEPS = 30
+# Residuals are not believed to be better than that, however well a synthetic sequence fits.
+_MIN_SIGMA_PX = 0.02
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """What the end of a map has brought.
+
+    Attributes:
+        covariance: (K, 6, 6) of the keyframes; None if not asked for or too many.
+        gauge: what it holds fixed.
+        report: numbers for the report.
+    """
+
+    covariance: Array | None
+    gauge: str
+    report: dict[str, Any]
+
+
+def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -> Conclusion:
+    """Adjust all keyframes and points of a map, in place, and the cameras where the images contradict them."""
+    everything = np.arange(len(keyframes.keyframes))
+    job = make_job(keyframes, everything, everything > 0)
+    model, report = job.model, dict[str, Any]()
+    for _ in range(2):
+        _adjust(model, max(residual_scale_px(model), _MIN_SIGMA_PX))
+        report["sigma_px"] = classify(model, job.num_elsewhere)
+        events.raise_if_cancelled()
+    if options.refine_camera:
+        refined, report["camera"] = _question_cameras(job, max(report["sigma_px"], _MIN_SIGMA_PX))
+        if refined is not None:
+            events.decided(STAGE, "the images contradict the given calibration, which is refined", **report["camera"])
+            job.model = model = refined
+    take_over(job, keyframes)
+    keyframes.rig = Rig(tuple(model.cameras), keyframes.rig.cam_from_rig)
+    covariance, gauge = None, ""
+    if options.covariance and 1 < len(everything) <= _MAX_COVARIANCE_KEYFRAMES:
+        covariance, gauge = _covariance(model, len(keyframes.rig.cameras))
+    return Conclusion(covariance, gauge, report)
+
+
+def _adjust(model: Reconstruction, sigma: float, given: list[Camera] | None = None) -> float:
+    """Adjust all, the cameras as well if they were given; returns the cost in units of the noise."""
+    num_sensors = 1 if model.rig is None else len(model.rig.cam_from_rig)
+    variable = np.ones(len(model.image_names), bool)
+    variable[:num_sensors] = False
+    # the engine counts a residual of one pixel as one sigma, so priors are handed over in that unit
+    priors = None if given is None else [replace(c, focal_sigma=_FOCAL_SIGMA * c.focal / sigma) for c in given]
+    result = adjust_bundle(
+        model,
+        AdjustOptions(
+            loss="cauchy", loss_scale_px=2 * sigma, max_iterations=_MAX_STEPS, relative_cost_tolerance=1e-5,
+            refine_focal=given is not None, refine_distortion=given is not None,
+            distortion_sigma=_DISTORTION_SIGMA / sigma,
+        ),
+        variable_images=variable, prior_cameras=priors,
+    )  # fmt: skip
+    return 2 * result.final_cost / sigma**2
+
+
+def _question_cameras(job: Job, sigma: float) -> tuple[Reconstruction | None, dict[str, Any]]:
+    """The model with refined cameras if they explain the same observations much better, and the numbers behind that."""
+    given = [_with_distortion(camera) for camera in job.model.cameras]
+    fixed, free = job.model.copy(), job.model.copy()
+    free.cameras = list(given)
+    before, after = _adjust(fixed, sigma), _adjust(free, sigma, given)
+    evidence = (before - after) / sum(len(camera.params) - 2 for camera in given)
+    changes = [c.focal / g.focal - 1 for c, g in zip(free.cameras, given, strict=True)]
+    accepted = evidence > _MIN_EVIDENCE and max(map(abs, changes)) < _MAX_CHANGE_SIGMAS * _FOCAL_SIGMA
+    numbers = {
+        "is_refined": bool(accepted), "evidence_per_parameter": evidence, "min_evidence": _MIN_EVIDENCE,
+        "focal_change": changes, "given": [c.params.tolist() for c in given],
+        "refined": [c.params.tolist() for c in free.cameras],
+    }  # fmt: skip
+    if accepted:
+        classify(free, job.num_elsewhere)
+    return free if accepted else None, numbers
+
+
+def _with_distortion(camera: Camera) -> Camera:
+    """The same camera in a model that has room for distortion, free to change."""
+    if camera.is_fisheye:
+        return replace(camera, is_fixed=False)
+    return replace(camera, model=CameraModel.OPENCV, params=camera.canonical, is_fixed=False)
+
+
+def _covariance(model: Reconstruction, num_sensors: int) -> tuple[Array, str]:
+    """(K, 6, 6) of the keyframes and what they are relative to."""
+    found = estimate_covariances(model, AdjustOptions(loss="trivial", refine_focal=False, refine_distortion=False))
+    return found.poses[::num_sensors], "centroid, mean rotation" + ("" if num_sensors > 1 else " and spread")

@@ -1,0 +1,95 @@
+"""What is kept of every frame, and how a result is made of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.geometry import rigid3
+from sfmapp.odometry.finish import Conclusion
+from sfmapp.odometry.keyframe_map import KeyframeMap
+from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
+from sfmapp.odometry.tracker import measure_pose
+
+Array = NDArray[np.float64]
+
+_NO_POSE = np.full(7, np.nan)
+
+
+@dataclass
+class FrameRecord:
+    """What is kept of a frame: its pose relative to a keyframe, so that it moves with the map, and what it saw.
+
+    Attributes:
+        map_idx: number of the map in the order of their beginnings, -1 without one.
+        keyframe: position in the map's keyframes. frame_from_keyframe: (7,), NaN without a pose.
+        is_keyframe: it is that keyframe.
+        live: (7,) cam_from_world as it was given out.
+        point_id: (N,) int32 and xy: (N, 2) float32, the points that its pose was measured with.
+        time_s: CPU time of tracking, without the back end.
+    """
+
+    frame_idx: int
+    name: str
+    timestamp_s: float
+    state: FrameState = FrameState.WAITING
+    map_idx: int = -1
+    keyframe: int = -1
+    is_keyframe: bool = False
+    frame_from_keyframe: Array = field(default_factory=_NO_POSE.copy)
+    live: Array = field(default_factory=_NO_POSE.copy)
+    point_id: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    xy: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    time_s: float = 0.0
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the frame has a place in its map."""
+        return bool(np.isfinite(self.frame_from_keyframe[0]))
+
+
+def measure_again(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int) -> None:
+    """Poses of the frames between the keyframes of a map, from the points as they are in the end."""
+    camera = keyframes.rig.cameras[0]
+    for record in records:
+        if record.map_idx != map_idx or record.is_keyframe or not record.has_pose:
+            continue
+        keyframe = keyframes.keyframes[record.keyframe].rig_from_world
+        start = rigid3.compose(record.frame_from_keyframe, keyframe)
+        xyz = keyframes.point_xyz[record.point_id]
+        known = np.isfinite(xyz[:, 0])
+        measured = measure_pose(camera, start, xyz[known], record.xy[known].astype(np.float64))
+        if measured is not None:
+            record.frame_from_keyframe = rigid3.compose(measured[0], rigid3.inverse(keyframe))
+
+
+def gather(
+    records: list[FrameRecord], maps: dict[int, KeyframeMap], conclusions: dict[int, Conclusion]
+) -> OdometryResult:
+    """The result of a run, the map with the most frames first."""
+    poses = np.full((len(records), 7), np.nan)
+    frame_map = np.full(len(records), -1, np.int64)
+    for n, record in enumerate(records):
+        if record.has_pose:
+            keyframe = maps[record.map_idx].keyframes[record.keyframe]
+            poses[n] = rigid3.compose(record.frame_from_keyframe, keyframe.rig_from_world)
+            frame_map[n] = record.map_idx
+    order = sorted(maps, key=lambda m: (-int((frame_map == m).sum()), m))
+    place = np.array([-1 if m < 0 else order.index(int(m)) for m in frame_map], np.int32)
+    return OdometryResult(
+        np.array([r.frame_idx for r in records], np.int64), [r.name for r in records],
+        np.array([r.timestamp_s for r in records]), poses, np.array([r.live for r in records]).reshape(-1, 7), place,
+        np.array([r.state for r in records], np.uint8), [_map_result(maps[m], conclusions[m]) for m in order],
+    )  # fmt: skip
+
+
+def _map_result(keyframes: KeyframeMap, conclusion: Conclusion) -> MapResult:
+    num, num_sensors = len(keyframes.keyframes), len(keyframes.rig.cameras)
+    model, _ = keyframes.reconstruction(np.arange(num))
+    return MapResult(
+        model, np.array([k.frame_idx for k in keyframes.keyframes], np.int64),
+        np.arange(num, dtype=np.int64) * num_sensors, conclusion.covariance, conclusion.gauge,
+        "stereo" if num_sensors > 1 else "none", 0.0 if num_sensors > 1 else None,
+    )  # fmt: skip
