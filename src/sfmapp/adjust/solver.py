@@ -172,12 +172,14 @@ def make_engine(
 
 def compile_kernels() -> None:
     """Compile, or load from the cache, every kernel of this package, by running each on next to nothing."""
+    from sfmapp.adjust.covariance import estimate_covariances
     from sfmapp.adjust.pose import refine_pose
     from sfmapp.scene.synthetic import make_scene
 
     scene = make_scene(0, 3, 8)
     model = scene.observed.copy()
     adjust_bundle(model, AdjustOptions(max_iterations=2), variable_images=np.array([True, True, False]))
+    estimate_covariances(model, AdjustOptions(refine_focal=False, refine_distortion=False))
     camera, tracks = model.cameras[0], model.tracks
     refine_pose(camera.canonical, camera.is_fisheye, model.cam_from_world[0], model.point_xyz, tracks.obs_xy[:8])
     no_images = np.zeros(0, np.int32)
