@@ -7,6 +7,7 @@ import contextlib
 import json
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -56,3 +57,35 @@ def print_json(value: Any) -> None:
     from sfmapp.pipelines.workspace import plain_number
 
     print(json.dumps(value, default=plain_number), flush=True)
+
+
+def limit_library_threads() -> None:
+    """Before numpy is imported: our own workers use the cores; a thread pool in the linear algebra beneath each of them
+    would only compete with them for the cores, and would make sums depend on their number."""
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
+
+def load_numba_without_blas() -> None:
+    """numba loads all of scipy.linalg for kernels that call BLAS, a fifth of a second and 30 MB; none of ours does.
+    This process is the command's own; a program that imports sfmapp keeps its numba whole."""
+    absent = sys.modules.setdefault("scipy.linalg", None)  # type: ignore[arg-type]
+    try:
+        import numba.np.arraymath  # noqa: F401
+    finally:
+        if absent is None:
+            del sys.modules["scipy.linalg"]
+
+
+def list_options(args: argparse.Namespace) -> int:
+    """Print every option with its type, default and comment."""
+    from sfmapp.pipelines import options
+
+    rows = options.list_options()
+    if args.json:
+        print_json([dict(zip(("name", "type", "default", "comment"), row, strict=True)) for row in rows])
+        return 0
+    width = max(len(name) for name, *_ in rows)
+    for name, kind, default, comment in rows:
+        print(f"{name:<{width}}  {default}  [{kind}]\n{'':<{width}}  {comment}")
+    return 0

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 
 import sfmapp
-from sfmapp.cli import convert, inspect, reconstruct
+from sfmapp.cli import convert, evaluate, inspect, odometry, reconstruct
 from sfmapp.errors import SfmError
 
 BUG = 1
@@ -49,13 +49,13 @@ def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     parser = argparse.ArgumentParser(
         prog="sfmapp",
-        description="Photographs into cameras and points, on an ordinary CPU.",
+        description="Photographs and video into cameras, points and trajectories, on an ordinary CPU.",
         epilog=EXIT_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"sfmapp {sfmapp.__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for family in (reconstruct, inspect, convert):
+    for family in (reconstruct, odometry, inspect, convert):
         family.add_commands(commands)
     return parser
 

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sfmapp.cli.common import add_output_flags, listening, print_json
+from sfmapp.cli.common import (
+    add_output_flags,
+    limit_library_threads,
+    list_options,
+    listening,
+    load_numba_without_blas,
+    print_json,
+)
 
 if TYPE_CHECKING:
     from sfmapp.pipelines.options import Options
@@ -66,7 +71,7 @@ def _add_option_flags(parser: argparse.ArgumentParser) -> None:
 
 def _options(args: argparse.Namespace) -> Options:
     """The effective options of a command line."""
-    _limit_library_threads()
+    limit_library_threads()
     from sfmapp.pipelines.options import load_options
 
     flags = {
@@ -80,27 +85,9 @@ def _options(args: argparse.Namespace) -> Options:
     return load_options(args.preset, settings)
 
 
-def _limit_library_threads() -> None:
-    """Before numpy is imported: our own workers use the cores; a thread pool in the linear algebra beneath each of them
-    would only compete with them for the cores, and would make sums depend on their number."""
-    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
-
-
-def _load_numba_without_blas() -> None:
-    """numba loads all of scipy.linalg for kernels that call BLAS, a fifth of a second and 30 MB; none of ours does.
-    This process is the command's own; a program that imports sfmapp keeps its numba whole."""
-    absent = sys.modules.setdefault("scipy.linalg", None)  # type: ignore[arg-type]
-    try:
-        import numba.np.arraymath  # noqa: F401
-    finally:
-        if absent is None:
-            del sys.modules["scipy.linalg"]
-
-
 def _reconstruct(args: argparse.Namespace) -> int:
     if args.list_options:
-        return _list_options(args)
+        return list_options(args)
     if args.images is None or args.output is None:
         args.parser.error("IMAGES and -o OUT are needed")
     report = _run(args, args.images, _options(args))
@@ -135,7 +122,7 @@ def _demo(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace, images: str, options: Options) -> dict[str, Any]:
-    _load_numba_without_blas()
+    load_numba_without_blas()
     from sfmapp.pipelines.reconstruct import reconstruct
     from sfmapp.pipelines.usage import Stopwatch
 
@@ -143,19 +130,6 @@ def _run(args: argparse.Namespace, images: str, options: Options) -> dict[str, A
     with listening(args) as events:
         result = reconstruct(images, args.output, options, events=events, record=not args.no_recording, watch=watch)
     return result.report
-
-
-def _list_options(args: argparse.Namespace) -> int:
-    from sfmapp.pipelines.options import list_options
-
-    rows = list_options()
-    if args.json:
-        print_json([dict(zip(("name", "type", "default", "comment"), row, strict=True)) for row in rows])
-        return 0
-    width = max(len(name) for name, *_ in rows)
-    for name, kind, default, comment in rows:
-        print(f"{name:<{width}}  {default}  [{kind}]\n{'':<{width}}  {comment}")
-    return 0
 
 
 def _result(output: Path, report: dict[str, Any]) -> dict[str, Any]:

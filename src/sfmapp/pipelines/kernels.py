@@ -1,6 +1,7 @@
-"""Compile the numba kernels in the background while the first images are read, and say so if it takes long.
+"""Compile the numba kernels before they are needed, and say so if it takes long.
 
-The first run on a machine compiles them, tens of CPU seconds; later ones load them from numba's cache.
+The first run on a machine compiles them, tens of CPU seconds; later ones load them from numba's cache. A reconstruction
+does so in the background while the first images are read; odometry before its first frame, which must not wait.
 """
 
 from __future__ import annotations
@@ -18,12 +19,15 @@ from sfmapp.events import Events
 STAGE = "kernels"
 # in the order in which a run needs them
 MODULES = ("sfmapp.features.extract", "sfmapp.matching.stage", "sfmapp.mapping.incremental")
+ODOMETRY_MODULES = ("sfmapp.odometry.run",)
 
 
 @contextmanager
 def kernels_compiling(events: Events, usage: dict[str, dict[str, Any]]) -> Iterator[None]:
-    """Compile all kernels in a thread beside the block; adds what it took to ``usage``."""
-    thread = threading.Thread(target=_compile, args=(events, usage), name=STAGE, daemon=True)
+    """Compile those of a reconstruction in a thread beside the block; adds what it took to ``usage``."""
+    thread = threading.Thread(
+        target=lambda: usage.update({STAGE: _compile(events, MODULES)}), name=STAGE, daemon=True
+    )  # fmt: skip
     thread.start()
     try:
         yield
@@ -31,18 +35,29 @@ def kernels_compiling(events: Events, usage: dict[str, dict[str, Any]]) -> Itera
         thread.join()
 
 
-def _compile(events: Events, usage: dict[str, dict[str, Any]]) -> None:
+def compile_odometry_kernels(events: Events) -> dict[str, Any]:
+    """Compile those of odometry; returns what it took.
+
+    Raises:
+        InterruptedRunError: ``events`` was asked to stop.
+    """
+    took = _compile(events, ODOMETRY_MODULES)
+    events.raise_if_cancelled()
+    return took
+
+
+def _compile(events: Events, modules: tuple[str, ...]) -> dict[str, Any]:
     from numba.core import event as numba_event
 
     wall, cpu = time.monotonic(), time.thread_time()
     listener = _listener(events)
     numba_event.register("numba:compile", listener)
     try:
-        for name in MODULES:
+        for name in modules:
             import_module(name).compile_kernels()
             events.raise_if_cancelled()
     except InterruptedRunError:
-        pass  # the block hears of it at its own next step
+        pass  # the run hears of it at its own next step
     except Exception as error:  # whoever calls the kernel next meets the same error, where it belongs
         events.warned(STAGE, f"compiling ahead failed: {type(error).__name__}: {error}")
     finally:
@@ -50,7 +65,7 @@ def _compile(events: Events, usage: dict[str, dict[str, Any]]) -> None:
     took = {"wall_s": round(time.monotonic() - wall, 4), "cpu_s": round(time.thread_time() - cpu, 4)}
     if listener.num_compiled:
         events.finished(STAGE, f"{listener.num_compiled} kernels compiled, once", **took)
-    usage[STAGE] = took | {"num_compiled": listener.num_compiled}
+    return took | {"num_compiled": listener.num_compiled}
 
 
 def _listener(events: Events) -> Any:

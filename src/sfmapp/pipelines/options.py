@@ -23,9 +23,11 @@ from sfmapp.adjust.solver import AdjustOptions
 from sfmapp.errors import SfmError, UsageError
 from sfmapp.features.extract import FeatureOptions
 from sfmapp.images.image_set import ImageOptions
+from sfmapp.images.sequence import SequenceOptions
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.pairs import PairOptions
+from sfmapp.odometry.options import OdometryOptions
 from sfmapp.pipelines import resources
 
 LIST_ADVICE = "sfmapp reconstruct --list-options shows every option with its default"
@@ -33,10 +35,11 @@ LIST_ADVICE = "sfmapp reconstruct --list-options shows every option with its def
 
 @dataclass(frozen=True)
 class Options:
-    """Everything that a reconstruction obeys. The options of a stage live next to its code.
+    """Everything that a run obeys. The options of a stage live next to its code.
 
     Attributes:
-        images, features, pairs, matching, mapping, adjust: the options of the stages.
+        images, features, pairs, matching, mapping, adjust: the options of the stages of a reconstruction.
+        sequence, odometry: those of odometry.
         seed: where every random choice starts; the same seed gives the same bytes.
         threads: worker threads; None: as many as the process has cores. Results do not depend on it.
         min_registered: fail (exit code 5) when fewer images are registered; None: any model will do.
@@ -48,6 +51,8 @@ class Options:
     matching: MatchingOptions = field(default_factory=MatchingOptions)
     mapping: MappingOptions = field(default_factory=MappingOptions)
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
+    sequence: SequenceOptions = field(default_factory=SequenceOptions)
+    odometry: OdometryOptions = field(default_factory=OdometryOptions)
     seed: int = 0
     threads: int | None = None
     min_registered: int | None = None
@@ -82,10 +87,14 @@ def options_from_dict(values: Mapping[str, Any]) -> Options:
 
 def with_absolute_paths(options: Options) -> Options:
     """The same options, good in any working directory."""
-    masks = options.images.mask_path
-    if masks is None:
-        return options
-    return dataclasses.replace(options, images=dataclasses.replace(options.images, mask_path=os.path.abspath(masks)))
+    masks, sequence = options.images.mask_path, options.sequence
+    if masks is not None:
+        images = dataclasses.replace(options.images, mask_path=os.path.abspath(masks))
+        options = dataclasses.replace(options, images=images)
+    given = {name: path for name in ("camera", "imu", "truth") if (path := getattr(sequence, name)) is not None}
+    # a camera may be a file or numbers
+    found = {name: os.path.abspath(path) for name, path in given.items() if name != "camera" or os.path.exists(path)}
+    return dataclasses.replace(options, sequence=dataclasses.replace(sequence, **found)) if found else options
 
 
 def options_to_dict(options: Any) -> dict[str, Any]:

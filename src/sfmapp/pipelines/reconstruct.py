@@ -85,7 +85,7 @@ def reconstruct(
         for listener in (event_log, decisions, recorder):
             if listener is not None:
                 events.subscribe(listener)
-        run = Run(source, workspace, options, events, watch or Stopwatch(), decisions, threads, recorder)
+        run = Run(source, workspace, options, events, watch or Stopwatch(), decisions, threads, recorder=recorder)
         report = _run(run)
         model, _ = read_model(workspace.model())
     found = report["models"][0]["num_registered"]
@@ -106,7 +106,7 @@ def _run(run: Run) -> dict[str, Any]:
     keys = stage_keys(run.options, run.image_set)
     if report := results.earlier_report(run, keys):
         return report
-    results.note_inputs(run, keys)
+    run.note_inputs(keys.inputs)
     try:
         models = _reconstruct(run, run.image_set, keys)
     except NoReconstructionError as failure:

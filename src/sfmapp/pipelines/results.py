@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import sfmapp
 from sfmapp.errors import NoReconstructionError
-from sfmapp.pipelines.options import options_to_dict
-from sfmapp.pipelines.workspace import plain_number, recorded_versions
+from sfmapp.pipelines.workspace import plain_number
 from sfmapp.report.document import FORMAT, camera_rows, funnel_of_images, funnel_without_matches, make_checks
 from sfmapp.report.html import render_html
 
@@ -49,19 +47,6 @@ def earlier_report(run: Run, keys: StageKeys) -> dict[str, Any] | None:
     return report
 
 
-def note_inputs(run: Run, keys: StageKeys) -> None:
-    """Write down what this run works on and how, before it begins."""
-    run.workspace.manifest |= {
-        # absolute, so that the workspace can be looked at from anywhere
-        "source": os.path.abspath(run.source),
-        "seed": run.options.seed,
-        "options": options_to_dict(run.options),
-        "versions": {"sfmapp": sfmapp.__version__, **recorded_versions()},
-        "inputs": keys.inputs,
-    }
-    run.workspace.save()
-
-
 def write_results(
     run: Run, keys: StageKeys, models: Sequence[Reconstruction], failure: NoReconstructionError | None = None
 ) -> dict[str, Any]:
@@ -77,7 +62,7 @@ def write_results(
     report = _make_report(run, models, failure)
     workspace.write_text("report.html", render_html(report, models[0] if models else None))
     report["run"] |= run.watch.read()  # the last measurement that can still be written down
-    workspace.write_text("report.json", _report_text(report))
+    workspace.write_text("report.json", report_text(report))
     workspace.finish("mapping", run.usage.get("mapping", {}))
     manifest["usage"] = run.usage
     workspace.save()
@@ -118,7 +103,7 @@ def _make_report(run: Run, models: Sequence[Reconstruction], failure: NoReconstr
             "message": str(failure) if failure else "",
             "advice": failure.advice if failure else None,
         },
-        "run": _run_facts(run) | run.watch.read(),
+        "run": run.facts(),
         "models": summaries,
         "checks": make_checks(summaries[0], len(models), images, cameras) if models else [],
         "images": images,
@@ -140,19 +125,7 @@ def _image_rows(run: Run, failure: NoReconstructionError | None) -> list[dict[st
     return funnel_of_images(names, run.features, run.correspondences, mapping.get("images", []), run.options.mapping)
 
 
-def _run_facts(run: Run) -> dict[str, Any]:
-    return {
-        "source": run.source,
-        "seed": run.options.seed,
-        "threads": run.threads,
-        "options": options_to_dict(run.options),
-        "versions": run.workspace.manifest["versions"],
-        "started": run.started.isoformat(timespec="seconds"),
-        "is_up_to_date": False,
-    }
-
-
-def _report_text(report: Mapping[str, Any]) -> str:
+def report_text(report: Mapping[str, Any]) -> str:
     """JSON with a line for each entry of the outermost objects and lists: readable, and written in one go."""
     parts = []
     for key, value in report.items():

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+import sfmapp
 from sfmapp.events import Events
 from sfmapp.pipelines.listeners import DecisionLog
-from sfmapp.pipelines.options import Options
+from sfmapp.pipelines.options import Options, options_to_dict
 from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import Workspace
+from sfmapp.pipelines.workspace import Workspace, recorded_versions
 from sfmapp.viewer.listener import RecordingListener
 
 if TYPE_CHECKING:
@@ -22,16 +24,14 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Run:
-    """State of a reconstruction under way.
+class Job:
+    """What every command that writes a workspace keeps at hand.
 
     Attributes:
-        source: what the user gave as images.
+        source: what the user gave to work on.
         threads: workers.
-        recorder: watches the run for a recording; None if none is wanted.
         usage: wall and CPU seconds and peak memory of each stage, by name.
         stages: the report of each stage, by name.
-        image_set, features, correspondences: results so far.
     """
 
     source: str
@@ -41,22 +41,63 @@ class Run:
     watch: Stopwatch
     log: DecisionLog
     threads: int
-    recorder: RecordingListener | None
     usage: dict[str, dict[str, Any]] = field(default_factory=dict)
     stages: dict[str, Any] = field(default_factory=dict)
-    image_set: ImageSet | None = None
-    features: list[Features] = field(default_factory=list)
-    correspondences: Correspondences | None = None
     started: datetime = field(default_factory=lambda: datetime.now(UTC))
 
     @contextmanager
     def stage(self, name: str, key: str | None = None) -> Iterator[None]:
         """Measure a step; with a key, note in the manifest when it begins and ends. Obeys a wish to stop."""
         self.events.raise_if_cancelled()
-        watch = Stopwatch()
-        if key is not None:
-            self.workspace.begin(name, key)
-        yield
-        self.usage[name] = watch.read()
+        with self.measured(name):
+            if key is not None:
+                self.workspace.begin(name, key)
+            yield
         if key is not None:
             self.workspace.finish(name, self.usage[name])
+
+    @contextmanager
+    def measured(self, name: str) -> Iterator[None]:
+        """Measure a step that is done in any case."""
+        watch = Stopwatch()
+        yield
+        self.usage[name] = watch.read()
+
+    def facts(self) -> dict[str, Any]:
+        """What the report says of the run: how it was called, and what it has taken so far."""
+        return {
+            "source": self.source,
+            "seed": self.options.seed,
+            "threads": self.threads,
+            "options": options_to_dict(self.options),
+            "versions": self.workspace.manifest["versions"],
+            "started": self.started.isoformat(timespec="seconds"),
+            "is_up_to_date": False,
+        } | self.watch.read()
+
+    def note_inputs(self, inputs: dict[str, str]) -> None:
+        """Write down what this run works on and how, before it begins; ``inputs``: digests by name."""
+        self.workspace.manifest |= {
+            # absolute, so that the workspace can be looked at from anywhere; a stream has no place
+            "source": self.source if "://" in self.source else os.path.abspath(self.source),
+            "seed": self.options.seed,
+            "options": options_to_dict(self.options),
+            "versions": {"sfmapp": sfmapp.__version__, **recorded_versions()},
+            "inputs": inputs,
+        }
+        self.workspace.save()
+
+
+@dataclass
+class Run(Job):
+    """State of a reconstruction under way.
+
+    Attributes:
+        recorder: watches the run for a recording; None if none is wanted.
+        image_set, features, correspondences: results so far.
+    """
+
+    recorder: RecordingListener | None = None
+    image_set: ImageSet | None = None
+    features: list[Features] = field(default_factory=list)
+    correspondences: Correspondences | None = None

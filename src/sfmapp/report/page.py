@@ -21,6 +21,7 @@ border-radius:50%;margin-right:.5rem}
 .green::before{background:#2a9d4a}.amber::before{background:#e0a100}.red::before{background:#d1372c}
 .failure{border-left:.3rem solid #d1372c;padding:.3rem 1rem;background:#d1372c18}
 .dim{color:#888}svg{width:100%;max-height:32rem;border:1px solid #8884}details{margin:.5rem 0}
+.plot{max-height:none}.plot text,.view text{fill:currentColor;font-size:13px}.grid{stroke:#8884}
 """
 
 

@@ -24,14 +24,14 @@ def top_view_svg(model: Reconstruction) -> str:
     """Points in their colours and cameras as triangles, seen along the mean downward direction of the images."""
     registered = model.registered_idx
     rotation = rigid3.rotation_matrix(model.cam_from_world[registered])
-    axes = _ground_axes(rotation)
+    axes = ground_axes(rotation)
     centers = model.centers[registered] @ axes.T
     points_idx = np.flatnonzero(model.is_triangulated)
     points_idx = points_idx[:: max(1, len(points_idx) // MAX_POINTS)]
     points = model.point_xyz[points_idx] @ axes.T
-    scale, offset = _frame(points, centers)
+    scale, offset = fit_page(points, centers)
     to_page = lambda xy: (xy * scale + offset).round(1)  # noqa: E731
-    parts = _points(to_page(points), model.point_rgb[points_idx])
+    parts = point_paths(to_page(points), model.point_rgb[points_idx])
     # 2.5 % of the width: visible, and still apart in a ring of fifty cameras
     size = 0.025 * WIDTH / abs(scale[0])
     forward, right = rotation[:, 2] @ axes.T, rotation[:, 0] @ axes.T
@@ -43,7 +43,7 @@ def top_view_svg(model: Reconstruction) -> str:
     return f'<svg viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}" {style}>{"".join(parts)}</svg>'
 
 
-def _ground_axes(rotation: Array) -> Array:
+def ground_axes(rotation: Array) -> Array:
     """(2, 3) right and forward, both across the mean downward direction of cameras with cam_from_world (R, 3, 3)."""
     down = rotation[:, 1].mean(0)
     # images that are turned against each other have no common downward direction: any will do
@@ -55,7 +55,7 @@ def _ground_axes(rotation: Array) -> Array:
     return np.array([np.cross(down, forward), forward])
 
 
-def _frame(points: Array, centers: Array) -> tuple[Array, Array]:
+def fit_page(points: Array, centers: Array) -> tuple[Array, Array]:
     """Scale (2,) and offset (2,) that fit the cameras and all but the most distant points into the page."""
     shown = centers
     if len(points):
@@ -67,7 +67,7 @@ def _frame(points: Array, centers: Array) -> tuple[Array, Array]:
     return scale, np.array([WIDTH, HEIGHT]) / 2 - scale * (low + high) / 2
 
 
-def _points(xy: Array, rgb: NDArray[np.uint8]) -> list[str]:
+def point_paths(xy: Array, rgb: NDArray[np.uint8]) -> list[str]:
     """Dots grouped by coarse colour: one path each, a third of the bytes of single circles."""
     inside = (xy >= 0).all(1) & (xy[:, 0] <= WIDTH) & (xy[:, 1] <= HEIGHT)
     groups: dict[tuple[Any, ...], list[str]] = defaultdict(list)

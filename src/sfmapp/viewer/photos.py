@@ -62,6 +62,12 @@ def load_screen_photo(path: Path, orientation: int, max_side_px: int, thumbnail_
     return ScreenPhoto(photo, pixels.shape[1::-1], _jpeg(thumbnail, _THUMBNAIL_QUALITY), thumbnail.shape[1::-1])
 
 
+def shrunk_jpeg(pixels: Any, max_side_px: int, quality: int) -> tuple[bytes, tuple[int, int]]:
+    """uint8 pixels (H, W) or (H, W, 3) BGR as JPEG bytes, shrunk to fit, and the size (width, height) of that."""
+    small = _shrink(pixels, max_side_px)
+    return _jpeg(small, quality), small.shape[1::-1]
+
+
 def _decode_jpeg(data: bytes, shrink: float) -> Any:
     """(H, W, 3) BGR uint8 as stored, reduced by the largest power of two below shrink; None if it is damaged."""
     import cv2

@@ -37,12 +37,12 @@ class Stage:
 
 def set_stage(replay: Replay) -> Stage:
     """Place the models of a replay side by side, with all of them in view."""
-    rotation = _turn_to_z(replay.up)
+    rotation = turn_to_z(replay.up)
     num_models = len(replay.model_cam_from_world)
     if not num_models:
         return Stage(rotation, np.ones(0), np.zeros((0, 3)), 0.1, np.array([0.0, -3.0, 1.5]), np.zeros(3))
     forward = rigid3.rotation_matrix(_poses(replay, 0))[:, 2] @ rotation.T
-    direction = _eye_direction(forward.mean(0))
+    direction = eye_direction(forward.mean(0))
     right = np.array([-direction[1], direction[0], 0.0])
     right /= np.linalg.norm(right)
     bodies = [_body(replay, m, rotation) for m in range(num_models)]
@@ -58,7 +58,7 @@ def set_stage(replay: Replay) -> Stage:
         shift[m] += (edge + _FURTHER_GAP * size - along.min()) * right
         bodies[m] = bodies[m] + shift[m]
         edge = float((bodies[m] @ right).max())
-    eye, target = _frame(np.concatenate(bodies), direction)
+    eye, target = frame_view(np.concatenate(bodies), direction)
     return Stage(rotation, scale, shift, _frustum_length(replay), eye, target)
 
 
@@ -90,7 +90,7 @@ def _frustum_length(replay: Replay) -> float:
     return float(np.clip(0.45 * nearest, 0.04 * depth, 0.12 * depth)) or 0.1
 
 
-def _eye_direction(mean_forward: Array) -> Array:
+def eye_direction(mean_forward: Array) -> Array:
     """(3,) unit vector from the scene to the eye: behind and above the cameras, a little aside so that depth shows."""
     heading = mean_forward * [1.0, 1.0, 0.0]
     length = float(np.linalg.norm(heading))
@@ -101,7 +101,7 @@ def _eye_direction(mean_forward: Array) -> Array:
     return np.asarray(direction / np.linalg.norm(direction))
 
 
-def _frame(points: Array, direction: Array) -> tuple[Array, Array]:
+def frame_view(points: Array, direction: Array) -> tuple[Array, Array]:
     """Eye and target (3,) each, the eye in a unit direction from the target, so that points (N, 3) fill the view."""
     right = np.cross(-direction, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -120,7 +120,7 @@ def _frame(points: Array, direction: Array) -> tuple[Array, Array]:
     return target + distance * direction, target
 
 
-def _turn_to_z(up: Array) -> Array:
+def turn_to_z(up: Array) -> Array:
     """The smallest rotation (3, 3) that takes a vector to +z."""
     z = np.asarray(up, np.float64) / np.linalg.norm(up)
     axis = np.cross(z, [0.0, 0.0, 1.0])

@@ -9,10 +9,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
 from sfmapp.errors import InputError, SfmError
+from sfmapp.viewer.live import Screen
 
 HOST = "127.0.0.1"
 WEB_PORT, DATA_PORT = 9090, 9876
@@ -57,20 +59,62 @@ def view(
         raise SfmError(f"rerun ended with code {code}", f"try: rerun {recording}")
 
 
+@dataclass
+class LiveViewer:
+    """A viewer that waits for a run to show.
+
+    Attributes:
+        screen: where the run has to send what it shows.
+    """
+
+    screen: Screen
+    _process: subprocess.Popen[bytes]
+    _is_server: bool
+
+    def wait(self) -> None:
+        """A window stays by itself; a server until it is stopped with Ctrl-C."""
+        if self._is_server:
+            _wait(self._process)
+
+    def close(self) -> None:
+        """End it."""
+        self._process.terminate()
+        self._process.wait()
+
+
+def open_live_viewer(*, tell: Callable[[str], None], serve: bool | None = None) -> LiveViewer:
+    """Open a window that shows a run under way, or serve one for a browser where there is no screen.
+
+    Args:
+        tell: given a line on how to reach it.
+        serve: for a browser in any case (True) or never (False).
+    """
+    serve = not has_screen() if serve is None else serve
+    data_port, web_port = free_port(DATA_PORT), free_port(WEB_PORT)
+    command = server_command(None, web_port, data_port) if serve else window_command(None, str(data_port))
+    # a session of its own: the window outlives the run, and a Ctrl-C for the run is none for the viewer
+    process = subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    if serve:
+        tell(f"watch it at {server_url(web_port, data_port)} in a browser on this machine")
+    return LiveViewer(Screen(f"rerun+http://{HOST}:{data_port}/proxy"), process, serve)
+
+
 def has_screen() -> bool:
     """Whether a window can probably be opened."""
     return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def window_command(recording: Path) -> list[str]:
+def window_command(recording: Path | None, port: str = "auto") -> list[str]:
     """The native viewer. It, too, listens for data: on this machine only, on any free port."""
-    return [*_RERUN, "--bind", HOST, "--port", "auto", str(recording)]
+    return [*_RERUN, "--bind", HOST, "--port", port, *([str(recording)] if recording else [])]
 
 
-def server_command(recording: Path, web_port: int, data_port: int) -> list[str]:
+def server_command(recording: Path | None, web_port: int, data_port: int) -> list[str]:
     """The web viewer and the data it fetches, each on a port of this machine only."""
     ports = ["--web-viewer-port", str(web_port), "--port", str(data_port)]
-    return [*_RERUN, "--serve-web", "--bind", HOST, *ports, str(recording)]
+    return [*_RERUN, "--serve-web", "--bind", HOST, *ports, *([str(recording)] if recording else [])]
 
 
 def server_url(web_port: int, data_port: int) -> str:
@@ -104,7 +148,10 @@ def _open_window(recording: Path) -> bool:
 
 def _run(command: Sequence[str]) -> int:
     """Run to the end; Ctrl-C reaches the child as well, and is its business."""
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    return _wait(subprocess.Popen(command, stdin=subprocess.DEVNULL))
+
+
+def _wait(process: subprocess.Popen[bytes]) -> int:
     while True:
         try:
             return process.wait()

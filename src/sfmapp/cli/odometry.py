@@ -1,0 +1,162 @@
+"""``sfmapp odometry``: a sequence to a trajectory and a map."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sfmapp.cli.common import (
+    add_output_flags,
+    limit_library_threads,
+    list_options,
+    listening,
+    load_numba_without_blas,
+    print_json,
+)
+
+if TYPE_CHECKING:
+    from sfmapp.pipelines.options import Options
+    from sfmapp.viewer.view import LiveViewer
+
+EXAMPLES = """\
+examples:
+  sfmapp odometry walk.mp4 -o out/ --camera PINHOLE,525,525,320,240 --view
+  sfmapp odometry dataset/sequences/00 -o out/ --truth poses/00.txt
+  sfmapp odometry MH_01_easy -o out/ --mono --scale imu
+  sfmapp odometry frames/ -o out/ --camera calib.json --scale marker:DICT_4X4_50:0.16
+
+Frames come from a folder of images, a video or stream, or a sequence of KITTI, TUM or EuRoC, whose cameras, times,
+truth and IMU are found by themselves. With two cameras lengths are metres; with one their unit is arbitrary unless
+--scale tells it. OUT/report.html tells how good it is, where there are gaps, and why."""
+
+SCALE = (
+    "where metres come from: marker:DICT:METRES (side of an ArUco or AprilTag marker), distance:A:B:METRES (between "
+    "the cameras of two frames), camera_height:METRES (over level ground), or imu"
+)
+
+
+def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the commands of this family to the parser."""
+    parser = commands.add_parser(
+        "odometry", help="a sequence of frames to a trajectory and a map", epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Follow a camera, or a stereo pair, through a sequence.",
+    )  # fmt: skip
+    parser.add_argument("sequence", metavar="SEQUENCE", nargs="?", help="folder, video, stream or data set")
+    parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="folder of the results, made if need be")
+    parser.add_argument("--list-options", action="store_true", help="list every stage.option and its default")
+    _add_sequence_flags(parser)
+    group = parser.add_argument_group("looking at it")
+    group.add_argument("--view", action="store_true", help="watch in rerun while it runs")
+    group.add_argument("--no-record", action="store_true", help="do not write recording.rrd, which replays the run")
+    group = parser.add_argument_group("options (later ones win: presets in order, then --set, then the flags)")
+    group.add_argument("--preset", metavar="NAME|FILE", action="append", default=[], help="may be repeated")
+    group.add_argument("--set", metavar="STAGE.OPTION=VALUE", action="append", default=[], help="may be repeated")
+    group.add_argument("--seed", metavar="N", help="start of every random choice; the same seed, the same bytes")
+    group.add_argument("--threads", metavar="N", help="workers; default: all cores. Results do not depend on it")
+    add_output_flags(parser, has_log=True)
+    parser.set_defaults(run=_odometry, parser=parser)
+
+
+def _add_sequence_flags(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("sequence")
+    group.add_argument("--camera", metavar="MODEL,...|FILE", help="intrinsics, such as PINHOLE,fx,fy,cx,cy, or a file")
+    group.add_argument("--self-calibrate", action="store_true", help="find them from the first seconds")
+    group.add_argument("--mono", action="store_true", help="use the first camera alone")
+    group.add_argument("--truth", metavar="FILE", help="true trajectory of TUM, KITTI or EuRoC, to compare with")
+    group.add_argument("--imu", metavar="FILE", help="inertial measurements in EuRoC's form")
+    group.add_argument("--scale", metavar="SOURCE", help=SCALE)
+    group.add_argument("--start", metavar="N", help="first frame to play")
+    group.add_argument("--stop", metavar="N", help="play the frames before this one")
+    group.add_argument("--step", metavar="N", help="play every N-th frame")
+    group.add_argument("--reverse", action="store_true", help="play it backwards")
+    group.add_argument("--fps", metavar="RATE", help="frames per second where the sequence does not tell")
+
+
+def _options(args: argparse.Namespace) -> Options:
+    """The effective options of a command line."""
+    limit_library_threads()
+    from sfmapp.pipelines.options import load_options
+
+    named = ("camera", "truth", "imu", "start", "stop", "step", "fps")
+    flags: dict[str, Any] = {"seed": args.seed, "threads": args.threads, "scale.source": args.scale}
+    flags |= {f"sequence.{name}": getattr(args, name) for name in named}
+    flags |= {f"sequence.{name}": True for name in ("mono", "reverse") if getattr(args, name)}
+    settings = [*args.set, *(f"{name}={value}" for name, value in flags.items() if value is not None)]
+    return load_options(args.preset, settings)
+
+
+def _odometry(args: argparse.Namespace) -> int:
+    if args.list_options:
+        return list_options(args)
+    if args.sequence is None or args.output is None:
+        args.parser.error("SEQUENCE and -o OUT are needed")
+    options = _options(args)
+    load_numba_without_blas()
+    from sfmapp.pipelines.odometry import track_sequence
+    from sfmapp.pipelines.usage import Stopwatch
+
+    watch, viewer = Stopwatch(whole_process=True), _open_viewer(args)
+    with listening(args) as events:
+        result = track_sequence(
+            args.sequence, args.output, options, events=events, record=not args.no_record,
+            screen=viewer.screen if viewer else None, self_calibrate=args.self_calibrate, watch=watch,
+        )  # fmt: skip
+    if args.json:
+        print_json({"exit_code": 0, **summary(args.output, result.report)})
+    elif not args.quiet:
+        _print_summary(args, result.report)
+    if viewer is not None:
+        viewer.wait()
+    return 0
+
+
+def _open_viewer(args: argparse.Namespace) -> LiveViewer | None:
+    if not args.view:
+        return None
+    import sys
+
+    from sfmapp.viewer.view import open_live_viewer
+
+    return open_live_viewer(tell=lambda line: print(line, file=sys.stderr, flush=True))
+
+
+def summary(output: Path, report: dict[str, Any]) -> dict[str, Any]:
+    """What ``--json`` prints: the outcome in numbers; the rest is in report.json."""
+    paths = {name: str(output / path) for name, path in (
+        ("trajectory", "trajectory.tum"), ("model", "sparse/0"), ("report", "report.json"),
+    )}  # fmt: skip
+    named = ("frames", "maps", "truth", "timing", "run")
+    return {"output": str(output), **paths, **{name: report[name] for name in named}}
+
+
+def _print_summary(args: argparse.Namespace, report: dict[str, Any]) -> None:
+    from sfmapp.report.odometry_html import scale_text
+
+    output, frames, first, run, timing = (
+        args.output, report["frames"], report["maps"][0], report["run"], report["timing"],
+    )  # fmt: skip
+    print(
+        f"{frames['num_with_pose']} of {frames['num_frames']} frames have a pose; path of {first['path_length']:.4g},"
+        f" unit: {scale_text(first)}; {first['num_keyframes']} keyframes, {first['num_points']} points"
+    )
+    for gap in frames["gaps"]:
+        if gap["num_frames"]:
+            print(f"  no pose from frame {gap['first_frame']} to {gap['last_frame']} ({gap['seconds']:.1f} s)")
+    if len(report["maps"]) > 1:
+        sizes = ", ".join(str(other["num_frames"]) for other in report["maps"])
+        print(f"  it falls into {len(report['maps'])} maps of {sizes} frames, each with a world of its own")
+    for row in report["truth"]:
+        if row["poses"] == "final":
+            ate, which = row["ate_m"], f", map {row['map']}" if row["map"] else ""
+            print(
+                f"  against the truth{which}: off by {ate['rmse']:.3f} m rmse,"
+                f" {ate['max']:.3f} m at worst, over {row['true_path_m']:.1f} m ({row['alignment'].upper()})"
+            )
+    print(
+        f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB;"
+        f" {timing['cpu_ms_per_frame']:.1f} CPU ms a frame, {timing['frames_per_second']:.1f} frames a second"
+    )
+    looks = "" if args.no_record else f"; look at it: sfmapp view {output}"
+    print(f"trajectory {output / 'trajectory.tum'}, report {output / 'report.html'}{looks}")

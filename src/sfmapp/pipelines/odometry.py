@@ -1,0 +1,182 @@
+"""A sequence to a trajectory and keyframe maps: the second job, on a page.
+
+:func:`track_sequence` opens the workspace and sees to it that every end is a clean one; :func:`_run` is the job.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import sfmapp
+from sfmapp.errors import InterruptedRunError, NoReconstructionError
+from sfmapp.events import Events
+from sfmapp.formats.sequences import open_sequence
+from sfmapp.images.sequence import Frame, Imu, Sequence, SequenceKind, Truth
+from sfmapp.odometry.run import run_odometry
+from sfmapp.pipelines.kernels import compile_odometry_kernels
+from sfmapp.pipelines.listeners import DecisionLog, EventLog
+from sfmapp.pipelines.odometry_results import write_odometry
+from sfmapp.pipelines.odometry_timing import FrameLog, ThreadTimes
+from sfmapp.pipelines.options import Options, with_absolute_paths
+from sfmapp.pipelines.run import Job
+from sfmapp.pipelines.usage import Stopwatch
+from sfmapp.pipelines.workspace import ODOMETRY, open_workspace
+from sfmapp.viewer.live import LiveView, Screen
+
+if TYPE_CHECKING:
+    from sfmapp.odometry.result import OdometryResult
+    from sfmapp.scene.rig import Rig
+
+NO_MAP_ADVICE = (
+    "the camera has to move sideways past something still and textured; OUT/report.html and -v tell what was seen"
+)
+
+
+class TrackResult(NamedTuple):
+    """What the run found, and the report of it as in ``report.json``."""
+
+    odometry: OdometryResult
+    report: dict[str, Any]
+
+
+@dataclass(kw_only=True)
+class Tracking(Job):
+    """State of an odometry run under way.
+
+    Attributes:
+        frames: what was told of each frame.
+        threads_cpu: CPU time by thread.
+        live: draws what happens; None if nobody looks.
+        sequence: once it is open.
+    """
+
+    frames: FrameLog
+    threads_cpu: ThreadTimes
+    live: LiveView | None
+    sequence: Sequence | None = None
+
+
+def track_sequence(
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    options: Options | None = None,
+    *,
+    events: Events | None = None,
+    record: bool = True,
+    screen: Screen | None = None,
+    self_calibrate: bool = False,
+    watch: Stopwatch | None = None,
+) -> TrackResult:
+    """Follow a camera (or a stereo rig) through a sequence.
+
+    Args:
+        source: a folder of frames, a video file or stream, or the folder of a KITTI, TUM or EuRoC sequence.
+        output: folder of the results: new, empty, or of an earlier odometry run, whose results are replaced.
+        options: of all stages; ``sequence`` and ``odometry`` count here. See :func:`sfmapp.load_options`.
+        events: listens in, and can ask the run to stop: what was tracked until then is written.
+        record: write ``recording.rrd``, which replays the run.
+        screen: shows the run while it is under way; None: nobody looks.
+        self_calibrate: find the intrinsics by a reconstruction from the first seconds.
+        watch: started earlier, if more is to be counted in the report than this call.
+
+    Raises:
+        UsageError: the output folder holds something else, or another run is at work in it.
+        InputError: the sequence does not exist or cannot be read, or its camera is not known.
+        NoReconstructionError: no map could be made; the report is written.
+        InterruptedRunError: ``events`` was asked to stop.
+    """
+    from threadpoolctl import threadpool_limits
+
+    source, options, events = os.fspath(source), with_absolute_paths(options or Options()), events or Events()
+    threads = options.threads or len(os.sched_getaffinity(0))
+    with ExitStack() as stack:
+        workspace = stack.enter_context(open_workspace(Path(output), ODOMETRY))
+        event_log = stack.enter_context(EventLog(workspace.log, source=source, version=sfmapp.__version__))
+        # sums must not depend on how many threads the linear algebra would use
+        stack.enter_context(threadpool_limits(1, "blas"))
+        live = LiveView(workspace.recording if record else None, screen) if record or screen else None
+        if live is not None:
+            stack.enter_context(live)
+        run = Tracking(
+            source, workspace, options, events, watch or Stopwatch(), DecisionLog(), threads,
+            frames=FrameLog(), threads_cpu=ThreadTimes(), live=live,
+        )  # fmt: skip
+        for listener in (event_log, run.log, run.frames, live):
+            if listener is not None:
+                events.subscribe(listener)
+        return _run(run, self_calibrate)
+
+
+def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
+    """The job: the sequence, its frames, and what is written of them, also of a run that was cut short."""
+    options, events = run.options, run.events
+    run.note_inputs({})
+    with run.stage("sequence"):
+        if self_calibrate:
+            from sfmapp.pipelines.self_calibrate import self_calibrated
+
+            options, run.stages["self_calibration"] = self_calibrated(run.source, options, run.threads, events)
+        run.sequence = open_sequence(run.source, options.sequence, events)
+    if run.live is not None:
+        run.live.begin(run.sequence)
+    with run.stage("kernels"):
+        run.stages["kernels"] = compile_odometry_kernels(events)
+    with run.measured("odometry"):
+        result = run_odometry(
+            Watched(run.sequence, run), options.odometry, seed=options.seed, threads=run.threads, events=events.deaf()
+        )
+        run.threads_cpu.sample()
+    run.stages["odometry"] = result.report
+    failure = None if result.maps else no_map(run, result)
+    report = write_odometry(run, result, failure)
+    if events.is_cancelled:
+        where = f"what was tracked so far is in {run.workspace.folder}"
+        raise InterruptedRunError("stopped on request", f"{where}; the same command begins again")
+    if failure is not None:
+        raise failure
+    return TrackResult(result, report)
+
+
+def no_map(run: Tracking, result: OdometryResult) -> NoReconstructionError:
+    """Why nothing came of it, as well as it can be told."""
+    seen = len(result.frame_idx)
+    if seen < 2:
+        found = "no frame could be read" if seen == 0 else "only one frame could be read"
+        return NoReconstructionError(f"{run.source}: {found}", "-v names the files and what is wrong with them")
+    return NoReconstructionError(f"{run.source}: {seen} frames were read, but no map could be begun", NO_MAP_ADVICE)
+
+
+class Watched:
+    """A sequence that ends early when the run is asked to stop, and on whose frames the clocks are read."""
+
+    kind: SequenceKind
+    source: str
+    rig: Rig
+    num_frames: int | None
+    frames_per_second: float | None
+    imu: Imu | None
+    truth: Truth | None
+
+    def __init__(self, sequence: Sequence, run: Tracking) -> None:
+        for name in ("kind", "source", "rig", "num_frames", "frames_per_second", "imu", "truth"):
+            setattr(self, name, getattr(sequence, name))
+        self._sequence, self._run = sequence, run
+
+    def frames(self) -> Iterator[Frame]:
+        """See :class:`~sfmapp.images.sequence.Sequence`."""
+        frames = self._sequence.frames()
+        try:
+            for frame in frames:
+                self._run.threads_cpu.sample()
+                if self._run.events.is_cancelled:
+                    self._run.events.warned("odometry", f"stopped on request before {frame.name}")
+                    return
+                yield frame
+        finally:
+            self._run.threads_cpu.sample()  # while the thread that reads ahead is still there
+            frames.close()  # type: ignore[attr-defined]  # a generator: ends its thread

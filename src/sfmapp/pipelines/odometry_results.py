@@ -1,0 +1,213 @@
+"""What an odometry run writes: trajectories, frames, covariances, maps, recording and report."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sfmapp.errors import NoReconstructionError
+from sfmapp.formats.trajectory import write_tum
+from sfmapp.odometry.result import FrameState, OdometryResult
+from sfmapp.pipelines.odometry_timing import frame_statistics
+from sfmapp.pipelines.results import report_text
+from sfmapp.report.odometry_document import (
+    FORMAT,
+    Against,
+    FrameFacts,
+    against_truth,
+    errors_of_frames,
+    frame_summary,
+    make_checks,
+    map_row,
+    truth_row,
+)
+from sfmapp.report.odometry_html import render_odometry_html
+from sfmapp.scene.camera import PARAM_NAMES
+
+if TYPE_CHECKING:
+    from sfmapp.images import sequence as sequences
+    from sfmapp.pipelines.odometry import Tracking
+    from sfmapp.pipelines.workspace import Workspace
+
+_AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
+FRAME_COLUMNS = ("index", "timestamp_s", "name", "state", "map", "tracked_points", "mapped_points", "tracking_ms")
+COVARIANCE_COLUMNS = (
+    "map", "index", "timestamp_s", "name", *(f"{a}_{b}" for i, a in enumerate(_AXES) for b in _AXES[i:])
+)  # fmt: skip
+
+
+def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstructionError | None) -> dict[str, Any]:
+    """Write everything, the report last; returns it."""
+    assert run.sequence is not None
+    workspace, truth = run.workspace, run.sequence.truth
+    facts = run.frames.facts(result.frame_idx)
+    with run.measured("output"):
+        write_trajectories(workspace, result)
+        workspace.write_text("frames.csv", _frames_csv(result, facts))
+        workspace.write_text("covariance.csv", _covariance_csv(result))
+        workspace.write_models([entry.reconstruction for entry in result.maps])
+    against = [against_truth(result, truth, m) for m in range(len(result.maps))] if truth is not None else []
+    with run.measured("recording"):
+        _finish_recording(run, result, against)
+    report = make_report(run, result, facts, against, failure)
+    workspace.write_text("report.html", render_odometry_html(report, result, facts, truth, against))
+    report["run"] |= run.watch.read()  # the last measurement that can still be written down
+    workspace.write_text("report.json", report_text(report))
+    workspace.manifest["usage"] = run.usage
+    workspace.save()
+    return report
+
+
+def write_trajectories(workspace: Workspace, result: OdometryResult) -> None:
+    """A file of final poses for each map, the live poses of the largest, and the largest as KITTI has it.
+
+    Maps have worlds of their own, so they cannot share a file. What an earlier run left is taken away.
+    """
+    from sfmapp.formats.kitti import write_kitti
+
+    folder = workspace.folder
+    kept = {"trajectory.tum", "trajectory_live.tum", *(f"trajectory-{m}.tum" for m in range(1, len(result.maps)))}
+    for path in folder.glob("trajectory*"):
+        is_ours = path.name in ("trajectory.tum", "trajectory_live.tum", "trajectory.kitti")
+        number = path.name.removeprefix("trajectory-").removesuffix(".tum")
+        if (is_ours or number.isdigit()) and (path.name not in kept or not result.maps):
+            path.unlink()
+    for m in range(len(result.maps)):
+        name = "trajectory.tum" if m == 0 else f"trajectory-{m}.tum"
+        write_tum(folder / name, result.timestamps_s, poses_of_map(result, m))
+    if result.maps:
+        write_tum(folder / "trajectory_live.tum", result.timestamps_s, poses_of_map(result, 0, live=True))
+        write_kitti(folder / "trajectory.kitti", poses_of_map(result, 0))
+
+
+def poses_of_map(result: OdometryResult, map_idx: int, *, live: bool = False) -> Any:
+    """(F, 7) poses of the frames of one map, NaN for all others."""
+    poses = result.live_cam_from_world if live else result.cam_from_world
+    return np.where((result.frame_map == map_idx)[:, None], poses, np.nan)
+
+
+def _frames_csv(result: OdometryResult, facts: FrameFacts) -> str:
+    rows = []
+    for k, name in enumerate(result.frame_names):
+        counts = ["" if np.isnan(v) else int(v) for v in (facts.num_tracked[k], facts.num_mapped[k])]
+        time_ms = "" if np.isnan(facts.time_ms[k]) else f"{facts.time_ms[k]:.3f}"
+        state, map_idx = FrameState(int(result.frame_state[k])).name.lower(), int(result.frame_map[k])
+        shown = map_idx if map_idx >= 0 else ""
+        rows.append(
+            [int(result.frame_idx[k]), repr(float(result.timestamps_s[k])), name, state, shown, *counts, time_ms]
+        )
+    return _csv(FRAME_COLUMNS, rows)
+
+
+def _covariance_csv(result: OdometryResult) -> str:
+    """The upper triangles of the keyframes' covariances; keyframes without one are left out."""
+    position = {int(idx): k for k, idx in enumerate(result.frame_idx)}
+    upper = np.triu_indices(6)
+    rows = []
+    for m, entry in enumerate(result.maps):
+        if entry.covariance is None:
+            continue
+        for frame_idx, covariance in zip(entry.keyframe_frame_idx.tolist(), entry.covariance, strict=True):
+            if np.isfinite(covariance).all():
+                k = position[frame_idx]
+                values = [f"{value:.9e}" for value in covariance[upper]]
+                rows.append([m, frame_idx, repr(float(result.timestamps_s[k])), result.frame_names[k], *values])
+    return _csv(COVARIANCE_COLUMNS, rows)
+
+
+def _csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([head, *rows])
+    return text.getvalue()
+
+
+def _finish_recording(run: Tracking, result: OdometryResult, against: Sequence[Against | None]) -> None:
+    """Let the recording show the end; a failure is a warning. A recording of other results is taken away."""
+    manifest = run.workspace.manifest
+    if run.live is None or not run.live.is_recording:
+        run.workspace.recording.unlink(missing_ok=True)
+        manifest["recording"] = "not wanted"
+    if run.live is None:
+        return
+    fits = [fit and fit.error.truth_from_estimate for fit in against]
+    problem = run.live.end(result, fits, errors_of_frames(result, against))
+    if run.live.is_recording:
+        manifest["recording"] = "failed" if problem else "written"
+    if problem:
+        run.workspace.recording.unlink(missing_ok=True)
+        run.events.deaf().warned("recording", f"no recording: {problem}")
+
+
+def make_report(
+    run: Tracking, result: OdometryResult, facts: FrameFacts, against: Sequence[Against | None],
+    failure: NoReconstructionError | None,
+) -> dict[str, Any]:  # fmt: skip
+    """The report as in ``report.json``."""
+    assert run.sequence is not None
+    frames = frame_summary(result)
+    maps = [map_row(result, m) for m in range(len(result.maps))]
+    timing = run.threads_cpu.timing(len(result.frame_idx), run.frames.tracking_s, run.sequence.frames_per_second)
+    timing["tracking_ms"] = frame_statistics(facts.time_ms)
+    return {
+        "format": FORMAT,
+        "outcome": _outcome(run, failure),
+        "run": run.facts(),
+        "sequence": describe_sequence(run.sequence),
+        "frames": frames,
+        "maps": maps,
+        "truth": _truth_rows(run, result, against),
+        "timing": timing,
+        "checks": make_checks(frames, maps, timing, facts) if maps else [],
+        "usage": run.usage,
+        "warnings": run.log.warnings,
+        "decisions": run.log.decisions,
+        "stages": run.stages,
+    }
+
+
+def _outcome(run: Tracking, failure: NoReconstructionError | None) -> dict[str, Any]:
+    if run.events.is_cancelled:
+        message = "stopped on request: this is what was tracked until then"
+        return {"exit_code": 130, "message": message, "advice": "the same command begins again"}
+    if failure is not None:
+        return {"exit_code": failure.exit_code, "message": str(failure), "advice": failure.advice}
+    return {"exit_code": 0, "message": "", "advice": None}
+
+
+def _truth_rows(run: Tracking, result: OdometryResult, against: Sequence[Against | None]) -> list[dict[str, Any]]:
+    """The error of each map, and of the live poses of the largest."""
+    assert run.sequence is not None
+    rows = [{"map": m, "poses": "final", **truth_row(fit)} for m, fit in enumerate(against) if fit is not None]
+    if run.sequence.truth is not None and result.maps:
+        live = against_truth(result, run.sequence.truth, 0, live=True)
+        if live is not None:
+            rows.insert(1, {"map": 0, "poses": "live", **truth_row(live)})
+    return rows
+
+
+def describe_sequence(sequence: sequences.Sequence) -> Mapping[str, Any]:
+    """What was played, in plain values."""
+    cameras = [
+        {
+            "model": camera.model.name,
+            "width": camera.width,
+            "height": camera.height,
+            "params": dict(zip(PARAM_NAMES[camera.model], map(float, camera.params), strict=True)),
+            "focal_sigma_px": camera.focal_sigma,
+            "source": camera.focal_source,
+        }
+        for camera in sequence.rig.cameras
+    ]
+    return {
+        "kind": sequence.kind,
+        "num_frames": sequence.num_frames,
+        "frames_per_second": sequence.frames_per_second,
+        "stereo": sequence.rig.is_stereo,
+        "imu": sequence.imu is not None,
+        "truth": sequence.truth is not None,
+        "cameras": cameras,
+    }

@@ -1,0 +1,96 @@
+"""What an odometry run takes, frame by frame and thread by thread."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.events import Event
+from sfmapp.odometry.snapshot import FrameSnapshot
+from sfmapp.report.odometry_document import FrameFacts
+
+# the threads of a run by the beginning of their names, and what the report calls them
+READING, BACK_END, DRAWING = "frames", "adjust", "recording"
+_PART_OF = {READING: "reading", BACK_END: "back end", "loops": "loops"}
+
+
+class FrameLog:
+    """Listener that keeps a few numbers of each frame; of its arrays nothing."""
+
+    def __init__(self) -> None:
+        self._rows: dict[int, tuple[int, int, float]] = {}
+
+    def __call__(self, event: Event) -> None:
+        seen = event.data.get("snapshot")
+        if isinstance(seen, FrameSnapshot):
+            self._rows[seen.frame_idx] = (len(seen.xy), int(np.count_nonzero(seen.is_mapped)), seen.time_s)
+
+    @property
+    def tracking_s(self) -> float:
+        """CPU seconds of tracking in all."""
+        return sum(row[2] for row in self._rows.values())
+
+    def facts(self, frame_idx: NDArray[np.int64]) -> FrameFacts:
+        """Of the given frames (F,)."""
+        nothing = (np.nan, np.nan, np.nan)
+        table = np.array([self._rows.get(int(idx), nothing) for idx in frame_idx], np.float64).reshape(-1, 3)
+        return FrameFacts(table[:, 0], table[:, 1], 1e3 * table[:, 2])
+
+
+class ThreadTimes:
+    """CPU time of the process and of its threads by name, from the first sample on; threads that end are remembered."""
+
+    def __init__(self) -> None:
+        self._by_thread: dict[tuple[str, int], float] = {}
+        self._begin: tuple[float, float] | None = None
+        self._end = (0.0, 0.0)
+
+    def sample(self) -> None:
+        """Read the clocks."""
+        self._end = (time.process_time(), time.monotonic())
+        self._begin = self._begin or self._end
+        for thread in threading.enumerate():
+            name = thread.name.partition("_")[0]
+            if thread.ident is not None and (name in _PART_OF or name == DRAWING):
+                try:
+                    clock = time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
+                except OSError:  # it has ended between the two lines
+                    continue
+                self._by_thread[name, thread.ident] = clock
+
+    def total(self, name: str) -> float:
+        """CPU seconds of all threads of a name."""
+        return sum(seconds for (found, _), seconds in self._by_thread.items() if found == name)
+
+    def timing(self, num_frames: int, tracking_s: float, rate: float | None) -> dict[str, Any]:
+        """Time of a frame: CPU milliseconds in all and of each part, and how that compares with the camera's rate."""
+        if num_frames == 0 or self._begin is None:
+            return {}
+        cpu_s = self._end[0] - self._begin[0] - self.total(DRAWING)
+        wall_s = self._end[1] - self._begin[1]
+        parts = {"tracking": tracking_s, **{part: self.total(name) for name, part in _PART_OF.items()}}
+        # final adjustment, covariances, what the listeners do: all that no clock of its own was read for
+        parts["rest"] = max(0.0, cpu_s - sum(parts.values()))
+        per_second = num_frames / wall_s if wall_s > 0 else 0.0
+        return {
+            "num_frames": num_frames,
+            "wall_s": round(wall_s, 3),
+            "frames_per_second": round(per_second, 2),
+            "times_real_time": round(per_second / rate, 3) if rate else None,
+            "cpu_s": round(cpu_s, 3),
+            "cpu_ms_per_frame": round(1e3 * cpu_s / num_frames, 3),
+            "parts_cpu_ms": {part: round(1e3 * value / num_frames, 3) for part, value in parts.items() if value > 0},
+        }
+
+
+def frame_statistics(values: NDArray[np.float64]) -> Mapping[str, float] | None:
+    """Median, 95th percentile and worst of what was measured."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return None
+    return {"median": float(np.median(known)), "p95": float(np.percentile(known, 95)), "max": float(known.max())}

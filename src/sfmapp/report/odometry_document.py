@@ -1,0 +1,203 @@
+"""What came of a sequence, as JSON-able rows: frames and gaps, maps, the error against the truth, and checks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.errors import InputError
+from sfmapp.evaluation.trajectory import (
+    AbsoluteError,
+    Alignment,
+    Pairs,
+    Trajectory,
+    absolute_error,
+    associate,
+    statistics,
+)
+from sfmapp.geometry import rigid3
+from sfmapp.images.sequence import Truth
+from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
+from sfmapp.report.document import check
+
+FORMAT = "sfmapp odometry report 1"
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FrameFacts:
+    """What was seen of each frame while it was tracked, over frames (F); NaN where nothing was told.
+
+    Attributes:
+        num_tracked, num_mapped: (F,) float64 points followed, and those that the pose was measured with.
+        time_ms: (F,) CPU milliseconds of tracking, back end not included.
+    """
+
+    num_tracked: Array
+    num_mapped: Array
+    time_ms: Array
+
+
+@dataclass(frozen=True)
+class Against:
+    """One map's trajectory against the truth."""
+
+    pairs: Pairs
+    error: AbsoluteError
+    alignment: str
+
+
+def frame_summary(result: OdometryResult) -> dict[str, Any]:
+    """Counts of the frames by what became of them, and the gaps."""
+    counts = {state.name.lower(): int((result.frame_state == state).sum()) for state in FrameState}
+    has_pose = np.isfinite(result.cam_from_world[:, 0])
+    played = int(result.frame_idx[-1] - result.frame_idx[0]) + 1 if len(result.frame_idx) else 0
+    return {
+        "num_frames": len(result.frame_idx),
+        "num_unreadable": played - len(result.frame_idx),
+        "num_with_pose": int(has_pose.sum()),
+        "num_in_largest_map": int((result.frame_map == 0).sum()),
+        **counts,
+        "gaps": gaps(result),
+    }
+
+
+def gaps(result: OdometryResult) -> list[dict[str, Any]]:
+    """Stretches of frames without a pose, in order; one of no frames where one map follows right after another."""
+    has_pose = np.isfinite(result.cam_from_world[:, 0])
+    edges = np.diff(np.concatenate([[0], (~has_pose).astype(np.int8), [0]]))
+    rows = []
+    for first, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
+        before, after = max(int(first) - 1, 0), min(int(end), len(has_pose) - 1)
+        rows.append(
+            {
+                "first_frame": int(result.frame_idx[first]),
+                "last_frame": int(result.frame_idx[end - 1]),
+                "num_frames": int(end - first),
+                "seconds": float(result.timestamps_s[after] - result.timestamps_s[before]),
+                "map_before": int(result.frame_map[first - 1]) if first else None,
+                "map_after": int(result.frame_map[end]) if end < len(has_pose) else None,
+            }
+        )
+    changes = (np.diff(result.frame_map) != 0) & has_pose[1:] & has_pose[:-1]
+    for k in np.flatnonzero(changes):
+        rows.append(
+            {
+                "first_frame": int(result.frame_idx[k + 1]),
+                "last_frame": int(result.frame_idx[k]),
+                "num_frames": 0,
+                "seconds": float(result.timestamps_s[k + 1] - result.timestamps_s[k]),
+                "map_before": int(result.frame_map[k]),
+                "map_after": int(result.frame_map[k + 1]),
+            }
+        )
+    return sorted(rows, key=lambda row: row["first_frame"])
+
+
+def map_row(result: OdometryResult, map_idx: int) -> dict[str, Any]:
+    """One map in numbers; lengths in metres if its scale is known."""
+    entry, mine = result.maps[map_idx], np.flatnonzero(result.frame_map == map_idx)
+    summary = entry.reconstruction.summary()
+    centers = rigid3.center(result.cam_from_world[mine])
+    return {
+        "idx": map_idx,
+        "num_frames": len(mine),
+        "first_frame": int(result.frame_idx[mine[0]]) if len(mine) else None,
+        "last_frame": int(result.frame_idx[mine[-1]]) if len(mine) else None,
+        "num_keyframes": len(entry.keyframe_frame_idx),
+        **{key: summary[key] for key in ("num_points", "num_observations", "mean_track_length")},
+        "mean_reprojection_error_px": summary["mean_reprojection_error_px"],
+        "path_length": float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum()),
+        "unit": unit_of(entry),
+        "scale_source": entry.scale_source,
+        "scale_sigma": entry.scale_sigma,
+        "gauge": entry.gauge,
+        **_uncertainty(entry),
+    }
+
+
+def unit_of(entry: MapResult) -> str:
+    """``m``, or empty where the unit of length is arbitrary."""
+    return "" if entry.scale_source == "none" else "m"
+
+
+def _uncertainty(entry: MapResult) -> dict[str, Any]:
+    """Standard deviations of the keyframes: position as the root of the trace, rotation in degrees likewise."""
+    if entry.covariance is None or not np.isfinite(entry.covariance).any():
+        return {"position_sigma": None, "rotation_sigma_deg": None}
+    diagonal = np.maximum(np.diagonal(entry.covariance, axis1=1, axis2=2), 0)
+    rotation, position = np.sqrt(diagonal[:, :3].sum(1)), np.sqrt(diagonal[:, 3:].sum(1))
+    return {
+        "position_sigma": {"median": float(np.nanmedian(position)), "max": float(np.nanmax(position))},
+        "rotation_sigma_deg": {
+            "median": float(np.degrees(np.nanmedian(rotation))), "max": float(np.degrees(np.nanmax(rotation))),
+        },
+    }  # fmt: skip
+
+
+def against_truth(result: OdometryResult, truth: Truth, map_idx: int, *, live: bool = False) -> Against | None:
+    """A map's final (or live) poses after an alignment to the truth: with a scale of its own where that is unknown.
+
+    None if the two have too little in common.
+    """
+    poses = result.live_cam_from_world if live else result.cam_from_world
+    mine = np.where((result.frame_map == map_idx)[:, None], poses, np.nan)
+    alignment: Alignment = "sim3" if unit_of(result.maps[map_idx]) == "" else "se3"
+    times = truth.timestamps_s
+    # nearer than half a frame: a truth that is sampled more sparsely than the frames still names its own
+    step = float(np.median(np.diff(result.timestamps_s))) if len(result.timestamps_s) > 1 else 0.02
+    try:
+        pairs = associate(
+            Trajectory.from_cam_from_world(mine, result.timestamps_s),
+            Trajectory.from_cam_from_world(truth.cam_from_world, times),
+            max_difference_s=step / 2,
+        )
+        return Against(pairs, absolute_error(pairs, alignment), alignment)
+    except InputError:
+        return None
+
+
+def errors_of_frames(result: OdometryResult, against: Sequence[Against | None]) -> Array:
+    """(F,) distance of each frame's final position from the truth, NaN where it is not known."""
+    errors = np.full(len(result.frame_idx), np.nan)
+    for fit in against:
+        if fit is not None:
+            errors[fit.pairs.estimate_idx] = fit.error.translation_m
+    return errors
+
+
+def truth_row(against: Against) -> dict[str, Any]:
+    """The error in numbers: metres and degrees."""
+    return {
+        "alignment": against.alignment,
+        "num_pairs": len(against.pairs),
+        "scale": against.error.scale,
+        "true_path_m": against.pairs.truth.path_m,
+        "ate_m": statistics(against.error.translation_m),
+        "rotation_deg": statistics(against.error.rotation_deg),
+    }
+
+
+def make_checks(
+    frames: Mapping[str, Any], maps: Sequence[Mapping[str, Any]], timing: Mapping[str, Any], facts: FrameFacts
+) -> list[dict[str, str]]:
+    """Traffic lights over a run, each with its thresholds in words."""
+    share = 100 * frames["num_in_largest_map"] / max(1, frames["num_frames"])
+    rows = [
+        check("frames with a pose in the largest map", share, f"{share:.1f} %", 98, 80, "%"),
+        check("separate maps", -len(maps), str(len(maps)), -1, -2),
+    ]
+    if np.isfinite(facts.num_mapped).any():
+        mapped = float(np.nanmedian(facts.num_mapped))
+        rows.append(check("points that a pose was measured with (median)", mapped, f"{mapped:.0f}", 100, 40))
+    if maps:
+        error = maps[0]["mean_reprojection_error_px"]
+        rows.append(check("reprojection error of the keyframes (mean)", -error, f"{error:.2f} px", -1, -2, "px"))
+    if timing.get("times_real_time"):
+        speed = timing["times_real_time"]
+        rows.append(check("speed against the camera's", speed, f"{speed:.2f} x", 1, 0.5, "x"))
+    return rows

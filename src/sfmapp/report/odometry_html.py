@@ -1,0 +1,235 @@
+"""The report of an odometry run as a page of HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from sfmapp.geometry import rigid3, similarity
+from sfmapp.images.sequence import Truth
+from sfmapp.odometry.result import OdometryResult
+from sfmapp.report.odometry_document import Against, FrameFacts, errors_of_frames, unit_of
+from sfmapp.report.page import check_table, failure_box, log_table, render_page, table, usage_table
+from sfmapp.report.path_view import PATH_COLOR, TRUTH_COLOR, PathScene, legend, path_view_svg
+from sfmapp.report.plots import Curve, plot_svg
+
+MAX_VIEWS = 4
+MAX_GAPS = 50
+_ORANGE, _GREY = "#e07b00", "#999"
+
+
+def render_odometry_html(
+    report: Mapping[str, Any], result: OdometryResult | None, facts: FrameFacts | None, truth: Truth | None,
+    against: Sequence[Against | None],
+) -> str:  # fmt: skip
+    """The page of a report; ``against``: each map against the truth, empty without one."""
+    body = [_headline(report), failure_box(report["outcome"]), check_table(report["checks"])]
+    if result is not None and facts is not None and len(result.frame_idx):
+        body.append(_views(result, truth, against))
+        body.append("<h2>Frame by frame</h2>" + _plots(result, facts, against))
+        body.append(_gaps(report["frames"]["gaps"]))
+    body.append(_maps(report["maps"]) + _truth(report.get("truth")))
+    body.append(_loops(report) + _sequence(report["sequence"]))
+    body.append(_timing(report.get("timing")) + usage_table(report["usage"], report["run"]))
+    body.append(log_table("Warnings", report["warnings"]) + log_table("Decisions", report["decisions"]))
+    return render_page(f"sfmapp odometry: {report['run']['source']}", body)
+
+
+def _headline(report: Mapping[str, Any]) -> str:
+    run, frames, parts = report["run"], report["frames"], []
+    if frames:
+        parts.append(f"{frames['num_with_pose']} of {frames['num_frames']} frames with a pose")
+    if report["maps"]:
+        first = report["maps"][0]
+        parts.append(f"path {first['path_length']:.4g} {first['unit'] or '(unit arbitrary)'}")
+        parts.append(f"{first['num_keyframes']} keyframes")
+        parts.append(f"{first['num_points']} points")
+    if timing := report.get("timing"):
+        parts.append(f"{timing['cpu_ms_per_frame']:.1f} CPU ms a frame")
+        parts.append(f"{timing['frames_per_second']:.1f} frames a second")
+    parts += [f"seed {run['seed']}", f"sfmapp {run['versions']['sfmapp']}", run["started"]]
+    return f'<p class="dim">{escape("; ".join(parts))}</p>'
+
+
+def _views(result: OdometryResult, truth: Truth | None, against: Sequence[Against | None]) -> str:
+    """Each map from above; those that the truth joins share its frame but not one picture."""
+    parts = []
+    for map_idx in range(min(len(result.maps), MAX_VIEWS)):
+        fit = against[map_idx] if against else None
+        unit = unit_of(result.maps[map_idx])
+        svg = path_view_svg(_scene(result, map_idx, truth, fit, "m" if fit else unit))
+        entries = [(PATH_COLOR, "trajectory, keyframes as dots")]
+        if fit:
+            entries.append((TRUTH_COLOR, f"truth; the trajectory is laid on it ({fit.alignment.upper()})"))
+        title = "From above" + (f", map {map_idx}" if len(result.maps) > 1 else "")
+        parts.append(f"<h2>{title}</h2>{svg}{legend(entries)}")
+    if len(result.maps) > MAX_VIEWS:
+        parts.append(f"<p class=dim>{len(result.maps) - MAX_VIEWS} smaller maps are not drawn</p>")
+    return "".join(parts)
+
+
+def _scene(
+    result: OdometryResult, map_idx: int, truth: Truth | None, fit: Against | None, unit: str
+) -> PathScene:  # fmt: skip
+    entry = result.maps[map_idx]
+    model = entry.reconstruction
+    mine = result.frame_map == map_idx
+    first, last = np.flatnonzero(mine)[[0, -1]]
+    poses = np.where(mine[:, None], result.cam_from_world, np.nan)[first : last + 1]
+    keyframes = model.cam_from_world[entry.keyframe_image_idx]
+    points = model.point_xyz[model.is_triangulated]
+    centers = np.zeros((0, 3))
+    if fit is not None and truth is not None:
+        to_truth = fit.error.truth_from_estimate
+        poses, keyframes = similarity.transform_poses(to_truth, poses), similarity.transform_poses(to_truth, keyframes)
+        points = similarity.apply(to_truth, points)
+        during = slice(int(fit.pairs.truth_idx[0]), int(fit.pairs.truth_idx[-1]) + 1)
+        centers = rigid3.center(truth.cam_from_world[during])
+    return PathScene(poses, keyframes, points, centers, unit)
+
+
+def _plots(result: OdometryResult, facts: FrameFacts, against: Sequence[Against | None]) -> str:
+    x = result.frame_idx.astype(np.float64)
+    has_pose = np.isfinite(result.cam_from_world[:, 0])
+    edges = np.diff(np.concatenate([[0], (~has_pose).astype(np.int8), [0]]))
+    spans = zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1, strict=True)
+    gaps = [(float(x[first]), float(x[last])) for first, last in spans]
+    parts = [
+        "<h3>Points</h3>",
+        plot_svg(
+            x,
+            [Curve("tracked", facts.num_tracked, _GREY), Curve("measured with", facts.num_mapped, PATH_COLOR)],
+            gaps,
+            "frame",
+        ),
+        "<h3>CPU time of tracking, ms</h3>",
+        plot_svg(x, [Curve("tracking", facts.time_ms, _ORANGE)], gaps, "frame"),
+    ]
+    if any(against):
+        error = errors_of_frames(result, against)
+        parts += [
+            "<h3>Distance from the truth, m</h3>",
+            plot_svg(x, [Curve("final", error, TRUTH_COLOR)], gaps, "frame"),
+        ]
+    return "".join(parts)
+
+
+def _gaps(gaps: Sequence[Mapping[str, Any]]) -> str:
+    if not gaps:
+        return ""
+    head = [
+        ("", "from frame"),
+        ("", "to frame"),
+        ("", "frames"),
+        ("", "seconds"),
+        ("", "map before"),
+        ("", "map after"),
+    ]
+    keys = ("first_frame", "last_frame", "num_frames", "seconds", "map_before", "map_after")
+    rows = [[("", f"{row[k]:.2f}" if k == "seconds" else row[k]) for k in keys] for row in gaps[:MAX_GAPS]]
+    more = f"<p class=dim>{len(gaps) - MAX_GAPS} more in report.json</p>" if len(gaps) > MAX_GAPS else ""
+    return "<h2>Gaps: frames without a pose</h2>" + table(head, rows) + more
+
+
+def _maps(maps: Iterable[Mapping[str, Any]]) -> str:
+    head = [
+        ("", "map"), ("", "frames"), ("", "from"), ("", "to"), ("", "keyframes"), ("", "points"), ("", "error px"),
+        ("", "path"), ("t", "unit of length"), ("", "position sigma"), ("", "rotation sigma"), ("t", "gauge"),
+    ]  # fmt: skip
+    rows = []
+    for row in maps:
+        unit, position, rotation = row["unit"], row["position_sigma"], row["rotation_sigma_deg"]
+        rows.append(
+            [
+                ("", row["idx"]), ("", row["num_frames"]), ("", row["first_frame"]), ("", row["last_frame"]),
+                ("", row["num_keyframes"]), ("", row["num_points"]), ("", f"{row['mean_reprojection_error_px']:.2f}"),
+                ("", f"{row['path_length']:.4g} {unit}".rstrip()), ("t", scale_text(row)),
+                ("", f"{position['median']:.2g} {unit}, at most {position['max']:.2g}" if position else "-"),
+                ("", f"{rotation['median']:.2g} deg, at most {rotation['max']:.2g}" if rotation else "-"),
+                ("w dim", row["gauge"]),
+            ]
+        )  # fmt: skip
+    return "<h2>Maps</h2>" + table(head, rows) if rows else ""
+
+
+def scale_text(row: Mapping[str, Any]) -> str:
+    """Where a map's unit of length comes from, and how sure it is."""
+    if row["scale_source"] == "none":
+        return "arbitrary"
+    sigma = row["scale_sigma"]
+    text = f"metres, from {row['scale_source'].replace('_', ' ')}"
+    return text if sigma is None else f"{text}, \N{PLUS-MINUS SIGN}{100 * sigma:.2g} %"
+
+
+def _truth(rows: Sequence[Mapping[str, Any]] | None) -> str:
+    if not rows:
+        return ""
+    head = [
+        ("", "map"), ("t", "poses"), ("t", "alignment"), ("", "frames"), ("", "true path m"), ("", "rmse m"),
+        ("", "% of path"), ("", "mean"), ("", "median"), ("", "worst"), ("", "rotation rmse deg"), ("", "scale"),
+    ]  # fmt: skip
+    cells = []
+    for row in rows:
+        ate, path = row["ate_m"], row["true_path_m"]
+        share = f"{100 * ate['rmse'] / path:.2f}" if path else "-"
+        cells.append(
+            [
+                ("", row["map"]), ("t", row["poses"]), ("t", row["alignment"].upper()), ("", row["num_pairs"]),
+                ("", f"{path:.1f}"), ("", f"{ate['rmse']:.3f}"), ("", share),
+                ("", f"{ate['mean']:.3f}"), ("", f"{ate['median']:.3f}"), ("", f"{ate['max']:.3f}"),
+                ("", f"{row['rotation_deg']['rmse']:.3f}"), ("", f"{row['scale']:.4g}"),
+            ]
+        )  # fmt: skip
+    return "<h2>Against the truth</h2>" + table(head, cells)
+
+
+def _loops(report: Mapping[str, Any]) -> str:
+    loops = (report["stages"].get("odometry") or {}).get("loops")
+    if not loops:
+        return ""
+    if not isinstance(loops, list):
+        text = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in dict(loops).items())
+        return f"<h2>Loops</h2><p>{escape(text)}</p>"
+    keys = list(dict.fromkeys(key for row in loops for key in row))
+    rows = [[("", _short(row.get(key))) for key in keys] for row in loops]
+    return "<h2>Loops</h2>" + table([("", key.replace("_", " ")) for key in keys], rows)
+
+
+def _sequence(sequence: Mapping[str, Any]) -> str:
+    if not sequence:
+        return ""
+    rows = [[("t", key.replace("_", " ")), ("w", _short(value))] for key, value in sequence.items() if key != "cameras"]
+    head = [("", "camera"), ("t", "model"), ("", "size"), ("t", "parameters")]
+    cameras = [
+        [
+            ("", k), ("t", camera["model"]), ("", f"{camera['width']} x {camera['height']}"),
+            ("w", ", ".join(f"{name} {value:.6g}" for name, value in camera["params"].items())),
+        ]
+        for k, camera in enumerate(sequence.get("cameras", ()))
+    ]  # fmt: skip
+    return "<h2>Sequence</h2>" + table([("t", ""), ("t", "")], rows) + (table(head, cameras) if cameras else "")
+
+
+def _timing(timing: Mapping[str, Any] | None) -> str:
+    if not timing:
+        return ""
+    rows = [[("t", part.replace("_", " ")), ("", f"{value:.1f}")] for part, value in timing["parts_cpu_ms"].items()]
+    rows.append([("t", "all"), ("", f"{timing['cpu_ms_per_frame']:.1f}")])
+    note = (
+        f"{timing['num_frames']} frames in {timing['wall_s']:.1f} s, {timing['frames_per_second']:.1f} a second. "
+        "Compiling kernels and drawing the recording are not counted."
+    )
+    return "<h2>Time of a frame</h2>" + table([("t", "part"), ("", "CPU ms")], rows) + f"<p class=dim>{note}</p>"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return str(value)

@@ -1,0 +1,313 @@
+"""Shows an odometry run while it is under way, and records it: the end that stays with the run.
+
+Everything is drawn by a child process (:mod:`sfmapp.viewer.live_process`), which is sent what happens through a pipe by
+a thread of its own. Tracking never waits for it: when the child falls behind, images are left out, then tracked points,
+and only a child that reads nothing at all is given up.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import struct
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.events import Event
+from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
+from sfmapp.viewer.listener import MAX_MESSAGES
+
+if TYPE_CHECKING:
+    from sfmapp.images import sequence as sequences
+    from sfmapp.odometry.result import OdometryResult
+
+Array = NDArray[np.float64]
+
+# What may wait for the child: images go first, then tracked points, then the child.
+MAX_IMAGE_BYTES, MAX_POINT_BYTES, MAX_BYTES = 1 << 25, 1 << 26, 1 << 28
+# Frames of a recording that are shown with their image: every one of a thousand, every second of two thousand.
+MAX_IMAGES = 1000
+_LEVELS = {"decided": "INFO", "warned": "WARN"}
+# the child opens rerun (seconds on a busy machine) and, at the end, writes what still waits
+END_TIMEOUT_S = 300.0
+
+
+@dataclass(frozen=True)
+class Screen:
+    """Where a live run is shown: the address that rerun's viewer receives data on."""
+
+    url: str
+
+
+def thinned_stride(frame_number: int, num_frames: int | None) -> int:
+    """Every how manieth frame is shown with its image, so that a recording of any length stays modest.
+
+    Of a sequence of unknown length the first thousand, then every second of as many more, then every fourth.
+    """
+    if num_frames is not None:
+        return max(1, -(-num_frames // MAX_IMAGES))
+    return 1 << max(0, (frame_number // MAX_IMAGES).bit_length())
+
+
+class LiveView:
+    """Listener of a run; a context manager that ends its child in any case."""
+
+    def __init__(self, recording: Path | None, screen: Screen | None) -> None:
+        self._recording, self._screen = recording, screen
+        self._outbox: Outbox | None = None
+        self._num_frames: int | None = None
+        self._count = self._num_messages = 0
+        self._with_next_frame: list[dict[str, Any]] = []
+
+    @property
+    def is_recording(self) -> bool:
+        return self._recording is not None
+
+    def begin(self, sequence: sequences.Sequence) -> None:
+        """Start the child, which first learns what will be played."""
+        camera = sequence.rig.cameras[0]
+        self._num_frames = sequence.num_frames
+        truth = sequence.truth
+        command = [
+            sys.executable, "-m", "sfmapp.viewer.live_process",
+            str(self._recording.absolute()) if self._recording else "", self._screen.url if self._screen else "",
+        ]  # fmt: skip
+        self._outbox = Outbox(command)
+        self._send(
+            "begin", title=os.path.basename(os.path.abspath(sequence.source)) or sequence.source, camera=camera,
+            truth_times=None if truth is None else truth.timestamps_s,
+            truth_cam_from_world=None if truth is None else truth.cam_from_world,
+            is_metric=sequence.rig.is_stereo,
+        )  # fmt: skip
+
+    def __call__(self, event: Event) -> None:
+        if self._outbox is None:
+            return
+        snapshot = event.data.get("snapshot")
+        if isinstance(snapshot, FrameSnapshot):
+            self._send_frame(snapshot)
+        # what is decided at a frame is told before the frame, but drawn with it
+        elif isinstance(snapshot, MapSnapshot):
+            self._with_next_frame.append({"kind": "map", **_map_message(snapshot)})
+        if event.kind in _LEVELS and event.message and self._num_messages < MAX_MESSAGES:
+            self._num_messages += 1
+            text = f"{event.stage}: {event.message}"
+            self._with_next_frame.append({"kind": "log", "level": _LEVELS[event.kind], "text": text})
+
+    def end(self, result: OdometryResult, truth_from_map: Sequence[Array | None], errors_m: Array) -> str:
+        """Show the final result and close; returns what went wrong, empty for nothing.
+
+        Args:
+            truth_from_map: (8,) similarity of each map, None for one that has too little in common with the truth;
+                empty without truth.
+            errors_m: (F,) distance of each frame from the truth, NaN where it is not known.
+        """
+        if self._outbox is None:
+            return ""
+        self._send_decisions()
+        self._send(
+            "end", frame_idx=result.frame_idx, timestamps_s=result.timestamps_s, frame_map=result.frame_map,
+            cam_from_world=result.cam_from_world, truth_from_map=list(truth_from_map), errors=errors_m, maps=_final_maps(result),
+        )  # fmt: skip
+        outbox, self._outbox = self._outbox, None
+        return outbox.close(END_TIMEOUT_S)
+
+    def __enter__(self) -> LiveView:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._outbox is not None:
+            self._outbox.abandon()
+            self._outbox = None
+
+    def _send_frame(self, seen: FrameSnapshot) -> None:
+        assert self._outbox is not None
+        stride = thinned_stride(self._count, self._num_frames)
+        is_shown = self._count % stride == 0
+        self._count += 1
+        waiting = self._outbox.num_bytes
+        image = seen.image if is_shown and waiting < MAX_IMAGE_BYTES else None
+        has_points = is_shown and waiting < MAX_POINT_BYTES
+        self._send(
+            "frame", frame_idx=seen.frame_idx, timestamp_s=seen.timestamp_s, state=int(seen.state), image=image,
+            xy=seen.xy if has_points else None, is_mapped=seen.is_mapped if has_points else None,
+            num_tracked=len(seen.xy), num_mapped=int(np.count_nonzero(seen.is_mapped)), map_idx=seen.map_idx,
+            cam_from_world=seen.cam_from_world, time_s=seen.time_s,
+        )  # fmt: skip
+        self._send_decisions()
+
+    def _send_decisions(self) -> None:
+        assert self._outbox is not None
+        for message in self._with_next_frame:
+            self._outbox.put(message)
+        self._with_next_frame.clear()
+
+    def _send(self, kind: str, **content: Any) -> None:
+        assert self._outbox is not None
+        self._outbox.put({"kind": kind, **content})
+
+
+def _map_message(seen: MapSnapshot) -> dict[str, Any]:
+    return {
+        "frame_idx": seen.frame_idx,
+        "map_idx": seen.map_idx,
+        "keyframe_frame_idx": seen.keyframe_frame_idx,
+        "keyframe_cam_from_world": seen.keyframe_cam_from_world,
+        "point_id": seen.point_id,
+        "point_xyz": np.asarray(seen.point_xyz, np.float32),
+        "is_complete": seen.is_complete,
+    }
+
+
+def _final_maps(result: OdometryResult) -> list[dict[str, Any]]:
+    maps = []
+    for entry in result.maps:
+        model = entry.reconstruction
+        kept = np.flatnonzero(model.is_triangulated)
+        maps.append(
+            {
+                "keyframe_cam_from_world": model.cam_from_world[entry.keyframe_image_idx],
+                "point_xyz": model.point_xyz[kept].astype(np.float32),
+                "point_rgb": model.point_rgb[kept],
+                "unit": "" if entry.scale_source == "none" else "m",
+            }
+        )
+    return maps
+
+
+# ------------------------------------------------------------------------------------------------------------- the pipe
+
+
+class Outbox:
+    """Messages on their way to a child's standard input: dicts of plain values and arrays."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        # a session of its own: a Ctrl-C in the terminal is for the run, which then tells the child how it ended
+        self._child = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
+        )
+        self._waiting: deque[dict[str, Any] | None] = deque()
+        self._changed = threading.Condition()
+        self._error_text: list[bytes] = []
+        self._has_failed = False
+        self.num_bytes = 0
+        self._threads = [
+            threading.Thread(target=work, name=name, daemon=True)
+            for work, name in ((self._write_all, "recording_0"), (self._read_errors, "recording_1"))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def put(self, message: dict[str, Any]) -> None:
+        """Send a message when the child has time; never waits."""
+        with self._changed:
+            if self._has_failed:
+                return
+            self._waiting.append(message)
+            self.num_bytes += _size(message)
+            if self.num_bytes > MAX_BYTES:
+                self._give_up()
+            self._changed.notify()
+
+    def close(self, timeout_s: float) -> str:
+        """Let the child finish; returns what went wrong, empty for nothing."""
+        with self._changed:
+            self._waiting.append(None)
+            self._changed.notify()
+        self._threads[0].join(timeout_s)
+        try:
+            code = self._child.wait(0.0 if self._threads[0].is_alive() else timeout_s)
+        except subprocess.TimeoutExpired:
+            self.abandon()
+            return f"not finished after {timeout_s:g} s"
+        self._threads[1].join(timeout_s)
+        if code == 0 and not self._has_failed:
+            return ""
+        lines = b"".join(self._error_text).decode(errors="replace").strip().splitlines()
+        return f"exit code {code}: {lines[-1] if lines else 'it could not keep up'}"
+
+    def abandon(self) -> None:
+        """End the child at once."""
+        with self._changed:
+            self._give_up()
+            self._changed.notify()
+        for thread in self._threads:
+            thread.join(10.0)
+
+    def _give_up(self) -> None:
+        self._has_failed = True
+        self._waiting.clear()
+        self._waiting.append(None)
+        self.num_bytes = 0
+        self._child.kill()
+
+    def _write_all(self) -> None:
+        assert self._child.stdin is not None
+        try:
+            while (message := self._next()) is not None:
+                write_message(self._child.stdin.fileno(), message)
+            self._child.stdin.close()
+        except OSError:  # the child has died; how is asked for at the end
+            with self._changed:
+                self._has_failed = True
+                self._waiting.clear()
+
+    def _next(self) -> dict[str, Any] | None:
+        with self._changed:
+            while not self._waiting:
+                self._changed.wait()
+            message = self._waiting.popleft()
+            self.num_bytes -= 0 if message is None else _size(message)
+            return message
+
+    def _read_errors(self) -> None:
+        assert self._child.stderr is not None
+        while data := os.read(self._child.stderr.fileno(), 1 << 14):
+            self._error_text = [*self._error_text[-3:], data]
+        self._child.wait()
+
+
+def _size(message: dict[str, Any]) -> int:
+    return 200 + sum(value.nbytes for value in message.values() if isinstance(value, np.ndarray))
+
+
+def write_message(descriptor: int, message: dict[str, Any]) -> None:
+    """Pickle a message without copying its arrays: sizes, the pickle, then the bytes of each array."""
+    buffers: list[pickle.PickleBuffer] = []
+    parts: list[Any] = [pickle.dumps(message, 5, buffer_callback=buffers.append), *(buffer.raw() for buffer in buffers)]
+    sizes = [len(memoryview(part).cast("B")) for part in parts]
+    _write(descriptor, struct.pack(f"<{1 + len(sizes)}Q", len(sizes), *sizes))
+    for part in parts:
+        _write(descriptor, part)
+
+
+def _write(descriptor: int, data: Any) -> None:
+    view = memoryview(data).cast("B")
+    while len(view):
+        view = view[os.write(descriptor, view) :]
+
+
+def read_message(read: Callable[[int], bytes]) -> dict[str, Any] | None:
+    """What :func:`write_message` wrote; None at the end, also where it comes in the middle of a message."""
+    head = read(8)
+    if len(head) < 8:
+        return None
+    (count,) = struct.unpack("<Q", head)
+    sizes = struct.unpack(f"<{count}Q", read(8 * count))
+    parts = [bytearray(read(size)) for size in sizes]
+    if any(len(part) < size for part, size in zip(parts, sizes, strict=True)):
+        return None
+    message: dict[str, Any] = pickle.loads(parts[0], buffers=parts[1:])
+    return message

@@ -1,0 +1,338 @@
+"""Draws an odometry run with rerun, message by message.
+
+Entities (everything on the timelines ``frame`` and ``time``)::
+
+    world/scene                     turned so that up is up
+    world/scene/live/map0/points, keyframes, path   blocks of the map and of the trajectory, as they are known
+    world/scene/live/camera         where the camera is now
+    world/scene/live/truth          the true path so far, laid on the trajectory
+    world/scene/final/map0/...      the result
+    image, image/mapped, image/tracked   the frame, points that the pose was measured with, and the other tracks
+    plots/points, time, error       numbers by frame
+    log                             decisions
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from sfmapp.evaluation.trajectory import Alignment, Trajectory
+from sfmapp.geometry import rigid3, similarity
+from sfmapp.odometry.result import FrameState
+from sfmapp.viewer.live_scene import FRUSTUM_SHARE, LiveMap, frustum_lines, unbroken
+from sfmapp.viewer.photos import shrunk_jpeg
+from sfmapp.viewer.replay import up_direction
+from sfmapp.viewer.stage import eye_direction, frame_view, turn_to_z
+
+Array = NDArray[np.float64]
+
+APPLICATION = "sfmapp odometry"
+FRAME_TIMELINE, TIME_TIMELINE = "frame", "time"
+# 30 KB an image of 640 pixels: a thousand of them stay below 40 MB
+_IMAGE_SIDE_PX, _IMAGE_QUALITY = 640, 70
+_BLUE, _ORANGE, _GREEN, _GREY, _RED = (80, 150, 255), (255, 150, 40), (90, 200, 120), (140, 140, 150), (235, 70, 60)
+# negative: in points of the screen, not in units of the scene
+_LINE_WIDTH = -1.2
+_LIVE, _FINAL = "world/scene/live", "world/scene/final"
+_MAX_FINAL_POINTS = 300_000
+
+
+class LiveDrawing:
+    """A recording under way, to a file, to a viewer, or both."""
+
+    def __init__(self, path: Path | None, url: str | None) -> None:
+        self._recording = rr.RecordingStream(APPLICATION)
+        sinks = [*([rr.FileSink(os.fspath(path))] if path else []), *([rr.GrpcSink(url)] if url else [])]
+        self._recording.set_sinks(*sinks)
+        self._maps: dict[int, LiveMap] = {}
+        self._truth: Trajectory | None = None
+        self._alignment: Alignment = "sim3"
+        self._count = 0
+        self._begin_s = 0.0
+        self._last = rigid3.IDENTITY
+        self._newest: Mapping[str, Any] | None = None
+        self._drawers = {
+            "begin": self._begin, "frame": self._frame, "map": self._map, "log": self._log, "end": self._end,
+        }  # fmt: skip
+
+    def draw(self, message: Mapping[str, Any]) -> None:
+        """Show what a message tells."""
+        self._drawers[message["kind"]](message)
+
+    def close(self) -> None:
+        """Write out what is left."""
+        self._recording.flush()
+        self._recording.disconnect()
+
+    # ------------------------------------------------------------------ messages
+
+    def _begin(self, message: Mapping[str, Any]) -> None:
+        recording, self._camera = self._recording, message["camera"]
+        self._has_truth = message["truth_times"] is not None
+        if self._has_truth:
+            poses = message["truth_cam_from_world"]
+            self._truth = Trajectory.from_cam_from_world(poses, message["truth_times"])
+            self._alignment = "se3" if message["is_metric"] else "sim3"
+        recording.send_recording_name(message["title"])
+        recording.send_blueprint(blueprint(None, self._has_truth), make_active=True, make_default=True)
+        recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        # cameras are taken to start level until more of them are known
+        recording.log("world/scene", rr.Transform3D(mat3x3=turn_to_z(np.array([0.0, -1.0, 0.0]))), static=True)
+        for path, color, radius in (("mapped", _GREEN, 2.2), ("tracked", _ORANGE, 1.8)):
+            fields = rr.Points2D.from_fields(radii=rr.Radius.ui_points(radius), colors=color)
+            recording.log(f"image/{path}", fields, static=True)
+        curves = [
+            ("points/tracked", _ORANGE, "tracked"), ("points/mapped", _GREEN, "measured with"),
+            ("time/tracking", _BLUE, "tracking"), ("error/live", _GREY, "live"), ("error/final", _GREEN, "final"),
+        ]  # fmt: skip
+        for name, color, label in curves:
+            recording.log(f"plots/{name}", rr.SeriesLines(colors=[color], names=[label], widths=[1.5]), static=True)
+
+    def _frame(self, message: Mapping[str, Any]) -> None:
+        if self._count == 0:
+            self._begin_s = message["timestamp_s"]
+        self._count += 1
+        self._set_time(message["frame_idx"], message["timestamp_s"])
+        recording = self._recording
+        self._draw_image(message)
+        for name, value in (("tracked", message["num_tracked"]), ("mapped", message["num_mapped"])):
+            recording.log(f"plots/points/{name}", rr.Scalars(value))
+        recording.log("plots/time/tracking", rr.Scalars(1e3 * message["time_s"]))
+        pose, map_idx = message["cam_from_world"], message["map_idx"]
+        if not np.isfinite(pose[0]) or map_idx < 0:
+            return
+        ours = self._map_of(map_idx)
+        block = ours.add_frame(self._count, message["timestamp_s"], pose)
+        self._draw_path(map_idx, {block})
+        self._newest = message
+        self._last = rigid3.compose(ours.placement, rigid3.inverse(pose))
+        self._draw_camera(ours, map_idx)
+
+    def _map(self, message: Mapping[str, Any]) -> None:
+        map_idx = message["map_idx"]
+        ours = self._map_of(map_idx)
+        changed = ours.change(message)
+        newest = self._newest
+        if newest is not None and newest["frame_idx"] == message["frame_idx"] and newest["image"] is not None:
+            ours.colour(self._camera, newest["cam_from_world"], newest["image"])
+        self._draw_points(map_idx, changed.points)
+        for block in sorted(changed.keyframes):
+            lines = frustum_lines(self._camera, ours.keyframe_poses(block), ours.frustum or 0.1)
+            strips = rr.LineStrips3D(lines, colors=_BLUE, radii=rr.Radius.ui_points(0.7))
+            self._recording.log(f"{_LIVE}/map{map_idx}/keyframes/{block}", strips)
+        self._draw_path(map_idx, changed.frames)
+        if self._truth is not None:
+            self._draw_truth(ours, map_idx)
+
+    def _log(self, message: Mapping[str, Any]) -> None:
+        self._recording.log("log", rr.TextLog(message["text"], level=message["level"]))
+
+    def _end(self, message: Mapping[str, Any]) -> None:
+        """The result, a frame after the last, and with it what is up and a view of it all."""
+        recording = self._recording
+        if not len(message["frame_idx"]):
+            return
+        step = float(np.median(np.diff(message["timestamps_s"]))) if len(message["timestamps_s"]) > 1 else 0.1
+        self._set_time(int(message["frame_idx"][-1]) + 1, float(message["timestamps_s"][-1]) + step)
+        if np.isfinite(message["errors"]).any():
+            known = np.isfinite(message["errors"])
+            times = [
+                rr.TimeColumn(FRAME_TIMELINE, sequence=message["frame_idx"][known]),
+                rr.TimeColumn(TIME_TIMELINE, duration=message["timestamps_s"][known] - self._begin_s),
+            ]
+            recording.send_columns("plots/error/final", times, rr.Scalars.columns(scalars=message["errors"][known]))
+        if not message["maps"]:
+            return
+        recording.log(_LIVE, rr.Clear(recursive=True))
+        bodies, headings = self._draw_final(message)
+        has_pose = (message["frame_map"] == 0) & np.isfinite(message["cam_from_world"][:, 0])
+        poses = message["cam_from_world"][has_pose]
+        rotation = turn_to_z(up_direction(poses[:: max(1, len(poses) // 1000)]))
+        recording.log("world/scene", rr.Transform3D(mat3x3=rotation), static=True)
+        direction = eye_direction((headings @ rotation.T).mean(0))
+        eye = frame_view(np.concatenate(bodies) @ rotation.T, direction)
+        recording.send_blueprint(blueprint(eye, self._has_truth), make_active=True, make_default=True)
+
+    # ------------------------------------------------------------------ parts
+
+    def _set_time(self, frame_idx: int, timestamp_s: float) -> None:
+        self._recording.set_time(FRAME_TIMELINE, sequence=frame_idx)
+        self._recording.set_time(TIME_TIMELINE, duration=timestamp_s - self._begin_s)
+
+    def _map_of(self, map_idx: int) -> LiveMap:
+        """A map; one that is new begins where the camera was last seen."""
+        if map_idx not in self._maps:
+            self._maps[map_idx] = LiveMap(self._last)
+            placed = rr.Transform3D(translation=self._last[4:], quaternion=self._last[:4])
+            self._recording.log(f"{_LIVE}/map{map_idx}", placed)
+        return self._maps[map_idx]
+
+    def _draw_image(self, message: Mapping[str, Any]) -> None:
+        recording = self._recording
+        if message["image"] is None:
+            return
+        height, width = message["image"].shape
+        data, (shown_width, _) = shrunk_jpeg(message["image"], _IMAGE_SIDE_PX, _IMAGE_QUALITY)
+        recording.log("image", rr.EncodedImage(contents=data, media_type="image/jpeg"))
+        if message["xy"] is None:
+            return
+        xy, is_mapped = message["xy"] * (shown_width / width), message["is_mapped"]
+        recording.log("image/mapped", rr.Points2D.from_fields(positions=xy[is_mapped]))
+        recording.log("image/tracked", rr.Points2D.from_fields(positions=xy[~is_mapped]))
+        state = FrameState(message["state"])
+        if state in (FrameState.LOST, FrameState.RELOCALIZED):
+            where = np.array([[0.0, 0.0]])
+            shown = rr.Boxes2D(mins=where, sizes=[[shown_width, height * shown_width / width]], colors=_RED, radii=3.0)
+            recording.log("image/lost", shown if state == FrameState.LOST else rr.Clear(recursive=False))
+
+    def _draw_points(self, map_idx: int, blocks: set[int]) -> None:
+        for block in sorted(blocks):
+            xyz, grey = self._maps[map_idx].points(block)
+            points = rr.Points3D(xyz, colors=np.repeat(grey[:, None], 3, 1), radii=rr.Radius.ui_points(1.5))
+            self._recording.log(f"{_LIVE}/map{map_idx}/points/{block}", points)
+
+    def _draw_path(self, map_idx: int, blocks: set[int]) -> None:
+        for block in sorted(blocks):
+            strips = rr.LineStrips3D(self._maps[map_idx].strips(block), colors=_ORANGE, radii=rr.Radius.ui_points(1.2))
+            self._recording.log(f"{_LIVE}/map{map_idx}/path/{block}", strips)
+
+    def _draw_camera(self, ours: LiveMap, map_idx: int) -> None:
+        path = f"{_LIVE}/camera"
+        self._recording.log(path, rr.Transform3D(translation=self._last[4:], quaternion=self._last[:4]))
+        # the frustum says it all; axes of no length are an error to the viewer
+        self._recording.log(path, rr.TransformAxes3D(1e-6))
+        k = self._camera.k_matrix
+        pinhole = rr.Pinhole(
+            image_from_camera=k, resolution=[self._camera.width, self._camera.height], color=_ORANGE,
+            line_width=_LINE_WIDTH, image_plane_distance=1.5 * (ours.frustum or 0.1), camera_xyz=rr.ViewCoordinates.RDF,
+        )  # fmt: skip
+        self._recording.log(path, pinhole)
+
+    def _draw_truth(self, ours: LiveMap, map_idx: int) -> None:
+        """The true path until now, laid on the trajectory as it is now."""
+        assert self._truth is not None
+        fit = ours.against(self._truth, self._alignment)
+        if fit is None:
+            return
+        map_from_truth, error = fit
+        self._recording.log("plots/error/live", rr.Scalars(error))
+        times = self._truth.timestamps_s
+        assert times is not None
+        until = int(np.searchsorted(times, ours.last_time_s, side="right"))
+        since = int(np.searchsorted(times, ours.first_time_s))
+        xyz = similarity.apply(map_from_truth, self._truth.position[since:until][:: max(1, (until - since) // 2000)])
+        if len(xyz) > 1:
+            strips = rr.LineStrips3D([xyz], colors=_GREEN, radii=rr.Radius.ui_points(1.0))
+            self._recording.log(f"{_LIVE}/map{map_idx}/truth", strips)
+
+    def _draw_final(self, message: Mapping[str, Any]) -> tuple[list[Array], Array]:
+        """All maps of the result in one scene; returns what a view has to hold, and where the cameras look."""
+        recording = self._recording
+        bodies: list[Array] = []
+        headings: list[Array] = []
+        for m, entry in enumerate(message["maps"]):
+            place = placement(message, m, bodies)
+            if place is None:
+                continue
+            mine = np.where((message["frame_map"] == m)[:, None], message["cam_from_world"], np.nan)
+            known = np.isfinite(mine[:, 0])
+            poses = np.full_like(mine, np.nan)
+            poses[known] = similarity.transform_poses(place, mine[known])
+            keyframes = similarity.transform_poses(place, entry["keyframe_cam_from_world"])
+            xyz = similarity.apply(place, entry["point_xyz"].astype(np.float64))
+            root = f"{_FINAL}/map{m}"
+            kept = slice(None, None, max(1, -(-len(xyz) // _MAX_FINAL_POINTS)))
+            points = rr.Points3D(xyz[kept], colors=entry["point_rgb"][kept], radii=rr.Radius.ui_points(1.5))
+            recording.log(f"{root}/points", points)
+            length = final_frustum(keyframes, xyz)
+            frusta = frustum_lines(self._camera, keyframes, length)
+            recording.log(f"{root}/keyframes", rr.LineStrips3D(frusta, colors=_BLUE, radii=rr.Radius.ui_points(0.7)))
+            path = unbroken(rigid3.center(poses), np.arange(len(poses)))
+            recording.log(f"{root}/path", rr.LineStrips3D(path, colors=_ORANGE, radii=rr.Radius.ui_points(1.6)))
+            if self._truth is not None and (fit := message["truth_from_map"][m]) is not None:
+                self._draw_final_truth(root, similarity.compose(place, similarity.inverse(fit)), message, known)
+            bodies.append(body_of(rigid3.center(poses[known]), xyz))
+            headings.append(rigid3.rotation_matrix(poses[known])[:, 2])
+        return bodies, np.concatenate(headings)
+
+    def _draw_final_truth(
+        self, root: str, scene_from_truth: Array, message: Mapping[str, Any], known: NDArray[np.bool_]
+    ) -> None:
+        assert self._truth is not None
+        assert self._truth.timestamps_s is not None
+        first, last = message["timestamps_s"][known][[0, -1]]
+        during = (self._truth.timestamps_s >= first) & (self._truth.timestamps_s <= last)
+        xyz = similarity.apply(scene_from_truth, self._truth.position[during])
+        strips = rr.LineStrips3D([xyz], colors=_GREEN, radii=rr.Radius.ui_points(1.0))
+        self._recording.log(f"{root}/truth", strips)
+
+
+def placement(message: Mapping[str, Any], m: int, bodies: Sequence[Array]) -> Array | None:
+    """``scene_from_map`` (8,): where the truth says, or beside the maps before it; the first stays where it is."""
+    if m == 0:
+        return similarity.IDENTITY
+    if not (message["frame_map"] == m).any() or not len(message["maps"][m]["keyframe_cam_from_world"]):
+        return None
+    fits = message["truth_from_map"]
+    if fits and fits[0] is not None and fits[m] is not None:
+        return similarity.compose(similarity.inverse(fits[0]), fits[m])
+    before = np.concatenate(bodies)
+    size = np.ptp(bodies[0], axis=0).max()
+    centers = rigid3.center(message["maps"][m]["keyframe_cam_from_world"])
+    extent = np.ptp(centers, axis=0).max()
+    scale = 1.0 if message["maps"][m]["unit"] or not extent > 0 else 0.4 * size / extent
+    shift = np.array([before[:, 0].max() + 0.15 * size - scale * centers[:, 0].min(), 0.0, 0.0])
+    return np.concatenate([rigid3.IDENTITY[:4], shift, [scale]])
+
+
+def body_of(centers: Array, xyz: Array) -> Array:
+    """(N, 3) the path, and the points that are not farther from its middle than it is long."""
+    middle, half = centers.mean(0), np.ptp(centers, axis=0).max()
+    near = xyz[(np.abs(xyz - middle) < half).all(1)]
+    return np.concatenate([centers, near[:: max(1, len(near) // 5000)]])
+
+
+def final_frustum(keyframes: Array, xyz: Array) -> float:
+    """Length of the cameras: a share of the distance to what they see, no more than half the way to the next."""
+    if not len(xyz) or len(keyframes) < 2:
+        return 0.1
+    centers = rigid3.center(keyframes)
+    sample = xyz[:: max(1, len(xyz) // 2000)]
+    nearest = np.median([np.linalg.norm(sample - c, axis=1).min() for c in centers[:: max(1, len(centers) // 50)]])
+    apart = float(np.median(np.linalg.norm(np.diff(centers, axis=0), axis=1)))
+    size = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    return float(np.clip(FRUSTUM_SHARE * 3 * nearest, 0.004 * size, max(0.6 * apart, 0.004 * size))) or 0.1
+
+
+def blueprint(eye: tuple[Array, Array] | None, has_truth: bool) -> rrb.Blueprint:
+    """The layout. While the run is under way the view follows the camera; at its end it looks at all of the map."""
+    if eye is None:
+        controls = rrb.EyeControls3D(tracking_entity=f"{_LIVE}/camera")
+    else:
+        controls = rrb.EyeControls3D(position=eye[0], look_target=eye[1], eye_up=(0.0, 0.0, 1.0))
+    world = rrb.Spatial3DView(origin="world", name="Map and trajectory", eye_controls=controls, line_grid=False)
+    image = rrb.Spatial2DView(origin="image", name="Frame: green points are in the map, orange ones are not yet")
+    shown = [("points", "Points"), ("time", "CPU time of tracking (ms)")]
+    shown += [("error", "Distance from the truth (m)")] if has_truth else []
+    plots = [rrb.TimeSeriesView(origin=f"plots/{name}", name=label) for name, label in shown]
+    columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
+    log = rrb.TextLogView(origin="log", name="Decisions", columns=columns)
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(world, image, row_shares=[5, 3]),
+            rrb.Vertical(*plots, log, row_shares=[*[2] * len(plots), 2]),
+            column_shares=[5, 2],
+        ),
+        rrb.TimePanel(timeline=FRAME_TIMELINE, state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_views=False,
+    )
