@@ -20,16 +20,21 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.colmap_model import checked_camera
 from sfmapp.formats.flat_yaml import parse_flat_yaml
+from sfmapp.formats.opencv_lens import (
+    SIGMA_CALIBRATED,
+    CalibratedCamera,
+    FullLens,
+    Size,
+    camera_from_opencv,
+    scaled_to,
+)
 from sfmapp.formats.text_input import nearest_rotation, read_json_object, read_limited_text
 from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel, simple_camera
 from sfmapp.scene.rig import Rig
 
 Array = NDArray[np.float64]
-Size = tuple[int, int]
 
-# Trust in a calibration that somebody else made, relative to the focal length: as for camera_params of photographs.
-_SIGMA_CALIBRATED = 0.01
 _LARGEST_BYTES = 1 << 22
 
 _MATRIX_NAMES = ("K", "camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "intrinsics", "intrinsic")
@@ -54,12 +59,14 @@ class Calibration:
         rig: one camera, or two with their poses in metres.
         body_from_cam: (7,) pose that takes points of the first camera to the frame of the body or IMU; None if unknown.
         frames_per_second: None if it does not say.
+        lenses: for each camera of the rig the lens whose frames are to be resampled to be its own; None for none.
         notes: what was changed on the way (a lens fitted, a size scaled), one line each.
     """
 
     rig: Rig
     body_from_cam: Array | None = None
     frames_per_second: float | None = None
+    lenses: tuple[FullLens | None, ...] = (None, None)
     notes: tuple[str, ...] = ()
 
 
@@ -89,109 +96,7 @@ def camera_from_text(text: str, size: Size) -> Camera:
     if not np.isfinite(params).all() or not (focals > 0).all():
         raise UsageError(f"camera is {text!r}, expected finite numbers and positive focal lengths: {expected}")
     camera = simple_camera(model, *size, 1.0, source="user").with_params(params)
-    return replace(camera, focal_sigma=_SIGMA_CALIBRATED * camera.focal)
-
-
-def camera_from_opencv(
-    place: str, size: Size, intrinsics: Sequence[float] | Array, coefficients: Sequence[float] | Array, fisheye: bool
-) -> tuple[Camera, str | None]:
-    """A camera of numbers in OpenCV's terms, and a note if the lens had to be fitted.
-
-    Args:
-        place: begins the messages.
-        intrinsics: fx, fy, cx, cy; pixel centres at whole numbers.
-        coefficients: k1, k2, p1, p2, k3, ... as ``cv2.projectPoints`` has them, or k1..k4 of a fisheye lens.
-
-    Raises:
-        InputError: numbers that no lens has, or a lens with no inverse in the picture.
-    """
-    fx, fy, cx, cy = (float(value) for value in intrinsics)
-    lens = [float(value) for value in coefficients]
-    while lens and lens[-1] == 0.0:
-        lens.pop()
-    note = None
-    if not all(map(math.isfinite, (fx, fy, cx, cy, *lens))) or min(fx, fy) <= 0:
-        raise InputError(f"{place}: expected finite numbers and positive focal lengths, found {fx, fy, cx, cy, *lens}")
-    if fisheye:
-        if len(lens) > 4:
-            raise InputError(f"{place}: expected 4 coefficients of a fisheye lens, found {len(lens)}")
-        model, params = "OPENCV_FISHEYE", [fx, fy, cx, cy, *lens, *[0.0] * (4 - len(lens))]
-    elif not lens:
-        model, params = "PINHOLE", [fx, fy, cx, cy]
-    elif len(lens) <= 4:
-        model, params = "OPENCV", [fx, fy, cx, cy, *lens, *[0.0] * (4 - len(lens))]
-    else:
-        params, rms, largest = _nearest_opencv(place, size, np.array([fx, fy, cx, cy]), np.array(lens))
-        model = "OPENCV"
-        note = (
-            f"{place}: a lens of {len(lens)} coefficients was fitted with k1, k2, p1, p2:"
-            f" {rms:.3f} px rms over the picture, {largest:.3f} px at most"
-        )
-    params[2:4] = [params[2] + 0.5, params[3] + 0.5]
-    camera = checked_camera(Path(place), 0, model, *size, params)
-    return replace(camera, focal_sigma=_SIGMA_CALIBRATED * camera.focal), note
-
-
-def _nearest_opencv(place: str, size: Size, intrinsics: Array, lens: Array) -> tuple[list[float], float, float]:
-    """OPENCV parameters (pixel centres at whole numbers) that come nearest in the picture; rms and largest error in
-    pixels. Gauss-Newton over a grid of pixels; the start, the lens cut off behind p2, is near in practice."""
-    import cv2
-
-    width, height = size
-    matrix = np.array([[intrinsics[0], 0, intrinsics[2]], [0, intrinsics[1], intrinsics[3]], [0, 0, 1]])
-    # OpenCV takes 4, 5, 8, 12 or 14
-    wanted = next((count for count in (5, 8, 12, 14) if count >= len(lens)), 0)
-    if not wanted:
-        raise InputError(f"{place}: expected at most 14 coefficients of a lens, found {len(lens)}")
-    full = np.concatenate([lens, np.zeros(wanted - len(lens))])
-    grid = np.stack(np.meshgrid(np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 25)), -1).reshape(-1, 1, 2)
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
-    rays = cv2.undistortPoints(grid, matrix, full, criteria=criteria).reshape(-1, 2)
-    homogeneous = np.concatenate([rays, np.ones((len(rays), 1))], 1)
-    back = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), matrix, full)[0].reshape(-1, 2)
-    pixels = grid.reshape(-1, 2)
-    good = np.abs(back - pixels).max(1) < 1e-3
-    if good.sum() < 0.9 * len(good):
-        raise InputError(f"{place}: the lens has no inverse in a picture of {width}x{height}: {lens.tolist()}")
-    x, y, pixels = rays[good, 0], rays[good, 1], pixels[good]
-    r2 = x * x + y * y
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    params = np.concatenate([intrinsics, lens[:4]])
-    for _ in range(20):
-        fx, fy, cx, cy, k1, k2, p1, p2 = params
-        radial = 1 + r2 * (k1 + r2 * k2)
-        u, v = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-        residual = np.concatenate([fx * u + cx - pixels[:, 0], fy * v + cy - pixels[:, 1]])
-        du = [u, zero, one, zero, fx * x * r2, fx * x * r2 * r2, fx * 2 * x * y, fx * (r2 + 2 * x * x)]
-        dv = [zero, v, zero, one, fy * y * r2, fy * y * r2 * r2, fy * (r2 + 2 * y * y), fy * 2 * x * y]
-        step = np.linalg.lstsq(np.concatenate([np.stack(du, 1), np.stack(dv, 1)]), residual, rcond=None)[0]
-        params = params - step
-        if np.abs(step).max() < 1e-10:
-            break
-    error = np.hypot(*residual.reshape(2, -1))
-    return params.tolist(), float(np.sqrt(np.mean(error**2))), float(error.max())
-
-
-def scaled_to(place: str, camera: Camera, size: Size) -> tuple[Camera, str | None]:
-    """The camera for images of another size but the same shape, and a note if that was needed.
-
-    Raises:
-        InputError: the shapes differ: the images were cut, or the calibration is of another camera.
-    """
-    if (camera.width, camera.height) == size:
-        return camera, None
-    scale = size[0] / camera.width
-    if abs(camera.height * scale - size[1]) > 1.0:
-        raise InputError(
-            f"{place}: expected a calibration for images of {size[0]}x{size[1]} pixels, found one for "
-            f"{camera.width}x{camera.height}",
-            "calibrate the camera at the size of the images, or give --camera",
-        )
-    is_length = [name[0] in "fc" for name in PARAM_NAMES[camera.model]]
-    sigma = camera.focal_sigma and camera.focal_sigma * scale
-    params = np.where(is_length, camera.params * scale, camera.params)
-    note = f"{place}: calibrated at {camera.width}x{camera.height}, scaled to the images' {size[0]}x{size[1]}"
-    return replace(camera, width=size[0], height=size[1], params=params, focal_sigma=sigma), note
+    return replace(camera, focal_sigma=SIGMA_CALIBRATED * camera.focal)
 
 
 def read_calibration(path: str | Path, image_sizes: Sequence[Size]) -> Calibration:
@@ -237,7 +142,7 @@ def _from_colmap(place: str, fields: list[str], image_sizes: Sequence[Size]) -> 
             f"{place}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {' '.join(fields)[:80]}"
         ) from None
     camera = checked_camera(Path(place), fields[0], fields[1], width, height, params)
-    return _of_cameras(place, [replace(camera, focal_sigma=_SIGMA_CALIBRATED * camera.focal)], image_sizes)
+    return _of_cameras(place, [_trusted(camera)], image_sizes)
 
 
 def _from_plain_numbers(place: str, fields: list[str], image_sizes: Sequence[Size]) -> Calibration:
@@ -252,8 +157,8 @@ def _from_plain_numbers(place: str, fields: list[str], image_sizes: Sequence[Siz
             f"{place}: expected fx fy cx cy, with k1 k2 p1 p2 and k3 or without, or a 3 x 3 matrix, found "
             f"{len(fields)} numbers"
         )
-    camera, note = camera_from_opencv(place, image_sizes[0], values[:4], values[4:], False)
-    return _of_cameras(place, [camera], image_sizes, notes=(note,) if note else ())
+    camera = camera_from_opencv(place, image_sizes[0], values[:4], values[4:], False)
+    return _of_cameras(place, [camera], image_sizes)
 
 
 def calibration_from_fields(place: str, fields: dict[str, Any], image_sizes: Sequence[Size]) -> Calibration:
@@ -277,17 +182,17 @@ def calibration_from_fields(place: str, fields: dict[str, Any], image_sizes: Seq
 
 
 def _from_one(place: str, fields: dict[str, Any], image_sizes: Sequence[Size]) -> Calibration:
-    camera, note = _camera(place, fields, image_sizes[0])
-    notes = (note,) if note else ()
-    body = None
+    camera = _camera(place, fields, image_sizes[0])
+    return _of_cameras(place, [camera, camera], image_sizes, _body_from_cam(place, fields), _beside(place, fields))
+
+
+def _body_from_cam(place: str, fields: dict[str, Any]) -> Array | None:
+    """(7,) from EuRoC's ``T_BS`` or Kalibr's ``T_cam_imu``, whose body is the IMU."""
     if "T_BS" in fields:
-        body = read_pose(f"{place}: T_BS", fields["T_BS"])
-    elif "T_cam_imu" in fields:
-        body = rigid3.inverse(read_pose(f"{place}: T_cam_imu", fields["T_cam_imu"]))
-    right = _beside(place, fields)
-    if right is None:
-        return _of_cameras(place, [camera], image_sizes, body, notes=notes)
-    return _of_cameras(place, [camera, camera], image_sizes, body, [right], notes)
+        return read_pose(f"{place}: T_BS", fields["T_BS"])
+    if "T_cam_imu" in fields:
+        return rigid3.inverse(read_pose(f"{place}: T_cam_imu", fields["T_cam_imu"]))
+    return None
 
 
 def _beside(place: str, fields: dict[str, Any]) -> Array | None:
@@ -302,52 +207,39 @@ def _beside(place: str, fields: dict[str, Any]) -> Array | None:
 
 def _from_sections(place: str, fields: dict[str, Any], pair: Sequence[str], image_sizes: Sequence[Size]) -> Calibration:
     """``cam0`` and perhaps ``cam1`` as sections: Kalibr's camchain, and whoever writes alike."""
-    cameras, bodies = [], []
-    notes: list[str] = []
+    cameras: list[CalibratedCamera] = []
+    bodies: list[Array | None] = []
     chain = None
     for position, name in enumerate(pair[: len(image_sizes)]):
         section = fields.get(name)
         if not isinstance(section, dict):
             break
-        one = _from_one(f"{place}: {name}", section, [image_sizes[position]])
-        cameras.append(one.rig.cameras[0])
-        notes.extend(one.notes)
-        bodies.append(one.body_from_cam)
+        cameras.append(_camera(f"{place}: {name}", section, image_sizes[position]))
+        bodies.append(_body_from_cam(f"{place}: {name}", section))
         if "T_cn_cnm1" in section and position == 1:
             chain = read_pose(f"{place}: {name}: T_cn_cnm1", section["T_cn_cnm1"])
-    others = []
     if len(cameras) == 2:
         if chain is None and bodies[0] is not None and bodies[1] is not None:
             chain = rigid3.compose(rigid3.inverse(bodies[1]), bodies[0])
         if chain is None:
             chain = _beside(place, fields)
-        if chain is None:
-            cameras = cameras[:1]
-            notes.append(f"{place}: it does not say where {pair[1]} sits")
-        else:
-            others = [chain]
-    return _of_cameras(place, cameras, image_sizes, bodies[0], others, tuple(notes))
+    return _of_cameras(place, cameras, image_sizes, bodies[0], chain)
 
 
 def _from_opencv_pair(place: str, fields: dict[str, Any], image_sizes: Sequence[Size]) -> Calibration:
     letter = "M" if "M1" in fields else "K"
-    cameras: list[Camera] = []
-    notes: list[str] = []
+    cameras: list[CalibratedCamera] = []
     for position in range(min(2, len(image_sizes))):
+        if f"{letter}{position + 1}" not in fields:
+            break
         names = {"K": fields.get(f"{letter}{position + 1}"), "D": fields.get(f"D{position + 1}", [])}
         shared = {key: value for key, value in fields.items() if "size" in key or "width" in key or "height" in key}
-        camera, note = _camera(f"{place}: {letter}{position + 1}", {**shared, **names}, image_sizes[position])
-        cameras.append(camera)
-        notes.extend([note] if note else [])
-    others = []
-    if len(cameras) == 2:
-        if "R" in fields and "T" in fields:
-            rotation = nearest_rotation(f"{place}: R", _numbers(f"{place}: R", fields["R"], (3, 3)))
-            others = [rigid3.from_matrix(rotation, _numbers(f"{place}: T", fields["T"], (3,)))]
-        else:
-            cameras = cameras[:1]
-            notes.append(f"{place}: it does not say where the second camera sits (no R and T)")
-    return _of_cameras(place, cameras, image_sizes, None, others, tuple(notes))
+        cameras.append(_camera(f"{place}: {letter}{position + 1}", {**shared, **names}, image_sizes[position]))
+    second = None
+    if "R" in fields and "T" in fields:
+        rotation = nearest_rotation(f"{place}: R", _numbers(f"{place}: R", fields["R"], (3, 3)))
+        second = rigid3.from_matrix(rotation, _numbers(f"{place}: T", fields["T"], (3,)))
+    return _of_cameras(place, cameras, image_sizes, None, second)
 
 
 def _from_projections(place: str, fields: dict[str, Any], image_sizes: Sequence[Size], first: int) -> Calibration:
@@ -363,13 +255,13 @@ def _from_projections(place: str, fields: dict[str, Any], image_sizes: Sequence[
         if matrix[0, 1] or matrix[1, 0] or matrix[2, :3].tolist() != [0, 0, 1]:
             raise InputError(f"{place}: {name}: expected K [I | t] with a K without skew, found {matrix.tolist()}")
         intrinsics = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
-        cameras.append(camera_from_opencv(f"{place}: {name}", image_sizes[position], intrinsics, [], False)[0])
+        cameras.append(camera_from_opencv(f"{place}: {name}", image_sizes[position], intrinsics, [], False))
         positions.append(np.linalg.solve(matrix[:, :3], matrix[:, 3]))
-    others = [np.array([0.0, 0.0, 0.0, 1.0, *(position - positions[0])]) for position in positions[1:]]
-    if others and not np.linalg.norm(others[0][4:]) > 1e-6:
-        cameras, others = cameras[:1], []
+    second = None
+    if len(positions) > 1 and np.linalg.norm(positions[1] - positions[0]) > 1e-6:
+        second = np.array([0.0, 0.0, 0.0, 1.0, *(positions[1] - positions[0])])
     body = np.array([0.0, 0.0, 0.0, 1.0, *-positions[0]])
-    return _of_cameras(place, cameras, image_sizes, body, others)
+    return _of_cameras(place, cameras, image_sizes, body, second)
 
 
 def kitti_calibration(path: Path, image_sizes: Sequence[Size], first: int) -> Calibration:
@@ -384,25 +276,29 @@ def kitti_calibration(path: Path, image_sizes: Sequence[Size], first: int) -> Ca
 
 def _of_cameras(
     place: str,
-    cameras: list[Camera],
+    cameras: list[CalibratedCamera],
     image_sizes: Sequence[Size],
     body_from_cam: Array | None = None,
-    others: Sequence[Array] = (),
-    notes: tuple[str, ...] = (),
+    second: Array | None = None,
 ) -> Calibration:
-    """Cameras scaled to their images; ``others`` are the poses of those behind the first, in the frame of the first."""
-    fitted = [scaled_to(place, camera, size) for camera, size in zip(cameras, image_sizes, strict=False)]
-    poses = np.array([rigid3.IDENTITY, *others])[: len(fitted)]
-    notes += tuple(note for _, note in fitted if note)
-    return Calibration(Rig(tuple(camera for camera, _ in fitted), poses), body_from_cam, notes=notes)
+    """The cameras scaled to their images; without the pose of the second in the frame of the first, the first alone."""
+    known = cameras if second is not None else cameras[:1]
+    fitted = [scaled_to(place, camera, size) for camera, size in zip(known, image_sizes, strict=False)]
+    poses = np.array([rigid3.IDENTITY] if len(fitted) < 2 else [rigid3.IDENTITY, second])
+    return Calibration(
+        Rig(tuple(one.camera for one in fitted), poses),
+        body_from_cam,
+        lenses=tuple(one.lens for one in fitted),
+        notes=tuple(note for one in fitted for note in one.notes),
+    )
 
 
-def _camera(place: str, fields: dict[str, Any], image_size: Size) -> tuple[Camera, str | None]:
+def _camera(place: str, fields: dict[str, Any], image_size: Size) -> CalibratedCamera:
     """One camera of a section, at the size that the section states, or else at that of the images."""
     size = _size(place, fields) or image_size
     if isinstance(fields.get("params"), list) and isinstance(fields.get("model"), str):
         camera = checked_camera(Path(place), 0, fields["model"].upper(), *size, _numbers(place, fields["params"], None))
-        return replace(camera, focal_sigma=_SIGMA_CALIBRATED * camera.focal), None
+        return _trusted(camera)
     name = str(fields.get("distortion_model", fields.get("distortion_type", ""))).lower()
     if name not in _FISHEYE_NAMES + _PERSPECTIVE_NAMES:
         raise InputError(f"{place}: expected a distortion model such as radtan or equidistant, found {name!r}")
@@ -410,6 +306,10 @@ def _camera(place: str, fields: dict[str, Any], image_size: Size) -> tuple[Camer
         raise InputError(f"{place}: expected camera_model pinhole, found {fields['camera_model']!r}")
     fisheye = name in _FISHEYE_NAMES or str(fields.get("camera_model", "")).lower() in _FISHEYE_NAMES
     return camera_from_opencv(place, size, _intrinsics(place, fields), _coefficients(place, fields), fisheye)
+
+
+def _trusted(camera: Camera) -> CalibratedCamera:
+    return CalibratedCamera(replace(camera, focal_sigma=SIGMA_CALIBRATED * camera.focal))
 
 
 def _intrinsics(place: str, fields: dict[str, Any]) -> Array:

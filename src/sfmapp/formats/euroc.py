@@ -134,7 +134,7 @@ def _read_rig(mav: Path, cameras: list[str], sizes: tuple[Size, ...]) -> Calibra
         return replace(parts[0], notes=notes)
     second = rigid3.compose(rigid3.inverse(parts[1].body_from_cam), body)
     rig = Rig((first.cameras[0], parts[1].rig.cameras[0]), np.array([rigid3.IDENTITY, second]))
-    return replace(parts[0], rig=rig, notes=notes)
+    return replace(parts[0], rig=rig, lenses=(parts[0].lenses[0], parts[1].lenses[0]), notes=notes)
 
 
 def read_imu(path: Path, body_from_cam: Array) -> Imu:

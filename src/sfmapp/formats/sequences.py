@@ -17,6 +17,7 @@ from sfmapp.formats.calibration import Calibration, camera_from_text, read_calib
 from sfmapp.formats.euroc import find_mav, read_euroc_sequence, read_euroc_truth, read_imu
 from sfmapp.formats.kitti import FRAMES_PER_SECOND as KITTI_FPS
 from sfmapp.formats.kitti import is_kitti, read_kitti, read_kitti_sequence
+from sfmapp.formats.opencv_lens import sampling_map
 from sfmapp.formats.plain_sequence import (
     find_calibration,
     find_pair,
@@ -52,6 +53,8 @@ Array = NDArray[np.float64]
 _LISTS = frozenset({"rgb.txt", "data.csv", "times.txt", "timestamps.txt", "calib.txt", "calib.json", "poses.txt"})
 # Where frames lie that do not lie in the folder itself.
 _FRAME_FOLDERS = ("images", "frames", "rgb", "color", "image", "img", "imgs", "data", "input", "undistorted")
+# Nothing that moves carries cameras further apart; a calibration in millimetres says that it does.
+_WIDEST_BASELINE_M = 10.0
 _LAYOUTS = (
     "a folder with images; image_0 and calib.txt (KITTI); rgb.txt and rgb (TUM); mav0 or cam0/data (EuRoC); "
     "left and right; or a video"
@@ -205,6 +208,9 @@ def _rig(
     rig = calibration.rig if len(sizes) > 1 else Rig.single(calibration.rig.cameras[0])
     if len(sizes) > 1 and not rig.is_stereo:
         events.warned(STAGE, f"{what}: images of two cameras, but no calibration of the pair: the first is used alone")
+    if rig.is_stereo and np.linalg.norm(rig.cam_from_rig[1, 4:]) > _WIDEST_BASELINE_M:
+        baseline = np.linalg.norm(rig.cam_from_rig[1, 4:])
+        events.warned(STAGE, f"{what}: the cameras of the pair are {baseline:.0f} m apart: are lengths in millimetres?")
     for camera in rig.cameras:
         fx, fy, cx, cy = camera.canonical[:4]
         long_side = max(camera.width, camera.height)
@@ -214,6 +220,11 @@ def _rig(
             text = f"fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g} for {camera.width}x{camera.height} pixels"
             events.warned(STAGE, f"{what}: the calibration is unlike that of any camera: {text}")
     return rig
+
+
+def _sampling(rig: Rig, calibration: Calibration | None) -> tuple[NDArray[np.float32] | None, ...]:
+    lenses = calibration.lenses if calibration else (None,)
+    return tuple(sampling_map(camera, lens) for camera, lens in zip(rig.cameras, lenses, strict=False))
 
 
 # ------------------------------------------------------------------------------------------------------ what is played
@@ -252,6 +263,7 @@ def _sequence(
         [recording.names[i] for i in played],
         times[played],
         [recording.paths[i][: len(rig.cameras)] for i in played],
+        _sampling(rig, calibration),
         fps,
         imu,
         truth,
@@ -361,7 +373,7 @@ def _open_video(source: str, options: SequenceOptions, events: Events, require_c
     truth = None
     if options.truth is not None:
         truth = _read_truth(Path(options.truth), np.zeros(0), [], body_from_cam)
-    sequence = VideoSequence(source, rig, facts, options, events, imu, truth)
+    sequence = VideoSequence(source, rig, facts, options, events, _sampling(rig, calibration), imu, truth)
     _tell(sequence, events)
     return sequence
 

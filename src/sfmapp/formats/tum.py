@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
 from sfmapp.events import Events
-from sfmapp.formats.calibration import Calibration, camera_from_opencv, scaled_to
+from sfmapp.formats.calibration import Calibration
+from sfmapp.formats.opencv_lens import camera_from_opencv, scaled_to
 from sfmapp.formats.sequence_files import (
     Recording,
     Size,
@@ -102,7 +103,6 @@ def _published_calibration(folder: Path, size: Size) -> Calibration | None:
         if found:
             intrinsics, lens = _PUBLISHED[found[1]]
             place = f"TUM's freiburg{found[1]} camera"
-            camera, note = camera_from_opencv(place, _SIZE, intrinsics, lens, False)
-            fitted, scale_note = scaled_to(place, camera, size)
-            return Calibration(Rig.single(fitted), notes=tuple(text for text in (note, scale_note) if text))
+            fitted = scaled_to(place, camera_from_opencv(place, _SIZE, intrinsics, lens, False), size)
+            return Calibration(Rig.single(fitted.camera), lenses=(fitted.lens,), notes=fitted.notes)
     return None

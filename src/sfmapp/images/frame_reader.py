@@ -154,6 +154,16 @@ def _scaled_to_8_bits(raw: NDArray[np.uint16], white: int) -> tuple[Pixels, int]
     return table[raw], white
 
 
+def resampled(gray: Pixels, sampling: NDArray[np.float32] | None) -> Pixels:
+    """The frame (H, W) whose pixels lie at ``sampling`` (H, W, 2) in the file's (OpenCV's pixel rule), bilinearly; the
+    frame itself without sampling. It makes the frames of a lens with many coefficients those of a simpler one."""
+    if sampling is None:
+        return gray
+    import cv2
+
+    return cv2.remap(gray, sampling, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
 class _FileReader:
     """One walk over files; called from the thread that reads ahead."""
 
@@ -195,7 +205,7 @@ class _FileReader:
                 f"{header.width}x{header.height} pixels, where the camera has {camera.width}x{camera.height}"
             )
         gray, self._white[camera_idx] = decode_gray(data, header, self._white[camera_idx])
-        return gray
+        return resampled(gray, self._sequence.sampling[camera_idx])
 
 
 @dataclass
@@ -206,6 +216,7 @@ class FileSequence:
         names: N names of frames.
         timestamps_s: (N,) strictly ascending.
         paths: for each frame, one file for each camera of the rig.
+        sampling: for each camera, where the pixels of its frames are found in the files, see :func:`resampled`.
         events: told about frames that are left out.
     """
 
@@ -215,6 +226,7 @@ class FileSequence:
     names: list[str]
     timestamps_s: NDArray[np.float64]
     paths: list[tuple[Path, ...]]
+    sampling: tuple[NDArray[np.float32] | None, ...]
     frames_per_second: float | None
     imu: Imu | None
     truth: Truth | None

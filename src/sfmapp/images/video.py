@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
-from sfmapp.images.frame_reader import LARGEST_FRAME_PX, REPEATED, ProblemTeller, Skipped, read_ahead
+from sfmapp.images.frame_reader import LARGEST_FRAME_PX, REPEATED, ProblemTeller, Skipped, read_ahead, resampled
 from sfmapp.images.sequence import Frame, Imu, SequenceKind, SequenceOptions, Truth
 from sfmapp.images.sources import printable
 from sfmapp.scene.rig import Rig
@@ -103,6 +103,7 @@ class VideoSequence:
     facts: VideoFacts
     options: SequenceOptions
     events: Events
+    sampling: tuple[NDArray[np.float32] | None, ...] = (None,)
     imu: Imu | None = None
     truth: Truth | None = None
     kind: SequenceKind = "video"
@@ -182,7 +183,7 @@ class _VideoReader:
         if self._last is not None and np.array_equal(gray, self._last):
             return Skipped(name, REPEATED)
         self._last, self._last_s = gray, stamp
-        return Frame(idx, name, stamp, (gray,))
+        return Frame(idx, name, stamp, (resampled(gray, self._video.sampling[0]),))
 
     def _timestamp(self, position: int, position_ms: float) -> float:
         fps = self._video.options.fps
