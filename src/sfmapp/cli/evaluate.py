@@ -1,0 +1,84 @@
+"""``sfmapp evaluate``: a trajectory against the truth."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from sfmapp.cli.common import add_output_flags, print_json
+
+ALIGNMENTS = ("sim3", "se3", "origin", "none")
+
+EPILOG = """\
+formats, told apart by what is in the files:
+  TUM    8 columns: timestamp tx ty tz qx qy qz qw
+  KITTI  12 columns: the rows of world_from_cam; line i is frame i. --times FILE gives the lines their seconds, which a
+         comparison with another format needs
+  EuRoC  data.csv: nanoseconds, position, quaternion w x y z, with commas"""
+
+
+def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command of this family to the parser."""
+    parser = commands.add_parser(
+        "evaluate", help="hold a trajectory against the truth: ATE, RPE, KITTI's drift, and a picture",
+        description="Print the absolute error (ATE), the relative error (RPE) and KITTI's t_rel and r_rel of a "
+        "trajectory, and draw it against the truth.",
+        epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("trajectory", metavar="TRAJ", type=Path, help="the estimate, or the folder of an odometry run")
+    parser.add_argument("truth", metavar="TRUTH", type=Path, help="the true poses")
+    pairs = parser.add_argument_group("pairs of poses")
+    pairs.add_argument("--max-diff", metavar="SECONDS", type=float, default=0.01,
+                       help="poses further apart in time are no pair; default: 0.01")  # fmt: skip
+    pairs.add_argument("--offset", metavar="SECONDS", type=float, default=0.0, help="added to the timestamps of TRAJ")
+    pairs.add_argument("--times", metavar="FILE", type=Path, help="a line of seconds for each of a KITTI trajectory")
+    errors = parser.add_argument_group("errors")
+    errors.add_argument("--align", choices=ALIGNMENTS, action="append",
+                        help="sim3: best rotation, translation and scale; se3: the same without scale; origin: the "
+                        "first poses on each other; none. May be repeated; default: sim3 and se3")  # fmt: skip
+    errors.add_argument("--delta", metavar="N{f,s,m}", action="append",
+                        help="RPE over so many frames, seconds or metres of path, such as 1f, 0.5s, 10m. May be "
+                        "repeated; default: a frame, a second, and about a tenth of the path")  # fmt: skip
+    errors.add_argument("--all-pairs", action="store_true",
+                        help="RPE over motions from every pose, not from where the one before has ended")  # fmt: skip
+    errors.add_argument("--pairs-from", choices=("truth", "estimate"), default="truth",
+                        help="whose path measures the metres of --delta; default: truth")  # fmt: skip
+    drawing = parser.add_argument_group("picture").add_mutually_exclusive_group()
+    drawing.add_argument("--plot", metavar="PNG", type=Path, help="where to draw it; default: TRAJ.png")
+    drawing.add_argument("--no-plot", action="store_true", help="no picture")
+    add_output_flags(parser)
+    parser.set_defaults(run=_evaluate)
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    from sfmapp.errors import InputError
+    from sfmapp.pipelines.evaluate import EvaluateOptions, draw, evaluate, parse_delta
+
+    options = EvaluateOptions(
+        alignments=tuple(args.align or ("sim3", "se3")),
+        deltas=tuple(map(parse_delta, args.delta)) if args.delta else None,
+        max_difference_s=args.max_diff,
+        offset_s=args.offset,
+        is_overlapping=args.all_pairs,
+        is_by_estimate=args.pairs_from == "estimate",
+    )
+    result = evaluate(args.trajectory, args.truth, options, times=args.times)
+    picture: Path | None = None
+    if not args.no_plot:
+        read = result.estimate.path
+        picture = args.plot or read.with_name(read.name + ".png")
+        try:
+            draw(result, picture)
+        except InputError as error:
+            if args.plot is not None:
+                raise
+            print(f"sfmapp: no picture: {error}", file=sys.stderr)  # TRAJ may lie where nobody may write
+            picture = None
+    if args.json:
+        print_json({"exit_code": 0, **result.to_dict(), "plot": None if picture is None else str(picture)})
+    elif not args.quiet:
+        print(result.table())
+        if picture is not None:
+            print(f"drawn: {picture}")
+    return 0
