@@ -1,0 +1,673 @@
+"""A map and an inertial sensor: scale, the vertical, velocities and biases; rotations predicted from the gyroscope.
+
+Between two keyframes the measurements are integrated once (Forster, Carlone, Dellaert and Scaramuzza, "On-manifold
+preintegration for real-time visual-inertial odometry", T-RO 2017). The gyroscope's bias comes from the rotations;
+scale, gravity and the accelerometer's bias from a linear system without velocities (Mur-Artal and Tardos,
+"Visual-inertial monocular SLAM with map reuse", RA-L 2017; Martinelli, "Closed-form solution of visual-inertial
+structure from motion", IJCV 2014); all of it is then refined in a gtsam factor graph in which the map's poses are
+measurements with noise.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sfmapp.geometry import rigid3, similarity
+from sfmapp.odometry.scale import ScaleEstimate, ScaleRefusal
+
+if TYPE_CHECKING:
+    from sfmapp.images.sequence import Imu
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+GRAVITY = 9.81
+# No inertial sensor is slower than 10 Hz: a longer silence is a gap.
+_MAX_SILENCE_S = 0.1
+# What biases of small sensors may reasonably be, as standard deviations of their priors.
+_GYRO_BIAS_SIGMA, _ACCEL_BIAS_SIGMA = 0.1, 0.3
+
+
+@dataclass(frozen=True)
+class InertialOptions:
+    """How a map is aligned with its inertial measurements."""
+
+    min_interval_s: float = 0.2  # poses closer in time than this to the one before are left out
+    max_interval_s: float = 2.0  # over longer intervals nothing is integrated
+    max_poses: int = 400  # of more poses fewer are taken, evenly in time as long as the intervals allow
+    min_intervals: int = 10  # fewer say nothing reliable
+    max_sigma_relative: float = 0.1  # a less certain scale is refused
+    max_rotation_residual: float = 0.25  # share of the rotations that the gyroscope may contradict (at least 1 degree)
+
+
+@dataclass(frozen=True)
+class InertialAlignment:
+    """How a map lies in the world that its inertial sensor feels.
+
+    Attributes:
+        scale: metres per map unit; 1 for a metric map. sigma_relative: its relative standard deviation.
+        world_from_map: (8,) similarity into a world in metres, z up, with the map's origin and the smallest turn.
+        gravity_in_map: (3,) m/s^2 along the map's axes, downwards. gravity_sigma_rad: of its direction, both angles.
+        pose_idx: (J,) positions of the poses that took part, ascending.
+        velocity: (J, 3) m/s of the sensor in the z-up world.
+        gyro_bias, accel_bias: (3,) means over the poses; gyro_bias_sigma, accel_bias_sigma: (3,) at the middle one.
+        residual: chi2 over degrees of freedom of the refined graph, 1 where all noises are as modelled.
+        evidence: numbers for the report, JSON-able.
+    """
+
+    scale: float
+    sigma_relative: float
+    world_from_map: Array
+    gravity_in_map: Array
+    gravity_sigma_rad: float
+    pose_idx: Ints
+    velocity: Array
+    gyro_bias: Array
+    accel_bias: Array
+    gyro_bias_sigma: Array
+    accel_bias_sigma: Array
+    residual: float
+    evidence: dict[str, Any]
+
+    @property
+    def scale_estimate(self) -> ScaleEstimate:
+        """For the report."""
+        return ScaleEstimate(self.scale, self.sigma_relative, "imu", self.evidence)
+
+
+@dataclass(frozen=True)
+class _Interval:
+    """Measurements integrated from pose first to pose second: steps (n, 7) of duration, gyro, accel, and their result.
+
+    delta is (60,): rotation (9) row by row, velocity (3), position (3), their slopes by the biases: rotation by gyro,
+    velocity by gyro and accel, position by gyro and accel, (9) each.
+    """
+
+    first: int
+    second: int
+    steps: Array
+    delta: Array
+
+    @property
+    def duration(self) -> float:
+        return float(self.steps[:, 0].sum())
+
+    @property
+    def rotation(self) -> Array:
+        return self.delta[:9].reshape(3, 3)
+
+    def slope(self, n: int) -> Array:
+        """Slopes in the order above, n from 0 to 4."""
+        return self.delta[15 + 9 * n : 24 + 9 * n].reshape(3, 3)
+
+
+def imu_rotation(imu: Imu, start_s: float, stop_s: float, gyro_bias: ArrayLike = (0.0, 0.0, 0.0)) -> Array | None:
+    """Rotation (3, 3) of the rig's first camera from one moment to a later one: ``x_cam(stop) = R x_cam(start)``.
+
+    Args:
+        gyro_bias: (3,) rad/s, taken off the measurements.
+
+    Returns:
+        None where the measurements do not cover the time.
+    """
+    steps = _steps(imu, start_s, stop_s)
+    if steps is None:
+        return None
+    turn = np.empty((3, 3))
+    _integrate_rotation(steps, np.asarray(gyro_bias, np.float64), turn)
+    imu_from_cam = rigid3.rotation_matrix(imu.imu_from_cam)
+    return np.asarray(imu_from_cam.T @ turn.T @ imu_from_cam)
+
+
+def align_imu(
+    timestamps_s: ArrayLike,
+    cam_from_world: ArrayLike,
+    imu: Imu,
+    *,
+    is_metric: bool,
+    covariance: ArrayLike | None = None,
+    options: InertialOptions = InertialOptions(),
+) -> InertialAlignment | ScaleRefusal:
+    """Scale and vertical of a map from inertial measurements.
+
+    Args:
+        timestamps_s: (K,) ascending, on the clock of the measurements.
+        cam_from_world: (K, 7) poses of the rig's first camera in one map; NaN where there is none.
+        is_metric: the map is in metres (stereo): the scale is 1 and only the rest is found.
+        covariance: (K, 6, 6) of the poses as in ``MapResult``; None to judge their noise by how they fit.
+
+    Returns:
+        The alignment, or why the measurements do not give one: too few, contradicting the map's rotations (wrong clock
+        or mounting), or a motion too even to tell the scale.
+    """
+    times, poses = np.asarray(timestamps_s, np.float64), np.asarray(cam_from_world, np.float64)
+    chosen = _choose_poses(times, poses, options)
+    intervals = _intervals(times, chosen, imu, options.max_interval_s)
+    evidence: dict[str, Any] = {"num_poses": len(chosen), "num_intervals": len(intervals)}
+    if len(intervals) < options.min_intervals:
+        reason = (
+            f"{len(intervals)} intervals between poses have inertial measurements, "
+            f"at least {options.min_intervals} are asked for"
+        )
+        return ScaleRefusal("imu", reason, evidence)
+    map_from_imu = _map_from_imu_rotation(poses, imu)
+    gyro_bias, rotation_residual, rotation = _gyro_bias(intervals, map_from_imu)
+    evidence |= {
+        "rotation_residual_deg": float(np.degrees(rotation_residual)),
+        "rotation_deg": float(np.degrees(rotation)),
+    }
+    if rotation_residual > max(np.radians(1.0), options.max_rotation_residual * rotation):
+        reason = (
+            f"the gyroscope contradicts the map's rotations by {np.degrees(rotation_residual):.1f} of "
+            f"{np.degrees(rotation):.1f} degrees an interval: are the clocks and the mounting of the sensor right?"
+        )
+        return ScaleRefusal("imu", reason, evidence)
+    intervals = [_reintegrate(interval, gyro_bias) for interval in intervals]
+    start = _solve_linear(intervals, rigid3.center(poses), map_from_imu, poses, imu, is_metric)
+    evidence |= {"condition": start.condition, "position_sigma_map_units": start.position_sigma}
+    if start.inverse_scale <= 0:
+        return ScaleRefusal("imu", "the motion does not tell the scale: accelerations and positions disagree", evidence)
+    graph = _Graph(
+        times, poses, imu, intervals, start, gyro_bias, rotation_residual / np.sqrt(2.0), is_metric, covariance
+    )
+    alignment = graph.solve(evidence)
+    if isinstance(alignment, InertialAlignment) and alignment.sigma_relative > options.max_sigma_relative:
+        reason = (
+            f"the motion gives the scale to {alignment.sigma_relative:.0%} only, at most "
+            f"{options.max_sigma_relative:.0%} are allowed: move and turn the camera more briskly"
+        )
+        return ScaleRefusal("imu", reason, alignment.evidence)
+    return alignment
+
+
+def _choose_poses(times: Array, poses: Array, options: InertialOptions) -> Ints:
+    """Positions of poses that exist and are far enough apart in time."""
+    known = np.flatnonzero(np.isfinite(poses).all(1))
+    duration = float(np.ptp(times[known])) if len(known) else 0.0
+    apart = max(options.min_interval_s, min(duration / options.max_poses, 0.5 * options.max_interval_s))
+    chosen: list[int] = []
+    for k in known:
+        # times in floating point: ten thousandths of an interval do not count
+        if not chosen or times[k] - times[chosen[-1]] >= 0.9999 * apart:
+            chosen.append(int(k))
+    return np.array(chosen, np.int64)
+
+
+def _map_from_imu_rotation(poses: Array, imu: Imu) -> Array:
+    """(K, 3, 3)."""
+    turned: Array = rigid3.rotation_matrix(poses).swapaxes(1, 2) @ rigid3.rotation_matrix(imu.imu_from_cam).T
+    return turned
+
+
+# ---- integration
+
+
+def _steps(imu: Imu, start_s: float, stop_s: float) -> Array | None:
+    """(n, 7) duration, mean gyro and mean accel between neighbouring samples from start to stop; None in gaps."""
+    times = imu.timestamps_s
+    low, high = int(np.searchsorted(times, start_s, "right")), int(np.searchsorted(times, stop_s, "left"))
+    if not stop_s > start_s or len(times) < 2:
+        return None
+    index = np.clip(np.arange(low - 1, high + 1), 0, len(times) - 1)
+    nodes = np.concatenate([[start_s], times[low:high], [stop_s]])
+    silence = np.diff(times[index]).max(initial=0.0)
+    if silence > _MAX_SILENCE_S or times[0] - start_s > _MAX_SILENCE_S or stop_s - times[-1] > _MAX_SILENCE_S:
+        return None
+    local = times[index[0] : index[-1] + 1]
+    values = np.concatenate([imu.gyro[index[0] : index[-1] + 1], imu.accel[index[0] : index[-1] + 1]], 1)
+    at_nodes = np.stack([np.interp(nodes, local, column) for column in values.T], 1)
+    steps = np.column_stack([np.diff(nodes), 0.5 * (at_nodes[1:] + at_nodes[:-1])])
+    return np.ascontiguousarray(steps[steps[:, 0] > 0])
+
+
+@numba.njit(cache=True, nogil=True)
+def _turn_by(wx: float, wy: float, wz: float, out: Array, slope: Array) -> None:
+    """exp(w) and its right Jacobian, (3, 3), by series: a step of an inertial sensor is a small angle."""
+    n2 = wx * wx + wy * wy + wz * wz
+    a = 1.0 - n2 / 6.0 * (1.0 - n2 / 20.0 * (1.0 - n2 / 42.0))
+    b = 0.5 - n2 / 24.0 * (1.0 - n2 / 30.0 * (1.0 - n2 / 56.0))
+    c = (1.0 - n2 / 20.0 * (1.0 - n2 / 42.0)) / 6.0
+    w = (wx, wy, wz)
+    for i in range(3):
+        for j in range(3):
+            square = w[i] * w[j] - (n2 if i == j else 0.0)
+            out[i, j] = (1.0 if i == j else 0.0) + b * square
+            slope[i, j] = (1.0 if i == j else 0.0) + c * square
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[k, j] += a * w[i]
+        out[j, k] -= a * w[i]
+        slope[k, j] -= b * w[i]
+        slope[j, k] += b * w[i]
+
+
+@numba.njit(cache=True, nogil=True)
+def _integrate_rotation(steps: Array, gyro_bias: Array, turn: Array) -> None:
+    """Rotation imu(start) from imu(stop) into turn (3, 3)."""
+    step, slope, new = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    turn[:] = np.eye(3)
+    for n in range(steps.shape[0]):
+        h = steps[n, 0]
+        _turn_by(
+            (steps[n, 1] - gyro_bias[0]) * h, (steps[n, 2] - gyro_bias[1]) * h, (steps[n, 3] - gyro_bias[2]) * h, step,
+            slope,
+        )  # fmt: skip
+        _multiply(turn, step, new)
+        turn[:] = new
+
+
+@numba.njit(cache=True, nogil=True)
+def _multiply(a: Array, b: Array, out: Array) -> None:
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+
+
+@numba.njit(cache=True, nogil=True)
+def _integrate(steps: Array, gyro_bias: Array, out: Array) -> None:
+    """Fill out (60,), see _Interval (Forster et al. 2017, equations 33 and 44, and the appendix for the slopes)."""
+    turn, new, step, slope = np.eye(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    half, cross, lean, a = np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, 3)), np.empty(3)
+    velocity, position = np.zeros(3), np.zeros(3)
+    r_g, v_g, v_a, p_g, p_a = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    for n in range(steps.shape[0]):
+        h = steps[n, 0]
+        wx, wy, wz = steps[n, 1] - gyro_bias[0], steps[n, 2] - gyro_bias[1], steps[n, 3] - gyro_bias[2]
+        # the mean force of a step acts in the orientation of its middle
+        _turn_by(0.5 * wx * h, 0.5 * wy * h, 0.5 * wz * h, step, slope)
+        _multiply(turn, step, half)
+        for i in range(3):
+            a[i] = half[i, 0] * steps[n, 4] + half[i, 1] * steps[n, 5] + half[i, 2] * steps[n, 6]
+        cross[0, 1], cross[0, 2], cross[1, 2] = -steps[n, 6], steps[n, 5], -steps[n, 4]
+        cross[1, 0], cross[2, 0], cross[2, 1] = steps[n, 6], -steps[n, 5], steps[n, 4]
+        _multiply(half, cross, new)
+        _multiply(new, r_g, lean)
+        for i in range(3):
+            position[i] += velocity[i] * h + 0.5 * a[i] * h * h
+            velocity[i] += a[i] * h
+            for j in range(3):
+                p_g[i, j] += v_g[i, j] * h - 0.5 * lean[i, j] * h * h
+                p_a[i, j] += v_a[i, j] * h - 0.5 * half[i, j] * h * h
+                v_g[i, j] -= lean[i, j] * h
+                v_a[i, j] -= half[i, j] * h
+        _turn_by(wx * h, wy * h, wz * h, step, slope)
+        _multiply(turn, step, new)
+        turn[:] = new
+        for i in range(3):
+            for j in range(3):
+                new[i, j] = step[0, i] * r_g[0, j] + step[1, i] * r_g[1, j] + step[2, i] * r_g[2, j] - slope[i, j] * h
+        r_g[:] = new
+    out[:9], out[9:12], out[12:15] = turn.ravel(), velocity, position
+    out[15:24], out[24:33], out[33:42] = r_g.ravel(), v_g.ravel(), v_a.ravel()
+    out[42:51], out[51:60] = p_g.ravel(), p_a.ravel()
+
+
+def _reintegrate(interval: _Interval, gyro_bias: Array) -> _Interval:
+    delta = np.empty(60)
+    _integrate(interval.steps, gyro_bias, delta)
+    return _Interval(interval.first, interval.second, interval.steps, delta)
+
+
+def _intervals(times: Array, chosen: Ints, imu: Imu, max_interval_s: float) -> list[_Interval]:
+    """Between neighbouring poses, where the measurements cover the time."""
+    out = []
+    for first, second in itertools.pairwise(chosen):
+        steps = _steps(imu, times[first], times[second]) if times[second] - times[first] <= max_interval_s else None
+        if steps is not None:
+            out.append(_reintegrate(_Interval(int(first), int(second), steps, np.empty(60)), np.zeros(3)))
+    return out
+
+
+# ---- the start
+
+
+def _gyro_bias(intervals: list[_Interval], map_from_imu: Array) -> tuple[Array, float, float]:
+    """Bias (3,), robust rms of what it leaves of the rotations and rms of the rotations, radians an interval."""
+    bias = np.zeros(3)
+    first, second = np.array([(i.first, i.second) for i in intervals]).T
+    seen = map_from_imu[first].swapaxes(1, 2) @ map_from_imu[second]
+    for _ in range(4):
+        intervals = [_reintegrate(interval, bias) for interval in intervals]
+        left = rigid3.log_so3(np.stack([i.rotation for i in intervals]).swapaxes(1, 2) @ seen)
+        slopes = np.stack([i.slope(0) for i in intervals])
+        scale = float(np.median(np.linalg.norm(left, axis=1))) + 1e-12
+        weight = 1.0 / (1.0 + (left**2).sum(1) / (2.0 * scale) ** 2)
+        normal = np.einsum("n,nki,nkj->ij", weight, slopes, slopes)
+        bias = bias + np.linalg.solve(normal, np.einsum("n,nki,nk->i", weight, slopes, left))
+    # of three normal components the median of the squared length is 2.366 variances
+    residual = float(np.sqrt(np.median((left**2).sum(1)) * 3.0 / 2.366))
+    return bias, residual, float(np.sqrt((rigid3.log_so3(seen) ** 2).sum(1).mean()))
+
+
+@dataclass(frozen=True)
+class _Start:
+    """Map units per metre, gravity (3,) m/s^2 in the map's axes, accel bias, noise of a map position in map units."""
+
+    inverse_scale: float
+    gravity: Array
+    accel_bias: Array
+    position_sigma: float
+    condition: float
+
+
+def _solve_linear(
+    intervals: list[_Interval], centers: Array, map_from_imu: Array, poses: Array, imu: Imu, is_metric: bool
+) -> _Start:
+    """Scale, gravity and accelerometer bias from mean velocities over neighbouring intervals.
+
+    With rho = 1 / scale the change of the camera's mean velocity in map units is
+    rho (what was integrated, less what the lever arm moved) + rho g (dt1 + dt2) / 2 + rho (slopes) bias:
+    the noisy positions stand alone on one side, so that noise does not shrink the scale.
+    """
+    pairs = [(a, b) for a, b in itertools.pairwise(intervals) if a.second == b.first]
+    lever = np.einsum("kij,j->ki", rigid3.rotation_matrix(poses).swapaxes(1, 2), rigid3.inverse(imu.imu_from_cam)[4:])
+    rows, left, blur = [], [], []
+    for a, b in pairs:
+        dt1, dt2 = a.duration, b.duration
+        r1, r2 = map_from_imu[a.first], map_from_imu[b.first]
+        index = [a.first, a.second, b.second]
+        felt = r1 @ (a.delta[9:12] - a.delta[12:15] / dt1) + r2 @ b.delta[12:15] / dt2
+        by_bias = r1 @ (a.slope(2) - a.slope(4) / dt1) + r2 @ b.slope(4) / dt2
+        of_lever = _velocity_change(lever[index], dt1, dt2)
+        rows.append(np.column_stack([felt - of_lever, 0.5 * (dt1 + dt2) * np.eye(3), by_bias]))
+        left.append(_velocity_change(centers[index], dt1, dt2))
+        blur.append(np.sqrt(1 / dt1**2 + 1 / dt2**2 + (1 / dt1 + 1 / dt2) ** 2))
+    if len(pairs) < 4:
+        return _Start(0.0, np.zeros(3), np.zeros(3), np.nan, np.inf)
+    weight = 1.0 / np.array(blur)
+    design, target = np.array(rows) * weight[:, None, None], np.array(left) * weight[:, None]
+    return _constrain(design, target, is_metric)
+
+
+def _velocity_change(positions: Array, dt1: float, dt2: float) -> Array:
+    changed: Array = (positions[2] - positions[1]) / dt2 - (positions[1] - positions[0]) / dt1
+    return changed
+
+
+def _constrain(design: Array, target: Array, is_metric: bool) -> _Start:
+    """Reweighted least squares of design (N, 3, 7) x = target (N, 3) with |gravity| known; x = rho (1, g, bias)."""
+    loose = np.linalg.lstsq(design[..., :4].reshape(-1, 4), target.ravel(), rcond=None)[0]
+    rho = 1.0 if is_metric else (float(loose[0]) if loose[0] > 0 else float(np.linalg.norm(loose[1:])) / GRAVITY)
+    down, bias, condition, sigma = loose[1:] / np.linalg.norm(loose[1:]), np.zeros(3), np.inf, np.nan
+    for _ in range(10):
+        basis = np.linalg.svd(down[None])[2][1:].T
+        x = rho * np.concatenate([[1.0], GRAVITY * down, bias])
+        left = target - design @ x
+        length2 = (left**2).sum(1)
+        sigma = float(np.sqrt(np.median(length2) / 2.366)) + 1e-300
+        weight = 1.0 / np.sqrt(1.0 + length2 / (3.0 * sigma) ** 2)
+        slopes = np.concatenate(
+            [(design @ (x / rho))[..., None], rho * GRAVITY * design[..., 1:4] @ basis, rho * design[..., 4:]], -1
+        )
+        slopes = slopes[..., 1:] if is_metric else slopes
+        prior = np.zeros((3, slopes.shape[2]))
+        prior[:, -3:] = sigma / _ACCEL_BIAS_SIGMA * np.eye(3)
+        a = np.concatenate([(slopes * weight[:, None, None]).reshape(-1, slopes.shape[2]), prior])
+        b = np.concatenate([(left * weight[:, None]).ravel(), -sigma / _ACCEL_BIAS_SIGMA * bias])
+        step = np.linalg.lstsq(a, b, rcond=None)[0]
+        condition = float(np.linalg.cond(a / np.linalg.norm(a, axis=0)))
+        if not is_metric:
+            rho = max(rho + float(step[0]), 0.1 * rho)  # a scale does not change its sign
+        down = down + basis @ np.clip(step[-5:-3], -0.5, 0.5)
+        down /= np.linalg.norm(down)
+        bias = bias + step[-3:]
+    return _Start(rho, GRAVITY * down, bias, sigma, condition)
+
+
+# ---- the refinement
+
+
+def _upright(gravity: Array) -> Array:
+    """The smallest rotation (3, 3) that turns the direction against gravity to z."""
+    up = -gravity / np.linalg.norm(gravity)
+    axis, sine = np.cross(up, [0.0, 0.0, 1.0]), np.hypot(up[0], up[1])
+    if sine < 1e-12:
+        return np.eye(3) if up[2] > 0 else np.diag([1.0, -1.0, -1.0])
+    return rigid3.exp_so3(axis / sine * np.arctan2(sine, up[2]))
+
+
+class _Graph:
+    """Poses X, velocities V and biases B of the sensor in the z-up world, and A: log scale and two angles of tilt."""
+
+    def __init__(
+        self, times: Array, poses: Array, imu: Imu, intervals: list[_Interval], start: _Start, gyro_bias: Array,
+        rotation_sigma: float, is_metric: bool, covariance: ArrayLike | None,
+    ) -> None:  # fmt: skip
+        self._poses, self._imu, self._intervals, self._is_metric = poses, imu, intervals, is_metric
+        self._covariance = None if covariance is None else np.asarray(covariance, np.float64)
+        self._start, self._gyro_bias = start, gyro_bias
+        self._index = sorted({k for interval in intervals for k in (interval.first, interval.second)})
+        # rounding alone leaves less than this; zero noise would make the graph singular
+        self._sigmas = np.r_[np.full(3, max(rotation_sigma, 1e-7)), np.full(3, max(start.position_sigma, self._tiny()))]
+        self._world_from_map = _upright(start.gravity)
+
+    def _tiny(self) -> float:
+        centers = rigid3.center(self._poses[self._index])
+        return 1e-7 * float(np.linalg.norm(np.ptp(centers, axis=0))) + 1e-300
+
+    def solve(self, evidence: dict[str, Any]) -> InertialAlignment | ScaleRefusal:
+        """Refine; poses without covariances are weighed twice: by the start's residuals, then by the graph's own."""
+        values = self._initial()
+        rounds = 2 if self._covariance is None else 1
+        for n in range(rounds):
+            graph = self._build()
+            try:
+                values = _optimize(graph, values)
+            except RuntimeError:
+                return ScaleRefusal(
+                    "imu", "the motion leaves scale or gravity open: the refinement is singular", evidence
+                )
+            if n + 1 < rounds:
+                self._weigh(values)
+        try:
+            return self._read(graph, values, evidence)
+        except RuntimeError:
+            return ScaleRefusal("imu", "the motion leaves scale or gravity open: no covariance can be had", evidence)
+
+    def _initial(self) -> Any:
+        import gtsam
+        from gtsam.symbol_shorthand import A, B, V, X
+
+        values, scale = gtsam.Values(), 1.0 / self._start.inverse_scale
+        values.insert(A(0), np.array([np.log(scale), 0.0, 0.0]))
+        sensor = {}
+        for k in self._index:
+            map_from_cam = rigid3.inverse(self._poses[k])
+            rotation = self._world_from_map @ rigid3.rotation_matrix(map_from_cam)
+            center = scale * self._world_from_map @ map_from_cam[4:]
+            pose = rigid3.compose(rigid3.from_matrix(rotation, center), rigid3.inverse(self._imu.imu_from_cam))
+            sensor[k] = pose
+            values.insert(X(k), gtsam.Pose3(gtsam.Rot3(rigid3.rotation_matrix(pose)), pose[4:]))
+            values.insert(B(k), gtsam.imuBias.ConstantBias(self._start.accel_bias, self._gyro_bias))
+        down = np.array([0.0, 0.0, -GRAVITY])
+        velocity: dict[int, Array] = {}
+        for i in self._intervals:
+            dt, turn = i.duration, rigid3.rotation_matrix(sensor[i.first])
+            gained = i.delta[12:15] + i.slope(4) @ self._start.accel_bias
+            velocity[i.first] = (sensor[i.second][4:] - sensor[i.first][4:] - turn @ gained) / dt - 0.5 * down * dt
+            velocity[i.second] = (
+                velocity[i.first] + down * dt + turn @ (i.delta[9:12] + i.slope(2) @ self._start.accel_bias)
+            )
+        for k in self._index:
+            values.insert(V(k), velocity[k])
+        return values
+
+    def _build(self) -> Any:
+        import gtsam
+        from gtsam.symbol_shorthand import A, B, V, X
+
+        graph, loss = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.mEstimator.Huber.Create(3.0)
+        parameters = _preintegration(self._imu)
+        bias = gtsam.imuBias.ConstantBias(self._start.accel_bias, self._gyro_bias)
+        linked: set[int] = set()
+        for i in self._intervals:
+            sums = gtsam.PreintegratedCombinedMeasurements(parameters, bias)
+            for step in _midway(i.steps, self._gyro_bias):
+                sums.integrateMeasurement(step[4:], step[1:4], step[0])
+            a, b = i.first, i.second
+            graph.push_back(gtsam.CombinedImuFactor(X(a), V(a), X(b), V(b), B(a), B(b), sums))
+            if a not in linked:  # the first of a chain of intervals
+                sigmas = np.repeat([_ACCEL_BIAS_SIGMA, _GYRO_BIAS_SIGMA], 3)
+                prior = gtsam.imuBias.ConstantBias(np.zeros(3), self._gyro_bias)
+                graph.push_back(gtsam.PriorFactorConstantBias(B(a), prior, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+            linked.update((a, b))
+        for k in self._index:
+            noise = (
+                gtsam.noiseModel.Diagonal.Sigmas(self._sigmas)
+                if self._covariance is None
+                else gtsam.noiseModel.Gaussian.Covariance(self._covariance[k])
+            )
+            link = _MapPose(self._poses[k], self._imu, self._world_from_map)
+            graph.push_back(gtsam.CustomFactor(gtsam.noiseModel.Robust.Create(loss, noise), [X(k), A(0)], link.error))
+        # the tilt is only kept from running away; the scale of a metric map is known
+        sigmas = np.array([1e-9 if self._is_metric else 10.0, 10.0, 10.0])
+        scale = 1.0 if self._is_metric else 1.0 / self._start.inverse_scale
+        center = np.array([np.log(scale), 0.0, 0.0])
+        graph.push_back(gtsam.PriorFactorVector(A(0), center, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+        return graph
+
+    def _links(self, values: Any) -> Array:
+        """(J, 6) residuals of the map's poses: radians and map units."""
+        from gtsam.symbol_shorthand import A, X
+
+        out = np.empty((len(self._index), 6))
+        for n, k in enumerate(self._index):
+            link = _MapPose(self._poses[k], self._imu, self._world_from_map)
+            out[n] = link.residual(values.atPose3(X(k)), values.atVector(A(0)))
+        return out
+
+    def _weigh(self, values: Any) -> None:
+        """Noise of rotations and positions from their residuals, robustly; the sums over all that was fitted with."""
+        squares = self._links(values).reshape(-1, 2, 3) ** 2
+        sigma = np.sqrt(np.median(squares.sum(2), 0) / 2.366)
+        # the graph bends towards the poses: it may not talk their noise away
+        self._sigmas = np.maximum(np.repeat(sigma, 3), 0.3 * self._sigmas)
+
+    def _read(self, graph: Any, values: Any, evidence: dict[str, Any]) -> InertialAlignment:
+        import gtsam
+        from gtsam.symbol_shorthand import A, B, V
+
+        log_scale, *tilt = values.atVector(A(0))
+        rotation = rigid3.exp_so3(np.r_[tilt, 0.0]) @ self._world_from_map
+        gravity = rotation.T @ [0.0, 0.0, -GRAVITY]
+        upright = _upright(gravity)
+        keep_heading = upright @ rotation.T
+        marginals = gtsam.Marginals(graph, values)
+        # rows: 15 an interval, 6 a pose, 6 a chain; unknowns: 15 a pose and 3
+        chains = len(self._index) - len(self._intervals)
+        num_free = 15 * len(self._intervals) + 6 * len(self._index) + 6 * chains + 3 - 15 * len(self._index) - 3
+        residual = 2.0 * graph.error(values) / num_free
+        widen = np.sqrt(max(residual, 1.0))
+        covariance = marginals.marginalCovariance(A(0))
+        middle = marginals.marginalCovariance(B(self._index[len(self._index) // 2]))
+        biases = np.array([values.atConstantBias(B(k)).vector() for k in self._index]).mean(0)
+        bias_sigma = widen * np.sqrt(np.diag(middle))
+        sigma = 0.0 if self._is_metric else float(widen * np.sqrt(covariance[0, 0]))
+        gravity_sigma = float(widen * np.sqrt(covariance[1, 1] + covariance[2, 2]))
+        evidence = evidence | {
+            "residual": float(residual), "gravity_sigma_deg": float(np.degrees(gravity_sigma)),
+            "rotation_sigma_deg": float(np.degrees(self._sigmas[0])),
+            "position_sigma_map_units": float(self._sigmas[3]),
+            "gyro_bias": biases[3:].tolist(), "accel_bias": biases[:3].tolist(),
+        }  # fmt: skip
+        scale = 1.0 if self._is_metric else float(np.exp(log_scale))
+        return InertialAlignment(
+            scale, sigma, similarity.from_parts(upright, np.zeros(3), scale), gravity, gravity_sigma,
+            np.array(self._index), np.array([values.atVector(V(k)) for k in self._index]) @ keep_heading.T, biases[3:],
+            biases[:3], bias_sigma[3:], bias_sigma[:3], float(residual), evidence,
+        )  # fmt: skip
+
+
+def _optimize(graph: Any, values: Any) -> Any:
+    import gtsam
+
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(30)
+    parameters.setRelativeErrorTol(1e-6)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+
+
+def _preintegration(imu: Imu) -> Any:
+    """gtsam's parameters, z up."""
+    import gtsam
+
+    parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY)
+    tiny = 1e-8  # zero densities would make the factors singular
+    parameters.setAccelerometerCovariance(max(imu.accel_noise, tiny) ** 2 * np.eye(3))
+    parameters.setGyroscopeCovariance(max(imu.gyro_noise, tiny) ** 2 * np.eye(3))
+    parameters.setBiasAccCovariance(max(imu.accel_walk, tiny) ** 2 * np.eye(3))
+    parameters.setBiasOmegaCovariance(max(imu.gyro_walk, tiny) ** 2 * np.eye(3))
+    # of what is lost between samples: far below what any camera sees
+    parameters.setIntegrationCovariance(1e-12 * np.eye(3))
+    return parameters
+
+
+def _midway(steps: Array, gyro_bias: Array) -> Array:
+    """Steps with the force turned to the middle of each: gtsam applies it in the orientation of the start."""
+    half = rigid3.exp_so3(0.5 * steps[:, :1] * (steps[:, 1:4] - gyro_bias))
+    return np.column_stack([steps[:, :4], np.einsum("nij,nj->ni", half, steps[:, 4:])])
+
+
+class _MapPose:
+    """A pose of the map as a measurement of the sensor's pose, given the map's scale and tilt.
+
+    The residual (6,) is the (w, v) of ``x_cam <- exp(w) x_cam + v`` that carries what is measured to what is predicted,
+    up to the sign: radians and map units, so that covariances of the map apply as they are.
+    """
+
+    def __init__(self, cam_from_map: Array, imu: Imu, world_from_map: Array) -> None:
+        self._cam_from_map = rigid3.rotation_matrix(cam_from_map)
+        self._center = rigid3.center(cam_from_map)
+        self._imu_from_cam = rigid3.rotation_matrix(imu.imu_from_cam)
+        self._arm, self._arm_cross = imu.imu_from_cam[4:], rigid3.skew(imu.imu_from_cam[4:])
+        self._world_from_map = world_from_map
+
+    def residual(self, pose: Any, alignment: Array) -> Array:
+        """(6,) at a gtsam.Pose3 of the sensor and (3,) log scale and tilt."""
+        cam_from_world = self._upright_cam(alignment)
+        rotation = pose.rotation().matrix()
+        angle = rigid3.log_so3(cam_from_world @ rotation @ self._imu_from_cam)
+        center = pose.translation() + rotation @ self._arm
+        return np.r_[angle, cam_from_world @ center / np.exp(alignment[0]) - self._cam_from_map @ self._center]
+
+    def _upright_cam(self, alignment: Array) -> Array:
+        tilt = rigid3.exp_so3([-alignment[1], -alignment[2], 0.0])
+        return np.asarray(self._cam_from_map @ self._world_from_map.T @ tilt)
+
+    def slopes(self, pose: Any, alignment: Array) -> tuple[Array, Array]:
+        """Of the residual, (6, 6) by the pose's tangent and (6, 3) by log scale and tilt."""
+        cam_from_world, scale = self._upright_cam(alignment), np.exp(alignment[0])
+        rotation = pose.rotation().matrix()
+        turned, center = rotation @ self._imu_from_cam, pose.translation() + rotation @ self._arm
+        of_tilt = (np.eye(3) + 0.5 * rigid3.skew([alignment[1], alignment[2], 0.0]))[:, :2]
+        # inverse right Jacobian, to first order
+        of_angle = np.eye(3) + 0.5 * rigid3.skew(rigid3.log_so3(cam_from_world @ turned))
+        by_pose, by_alignment = np.zeros((6, 6)), np.zeros((6, 3))
+        by_pose[:3, :3] = of_angle @ self._imu_from_cam.T
+        by_pose[3:, :3] = -cam_from_world @ rotation @ self._arm_cross / scale
+        by_pose[3:, 3:] = cam_from_world @ rotation / scale
+        by_alignment[:3, 1:] = -of_angle @ turned.T @ of_tilt
+        by_alignment[3:, 0] = -cam_from_world @ center / scale
+        by_alignment[3:, 1:] = cam_from_world @ rigid3.skew(center) @ of_tilt / scale
+        return by_pose, by_alignment
+
+    def error(self, factor: Any, values: Any, slopes: Any) -> Array:
+        """For gtsam.CustomFactor."""
+        pose_key, alignment_key = factor.keys()
+        pose, alignment = values.atPose3(pose_key), values.atVector(alignment_key)
+        if slopes is not None:
+            slopes[0], slopes[1] = self.slopes(pose, alignment)
+        return self.residual(pose, alignment)
+
+
+def compile_kernels() -> None:
+    """Compile the kernels of this module, or load them from numba's cache."""
+    steps = np.zeros((1, 7))
+    _integrate_rotation(steps, np.zeros(3), np.empty((3, 3)))
+    _integrate(steps, np.zeros(3), np.empty(60))
