@@ -64,6 +64,8 @@ def _evaluate(args: argparse.Namespace) -> int:
         is_by_estimate=args.pairs_from == "estimate",
     )
     result = evaluate(args.trajectory, args.truth, options, times=args.times)
+    if not args.json and not args.quiet:
+        print(result.table(), flush=True)
     picture: Path | None = None
     if not args.no_plot:
         read = result.estimate.path
@@ -77,8 +79,6 @@ def _evaluate(args: argparse.Namespace) -> int:
             picture = None
     if args.json:
         print_json({"exit_code": 0, **result.to_dict(), "plot": None if picture is None else str(picture)})
-    elif not args.quiet:
-        print(result.table())
-        if picture is not None:
-            print(f"drawn: {picture}")
+    elif picture is not None and not args.quiet:
+        print(f"drawn: {picture}")
     return 0

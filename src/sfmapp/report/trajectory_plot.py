@@ -30,6 +30,8 @@ _START: Color = (28, 146, 92)
 _END: Color = (32, 36, 42)
 # more corners than this are not to be seen on the canvas
 _MAX_CORNERS = 4000
+# a scale for errors begins here (metres, degrees): less is rounding
+_ROUNDING = 1e-9
 # a view this much wider than tall gets the whole width
 _WIDE = 1.9
 
@@ -134,8 +136,8 @@ def _head(page: Drawing, title: str, facts: Sequence[str]) -> None:
 
 def _fit(panel: _Panel, shown: Array, axes: tuple[int, int]) -> _View:
     low, high = shown[:, axes].min(0), shown[:, axes].max(0)
-    # a trajectory that stays in one place is a dot in the middle
-    size = np.maximum(high - low, max(float((high - low).max()) * 1e-6, 1e-9))
+    # a trajectory that stays in one place is a dot in the middle of a metre
+    size = np.maximum(high - low, 1e-6 * float((high - low).max()) or 1.0)
     zoom = 0.88 * min(panel.width / size[0], panel.height / size[1])
     return _View(panel, axes, (low + high) / 2 - np.array([panel.width, panel.height]) / zoom / 2, zoom)
 
@@ -147,7 +149,7 @@ def _draw_view(page: Drawing, view: _View, truth: Trajectory, pairs: Pairs, erro
     page.line(view.to_page(truth.position[::stride]), _TRUTH, 9)
     stride = -(-len(pairs) // _MAX_CORNERS)
     xy, errors = view.to_page(error.aligned.position[::stride]), error.translation_m[::stride]
-    worst = float(error.translation_m.max()) or 1.0
+    worst = max(float(error.translation_m.max()), _ROUNDING)
     # a gap that falls between two shown corners is one between them
     is_gap = np.maximum.reduceat(pairs.is_gap[1:], np.arange(0, len(pairs) - 1, stride))[: len(xy) - 1]
     for k in np.flatnonzero(is_gap):
@@ -204,16 +206,16 @@ def _view_grid(page: Drawing, view: _View) -> None:
 
 def _ticks(low: float, high: float, least: int) -> Array:
     """Round numbers, at least so many of them."""
-    return np.array(next(t for about in range(least, 6 * least) if len(t := ticks(low, high, about)) >= least))
+    tries = (ticks(low, high, about) for about in range(least, 6 * least))
+    return np.array(next((values for values in tries if len(values) >= least), [low]))
 
 
 def _labels(values: Array) -> list[str]:
     """Numbers with as many digits as tell the neighbours apart."""
-    step = (
-        float(np.min(np.diff(values))) if len(values) > 1 else max(abs(float(values[0])), 1.0) if len(values) else 1.0
-    )
+    step = float(np.diff(values).min(initial=np.abs(values).max(initial=1.0)))
     digits = max(0, -int(np.floor(np.log10(step) + 1e-9)))
-    return [f"{value + 0.0:.{digits}f}".replace("-", "\N{MINUS SIGN}") for value in values]
+    texts = [f"{value + 0.0:.{digits}f}" if digits < 5 else f"{value + 0.0:.3g}" for value in values]
+    return [text.replace("-", "\N{MINUS SIGN}") for text in texts]
 
 
 def _frame(page: Drawing, panel: _Panel) -> None:
@@ -328,7 +330,7 @@ def _draw_strips(
     is_stacked, label = panels[0].left == panels[-1].left, "time, s" if has_time else "frame"
     names = "position error, m", "rotation error, degrees"
     for panel, title, values in zip(panels[:2], names, (error.translation_m, error.rotation_deg), strict=True):
-        strip = _Strip(panel, *span, 0.0, 1.08 * float(values.max()) or 1.0, gaps)
+        strip = _Strip(panel, *span, 0.0, 1.08 * max(float(values.max()), _ROUNDING), gaps)
         _strip_grid(page, strip, title, "" if is_stacked else label)
         page.line(strip.points(time, values, pairs.is_gap), _LINE, 2)
         rmse = float(np.sqrt((values**2).mean()))
