@@ -26,10 +26,11 @@ _MAX_SIGMA_PX = 0.2
 # the score this takes, by the square of the noise in grey levels: what noise alone makes, and more; a difference of two
 # pixels has the variance 2 noise^2 and is twice the gradient
 _FLOOR = 2.0 * _WINDOW**2 + 4.0 * 2.0 / _MAX_SIGMA_PX**2
-# Noise grows with the light, and compression changes its colour, so it is judged by the scores it makes: the lowest
-# tenth at a range of grey are taken for plain surfaces. Noise peaks at four times that score, and where compression has
-# correlated it at ten, but there it rarely passes six.
-_ABOVE_PLAIN = 6.0
+# Noise grows with the light, so it is judged for each range of grey, in two ways, of which the lower counts. The lowest
+# tenth of the scores are taken for plain surfaces, and noise peaks at four times that, or six to ten where compression
+# has correlated it. Even texture without plain surfaces is told from noise by its second differences in both
+# directions: it is smooth, and noise is rough, though compression takes away up to two thirds of their variance.
+_ABOVE_PLAIN, _ABOVE_ROUGH = 6.0, 3.0
 # grey levels between which plain surfaces are believed: rounding alone makes 0.3, and what varies by more is texture
 _MIN_NOISE, _MAX_NOISE = 0.6, 3.0
 _SAMPLED = 4  # of so many rows and columns one enters the histogram
@@ -47,11 +48,33 @@ def _count_scores(scores: Floats, grey: Bytes, counts: Longs, num: int) -> None:
         counts[grey[k] >> 4, min(max(octave, 0), counts.shape[1] - 1)] += 1
 
 
-def _floors(counts: Longs) -> Floats:
-    """(16,) least score of a corner for each range of grey, from the histogram of scores."""
-    total = counts.sum(axis=1)
-    plain = (np.cumsum(counts, axis=1) * 10 > total[:, None]).argmax(axis=1)
-    floors = np.where(total < _MIN_SAMPLES, 0.0, _ABOVE_PLAIN * 2.0 ** (0.25 * (plain + 0.5)))
+@numba.njit(cache=True, nogil=True)
+def _count_roughness(data: Bytes, layout: Longs, counts: Longs) -> None:
+    """Histogram, for each of 16 ranges of grey, of second differences in both directions (Immerkaer, 1996)."""
+    start, step, height, width = layout
+    for r in range(1, height - 1, _SAMPLED):
+        for p in range(start + r * step + 1, start + r * step + width - 1, _SAMPLED):
+            edges = int(data[p - step]) + int(data[p + step]) + int(data[p - 1]) + int(data[p + 1])
+            corners = int(data[p - step - 1]) + int(data[p - step + 1]) + int(data[p + step - 1])
+            value = abs(corners + int(data[p + step + 1]) - 2 * edges + 4 * int(data[p]))
+            counts[data[p] >> 4, min(value, counts.shape[1] - 1)] += 1
+
+
+def _quantile_bins(counts: Longs, share: float) -> Doubles:
+    """(16,) bins, with fractions, below which a share of each histogram lies."""
+    total, below = counts.sum(axis=1), np.cumsum(counts, axis=1)
+    k = (below >= share * total[:, None]).argmax(axis=1)
+    rows = np.arange(len(counts))
+    return k + (share * total - below[rows, k] + counts[rows, k]) / np.maximum(counts[rows, k], 1)
+
+
+def _floors(scores: Longs, roughness: Longs) -> Floats:
+    """(16,) least score of a corner for each range of grey, from the histograms."""
+    plain = 2.0 ** (0.25 * _quantile_bins(scores, 0.1))
+    # whole numbers are the middles of their bins; of noise of 1 the differences have a standard deviation of 6
+    noise = np.maximum(_quantile_bins(roughness, 0.5) - 0.5, 0.0) / (0.6745 * 6.0)
+    floors = np.minimum(_ABOVE_PLAIN * plain, _ABOVE_ROUGH * _FLOOR * noise**2)
+    floors[np.minimum(scores.sum(axis=1), roughness.sum(axis=1)) < _MIN_SAMPLES] = 0.0
     return np.clip(floors, _FLOOR * _MIN_NOISE**2, _FLOOR * _MAX_NOISE**2).astype(np.float32)
 
 
@@ -236,9 +259,10 @@ def find_corners(
     layout = pyramid.layout[0]
     capacity = height * width // 16
     places, value, grey = np.empty((capacity, 2)), np.empty(capacity, np.float32), np.empty(capacity, np.uint8)
-    counts = np.zeros((16, 88), np.int64)
-    count = _find_maxima(pyramid.data, layout, _FLOOR * _MIN_NOISE**2, counts, places, value, grey)
-    is_corner = value[:count] >= _floors(counts)[grey[:count] >> 4]
+    scores, roughness = np.zeros((16, 88), np.int64), np.zeros((16, 512), np.int64)
+    _count_roughness(pyramid.data, layout, roughness)
+    count = _find_maxima(pyramid.data, layout, _FLOOR * _MIN_NOISE**2, scores, places, value, grey)
+    is_corner = value[:count] >= _floors(scores, roughness)[grey[:count] >> 4]
     places, value = places[:count][is_corner], value[:count][is_corner]
     if mask is not None:
         allowed = np.asarray(mask)[places[:, 1].astype(np.int64), places[:, 0].astype(np.int64)] != 0

@@ -105,7 +105,7 @@ def _is_unique(first: Floats, second: Floats) -> NDArray[np.bool_]:
 
 def search_along_epipolar(
     reference: Pyramid, reference_xy: Doubles, target: Pyramid, segments: Doubles, counts: NDArray[np.int64], *,
-    affine: Doubles | None = None, search_level: int = 2, half_width: int = 7, min_zncc: float = 0.8, threads: int = 1,
+    affine: Doubles | None = None, search_level: int = 1, half_width: int = 5, min_zncc: float = 0.8, threads: int = 1,
 ) -> Matches:  # fmt: skip
     """Find points of one image in another where only a curve is known for each.
 
