@@ -16,6 +16,8 @@ from sfmapp.scene.camera import Camera, project
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_MIN_SCALE = 0.4
+
 
 @dataclass(frozen=True)
 class ActiveTracks:
@@ -63,28 +65,51 @@ class ActiveTracks:
         )
         return both.subset(np.argsort(both.point_id, kind="stable"))
 
-    def world_points(self, keyframe_poses: Mapping[int, Array]) -> Array:
+    def world_points(self, references: References) -> Array:
         """(N, 3) where the tracks are believed to be, from their reference keyframes and inverse depths."""
-        xyz = np.empty((len(self), 3))
-        for keyframe in np.unique(self.reference):
-            mine = self.reference == keyframe
-            rays = np.column_stack([self.reference_ray[mine], np.ones(mine.sum())])
-            xyz[mine] = rigid3.apply(
-                rigid3.inverse(keyframe_poses[int(keyframe)]), rays / self.inverse_depth[mine, None]
-            )
-        return xyz
+        rays = np.column_stack([self.reference_ray, np.ones(len(self))]) / self.inverse_depth[:, None]
+        k = references.position(self.reference)
+        return np.einsum("nji,nj->ni", references.rotation[k], rays - references.translation[k])
 
 
-def patch_warp(camera_from_reference: Array, reference_ray: Array, depth_ratio: Array) -> Array:
+@dataclass(frozen=True)
+class References:
+    """Poses of the keyframes that tracks refer to.
+
+    Attributes:
+        keyframe: (K,) int64 ascending. rotation: (K, 3, 3) and translation: (K, 3), cam_from_world.
+    """
+
+    keyframe: NDArray[np.int64]
+    rotation: Array
+    translation: Array
+
+    @staticmethod
+    def of(keyframe: NDArray[np.int64], cam_from_world: Array) -> References:
+        """Of keyframes (K,) ascending with poses (K, 7)."""
+        poses = cam_from_world.reshape(-1, 7)
+        return References(keyframe, rigid3.rotation_matrix(poses), poses[:, 4:])
+
+    def position(self, keyframe: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(N,) rows of keyframes."""
+        return np.searchsorted(self.keyframe, keyframe)
+
+    def camera_from(self, cam_from_world: Array) -> tuple[Array, Array]:
+        """(K, 3, 3) rotations and (K, 3) translations that take points from the keyframes to a camera (7,)."""
+        rotation = rigid3.rotation_matrix(cam_from_world) @ self.rotation.transpose(0, 2, 1)
+        return rotation, cam_from_world[4:] - np.einsum("kij,kj->ki", rotation, self.translation)
+
+
+def patch_warp(rotation: Array, reference_ray: Array, depth_ratio: Array) -> Array:
     """(N, 2, 2) how an offset in the image becomes one in the reference image, for surfaces that face the camera.
 
     Args:
-        camera_from_reference: (7,) pose.
+        rotation: (N, 3, 3) or (3, 3), of the camera from the reference.
         reference_ray: (N, 2) normalised image points in the reference.
         depth_ratio: (N,) depth in the image over depth in the reference.
     """
-    rotation = rigid3.rotation_matrix(camera_from_reference).T[:, :2]
-    return depth_ratio[:, None, None] * (rotation[:2] - reference_ray[:, :, None] * rotation[2])
+    columns = np.swapaxes(rotation, -1, -2)[..., :2]
+    return depth_ratio[:, None, None] * (columns[..., :2, :] - reference_ray[:, :, None] * columns[..., 2:, :])
 
 
 def follow(
@@ -92,8 +117,8 @@ def follow(
     xyz: Array,
     camera: Camera,
     predicted: Array,
-    keyframe_poses: Mapping[int, Array],
-    keyframe_pyramids: Mapping[int, Pyramid],
+    references: References,
+    images: Mapping[int, Pyramid],
     pyramid: Pyramid,
     coarsest_level: int,
 ) -> tuple[ActiveTracks, Mask]:
@@ -102,7 +127,7 @@ def follow(
     Args:
         xyz: (N, 3) world points of the tracks.
         predicted: (7,) cam_from_world of the new image.
-        keyframe_poses, keyframe_pyramids: of all reference keyframes.
+        references, images: poses and pyramids of all reference keyframes.
         coarsest_level: pyramid level at which the search begins: the worse the prediction, the coarser.
 
     Returns:
@@ -110,16 +135,20 @@ def follow(
     """
     in_camera = rigid3.apply(predicted, xyz)
     guess = project(camera, in_camera)
+    k = references.position(tracks.reference)
+    axis, offset = references.rotation[k, 2], references.translation[k, 2]
+    ratio = in_camera[:, 2] / (np.einsum("ni,ni->n", axis, xyz) + offset)
+    # a patch that has grown or shrunk beyond that is not the same patch any more
+    usable = np.isfinite(guess[:, 0]) & (ratio > _MIN_SCALE) & (ratio < 1 / _MIN_SCALE)
+    rotation = references.camera_from(predicted)[0]
+    warp = patch_warp(rotation[k], tracks.reference_ray, ratio)
     xy, zncc, found = tracks.xy.copy(), tracks.zncc.copy(), np.zeros(len(tracks), bool)
-    for keyframe in np.unique(tracks.reference):
-        mine = np.flatnonzero((tracks.reference == keyframe) & np.isfinite(guess[:, 0]))
-        from_reference = rigid3.compose(predicted, rigid3.inverse(keyframe_poses[int(keyframe)]))
-        ratio = in_camera[mine, 2] / rigid3.apply(keyframe_poses[int(keyframe)], xyz[mine])[:, 2]
-        # a patch that has grown or shrunk beyond that is not the same patch any more
-        mine, ratio = mine[(ratio > 0.4) & (ratio < 2.5)], ratio[(ratio > 0.4) & (ratio < 2.5)]
-        aligned = align_patches(
-            keyframe_pyramids[int(keyframe)], tracks.reference_xy[mine], pyramid, guess[mine],
-            affine=patch_warp(from_reference, tracks.reference_ray[mine], ratio), coarsest_level=coarsest_level,
-        )  # fmt: skip
-        xy[mine], zncc[mine], found[mine] = aligned.xy, aligned.zncc, aligned.is_converged
+    for n, keyframe in enumerate(references.keyframe):
+        mine = np.flatnonzero(usable & (k == n))
+        if len(mine):
+            aligned = align_patches(
+                images[int(keyframe)], tracks.reference_xy[mine], pyramid, guess[mine], affine=warp[mine],
+                coarsest_level=coarsest_level,
+            )  # fmt: skip
+            xy[mine], zncc[mine], found[mine] = aligned.xy, aligned.zncc, aligned.is_converged
     return replace(tracks, xy=xy, zncc=zncc), found

@@ -58,7 +58,7 @@ class KeyframeMap:
         self.keyframes.append(keyframe)
         self.count(keyframe.point_id, np.isfinite(keyframe.xy[:, :, 0]).sum(1))
 
-    def count(self, point_id: NDArray[np.int64], observations: NDArray[np.integer]) -> None:
+    def count(self, point_id: NDArray[np.int64], observations: NDArray[np.integer] | NDArray[np.bool_]) -> None:
         """Points (N,), each at most once, are seen so many times more."""
         self._num_observations[point_id] += observations.astype(np.int32)
 

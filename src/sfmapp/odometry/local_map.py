@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.triangulation import triangulate_tracks
-from sfmapp.odometry.active_tracks import ActiveTracks, patch_warp
+from sfmapp.odometry.active_tracks import ActiveTracks, References, patch_warp
 from sfmapp.odometry.alignment import align_patches
 from sfmapp.odometry.backend import Backend, Job, choose_window, make_job
 from sfmapp.odometry.corners import find_corners
@@ -31,6 +31,8 @@ _KEPT_IMAGES = 20
 _MIN_LIKENESS = 0.9
 # Points that are looked for again: how alike and how near the prediction they must be, and the change of scale allowed.
 _FOUND_LIKENESS, _FOUND_PX, _FOUND_SCALE = 0.85, 3.0, 1.5
+# Points are looked for so far from the border, and where no track is in the same cell.
+_MARGIN_PX, _CELL_PX = 8.0, 4
 # A triangulated point agrees with its observations to that many pixels.
 _TRIANGULATION_PX = 2.0
 
@@ -69,16 +71,17 @@ class LocalMap:
         """(7,) rig_from_world of a keyframe."""
         return self.keyframes.keyframes[keyframe].rig_from_world
 
-    def poses(self, keyframes: NDArray[np.int64]) -> dict[int, Array]:
-        """Poses of some keyframes."""
-        return {int(k): self.pose(int(k)) for k in np.unique(keyframes)}
+    def references(self, tracks: ActiveTracks) -> References:
+        """The keyframes that tracks refer to."""
+        keyframe = np.unique(tracks.reference)
+        return References.of(keyframe, np.array([self.pose(int(k)) for k in keyframe]))
 
     def points_of(self, tracks: ActiveTracks) -> tuple[Array, Mask]:
         """(N, 3) world points of tracks, guessed where they are not in the map, and (N,) which are in it."""
         xyz = self.keyframes.point_xyz[tracks.point_id]
         mapped = np.isfinite(xyz[:, 0])
         guessed = tracks.subset(~mapped)
-        xyz[~mapped] = guessed.world_points(self.poses(guessed.reference))
+        xyz[~mapped] = guessed.world_points(self.references(guessed))
         return xyz, mapped
 
     def begin(self, view: View, corners: Array) -> ActiveTracks:
@@ -106,7 +109,8 @@ class LocalMap:
             The tracks to follow from here.
         """
         pyramid = view.pyramids[0]
-        tracks = tracks.joined(self._find_again(tracks, pyramid, pose))
+        if self.images:
+            tracks = tracks.joined(self._find_again(tracks, pyramid, pose))
         number = self.newest + 1
         self.images[number] = pyramid
         tracks = self._renew_references(tracks, number, pose)
@@ -139,62 +143,71 @@ class LocalMap:
         model, tracks = job.model, job.model.tracks
         new = np.flatnonzero(np.isnan(model.point_xyz[:, 0]) & np.isin(job.point_id, wanted, assume_unique=True))
         canonical, fisheye = model.canonical_cameras()
+        smallest = self.options.min_stereo_deg if self.rig.is_stereo else self.options.min_triangulation_deg
         triangulate_tracks(
             new, tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy, rigid3.rotation_matrix(model.cam_from_world),
             model.cam_from_world[:, 4:].copy(), model.image_camera_idx, canonical, fisheye, _TRIANGULATION_PX,
-            math.radians(self.options.min_triangulation_deg), model.point_xyz, model.obs_is_inlier,
+            math.radians(smallest), model.point_xyz, model.obs_is_inlier,
         )  # fmt: skip
         self.keyframes.point_xyz[job.point_id[new]] = model.point_xyz[new]
         self.counts["triangulated"] += int(np.isfinite(model.point_xyz[new, 0]).sum())
 
     def _find_again(self, tracks: ActiveTracks, pyramid: Pyramid, pose: Array) -> ActiveTracks:
         """Look for points of recent keyframes that are not tracked any more."""
+        lost = self._lost_points(tracks)
+        xyz = self.keyframes.point_xyz[lost.point_id]
+        references = self.references(lost)
+        k = references.position(lost.reference)
+        in_camera = rigid3.apply(pose, xyz)
+        in_reference = np.einsum("nij,nj->ni", references.rotation[k], xyz) + references.translation[k]
+        guess, ratio = project(self.camera, in_camera), in_camera[:, 2] / in_reference[:, 2]
+        height, width = pyramid.shape
+        margin = np.minimum(guess, np.array([width, height]) - guess).min(1)
+        near = (margin > _MARGIN_PX) & (ratio < _FOUND_SCALE) & (ratio > 1 / _FOUND_SCALE)  # False for NaN
+        near[near] = self._is_free(guess[near], tracks.xy, width)
+        guess, ratio, k, depth = guess[near], ratio[near], k[near], in_reference[near, 2]
+        lost = replace(
+            lost.subset(near), reference_ray=in_reference[near, :2] / depth[:, None], inverse_depth=1 / depth
+        )
+        warp = patch_warp(references.camera_from(pose)[0][k], lost.reference_ray, ratio)
+        xy, zncc, found = guess.copy(), lost.zncc.copy(), np.zeros(len(lost), bool)
+        for reference in np.unique(lost.reference):
+            mine = np.flatnonzero(lost.reference == reference)
+            aligned = align_patches(
+                self.images[int(reference)], lost.reference_xy[mine], pyramid, guess[mine], affine=warp[mine],
+                coarsest_level=1,
+            )  # fmt: skip
+            xy[mine], zncc[mine], found[mine] = aligned.xy, aligned.zncc, aligned.is_converged
+        found &= (np.linalg.norm(xy - guess, axis=1) < _FOUND_PX) & (zncc > _FOUND_LIKENESS)
+        self.counts["points_found_again"] += int(found.sum())
+        return replace(lost, xy=xy, zncc=zncc).subset(found)
+
+    def _lost_points(self, tracks: ActiveTracks) -> ActiveTracks:
+        """Points of keyframes whose images are kept that are not tracked, each as the newest of these saw it."""
+        kept = sorted(self.images)
+        seen = [self.keyframes.keyframes[k] for k in kept]
+        point_id = np.concatenate([k.point_id for k in seen])
+        xy = np.concatenate([k.xy[:, 0] for k in seen])
+        reference = np.repeat(kept, [len(k.point_id) for k in seen])
+        wanted = np.concatenate([k.is_inlier[:, 0] for k in seen]) & self.keyframes.is_triangulated(point_id)
         known = np.zeros(self.keyframes.num_points, bool)
         known[tracks.point_id] = True
-        height, width = pyramid.shape
-        taken = np.zeros((height // 4 + 1, width // 4 + 1), bool)
-        taken[(tracks.xy[:, 1] // 4).astype(int), (tracks.xy[:, 0] // 4).astype(int)] = True
-        found = [ActiveTracks.none()]
-        room = self.options.max_tracks // 4
-        for k in sorted(self.images, reverse=True):
-            keyframe = self.keyframes.keyframes[k]
-            xyz = self.keyframes.point_xyz[keyframe.point_id]
-            mine = np.flatnonzero(keyframe.is_inlier[:, 0] & ~known[keyframe.point_id] & np.isfinite(xyz[:, 0]))
-            known[keyframe.point_id[mine]] = True  # the newest keyframe that saw a point has its best picture
-            in_camera, in_reference = rigid3.apply(pose, xyz[mine]), rigid3.apply(keyframe.rig_from_world, xyz[mine])
-            guess = project(self.camera, in_camera)
-            ratio = in_camera[:, 2] / in_reference[:, 2]
-            inside = (
-                (guess > 8).all(1)
-                & (guess[:, 0] < width - 8)
-                & (guess[:, 1] < height - 8)
-                & (ratio < _FOUND_SCALE)
-                & (ratio > 1 / _FOUND_SCALE)
-            )  # fmt: skip  (False for NaN)
-            inside[inside] &= ~taken[(guess[inside, 1] // 4).astype(int), (guess[inside, 0] // 4).astype(int)]
-            if inside.sum() < 4:
-                continue
-            mine, guess, ratio = mine[inside], guess[inside], ratio[inside]
-            ray = in_reference[inside, :2] / in_reference[inside, 2:]
-            warp = patch_warp(rigid3.compose(pose, rigid3.inverse(keyframe.rig_from_world)), ray, ratio)
-            reference_xy = keyframe.xy[mine, 0]
-            aligned = align_patches(self.images[k], reference_xy, pyramid, guess, affine=warp, coarsest_level=1)
-            near = np.linalg.norm(aligned.xy - guess, axis=1) < _FOUND_PX
-            good = aligned.is_converged & near & (aligned.zncc > _FOUND_LIKENESS)
-            found.append(
-                ActiveTracks(
-                    keyframe.point_id[mine], aligned.xy, np.full(len(mine), k), reference_xy, ray,
-                    1 / in_reference[inside, 2], aligned.zncc,
-                ).subset(good)
-            )  # fmt: skip
-            taken[(found[-1].xy[:, 1] // 4).astype(int), (found[-1].xy[:, 0] // 4).astype(int)] = True
-            if sum(map(len, found)) > room:
-                break
-        again = found[0]
-        for more in found[1:]:
-            again = again.joined(more)
-        self.counts["points_found_again"] += len(again)
-        return again
+        chosen = np.flatnonzero(wanted & ~known[point_id])[::-1]
+        ids, newest = np.unique(point_id[chosen], return_index=True)
+        chosen = chosen[newest]
+        ones = np.ones(len(ids))
+        return ActiveTracks(
+            ids, xy[chosen], reference[chosen], xy[chosen], np.zeros((len(ids), 2)), ones, ones.astype(np.float32)
+        )
+
+    def _is_free(self, xy: Array, taken_xy: Array, width: int) -> Mask:
+        """(N,) which places have no track in their cell of 4 pixels; of several in a cell, the first."""
+        columns = width // _CELL_PX + 1
+        taken = np.floor_divide(taken_xy, _CELL_PX).astype(np.int64) @ [1, columns]
+        cells = np.floor_divide(xy, _CELL_PX).astype(np.int64) @ [1, columns]
+        free = np.zeros(len(xy), bool)
+        free[np.unique(cells, return_index=True)[1]] = True
+        return free & ~np.isin(cells, taken)
 
     def _renew_references(self, tracks: ActiveTracks, number: int, pose: Array) -> ActiveTracks:
         """Give tracks whose patch has changed, or whose reference image will be dropped, the new keyframe."""
@@ -247,4 +260,5 @@ class LocalMap:
         depth = np.where(mapped, rigid3.apply(keyframe.rig_from_world, xyz)[:, 2], np.nan)
         keyframe.xy[:, 1] = match_stereo(self.rig, view.pyramids, tracks.xy, depth)
         keyframe.is_inlier[:, 1] = np.isfinite(keyframe.xy[:, 1, 0])
+        self.keyframes.count(keyframe.point_id, keyframe.is_inlier[:, 1])
         self.counts["stereo_matches"] += int(keyframe.is_inlier[:, 1].sum())

@@ -15,7 +15,8 @@ class OdometryOptions:
     keyframe_loss: float = 0.75  # a keyframe is due when fewer than this share of its mapped points is still tracked
     window: int = 10  # keyframes whose poses the local adjustment may change
     window_anchors: int = 10  # earlier keyframes that take part unchanged, those that share the most points
-    min_triangulation_deg: float = 1.0  # smallest angle between the rays of a new point
+    min_triangulation_deg: float = 1.0  # smallest angle between the rays of a new point of one moving camera
+    min_stereo_deg: float = 0.2  # the same with a rig, whose baseline is known: a depth to a tenth or so
     max_lost_s: float = 1.0  # seconds without relocalisation after which a new map is begun
     motion: Literal["free", "planar"] = "free"  # planar: a wheeled robot on level ground, for the first two views
     loops: bool = True  # look for places seen before, close loops and join maps

@@ -68,11 +68,7 @@ class Odometry:
         )
         record = FrameRecord(frame.idx, frame.name, frame.timestamp_s)
         self.records.append(record)
-        if self.local is not None and self.lost_since is None:
-            self._track(record, view)
-        elif self.maps and self._recover(record, view):
-            pass
-        else:
+        if not (self._track(record, view) or self._recover(record, view)):
             self._begin(record, view)
         self.previous = view.pyramids[0]
         record.time_s = time.thread_time() - start
@@ -89,6 +85,8 @@ class Odometry:
         """Look for a first map, or for another one after a loss that lasts."""
         if self.lost_since is not None:
             record.state = FrameState.LOST
+            if record.timestamp_s == self.lost_since:
+                self.events.warned(STAGE, f"{record.name}: tracking is lost", frame_idx=record.frame_idx)
             if record.timestamp_s - self.lost_since < self.options.max_lost_s:
                 return
         self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
@@ -156,16 +154,16 @@ class Odometry:
 
     # ------------------------------------------------------------------ tracking
 
-    def _track(self, record: FrameRecord, view: View) -> None:
-        """Measure the pose in the current map; make a keyframe where one is due."""
+    def _track(self, record: FrameRecord, view: View) -> bool:
+        """Measure the pose in the current map; make a keyframe where one is due. False if there is no pose."""
         local, number = self.local, len(self.records)
-        assert local is not None
-        assert self.previous is not None
+        if local is None or self.previous is None or self.lost_since is not None:
+            return False
         self._take_over(local, number)
         tracked = track(local, self.tracks, self.pose, self.step, self.previous, view.pyramids[0])
         if tracked is None:
-            self._lose(record, local)
-            return
+            self._lose(record)
+            return False
         self.step = rigid3.compose(tracked.pose, rigid3.inverse(self.pose))
         self.pose, self.tracks, self.is_mapped = tracked.pose, tracked.tracks, tracked.is_mapped
         reason = keyframe_reason(local, tracked, self.num_mapped_at_keyframe, self.options)
@@ -173,6 +171,7 @@ class Odometry:
             self._settle(record, FrameState.TRACKED, self.pose, tracks=self.tracks.subset(self.is_mapped))
         else:
             self._make_keyframe(record, view, FrameState.TRACKED, reason)
+        return True
 
     def _make_keyframe(self, record: FrameRecord, view: View, state: FrameState, reason: str) -> None:
         local = self.local
@@ -197,19 +196,18 @@ class Odometry:
 
     # ------------------------------------------------------------------ loss
 
-    def _lose(self, record: FrameRecord, local: LocalMap) -> None:
-        record.state, self.lost_since = FrameState.LOST, record.timestamp_s
+    def _lose(self, record: FrameRecord) -> None:
+        self.lost_since = record.timestamp_s
         self.counts["losses"] += 1
         self.step = _IDENTITY
         self.beginning = Beginning(self.rig.cameras[0], self.options, self.seed)
         self.waiting.clear()
-        self.events.warned(STAGE, f"{record.name}: tracking is lost", frame_idx=record.frame_idx, map=local.map_idx)
 
     def _recover(self, record: FrameRecord, view: View) -> bool:
         """After a loss: the tracks where they were, or any place of any map that the frame looks like."""
         local = self.local
-        assert local is not None
-        assert self.previous is not None
+        if local is None or self.previous is None:
+            return False
         self._take_over(local, None)
         if len(self.tracks) >= MIN_INLIERS and not self.waiting:
             tracked = track(local, self.tracks, self.pose, _IDENTITY, self.previous, view.pyramids[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,6 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.pose import refine_pose
 from sfmapp.geometry import rigid3
-from sfmapp.geometry.epipolar import essential_from_pose, sampson_errors
 from sfmapp.geometry.resection import estimate_pose
 from sfmapp.odometry.active_tracks import ActiveTracks, follow
 from sfmapp.odometry.local_map import LocalMap
@@ -68,25 +68,37 @@ def track(
         None if the pose cannot be measured.
     """
     xyz, mapped = local.points_of(tracks)
-    poses = local.poses(tracks.reference)
-    predicted = rigid3.compose(step, pose)
-    followed, found = follow(tracks, xyz, local.camera, predicted, poses, local.images, pyramid, _NEAR_LEVEL)
-    if found.sum() < _MIN_FOUND * len(tracks):
-        rotation = align_small_images(previous, pyramid, local.camera.focal)
-        turn = np.zeros(3) if rotation is None else rigid3.log_so3(rotation)
-        other = rigid3.compose(rigid3.from_matrix(rigid3.exp_so3(turn), np.zeros(3)), pose)
-        again, found_again = follow(tracks, xyz, local.camera, other, poses, local.images, pyramid, _FAR_LEVEL)
-        if found_again.sum() > found.sum():
-            followed, found, predicted = again, found_again, other
-    tracks, xyz, mapped = followed.subset(found), xyz[found], mapped[found]
-    measured = measure_pose(local.camera, predicted, xyz[mapped], tracks.xy[mapped])
-    if measured is None:
+    references = local.references(tracks)
+    for start, level in _predictions(local, pose, step, previous, pyramid):
+        followed, found = follow(tracks, xyz, local.camera, start, references, local.images, pyramid, level)
+        if found.sum() < _MIN_FOUND * len(tracks) and level == _NEAR_LEVEL:
+            continue
+        usable = found & mapped
+        measured = measure_pose(local.camera, start, xyz[usable], followed.xy[usable])
+        if measured is not None:
+            break
+    else:
         return None
+    tracks, mapped = followed.subset(found), mapped[found]
     new_pose, covariance, inlier, sigma = measured
     keep = np.ones(len(tracks), bool)
     keep[mapped] = inlier
     keep[~mapped] = _near_epipolar_lines(local, tracks.subset(~mapped), new_pose)
     return Tracked(new_pose, covariance, tracks.subset(keep), mapped[keep], int(mapped.sum()), int(inlier.sum()), sigma)
+
+
+def _predictions(
+    local: LocalMap, pose: Array, step: Array, previous: Pyramid, pyramid: Pyramid
+) -> Iterator[tuple[Array, int]]:
+    """Poses (7,) to begin with, and the level to search from: steady motion, the turn that the images as a whole show,
+    no motion. The later ones are only worked out if they are asked for."""
+    predicted = rigid3.compose(step, pose)
+    yield predicted, _NEAR_LEVEL
+    rotation = align_small_images(previous, pyramid, local.camera.focal)
+    if rotation is not None:
+        yield rigid3.compose(rigid3.from_matrix(rotation, np.zeros(3)), pose), _FAR_LEVEL
+    yield predicted, _FAR_LEVEL
+    yield pose, _FAR_LEVEL
 
 
 def measure_pose(camera: Camera, start: Array, xyz: Array, xy: Array) -> tuple[Array, Array, Mask, float] | None:
@@ -117,15 +129,18 @@ def measure_pose(camera: Camera, start: Array, xyz: Array, xy: Array) -> tuple[A
 
 
 def _near_epipolar_lines(local: LocalMap, tracks: ActiveTracks, pose: Array) -> Mask:
-    """(N,) which unmapped tracks are near the epipolar lines of their reference keyframes."""
-    near = np.ones(len(tracks), bool)
-    here = pixels_to_normalized(local.camera, tracks.xy)
-    for keyframe, reference_pose in local.poses(tracks.reference).items():
-        mine = tracks.reference == keyframe
-        relative = rigid3.compose(pose, rigid3.inverse(reference_pose))
-        errors = sampson_errors(essential_from_pose(relative), tracks.reference_ray[mine], here[mine])
-        near[mine] = ~(errors > (_MAX_EPIPOLAR_PX / local.camera.focal) ** 2)
-    return near
+    """(N,) which unmapped tracks are near the epipolar lines of their reference keyframes (Sampson's distance)."""
+    references = local.references(tracks)
+    rotation, translation = references.camera_from(pose)
+    k = references.position(tracks.reference)
+    there = np.column_stack([tracks.reference_ray, np.ones(len(tracks))])
+    here = np.column_stack([pixels_to_normalized(local.camera, tracks.xy), np.ones(len(tracks))])
+    turned = np.einsum("nij,nj->ni", rotation[k], there)
+    line = np.cross(translation[k], turned)
+    other = np.einsum("nji,nj->ni", rotation[k], np.cross(here, translation[k]))
+    gradient2 = (line[:, :2] ** 2).sum(1) + (other[:, :2] ** 2).sum(1)
+    limit = (_MAX_EPIPOLAR_PX / local.camera.focal) ** 2
+    return ~((line * here).sum(1) ** 2 > limit * gradient2)
 
 
 def keyframe_reason(local: LocalMap, tracked: Tracked, num_mapped_before: int, options: OdometryOptions) -> str | None:
