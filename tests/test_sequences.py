@@ -78,7 +78,7 @@ def assert_same_poses(a: np.ndarray, b: np.ndarray, tolerance: float = 1e-6) -> 
 
 
 def assert_frames_ascend(frames: list[Frame], sequence: Sequence) -> None:
-    assert all(a.timestamp_s < b.timestamp_s and a.idx < b.idx for a, b in zip(frames, frames[1:], strict=False))
+    assert all(a.timestamp_s < b.timestamp_s and a.idx < b.idx for a, b in itertools.pairwise(frames))
     for frame in frames:
         assert len(frame.images) == len(sequence.rig.cameras)
         for image, camera in zip(frame.images, sequence.rig.cameras, strict=True):
