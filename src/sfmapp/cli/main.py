@@ -55,7 +55,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"sfmapp {sfmapp.__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for family in (reconstruct, odometry, inspect, convert):
+    for family in (reconstruct, odometry, evaluate, inspect, convert):
         family.add_commands(commands)
     return parser
 
