@@ -60,10 +60,12 @@ class View:
 
     Attributes:
         shape: (height, width). xy: (N, 2) float64 corners in house pixels.
+        point_id: (N,) which points they are, -1 where unknown.
     """
 
-    def __init__(self, image: Bytes, xy: Array) -> None:
+    def __init__(self, image: Bytes, xy: Array, point_id: Ids | None = None) -> None:
         self.shape: tuple[int, int] = image.shape[:2]
+        self.point_id: Ids = np.full(len(xy), -1) if point_id is None else np.array(point_id, np.int64)
         self.xy = np.ascontiguousarray(xy, np.float64)
         self._levels = _pyramid(image)
         self._known: dict[tuple[float, float], Bytes] = {}
@@ -162,7 +164,7 @@ class Places:
         Returns:
             The image with its described points, to look for loops with before it is forgotten.
         """
-        view = View(image, xy)
+        view = View(image, xy, point_id)
         kept = slice(0, self.options.max_points)
         described = view.descriptors()[kept].copy()
         place = Place(map_idx, frame_idx, np.array(point_id[kept]), view.xy[kept].astype(np.float32), described)

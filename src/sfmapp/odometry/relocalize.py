@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numba
 import numpy as np
@@ -61,19 +61,25 @@ class RelocalizeOptions:
 
 @dataclass(frozen=True)
 class LocalPoints:
-    """The points around a place: (M,) ids ascending, (M, 3) world, (M, 128) descriptors and, of the keyframe each was
-    described in, (M,) the depth there and (M, 3, 3) rotation cam_from_world."""
+    """The points around a place (M), each as it was seen in one keyframe.
+
+    Attributes:
+        point_id: (M,) ascending. xyz: (M, 3) world.
+        keyframe_idx: (M,) position of the keyframe. xy: (M, 2) pixels there. descriptors: (M, 128) uint8.
+        depth: (M,) in that keyframe. rotation: (M, 3, 3) its cam_from_world.
+    """
 
     point_id: Ids
     xyz: Array
+    keyframe_idx: Ids
+    xy: Array
     descriptors: Bytes
     depth: Array
     rotation: Array
 
-    def subset(self, chosen: Mask) -> LocalPoints:
-        return LocalPoints(
-            self.point_id[chosen], self.xyz[chosen], self.descriptors[chosen], self.depth[chosen], self.rotation[chosen]
-        )
+    def subset(self, chosen: Mask | Ids) -> LocalPoints:
+        """The chosen points."""
+        return LocalPoints(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -128,7 +134,10 @@ def locate(
     """The pose of an image at a place, or None where too few points agree to have one."""
     camera = keyframes.rig.cameras[0]
     local = local_points(keyframes, places, candidate.frame_idx, options.num_neighbors)
-    point, corner = match_points(local.descriptors, view, roll, options)
+    # the points around join in once there is a pose: to match them without one costs more than it finds
+    own = np.flatnonzero(local.keyframe_idx == position_of(keyframes, candidate.frame_idx))
+    point, corner = match_points(local.descriptors[own], view, roll, options)
+    point = own[point]
     if len(point) < options.min_matches:
         return None
     normalized = pixels_to_normalized(camera, view.xy[corner])
@@ -181,30 +190,29 @@ def is_convincing(found: Located, view: View, options: RelocalizeOptions) -> boo
 def local_points(keyframes: KeyframeMap, places: Places, frame_idx: int, num_neighbors: int) -> LocalPoints:
     """The triangulated points of a keyframe and of those that share most points with it, each as it looked in the
     first of these that has it."""
-    position = {k.frame_idx: n for n, k in enumerate(keyframes.keyframes)}
-    around = [position[frame_idx]]
+    around = [position_of(keyframes, frame_idx)]
     shared = shared_points(keyframes, around[0])
     shared[around[0]] = 0
     best = np.argsort(-shared, kind="stable")[:num_neighbors]
     around += [int(k) for k in best if shared[k] > 0 and keyframes.keyframes[k].frame_idx in places]
-    ids, descriptors, depths, rotations, xyzs = [], [], [], [], []
+    parts = []
     for k in around:
         keyframe = keyframes.keyframes[k]
         place = places[keyframe.frame_idx]
         xyz = keyframes.point_xyz[place.point_id]
         depth = rigid3.apply(keyframe.rig_from_world, xyz)[:, 2]
-        good = depth > 0  # False for NaN
-        ids.append(place.point_id[good])
-        descriptors.append(place.descriptors[good])
-        depths.append(depth[good])
-        xyzs.append(xyz[good])
-        rotation = rigid3.rotation_matrix(keyframe.rig_from_world)
-        rotations.append(np.broadcast_to(rotation, (int(good.sum()), 3, 3)))
-    point_id, first = np.unique(np.concatenate(ids), return_index=True)
-    return LocalPoints(
-        point_id, np.concatenate(xyzs)[first], np.concatenate(descriptors)[first], np.concatenate(depths)[first],
-        np.concatenate(rotations)[first],
-    )  # fmt: skip
+        rotation = np.broadcast_to(rigid3.rotation_matrix(keyframe.rig_from_world), (len(xyz), 3, 3))
+        seen = LocalPoints(
+            place.point_id, xyz, np.full(len(xyz), k), place.xy.astype(np.float64), place.descriptors, depth, rotation
+        )
+        parts.append(seen.subset(depth > 0))  # False for NaN
+    joined = LocalPoints(*(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(LocalPoints)))
+    return joined.subset(np.unique(joined.point_id, return_index=True)[1])
+
+
+def position_of(keyframes: KeyframeMap, frame_idx: int) -> int:
+    """Position of the keyframe that a frame is."""
+    return next(n for n, k in enumerate(keyframes.keyframes) if k.frame_idx == frame_idx)
 
 
 def shared_points(keyframes: KeyframeMap, keyframe_idx: int) -> NDArray[np.int64]:
@@ -289,7 +297,7 @@ def agreement_at(local: LocalPoints, view: View, camera: Camera, pose: Array) ->
     expected = project(camera, in_camera)
     margin = 2.0 * SIGMA_PX * 3.0
     size = np.array(view.shape[::-1])
-    seen: Mask = ((expected > margin) & (expected < size - margin)).all(1)  # False for NaN
+    seen = np.asarray(((expected > margin) & (expected < size - margin)).all(1))  # False for NaN
     if seen.sum() < 2:
         return int(seen.sum()), 0.0
     shown = local.subset(seen)
@@ -334,7 +342,7 @@ def _nearest_within(  # type: ignore[no-untyped-def]
         for n in range(xy.shape[0]):
             dx, dy = xy[n, 0] - expected[m, 0], xy[n, 1] - expected[m, 1]
             if dx * dx + dy * dy <= radius * radius:
-                total = 0
+                total = np.int64(0)
                 for k in range(128):
                     total += np.int64(descriptors[m, k]) * np.int64(described[scale_idx[m], n, k])
                 if total > product[m]:
