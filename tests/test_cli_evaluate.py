@@ -265,6 +265,33 @@ def test_parts_are_not_sold_as_the_whole(tmp_path: Path) -> None:
     assert "1 gap" in result.table()
 
 
+def test_a_straight_path_leaves_the_turn_about_it_open(tmp_path: Path) -> None:
+    truth = straight(100, 50.0)
+    result = evaluate(write_tum(tmp_path / "a.tum", worse(truth)), write_tum(tmp_path / "b.tum", truth))
+    assert any("straight" in note for note in result.notes)
+    truth = loop()
+    result = evaluate(write_tum(tmp_path / "a.tum", worse(truth)), write_tum(tmp_path / "b.tum", truth))
+    assert not any("straight" in note for note in result.notes)
+
+
+def test_a_sequence_is_its_truth(tmp_path: Path) -> None:
+    from PIL import Image
+
+    truth = loop(30)
+    for k in range(30):
+        (tmp_path / "00" / "image_0").mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.full((8, 8), k, np.uint8)).save(tmp_path / "00" / "image_0" / f"{k:06d}.png")
+    write_kitti(tmp_path / "00" / "poses.txt", truth)
+    assert truth.timestamps_s is not None
+    (tmp_path / "00" / "times.txt").write_text("\n".join(f"{0.1 * k:.6e}" for k in range(30)))
+    played = Trajectory(truth.position, truth.rotation, truth.timestamps_s - 1.5e9)
+    ours = write_tum(tmp_path / "a.tum", worse(played))
+    assert len(evaluate(ours, tmp_path / "00").pairs) == 30
+    (tmp_path / "00" / "poses.txt").unlink()
+    with pytest.raises(InputError, match="expected true poses"):
+        evaluate(ours, tmp_path / "00")
+
+
 def test_a_short_path_tells_why_there_is_no_t_rel(tmp_path: Path) -> None:
     truth = loop(radius=3.0)
     result = evaluate(write_tum(tmp_path / "a.tum", worse(truth)), write_tum(tmp_path / "b.tum", truth))

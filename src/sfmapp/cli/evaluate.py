@@ -27,7 +27,9 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("trajectory", metavar="TRAJ", type=Path, help="the estimate, or the folder of an odometry run")
-    parser.add_argument("truth", metavar="TRUTH", type=Path, help="the true poses")
+    parser.add_argument(
+        "truth", metavar="TRUTH", type=Path, help="the true poses: a file, or the folder of a sequence that has them"
+    )
     pairs = parser.add_argument_group("pairs of poses")
     pairs.add_argument("--max-diff", metavar="SECONDS", type=float, default=0.01,
                        help="poses further apart in time are no pair; default: 0.01")  # fmt: skip

@@ -327,6 +327,15 @@ def _alignment(pairs: Pairs, how: Alignment) -> tuple[Array, Array, float]:
     return rotation, x_b.mean(0) - rotation @ x_a.mean(0), 1.0  # the best rotation does not depend on the scale
 
 
+def is_straight(pairs: Pairs) -> bool:
+    """The positions lie on a line within the errors of an alignment, so the turn about it is not theirs to tell."""
+    try:
+        fit = similarity.align_poses(_cam_from_world(pairs.estimate), _cam_from_world(pairs.truth))
+    except ValueError:
+        return True
+    return fit.is_twist_from_orientations
+
+
 def _cam_from_world(trajectory: Trajectory) -> Array:
     return rigid3.inverse(rigid3.from_matrix(trajectory.rotation, trajectory.position))
 

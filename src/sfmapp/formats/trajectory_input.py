@@ -22,6 +22,7 @@ from sfmapp.errors import InputError
 from sfmapp.evaluation.trajectory import Trajectory
 from sfmapp.formats.text_input import read_limited_text
 from sfmapp.geometry import rigid3
+from sfmapp.images.sequence import SequenceKind
 
 Array = NDArray[np.float64]
 TrajectoryFormat = Literal["tum", "kitti", "euroc"]
@@ -39,14 +40,14 @@ class TrajectoryFile:
     """What a file holds.
 
     Attributes:
-        path, format: where it is from, and what it turned out to be.
+        path, format: where it is from, and what it turned out to be; a kind of sequence if it is one's truth.
         trajectory: its poses in the order of the file; a line with "nan" in it is a gap.
         is_numbered: ``PATH.frames`` beside a KITTI trajectory names the frame of each line (see
             :func:`sfmapp.formats.kitti.write_kitti`): the others are gaps, and the last ones may be missing.
     """
 
     path: Path
-    format: TrajectoryFormat
+    format: TrajectoryFormat | SequenceKind
     trajectory: Trajectory
     is_numbered: bool = False
 

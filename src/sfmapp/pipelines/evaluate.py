@@ -27,6 +27,7 @@ from sfmapp.evaluation.trajectory import (
     Trajectory,
     absolute_error,
     associate,
+    is_straight,
     kitti_drift,
     path_shares_m,
     relative_error,
@@ -136,7 +137,9 @@ def evaluate(
     Args:
         estimate: TUM, KITTI or EuRoC text (see :mod:`sfmapp.formats.trajectory_input`), or the folder of an odometry
             run, of which ``trajectory.tum`` is taken (``trajectory.kitti`` if the truth has no timestamps).
-        truth: a file of the same formats, not necessarily the same one.
+        truth: a file of the same formats, not necessarily the same one, or the folder of a sequence (see
+            :func:`sfmapp.formats.sequences.open_sequence`): then it is of the first camera on the clock of the frames,
+            and played as the run was if ``estimate`` is the folder of one.
         times: file with the seconds of the lines of KITTI trajectories.
 
     Raises:
@@ -147,7 +150,9 @@ def evaluate(
     if not options.max_difference_s >= 0 or not math.isfinite(options.max_difference_s + options.offset_s):
         raise UsageError("expected a maximum difference of at least 0 s and a finite offset")
     seconds = None if times is None else Path(times)
-    true_file = read_trajectory(Path(truth), seconds)
+    true_file = (
+        read_trajectory(Path(truth), seconds) if not Path(truth).is_dir() else _of_sequence(Path(truth), Path(estimate))
+    )
     our_file = read_trajectory(_trajectory_of(Path(estimate), true_file.trajectory), seconds)
     ours, theirs = _same_length(our_file, true_file)
     pairs = associate(ours, theirs, max_difference_s=options.max_difference_s, offset_s=options.offset_s)
@@ -177,7 +182,7 @@ def draw(result: Evaluation, path: str | os.PathLike[str]) -> None:
         _ALIGNMENT_NAMES[how] + (f" {errors.absolute.scale:.4g}" if how == "sim3" else ""),
         f"{len(pairs)} poses",
         f"coverage {100 * pairs.coverage:.1f} %",
-        f"{pairs.truth.path_m:.4g} m of path",
+        f"{_metres(pairs.truth.path_m)} of path",
     ]
     if len(errors.drift.first):
         facts.append(f"{'drift' if errors.is_by_share else 't_rel'} {errors.drift.t_rel_percent:.3g} %")
@@ -211,6 +216,28 @@ def _trajectory_of(path: Path, truth: Trajectory) -> Path:
     if not tum.is_file():
         raise InputError(f"{path}: expected a trajectory, found a folder without trajectory.tum")
     return kitti if truth.timestamps_s is None and kitti.is_file() else tum
+
+
+def _of_sequence(folder: Path, estimate: Path) -> TrajectoryFile:
+    """The truth of a sequence, played backwards or in steps as the run was."""
+    from sfmapp.events import Events
+    from sfmapp.formats.sequences import open_sequence
+    from sfmapp.images.sequence import SequenceOptions
+    from sfmapp.pipelines.options import options_from_dict
+    from sfmapp.pipelines.workspace import MANIFEST, read_manifest
+
+    options = SequenceOptions()
+    if (estimate / MANIFEST).is_file():
+        options = options_from_dict(read_manifest(estimate).get("options", {})).sequence
+    sequence = open_sequence(folder, options, Events(), require_camera=False)
+    if sequence.truth is None:
+        raise InputError(
+            f"{folder}: expected true poses beside the frames, found none", "name the file that holds them"
+        )
+    truth = sequence.truth
+    return TrajectoryFile(
+        folder, sequence.kind, Trajectory.from_cam_from_world(truth.cam_from_world, truth.timestamps_s)
+    )
 
 
 def _same_length(estimate: TrajectoryFile, truth: TrajectoryFile) -> tuple[Trajectory, Trajectory]:
@@ -279,10 +306,15 @@ def _notes(result: Evaluation, options: EvaluateOptions) -> list[str]:
             notes.append(f"the timestamps of the {name} do not ascend ({(steps < 0).sum()} steps back): sorted by time")
         if (steps == 0).any():
             notes.append(f"{(steps == 0).sum()} poses of the {name} have the timestamp of the one before")
-    if result.truth.format == "euroc" and result.estimate.format != "euroc":
+    if result.truth.format == "euroc" and result.estimate.format != "euroc" and not result.truth.path.is_dir():
         notes.append(
-            "EuRoC's truth is of the IMU: a trajectory of a camera differs from it by the lever between the two, a few "
-            "centimetres"
+            "EuRoC's truth is of the IMU, a few centimetres beside the camera: if the estimate is of the camera, give "
+            "the folder of the sequence instead"
+        )
+    if {"sim3", "se3"} & set(result.errors) and is_straight(pairs):
+        notes.append(
+            "the path is straight within its errors: the alignment of positions leaves the turn about it open, and the "
+            "ATE of rotations with it"
         )
     if "sim3" in result.errors and "se3" in result.errors and result.telling_alignment == "sim3":
         notes.append(
@@ -297,14 +329,18 @@ def _drift_note(result: Evaluation) -> str:
     errors = next(iter(result.errors.values()))
     if errors.is_by_share:
         return (
-            f"no t_rel and r_rel: KITTI's stretches are 100 to 800 m long, this path is {result.pairs.truth.path_m:.4g}"
-            " m; the drift is over stretches of 10, 20, ..., 80 % of the path instead"
+            f"no t_rel and r_rel: KITTI's stretches are 100 to 800 m long, this path is "
+            f"{_metres(result.pairs.truth.path_m)}; the drift is over stretches of 10, 20, ..., 80 % of it instead"
         )
     longest = errors.drift.length_m.max(initial=0)
     if not longest:
         return "no t_rel and r_rel: no stretch of 100 m is followed by another pose"
     lengths = "100 m" if longest == KITTI_LENGTHS_M[0] else f"100 to {longest:g} m"
     return f"t_rel and r_rel are means over {len(errors.drift.first)} stretches of {lengths}"
+
+
+def _metres(length: float) -> str:
+    return f"{length:.0f} m" if length >= 1000 else f"{length:.4g} m"
 
 
 def _errors_dict(errors: Errors) -> dict[str, Any]:
@@ -344,12 +380,13 @@ def _table_lines(result: Evaluation) -> list[str]:
     pairs = result.pairs
     times = pairs.truth.timestamps_s
     duration = "" if times is None else f" in {np.ptp(times):.4g} s"
+    num_gaps = int(pairs.is_gap.sum())
     lines = [
-        f"{result.estimate.path} ({_FORMAT_NAMES[result.estimate.format]})",
-        f"against {result.truth.path} ({_FORMAT_NAMES[result.truth.format]})",
+        f"{result.estimate.path} ({_FORMAT_NAMES.get(result.estimate.format, result.estimate.format)})",
+        f"against {result.truth.path} ({_FORMAT_NAMES.get(result.truth.format, result.truth.format)})",
         f"{len(pairs)} pairs of {pairs.num_estimate} estimated and {pairs.num_truth} true poses, "
-        f"{pairs.truth.path_m:.4g} m{duration}, coverage {100 * pairs.coverage:.1f} %, "
-        f"{int(pairs.is_gap.sum()) or 'no'} gap{'' if pairs.is_gap.sum() == 1 else 's'}",
+        f"{_metres(pairs.truth.path_m)}{duration}, coverage {100 * pairs.coverage:.1f} %, "
+        f"{num_gaps or 'no'} gap{'' if num_gaps == 1 else 's'}",
         "",
     ]
     for how, errors in result.errors.items():
