@@ -20,7 +20,9 @@ from sfmapp.images.sequence import Frame, Imu, Sequence, SequenceKind, Truth
 from sfmapp.odometry.run import run_odometry
 from sfmapp.pipelines.kernels import compile_odometry_kernels
 from sfmapp.pipelines.listeners import DecisionLog, EventLog
+from sfmapp.pipelines.odometry_keyframes import KeyframeWatch
 from sfmapp.pipelines.odometry_results import write_odometry
+from sfmapp.pipelines.odometry_scale import ScaleWish, check_wish, parse_scale, scale_maps
 from sfmapp.pipelines.odometry_timing import FrameLog, ThreadTimes
 from sfmapp.pipelines.options import Options, with_absolute_paths
 from sfmapp.pipelines.run import Job
@@ -52,12 +54,16 @@ class Tracking(Job):
         frames: what was told of each frame.
         threads_cpu: CPU time by thread.
         live: draws what happens; None if nobody looks.
+        keyframes: looks at the images of keyframes.
+        wish: what the unit of length is to come from; None: an arbitrary one will do.
         sequence: once it is open.
     """
 
     frames: FrameLog
     threads_cpu: ThreadTimes
     live: LiveView | None
+    keyframes: KeyframeWatch
+    wish: ScaleWish | None
     sequence: Sequence | None = None
 
 
@@ -93,6 +99,7 @@ def track_sequence(
     from threadpoolctl import threadpool_limits
 
     source, options, events = os.fspath(source), with_absolute_paths(options or Options()), events or Events()
+    wish = parse_scale(options.scale.source) if options.scale.source is not None else None
     threads = options.threads or len(os.sched_getaffinity(0))
     with ExitStack() as stack:
         workspace = stack.enter_context(open_workspace(Path(output), ODOMETRY))
@@ -105,8 +112,9 @@ def track_sequence(
         run = Tracking(
             source, workspace, options, events, watch or Stopwatch(), DecisionLog(), threads,
             frames=FrameLog(), threads_cpu=ThreadTimes(), live=live,
+            keyframes=KeyframeWatch(wish.detector() if wish else None), wish=wish,
         )  # fmt: skip
-        for listener in (event_log, run.log, run.frames, live):
+        for listener in (event_log, run.log, run.frames, run.keyframes, live):
             if listener is not None:
                 events.subscribe(listener)
         return _run(run, self_calibrate)
@@ -122,6 +130,8 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
 
             options, run.stages["self_calibration"] = self_calibrated(run.source, options, run.threads, events)
         run.sequence = open_sequence(run.source, options.sequence, events)
+        if run.wish is not None:
+            check_wish(run.wish, run.sequence)
     if run.live is not None:
         run.live.begin(run.sequence)
     with run.stage("kernels"):
@@ -132,6 +142,11 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         )
         run.threads_cpu.sample()
     run.stages["odometry"] = result.report
+    with run.measured("scale"):
+        run.keyframes.colour(result)
+        if run.wish is not None:
+            deaf = events.deaf()
+            run.stages["scale"] = scale_maps(result, run.wish, run.keyframes, run.sequence.imu, deaf)
     failure = None if result.maps else no_map(run, result)
     report = write_odometry(run, result, failure)
     if events.is_cancelled:
@@ -178,5 +193,5 @@ class Watched:
                     return
                 yield frame
         finally:
-            self._run.threads_cpu.sample()  # while the thread that reads ahead is still there
+            self._run.threads_cpu.frames_ended()  # while the thread that reads ahead is still there
             frames.close()  # type: ignore[attr-defined]  # a generator: ends its thread

@@ -133,7 +133,7 @@ def _finish_recording(run: Tracking, result: OdometryResult, against: Sequence[A
         manifest["recording"] = "not wanted"
     if run.live is None:
         return
-    fits = [fit and fit.error.truth_from_estimate for fit in against]
+    fits = [None if fit is None else fit.error.truth_from_estimate for fit in against]
     problem = run.live.end(result, fits, errors_of_frames(result, against))
     if run.live.is_recording:
         manifest["recording"] = "failed" if problem else "written"

@@ -49,6 +49,7 @@ class ThreadTimes:
         self._by_thread: dict[tuple[str, int], float] = {}
         self._begin: tuple[float, float] | None = None
         self._end = (0.0, 0.0)
+        self._frames_end = 0.0
 
     def sample(self) -> None:
         """Read the clocks."""
@@ -63,6 +64,11 @@ class ThreadTimes:
                     continue
                 self._by_thread[name, thread.ident] = clock
 
+    def frames_ended(self) -> None:
+        """There are no more frames: what follows is the end of the run."""
+        self.sample()
+        self._frames_end = self._end[0]
+
     def total(self, name: str) -> float:
         """CPU seconds of all threads of a name."""
         return sum(seconds for (found, _), seconds in self._by_thread.items() if found == name)
@@ -74,7 +80,9 @@ class ThreadTimes:
         cpu_s = self._end[0] - self._begin[0] - self.total(DRAWING)
         wall_s = self._end[1] - self._begin[1]
         parts = {"tracking": tracking_s, **{part: self.total(name) for name, part in _PART_OF.items()}}
-        # final adjustment, covariances, what the listeners do: all that no clock of its own was read for
+        # the last adjustment of everything, and the covariances
+        parts["the end"] = self._end[0] - self._frames_end if self._frames_end else 0.0
+        # what the listeners do, and all else that no clock of its own was read for
         parts["rest"] = max(0.0, cpu_s - sum(parts.values()))
         per_second = num_frames / wall_s if wall_s > 0 else 0.0
         return {

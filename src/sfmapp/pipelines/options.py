@@ -29,6 +29,7 @@ from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.pairs import PairOptions
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.pipelines import resources
+from sfmapp.pipelines.odometry_scale import ScaleOptions
 
 LIST_ADVICE = "sfmapp reconstruct --list-options shows every option with its default"
 
@@ -39,7 +40,7 @@ class Options:
 
     Attributes:
         images, features, pairs, matching, mapping, adjust: the options of the stages of a reconstruction.
-        sequence, odometry: those of odometry.
+        sequence, odometry, scale: those of odometry.
         seed: where every random choice starts; the same seed gives the same bytes.
         threads: worker threads; None: as many as the process has cores. Results do not depend on it.
         min_registered: fail (exit code 5) when fewer images are registered; None: any model will do.
@@ -53,6 +54,7 @@ class Options:
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
     sequence: SequenceOptions = field(default_factory=SequenceOptions)
     odometry: OdometryOptions = field(default_factory=OdometryOptions)
+    scale: ScaleOptions = field(default_factory=ScaleOptions)
     seed: int = 0
     threads: int | None = None
     min_registered: int | None = None

@@ -137,9 +137,12 @@ def _gaps(gaps: Sequence[Mapping[str, Any]]) -> str:
 def _maps(maps: Iterable[Mapping[str, Any]]) -> str:
     head = [
         ("", "map"), ("", "frames"), ("", "from"), ("", "to"), ("", "keyframes"), ("", "points"), ("", "error px"),
-        ("", "path"), ("t", "unit of length"), ("", "position sigma"), ("", "rotation sigma"), ("t", "gauge"),
+        ("", "path"), ("t", "unit of length"),
     ]  # fmt: skip
-    rows = []
+    sure = [
+        ("", "map"), ("", "position"), ("", "at most"), ("", "rotation deg"), ("", "at most"), ("t", "held fixed"),
+    ]  # fmt: skip
+    rows, sigmas = [], []
     for row in maps:
         unit, position, rotation = row["unit"], row["position_sigma"], row["rotation_sigma_deg"]
         rows.append(
@@ -147,12 +150,16 @@ def _maps(maps: Iterable[Mapping[str, Any]]) -> str:
                 ("", row["idx"]), ("", row["num_frames"]), ("", row["first_frame"]), ("", row["last_frame"]),
                 ("", row["num_keyframes"]), ("", row["num_points"]), ("", f"{row['mean_reprojection_error_px']:.2f}"),
                 ("", f"{row['path_length']:.4g} {unit}".rstrip()), ("t", scale_text(row)),
-                ("", f"{position['median']:.2g} {unit}, at most {position['max']:.2g}" if position else "-"),
-                ("", f"{rotation['median']:.2g} deg, at most {rotation['max']:.2g}" if rotation else "-"),
-                ("w dim", row["gauge"]),
             ]
         )  # fmt: skip
-    return "<h2>Maps</h2>" + table(head, rows) if rows else ""
+        if position and rotation:
+            texts = [f"{position['median']:.2g} {unit}", f"{position['max']:.2g} {unit}"]
+            texts += [f"{rotation['median']:.2g}", f"{rotation['max']:.2g}"]
+            sigmas.append([("", row["idx"]), *(("", text) for text in texts), ("w dim", row["gauge"])])
+    if not rows:
+        return ""
+    more = "<h3>Standard deviation of the keyframes (median)</h3>" + table(sure, sigmas) if sigmas else ""
+    return "<h2>Maps</h2>" + table(head, rows) + more
 
 
 def scale_text(row: Mapping[str, Any]) -> str:

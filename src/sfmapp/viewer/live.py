@@ -117,7 +117,8 @@ class LiveView:
         self._send_decisions()
         self._send(
             "end", frame_idx=result.frame_idx, timestamps_s=result.timestamps_s, frame_map=result.frame_map,
-            cam_from_world=result.cam_from_world, truth_from_map=list(truth_from_map), errors=errors_m, maps=_final_maps(result),
+            cam_from_world=result.cam_from_world, truth_from_map=list(truth_from_map), errors=errors_m,
+            maps=_final_maps(result),
         )  # fmt: skip
         outbox, self._outbox = self._outbox, None
         return outbox.close(END_TIMEOUT_S)

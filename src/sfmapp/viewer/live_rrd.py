@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from sfmapp.evaluation.trajectory import Alignment, Trajectory
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.odometry.result import FrameState
-from sfmapp.viewer.live_scene import FRUSTUM_SHARE, LiveMap, frustum_lines, unbroken
+from sfmapp.viewer.live_scene import FRUSTUM_SHARE, Changed, LiveMap, frustum_lines, unbroken
 from sfmapp.viewer.photos import shrunk_jpeg
 from sfmapp.viewer.replay import up_direction
 from sfmapp.viewer.stage import eye_direction, frame_view, turn_to_z
@@ -43,6 +43,8 @@ _BLUE, _ORANGE, _GREEN, _GREY, _RED = (80, 150, 255), (255, 150, 40), (90, 200, 
 _LINE_WIDTH = -1.2
 _LIVE, _FINAL = "world/scene/live", "world/scene/final"
 _MAX_FINAL_POINTS = 300_000
+# Points move with every keyframe; drawn as often they would take sixty megabytes of a recording of a thousand frames.
+DRAW_EVERY = 8
 
 
 class LiveDrawing:
@@ -55,10 +57,13 @@ class LiveDrawing:
         self._maps: dict[int, LiveMap] = {}
         self._truth: Trajectory | None = None
         self._alignment: Alignment = "sim3"
-        self._count = 0
+        self._count = self._drawn_at = 0
         self._begin_s = 0.0
         self._last = rigid3.IDENTITY
         self._newest: Mapping[str, Any] | None = None
+        self._is_watched = url is not None
+        self._shown_extent = 0.0
+        self._rotation = turn_to_z(np.array([0.0, -1.0, 0.0]))
         self._drawers = {
             "begin": self._begin, "frame": self._frame, "map": self._map, "log": self._log, "end": self._end,
         }  # fmt: skip
@@ -85,7 +90,10 @@ class LiveDrawing:
         recording.send_blueprint(blueprint(None, self._has_truth), make_active=True, make_default=True)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         # cameras are taken to start level until more of them are known
-        recording.log("world/scene", rr.Transform3D(mat3x3=turn_to_z(np.array([0.0, -1.0, 0.0]))), static=True)
+        recording.log("world/scene", rr.Transform3D(mat3x3=self._rotation), static=True)
+        # frusta and lines say it all; axes of no length are an error to the viewer
+        for path in ("world/scene", _LIVE, f"{_LIVE}/camera"):
+            recording.log(path, rr.TransformAxes3D(1e-6), static=True)
         for path, color, radius in (("mapped", _GREEN, 2.2), ("tracked", _ORANGE, 1.8)):
             fields = rr.Points2D.from_fields(radii=rr.Radius.ui_points(radius), colors=color)
             recording.log(f"image/{path}", fields, static=True)
@@ -110,7 +118,7 @@ class LiveDrawing:
         if not np.isfinite(pose[0]) or map_idx < 0:
             return
         ours = self._map_of(map_idx)
-        block = ours.add_frame(self._count, message["timestamp_s"], pose)
+        block = ours.add_frame(message["frame_idx"], message["timestamp_s"], pose)
         self._draw_path(map_idx, {block})
         self._newest = message
         self._last = rigid3.compose(ours.placement, rigid3.inverse(pose))
@@ -119,18 +127,44 @@ class LiveDrawing:
     def _map(self, message: Mapping[str, Any]) -> None:
         map_idx = message["map_idx"]
         ours = self._map_of(map_idx)
-        changed = ours.change(message)
+        ours.change(message)
         newest = self._newest
         if newest is not None and newest["frame_idx"] == message["frame_idx"] and newest["image"] is not None:
             ours.colour(self._camera, newest["cam_from_world"], newest["image"])
+        if message["is_complete"] or self._count - self._drawn_at >= DRAW_EVERY:
+            self._drawn_at = self._count
+            self._draw_map(ours, map_idx)
+            if self._truth is not None:
+                self._draw_truth(ours, map_idx)
+
+    def _draw_map(self, ours: LiveMap, map_idx: int) -> None:
+        changed, ours.changed = ours.changed, Changed()
         self._draw_points(map_idx, changed.points)
         for block in sorted(changed.keyframes):
             lines = frustum_lines(self._camera, ours.keyframe_poses(block), ours.frustum or 0.1)
             strips = rr.LineStrips3D(lines, colors=_BLUE, radii=rr.Radius.ui_points(0.7))
             self._recording.log(f"{_LIVE}/map{map_idx}/keyframes/{block}", strips)
         self._draw_path(map_idx, changed.frames)
-        if self._truth is not None:
-            self._draw_truth(ours, map_idx)
+        if self._is_watched:
+            self._step_back(ours)
+
+    def _step_back(self, ours: LiveMap) -> None:
+        """Keep a map that grows in view: not at every frame, for whoever watches may have turned the view."""
+        poses = ours.frame_poses()
+        poses = poses[np.isfinite(poses[:, 0])]
+        if len(poses) < 2 or not ours.frustum:
+            return
+        xyz = ours.point_xyz[np.isfinite(ours.point_xyz[:, 0])].astype(np.float64)
+        reach = ours.frustum / FRUSTUM_SHARE
+        centers = rigid3.center(poses)
+        near = np.linalg.norm(xyz - centers[-1], axis=1) < 2 * reach
+        body = rigid3.apply(ours.placement, np.concatenate([centers, xyz[near]])) @ self._rotation.T
+        extent = float(np.linalg.norm(np.ptp(body, axis=0)))
+        if extent > 1.7 * self._shown_extent or extent < 0.3 * self._shown_extent:
+            self._shown_extent = extent
+            heading = rigid3.rotation_matrix(rigid3.compose(ours.placement, rigid3.inverse(poses[-1])))[:, 2]
+            eye = frame_view(body, eye_direction(self._rotation @ heading))
+            self._recording.send_blueprint(blueprint(eye, self._has_truth), make_active=True, make_default=True)
 
     def _log(self, message: Mapping[str, Any]) -> None:
         self._recording.log("log", rr.TextLog(message["text"], level=message["level"]))
@@ -151,6 +185,7 @@ class LiveDrawing:
             recording.send_columns("plots/error/final", times, rr.Scalars.columns(scalars=message["errors"][known]))
         if not message["maps"]:
             return
+        self._lay_live_on_final(message)
         recording.log(_LIVE, rr.Clear(recursive=True))
         bodies, headings = self._draw_final(message)
         has_pose = (message["frame_map"] == 0) & np.isfinite(message["cam_from_world"][:, 0])
@@ -160,6 +195,25 @@ class LiveDrawing:
         direction = eye_direction((headings @ rotation.T).mean(0))
         eye = frame_view(np.concatenate(bodies) @ rotation.T, direction)
         recording.send_blueprint(blueprint(eye, self._has_truth), make_active=True, make_default=True)
+
+    def _lay_live_on_final(self, message: Mapping[str, Any]) -> None:
+        """Scale, and what was corrected in the end, also hold for what was drawn before: nothing jumps when played."""
+        position = {int(idx): k for k, idx in enumerate(message["frame_idx"])}
+        for ours in self._maps.values():
+            poses, idx = ours.frame_poses(), ours.frame_numbers
+            rows = np.array([position.get(int(i), -1) for i in idx], np.int64)
+            shared = (rows >= 0) & np.isfinite(poses[:, 0])
+            shared[shared] &= message["frame_map"][rows[shared]] == 0
+            if shared.sum() < 3:
+                continue
+            live = rigid3.compose(poses[shared], rigid3.inverse(ours.placement))
+            try:
+                fit = similarity.align_poses(live, message["cam_from_world"][rows[shared]]).b_from_a
+            except ValueError:  # all in one place
+                continue
+            moved = rr.Transform3D(translation=fit[4:7], quaternion=fit[:4], scale=fit[7])
+            self._recording.log(_LIVE, moved, static=True)
+            return
 
     # ------------------------------------------------------------------ parts
 
@@ -173,6 +227,7 @@ class LiveDrawing:
             self._maps[map_idx] = LiveMap(self._last)
             placed = rr.Transform3D(translation=self._last[4:], quaternion=self._last[:4])
             self._recording.log(f"{_LIVE}/map{map_idx}", placed)
+            self._recording.log(f"{_LIVE}/map{map_idx}", rr.TransformAxes3D(1e-6), static=True)
         return self._maps[map_idx]
 
     def _draw_image(self, message: Mapping[str, Any]) -> None:
@@ -207,8 +262,6 @@ class LiveDrawing:
     def _draw_camera(self, ours: LiveMap, map_idx: int) -> None:
         path = f"{_LIVE}/camera"
         self._recording.log(path, rr.Transform3D(translation=self._last[4:], quaternion=self._last[:4]))
-        # the frustum says it all; axes of no length are an error to the viewer
-        self._recording.log(path, rr.TransformAxes3D(1e-6))
         k = self._camera.k_matrix
         pinhole = rr.Pinhole(
             image_from_camera=k, resolution=[self._camera.width, self._camera.height], color=_ORANGE,
@@ -313,10 +366,9 @@ def final_frustum(keyframes: Array, xyz: Array) -> float:
 
 
 def blueprint(eye: tuple[Array, Array] | None, has_truth: bool) -> rrb.Blueprint:
-    """The layout. While the run is under way the view follows the camera; at its end it looks at all of the map."""
-    if eye is None:
-        controls = rrb.EyeControls3D(tracking_entity=f"{_LIVE}/camera")
-    else:
+    """The layout, looking at the map from an eye at a target."""
+    controls = None
+    if eye is not None:
         controls = rrb.EyeControls3D(position=eye[0], look_target=eye[1], eye_up=(0.0, 0.0, 1.0))
     world = rrb.Spatial3DView(origin="world", name="Map and trajectory", eye_controls=controls, line_grid=False)
     image = rrb.Spatial2DView(origin="image", name="Frame: green points are in the map, orange ones are not yet")

@@ -19,7 +19,7 @@ Ints = NDArray[np.int64]
 
 # Things are drawn in blocks, so that a change of a few of them does not repeat all: the sizes balance the bytes of a
 # recording against the number of entities that the viewer has to walk through.
-POINT_BLOCK, KEYFRAME_BLOCK, FRAME_BLOCK = 2048, 32, 64
+POINT_BLOCK, KEYFRAME_BLOCK, FRAME_BLOCK = 1024, 32, 64
 # Cameras are drawn this long, as a share of the distance to what they see.
 FRUSTUM_SHARE = 0.06
 _UNKNOWN_GREY = 128
@@ -33,6 +33,12 @@ class Changed:
     keyframes: set[int] = field(default_factory=set)
     frames: set[int] = field(default_factory=set)
 
+    def add(self, other: Changed) -> None:
+        """These as well."""
+        self.points |= other.points
+        self.keyframes |= other.keyframes
+        self.frames |= other.frames
+
 
 class LiveMap:
     """One map as it is known so far. The path hangs on the keyframes: when they move, it moves along.
@@ -40,10 +46,12 @@ class LiveMap:
     Attributes:
         placement: (7,) scene_from_map: maps without a link begin where the camera was last.
         frustum: length of the cameras as they are drawn.
+        changed: what has changed since it was drawn.
     """
 
     def __init__(self, placement: Array) -> None:
         self.placement = placement
+        self.changed = Changed()
         self.frustum = 0.0
         self.keyframes: dict[int, Array] = {}
         self._order: dict[int, int] = {}
@@ -70,8 +78,8 @@ class LiveMap:
         self._time.append(timestamp_s)
         return (len(self._frame_number) - 1) // FRAME_BLOCK
 
-    def change(self, message: Mapping[str, Any]) -> Changed:
-        """Take over new and moved keyframes and points; returns what has to be drawn again."""
+    def change(self, message: Mapping[str, Any]) -> None:
+        """Take over new and moved keyframes and points."""
         frames, poses = message["keyframe_frame_idx"].tolist(), np.asarray(message["keyframe_cam_from_world"])
         ids, xyz = np.asarray(message["point_id"], np.int64), message["point_xyz"]
         changed = Changed()
@@ -89,7 +97,7 @@ class LiveMap:
         self.point_xyz[ids] = xyz
         changed.points |= set(np.unique(ids // POINT_BLOCK).tolist())
         self._set_frustum(poses[-1] if len(poses) else None, xyz, changed)
-        return changed
+        self.changed.add(changed)
 
     def colour(self, camera: Camera, cam_from_world: Array, image: NDArray[np.uint8]) -> None:
         """Give new points the grey that they have in the image of the keyframe that they came with."""
@@ -169,11 +177,16 @@ class LiveMap:
                 out.append(np.full(7, np.nan))
         return np.array(out).reshape(-1, 7)
 
+    @property
+    def frame_numbers(self) -> Ints:
+        """(N,) of the frames along the path."""
+        return np.array(self._frame_number, np.int64)
+
     def strips(self, block: int) -> list[Array]:
         """The path of a block, from the end of the block before it, as lines (N, 3) that gaps interrupt."""
         first = max(0, block * FRAME_BLOCK - 1)
         stop = min(len(self._frame_number), (block + 1) * FRAME_BLOCK)
-        return unbroken(rigid3.center(self.frame_poses(first, stop)), np.array(self._frame_number[first:stop]))
+        return unbroken(rigid3.center(self.frame_poses(first, stop)), self.frame_numbers[first:stop])
 
     def against(self, truth: Trajectory, alignment: Alignment) -> tuple[Array, float] | None:
         """``map_from_truth`` (8,) over the path so far, and the newest frame's distance from the truth; None so far."""

@@ -1,0 +1,181 @@
+"""Metres for the maps of one camera: from what the user knows, map by map, and said in the report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.errors import UsageError
+from sfmapp.events import Events
+from sfmapp.images.sequence import Imu, Sequence
+from sfmapp.odometry.markers import MarkerDetector, MarkerKind, parse_marker, scale_from_markers
+from sfmapp.odometry.result import MapResult, OdometryResult
+from sfmapp.odometry.scale import (
+    KnownDistance,
+    Length,
+    ScaleEstimate,
+    ScaleRefusal,
+    apply_scale,
+    parse_distance,
+    parse_length,
+    scale_covariance,
+    scale_from_camera_height,
+    scale_from_distance,
+    scale_from_path,
+)
+from sfmapp.pipelines.odometry_keyframes import KeyframeWatch
+
+STAGE = "scale"
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ScaleOptions:
+    """Where metres come from when there is one camera."""
+
+    # marker:DICT:METRES, distance:FRAME:FRAME:METRES, distance:path:METRES, camera_height:METRES or imu; auto: nowhere
+    source: str | None = None
+
+
+@dataclass(frozen=True)
+class ScaleWish:
+    """What a scale is to come from; one of the four is set.
+
+    Attributes:
+        text: as the user wrote it.
+        camera_height: of the camera over the ground.
+    """
+
+    text: str
+    marker: MarkerKind | None = None
+    distance: KnownDistance | None = None
+    camera_height: Length | None = None
+    imu: bool = False
+
+    def detector(self) -> MarkerDetector | None:
+        """What looks for the markers, if it is they."""
+        return None if self.marker is None else MarkerDetector(self.marker.dictionary)
+
+
+def parse_scale(text: str) -> ScaleWish:
+    """``marker:DICT:METRES``, ``distance:A:B:METRES``, ``distance:path:METRES``, ``camera_height:METRES`` or ``imu``.
+
+    Raises:
+        UsageError: none of these.
+    """
+    kind, _, rest = text.strip().partition(":")
+    match kind:
+        case "marker":
+            return ScaleWish(text, marker=parse_marker(rest))
+        case "distance":
+            return ScaleWish(text, distance=parse_distance(rest.replace(":", ",")))
+        case "camera_height":
+            return ScaleWish(text, camera_height=parse_length(rest))
+        case "imu" if not rest:
+            return ScaleWish(text, imu=True)
+    raise UsageError(
+        f"--scale {text}: expected marker, distance, camera_height or imu",
+        "marker:DICT_4X4_50:0.16, distance:FRAME:FRAME:2.5, distance:path:120, camera_height:1.65, or imu",
+    )
+
+
+def check_wish(wish: ScaleWish, sequence: Sequence) -> None:
+    """Refuse what the sequence cannot give, before an hour is spent on it.
+
+    Raises:
+        UsageError: a stereo sequence, which is in metres already, or no IMU.
+    """
+    if sequence.rig.is_stereo:
+        raise UsageError(f"--scale {wish.text}: the sequence is stereo and in metres", "leave it out, or add --mono")
+    if wish.imu and sequence.imu is None:
+        raise UsageError("--scale imu: the sequence has no inertial measurements", "name them: --imu FILE")
+
+
+def scale_maps(
+    result: OdometryResult, wish: ScaleWish, watch: KeyframeWatch, imu: Imu | None, events: Events
+) -> list[dict[str, Any]]:
+    """Put each map in metres that the wish can be had for, in place; returns a row for each, with the evidence."""
+    rows = []
+    for m in range(len(result.maps)):
+        found = _estimate(result, m, wish, watch, imu)
+        row: dict[str, Any] = {"map": m, "source": found.source, "evidence": found.evidence}
+        if isinstance(found, ScaleEstimate):
+            rescale(result, m, found)
+            row |= {"metres_per_unit": found.scale, "sigma_relative": found.sigma_relative}
+            text = f"map {m} is in metres, from {found.source.replace('_', ' ')}, to {100 * found.sigma_relative:.2g} %"
+            events.decided(STAGE, text, **row)
+        else:
+            row["reason"] = found.reason
+            events.warned(STAGE, f"map {m} keeps an arbitrary unit of length: {found.reason}", **row)
+        rows.append(row)
+    return rows
+
+
+def rescale(result: OdometryResult, map_idx: int, found: ScaleEstimate) -> None:
+    """A map and its part of the trajectory in metres."""
+    entry, mine = result.maps[map_idx], result.frame_map == map_idx
+    covariance = None if entry.covariance is None else scale_covariance(entry.covariance, found.scale)
+    result.maps[map_idx] = replace(
+        entry, reconstruction=apply_scale(entry.reconstruction, found.scale), covariance=covariance,
+        scale_source=found.source, scale_sigma=found.sigma_relative,
+    )  # fmt: skip
+    result.cam_from_world[mine, 4:] *= found.scale
+    result.live_cam_from_world[mine, 4:] *= found.scale
+
+
+def _estimate(
+    result: OdometryResult, m: int, wish: ScaleWish, watch: KeyframeWatch, imu: Imu | None
+) -> ScaleEstimate | ScaleRefusal:
+    entry = result.maps[m]
+    if wish.marker is not None:
+        return scale_from_markers(entry.reconstruction, watch.sightings(entry), wish.marker.side)
+    if wish.camera_height is not None:
+        return scale_from_camera_height(entry.reconstruction, entry.keyframe_image_idx, wish.camera_height)
+    if wish.distance is not None:
+        return _from_distance(result, m, wish.distance)
+    assert imu is not None
+    return _from_imu(result, m, imu)
+
+
+def _from_distance(result: OdometryResult, m: int, wish: KnownDistance) -> ScaleEstimate | ScaleRefusal:
+    entry = result.maps[m]
+    if wish.frames is None:
+        return scale_from_path(entry.reconstruction.cam_from_world[entry.keyframe_image_idx], wish.length)
+    positions = [_frame_named(result, name) for name in wish.frames]
+    for name, k in zip(wish.frames, positions, strict=True):
+        if k is None:
+            shown = ", ".join(result.frame_names[:2])
+            reason = f"there is no frame {name!r}; they are named such as {shown}, or by number"
+            return ScaleRefusal("distance", reason, {})
+        if result.frame_map[k] != m:
+            return ScaleRefusal("distance", f"frame {name} has no pose in it", {})
+    a, b = (k for k in positions if k is not None)
+    poses = result.cam_from_world
+    return scale_from_distance(
+        poses[a], poses[b], wish.length, _covariance_near(result, entry, a), _covariance_near(result, entry, b)
+    )
+
+
+def _frame_named(result: OdometryResult, name: str) -> int | None:
+    """Position of a frame given by its name, with or without folder and suffix, or by its number."""
+    for k, full in enumerate(result.frame_names):
+        if name in (full, full.rpartition("/")[2], full.rpartition("/")[2].rpartition(".")[0]):
+            return k
+    found = np.flatnonzero(result.frame_idx == int(name)) if name.isdigit() else np.zeros(0, np.int64)
+    return int(found[0]) if len(found) else None
+
+
+def _covariance_near(result: OdometryResult, entry: MapResult, position: int) -> Array | None:
+    """That of the keyframe which is nearest in the order of frames; None where there is none."""
+    if entry.covariance is None or not len(entry.covariance):
+        return None
+    nearest = int(np.abs(entry.keyframe_frame_idx - result.frame_idx[position]).argmin())
+    covariance = entry.covariance[nearest]
+    return covariance if np.isfinite(covariance).all() else None
+
+
+def _from_imu(result: OdometryResult, m: int, imu: Imu) -> ScaleEstimate | ScaleRefusal:
+    return ScaleRefusal("imu", "inertial measurements are not looked at yet", {})
