@@ -16,7 +16,10 @@ from sfmapp.scene.camera import Camera, project
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+# A patch that has grown or shrunk beyond that is not the same patch any more.
 _MIN_SCALE = 0.4
+# Nor is one that looks less alike: patches of unrelated images with texture correlate above it one time in a hundred.
+_MIN_LIKENESS = 0.6
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,6 @@ def follow(
     k = references.position(tracks.reference)
     axis, offset = references.rotation[k, 2], references.translation[k, 2]
     ratio = in_camera[:, 2] / (np.einsum("ni,ni->n", axis, xyz) + offset)
-    # a patch that has grown or shrunk beyond that is not the same patch any more
     usable = np.isfinite(guess[:, 0]) & (ratio > _MIN_SCALE) & (ratio < 1 / _MIN_SCALE)
     rotation = references.camera_from(predicted)[0]
     warp = patch_warp(rotation[k], tracks.reference_ray, ratio)
@@ -151,4 +153,5 @@ def follow(
                 coarsest_level=coarsest_level,
             )  # fmt: skip
             xy[mine], zncc[mine], found[mine] = aligned.xy, aligned.zncc, aligned.is_converged
+    found &= zncc > _MIN_LIKENESS
     return replace(tracks, xy=xy, zncc=zncc), found
