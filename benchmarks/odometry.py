@@ -1,0 +1,347 @@
+"""Whole command against the truth: `sfmapp odometry` on real and rendered sequences, and pycolmap beside it if asked.
+
+    python benchmarks/odometry.py                     # kitti00-200 forward, in steps of two, backwards; rendered ones
+    python benchmarks/odometry.py --rendered 0 --peer # real data alone, and pycolmap on every second frame (minutes)
+    python benchmarks/odometry.py FOLDER ...          # sequences with a truth: KITTI, TUM, EuRoC
+
+The command runs as a process of its own with its default options, without a recording; wall seconds, CPU seconds (user
+and system, children included) and peak resident memory are those of the process, its start and its imports included.
+Every case runs twice or more with the same seed: costs are medians, and the files have to be the same bytes. A run
+before all of them compiles the kernels. See README.md for what the numbers mean.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from sfmapp.errors import SfmError
+from sfmapp.evaluation.measured import ProcessUsage, run_measured
+from sfmapp.evaluation.second_opinion import CameraGroup, SecondOpinionOptions, ask_second_opinion
+from sfmapp.evaluation.trajectory import Trajectory, absolute_error, associate, kitti_drift, statistics
+from sfmapp.events import Events
+from sfmapp.formats.colmap import read_model
+from sfmapp.formats.sequences import SequenceOptions, open_sequence
+from sfmapp.pipelines.evaluate import evaluate
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))
+# one of each kind, as render_sequences.py lays them out
+RENDERED = {"street": (), "street-mono": ("--mono",), "hall": (), "hall-mono": ("--mono",), "room": ()}
+# what a run with the same seed has to write again byte for byte; other files hold times
+REPEATABLE = ("trajectory*.tum", "trajectory.kitti*", "covariance.csv", "sparse/*/*.bin")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A sequence and how it is played."""
+
+    name: str
+    sequence: Path
+    flags: tuple[str, ...] = ()
+
+
+def find_cases(args: argparse.Namespace) -> list[Case]:
+    """The given sequences; without any, kitti00-200 in three ways and the rendered ones."""
+    if args.folders:
+        return [Case(folder.resolve().name, folder) for folder in args.folders]
+    cases = []
+    kitti = DATA / "kitti00-200"
+    if kitti.is_dir():
+        for name, flags in (("", ()), (" step 2", ("--step", "2")), (" backwards", ("--reverse",))):
+            cases.append(Case(f"kitti00-200{name}", kitti, flags))
+    for name, flags in RENDERED.items() if args.rendered else ():
+        folder = args.rendered_folder / f"{name}-{args.rendered}"
+        if not folder.is_dir():
+            place = name.partition("-")[0]
+            script = [sys.executable, str(ROOT / "benchmarks" / "render_sequences.py"), place, str(folder)]
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            subprocess.run([*script, "--frames", str(args.rendered), *flags], check=True, stdout=sys.stderr)
+        cases.append(Case(f"rendered {name}", folder))
+    return cases
+
+
+def run_sfmapp(case: Case, out: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """One run of the command in a fresh workspace."""
+    script = Path(sys.executable).with_name("sfmapp")
+    command = [
+        str(script),
+        "odometry",
+        str(case.sequence),
+        "-o",
+        str(out),
+        "--seed",
+        str(args.seed),
+        "-q",
+        "--no-record",
+    ]
+    command += ["--threads", str(args.threads)] if args.threads else []
+    command += [*case.flags, *(flag for setting in args.set for flag in ("--set", setting))]
+    usage = run_measured(command, out.with_suffix(".log"))
+    if usage.exit_code:
+        tail = out.with_suffix(".log").read_text(errors="replace")[-2000:]
+        print(f"{case.name}: sfmapp ended with code {usage.exit_code}:\n{tail}", file=sys.stderr)
+    return asdict(usage) | report_numbers(out, usage) | truth_numbers(out, case) | {"digest": digest(out)}
+
+
+def report_numbers(out: Path, usage: ProcessUsage) -> dict[str, Any]:
+    """What the run tells of itself."""
+    try:
+        report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {"num_frames": None}
+    frames, maps, timing = report["frames"], report["maps"], report["timing"]
+    count = max(frames["num_frames"], 1)
+    return {
+        "num_frames": frames["num_frames"],
+        "num_with_pose": frames["num_with_pose"],
+        "num_in_largest_map": frames["num_in_largest_map"],
+        "num_maps": len(maps),
+        "num_keyframes": maps[0]["num_keyframes"] if maps else 0,
+        "unit": maps[0]["unit"] if maps else "",
+        "process_cpu_ms_per_frame": 1e3 * usage.cpu_s / count,
+        "cpu_ms_per_frame": timing["cpu_ms_per_frame"],
+        "cpu_ms_by_part": timing.get("parts_cpu_ms"),
+        "tracking_ms": timing.get("tracking_ms"),
+        "live_ate_m": next((row["ate_m"]["rmse"] for row in report["truth"] if row["poses"] == "live"), None),
+    }
+
+
+def truth_numbers(out: Path, case: Case) -> dict[str, Any]:
+    """Errors of the largest map by ``sfmapp evaluate``'s own code: with a scale of its own where it has no unit."""
+    try:
+        result = evaluate(out, case.sequence)
+        unit = json.loads((out / "report.json").read_text(encoding="utf-8"))["maps"][0]["unit"]
+    except (SfmError, OSError, LookupError) as error:
+        return {"truth": None, "why": str(error)}
+    errors = result.errors["se3" if unit == "m" else "sim3"]
+    ate = statistics(errors.absolute.translation_m)
+    assert ate is not None
+    return {
+        "truth": {
+            "alignment": "se3" if unit == "m" else "sim3",
+            "ate_m": ate,
+            "ate_percent": 100 * ate["rmse"] / result.pairs.truth.path_m,
+            "scale": errors.absolute.scale,
+            "path_m": result.pairs.truth.path_m,
+            "coverage": result.pairs.coverage,
+            "drift_percent": errors.drift.t_rel_percent,
+            "drift_deg_per_100m": 100 * errors.drift.r_rel_deg_per_m,
+            "is_kitti_drift": not errors.is_by_share,
+        }
+    }
+
+
+def digest(out: Path) -> str:
+    """Of all files that have to be the same in a second run."""
+    total = hashlib.blake2b(digest_size=16)
+    for path in sorted({path for pattern in REPEATABLE for path in out.glob(pattern)}):
+        total.update(f"{path.relative_to(out)}\n".encode())
+        total.update(path.read_bytes())
+    return total.hexdigest()
+
+
+def run_peer(case: Case, work: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """pycolmap on every second frame of the first camera: exhaustive matching, starting from the known intrinsics."""
+    sequence = open_sequence(case.sequence, SequenceOptions(mono=True), Events())
+    frames = [(frame.name, frame.timestamp_s) for frame in sequence.frames()][::2]
+    camera, truth = sequence.rig.cameras[0], sequence.truth
+    names = [name for name, _ in frames]
+    options = SecondOpinionOptions(seed=args.seed, num_threads=args.threads, camera_model=camera.model.name)
+    group = CameraGroup(tuple(names), tuple(camera.params.tolist()))
+    opinion = ask_second_opinion(case.sequence, names, work / "pycolmap", options, camera_groups=[group])
+    values = {
+        "exit_code": 0, "wall_s": opinion.wall_s, "cpu_s": opinion.cpu_s, "peak_memory_mb": opinion.peak_memory_mb,
+        "num_frames": len(names), "num_with_pose": opinion.num_registered, "num_in_largest_map": opinion.num_registered,
+        "process_cpu_ms_per_frame": 1e3 * opinion.cpu_s / max(len(names), 1), "truth": None,
+    }  # fmt: skip
+    if opinion.model_folder is None or truth is None:
+        return values
+    model = read_model(opinion.model_folder)[0]
+    pose_of = dict(zip(model.image_names, model.cam_from_world, strict=True))
+    poses = np.array([pose_of.get(name, np.full(7, np.nan)) for name in names])
+    pairs = associate(
+        Trajectory.from_cam_from_world(poses, [time for _, time in frames]),
+        Trajectory.from_cam_from_world(truth.cam_from_world, truth.timestamps_s),
+    )
+    error = absolute_error(pairs, "sim3")
+    ate = statistics(error.translation_m)
+    assert ate is not None
+    drift = kitti_drift(pairs, scale=error.scale)
+    path = pairs.truth.path_m
+    values["truth"] = {"alignment": "sim3", "ate_m": ate, "ate_percent": 100 * ate["rmse"] / path, "path_m": path,
+                       "scale": error.scale, "coverage": pairs.coverage, "drift_percent": drift.t_rel_percent,
+                       "drift_deg_per_100m": 100 * drift.r_rel_deg_per_m, "is_kitti_drift": True}  # fmt: skip
+    return values
+
+
+def measure(cases: Sequence[Case], args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """All runs of all cases."""
+    for case in cases:
+        for path in case.sequence.rglob("*.png"):  # nobody shall wait for the disk
+            path.read_bytes()
+        for repeat in range(args.repeats):
+            load = os.getloadavg()[0]
+            with tempfile.TemporaryDirectory(dir=args.work) as work:
+                run = run_sfmapp(case, Path(work) / "out", args)
+            yield {"case": case.name, "program": "sfmapp", "repeat": repeat, "load_before": load} | run
+        if args.peer and not case.flags:
+            load = os.getloadavg()[0]
+            with tempfile.TemporaryDirectory(dir=args.work) as work:
+                try:
+                    run = run_peer(case, Path(work), args)
+                except SfmError as error:
+                    print(f"{case.name}: pycolmap failed: {error}", file=sys.stderr)
+                    continue
+            yield {"case": case.name, "program": "pycolmap", "repeat": 0, "load_before": load} | run
+
+
+def summaries(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each case and program: medians of the costs and the first run's results; failed runs are counted."""
+    rows = []
+    for case, program in dict.fromkeys((run["case"], run["program"]) for run in runs):
+        chosen = [run for run in runs if (run["case"], run["program"]) == (case, program)]
+        num_failed = sum(run["exit_code"] != 0 for run in chosen)
+        chosen = [run for run in chosen if run["exit_code"] == 0] or chosen[:1]
+        row = {key: chosen[0].get(key) for key in RESULT_KEYS}
+        row |= {"case": case, "program": program, "num_failed": num_failed}
+        for key in COST_KEYS:
+            values = [run[key] for run in chosen if run.get(key) is not None]
+            row[key] = median(values) if values else None
+        digests = {run.get("digest") for run in chosen}
+        row["same_bytes"] = None if len(chosen) < 2 else len(digests) == 1
+        rows.append(row)
+    return rows
+
+
+COST_KEYS = ("wall_s", "cpu_s", "peak_memory_mb", "cpu_ms_per_frame", "process_cpu_ms_per_frame")
+RESULT_KEYS = (
+    "num_frames",
+    "num_with_pose",
+    "num_in_largest_map",
+    "num_maps",
+    "unit",
+    "live_ate_m",
+    "truth",
+    "exit_code",
+)
+
+
+def markdown(report: dict[str, Any]) -> str:
+    """One table."""
+    lines = [
+        f"sfmapp {report['versions']['sfmapp']} at {report['commit']}, seed {report['seed']}, "
+        f"{report['repeats']} runs; {report['cpu']}, {report['cores']} cores, {report['date']}.",
+        "",
+        "| sequence | frames in the largest map | ATE rmse m (% of path) | live ATE m | drift %, deg/100 m "
+        "| CPU ms a frame (whole process) | frames/s | peak MB | same bytes |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in report["rows"]:
+        truth = row["truth"] or {}
+        ate = f"{truth['ate_m']['rmse']:.3f} ({truth['ate_percent']:.2f} %) {truth['alignment']}" if truth else "-"
+        drift = f"{truth['drift_percent']:.2f}, {truth['drift_deg_per_100m']:.2f}" if truth else "-"
+        if truth and not truth["is_kitti_drift"]:
+            drift += " *"
+        speed = row["num_frames"] / row["wall_s"] if row["num_frames"] and row["wall_s"] else None
+        same = {True: "yes", False: "NO", None: "-"}[row["same_bytes"]]
+        name = row["case"] + ("" if row["program"] == "sfmapp" else f", {row['program']} on every second frame")
+        frames = f"{row['num_in_largest_map']} of {row['num_frames']}"
+        if row["num_failed"]:
+            frames += f" ({row['num_failed']} runs FAILED)"
+        lines.append(
+            f"| {name} | {frames} | {ate} | {_cell(row['live_ate_m'], '.3f')} | {drift} "
+            f"| {_cell(row['cpu_ms_per_frame'], '.1f')} ({_cell(row['process_cpu_ms_per_frame'], '.1f')}) "
+            f"| {_cell(speed, '.1f')} | {_cell(row['peak_memory_mb'], '.0f')} | {same} |"
+        )
+    loud = max((run["load_before"] for run in report["runs"]), default=0.0)
+    lines += ["", f"Highest load average before a run: {loud:.1f}."]
+    if any(row["truth"] and not row["truth"]["is_kitti_drift"] for row in report["rows"]):
+        lines.append("\\* the path is too short for KITTI's stretches: over 10, 20, ..., 80 % of it.")
+    return "\n".join(lines)
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def environment(args: argparse.Namespace) -> dict[str, Any]:
+    """What the numbers depend on."""
+    from importlib.metadata import version
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True).stdout.strip()
+
+    model = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
+    is_dirty = bool(git("status", "--porcelain", "--untracked-files=no", "src", "pipelines"))
+    names = ("sfmapp", "pycolmap", "numpy", "numba", "opencv-contrib-python-headless", "gtsam")
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="minutes"),
+        "commit": git("rev-parse", "--short", "HEAD") + ("+changes" if is_dirty else ""),
+        "versions": {name: version(name) for name in names},
+        "python": platform.python_version(),
+        "cpu": model[0].split(":")[1].strip() if model else platform.processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "seed": args.seed,
+        "repeats": args.repeats,
+        "threads": args.threads,
+        "settings": args.set,
+    }
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("folders", nargs="*", type=Path, help="sequences; default: kitti00-200 and rendered ones")
+    parser.add_argument(
+        "--repeats", type=int, default=2, help="runs of each case; two tell whether the bytes are the same"
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=None, help="default: the command's own choice")
+    parser.add_argument("--set", action="append", default=[], metavar="STAGE.OPTION=VALUE", help="option of sfmapp")
+    parser.add_argument("--rendered", type=int, default=300, metavar="N", help="frames of each rendered one; 0: none")
+    parser.add_argument("--rendered-folder", type=Path, default=ROOT / "out" / "rendered", help="where they are kept")
+    parser.add_argument("--only", action="append", metavar="TEXT", help="only the cases with this in their names")
+    parser.add_argument("--peer", action="store_true", help="pycolmap as well, on every second frame: minutes")
+    parser.add_argument("--work", type=Path, default=None, help="folder for the workspaces, which are removed again")
+    parser.add_argument(
+        "-o", "--output", type=Path, default=None, help="default: benchmarks/results/odometry-DATE.json"
+    )
+    args = parser.parse_args()
+    report: dict[str, Any] = environment(args) | {"runs": []}
+    output = args.output or ROOT / "benchmarks" / "results" / f"odometry-{report['date'][:10]}.json"
+    output.parent.mkdir(parents=True, exist_ok=True)
+    cases = [case for case in find_cases(args) if not args.only or any(text in case.name for text in args.only)]
+    if not cases:
+        sys.exit(f"no sequence to play: none in {DATA}, none named")
+    with tempfile.TemporaryDirectory(dir=args.work) as work:  # compiles what no cache holds yet
+        run_sfmapp(Case("warm", cases[0].sequence, ("--stop", "40")), Path(work) / "out", args)
+    for run in measure(cases, args):
+        report["runs"].append(run)
+        truth = run["truth"]
+        print(f"{run['case']} {run['program']}: {run.get('num_in_largest_map')} of {run['num_frames']} frames, "
+              f"ATE {truth['ate_m']['rmse'] if truth else None}, {run['wall_s']:.1f} s wall, {run['cpu_s']:.1f} s CPU, "
+              f"{run['peak_memory_mb']:.0f} MB", file=sys.stderr)  # fmt: skip
+        report["rows"] = summaries(report["runs"])
+        output.write_text(json.dumps(report, indent=1) + "\n")
+    text = markdown(report)
+    output.with_suffix(".md").write_text(text + "\n")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
