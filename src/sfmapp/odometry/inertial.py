@@ -30,6 +30,8 @@ Ints = NDArray[np.int64]
 GRAVITY = 9.81
 # No inertial sensor is slower than 10 Hz: a longer silence is a gap.
 _MAX_SILENCE_S = 0.1
+# Mean velocities over about a second are compared to start with: accelerations have shown in the positions by then.
+_SPAN_S = 1.0
 # What biases of small sensors may reasonably be, as standard deviations of their priors.
 _GYRO_BIAS_SIGMA, _ACCEL_BIAS_SIGMA = 0.1, 0.3
 
@@ -169,7 +171,7 @@ def align_imu(
         )
         return ScaleRefusal("imu", reason, evidence)
     intervals = [_reintegrate(interval, gyro_bias) for interval in intervals]
-    start = _solve_linear(intervals, rigid3.center(poses), map_from_imu, poses, imu, is_metric)
+    start = _solve_linear(intervals, gyro_bias, rigid3.center(poses), map_from_imu, poses, imu, is_metric)
     evidence |= {"condition": start.condition, "position_sigma_map_units": start.position_sigma}
     if start.inverse_scale <= 0:
         return ScaleRefusal("imu", "the motion does not tell the scale: accelerations and positions disagree", evidence)
@@ -357,7 +359,13 @@ class _Start:
 
 
 def _solve_linear(
-    intervals: list[_Interval], centers: Array, map_from_imu: Array, poses: Array, imu: Imu, is_metric: bool
+    intervals: list[_Interval],
+    gyro_bias: Array,
+    centers: Array,
+    map_from_imu: Array,
+    poses: Array,
+    imu: Imu,
+    is_metric: bool,
 ) -> _Start:
     """Scale, gravity and accelerometer bias from mean velocities over neighbouring intervals.
 
@@ -365,7 +373,7 @@ def _solve_linear(
     rho (what was integrated, less what the lever arm moved) + rho g (dt1 + dt2) / 2 + rho (slopes) bias:
     the noisy positions stand alone on one side, so that noise does not shrink the scale.
     """
-    pairs = [(a, b) for a, b in itertools.pairwise(intervals) if a.second == b.first]
+    pairs = _long_pairs(intervals, gyro_bias)
     lever = np.einsum("kij,j->ki", rigid3.rotation_matrix(poses).swapaxes(1, 2), rigid3.inverse(imu.imu_from_cam)[4:])
     rows, left, blur = [], [], []
     for a, b in pairs:
@@ -385,35 +393,69 @@ def _solve_linear(
     return _constrain(design, target, is_metric)
 
 
+def _long_pairs(intervals: list[_Interval], gyro_bias: Array) -> list[tuple[_Interval, _Interval]]:
+    """Neighbouring spans of about a second, from every pose: what motion adds grows with the span, noise does not."""
+    spans: dict[int, _Interval] = {}
+    for n, start in enumerate(intervals):
+        joined, duration = [start], start.duration
+        for after in intervals[n + 1 :]:
+            if duration >= _SPAN_S or after.first != joined[-1].second:
+                break
+            joined.append(after)
+            duration += after.duration
+        if duration >= _SPAN_S:
+            steps = np.concatenate([i.steps for i in joined])
+            span = _Interval(start.first, joined[-1].second, steps, np.empty(60))
+            spans[start.first] = _reintegrate(span, gyro_bias)
+    long = [(a, spans[a.second]) for a in spans.values() if a.second in spans]
+    return long or [(a, b) for a, b in itertools.pairwise(intervals) if a.second == b.first]
+
+
 def _velocity_change(positions: Array, dt1: float, dt2: float) -> Array:
     changed: Array = (positions[2] - positions[1]) / dt2 - (positions[1] - positions[0]) / dt1
     return changed
 
 
 def _constrain(design: Array, target: Array, is_metric: bool) -> _Start:
-    """Reweighted least squares of design (N, 3, 7) x = target (N, 3) with |gravity| known; x = rho (1, g, bias)."""
+    """Reweighted least squares of design (N, 3, 7) x = target (N, 3) with |gravity| known; x = rho (1, g, bias).
+
+    Started from the solution without that knowledge, and from gravity as it is felt on the average; the better end.
+    """
     loose = np.linalg.lstsq(design[..., :4].reshape(-1, 4), target.ravel(), rcond=None)[0]
-    rho = 1.0 if is_metric else (float(loose[0]) if loose[0] > 0 else float(np.linalg.norm(loose[1:])) / GRAVITY)
-    down, bias, condition, sigma = loose[1:] / np.linalg.norm(loose[1:]), np.zeros(3), np.inf, np.nan
-    for _ in range(10):
+    felt = np.linalg.lstsq(design[..., 1:4].reshape(-1, 3), -design[..., 0].ravel(), rcond=None)[0]
+    ends = []
+    for gravity in (loose[1:] * np.sign(loose[0]), felt):
+        down = gravity / max(float(np.linalg.norm(gravity)), 1e-300)
+        along = design[..., :4] @ np.r_[1.0, GRAVITY * down]
+        rho = float((along * target).sum() / max(float((along**2).sum()), 1e-300))
+        # not a sign, but a size to start from: what the positions do over what the sensor feels
+        rho = 1.0 if is_metric else max(rho, 0.1 * float(np.sqrt((target**2).sum() / (along**2).sum())))
+        ends.append(_descend(design, target, is_metric, rho, down))
+    return min(ends, key=lambda end: end.position_sigma)
+
+
+def _descend(design: Array, target: Array, is_metric: bool, rho: float, down: Array) -> _Start:
+    bias, condition, sigma = np.zeros(3), np.inf, np.nan
+    for _ in range(15):
         basis = np.linalg.svd(down[None])[2][1:].T
-        x = rho * np.concatenate([[1.0], GRAVITY * down, bias])
-        left = target - design @ x
+        x = np.concatenate([[1.0], GRAVITY * down, bias])
+        left = target - rho * design @ x
         length2 = (left**2).sum(1)
         sigma = float(np.sqrt(np.median(length2) / 2.366)) + 1e-300
         weight = 1.0 / np.sqrt(1.0 + length2 / (3.0 * sigma) ** 2)
         slopes = np.concatenate(
-            [(design @ (x / rho))[..., None], rho * GRAVITY * design[..., 1:4] @ basis, rho * design[..., 4:]], -1
+            [(design @ x)[..., None], rho * GRAVITY * design[..., 1:4] @ basis, rho * design[..., 4:]], -1
         )
         slopes = slopes[..., 1:] if is_metric else slopes
-        prior = np.zeros((3, slopes.shape[2]))
+        size = slopes.shape[2]
+        prior = np.zeros((3, size))
         prior[:, -3:] = sigma / _ACCEL_BIAS_SIGMA * np.eye(3)
-        a = np.concatenate([(slopes * weight[:, None, None]).reshape(-1, slopes.shape[2]), prior])
+        a = np.concatenate([(slopes * weight[:, None, None]).reshape(-1, size), prior])
         b = np.concatenate([(left * weight[:, None]).ravel(), -sigma / _ACCEL_BIAS_SIGMA * bias])
         step = np.linalg.lstsq(a, b, rcond=None)[0]
         condition = float(np.linalg.cond(a / np.linalg.norm(a, axis=0)))
         if not is_metric:
-            rho = max(rho + float(step[0]), 0.1 * rho)  # a scale does not change its sign
+            rho = float(np.clip(rho + step[0], 0.3 * rho, 3.0 * rho))  # a scale does not change its sign
         down = down + basis @ np.clip(step[-5:-3], -0.5, 0.5)
         down /= np.linalg.norm(down)
         bias = bias + step[-3:]
@@ -550,7 +592,6 @@ class _Graph:
         self._sigmas = np.maximum(np.repeat(sigma, 3), 0.3 * self._sigmas)
 
     def _read(self, graph: Any, values: Any, evidence: dict[str, Any]) -> InertialAlignment:
-        import gtsam
         from gtsam.symbol_shorthand import A, B, V
 
         log_scale, *tilt = values.atVector(A(0))
@@ -558,16 +599,14 @@ class _Graph:
         gravity = rotation.T @ [0.0, 0.0, -GRAVITY]
         upright = _upright(gravity)
         keep_heading = upright @ rotation.T
-        marginals = gtsam.Marginals(graph, values)
+        covariance, bias_covariance = _covariances(graph, values, A(0), B(self._index[len(self._index) // 2]))
         # rows: 15 an interval, 6 a pose, 6 a chain; unknowns: 15 a pose and 3
         chains = len(self._index) - len(self._intervals)
         num_free = 15 * len(self._intervals) + 6 * len(self._index) + 6 * chains + 3 - 15 * len(self._index) - 3
         residual = 2.0 * graph.error(values) / num_free
         widen = np.sqrt(max(residual, 1.0))
-        covariance = marginals.marginalCovariance(A(0))
-        middle = marginals.marginalCovariance(B(self._index[len(self._index) // 2]))
         biases = np.array([values.atConstantBias(B(k)).vector() for k in self._index]).mean(0)
-        bias_sigma = widen * np.sqrt(np.diag(middle))
+        bias_sigma = widen * np.sqrt(np.diag(bias_covariance))
         sigma = 0.0 if self._is_metric else float(widen * np.sqrt(covariance[0, 0]))
         gravity_sigma = float(widen * np.sqrt(covariance[1, 1] + covariance[2, 2]))
         evidence = evidence | {
@@ -593,6 +632,22 @@ def _optimize(graph: Any, values: Any) -> Any:
     return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
 
 
+def _covariances(graph: Any, values: Any, last: int, before: int) -> tuple[Array, Array]:
+    """Marginal covariances of two variables, by QR: Cholesky gives up on weak motion, where information cancels."""
+    import gtsam
+
+    linear = graph.linearize(values)
+    ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, [before, last], True)
+    net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
+    end, middle = net.at(net.size() - 1), net.at(net.size() - 2)
+    if list(end.keys()) != [last] or list(middle.keys()) != [before, last]:
+        raise RuntimeError("gtsam did not keep the order of elimination")
+    root = np.linalg.inv(end.R())
+    covariance = root @ root.T
+    root = np.linalg.inv(middle.R())
+    return covariance, root @ (np.eye(len(root)) + middle.S() @ covariance @ middle.S().T) @ root.T
+
+
 def _preintegration(imu: Imu) -> Any:
     """gtsam's parameters, z up."""
     import gtsam
@@ -603,8 +658,8 @@ def _preintegration(imu: Imu) -> Any:
     parameters.setGyroscopeCovariance(max(imu.gyro_noise, tiny) ** 2 * np.eye(3))
     parameters.setBiasAccCovariance(max(imu.accel_walk, tiny) ** 2 * np.eye(3))
     parameters.setBiasOmegaCovariance(max(imu.gyro_walk, tiny) ** 2 * np.eye(3))
-    # of what is lost between samples: far below what any camera sees
-    parameters.setIntegrationCovariance(1e-12 * np.eye(3))
+    # what is lost between samples: 0.03 mm over a second, far below what any camera sees
+    parameters.setIntegrationCovariance(1e-9 * np.eye(3))
     return parameters
 
 
