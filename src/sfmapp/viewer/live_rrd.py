@@ -39,8 +39,6 @@ FRAME_TIMELINE, TIME_TIMELINE = "frame", "time"
 # 30 KB an image of 640 pixels: a thousand of them stay below 40 MB
 _IMAGE_SIDE_PX, _IMAGE_QUALITY = 640, 70
 _BLUE, _ORANGE, _GREEN, _GREY, _RED = (80, 150, 255), (255, 150, 40), (90, 200, 120), (140, 140, 150), (235, 70, 60)
-# negative: in points of the screen, not in units of the scene
-_LINE_WIDTH = -1.2
 _LIVE, _FINAL = "world/scene/live", "world/scene/final"
 _MAX_FINAL_POINTS = 300_000
 # Points move with every keyframe; drawn as often they would take sixty megabytes of a recording of a thousand frames.
@@ -92,7 +90,7 @@ class LiveDrawing:
         # cameras are taken to start level until more of them are known
         recording.log("world/scene", rr.Transform3D(mat3x3=self._rotation), static=True)
         # frusta and lines say it all; axes of no length are an error to the viewer
-        for path in ("world/scene", _LIVE, f"{_LIVE}/camera"):
+        for path in ("world/scene", _LIVE):
             recording.log(path, rr.TransformAxes3D(1e-6), static=True)
         for path, color, radius in (("mapped", _GREEN, 2.2), ("tracked", _ORANGE, 1.8)):
             fields = rr.Points2D.from_fields(radii=rr.Radius.ui_points(radius), colors=color)
@@ -122,7 +120,7 @@ class LiveDrawing:
         self._draw_path(map_idx, {block})
         self._newest = message
         self._last = rigid3.compose(ours.placement, rigid3.inverse(pose))
-        self._draw_camera(ours, map_idx)
+        self._draw_camera(ours)
 
     def _map(self, message: Mapping[str, Any]) -> None:
         map_idx = message["map_idx"]
@@ -259,15 +257,11 @@ class LiveDrawing:
             strips = rr.LineStrips3D(self._maps[map_idx].strips(block), colors=_ORANGE, radii=rr.Radius.ui_points(1.2))
             self._recording.log(f"{_LIVE}/map{map_idx}/path/{block}", strips)
 
-    def _draw_camera(self, ours: LiveMap, map_idx: int) -> None:
-        path = f"{_LIVE}/camera"
-        self._recording.log(path, rr.Transform3D(translation=self._last[4:], quaternion=self._last[:4]))
-        k = self._camera.k_matrix
-        pinhole = rr.Pinhole(
-            image_from_camera=k, resolution=[self._camera.width, self._camera.height], color=_ORANGE,
-            line_width=_LINE_WIDTH, image_plane_distance=1.5 * (ours.frustum or 0.1), camera_xyz=rr.ViewCoordinates.RDF,
-        )  # fmt: skip
-        self._recording.log(path, pinhole)
+    def _draw_camera(self, ours: LiveMap) -> None:
+        lines = frustum_lines(self._camera, rigid3.inverse(self._last)[None], 1.5 * (ours.frustum or 0.1))
+        # not a pinhole: the viewer refuses those where a parent has a scale, as the live view has in the end
+        strips = rr.LineStrips3D(lines, colors=_ORANGE, radii=rr.Radius.ui_points(1.4))
+        self._recording.log(f"{_LIVE}/camera", strips)
 
     def _draw_truth(self, ours: LiveMap, map_idx: int) -> None:
         """The true path until now, laid on the trajectory as it is now."""
