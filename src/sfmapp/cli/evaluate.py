@@ -5,8 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sfmapp.cli.common import add_output_flags, print_json
+
+if TYPE_CHECKING:
+    from sfmapp.pipelines.evaluate import Evaluation
 
 ALIGNMENTS = ("sim3", "se3", "origin", "none")
 
@@ -54,8 +58,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    from sfmapp.errors import InputError
-    from sfmapp.pipelines.evaluate import EvaluateOptions, draw, evaluate, parse_delta
+    from sfmapp.pipelines.evaluate import EvaluateOptions, evaluate, parse_delta
 
     options = EvaluateOptions(
         alignments=tuple(args.align or ("sim3", "se3")),
@@ -66,21 +69,30 @@ def _evaluate(args: argparse.Namespace) -> int:
         is_by_estimate=args.pairs_from == "estimate",
     )
     result = evaluate(args.trajectory, args.truth, options, times=args.times)
-    if not args.json and not args.quiet:
-        print(result.table(), flush=True)
-    picture: Path | None = None
-    if not args.no_plot:
-        read = result.estimate.path
-        picture = args.plot or read.with_name(read.name + ".png")
-        try:
-            draw(result, picture)
-        except InputError as error:
-            if args.plot is not None:
-                raise
-            print(f"sfmapp: no picture: {error}", file=sys.stderr)  # TRAJ may lie where nobody may write
-            picture = None
+    try:  # before the table, which may go to a pipe that closes early
+        picture = None if args.no_plot else _draw(result, args.plot)
+    finally:
+        if not args.json and not args.quiet:
+            print(result.table())
     if args.json:
         print_json({"exit_code": 0, **result.to_dict(), "plot": None if picture is None else str(picture)})
     elif picture is not None and not args.quiet:
         print(f"drawn: {picture}")
     return 0
+
+
+def _draw(result: Evaluation, wanted: Path | None) -> Path | None:
+    """Where the picture is; None if nobody asked for a place and there is none beside the trajectory."""
+    from sfmapp.errors import InputError
+    from sfmapp.pipelines.evaluate import draw
+
+    read = result.estimate.path
+    path = wanted or read.with_name(read.name + ".png")
+    try:
+        draw(result, path)
+    except InputError as error:
+        if wanted is not None:
+            raise
+        print(f"sfmapp: no picture: {error}", file=sys.stderr)
+        return None
+    return path
