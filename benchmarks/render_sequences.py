@@ -51,7 +51,8 @@ def main() -> None:
     parser.add_argument("--moving-cars", type=int, default=0, help="street: cars that come the other way")
     parser.add_argument("--threads", type=int, default=2)
     edit = {"action": "append", "dest": "edits", "metavar": "AT:COUNT"}
-    for name, text in (("blackout", "COUNT frames from AT are black"), ("stand", "the camera stands for COUNT more frames at AT"),
+    for name, text in (("blackout", "COUNT frames from AT are black"),
+                       ("stand", "the camera stands for COUNT more frames at AT"),
                        ("pan", "a turn of 90 degrees on the spot in COUNT more frames at AT"),
                        ("splice", "COUNT frames of another place come before AT"),
                        ("lose", "COUNT frames from AT are missing")):  # fmt: skip
@@ -69,9 +70,8 @@ def main() -> None:
     args.out.mkdir(parents=True)
     start, cpu = time.perf_counter(), time.process_time()
     WRITERS[args.layout or LAYOUTS[args.place]](sequence, args.out, args.threads)
-    print(
-        f"{args.out}: {len(sequence)} frames, {time.perf_counter() - start:.0f} s, CPU {time.process_time() - cpu:.0f} s"
-    )
+    wall, cpu = time.perf_counter() - start, time.process_time() - cpu
+    print(f"{args.out}: {len(sequence)} frames, {wall:.0f} s, CPU {cpu:.0f} s")
 
 
 def make(args: argparse.Namespace) -> RenderedSequence:
@@ -109,7 +109,8 @@ def edited(sequence: RenderedSequence, args: argparse.Namespace, kind: str, at: 
 def write_images(sequence: RenderedSequence, path_of: Callable[[int, int], Path], threads: int) -> None:
     """Render all frames; those that repeat an earlier one byte for byte are linked to it."""
     rows = np.column_stack([
-        sequence.cam_from_world, sequence.motion, sequence.world_time_s, sequence.gain, sequence.noise_key, sequence.place
+        sequence.cam_from_world, sequence.motion, sequence.world_time_s, sequence.gain, sequence.noise_key,
+        sequence.place,
     ])  # fmt: skip
     first: dict[bytes, int] = {}
     jobs, links = [], []
@@ -161,7 +162,7 @@ def write_kitti_layout(sequence: RenderedSequence, out: Path, threads: int) -> N
 
 
 def write_tum_layout(sequence: RenderedSequence, out: Path, threads: int) -> None:
-    """TUM RGB-D without its depth: rgb, rgb.txt, groundtruth.txt. calib.json holds the camera, which TUM has on a web page."""
+    """TUM RGB-D without depth: rgb, rgb.txt, groundtruth.txt; calib.json for the camera, which TUM does not ship."""
     names = [f"{TUM_START_S + t:.6f}" for t in sequence.timestamps_s]
     head = "# color images\n# file: 'rendered'\n# timestamp filename\n"
     (out / "rgb.txt").write_text(head + "".join(f"{name} rgb/{name}.png\n" for name in names))
@@ -198,7 +199,8 @@ def write_euroc_layout(sequence: RenderedSequence, out: Path, threads: int) -> N
         pose = rigid3.compose(body_from_cam, rigid3.inverse(sequence.rig.cam_from_rig[sensor]))
         rate = 1 / np.median(np.diff(sequence.timestamps_s))
         (folder / "sensor.yaml").write_text(
-            f"%YAML:1.0\n\nsensor_type: camera\ncomment: rendered cam{sensor}\n\n{_transform(pose)}\nrate_hz: {rate:.6g}\n"
+            f"%YAML:1.0\n\nsensor_type: camera\ncomment: rendered cam{sensor}\n\n{_transform(pose)}\n"
+            f"rate_hz: {rate:.6g}\n"
             f"resolution: [{camera.width}, {camera.height}]\ncamera_model: pinhole\n"
             f"intrinsics: {opencv_intrinsics(camera)} #fu, fv, cu, cv\ndistortion_model: radial-tangential\n"
             f"distortion_coefficients: {camera.canonical[4:].tolist()}\n"

@@ -1,7 +1,8 @@
 """Smooth motions with exact derivatives, and what an inertial sensor measures on them.
 
-A motion is six sums of quintic B-splines of time: the place of a body in the world (z up) and its yaw, pitch and roll, so
-that velocity, acceleration and angular velocity are derivatives of polynomials. The body's axes: x forward, y left, z up.
+A motion is six sums of quintic B-splines of time: the place of a body in the world (z up) and its yaw, pitch and roll,
+so that velocity, acceleration and angular velocity are derivatives of polynomials. The body's axes: x forward, y left,
+z up.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ Array = NDArray[np.float64]
 DEGREE = 5
 GRAVITY = 9.81
 # a camera that looks along the body's x axis: its x axis is the body's -y, its y axis the body's -z
-CAM_FROM_BODY: Array = rigid3.from_matrix([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]], [0.0, 0, 0])
+CAM_FROM_BODY: Array = rigid3.from_matrix(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Motion:
     """A moving body.
 
     Attributes:
-        splines: scipy BSplines of time with values (6,): x, y, z in metres, yaw, pitch, roll in radians; their sum counts.
+        splines: scipy BSplines of time with values (6,) that add up: x, y, z in metres, yaw, pitch, roll in radians.
     """
 
     splines: tuple[Any, ...]
@@ -76,8 +77,11 @@ def interpolate(times_s: ArrayLike, values: ArrayLike) -> Any:
 
 
 def control_spline(controls: ArrayLike, step_s: float, start_s: float = 0.0) -> Any:
-    """The uniform quintic B-spline with control values (C, 6), one each ``step_s``, on ``start_s`` to ``start_s + (C - 5)
-    step_s``. It stays inside the hull of its controls and has no power above about half a cycle a step."""
+    """The uniform quintic B-spline with control values (C, 6), one each ``step_s``.
+
+    It runs from ``start_s`` for ``C - 5`` steps, stays inside the hull of its controls and has next to no power above
+    half a cycle a step.
+    """
     from scipy.interpolate import BSpline
 
     controls = np.asarray(controls, np.float64)
@@ -140,7 +144,7 @@ def measure_inertia(
     times = np.asarray(times_s, np.float64)
     turn = rigid3.rotation_matrix(imu_from_body)
     from_world = rigid3.rotation_matrix(motion.body_from_world(times))
-    force = motion.acceleration(times) + [0.0, 0.0, GRAVITY]
+    force = motion.acceleration(times) + np.array([0.0, 0.0, GRAVITY])
     root = np.sqrt(options.rate_hz)
 
     def bias(start: tuple[float, float, float], walk: float) -> Array:

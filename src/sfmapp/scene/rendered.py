@@ -1,8 +1,8 @@
 """Rendered sequences with exact truth: a hand-held walk through a room, a drone in a hall, a drive round a block.
 
-A sequence is plain arrays with one row for each frame, and the worlds that they are seen in; images are rendered when they
-are asked for, and equal byte for byte whenever they are. Edits (a blackout, a camera that stands still, a fast pan,
-frames from elsewhere, a jump, lost frames) are changes of these arrays.
+A sequence is plain arrays with one row for each frame, and the worlds that they are seen in; images are rendered when
+they are asked for, the same bytes every time. Edits (a blackout, a camera that stands still, a fast pan, frames from
+elsewhere, a jump, lost frames) are changes of these arrays.
 """
 
 from __future__ import annotations
@@ -103,7 +103,9 @@ class RenderedSequence:
         rows = {
             k: getattr(self, k)[idx] for k in ("cam_from_world", "motion", "world_time_s", "gain", "noise_key", "place")
         }
-        return replace(self, **rows, timestamps_s=step * np.arange(len(idx)), imu=None, imu_from_cam=None)
+        return replace(
+            self, **rows, timestamps_s=step * np.arange(len(idx), dtype=np.float64), imu=None, imu_from_cam=None
+        )
 
 
 def _sequence(
@@ -163,7 +165,8 @@ def room(
     gain = _wandering_gain(rng, times, 2.0, 0.05, 1.1)
     return _sequence(
         "room", room_world(seed), Rig.single(camera), times,
-        lambda t: rigid3.compose(CAM_FROM_BODY, body.body_from_world(t)), gain, optics or Optics(exposure_s=0.008, sub_exposures=2), seed,
+        lambda t: rigid3.compose(CAM_FROM_BODY, body.body_from_world(t)), gain,
+        optics or Optics(exposure_s=0.008, sub_exposures=2), seed,
     )  # fmt: skip
 
 
@@ -195,7 +198,7 @@ def hall(
     controls[:, :3] = rng.uniform([-3.6, -7.0, 0.7], [3.6, 7.0, 3.4], (count, 3))
     for k in range(1, count):  # no point much farther than can be flown in a step
         hop = controls[k, :3] - controls[k - 1, :3]
-        controls[k, :3] = controls[k - 1, :3] + hop * min(1.0, 2.6 / np.linalg.norm(hop))
+        controls[k, :3] = controls[k - 1, :3] + hop * min(1.0, 2.6 / float(np.linalg.norm(hop)))
     controls[:, 3] = np.cumsum(rng.normal(0, 0.75, count))
     controls[:rest] = [*controls[0, :2], 0.6, controls[0, 3], 0, 0]
     path = control_spline(controls, step)
@@ -318,8 +321,10 @@ def stand(sequence: RenderedSequence, at: int, count: int) -> RenderedSequence:
 
 
 def pan(sequence: RenderedSequence, at: int, count: int, angle_deg: float = 90.0) -> RenderedSequence:
-    """At frame ``at`` the camera turns about the world's vertical, on the spot, within ``count`` more frames. It goes on
-    along the same way and stays turned."""
+    """At frame ``at`` the camera turns on the spot about the world's vertical, within ``count`` more frames.
+
+    It goes on along the same way and stays turned.
+    """
     paused = stand(sequence, at, count)
     share = np.clip((np.arange(len(paused)) - at) / count, 0.0, 1.0)
     eased, rate = share**2 * (3 - 2 * share), 6 * share * (1 - share)  # smoothstep and its derivative

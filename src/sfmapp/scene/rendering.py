@@ -30,6 +30,7 @@ TILE_PX = 16
 NEAR_M = 0.02  # surfaces nearer than this are cut away
 MAX_PROBES = 6  # samples along the footprint; beyond this ratio of its axes the texture is blurred
 MAX_LEVELS = 13
+EDGE_GREY = 1.5  # surfaces that differ by less than this look like one
 # eight rooks: each row and column of an 8 x 8 grid is hit once, so edges of any direction get nine levels
 ROOKS = (np.array([[0, 3], [1, 6], [2, 0], [3, 5], [4, 2], [5, 7], [6, 1], [7, 4]]) + 0.5) / 8 - 0.5
 
@@ -59,7 +60,8 @@ class Atlas:
             height, width = texture.shape
             if width & (width - 1) or height & (height - 1) or max(width, height) >= 2**MAX_LEVELS:
                 raise ValueError(f"sides of a texture must be powers of two below {2**MAX_LEVELS}, got {texture.shape}")
-            level, count = texture.astype(np.float32), 0
+            level: NDArray[np.floating] = texture.astype(np.float32)
+            count = 0
             while True:
                 offsets[i, count] = used
                 parts.append(np.rint(level).astype(np.uint8).ravel())
@@ -67,7 +69,7 @@ class Atlas:
                 count += 1
                 if min(level.shape) == 1:
                     break
-                level = (level[::2, ::2] + level[1::2, ::2] + level[::2, 1::2] + level[1::2, 1::2]) / 4
+                level = 0.25 * (level[::2, ::2] + level[1::2, ::2] + level[::2, 1::2] + level[1::2, 1::2])
             sizes[i] = width, height, count
         return Atlas(np.concatenate(parts), sizes, offsets)
 
@@ -82,10 +84,11 @@ class World:
             from the visible side) and down its columns.
         texture: (Q,) index. window: (Q, 4) texture coordinate of the corner and how far it runs along each edge, in
             periods of the texture: (0, 0, 1, 1) shows it once. Textures repeat.
-        overlay: (Q,) index of a second texture that multiplies the first (128 means one), or -1; overlay_window as above.
+        overlay: (Q,) index of a second texture that multiplies the first (128 means one), or -1.
+        overlay_window: (Q, 4) is to the overlay what window is to the texture.
         shade: (Q,) factor on the grey values.
-        velocity: (Q, 3) m/s and cycle: (Q, 2) phase and length in metres: a moving rectangle starts again after each length
-            of way; at rest where the velocity is zero.
+        velocity: (Q, 3) m/s; zero at rest. cycle: (Q, 2) phase and length in metres: what moves starts again after each
+            length of way.
     """
 
     atlas: Atlas
@@ -127,8 +130,9 @@ class View:
     """One exact rendering.
 
     Attributes:
-        grey: (H, W) float32, neither rounded nor clipped. surface: (H, W) int32, the rectangle at the pixel's centre, -1
-            where the ray meets none. depth: (H, W) float32 along the optical axis, inf where it meets none.
+        grey: (H, W) float32, neither rounded nor clipped.
+        surface: (H, W) int32, the rectangle at the pixel's centre, -1 where the ray meets none.
+        depth: (H, W) float32 along the optical axis, inf where the ray meets none.
     """
 
     grey: NDArray[np.float32]
@@ -144,9 +148,9 @@ class Renderer:
         self.camera = camera
 
     @cached_property
-    def _rays(self) -> tuple[Array, Array, Array]:
+    def _rays(self) -> tuple[Array, Array, Array, Array]:
         """(H, W, 2) normalised image points of the pixel centres, (H, W, 4) their derivative by the pixel, (R, C, 4)
-        bounds of the tiles."""
+        bounds x0, x1, y0, y1 of the tiles, (4, max(R, C)) bounds of the tiles' columns and rows."""
         width, height = self.camera.width, self.camera.height
         x, y = np.meshgrid(np.arange(-1, width + 1) + 0.5, np.arange(-1, height + 1) + 0.5)
         rays = pixels_to_normalized(self.camera, np.stack([x.ravel(), y.ravel()], 1)).reshape(*x.shape, 2)
@@ -159,12 +163,34 @@ class Renderer:
             for c in range(columns):  # one pixel more all round, for the rays beside the centres
                 tile = rays[r * TILE_PX : (r + 1) * TILE_PX + 2, c * TILE_PX : (c + 1) * TILE_PX + 2].reshape(-1, 2)
                 bounds[r, c, ::2], bounds[r, c, 1::2] = tile.min(0), tile.max(0)
-        return np.ascontiguousarray(rays[1:-1, 1:-1]), np.ascontiguousarray(slopes), bounds
+        spans = np.zeros((4, max(rows, columns)))
+        spans[0, :columns], spans[1, :columns] = bounds[..., 0].min(0), bounds[..., 1].max(0)
+        spans[2, :rows], spans[3, :rows] = bounds[..., 2].min(1), bounds[..., 3].max(1)
+        return np.ascontiguousarray(rays[1:-1, 1:-1]), np.ascontiguousarray(slopes), bounds, spans
+
+    @cached_property
+    def _paint(self) -> tuple[Array, Ints]:
+        """What does not depend on the pose: (Q, 16) and (Q, 2) texture and overlay.
+
+        Columns: 0-5 left for the homography to the texture; 6-9 overlay coordinates as offset and factor of the
+        texture's, both in texels of their finest levels; 10, 11 extent and 14, 15 start of the window in texels;
+        12 shade; 13 how many levels coarser the overlay is read.
+        """
+        world = self.world
+        paint = np.zeros((len(world.origin), 16))
+        size = world.atlas.sizes[world.texture, :2]
+        other = world.atlas.sizes[np.maximum(world.overlay, 0), :2]
+        paint[:, 14:16], paint[:, 10:12] = world.window[:, :2] * size, world.window[:, 2:] * size
+        factor = world.overlay_window[:, 2:] * other / paint[:, 10:12]
+        paint[:, 7:10:2] = factor
+        paint[:, 6:9:2] = world.overlay_window[:, :2] * other - factor * paint[:, 14:16]
+        paint[:, 12], paint[:, 13] = world.shade, np.log2(np.abs(factor[:, 0]))
+        return paint, np.stack([world.texture, world.overlay], 1)
 
     def view(self, cam_from_world: ArrayLike, time_s: float = 0.0, *, edge_samples: bool = True) -> View:
         """What the camera sees from a pose (7,) at a time, without noise, vignetting or blur."""
         world = self.world
-        rays, slopes, bounds = self._rays
+        rays, slopes, bounds, spans = self._rays
         pose = np.ascontiguousarray(cam_from_world, np.float64)
         rotation = rigid3.rotation_matrix(pose)
         num = len(world.origin)
@@ -174,9 +200,14 @@ class Renderer:
         _see_quads(world.origin_at(time_s), world.edges, rotation, pose[4:], frame, inverse, box, nearest)
         order = np.flatnonzero(nearest > 0)
         order = order[np.argsort(-nearest[order], kind="stable")]
-        quads = (inverse[order], nearest[order], world.texture[order], world.window[order], world.overlay[order],
-                 world.overlay_window[order], world.shade[order])  # fmt: skip
-        starts, entries = _fill_tiles(quads[0], box[order], bounds)
+        paint, skins = self._paint
+        paint = paint[order]
+        # from the place on the rectangle to the place on its texture, in texels
+        paint[:, :6] = (
+            paint[:, 14:16, None] * inverse[order, 2, None] + paint[:, 10:12, None] * inverse[order, :2]
+        ).reshape(-1, 6)
+        quads = (inverse[order], nearest[order], paint, skins[order])
+        starts, entries = _fill_tiles(quads[0], box[order], bounds, spans)
         shape = rays.shape[:2]
         grey, found, depth = np.zeros(shape, np.float32), np.empty(shape, np.int32), np.empty(shape, np.float32)
         atlas = (world.atlas.pixels, world.atlas.sizes, world.atlas.offsets)
@@ -229,12 +260,12 @@ def moved_camera(cam_from_world: ArrayLike, motion: ArrayLike, dt_s: float) -> A
     return rigid3.from_matrix(rotation, -rotation @ (rigid3.center(cam_from_world) + dt_s * motion[3:]))
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _cross(a: Array, b: Array, out: Array) -> None:
     out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _see_quads(
     origin: Array, edges: Array, rotation: Array, shift: Array, frame: Array, inverse: Array, box: Array, nearest: Array
 ) -> None:
@@ -279,48 +310,69 @@ def _see_quads(
             inverse[q, 0, i], inverse[q, 1, i], inverse[q, 2, i] = u[i] / det, v[i] / det, n[i] / det
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _largest(x: float, y: float, z: float, tile: Array) -> float:
     """Largest value of x X + y Y + z over a tile's bounds."""
     return (x * tile[1] if x > 0 else x * tile[0]) + (y * tile[3] if y > 0 else y * tile[2]) + z
 
 
-@numba.njit(cache=True, nogil=True)
-def _reaches(h: Array, box: Array, tile: Array) -> bool:
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _reaches(h: Array, q: int, tile: Array) -> bool:
     """Whether a rectangle may be seen in a tile: none of its four sides has the whole tile outside."""
-    if box[0] > tile[1] or box[1] < tile[0] or box[2] > tile[3] or box[3] < tile[2]:
-        return False
     for row in range(2):
-        if _largest(h[row, 0], h[row, 1], h[row, 2], tile) < 0:
+        if _largest(h[q, row, 0], h[q, row, 1], h[q, row, 2], tile) < 0:
             return False
-        if _largest(h[2, 0] - h[row, 0], h[2, 1] - h[row, 1], h[2, 2] - h[row, 2], tile) < 0:
+        if _largest(h[q, 2, 0] - h[q, row, 0], h[q, 2, 1] - h[q, row, 1], h[q, 2, 2] - h[q, row, 2], tile) < 0:
             return False
-    return _largest(h[2, 0], h[2, 1], h[2, 2], tile) > 0
+    return _largest(h[q, 2, 0], h[q, 2, 1], h[q, 2, 2], tile) > 0
 
 
-@numba.njit(cache=True, nogil=True)
-def _fill_tiles(inverse: Array, box: Array, bounds: Array) -> tuple[Ints, NDArray[np.int32]]:
-    """CSR lists of the rectangles that reach each tile, in the order given."""
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _span(low: Array, high: Array, first: float, last: float) -> tuple[int, int]:
+    """Which tiles of a row or column, with ascending bounds, overlap an interval: begin and end."""
+    begin, end = 0, len(low)
+    while begin < end and high[begin] < first:
+        begin += 1
+    while end > begin and low[end - 1] > last:
+        end -= 1
+    return begin, end
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fill_tiles(inverse: Array, box: Array, bounds: Array, spans: Array) -> tuple[Ints, NDArray[np.int32]]:
+    """CSR lists of the rectangles that reach each tile, in the order given.
+
+    Spans: (4, tiles) lowest and highest x of the columns, lowest and highest y of the rows.
+    """
     rows, columns = bounds.shape[0], bounds.shape[1]
     starts = np.zeros(rows * columns + 1, np.int64)
-    capacity = 64 * rows * columns
-    entries = np.empty(capacity, np.int32)
-    used = 0
+    capacity, used = 64 * rows * columns, 0
+    pairs = np.empty((capacity, 2), np.int32)
+    for q in range(inverse.shape[0]):
+        if used + rows * columns > capacity:
+            capacity = 2 * capacity
+            longer = np.empty((capacity, 2), np.int32)
+            longer[:used] = pairs[:used]
+            pairs = longer
+        left, right = _span(spans[0, :columns], spans[1, :columns], box[q, 0], box[q, 1])
+        top, bottom = _span(spans[2, :rows], spans[3, :rows], box[q, 2], box[q, 3])
+        for r in range(top, bottom):
+            for c in range(left, right):
+                if _reaches(inverse, q, bounds[r, c]):
+                    pairs[used, 0], pairs[used, 1] = r * columns + c, q
+                    used += 1
+                    starts[r * columns + c + 1] += 1
     for tile in range(rows * columns):
-        if used + inverse.shape[0] > capacity:
-            capacity = 2 * capacity + inverse.shape[0]
-            longer = np.empty(capacity, np.int32)
-            longer[:used] = entries[:used]
-            entries = longer
-        for q in range(inverse.shape[0]):
-            if _reaches(inverse[q], box[q], bounds[tile // columns, tile % columns]):
-                entries[used] = q
-                used += 1
-        starts[tile + 1] = used
-    return starts, entries[:used]
+        starts[tile + 1] += starts[tile]
+    place = starts[:-1].copy()
+    entries = np.empty(used, np.int32)
+    for k in range(used):
+        entries[place[pairs[k, 0]]] = pairs[k, 1]
+        place[pairs[k, 0]] += 1
+    return starts, entries
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _hit(x: float, y: float, first: int, last: int, entries: Any, inverse: Array, nearest: Array) -> tuple[int, float]:
     """The nearest rectangle on a ray and its inverse depth; -1 if there is none."""
     best, found = 1e-12, -1
@@ -342,85 +394,91 @@ def _hit(x: float, y: float, first: int, last: int, entries: Any, inverse: Array
     return found, best
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _bilinear(pixels: Any, offset: int, width: int, height: int, s: float, t: float) -> float:
-    """A repeating texture at (s, t), in texels."""
+    """A repeating texture at (s, t), in texels of the level that begins at the offset."""
     s -= 0.5
     t -= 0.5
     fs, ft = math.floor(s), math.floor(t)
     s -= fs
     t -= ft
     i0, j0 = int(fs) & (width - 1), int(ft) & (height - 1)
-    i1 = (i0 + 1) & (width - 1)
-    top, low = offset + j0 * width, offset + ((j0 + 1) & (height - 1)) * width
-    upper = pixels[top + i0] + s * (float(pixels[top + i1]) - pixels[top + i0])
-    lower = pixels[low + i0] + s * (float(pixels[low + i1]) - pixels[low + i0])
+    i1, j1 = (i0 + 1) & (width - 1), (j0 + 1) & (height - 1)
+    # unsigned, so that numba does not look for negative indices
+    top_left, top_right = np.uint64(offset + j0 * width + i0), np.uint64(offset + j0 * width + i1)
+    low_left, low_right = np.uint64(offset + j1 * width + i0), np.uint64(offset + j1 * width + i1)
+    upper = pixels[top_left] + s * (float(pixels[top_right]) - pixels[top_left])
+    lower = pixels[low_left] + s * (float(pixels[low_right]) - pixels[low_left])
     return upper + t * (lower - upper)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def _trilinear(pixels: Any, sizes: Any, offsets: Any, texture: int, s: float, t: float, level: float) -> float:
-    """A texture at (s, t), in periods, between two levels of its pyramid."""
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _trilinear(pixels: Any, sizes: Ints, offsets: Ints, texture: int, s: float, t: float, level: float) -> float:
+    """A texture at (s, t), in texels of its finest level, between two levels of its pyramid."""
     low = min(int(level), sizes[texture, 2] - 1)
     width, height = sizes[texture, 0] >> low, sizes[texture, 1] >> low
-    value = _bilinear(pixels, offsets[texture, low], width, height, s * width, t * height)
+    scale = 1.0 / (1 << low)
+    value = _bilinear(pixels, offsets[texture, low], width, height, s * scale, t * scale)
     share = level - low
     if share > 0.0 and low + 1 < sizes[texture, 2]:
-        width, height = width >> 1, height >> 1
-        coarse = _bilinear(pixels, offsets[texture, low + 1], width, height, s * width, t * height)
+        scale *= 0.5
+        coarse = _bilinear(pixels, offsets[texture, low + 1], width >> 1, height >> 1, s * scale, t * scale)
         value += share * (coarse - value)
     return value
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _colour(
-    x: float, y: float, slope: Array, scale: float, probes: int, h: Array, texture: int, window: Array, overlay: int,
-    overlay_window: Array, shade: float, pixels: Any, sizes: Any, offsets: Any,
+    x: float, y: float, w: float, slopes: Array, i: int, j: int, scale: float, probes: int, q: int, inverse: Array,
+    paint: Array, skins: Ints, pixels: Any, sizes: Ints, offsets: Ints,
 ) -> float:  # fmt: skip
-    """Grey value that a rectangle shows on the ray (x, y, 1) over a footprint of ``scale`` pixels."""
-    w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
-    u = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w
-    v = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
-    # derivative of (u, v) by the ray, then by the pixel, in texels
-    ux, uy = (h[0, 0] - u * h[2, 0]) / w, (h[0, 1] - u * h[2, 1]) / w
-    vx, vy = (h[1, 0] - v * h[2, 0]) / w, (h[1, 1] - v * h[2, 1]) / w
-    su, sv = scale * window[2] * sizes[texture, 0], scale * window[3] * sizes[texture, 1]
-    j00, j01 = su * (ux * slope[0] + uy * slope[1]), su * (ux * slope[2] + uy * slope[3])
-    j10, j11 = sv * (vx * slope[0] + vy * slope[1]), sv * (vx * slope[2] + vy * slope[3])
+    """Grey value that rectangle q shows at inverse depth w on the ray (x, y, 1) near pixel (i, j), over a footprint of
+    ``scale`` pixels."""
+    z = 1.0 / w
+    s = (paint[q, 0] * x + paint[q, 1] * y + paint[q, 2]) * z
+    t = (paint[q, 3] * x + paint[q, 4] * y + paint[q, 5]) * z
+    # derivative of (s, t) by the ray, then by the pixel
+    z *= scale
+    wx, wy = inverse[q, 2, 0], inverse[q, 2, 1]
+    sx, sy = (paint[q, 0] - s * wx) * z, (paint[q, 1] - s * wy) * z
+    tx, ty = (paint[q, 3] - t * wx) * z, (paint[q, 4] - t * wy) * z
+    x0, y0, x1, y1 = slopes[i, j, 0], slopes[i, j, 1], slopes[i, j, 2], slopes[i, j, 3]
+    j00, j01 = sx * x0 + sy * y0, sx * x1 + sy * y1
+    j10, j11 = tx * x0 + ty * y0, tx * x1 + ty * y1
     # axes of the ellipse that a unit circle of the image becomes: eigenvalues of J J^T
     e, f, g = j00 * j00 + j01 * j01, j00 * j10 + j01 * j11, j10 * j10 + j11 * j11
     root = math.sqrt(0.25 * (e - g) * (e - g) + f * f)
-    long2 = 0.5 * (e + g) + root
-    short2 = max(0.5 * (e + g) - root, 1e-12)
-    s, t = window[0] + u * window[2], window[1] + v * window[3]
-    count = 1
-    if long2 > 1.5 * short2 and long2 > 1.0:
-        count = min(probes, int(math.ceil(math.sqrt(long2 / max(short2, 1.0)))))
-    level = max(0.0, 0.5 * math.log2(max(short2, long2 / (count * count))))
+    long2, short2 = 0.5 * (e + g) + root, 0.5 * (e + g) - root
+    count, blur2 = 1, long2
+    if long2 > 1.0 and long2 > 1.5 * short2:
+        count = min(probes, int(math.sqrt(long2 / max(short2, 1.0))) + 1)
+        blur2 = max(short2, long2 / (count * count))
+    level = 0.5 * math.log2(blur2) if blur2 > 1.0 else 0.0
+    texture, overlay = skins[q, 0], skins[q, 1]
     if count == 1:
         value = _trilinear(pixels, sizes, offsets, texture, s, t, level)
     else:
         ax, ay = (f, long2 - e) if e < g else (long2 - g, f)  # the long axis
-        norm = math.sqrt(long2 / (ax * ax + ay * ay))
-        ax, ay = ax * norm / sizes[texture, 0], ay * norm / sizes[texture, 1]
+        norm = math.sqrt(long2 / (ax * ax + ay * ay)) / count
+        s0, t0 = s - ax * norm * 0.5 * (count - 1), t - ay * norm * 0.5 * (count - 1)
         value = 0.0
         for k in range(count):
-            shift = (k + 0.5) / count - 0.5
-            value += _trilinear(pixels, sizes, offsets, texture, s + shift * ax, t + shift * ay, level)
+            value += _trilinear(pixels, sizes, offsets, texture, s0 + k * ax * norm, t0 + k * ay * norm, level)
         value /= count
-    if overlay >= 0:
-        extent = overlay_window[2] * sizes[overlay, 0] / (window[2] * sizes[texture, 0])
-        level = max(0.0, level + math.log2(max(abs(extent), 1e-6)))
-        s, t = overlay_window[0] + u * overlay_window[2], overlay_window[1] + v * overlay_window[3]
-        value *= _trilinear(pixels, sizes, offsets, overlay, s, t, level) / 128.0
-    return value * shade
+    if overlay >= 0:  # faint and coarse: no blending between levels
+        near = min(int(max(level + paint[q, 13] + 0.5, 0.0)), sizes[overlay, 2] - 1)
+        s = paint[q, 6] + paint[q, 7] * s
+        t = paint[q, 8] + paint[q, 9] * t
+        shrink = 1.0 / (1 << near)
+        width, height = sizes[overlay, 0] >> near, sizes[overlay, 1] >> near
+        value *= _bilinear(pixels, offsets[overlay, near], width, height, s * shrink, t * shrink) / 128.0
+    return value * paint[q, 12]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _trace_centres(
-    rays: Array, slopes: Array, starts: Ints, entries: Any, inverse: Array, nearest: Array, texture: Ints, window: Array,
-    overlay: Ints, overlay_window: Array, shade: Array, pixels: Any, sizes: Ints, offsets: Ints, grey: Any, found: Any,
-    depth: Any,
+    rays: Array, slopes: Array, starts: Ints, entries: Any, inverse: Array, nearest: Array, paint: Array, skins: Ints,
+    pixels: Any, sizes: Ints, offsets: Ints, grey: Any, found: Any, depth: Any,
 ) -> None:  # fmt: skip
     """One ray through every pixel's centre."""
     columns = -(-rays.shape[1] // TILE_PX)
@@ -434,27 +492,26 @@ def _trace_centres(
             if q >= 0:
                 depth[i, j] = 1.0 / w
                 grey[i, j] = _colour(
-                    x, y, slopes[i, j], 1.0, MAX_PROBES, inverse[q], texture[q], window[q], overlay[q],
-                    overlay_window[q], shade[q], pixels, sizes, offsets,
-                )  # fmt: skip
+                    x, y, w, slopes, i, j, 1.0, MAX_PROBES, q, inverse, paint, skins, pixels, sizes, offsets
+                )
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _trace_edges(
-    rays: Array, slopes: Array, starts: Ints, entries: Any, inverse: Array, nearest: Array, texture: Ints, window: Array,
-    overlay: Ints, overlay_window: Array, shade: Array, pixels: Any, sizes: Ints, offsets: Ints, samples: Array,
-    found: Any, grey: Any,
+    rays: Array, slopes: Array, starts: Ints, entries: Any, inverse: Array, nearest: Array, paint: Array, skins: Ints,
+    pixels: Any, sizes: Ints, offsets: Ints, samples: Array, found: Any, grey: Any,
 ) -> None:  # fmt: skip
-    """Several rays through every pixel whose neighbour shows another rectangle."""
+    """Several rays through every pixel whose neighbour shows another rectangle in another grey."""
     height, width = found.shape
     columns = -(-width // TILE_PX)
     for i in range(height):
         for j in range(width):
-            q = found[i, j]
-            if (
-                (j == 0 or found[i, j - 1] == q) and (j + 1 == width or found[i, j + 1] == q)
-                and (i == 0 or found[i - 1, j] == q) and (i + 1 == height or found[i + 1, j] == q)
-            ):  # fmt: skip
+            is_edge = False
+            for k in range(4):
+                r, c = i + (k == 0) - (k == 1), j + (k == 2) - (k == 3)
+                if 0 <= r < height and 0 <= c < width and found[r, c] != found[i, j]:
+                    is_edge |= abs(grey[r, c] - grey[i, j]) > EDGE_GREY
+            if not is_edge:
                 continue
             tile = (i // TILE_PX) * columns + j // TILE_PX
             total = 0.0
@@ -462,10 +519,7 @@ def _trace_edges(
                 dx, dy = samples[k, 0], samples[k, 1]
                 x = rays[i, j, 0] + slopes[i, j, 0] * dx + slopes[i, j, 2] * dy
                 y = rays[i, j, 1] + slopes[i, j, 1] * dx + slopes[i, j, 3] * dy
-                hit, _ = _hit(x, y, starts[tile], starts[tile + 1], entries, inverse, nearest)
+                hit, w = _hit(x, y, starts[tile], starts[tile + 1], entries, inverse, nearest)
                 if hit >= 0:
-                    total += _colour(
-                        x, y, slopes[i, j], 0.5, 3, inverse[hit], texture[hit], window[hit], overlay[hit],
-                        overlay_window[hit], shade[hit], pixels, sizes, offsets,
-                    )  # fmt: skip
+                    total += _colour(x, y, w, slopes, i, j, 0.5, 2, hit, inverse, paint, skins, pixels, sizes, offsets)
             grey[i, j] = total / samples.shape[0]

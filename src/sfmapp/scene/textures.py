@@ -330,11 +330,11 @@ def facade(rng: Rng, size: int = 1024) -> Grey:
     if style == 0:
         out = bricks(rng, size, 96, 32).astype(np.float32)
     elif style == 1:
-        out = (rng.uniform(130, 185) + 3 * noise(rng, size, 8, 5) + 3 * noise(rng, size, 256, 2)).astype(np.float32)
+        out = (rng.uniform(130, 185) + 3 * noise(rng, size, 8, 3) + 3 * noise(rng, size, 256, 2)).astype(np.float32)
         joint = size // int(rng.integers(24, 48))
         out[::joint] -= 18
     else:
-        out = (rng.uniform(110, 200) + 4 * noise(rng, size, 8, 6, 0.55)).astype(np.float32)
+        out = (rng.uniform(110, 200) + 4 * noise(rng, size, 16, 3, 0.7)).astype(np.float32)
     rows, columns = int(rng.integers(2, 5)), int(rng.integers(3, 7))
     wide, high = size // columns, int(size * 0.78) // rows
     w, h = int(wide * rng.uniform(0.35, 0.6)), int(high * rng.uniform(0.5, 0.7))
@@ -346,7 +346,7 @@ def facade(rng: Rng, size: int = 1024) -> Grey:
                 x, y = c * wide + (wide - w) // 2, int(size * 0.04) + r * high + (high - h) // 2
                 _facade_window(rng, out, x, y, w, h, panes, frame)
     plinth = int(size * 0.93)
-    out[plinth:] = 90 + 4 * noise(rng, size, 32, 4)[plinth:]
+    out[plinth:] = 90 + 4 * np.tile(noise(rng, size // 4, 8, 4), (1, 4))[: size - plinth]
     _ground_floor(rng, out, wide, w)
     x = int(rng.integers(4, size - 16))
     out[:, x : x + 7], out[:, x + 7 : x + 10] = 80, 120

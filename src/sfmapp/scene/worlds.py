@@ -1,9 +1,10 @@
-"""Three places to walk, fly and drive through: a furnished room, a machine hall, streets round a block. Metres, z up."""
+"""Three places to walk, fly and drive through: a room, a machine hall, streets round a block. Metres, z up."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,16 +24,15 @@ HALL_HALF = (7.0, 10.0)
 
 @dataclass(frozen=True)
 class Skin:
-    """How a rectangle is covered: texture index, the width in metres of one period (None: shown once, fitted), an overlay
-    (its period in metres) that makes repeats differ, a factor on the brightness, mirrored or not."""
+    """How a rectangle is covered."""
 
-    texture: int
-    metres: float | None = None
-    overlay: int = -1
-    overlay_metres: float = 7.3
-    tone: float = 1.0
-    mirrored: bool = False
-    glows: bool = False
+    texture: int  # index in the builder
+    metres: float | None = None  # width of one period; None: shown once, fitted
+    overlay: int = -1  # index of a texture that makes repeats differ; -1: none
+    overlay_metres: float = 7.3  # width of one of its periods
+    tone: float = 1.0  # factor on the brightness
+    mirrored: bool = False  # left and right exchanged
+    glows: bool = False  # as bright whichever way it faces
 
 
 class WorldBuilder:
@@ -52,7 +52,7 @@ class WorldBuilder:
         self, corner: ArrayLike, right: ArrayLike, down: ArrayLike, skin: Skin, velocity: ArrayLike = (0.0, 0.0, 0.0),
         cycle: tuple[float, float] = (0.0, 1.0),
     ) -> None:  # fmt: skip
-        """A rectangle by its top left corner and its edges as seen from the visible side; moving if it has a velocity."""
+        """A rectangle by its top left corner and its edges, as seen from the visible side."""
         right, down = np.asarray(right, np.float64), np.asarray(down, np.float64)
         normal = np.cross(down, right)
         normal /= np.linalg.norm(normal)
@@ -67,8 +67,8 @@ class WorldBuilder:
         over = np.concatenate([self.rng.random(2), extent / skin.overlay_metres])
         lit = 1.0 if skin.glows else AMBIENT + (1 - AMBIENT) * max(0.0, float(normal @ LIGHT))
         self._rows.append(
-            [*np.asarray(corner, np.float64), *right, *down, skin.texture, *window, skin.overlay, *over, skin.tone * lit,
-             *np.asarray(velocity, np.float64), *cycle]
+            [*np.asarray(corner, np.float64), *right, *down, skin.texture, *window, skin.overlay, *over,
+             skin.tone * lit,              *np.asarray(velocity, np.float64), *cycle]
         )  # fmt: skip
 
     def wall(self, centre: ArrayLike, normal: ArrayLike, width: float, height: float, skin: Skin) -> None:
@@ -81,8 +81,7 @@ class WorldBuilder:
         self, foot: ArrayLike, size: Sequence[float], skins: Skin | Sequence[Skin], yaw_deg: float = 0.0,
         velocity: ArrayLike = (0.0, 0.0, 0.0), cycle: tuple[float, float] = (0.0, 1.0), *, has_bottom: bool = False,
     ) -> None:  # fmt: skip
-        """A box on a foot point, seen from outside. Skins: one for all faces, or (front and back = x faces, left and right
-        = y faces, top)."""
+        """A box on a foot point, seen from outside. Skins: one for all, or for the x faces, the y faces, the top."""
         ends, sides, top = (skins,) * 3 if isinstance(skins, Skin) else skins
         c, s = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
         ex, ey = np.array([c, s, 0.0]), np.array([-s, c, 0.0])
@@ -133,6 +132,7 @@ class WorldBuilder:
         )  # fmt: skip
 
 
+@lru_cache(maxsize=2)
 def room_world(seed: int = 0) -> World:
     """A furnished room of 5 x 6 x 3 m: plain walls with a few posters, a window, desks, shelves, a sofa, clutter."""
     rng = np.random.default_rng([seed, 0x2003])
@@ -205,7 +205,8 @@ def _room_furniture(build: WorldBuilder, wood: Skin, dark: Skin, cloth: Skin) ->
 
     def clutter(x: float, y: float, z: float, extent: tuple[float, float], count: int) -> None:
         for _ in range(count):
-            at = np.array([x, y, z]) + [*rng.uniform(-0.5, 0.5, 2) * extent, 0.0]
+            dx, dy = rng.uniform(-0.5, 0.5, 2) * extent
+            at = (x + dx, y + dy, z)
             skins = (*prints, *cartons)
             skin = skins[int(rng.integers(len(skins)))]
             if rng.random() < 0.45:  # paper
@@ -258,6 +259,7 @@ def _room_furniture(build: WorldBuilder, wood: Skin, dark: Skin, cloth: Skin) ->
         build.box((2.05, 1.3, 0.3), (0.42, 0.42, 0.55 + 0.006 * yaw), plant, yaw)
 
 
+@lru_cache(maxsize=2)
 def hall_world(seed: int = 0) -> World:
     """A machine hall of 14 x 20 x 7 m: brick walls, windows, pillars, machines, pipes, crates."""
     rng = np.random.default_rng([seed, 0x4A11])
@@ -267,7 +269,7 @@ def hall_world(seed: int = 0) -> World:
     ground = Skin(build.texture(textures.concrete(rng, 1024)), 4.8, stains, 6.7, 0.75)
     roof = Skin(build.texture(textures.planks(rng, 512, 8, 80)), 3.0, stains, 5.1, 0.6)
     build.inside(HALL_HALF, 7.0, brick, ground, roof)
-    hx, hy = HALL_HALF
+    hx = HALL_HALF[0]
     steel = Skin(build.texture(textures.plaster(rng)), 2.0, stains, 2.7, 0.5)
     stripe = Skin(build.texture(np.full((16, 16), 225, np.uint8)), None, stains, 1.7)
     for x in (-3.6, 3.6):
@@ -349,6 +351,7 @@ class Streets:
 STREETS = Streets()
 
 
+@lru_cache(maxsize=2)
 def street_world(seed: int = 0, *, moving_cars: int = 0) -> World:
     """Four streets round a block, with houses, hedges, kerbs, parked cars, trees, poles; moving cars on request."""
     rng = np.random.default_rng([seed, 0x57E7])
@@ -381,7 +384,7 @@ class _Street:
         self.build = build
         self.rng = rng = build.rng
         self.stains = stains
-        self.facades = [build.texture(textures.facade(rng)) for _ in range(30)]
+        self.facades = [build.texture(textures.facade(rng)) for _ in range(24)]
         self.gable = Skin(build.texture(textures.bricks(rng, 1024, 40, 12)), 3.2, stains, 7.1)
         self.roof = Skin(build.texture(textures.tiles(rng, 512, 16, 110, 14)), 4.0, stains)
         self.pavement = Skin(build.texture(textures.tiles(rng)), 3.2, stains, 9.7)
@@ -423,7 +426,7 @@ class _Street:
                 self._house(np.array([x, y]), np.array([side, 0.0]), 26.0)
 
     def _row(self, start: Array, normal: Array, length: float) -> None:
-        """Houses, gardens and what stands at the kerb along one side of a block; the street is where the normal points."""
+        """Houses, gardens and what stands at the kerb along one side of a block; the normal points to the street."""
         rng, along = self.rng, np.abs(normal[::-1])
         done = 0.0
         while done < length - 7:
@@ -516,7 +519,7 @@ class _Street:
             horizontal = side % 2 == 0
             ends = x_ends if horizontal else y_ends
             length = ends[1] - ends[0]
-            # clockwise: +x on the upper street, -y on the right one, -x on the lower one, +y on the left one; against it:
+            # clockwise is +x on the upper street, -y on the right one, and so on; this is against it
             direction = {0: np.array([-1.0, 0]), 1: np.array([0, 1.0]), 2: np.array([1.0, 0]), 3: np.array([0, -1.0])}[
                 side
             ]
