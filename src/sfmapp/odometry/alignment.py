@@ -15,9 +15,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.lanes import pointer
+from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.odometry import lanes
-from sfmapp.odometry.pyramid import PAD, Bytes, Pyramid
+from sfmapp.odometry.pyramid import PAD, Bytes, Pyramid, build_pyramid
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -25,14 +25,14 @@ Doubles = NDArray[np.float64]
 MAX_HALF_WIDTH = 7  # a row of a patch is one vector
 _CHUNK = 256  # points to a task
 # float32 a point needs: 17 sampled rows of 32; 15 rows of T, gradient x, y, weight; 15 rows of w g~x, w g~y, w T~
-_SAMPLES, _ROWS, _SUMS = 0, 17 * 32, 17 * 32 + 15 * 64
+_SAMPLES, GRADED, _SUMS = 0, 17 * 32, 17 * 32 + 15 * 64
 SCRATCH = _SUMS + 15 * 48
 # last step, in pixels of the level: a tenth of the noise of a good track at the finest, and what the next level makes
 # good at the others
 _FINE_STEP_PX, _COARSE_STEP_PX = 0.01, 0.1
 # standard deviation that noise of one grey level in both images would give the position; where it is more, what the
 # sensor really adds moves the patch by its own gradients
-_MAX_SIGMA_PX = 0.25
+MAX_SIGMA_PX = 0.25
 # a gain taken for larger or smaller only makes the steps shorter or longer
 _MIN_GAIN, _MAX_GAIN = 0.6, 1.6
 
@@ -73,25 +73,39 @@ def _sample_shifted(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _sample_warped(
-    data: Bytes, layout: NDArray[np.int64], x: float, y: float, warp: Doubles, size: int, scratch: Floats, shift: float
-) -> None:
-    """Bilinear samples of a level at ``(x, y) + warp offset``, size x size of them, less a shift."""
-    start, step, height, width = layout
-    middle = 0.5 * (size - 1)
-    low, right, bottom = float(-PAD), width + PAD - 1.001, height + PAD - 1.001
-    for r in range(size):
-        for c in range(size):
-            dx, dy = c - middle, r - middle
-            u = min(max(x + warp[0, 0] * dx + warp[0, 1] * dy - 0.5, low), right)
-            v = min(max(y + warp[1, 0] * dx + warp[1, 1] * dy - 0.5, low), bottom)
-            c0, r0 = int(np.floor(u)), int(np.floor(v))
-            fx, fy = np.float32(u - c0), np.float32(v - r0)
-            place = start + r0 * step + c0
-            i00, i01 = np.float32(data[place]), np.float32(data[place + 1])
-            i10, i11 = np.float32(data[place + step]), np.float32(data[place + step + 1])
-            upper, lower = i00 + fx * (i01 - i00), i10 + fx * (i11 - i10)
-            scratch[32 * r + c] = upper + fy * (lower - upper) - np.float32(shift)
+def is_within_pad(layout: NDArray[np.int64], x: float, y: float, warp: Doubles, half: float) -> bool:
+    """Whether a warped square about (x, y) of a level stays on what the level and its border hold; False with NaN."""
+    reach_x, reach_y = half * (abs(warp[0, 0]) + abs(warp[0, 1])), half * (abs(warp[1, 0]) + abs(warp[1, 1]))
+    room = PAD - 1.0
+    return (
+        x - reach_x >= -room and x + reach_x <= layout[3] + room
+        and y - reach_y >= -room and y + reach_y <= layout[2] + room
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def sample_warped(
+    data: Bytes, layout: NDArray[np.int64], x: float, y: float, warp: Doubles, grow: float, size: int, scratch: Floats,
+    shift: float,
+) -> None:  # fmt: skip
+    """Bilinear samples of a level at ``(x, y) + grow warp offset`` less a shift, size rows of 32 in ``scratch``.
+
+    Columns beyond the patch repeat its last.
+    """
+    c, r = int(np.floor(x)), int(np.floor(y))
+    image = offset(pointer(data), layout[0] + r * layout[1] + c)
+    out = pointer(scratch)
+    a, b = lanes.splat(np.float32(grow * warp[0, 0])), lanes.splat(np.float32(grow * warp[1, 0]))
+    last = np.float32(0.5 * (size - 1))
+    less = lanes.splat(np.float32(shift))
+    for part in range((size + 15) // 16):
+        dx = lanes.ramp(np.float32(16 * part) - last, last)
+        for row in range(size):
+            dy = grow * (row - 0.5 * (size - 1))
+            u = lanes.fma(a, dx, lanes.splat(np.float32(x - 0.5 - c + warp[0, 1] * dy)))
+            v = lanes.fma(b, dx, lanes.splat(np.float32(y - 0.5 - r + warp[1, 1] * dy)))
+            value = lanes.subtract(lanes.sample(image, layout[1], u, v), less)
+            lanes.store(out, _SAMPLES + 32 * row + 16 * part, value)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -100,7 +114,7 @@ def _differentiate(scratch: Floats, window: Floats, rows: int) -> None:
     p, w = pointer(scratch), pointer(window)
     half = lanes.splat(np.float32(0.5))
     for r in range(rows):
-        at, to = _SAMPLES + 32 * (r + 1) + 1, _ROWS + 64 * r
+        at, to = _SAMPLES + 32 * (r + 1) + 1, GRADED + 64 * r
         lanes.store(p, to, lanes.load(p, at))
         lanes.store(p, to + 16, lanes.multiply(half, lanes.subtract(lanes.load(p, at + 1), lanes.load(p, at - 1))))
         lanes.store(p, to + 32, lanes.multiply(half, lanes.subtract(lanes.load(p, at + 32), lanes.load(p, at - 32))))
@@ -114,7 +128,7 @@ def _project(scratch: Floats, rows: int, hessian: Doubles) -> bool:
     zero = lanes.splat(np.float32(0))
     sw, st, sx, sy = zero, zero, zero, zero
     for r in range(rows):
-        at = _ROWS + 64 * r
+        at = GRADED + 64 * r
         w = lanes.load(p, at + 48)
         sw = lanes.add(sw, w)
         st = lanes.fma(w, lanes.load(p, at), st)
@@ -125,7 +139,7 @@ def _project(scratch: Floats, rows: int, hessian: Doubles) -> bool:
     at_, ax, ay = lanes.splat(mt), lanes.splat(mx), lanes.splat(my)
     stt, sxt, syt = zero, zero, zero
     for r in range(rows):
-        at = _ROWS + 64 * r
+        at = GRADED + 64 * r
         w = lanes.load(p, at + 48)
         wt = lanes.multiply(w, lanes.subtract(lanes.load(p, at), at_))
         lanes.store(p, _SUMS + 48 * r + 32, wt)
@@ -138,7 +152,7 @@ def _project(scratch: Floats, rows: int, hessian: Doubles) -> bool:
     cx, cy = lanes.splat(-lanes.total(sxt) / variance), lanes.splat(-lanes.total(syt) / variance)
     sxx, sxy, syy = zero, zero, zero
     for r in range(rows):
-        at = _ROWS + 64 * r
+        at = GRADED + 64 * r
         w, t = lanes.load(p, at + 48), lanes.subtract(lanes.load(p, at), at_)
         gx = lanes.fma(cx, t, lanes.subtract(lanes.load(p, at + 16), ax))
         gy = lanes.fma(cy, t, lanes.subtract(lanes.load(p, at + 32), ay))
@@ -191,7 +205,7 @@ def correlate(
         start += step
         down0, down1 = lanes.load_bytes(image, start), lanes.load_bytes(image, start + 1)
         value = lanes.fma(a00, up0, lanes.fma(a01, up1, lanes.fma(a10, down0, lanes.fma(a11, down1, less))))
-        w = lanes.load(p, _ROWS + 64 * r + 48)
+        w = lanes.load(p, GRADED + 64 * r + 48)
         weighted = lanes.multiply(w, value)
         sw, si, sii = lanes.add(sw, w), lanes.add(si, weighted), lanes.fma(weighted, value, sii)
         st = lanes.fma(lanes.load(p, _SUMS + 48 * r + 32), value, st)
@@ -214,6 +228,7 @@ def prepare_patch(
         hessian: (4,) filled.
     """
     source = level
+    hessian[3] = 0.0
     if is_warped:  # the level on which a step of the target is about a pixel
         size = np.sqrt(abs(warp[0, 0] * warp[1, 1] - warp[0, 1] * warp[1, 0]))
         if not 1e-3 < size < 1e3:  # or not a number
@@ -225,7 +240,9 @@ def prepare_patch(
     shift = float(data[start + int(np.floor(v)) * step + int(np.floor(u))])
     if is_warped:
         grow = 2.0 ** (level - source)
-        _sample_warped(data, layouts[source], u, v, warp * grow, 2 * half + 3, scratch, shift)
+        if not is_within_pad(layouts[source], u, v, warp, (half + 1) * grow):
+            return -1.0
+        sample_warped(data, layouts[source], u, v, warp, grow, 2 * half + 3, scratch, shift)
     else:
         left, top = u - 0.5 - (half + 1), v - 0.5 - (half + 1)
         c, r = int(np.floor(left)), int(np.floor(top))
@@ -235,7 +252,7 @@ def prepare_patch(
         return -1.0
     h00, h01, h11 = hessian[0], hessian[1], hessian[2]
     weakest = 0.5 * (h00 + h11) - np.sqrt(0.25 * (h00 - h11) ** 2 + h01 * h01)
-    return shift if weakest * _MAX_SIGMA_PX**2 > 2.0 else -1.0
+    return shift if weakest * MAX_SIGMA_PX**2 > 2.0 else -1.0
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -283,7 +300,7 @@ def _align(
     warps: Doubles, coarsest: int, finest: int, half: int, max_iterations: int, window: Floats, zncc: Floats,
     is_converged: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    scratch, hessian, position = np.empty(SCRATCH, np.float32), np.empty(4), np.empty(2)
+    scratch, hessian, position = np.zeros(SCRATCH, np.float32), np.empty(4), np.empty(2)
     rows = 2 * half + 1
     for i in range(xy1.shape[0]):
         zncc[i], is_converged[i] = 0.0, False
@@ -370,3 +387,9 @@ def align_patches(
         for first in starts:
             work(first)
     return Alignment(xy2, zncc, is_converged)
+
+
+def compile_kernels() -> None:
+    """Compile, or load from the cache, what this module and the pyramid run."""
+    pyramid, xy = build_pyramid(np.zeros((40, 40), np.uint8)), np.full((1, 2), 20.0)
+    align_patches(pyramid, xy, pyramid, xy)

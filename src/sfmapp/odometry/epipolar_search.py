@@ -25,7 +25,7 @@ from sfmapp.odometry.alignment import (
     patch_window,
     prepare_patch,
 )
-from sfmapp.odometry.pyramid import Bytes, Pyramid
+from sfmapp.odometry.pyramid import Bytes, Pyramid, build_pyramid
 
 _CHUNK = 64  # points to a task
 # pixels of the search level from the best candidate within which others are the same peak
@@ -46,7 +46,7 @@ def _search(
     best: NDArray[np.int64], best_score: Floats,
 ) -> None:  # fmt: skip
     """The first and second peak of each point: candidates, -1 where there is none, and correlations."""
-    scratch, hessian = np.empty(SCRATCH, np.float32), np.empty(4)
+    scratch, hessian = np.zeros(SCRATCH, np.float32), np.empty(4)
     start, step, height, width = layout2[level]
     scale = 0.5**level
     is_warped = warps.shape[0] > 0
@@ -175,3 +175,9 @@ def _for_chunks(work: Callable[[int], None], num: int, threads: int) -> None:
     else:
         for first in starts:
             work(first)
+
+
+def compile_kernels() -> None:
+    """Compile, or load from the cache, what this module runs."""
+    pyramid, xy = build_pyramid(np.zeros((40, 40), np.uint8)), np.full((1, 2), 20.0)
+    search_along_epipolar(pyramid, xy, pyramid, xy[:, None], np.ones(1, np.int64))
