@@ -196,11 +196,11 @@ def hall(
     count, rest = int(np.ceil(duration / step)) + DEGREE + 1, DEGREE + 1 + int(1.5 / step)
     controls = np.zeros((count, 6))
     controls[:, :3] = rng.uniform([-3.6, -7.0, 0.7], [3.6, 7.0, 3.4], (count, 3))
+    controls[:, 3] = np.cumsum(rng.normal(0, 0.75, count))
+    controls[:rest] = [*controls[0, :2], 0.6, controls[0, 3], 0, 0]
     for k in range(1, count):  # no point much farther than can be flown in a step
         hop = controls[k, :3] - controls[k - 1, :3]
         controls[k, :3] = controls[k - 1, :3] + hop * min(1.0, 2.6 / float(np.linalg.norm(hop)))
-    controls[:, 3] = np.cumsum(rng.normal(0, 0.75, count))
-    controls[:rest] = [*controls[0, :2], 0.6, controls[0, 3], 0, 0]
     path = control_spline(controls, step)
     knots = np.arange(-0.5, duration + 0.6, 0.1)
     force, yaw = path(knots, nu=2), path(knots)[:, 3]
