@@ -291,3 +291,8 @@ def _select(
     )  # fmt: skip
     chosen = order[rank[order] >= 0]
     return np.ascontiguousarray(xy[chosen[np.argsort(rank[chosen], kind="stable")[:max_new]]])
+
+
+def compile_kernels() -> None:
+    """Compile, or load from the cache, what this module runs."""
+    find_corners(np.zeros((40, 40), np.uint8), np.empty((0, 2)), 1, min_distance_px=5.0)

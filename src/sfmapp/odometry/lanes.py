@@ -18,7 +18,7 @@ from numba.extending import intrinsic, models, register_model
 
 WIDTH = 16
 
-_F32, _I32 = ir.FloatType(), ir.IntType(32)
+_F32, _I32, _I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _ROW = ir.VectorType(_F32, WIDTH)
 _INTS = ir.VectorType(_I32, WIDTH)
 
@@ -44,6 +44,11 @@ def _splat(builder: Any, scalar: Any) -> Any:
     return builder.shuffle_vector(
         builder.insert_element(empty, scalar, ir.Constant(_I32, 0)), empty, ir.Constant(_INTS, [0] * WIDTH)
     )
+
+
+def _fma(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    kind = ir.FunctionType(_ROW, [_ROW] * 3)
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.fma.v16f32"), [a, b, c])
 
 
 def _place(builder: Any, args: Any, kind: Any) -> Any:
@@ -75,6 +80,42 @@ def load_bytes(typingctx, base, index):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def sample(typingctx, base, step, u, v):  # type: ignore[no-untyped-def]
+    """Bilinear samples at columns u and rows v (16 floats each) of uint8 pixels about a pointer, rows step bytes apart.
+
+    Two pixels of a row come with one 32-bit word: three bytes beyond the last pixel are read.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        words, places = ir.VectorType(_I32, WIDTH), ir.VectorType(_I64, WIDTH)
+        pointers = ir.VectorType(_I32.as_pointer(), WIDTH)
+        mask = ir.VectorType(ir.IntType(1), WIDTH)
+        floor = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_ROW, [_ROW]), "llvm.floor.v16f32")
+        gather = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(words, [pointers, _I32, mask, words]), "llvm.masked.gather.v16i32.v16p0"
+        )
+        left, top = (builder.call(floor, [value]) for value in args[2:])
+        fx, fy = builder.fsub(args[2], left), builder.fsub(args[3], top)
+        empty, first = ir.Constant(places, ir.Undefined), ir.Constant(_I32, 0)
+        here = builder.insert_element(empty, builder.ptrtoint(args[0], _I64), first)
+        steps = builder.insert_element(empty, args[1], first)
+        here, steps = (builder.shuffle_vector(value, empty, ir.Constant(_INTS, [0] * WIDTH)) for value in (here, steps))
+        place = builder.add(here, builder.fptosi(left, places))
+        place = builder.add(place, builder.mul(builder.fptosi(top, places), steps))
+        rows = []
+        for at in (place, builder.add(place, steps)):
+            every, none = ir.Constant(mask, [1] * WIDTH), ir.Constant(words, ir.Undefined)
+            pair = builder.call(gather, [builder.inttoptr(at, pointers), ir.Constant(_I32, 1), every, none])
+            byte, eight = (ir.Constant(words, [value] * WIDTH) for value in (255, 8))
+            one = builder.sitofp(builder.and_(pair, byte), _ROW)
+            two = builder.sitofp(builder.and_(builder.lshr(pair, eight), byte), _ROW)
+            rows.append(_fma(builder, fx, builder.fsub(two, one), one))
+        return _fma(builder, fy, builder.fsub(rows[1], rows[0]), rows[0])
+
+    return row(base, types.intp, u, v), codegen
+
+
+@intrinsic
 def store(typingctx, base, index, value):  # type: ignore[no-untyped-def]
     """``base[index : index + 16] = value`` of a pointer to float32."""
 
@@ -96,12 +137,23 @@ def splat(typingctx, scalar):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def ramp(typingctx, first, most):  # type: ignore[no-untyped-def]
+    """``min(first + lane, most)`` of two float32."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        steps = ir.Constant(_ROW, [float(lane) for lane in range(WIDTH)])
+        value, most = builder.fadd(_splat(builder, args[0]), steps), _splat(builder, args[1])
+        return builder.select(builder.fcmp_ordered("<", value, most), value, most)
+
+    return row(types.float32, types.float32), codegen
+
+
+@intrinsic
 def fma(typingctx, a, b, c):  # type: ignore[no-untyped-def]
     """``a * b + c`` with one rounding."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.FunctionType(_ROW, [_ROW] * 3)
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.fma.v16f32"), args)
+        return _fma(builder, *args)
 
     return row(a, b, c), codegen
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry.rigid3 import exp_so3
-from sfmapp.odometry.pyramid import Pyramid
+from sfmapp.odometry.pyramid import Pyramid, build_pyramid
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -221,3 +221,10 @@ def align_small_images(reference: Pyramid, target: Pyramid, camera_focal_px: flo
     angle = np.arctan(np.hypot(*shift))
     start = exp_so3(angle / max(float(np.hypot(*shift)), 1e-12) * np.array([-shift[1], shift[0], 0.0]))
     return _refine(first, second, float(fine.std() / fine2.std()), start, camera_focal_px * 0.5**level)
+
+
+def compile_kernels() -> None:
+    """Compile, or load from the cache, what this module runs."""
+    y, x = np.mgrid[:64, :64]
+    pyramid = build_pyramid(((x // 16 + y // 16) % 2 * 200).astype(np.uint8), 2)
+    align_small_images(pyramid, pyramid, 64.0)
