@@ -218,7 +218,7 @@ def test_errors_are_as_large_as_their_sigmas(has_covariance: bool) -> None:
     """Poses of 0.2 degrees and 2 cm, a small sensor: errors of scale and gravity over their sigmas of rms about 1."""
     scores, residuals, sigmas = [], [], []
     times = np.arange(0, 20, 0.25)
-    for seed in range(12):
+    for seed in range(6 if has_covariance else 10):
         flight = Flight(seed)
         poses = a_map(flight, times, seed, 0.2, 0.02)
         size = np.r_[np.full(3, np.radians(0.2)), np.full(3, 0.02 / 2.7)]
@@ -232,8 +232,8 @@ def test_errors_are_as_large_as_their_sigmas(has_covariance: bool) -> None:
         assert np.abs(found.gyro_bias - GYRO_BIAS).max() < 2e-3
         assert np.abs(found.accel_bias - ACCEL_BIAS).max() < 0.1
     rms = np.sqrt(np.mean(np.square(scores), 0))  # 1.1 and 1.05 over 40 draws
-    assert 0.6 < rms[0] < 1.45  # 12 draws: 20 % at one sigma
-    assert 0.6 < rms[1] < 1.45
+    assert 0.5 < rms[0] < 1.6  # 6 and 10 draws: 30 and 22 % at one sigma
+    assert 0.5 < rms[1] < 1.6
     assert 0.85 < np.mean(residuals) < (1.15 if has_covariance else 1.5)
     assert 0.001 < np.median(sigmas) < 0.02
 
@@ -262,6 +262,24 @@ def test_gaps_wrong_poses_and_a_slow_sensor_are_borne() -> None:
     assert isinstance(found, InertialAlignment), found
     assert abs(np.log(found.scale / 2.7)) < 4 * found.sigma_relative
     assert found.evidence["num_intervals"] < 75
+    # a pose that is exact by definition, one of which nothing is known
+    covariance = np.tile(np.diag(np.r_[np.full(3, np.radians(0.1)), np.full(3, 0.01 / 2.7)] ** 2), (len(times), 1, 1))
+    covariance[0], covariance[20] = 0.0, np.nan
+    exact = a_map(flight, times, 5, 0.0, 0.0)
+    poses[0], poses[50] = exact[0], exact[50]
+    found = align_imu(times, poses, imu, is_metric=False, covariance=covariance)
+    assert isinstance(found, InertialAlignment), found
+    assert 20 not in found.pose_idx
+    assert abs(np.log(found.scale / 2.7)) < 4 * found.sigma_relative
+
+
+def test_weak_motion_has_a_large_but_honest_sigma() -> None:
+    times = np.arange(0, 25, 0.25)
+    weak = Flight(1, acceleration=0.1, turning=0.05)
+    found = align_imu(times, a_map(weak, times, 1, 0.2, 0.02), weak.imu(1, 25.0), is_metric=False)
+    assert isinstance(found, InertialAlignment), found
+    assert 0.015 < found.sigma_relative < 0.1
+    assert abs(np.log(found.scale / 2.7)) < 3 * found.sigma_relative
 
 
 def test_motion_that_says_nothing_is_refused() -> None:

@@ -142,13 +142,18 @@ def align_imu(
         timestamps_s: (K,) ascending, on the clock of the measurements.
         cam_from_world: (K, 7) poses of the rig's first camera in one map; NaN where there is none.
         is_metric: the map is in metres (stereo): the scale is 1 and only the rest is found.
-        covariance: (K, 6, 6) of the poses as in ``MapResult``; None to judge their noise by how they fit.
+        covariance: (K, 6, 6) over rotation and translation of ``x_cam <- exp(w) x_cam + v``, of errors that are
+            independent from pose to pose; poses where it is not finite are left out. None to judge the noise by how the
+            poses fit: better than covariances in a map's gauge, which count the drift that neighbours have in common.
 
     Returns:
         The alignment, or why the measurements do not give one: too few, contradicting the map's rotations (wrong clock
         or mounting), or a motion too even to tell the scale.
     """
-    times, poses = np.asarray(timestamps_s, np.float64), np.asarray(cam_from_world, np.float64)
+    times, poses = np.asarray(timestamps_s, np.float64), np.array(cam_from_world, np.float64)
+    if covariance is not None:
+        covariance = np.asarray(covariance, np.float64)
+        poses[~np.isfinite(covariance).all((1, 2))] = np.nan
     chosen = _choose_poses(times, poses, options)
     intervals = _intervals(times, chosen, imu, options.max_interval_s)
     evidence: dict[str, Any] = {"num_poses": len(chosen), "num_intervals": len(intervals)}
@@ -425,7 +430,7 @@ def _constrain(design: Array, target: Array, is_metric: bool) -> _Start:
     felt = np.linalg.lstsq(design[..., 1:4].reshape(-1, 3), -design[..., 0].ravel(), rcond=None)[0]
     ends = []
     for gravity in (loose[1:] * np.sign(loose[0]), felt):
-        down = gravity / max(float(np.linalg.norm(gravity)), 1e-300)
+        down = np.asarray(gravity / max(float(np.linalg.norm(gravity)), 1e-300), np.float64)
         along = design[..., :4] @ np.r_[1.0, GRAVITY * down]
         rho = float((along * target).sum() / max(float((along**2).sum()), 1e-300))
         # not a sign, but a size to start from: what the positions do over what the sensor feels
@@ -479,10 +484,10 @@ class _Graph:
 
     def __init__(
         self, times: Array, poses: Array, imu: Imu, intervals: list[_Interval], start: _Start, gyro_bias: Array,
-        rotation_sigma: float, is_metric: bool, covariance: ArrayLike | None,
+        rotation_sigma: float, is_metric: bool, covariance: Array | None,
     ) -> None:  # fmt: skip
         self._poses, self._imu, self._intervals, self._is_metric = poses, imu, intervals, is_metric
-        self._covariance = None if covariance is None else np.asarray(covariance, np.float64)
+        self._covariance = covariance
         self._start, self._gyro_bias = start, gyro_bias
         self._index = sorted({k for interval in intervals for k in (interval.first, interval.second)})
         # rounding alone leaves less than this; zero noise would make the graph singular
@@ -547,6 +552,7 @@ class _Graph:
         graph, loss = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.mEstimator.Huber.Create(3.0)
         parameters = _preintegration(self._imu)
         bias = gtsam.imuBias.ConstantBias(self._start.accel_bias, self._gyro_bias)
+        floor = np.diag(np.repeat([1e-7, self._tiny()], 3) ** 2)  # a pose that holds the gauge has a covariance of zero
         linked: set[int] = set()
         for i in self._intervals:
             sums = gtsam.PreintegratedCombinedMeasurements(parameters, bias)
@@ -563,12 +569,12 @@ class _Graph:
             noise = (
                 gtsam.noiseModel.Diagonal.Sigmas(self._sigmas)
                 if self._covariance is None
-                else gtsam.noiseModel.Gaussian.Covariance(self._covariance[k])
+                else gtsam.noiseModel.Gaussian.Covariance(self._covariance[k] + floor)
             )
             link = _MapPose(self._poses[k], self._imu, self._world_from_map)
             graph.push_back(gtsam.CustomFactor(gtsam.noiseModel.Robust.Create(loss, noise), [X(k), A(0)], link.error))
-        # the tilt is only kept from running away; the scale of a metric map is known
-        sigmas = np.array([1e-9 if self._is_metric else 10.0, 10.0, 10.0])
+        # the tilt is only kept from running away; a metric map's scale is known (1e-9 would be a constraint to gtsam)
+        sigmas = np.array([1e-6 if self._is_metric else 10.0, 10.0, 10.0])
         scale = 1.0 if self._is_metric else 1.0 / self._start.inverse_scale
         center = np.array([np.log(scale), 0.0, 0.0])
         graph.push_back(gtsam.PriorFactorVector(A(0), center, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
