@@ -198,7 +198,7 @@ def hall(
     controls[:, :3] = rng.uniform([-3.6, -7.0, 0.7], [3.6, 7.0, 3.4], (count, 3))
     controls[:, 3] = np.cumsum(rng.normal(0, 0.75, count))
     controls[:rest] = [*controls[0, :2], 0.6, controls[0, 3], 0, 0]
-    for k in range(1, count):  # no point much farther than can be flown in a step
+    for k in range(rest, count):  # no point much farther than can be flown in a step
         hop = controls[k, :3] - controls[k - 1, :3]
         controls[k, :3] = controls[k - 1, :3] + hop * min(1.0, 2.6 / float(np.linalg.norm(hop)))
     path = control_spline(controls, step)
