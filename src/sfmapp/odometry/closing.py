@@ -129,8 +129,6 @@ def fuse_points(keyframes: KeyframeMap, renamed: Ids) -> None:
         renamed: (M, 2) ids to give up, and the ids that they become; no id of the second column is in the first. Where
             a keyframe sees both, the observation of the second stays. A point without a position takes the other's.
     """
-    if not len(renamed):
-        return
     xyz = keyframes.point_xyz
     become = np.arange(keyframes.num_points)
     become[renamed[:, 0]] = renamed[:, 1]
@@ -150,6 +148,7 @@ def fuse_points(keyframes: KeyframeMap, renamed: Ids) -> None:
         keyframe.is_inlier = keyframe.is_inlier[order]
         # the observations that made the pair have been checked against the other side
         keyframe.is_inlier[is_new[order]] = np.isfinite(keyframe.xy[is_new[order]][..., 0])
+    keyframes.recount()
 
 
 def adjust_seam(keyframes: KeyframeMap, fused: Ids, sides: list[list[int]]) -> None:

@@ -62,6 +62,12 @@ class KeyframeMap:
         """Points (N,), each at most once, are seen so many times more."""
         self._num_observations[point_id] += observations.astype(np.int32)
 
+    def recount(self) -> None:
+        """Count afresh how often points are seen, after ids have changed."""
+        self._num_observations = np.zeros(len(self.point_xyz), np.int32)
+        for keyframe in self.keyframes:
+            self.count(keyframe.point_id, np.isfinite(keyframe.xy[:, :, 0]).sum(1))
+
     def num_observations(self, point_id: NDArray[np.int64]) -> NDArray[np.int32]:
         """(N,) how often points are seen, outliers included."""
         return self._num_observations[point_id]

@@ -91,6 +91,17 @@ class LocalMap:
         self._append(view, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), tracks)
         return tracks
 
+    def tracks_of_newest(self) -> ActiveTracks:
+        """The tracks that the newest keyframe saw, looked for as it saw them from now on: the map has changed."""
+        keyframe, number = self.keyframes.keyframes[-1], self.newest
+        good = keyframe.is_inlier[:, 0]
+        point_id, xy = keyframe.point_id[good], keyframe.xy[good, 0]
+        mapped = self.keyframes.is_triangulated(point_id)
+        known = self.tracks_at(point_id[mapped], xy[mapped], keyframe.rig_from_world)
+        known = replace(known, reference=np.full(len(known), number))
+        guessed = self._tracks(point_id[~mapped], xy[~mapped], number, known)
+        return known.joined(guessed)
+
     def tracks_at(self, point_id: NDArray[np.int64], xy: Array, pose: Array) -> ActiveTracks:
         """Tracks of points (N,), ascending, seen at pixels (N, 2) of a frame that is to become the next keyframe."""
         depth = rigid3.apply(pose, self.keyframes.point_xyz[point_id])[:, 2]
@@ -234,6 +245,10 @@ class LocalMap:
 
     def start_tracks(self, xy: Array, number: int, neighbours: ActiveTracks) -> ActiveTracks:
         """New tracks at corners (N, 2) of a keyframe."""
+        return self._tracks(self.keyframes.new_points(len(xy)), xy, number, neighbours)
+
+    def _tracks(self, point_id: NDArray[np.int64], xy: Array, number: int, neighbours: ActiveTracks) -> ActiveTracks:
+        """Tracks seen at (N, 2) in a keyframe, with the depths of their neighbours in the image for a guess."""
         inverse_depth = np.ones(len(xy))
         depths = self._inverse_depths(neighbours, number)
         known = np.isfinite(depths)
@@ -241,8 +256,8 @@ class LocalMap:
             squared = ((xy[:, None] - neighbours.xy[known][None]) ** 2).sum(2)
             inverse_depth = depths[known][np.argmin(squared, 1)]
         return ActiveTracks(
-            self.keyframes.new_points(len(xy)), xy, np.full(len(xy), number), xy.copy(),
-            pixels_to_normalized(self.camera, xy), inverse_depth, np.ones(len(xy), np.float32),
+            point_id, xy, np.full(len(xy), number), xy.copy(), pixels_to_normalized(self.camera, xy), inverse_depth,
+            np.ones(len(xy), np.float32),
         )  # fmt: skip
 
     def _inverse_depths(self, tracks: ActiveTracks, number: int) -> Array:

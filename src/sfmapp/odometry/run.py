@@ -13,17 +13,14 @@ from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Frame, Sequence
 from sfmapp.odometry.active_tracks import ActiveTracks
-from sfmapp.odometry.corners import find_corners
 from sfmapp.odometry.finish import conclude
 from sfmapp.odometry.initialize import Beginning, TwoViews, pose_between
 from sfmapp.odometry.keyframe_map import KeyframeMap
 from sfmapp.odometry.local_map import LocalMap, View
 from sfmapp.odometry.options import OdometryOptions
-from sfmapp.odometry.places import Places
-from sfmapp.odometry.places import View as PlaceView
 from sfmapp.odometry.pyramid import Pyramid, build_pyramid
+from sfmapp.odometry.recognition import Recognition
 from sfmapp.odometry.records import FrameRecord, gather, measure_again
-from sfmapp.odometry.relocalize import RelocalizeOptions, relocalize
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
 from sfmapp.odometry.tracker import MIN_INLIERS, keyframe_reason, measure_pose, track
@@ -34,10 +31,6 @@ STAGE = "odometry"
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 # Fewest points with depth that one look of a rig may begin a map with.
 _MIN_STEREO_POINTS = 40
-# A keyframe is remembered as a place once it shares fewer than this share of its points with the last such.
-_NEW_PLACE = 0.5
-# Frames with fewer corners than that are black, blurred or white: nothing to be found in them.
-_MIN_CORNERS = 40
 
 
 class Odometry:
@@ -49,8 +42,7 @@ class Odometry:
         self.records: list[FrameRecord] = []
         self.maps: dict[int, LocalMap] = {}
         self.local: LocalMap | None = None
-        self.places = Places(seed=seed)
-        self.last_place = np.zeros(0, np.int64)
+        self.recognition = Recognition(seed)
         self.beginning = Beginning(self.rig.cameras[0], options, seed)
         self.waiting: list[tuple[FrameRecord, View]] = []
         self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
@@ -58,7 +50,7 @@ class Odometry:
         self.previous: Pyramid | None = None
         self.num_mapped_at_keyframe = 0
         self.lost_since: float | None = None
-        self.counts = {"relocalizations": 0, "losses": 0}
+        self.counts = {"relocalizations": 0, "losses": 0, "loops": 0}
 
     def process(self, frame: Frame) -> FrameRecord:
         """Find the pose of the next frame."""
@@ -215,20 +207,15 @@ class Odometry:
                 self.pose, self.tracks, self.lost_since = tracked.pose, tracked.tracks, None
                 self._make_keyframe(record, view, FrameState.RELOCALIZED, "the tracks are found again")
                 return True
-        corners = find_corners(view.pyramids[0], np.zeros((0, 2)), self.options.max_tracks, min_distance_px=5.0)
-        if len(corners) < _MIN_CORNERS or not len(self.places):
-            return False
-        maps = {number: found.keyframes for number, found in self.maps.items()}
-        seen = PlaceView(view.images[0], corners)
-        found = relocalize(maps, self.places, seen, RelocalizeOptions())
+        found = self.recognition.find(self.maps, view)
         if found is None:
             return False
-        self.local, self.lost_since = self.maps[found.map_idx], None
-        self.pose, self.step = found.located.cam_from_world, _IDENTITY
-        self.tracks = self.local.tracks_at(found.located.point_id, corners[found.located.corner_idx], self.pose)
+        self.local, frame_idx, self.pose, point_id, xy = found
+        self.step, self.lost_since = _IDENTITY, None
+        self.tracks = self.local.tracks_at(point_id, xy, self.pose)
         self.counts["relocalizations"] += 1
         self.waiting.clear()
-        self._make_keyframe(record, view, FrameState.RELOCALIZED, f"relocalised at frame {found.frame_idx}")
+        self._make_keyframe(record, view, FrameState.RELOCALIZED, f"relocalised at frame {frame_idx}")
         return True
 
     # ------------------------------------------------------------------ what is noted and told
@@ -254,28 +241,39 @@ class Odometry:
             record.point_id, record.xy = tracks.point_id.astype(np.int32), tracks.xy.astype(np.float32)
 
     def _remember(self, view: View) -> None:
-        """Remember the newest keyframe as a place, if it shows something new."""
+        """Remember the newest keyframe as a place; close the loop if that is one."""
+        local = self.local
+        assert local is not None
         if not self.options.loops:
             return
-        assert self.local is not None
         mapped = self.tracks.subset(self.is_mapped)
-        common = np.isin(mapped.point_id, self.last_place, assume_unique=True).sum()
-        if len(mapped) < MIN_INLIERS or common > _NEW_PLACE * len(mapped):
+        closure = self.recognition.remember(self.maps, local, view, mapped.xy, mapped.point_id)
+        if closure is None:
             return
-        self.last_place = mapped.point_id
-        self.places.add(self.local.map_idx, view.frame_idx, view.images[0], mapped.xy, mapped.point_id)
+        for number in {closure.old_map, closure.new_map}:
+            self.maps[number].backend.finish(self.maps[number].keyframes)
+        self.local, scale = self.recognition.close(self.maps, self.records, closure)
+        self.pose, self.step = self.local.pose(self.local.newest), self.step * np.repeat([1.0, scale], [4, 3])
+        self.tracks = self.local.tracks_of_newest()
+        self._count_mapped()
+        self.counts["loops"] += 1
+        self._tell(
+            "a loop is closed" if closure.old_map == closure.new_map else "two maps are joined", everything=True,
+            shift_in_depths=closure.shift, rotation_deg=closure.rotation_deg, scale=closure.scale,
+            num_inliers=list(closure.num_inliers), rms_px=closure.rms_px,
+        )  # fmt: skip
 
-    def _tell(self, message: str, **data: Any) -> None:
-        """Say that the map has changed, with what is new in it."""
+    def _tell(self, message: str, everything: bool = False, **data: Any) -> None:
+        """Say that the map has changed, with what is new in it, or all of it."""
         local = self.local
         assert local is not None
         keyframes = local.keyframes
-        recent = np.arange(max(0, local.newest - self.options.window), local.newest + 1)
+        recent = np.arange(0 if everything else max(0, local.newest - self.options.window), local.newest + 1)
         ids = np.unique(np.concatenate([keyframes.keyframes[k].point_id for k in recent]))
         ids = ids[keyframes.is_triangulated(ids)]
         frames = np.array([keyframes.keyframes[k].frame_idx for k in recent], np.int64)
         poses = np.array([local.pose(int(k)) for k in recent])
-        snapshot = MapSnapshot(int(frames[-1]), local.map_idx, frames, poses, ids, keyframes.point_xyz[ids])
+        snapshot = MapSnapshot(int(frames[-1]), local.map_idx, frames, poses, ids, keyframes.point_xyz[ids], everything)
         self.events.decided(STAGE, message, snapshot=snapshot, frame_idx=int(frames[-1]), keyframe=local.newest, **data)
 
     # ------------------------------------------------------------------ the end

@@ -1,0 +1,125 @@
+"""Knowing a place again: keyframes remembered, loops closed, maps joined, lost frames found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.odometry.closing import apply_closure, join_maps
+from sfmapp.odometry.corners import find_corners
+from sfmapp.odometry.local_map import LocalMap, View
+from sfmapp.odometry.loops import LoopClosure, LoopFinder
+from sfmapp.odometry.places import Places
+from sfmapp.odometry.places import View as PlaceView
+from sfmapp.odometry.records import FrameRecord
+from sfmapp.odometry.relocalize import RelocalizeOptions, relocalize
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+# A keyframe is remembered as a place once it shares fewer than this share of its points with the last such.
+_NEW_PLACE = 0.5
+# Fewest points that make a place, and fewest corners in which a place may be seen again: frames with fewer are black,
+# blurred or white.
+_MIN_POINTS, _MIN_CORNERS = 15, 40
+# Corners of a lost frame; closer together than those that are tracked, as any of them may be a point of the map.
+_CORNERS, _CORNER_DISTANCE_PX = 1000, 5.0
+
+
+class Recognition:
+    """All places of all maps."""
+
+    def __init__(self, seed: int) -> None:
+        self._places, self._finder = Places(seed=seed), LoopFinder()
+        self._last = np.zeros(0, np.int64)
+
+    def remember(
+        self, maps: dict[int, LocalMap], local: LocalMap, view: View, xy: Array, ids: Ids
+    ) -> LoopClosure | None:
+        """Remember the newest keyframe of a map, if it shows something new, and say whether that closes a loop.
+
+        Args:
+            view: its frame. xy: (N, 2) pixels and ids: (N,) ascending, its triangulated points.
+        """
+        if len(ids) < _MIN_POINTS or np.isin(ids, self._last, True).sum() > _NEW_PLACE * len(ids):
+            return None
+        self._last = ids
+        seen = self._places.add(local.map_idx, view.frame_idx, view.images[0], xy, ids)
+        keyframes = {number: other.keyframes for number, other in maps.items()}
+        return self._finder.find(keyframes, local.map_idx, self._places, view.frame_idx, seen)
+
+    def close(
+        self, maps: dict[int, LocalMap], records: Sequence[FrameRecord], closure: LoopClosure
+    ) -> tuple[LocalMap, float]:
+        """Close a loop, or join two maps through it; the frames move along.
+
+        No adjustment may be under way. ``maps`` loses a map that was taken into another.
+
+        Returns:
+            The map that holds the newest keyframe now, and the factor on its unit of length.
+        """
+        self._finder.reset()
+        if closure.old_map != closure.new_map:
+            return self._join(maps, records, closure)
+        local = maps[closure.new_map]
+        closed = apply_closure(local.keyframes, self._places, closure)
+        become = _renaming(local.keyframes.num_points, closed.renamed)
+        for record in records:
+            if record.map_idx == local.map_idx and record.has_pose:
+                record.frame_from_keyframe[4:] *= closed.corrections[record.keyframe, 7]
+                record.point_id = become[record.point_id]
+        return local, float(closed.corrections[-1, 7])
+
+    def _join(
+        self, maps: dict[int, LocalMap], records: Sequence[FrameRecord], closure: LoopClosure
+    ) -> tuple[LocalMap, float]:
+        joined = join_maps({number: local.keyframes for number, local in maps.items()}, self._places, closure)
+        kept, absorbed = maps[joined.kept_map], maps.pop(joined.absorbed_map)
+        position = {keyframe.frame_idx: n for n, keyframe in enumerate(joined.keyframes.keyframes)}
+        become = _renaming(joined.keyframes.num_points, joined.renamed)
+        for local, offset, scale in ((kept, 0, 1.0), (absorbed, joined.id_offset, joined.kept_from_absorbed[7])):
+            place = [position[keyframe.frame_idx] for keyframe in local.keyframes.keyframes]
+            for record in records:
+                if record.map_idx == local.map_idx and record.has_pose:
+                    record.keyframe = place[record.keyframe]
+                    record.frame_from_keyframe[4:] *= scale
+                    record.point_id = become[record.point_id + offset]
+        for record in records:
+            if record.map_idx == absorbed.map_idx:
+                record.map_idx = kept.map_idx
+        newest = absorbed if closure.new_map == absorbed.map_idx else kept
+        kept.keyframes, kept.images = joined.keyframes, {len(position) - 1: newest.images[newest.newest]}
+        return kept, float(joined.kept_from_absorbed[7]) if newest is absorbed else 1.0
+
+    def find(self, maps: dict[int, LocalMap], view: View) -> tuple[LocalMap, int, Array, Ids, Array] | None:
+        """Find a lost frame in any of the maps.
+
+        Returns:
+            The map, the frame that it looks like, the pose (7,), and the points seen: ids (N,) and pixels (N, 2).
+        """
+        if not len(self._places):
+            return None
+        corners = find_corners(view.pyramids[0], np.zeros((0, 2)), _CORNERS, min_distance_px=_CORNER_DISTANCE_PX)
+        if len(corners) < _MIN_CORNERS:
+            return None
+        keyframes = {number: local.keyframes for number, local in maps.items()}
+        found = relocalize(keyframes, self._places, PlaceView(view.images[0], corners), RelocalizeOptions())
+        if found is None:
+            return None
+        located = found.located
+        return (
+            maps[found.map_idx],
+            found.frame_idx,
+            located.cam_from_world,
+            located.point_id,
+            corners[located.corner_idx],
+        )
+
+
+def _renaming(num_points: int, renamed: Ids) -> NDArray[np.int32]:
+    """(num_points,) what each id has become."""
+    become = np.arange(num_points, dtype=np.int32)
+    become[renamed[:, 0]] = renamed[:, 1]
+    return become
