@@ -108,7 +108,7 @@ def parse_length(text: str) -> Length:
         raise UsageError(f"a length is a positive number of metres, got {text!r}")
     mantissa, _, exponent = text.strip().lower().partition("e")
     digits = len(mantissa.partition(".")[2])
-    return Length(value, 0.5 * 10.0 ** (int(exponent or 0) - digits) / np.sqrt(3.0))
+    return Length(value, float(0.5 * 10.0 ** (int(exponent or 0) - digits) / np.sqrt(3.0)))
 
 
 def parse_distance(text: str) -> KnownDistance:
@@ -212,7 +212,8 @@ def scale_from_camera_height(
     At every keyframe a plane below the camera is fitted to the map's points that the keyframes around it see: random
     planes near ``down_in_cam`` (less its part along the motion, which is taken to be along the ground), scored by the
     points on them less those below them, then least squares of ``a.x = 1`` on the points within tolerance. The median
-    of the heights gives the scale, so a drifting map gets its mean scale; ``evidence`` tells of the drift.
+    of the heights gives the scale, so a drifting map gets its mean scale; ``evidence`` tells of the drift. Sigma holds
+    the map's noise and the given length's, not a body on springs or a lens that was calibrated wrongly.
 
     Args:
         reconstruction: a map.
