@@ -129,7 +129,8 @@ class FakeRunner:
 
     def _see_again(self, keyframe: Keyframe, ours: KeyframeMap, ids: NDArray[np.int64], rig: Rig) -> None:
         poses = rigid3.compose(rig.cam_from_rig, keyframe.rig_from_world[None])
-        xy = np.stack([project(c, rigid3.apply(p, ours.point_xyz[ids])) for c, p in zip(rig.cameras, poses)], 1)
+        views = zip(rig.cameras, poses, strict=True)
+        xy = np.stack([project(camera, rigid3.apply(pose, ours.point_xyz[ids])) for camera, pose in views], 1)
         inside = np.isfinite(xy).all((1, 2)) & (xy >= 0).all((1, 2)) & (xy < [WIDTH, HEIGHT]).all((1, 2))
         keyframe.point_id = np.concatenate([keyframe.point_id, ids[inside]])
         keyframe.xy = np.concatenate([keyframe.xy, xy[inside]])

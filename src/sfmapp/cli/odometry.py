@@ -32,7 +32,8 @@ truth and IMU are found by themselves. With two cameras lengths are metres; with
 
 SCALE = (
     "where metres come from: marker:DICT:METRES (side of an ArUco or AprilTag marker), distance:A:B:METRES (between "
-    "the cameras of two frames), camera_height:METRES (over level ground), or imu"
+    "the cameras of two frames), camera_height:METRES (over level ground), imu (the default where there is one), or "
+    "arbitrary"
 )
 
 

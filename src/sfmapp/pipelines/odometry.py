@@ -22,7 +22,7 @@ from sfmapp.pipelines.kernels import compile_odometry_kernels
 from sfmapp.pipelines.listeners import DecisionLog, EventLog
 from sfmapp.pipelines.odometry_keyframes import KeyframeWatch
 from sfmapp.pipelines.odometry_results import write_odometry
-from sfmapp.pipelines.odometry_scale import ScaleWish, check_wish, parse_scale, scale_maps
+from sfmapp.pipelines.odometry_scale import ScaleWish, parse_scale, scale_maps, settled_wish
 from sfmapp.pipelines.odometry_timing import FrameLog, ThreadTimes
 from sfmapp.pipelines.options import Options, with_absolute_paths
 from sfmapp.pipelines.run import Job
@@ -130,8 +130,7 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
 
             options, run.stages["self_calibration"] = self_calibrated(run.source, options, run.threads, events)
         run.sequence = open_sequence(run.source, options.sequence, events)
-        if run.wish is not None:
-            check_wish(run.wish, run.sequence)
+        run.wish = settled_wish(run.wish, options.scale.source is None, run.sequence)
     if run.live is not None:
         run.live.begin(run.sequence)
     with run.stage("kernels"):

@@ -151,7 +151,8 @@ def make_report(
     frames = frame_summary(result)
     maps = [map_row(result, m) for m in range(len(result.maps))]
     timing = run.threads_cpu.timing(len(result.frame_idx), run.frames.tracking_s, run.sequence.frames_per_second)
-    timing["tracking_ms"] = frame_statistics(facts.time_ms)
+    if timing:
+        timing["tracking_ms"] = frame_statistics(facts.time_ms)
     return {
         "format": FORMAT,
         "outcome": _outcome(run, failure),

@@ -36,7 +36,8 @@ Array = NDArray[np.float64]
 class ScaleOptions:
     """Where metres come from when there is one camera."""
 
-    # marker:DICT:METRES, distance:FRAME:FRAME:METRES, distance:path:METRES, camera_height:METRES or imu; auto: nowhere
+    # marker:DICT:METRES, distance:FRAME:FRAME:METRES, distance:path:METRES, camera_height:METRES, imu or arbitrary;
+    # auto: the IMU where there is one
     source: str | None = None
 
 
@@ -60,8 +61,9 @@ class ScaleWish:
         return None if self.marker is None else MarkerDetector(self.marker.dictionary)
 
 
-def parse_scale(text: str) -> ScaleWish:
-    """``marker:DICT:METRES``, ``distance:A:B:METRES``, ``distance:path:METRES``, ``camera_height:METRES`` or ``imu``.
+def parse_scale(text: str) -> ScaleWish | None:
+    """``marker:DICT:METRES``, ``distance:A:B:METRES``, ``distance:path:METRES``, ``camera_height:METRES``, ``imu``, or
+    ``arbitrary``, which is None.
 
     Raises:
         UsageError: none of these.
@@ -76,22 +78,31 @@ def parse_scale(text: str) -> ScaleWish:
             return ScaleWish(text, camera_height=parse_length(rest))
         case "imu" if not rest:
             return ScaleWish(text, imu=True)
+        case "arbitrary" if not rest:
+            return None
     raise UsageError(
         f"--scale {text}: expected marker, distance, camera_height or imu",
-        "marker:DICT_4X4_50:0.16, distance:FRAME:FRAME:2.5, distance:path:120, camera_height:1.65, or imu",
+        "marker:DICT_4X4_50:0.16, distance:FRAME:FRAME:2.5, distance:path:120, camera_height:1.65, imu or arbitrary",
     )
 
 
-def check_wish(wish: ScaleWish, sequence: Sequence) -> None:
-    """Refuse what the sequence cannot give, before an hour is spent on it.
+def settled_wish(wish: ScaleWish | None, is_auto: bool, sequence: Sequence) -> ScaleWish | None:
+    """What the scale will come from; what the sequence cannot give is refused before an hour is spent on it.
+
+    Args:
+        is_auto: the user has said nothing.
 
     Raises:
         UsageError: a stereo sequence, which is in metres already, or no IMU.
     """
+    if wish is None:
+        has_imu = is_auto and sequence.imu is not None and not sequence.rig.is_stereo
+        return ScaleWish("imu", imu=True) if has_imu else None
     if sequence.rig.is_stereo:
         raise UsageError(f"--scale {wish.text}: the sequence is stereo and in metres", "leave it out, or add --mono")
     if wish.imu and sequence.imu is None:
         raise UsageError("--scale imu: the sequence has no inertial measurements", "name them: --imu FILE")
+    return wish
 
 
 def scale_maps(
@@ -178,4 +189,12 @@ def _covariance_near(result: OdometryResult, entry: MapResult, position: int) ->
 
 
 def _from_imu(result: OdometryResult, m: int, imu: Imu) -> ScaleEstimate | ScaleRefusal:
-    return ScaleRefusal("imu", "inertial measurements are not looked at yet", {})
+    from sfmapp.odometry.inertial import align_imu
+
+    entry = result.maps[m]
+    times = result.timestamps_s[np.searchsorted(result.frame_idx, entry.keyframe_frame_idx)]
+    poses = entry.reconstruction.cam_from_world[entry.keyframe_image_idx]
+    found = align_imu(times, poses, imu, is_metric=False, covariance=entry.covariance)
+    if isinstance(found, ScaleRefusal):
+        return found
+    return ScaleEstimate(found.scale, found.sigma_relative, "imu", found.evidence)

@@ -74,7 +74,8 @@ class ThreadTimes:
         return sum(seconds for (found, _), seconds in self._by_thread.items() if found == name)
 
     def timing(self, num_frames: int, tracking_s: float, rate: float | None) -> dict[str, Any]:
-        """Time of a frame: CPU milliseconds in all and of each part, and how that compares with the camera's rate."""
+        """Time of a frame: CPU milliseconds in all and of each part, and how that compares with the camera's rate;
+        empty without a frame."""
         if num_frames == 0 or self._begin is None:
             return {}
         cpu_s = self._end[0] - self._begin[0] - self.total(DRAWING)

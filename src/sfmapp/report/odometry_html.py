@@ -168,7 +168,7 @@ def scale_text(row: Mapping[str, Any]) -> str:
         return "arbitrary"
     sigma = row["scale_sigma"]
     text = f"metres, from {row['scale_source'].replace('_', ' ')}"
-    return text if sigma is None else f"{text}, \N{PLUS-MINUS SIGN}{100 * sigma:.2g} %"
+    return f"{text}, \N{PLUS-MINUS SIGN}{100 * sigma:.2g} %" if sigma else text
 
 
 def _truth(rows: Sequence[Mapping[str, Any]] | None) -> str:

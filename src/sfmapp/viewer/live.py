@@ -132,6 +132,9 @@ class LiveView:
         if self._outbox is not None:
             self._outbox.abandon()
             self._outbox = None
+        if self._recording is not None:  # of a child that was ended, now or for want of time
+            for unfinished in self._recording.parent.glob(f".{self._recording.name}.*.part"):
+                unfinished.unlink(missing_ok=True)
 
     def _send_frame(self, seen: FrameSnapshot) -> None:
         assert self._outbox is not None
@@ -306,7 +309,10 @@ def read_message(read: Callable[[int], bytes]) -> dict[str, Any] | None:
     if len(head) < 8:
         return None
     (count,) = struct.unpack("<Q", head)
-    sizes = struct.unpack(f"<{count}Q", read(8 * count))
+    table = read(8 * count)
+    if len(table) < 8 * count:
+        return None
+    sizes = struct.unpack(f"<{count}Q", table)
     parts = [bytearray(read(size)) for size in sizes]
     if any(len(part) < size for part, size in zip(parts, sizes, strict=True)):
         return None
