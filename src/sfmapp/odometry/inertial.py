@@ -183,14 +183,18 @@ def align_imu(
     graph = _Graph(
         times, poses, imu, intervals, start, gyro_bias, rotation_residual / np.sqrt(2.0), is_metric, covariance
     )
-    alignment = graph.solve(evidence)
-    if isinstance(alignment, InertialAlignment) and alignment.sigma_relative > options.max_sigma_relative:
-        reason = (
-            f"the motion gives the scale to {alignment.sigma_relative:.0%} only, at most "
-            f"{options.max_sigma_relative:.0%} are allowed: move and turn the camera more briskly"
-        )
-        return ScaleRefusal("imu", reason, alignment.evidence)
-    return alignment
+    return _accept(graph.solve(evidence), options)
+
+
+def _accept(found: InertialAlignment | ScaleRefusal, options: InertialOptions) -> InertialAlignment | ScaleRefusal:
+    """Refuse a scale that is too uncertain."""
+    if isinstance(found, ScaleRefusal) or found.sigma_relative <= options.max_sigma_relative:
+        return found
+    reason = (
+        f"the motion gives the scale to {found.sigma_relative:.0%} only, at most "
+        f"{options.max_sigma_relative:.0%} are allowed: move and turn the camera more briskly"
+    )
+    return ScaleRefusal("imu", reason, found.evidence)
 
 
 def _choose_poses(times: Array, poses: Array, options: InertialOptions) -> Ints:
