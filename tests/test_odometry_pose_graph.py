@@ -203,7 +203,8 @@ def test_what_moves_as_one_keeps_its_images(small_map: KeyframeMap) -> None:
     before = [k.xy[:, 0].copy() for k in small_map.keyframes]
     move = random_similarity(np.random.default_rng(5))
     apply_corrections(small_map, np.tile(move, (12, 1)))
-    assert small_map.num_points == 60 and np.isnan(small_map.point_xyz[7]).all()
+    assert small_map.num_points == 60
+    assert np.isnan(small_map.point_xyz[7]).all()
     for keyframe, xy in zip(small_map.keyframes, before, strict=True):
         in_camera = rigid3.apply(keyframe.rig_from_world, small_map.point_xyz[keyframe.point_id])
         assert np.allclose(project(small_map.rig.cameras[0], in_camera), xy, atol=1e-8, equal_nan=True)

@@ -47,6 +47,7 @@ class LoopOptions:
     min_gap: int = 10  # keyframes just before one that are no loop
     min_shared: int = 15  # keyframes that share so many points are neighbours, no loop (ORB-SLAM)
     min_views: int = 3  # keyframes in which a loop must be seen
+    min_agreement: float = 0.6  # least mean over the views of the share of points in view that agree
     max_misses: int = 1  # keyframes in between that may fail to see it
     max_drift: float = 0.15  # stereo: longest correction, share of the way between
     max_drift_mono: float = 0.5  # the same where the scale drifts as well
@@ -115,6 +116,11 @@ class LoopFinder:
         self.options = options
         self._suspicion: _Suspicion | None = None
 
+    @property
+    def is_suspicious(self) -> bool:
+        """A loop was seen and waits for more keyframes to see it: show every one, those that are no place as well."""
+        return self._suspicion is not None
+
     def reset(self) -> None:
         """Forget what is suspected: the map has changed under it, or another has begun."""
         self._suspicion = None
@@ -126,7 +132,8 @@ class LoopFinder:
 
         Args:
             maps: by their numbers.
-            map_idx, frame_idx: the keyframe, which ``places`` must know; view: as ``places.add`` returned it.
+            map_idx, frame_idx: the keyframe, which ``places`` knows; while a loop is suspected any keyframe.
+            view: as ``places.add`` returned it, or its image, points and their ids.
 
         Returns:
             A loop once it is certain. The maps are only read.
@@ -169,15 +176,18 @@ class LoopFinder:
         seen = None
         if old_map is not None:
             pose = similarity.transform_poses(suspicion.old_from_new, keyframes.keyframes[new_idx].rig_from_world)
-            last_old = suspicion.views[0].new_idx - self.options.min_gap if old_map is keyframes else None
-            old_idx = _nearest_keyframe(old_map, pose, last_old)
-            if old_idx is not None and old_map.keyframes[old_idx].frame_idx in places:
+            last_old = max(0, suspicion.views[0].new_idx - self.options.min_gap) if old_map is keyframes else None
+            old_idx = _nearest_place(old_map, places, pose, last_old)
+            if old_idx is not None:
                 seen = self._seen_near(old_map, places, view, new_idx, old_idx, pose)
         if seen is not None:
             trial = _Suspicion(suspicion.old_map, suspicion.old_from_new, [*suspicion.views, seen])
             if self._fits(maps, map_idx, trial):
                 self._suspicion = trial
                 if len(trial.views) < self.options.min_views:
+                    return None
+                if np.mean([v.located.agreement for v in trial.views]) < self.options.min_agreement:
+                    self._suspicion = None
                     return None
                 self._suspicion = None
                 return self._closure(maps, map_idx, trial)
@@ -245,16 +255,16 @@ class LoopFinder:
         )  # fmt: skip
 
 
-def _nearest_keyframe(keyframes: KeyframeMap, pose: Array, last: int | None) -> int | None:
-    """The keyframe, up to a last one, that looks from nearest in nearly the same direction: distance over its depth,
-    plus radians between the axes."""
-    poses = np.array([k.rig_from_world for k in keyframes.keyframes[: None if last is None else max(last, 0)]])
-    if not len(poses):
+def _nearest_place(keyframes: KeyframeMap, places: Places, pose: Array, last: int | None) -> int | None:
+    """The keyframe before a last one that is a place and looks from nearest in nearly the same direction: distance over
+    its depth, plus radians between the axes."""
+    known = np.array([n for n, k in enumerate(keyframes.keyframes[:last]) if k.frame_idx in places], np.int64)
+    if not len(known):
         return None
-    distance = np.linalg.norm(rigid3.center(poses) - rigid3.center(pose), axis=1)
-    distance /= keyframe_depths(keyframes)[: len(poses)]
+    poses = np.array([keyframes.keyframes[n].rig_from_world for n in known])
+    distance = np.linalg.norm(rigid3.center(poses) - rigid3.center(pose), axis=1) / keyframe_depths(keyframes)[known]
     axis = rigid3.rotation_matrix(poses)[:, 2] @ rigid3.rotation_matrix(pose)[2]
-    return int(np.argmin(distance + np.arccos(np.clip(axis, -1.0, 1.0))))
+    return int(known[np.argmin(distance + np.arccos(np.clip(axis, -1.0, 1.0)))])
 
 
 def _initial_similarity(keyframes: KeyframeMap, view: LoopView, options: LoopOptions) -> Array | None:

@@ -40,7 +40,7 @@ _SIGMA_RANGE_PX = (1.6, _LEVEL_SIGMA_PX * 2 ** (_NUM_LEVELS - 1))
 # Descriptors that a vocabulary is learnt from, in all: 250 for each of 64 words.
 _SAMPLE_SIZE = 16384
 # Places that stand for one: of neighbours in time only the most similar is a candidate.
-_ISLAND = 5
+_ISLAND = 3
 _BLOCK = 256
 
 
@@ -50,7 +50,7 @@ class PlaceOptions:
 
     max_points: int = 400  # points described per keyframe, those followed longest; 128 bytes each
     num_words: int = 64  # size of the vocabulary; 256 bytes a word and keyframe
-    learn_after: int = 20  # keyframes after which the vocabulary is learnt first
+    learn_after: int = 10  # keyframes after which the vocabulary is learnt first
     min_similarity: float = 0.3  # least similarity of a candidate, in those of keyframes that follow each other (DBoW2)
     num_candidates: int = 3  # places tried for one image, at most
 

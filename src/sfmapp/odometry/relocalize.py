@@ -192,9 +192,10 @@ def local_points(keyframes: KeyframeMap, places: Places, frame_idx: int, num_nei
     first of these that has it."""
     around = [position_of(keyframes, frame_idx)]
     shared = shared_points(keyframes, around[0])
+    shared[[k.frame_idx not in places for k in keyframes.keyframes]] = 0
     shared[around[0]] = 0
     best = np.argsort(-shared, kind="stable")[:num_neighbors]
-    around += [int(k) for k in best if shared[k] > 0 and keyframes.keyframes[k].frame_idx in places]
+    around += [int(k) for k in best if shared[k] > 0]
     parts = []
     for k in around:
         keyframe = keyframes.keyframes[k]

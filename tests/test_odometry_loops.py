@@ -1,0 +1,507 @@
+"""Places, relocalisation, loops and joined maps, before textured walls whose images are known exactly."""
+
+from __future__ import annotations
+
+import copy
+
+import cv2
+import numpy as np
+import pytest
+
+from sfmapp.geometry import rigid3, similarity
+from sfmapp.odometry import relocalize as relocalization
+from sfmapp.odometry.closing import apply_closure, fuse_points, join_maps
+from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.loops import LoopFinder, LoopOptions
+from sfmapp.odometry.places import Candidate, PlaceOptions, Places, View
+from sfmapp.odometry.pose_graph import apply_corrections
+from sfmapp.odometry.relocalize import (
+    RelocalizeOptions,
+    is_beyond_chance,
+    is_convincing,
+    locate,
+    relocalize,
+    twist,
+)
+from sfmapp.scene.camera import CameraModel, project, simple_camera
+from sfmapp.scene.rig import Rig
+
+Array = np.ndarray
+
+CAMERA = simple_camera(CameraModel.SIMPLE_PINHOLE, 320, 240, 280.0)
+PX_PER_M = 80.0
+OPTIONS = RelocalizeOptions()
+
+
+def texture(seed: int, height: int = 1024, width: int = 2048) -> Array:
+    """Blotches of all sizes and hard-edged patches: corners everywhere, no two alike."""
+    rng = np.random.default_rng(seed)
+    out = np.zeros((height, width), np.float32)
+    for level in range(2, 8):
+        coarse = rng.normal(size=(height >> level, width >> level)).astype(np.float32)
+        out += cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    out *= 18.0
+    for _ in range(height * width // 2500):
+        x, y = rng.integers(0, width), rng.integers(0, height)
+        w, h = rng.integers(8, 40, 2)
+        out[y : y + h, x : x + w] += rng.uniform(-60, 60)
+    return np.clip(out + 128, 0, 255).astype(np.uint8)
+
+
+class Wall:
+    """The plane z = 0, its texture's corner at the origin; cameras stand at negative z and look along z."""
+
+    def __init__(self, image: Array) -> None:
+        self.image = image
+
+    def photograph(self, pose: Array, seed: int, gain: float = 1.0) -> Array:
+        rotation = rigid3.rotation_matrix(pose)
+        plane = np.column_stack([rotation[:, 0], rotation[:, 1], pose[4:]])
+        shift = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])
+        to_wall = np.diag([1 / PX_PER_M, 1 / PX_PER_M, 1.0]) @ np.linalg.inv(shift)
+        h = shift @ CAMERA.k_matrix @ plane @ to_wall
+        seen = cv2.warpPerspective(self.image, h, (CAMERA.width, CAMERA.height), flags=cv2.INTER_LINEAR)
+        noise = np.random.default_rng(seed).normal(0.0, 2.0, seen.shape)
+        return np.clip(gain * seen.astype(np.float64) + noise, 0, 255).astype(np.uint8)
+
+    @staticmethod
+    def points(pose: Array, xy: Array) -> Array:
+        """Where the rays of pixels meet the wall."""
+        rays = np.column_stack([(xy - [160.0, 120.0]) / 280.0, np.ones(len(xy))]) @ rigid3.rotation_matrix(pose)
+        center = rigid3.center(pose)
+        return center - rays * (center[2] / rays[:, 2:])
+
+
+def corners(image: Array, count: int = 250) -> Array:
+    found = cv2.goodFeaturesToTrack(image, count, 0.01, 7)
+    return found[:, 0].astype(np.float64) + 0.5
+
+
+def pose_at(x: float, y: float, distance: float = 3.0, roll_deg: float = 0.0, yaw_deg: float = 0.0) -> Array:
+    turn = rigid3.exp_so3([0, 0, np.radians(roll_deg)]) @ rigid3.exp_so3([0, np.radians(yaw_deg), 0])
+    return rigid3.from_matrix(turn, -turn @ np.array([x, y, -distance]))
+
+
+class Walker:
+    """Makes a map keyframe by keyframe: points are followed as long as they stay in view, exactly but for noise."""
+
+    def __init__(self, wall: Wall, map_idx: int = 0, noise_px: float = 0.3) -> None:
+        self.wall, self.map_idx, self.noise_px = wall, map_idx, noise_px
+        self.keyframes = KeyframeMap(Rig.single(CAMERA))
+        self.rng = np.random.default_rng(17 + map_idx)
+        self.images: dict[int, Array] = {}
+        self._alive = np.zeros(0, np.int64)
+
+    def step(self, frame_idx: int, pose: Array) -> Keyframe:
+        image = self.wall.photograph(pose, frame_idx)
+        self.images[frame_idx] = image
+        xy = project(CAMERA, rigid3.apply(pose, self.keyframes.point_xyz[self._alive]))
+        inside = ((xy > 4) & (xy < [316, 236])).all(1)
+        ids, xy = self._alive[inside], xy[inside]
+        fresh = corners(image)
+        if len(xy):
+            fresh = fresh[np.linalg.norm(fresh[:, None] - xy[None], axis=2).min(1) > 6]
+        new = self.keyframes.new_points(len(fresh))
+        self.keyframes.point_xyz[new] = self.wall.points(pose, fresh)
+        self._alive = np.concatenate([ids, new])
+        xy = np.concatenate([xy, fresh]) + self.noise_px * self.rng.normal(size=(len(self._alive), 2))
+        seen = np.ones((len(xy), 1), bool)
+        keyframe = Keyframe(frame_idx, 0.1 * frame_idx, f"{frame_idx:04d}", pose, self._alive.copy(), xy[:, None], seen)
+        self.keyframes.keyframes.append(keyframe)
+        return keyframe
+
+    def add_to(self, places: Places, keyframe: Keyframe) -> View:
+        image = self.images[keyframe.frame_idx]
+        return places.add(self.map_idx, keyframe.frame_idx, image, keyframe.xy[:, 0], keyframe.point_id)
+
+
+def round_trip() -> list[Array]:
+    """Right along the wall, down, back to the left, up to where it began, and on for a while."""
+    way = [(4 + 0.6 * k, 4.0) for k in range(20)]
+    way += [(16.0, 4 + 0.6 * k) for k in range(1, 7)]
+    way += [(16 - 0.6 * k, 8.2) for k in range(20)]
+    way += [(4.0, 8.2 - 0.6 * k) for k in range(1, 7)]
+    way += [(4 + 0.6 * k, 4.2) for k in range(6)]
+    return [
+        pose_at(x, y, 3.0 + 0.2 * np.sin(k), 2 * np.sin(0.7 * k), 3 * np.cos(0.4 * k)) for k, (x, y) in enumerate(way)
+    ]
+
+
+@pytest.fixture(scope="module")
+def wall() -> Wall:
+    return Wall(texture(1))
+
+
+@pytest.fixture(scope="module")
+def _walked(wall: Wall) -> tuple[Walker, Places]:
+    walker, places = Walker(wall), Places()
+    for n, pose in enumerate(round_trip()[:30]):
+        walker.add_to(places, walker.step(n, pose))
+    return walker, places
+
+
+@pytest.fixture
+def walked(_walked: tuple[Walker, Places]) -> tuple[KeyframeMap, Places]:
+    walker, places = copy.deepcopy((_walked[0].keyframes, _walked[1]))
+    return walker, places
+
+
+# ------------------------------------------------------------------------------------------------------ views, places
+
+
+def test_descriptors_bear_noise_scale_and_a_known_roll(wall: Wall) -> None:
+    """The right corner is the nearest one for nine in ten, at the right scale and roll, and for few without them."""
+    here = pose_at(8, 6)
+    before = View(wall.photograph(here, 0), corners(wall.photograph(here, 0)))
+    xyz = wall.points(here, before.xy)
+
+    def hits(there: Array, scale: float, roll: float) -> float:
+        xy = project(CAMERA, rigid3.apply(there, xyz))
+        inside = ((xy > 15) & (xy < [305, 225])).all(1)
+        after = View(wall.photograph(there, 1, 0.8), xy[inside])
+        products = after.descriptors(scale, roll).astype(np.float32) @ before.descriptors().T.astype(np.float32)
+        return float((products.argmax(1) == np.flatnonzero(inside)).mean())
+
+    assert hits(here, 1.0, 0.0) > 0.97
+    assert hits(pose_at(8, 6, 3.0 / 1.35), 1.35, 0.0) > 0.85
+    assert hits(pose_at(8, 6, 3.0 * 1.35), 1 / 1.35, 0.0) > 0.85
+    turned = pose_at(8, 6, roll_deg=40)
+    assert hits(turned, 1.0, np.radians(40)) > 0.85
+    assert hits(turned, 1.0, 0.0) < 0.3
+    assert hits(turned, 1.0, np.radians(-40)) < 0.3
+
+
+def test_twist_is_the_roll_between_cameras() -> None:
+    rng = np.random.default_rng(0)
+    for angle in (-3.0, -0.7, 0.0, 0.4, 2.9):
+        base = rigid3.exp_so3(rng.normal(size=3))
+        assert twist(rigid3.exp_so3([0, 0, angle]) @ base, base) == pytest.approx(angle)
+        tilted = rigid3.exp_so3([0.2, -0.3, 0.0]) @ rigid3.exp_so3([0, 0, angle]) @ base
+        assert np.cos(twist(tilted, base) - angle) > np.cos(0.05)
+
+
+def test_places_find_the_revisit(walked: tuple[KeyframeMap, Places], wall: Wall) -> None:
+    keyframes, places = walked
+    for n in (2, 9, 17, 25):
+        pose = keyframes.keyframes[n].rig_from_world.copy()
+        pose[4] += 0.25
+        image = wall.photograph(pose, 999, 1.2)
+        found = places.query_view(View(image, corners(image)))
+        assert abs(found[0].frame_idx - n) <= 1
+        assert found[0].similarity > 2 * found[-1].similarity
+
+
+def test_places_are_small_and_the_same_twice(wall: Wall) -> None:
+    rng = np.random.default_rng(0)
+    tables = []
+    for _ in range(2):
+        places = Places(PlaceOptions(learn_after=4))
+        rng = np.random.default_rng(0)
+        for n in range(20):
+            image = rng.integers(0, 255, (60, 80), np.uint8)
+            ids = np.arange(1000)
+            places.add(0, n, image, rng.uniform(5, 55, (1000, 2)), ids)
+        kept = places[3]
+        size = kept.point_id.nbytes + kept.xy.nbytes + kept.descriptors.nbytes + places._vectors[0].nbytes
+        assert size < 100_000
+        assert len(kept.point_id) == PlaceOptions().max_points
+        tables.append(places._vectors[: len(places)].tobytes())
+    assert tables[0] == tables[1]
+
+
+def test_places_follow_what_happens_to_keyframes_and_points(walked: tuple[KeyframeMap, Places]) -> None:
+    _, places = walked
+    before = places[5]
+    a, b = int(before.point_id[3]), int(before.point_id[10])
+    places.rename_points(0, np.array([b]), np.array([a]))
+    assert b not in places[5].point_id
+    assert len(places[5].point_id) == len(before.point_id) - 1
+    assert (np.diff(places[5].point_id) > 0).all()
+    at = np.searchsorted(places[5].point_id, a)
+    assert np.array_equal(places[5].descriptors[at], before.descriptors[3])
+    vector = places._vectors[places._row[9]].copy()
+    places.remove(5)
+    assert 5 not in places
+    assert len(places) == 29
+    assert np.array_equal(places._vectors[places._row[9]], vector)
+    assert all(c.frame_idx != 5 for c in places.query(4))
+    places.move_map(0, 3, 1000)
+    assert places[9].map_idx == 3
+    assert places[9].point_id.min() >= 1000
+    assert places.query(4, other_maps=True) == []
+
+
+# ------------------------------------------------------------------------------------------------------ relocalisation
+
+
+def test_a_lost_image_is_found_again(walked: tuple[KeyframeMap, Places], wall: Wall) -> None:
+    keyframes, places = walked
+    for x, y, distance, roll in [(7.3, 4.4, 3.0, 0), (10.2, 3.7, 3.6, 8), (15.2, 5.9, 2.5, -6), (13.0, 8.0, 2.6, 0)]:
+        pose = pose_at(x, y, distance, roll, 4.0)
+        image = wall.photograph(pose, 999, 1.2)
+        found = relocalize({0: keyframes}, places, View(image, corners(image)), OPTIONS)
+        assert found is not None
+        located = found.located
+        error = np.linalg.norm(rigid3.center(located.cam_from_world) - rigid3.center(pose))
+        # corners are found again to about a pixel: 0.01 m at 3 m, over 50 points and more less
+        assert error < 0.03
+        assert len(located.point_id) >= 40
+        assert located.agreement > 0.7
+        seen = project(CAMERA, rigid3.apply(pose, keyframes.point_xyz[located.point_id]))
+        assert np.median(np.linalg.norm(seen - corners(image)[located.corner_idx], axis=1)) < 1.5
+
+
+def test_a_turned_image_is_found_at_the_roll_it_is_tried_with(walked: tuple[KeyframeMap, Places], wall: Wall) -> None:
+    keyframes, places = walked
+    image = wall.photograph(pose_at(8.0, 4.1, 3.0, 28.0), 999)
+    assert relocalize({0: keyframes}, places, View(image, corners(image)), OPTIONS, np.radians(25)) is not None
+
+
+def test_an_unknown_place_is_not_found(walked: tuple[KeyframeMap, Places]) -> None:
+    keyframes, places = walked
+    other = Wall(texture(77))
+    for n in range(6):
+        image = other.photograph(pose_at(4 + 2 * n, 5, 3.0), n)
+        assert relocalize({0: keyframes}, places, View(image, corners(image)), OPTIONS) is None
+
+
+def test_the_same_poster_elsewhere_is_refused(walked: tuple[KeyframeMap, Places], wall: Wall) -> None:
+    """A third of the image is exactly what was there, all else is not: many matches agree, and the rest contradicts."""
+    keyframes, places = walked
+    here = pose_at(8.2, 4.0)
+    elsewhere = texture(78)
+    xy = (np.array([8.2, 4.0]) * PX_PER_M).astype(int)
+    part = (slice(xy[1] - 45, xy[1] + 45), slice(xy[0] - 65, xy[0] + 65))
+    elsewhere[part] = wall.image[part]
+    image = Wall(elsewhere).photograph(here, 5)
+    view = View(image, corners(image))
+    found = [locate(keyframes, places, view, Candidate(0, n, 1.0), OPTIONS, 0.0) for n in (6, 7, 8)]
+    assert any(f is not None and len(f.point_id) >= OPTIONS.min_inliers for f in found)
+    assert not any(f is not None and is_convincing(f, view, OPTIONS) for f in found)
+    assert relocalize({0: keyframes}, places, view, OPTIONS) is None
+    # the same image on its own wall is believed
+    image = wall.photograph(here, 5)
+    assert relocalize({0: keyframes}, places, View(image, corners(image)), OPTIONS) is not None
+
+
+def test_six_wrong_matches_in_ten(
+    walked: tuple[KeyframeMap, Places], wall: Wall, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keyframes, places = walked
+    right = relocalization.match_points
+
+    def mostly_wrong(*args: object) -> tuple[Array, Array]:
+        point, corner = right(*args)  # type: ignore[arg-type]
+        wrong = np.random.default_rng(0).permutation(len(point))[: int(0.6 * len(point))]
+        corner[wrong] = np.roll(corner[wrong], 7)
+        return point, corner
+
+    monkeypatch.setattr(relocalization, "match_points", mostly_wrong)
+    pose = pose_at(9.1, 4.2, 3.2)
+    image = wall.photograph(pose, 999)
+    found = relocalize({0: keyframes}, places, View(image, corners(image)), OPTIONS)
+    assert found is not None
+    assert np.linalg.norm(rigid3.center(found.located.cam_from_world) - rigid3.center(pose)) < 0.03
+
+
+def test_chance_is_told_from_agreement() -> None:
+    """Of random matches no pose explains enough, whatever its best; a handful of exact ones is enough."""
+    from sfmapp.geometry.resection import estimate_pose
+
+    rng = np.random.default_rng(0)
+    limit, most = OPTIONS.error_px(CAMERA), 0
+    for _ in range(20):
+        xyz = rng.uniform([-3, -2, 3], [3, 2, 9], (100, 3))
+        xy = rng.uniform([0, 0], [320, 240], (100, 2))
+        found = estimate_pose(xyz, (xy - [160, 120]) / 280.0, limit / 280.0, max_iterations=1000)
+        if found is not None:
+            most = max(most, found.num_inliers)
+            assert not is_beyond_chance(found.num_inliers, 100, limit, CAMERA)
+    assert 4 <= most <= 8
+    assert is_beyond_chance(14, 100, limit, CAMERA)
+    assert is_beyond_chance(8, 12, limit, CAMERA)
+
+
+# ------------------------------------------------------------------------------------------------------ loops
+
+
+def drift(num: int, sigma: float, seed: int, poses: list[Array]) -> Array:
+    """(K, 8) a random walk of similarities, each step about the keyframe's own centre."""
+    rng = np.random.default_rng(seed)
+    out = [similarity.IDENTITY]
+    for k in range(1, num):
+        e = sigma * rng.normal(size=7)
+        step = similarity.from_parts(rigid3.exp_so3(0.3 * e[:3]), e[3:6], float(np.exp(e[6])))
+        here = np.append(rigid3.inverse(poses[k]), 1.0)
+        local = similarity.compose(here, similarity.compose(step, similarity.inverse(here)))
+        out.append(similarity.compose(out[-1], local))
+    return np.array(out)
+
+
+def rms_error(keyframes: KeyframeMap, truth: list[Array]) -> float:
+    poses = np.array([k.rig_from_world for k in keyframes.keyframes])
+    b_from_a = similarity.align_poses(poses, np.array(truth)).b_from_a
+    error = similarity.apply(b_from_a, rigid3.center(poses)) - rigid3.center(np.array(truth))
+    return float(np.sqrt((error**2).sum(1).mean()))
+
+
+def walk_with_drift(wall: Wall, sigma: float, seed: int) -> tuple[Walker, list[Array], list[Array]]:
+    """All keyframes of the round trip in a map that has drifted, their true poses, and the similarity of the end."""
+    walker, truth = Walker(wall), round_trip()
+    for n, pose in enumerate(truth):
+        walker.step(n, pose)
+    moves = drift(len(truth), sigma, seed, truth)
+    apply_corrections(walker.keyframes, moves)
+    return walker, truth, list(moves)
+
+
+def test_a_loop_is_closed(wall: Wall) -> None:
+    walker, truth, moves = walk_with_drift(wall, 0.01, 4)
+    keyframes, everything = walker.keyframes, walker.keyframes.keyframes
+    places, finder, closure = Places(), LoopFinder(), None
+    keyframes.keyframes = []
+    for n, keyframe in enumerate(everything):
+        keyframes.keyframes.append(keyframe)
+        closure = finder.find({0: keyframes}, 0, places, n, walker.add_to(places, keyframe))
+        if closure is not None:
+            break
+    assert closure is not None
+    last = len(keyframes.keyframes)
+    views = closure.views
+    assert len(views) == LoopOptions().min_views
+    assert all(v.old_idx < 20 and v.new_idx >= 40 for v in views)
+    assert np.linalg.norm(rigid3.center(truth[views[0].new_idx]) - rigid3.center(truth[views[0].old_idx])) < 1.5
+    # the similarity is that of the drift between both sides
+    true = similarity.compose(moves[views[-1].old_idx], similarity.inverse(moves[views[-1].new_idx]))
+    center = rigid3.center(keyframes.keyframes[-1].rig_from_world)
+    lost = np.linalg.norm(similarity.apply(true, center) - center)
+    left = np.linalg.norm(similarity.apply(true, center) - similarity.apply(closure.old_from_new, center))
+    assert left < 0.25 * lost
+    assert left < 0.1
+    assert abs(np.log(closure.old_from_new[7] / true[7])) < 0.05
+    # each pair is one spot of the wall
+    spots = wall_spots(walker, moves)
+    pairs = closure.point_pairs
+    assert len(pairs) > 60
+    assert len(np.unique(pairs[:, 0])) == len(np.unique(pairs[:, 1])) == len(pairs)
+    assert np.median(np.linalg.norm(spots[pairs[:, 0]] - spots[pairs[:, 1]], axis=1)) < 0.03
+    before = rms_error(keyframes, truth[:last])
+    closed = apply_closure(keyframes, places, closure)
+    after = rms_error(keyframes, truth[:last])
+    # a walk pinned at its end keeps the middle's error: some of it goes, not all
+    assert 0.15 * before < after < 0.75 * before
+    assert closed.corrections.shape == (last, 8)
+    assert np.allclose(closed.corrections[0], similarity.IDENTITY)
+    for keyframe in keyframes.keyframes:
+        assert (np.diff(keyframe.point_id) > 0).all()
+        assert not np.isin(closed.renamed[:, 0], keyframe.point_id).any()
+        assert len(keyframe.xy) == len(keyframe.is_inlier) == len(keyframe.point_id)
+    assert np.isnan(keyframes.point_xyz[closed.renamed[:, 0], 0]).all()
+    shared = np.intersect1d(keyframes.keyframes[-1].point_id, keyframes.keyframes[views[-1].old_idx].point_id)
+    assert len(shared) >= 20
+    assert all((np.diff(places[k.frame_idx].point_id) > 0).all() for k in keyframes.keyframes)
+
+
+def wall_spots(walker: Walker, moves: list[Array]) -> Array:
+    """True places of all points of a map that was moved."""
+    out = np.full((walker.keyframes.num_points, 3), np.nan)
+    for pose, keyframe in zip(round_trip(), walker.keyframes.keyframes, strict=False):
+        out[keyframe.point_id] = walker.wall.points(pose, keyframe.xy[:, 0])
+    return out
+
+
+def walk_along(image: Array, options: LoopOptions) -> bool:
+    """Whether a loop is found on the way along a wall, on to new places all the time."""
+    walker, places, finder, found = Walker(Wall(image)), Places(), LoopFinder(options), False
+    for n in range(30):
+        keyframe = walker.step(n, pose_at(3 + 0.6 * n, 5.5 + 0.02 * n))
+        found |= finder.find({0: walker.keyframes}, 0, places, n, walker.add_to(places, keyframe)) is not None
+    return found
+
+
+def test_a_wall_that_repeats_itself_is_no_loop(wall: Wall) -> None:
+    """After eight metres all is as before. Only the way between can tell, and it does."""
+    image = wall.image.copy()
+    image[:, 960:1600] = image[:, 320:960]
+    assert not walk_along(wall.image, LoopOptions())
+    assert not walk_along(image, LoopOptions())
+    assert walk_along(image, LoopOptions(max_drift_mono=10.0))
+
+
+def test_a_wall_that_repeats_half_of_itself_is_no_loop(wall: Wall) -> None:
+    """The upper half of what is in view is as before: even if the map could be anywhere, the lower half contradicts."""
+    image = wall.image.copy()
+    image[:475, 960:1600] = image[:475, 320:960]
+    assert not walk_along(image, LoopOptions(max_drift_mono=10.0))
+
+
+def test_a_correction_that_nobody_could_have_lost_is_refused(wall: Wall) -> None:
+    walker, _, _ = walk_with_drift(wall, 0.0, 0)
+    keyframes, everything = walker.keyframes, walker.keyframes.keyframes
+    # the way back is torn from the way there by more than half of its length
+    tear = similarity.from_parts(np.eye(3), [40.0, 0.0, 0.0], 1.0)
+    apply_corrections(keyframes, np.array([similarity.IDENTITY if n < 49 else tear for n in range(len(everything))]))
+    places, finder = Places(), LoopFinder()
+    keyframes.keyframes = []
+    for n, keyframe in enumerate(everything):
+        keyframes.keyframes.append(keyframe)
+        assert finder.find({0: keyframes}, 0, places, n, walker.add_to(places, keyframe)) is None
+
+
+def test_two_halves_become_one(wall: Wall) -> None:
+    places, finder = Places(), LoopFinder()
+    first, second = Walker(wall, 0), Walker(wall, 1)
+    truth = round_trip()
+    for n, pose in enumerate(truth[:28]):
+        first.add_to(places, first.step(n, pose))
+    there = similarity.from_parts(rigid3.exp_so3([0.3, -0.5, 0.2]), [5.0, -3.0, 1.0], 1.8)
+    back = [pose_at(12 - 0.6 * k, 4.15, 3.1) for k in range(12)]
+    for pose in back:
+        second.step(100 + len(second.images), pose)
+    apply_corrections(second.keyframes, np.tile(there, (12, 1)))
+    maps, everything, closure = {0: first.keyframes, 1: second.keyframes}, second.keyframes.keyframes, None
+    second.keyframes.keyframes = []
+    for keyframe in everything:
+        second.keyframes.keyframes.append(keyframe)
+        view = second.add_to(places, keyframe)
+        closure = finder.find(maps, 1, places, keyframe.frame_idx, view)
+        if closure is not None:
+            break
+    assert closure is not None
+    assert (closure.new_map, closure.old_map) == (1, 0)
+    both = similarity.compose(closure.old_from_new, there)
+    assert both[7] == pytest.approx(1.0, abs=0.02)
+    assert np.linalg.norm(similarity.apply(both, [12.0, 4.0, 0.0]) - [12.0, 4.0, 0.0]) < 0.03
+    count = len(second.keyframes.keyframes)
+    joined = join_maps(maps, places, closure)
+    assert (joined.kept_map, joined.absorbed_map) == (0, 1)
+    frames = [k.frame_idx for k in joined.keyframes.keyframes]
+    assert frames == [*range(28), *range(100, 100 + count)]
+    assert rms_error(joined.keyframes, truth[:28] + back[:count]) < 0.02
+    assert joined.id_offset == first.keyframes.num_points
+    assert joined.keyframes.num_points == first.keyframes.num_points + second.keyframes.num_points
+    assert all(places[f].map_idx == 0 for f in frames)
+    shared = np.intersect1d(joined.keyframes.keyframes[-1].point_id, np.arange(joined.id_offset))
+    assert len(shared) >= 40
+    # the maps that were given are as they were
+    assert len(first.keyframes.keyframes) == 28
+    assert second.keyframes.keyframes[0].point_id.max() < joined.id_offset
+    with pytest.raises(ValueError, match="join_maps"):
+        apply_closure(first.keyframes, places, closure)
+
+
+def test_fusing_points_keeps_the_older_observation() -> None:
+    keyframes = KeyframeMap(Rig.single(CAMERA))
+    ids = keyframes.new_points(6)
+    keyframes.point_xyz[:6] = np.arange(18.0).reshape(6, 3)
+    keyframes.point_xyz[1] = np.nan
+    xy = np.arange(8.0).reshape(4, 1, 2)
+    keyframes.keyframes.append(Keyframe(0, 0.0, "0", rigid3.IDENTITY, ids[[0, 1, 4, 5]], xy, np.zeros((4, 1), bool)))
+    fuse_points(keyframes, np.array([[4, 1], [5, 2]]))
+    keyframe = keyframes.keyframes[0]
+    assert list(keyframe.point_id) == [0, 1, 2]
+    assert np.array_equal(keyframe.xy[:, 0, 0], [0.0, 2.0, 6.0])
+    assert list(keyframe.is_inlier[:, 0]) == [False, False, True]
+    assert np.array_equal(keyframes.point_xyz[1], [12.0, 13.0, 14.0])  # it had none of its own
+    assert np.array_equal(keyframes.point_xyz[2], [6.0, 7.0, 8.0])
+    assert np.isnan(keyframes.point_xyz[[4, 5], 0]).all()
