@@ -41,7 +41,7 @@ from sfmapp.pipelines.evaluate import evaluate
 ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))
 # one of each kind, as render_sequences.py lays them out
-RENDERED = {"street": (), "street-mono": ("--mono",), "hall": (), "hall-mono": ("--mono",), "room": ()}
+RENDERED = (("street", ()), ("street", ("--mono",)), ("hall", ()), ("hall", ("--mono",)), ("room", ()))
 # what a run with the same seed has to write again byte for byte; other files hold times
 REPEATABLE = ("trajectory*.tum", "trajectory.kitti*", "covariance.csv", "sparse/*/*.bin")
 
@@ -64,32 +64,27 @@ def find_cases(args: argparse.Namespace) -> list[Case]:
     if kitti.is_dir():
         for name, flags in (("", ()), (" step 2", ("--step", "2")), (" backwards", ("--reverse",))):
             cases.append(Case(f"kitti00-200{name}", kitti, flags))
-    for name, flags in RENDERED.items() if args.rendered else ():
-        folder = args.rendered_folder / f"{name}-{args.rendered}"
-        if not folder.is_dir():
-            place = name.partition("-")[0]
-            script = [sys.executable, str(ROOT / "benchmarks" / "render_sequences.py"), place, str(folder)]
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            subprocess.run([*script, "--frames", str(args.rendered), *flags], check=True, stdout=sys.stderr)
-        cases.append(Case(f"rendered {name}", folder))
+    for place, flags in RENDERED if args.rendered else ():
+        folder = args.rendered_folder / f"{place}-{args.rendered}"
+        cases.append(Case(" ".join([f"rendered {place}", *(flag.strip("-") for flag in flags)]), folder, flags))
     return cases
+
+
+def render(folder: Path, frames: int) -> None:
+    """Make a rendered sequence if it is not there; half of one is none."""
+    if not folder.is_dir():
+        half = folder.with_name(f".{folder.name}.{os.getpid()}")
+        script = [sys.executable, str(ROOT / "benchmarks" / "render_sequences.py"), folder.name.partition("-")[0]]
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        subprocess.run([*script, str(half), "--frames", str(frames)], check=True, stdout=sys.stderr)
+        half.rename(folder)
 
 
 def run_sfmapp(case: Case, out: Path, args: argparse.Namespace) -> dict[str, Any]:
     """One run of the command in a fresh workspace."""
     script = Path(sys.executable).with_name("sfmapp")
-    command = [
-        str(script),
-        "odometry",
-        str(case.sequence),
-        "-o",
-        str(out),
-        "--seed",
-        str(args.seed),
-        "-q",
-        "--no-record",
-    ]
-    command += ["--threads", str(args.threads)] if args.threads else []
+    command = [str(script), "odometry", str(case.sequence), "-o", str(out), "--seed", str(args.seed), "-q"]
+    command += ["--no-record", *(["--threads", str(args.threads)] if args.threads else [])]
     command += [*case.flags, *(flag for setting in args.set for flag in ("--set", setting))]
     usage = run_measured(command, out.with_suffix(".log"))
     if usage.exit_code:
@@ -192,6 +187,8 @@ def run_peer(case: Case, work: Path, args: argparse.Namespace) -> dict[str, Any]
 def measure(cases: Sequence[Case], args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """All runs of all cases."""
     for case in cases:
+        if case.sequence.parent == args.rendered_folder:
+            render(case.sequence, args.rendered)
         for path in case.sequence.rglob("*.png"):  # nobody shall wait for the disk
             path.read_bytes()
         for repeat in range(args.repeats):
@@ -328,8 +325,9 @@ def main() -> None:
     cases = [case for case in find_cases(args) if not args.only or any(text in case.name for text in args.only)]
     if not cases:
         sys.exit(f"no sequence to play: none in {DATA}, none named")
-    with tempfile.TemporaryDirectory(dir=args.work) as work:  # compiles what no cache holds yet
-        run_sfmapp(Case("warm", cases[0].sequence, ("--stop", "40")), Path(work) / "out", args)
+    for case in [case for case in cases if case.sequence.is_dir()][:1]:  # compiles what no cache holds yet
+        with tempfile.TemporaryDirectory(dir=args.work) as work:
+            run_sfmapp(Case("warm", case.sequence, ("--stop", "40")), Path(work) / "out", args)
     for run in measure(cases, args):
         report["runs"].append(run)
         truth = run["truth"]
