@@ -47,7 +47,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--mono", action="store_true", help="the first camera alone")
     parser.add_argument("--noise", type=float, help="standard deviation in grey levels")
-    parser.add_argument("--blur", type=float, help="exposure in seconds; blurs over four sub-exposures")
+    parser.add_argument("--blur", type=float, help="exposure in seconds; 0: no motion blur")
     parser.add_argument("--moving-cars", type=int, default=0, help="street: cars that come the other way")
     parser.add_argument("--threads", type=int, default=2)
     edit = {"action": "append", "dest": "edits", "metavar": "AT:COUNT"}
@@ -82,7 +82,7 @@ def make(args: argparse.Namespace) -> RenderedSequence:
     if args.noise is not None:
         optics = replace(optics, noise_sigma=args.noise)
     if args.blur is not None:
-        optics = replace(optics, exposure_s=args.blur, sub_exposures=4 if args.blur > 0 else 1)
+        optics = replace(optics, exposure_s=args.blur, sub_exposures=16 if args.blur > 0 else 1)
     if args.mono:
         rig = replace(sequence.rig, cameras=sequence.rig.cameras[:1], cam_from_rig=sequence.rig.cam_from_rig[:1])
         sequence = replace(sequence, rig=rig)

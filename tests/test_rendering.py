@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -227,6 +228,18 @@ def test_motion_blur_is_the_mean_over_the_exposure() -> None:
     halves = [renderer.view(moved_camera(pose, motion, t)).grey for t in (-0.0125, 0.0125)]
     expected = np.rint((halves[0] + halves[1]) / 2)
     assert np.abs(renderer.photograph(pose, optics, [0], motion=motion) - expected).max() <= 1
+    # at a hundredth of the speed nothing moves by a pixel: the sharp image
+    sharp = renderer.photograph(pose, QUIET, [0])
+    assert np.array_equal(renderer.photograph(pose, optics, [0], motion=motion / 100), sharp)
+    # with as many steps as it takes, twice as many change next to nothing
+    many = [
+        renderer.photograph(pose, replace(optics, sub_exposures=n), [0], motion=motion).astype(float) for n in (40, 2)
+    ]
+    twice = np.mean(
+        [renderer.view(moved_camera(pose, motion, t)).grey for t in np.linspace(-0.025, 0.025, 41)[1:] - 0.000625], 0
+    )
+    assert np.abs(many[0] - twice).max() < 3
+    assert np.abs(many[1] - twice).max() > 6
 
 
 def test_a_moving_quad_moves() -> None:

@@ -166,7 +166,7 @@ def room(
     return _sequence(
         "room", room_world(seed), Rig.single(camera), times,
         lambda t: rigid3.compose(CAM_FROM_BODY, body.body_from_world(t)), gain,
-        optics or Optics(exposure_s=0.008, sub_exposures=2), seed,
+        optics or Optics(exposure_s=0.008, sub_exposures=16), seed,
     )  # fmt: skip
 
 
@@ -223,7 +223,7 @@ def hall(
     cam_from_body = rigid3.compose(rigid3.inverse(imu_from_cam), imu_from_body)
     sequence = _sequence(
         "hall", hall_world(seed), rig, times, lambda t: rigid3.compose(cam_from_body, body.body_from_world(t)), gain,
-        optics or Optics(noise_sigma=2.5, exposure_s=0.006, sub_exposures=2, vignetting=0.25), seed,
+        optics or Optics(noise_sigma=2.5, exposure_s=0.006, sub_exposures=8, vignetting=0.25), seed,
     )  # fmt: skip
     return replace(sequence, imu=imu, imu_from_cam=imu_from_cam)
 
@@ -250,7 +250,7 @@ def street(
     return _sequence(
         "street", street_world(seed, moving_cars=moving_cars), rig or street_rig(), times,
         lambda t: rigid3.compose(CAM_FROM_BODY, body.body_from_world(t)), _wandering_gain(rng, times, 3.0, 0.04, 1.25),
-        optics or Optics(exposure_s=0.004, sub_exposures=1), seed,
+        optics or Optics(), seed,
     )  # fmt: skip
 
 

@@ -30,6 +30,7 @@ TILE_PX = 16
 NEAR_M = 0.02  # surfaces nearer than this are cut away
 MAX_PROBES = 6  # samples along the footprint; beyond this ratio of its axes the texture is blurred
 MAX_LEVELS = 13
+BLUR_STEP_PX = 1.5  # a moving image is sampled this densely: less than its own sharpness
 EDGE_GREY = 1.5  # surfaces that differ by less than this look like one
 # eight rooks: each row and column of an 8 x 8 grid is hit once, so edges of any direction get nine levels
 ROOKS = (np.array([[0, 3], [1, 6], [2, 0], [3, 5], [4, 2], [5, 7], [6, 1], [7, 4]]) + 0.5) / 8 - 0.5
@@ -121,7 +122,7 @@ class Optics:
     noise_sigma: float = 2.0  # standard deviation of the sensor's noise in grey levels
     vignetting: float = 0.1  # share of the light that is missing in the corners; falls with the squared radius
     exposure_s: float = 0.0  # how long the shutter is open; motion blurs over this time
-    sub_exposures: int = 1  # images averaged over the exposure
+    sub_exposures: int = 1  # most images averaged over the exposure; fewer where less moves. 1: no blur
     edge_samples: bool = True  # eight rays a pixel where surfaces meet; False: one ray everywhere
 
 
@@ -231,18 +232,28 @@ class Renderer:
             motion: (6,) angular velocity in the camera's frame (rad/s) and velocity of its centre in the world (m/s);
                 needed for motion blur.
         """
-        count = optics.sub_exposures if motion is not None and optics.exposure_s > 0 else 1
-        grey = np.zeros((self.camera.height, self.camera.width), np.float32)
-        for k in range(count):
-            shift_s = ((k + 0.5) / count - 0.5) * optics.exposure_s if count > 1 else 0.0
-            pose = moved_camera(cam_from_world, motion, shift_s) if motion is not None else cam_from_world
-            grey += self.view(pose, time_s + shift_s, edge_samples=optics.edge_samples).grey / np.float32(count)
+        view = self.view(cam_from_world, time_s, edge_samples=optics.edge_samples)
+        grey = view.grey
+        moving = np.zeros(6) if motion is None else np.asarray(motion, np.float64)
+        count = min(optics.sub_exposures, self._blur_steps(view.depth, moving, optics.exposure_s))
+        if count > 1:
+            grey = np.zeros_like(grey)
+            for k in range(count):
+                shift_s = ((k + 0.5) / count - 0.5) * optics.exposure_s
+                pose = moved_camera(cam_from_world, moving, shift_s)
+                grey += self.view(pose, time_s + shift_s, edge_samples=optics.edge_samples).grey / np.float32(count)
         grey *= self._vignette(optics.vignetting) * np.float32(gain)
         if optics.noise_sigma > 0:
             rng = np.random.default_rng([*key, 0x2E17DE2])
             grey += np.float32(optics.noise_sigma) * rng.standard_normal(grey.shape, np.float32)
         image: NDArray[np.uint8] = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
         return image
+
+    def _blur_steps(self, depth: NDArray[np.float32], motion: Array, exposure_s: float) -> int:
+        """How many images make a blur without ghosts: all but the nearest tenth moves by less than a step between."""
+        near = float(np.quantile(depth[::4, ::4], 0.1))
+        angle = exposure_s * (np.linalg.norm(motion[:3]) + np.linalg.norm(motion[3:]) / near)
+        return max(1, math.ceil(self.camera.focal * float(angle) / BLUR_STEP_PX))
 
     def _vignette(self, share: float) -> NDArray[np.float32]:
         rows, columns = self.camera.height, self.camera.width
