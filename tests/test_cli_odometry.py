@@ -28,7 +28,7 @@ def fake(monkeypatch: Patch) -> Patch:
 def use(monkeypatch: Patch, runner: FakeRunner) -> None:
     monkeypatch.setattr(pipeline, "open_sequence", lambda *_, **__: FakeSequence())
     monkeypatch.setattr(pipeline, "run_odometry", runner)
-    monkeypatch.setattr(pipeline, "compile_odometry_kernels", lambda _: {})
+    monkeypatch.setattr(pipeline, "compile_odometry_kernels", lambda *_, **__: {})
 
 
 def test_help_names_the_commands_and_their_flags(capsys: Capture) -> None:
@@ -143,7 +143,7 @@ def test_ctrl_c_writes_what_was_tracked(tmp_path: Path, sign: signal.Signals) ->
         "from sfmapp.pipelines import odometry as pipeline\n"
         "pipeline.open_sequence = lambda *_, **__: FakeSequence(pause_s=0.1)\n"
         "pipeline.run_odometry = FakeRunner()\n"
-        "pipeline.compile_odometry_kernels = lambda _: {}\n"
+        "pipeline.compile_odometry_kernels = lambda *_, **__: {}\n"
         "from sfmapp.cli.main import main\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )

@@ -36,7 +36,7 @@ Patch = pytest.MonkeyPatch
 def use(monkeypatch: Patch, sequence: FakeSequence, runner: object) -> None:
     monkeypatch.setattr(pipeline, "open_sequence", lambda *_, **__: sequence)
     monkeypatch.setattr(pipeline, "run_odometry", runner)
-    monkeypatch.setattr(pipeline, "compile_odometry_kernels", lambda _: {})
+    monkeypatch.setattr(pipeline, "compile_odometry_kernels", lambda *_, **__: {})
 
 
 def run(output: Path, *settings: str, events: Events | None = None) -> TrackResult:

@@ -231,7 +231,7 @@ def compile_kernels() -> None:
     from sfmapp.scene.synthetic import make_scene, true_correspondences
 
     scene = make_scene(0, 3, 24)
-    model, options = scene.observed, MappingOptions()
+    model = scene.observed
     features = [
         Features(
             np.zeros((len(scene.keypoints(i)), 4), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.uint8)
@@ -239,9 +239,6 @@ def compile_kernels() -> None:
         for i in range(3)
     ]
     build_tracks(true_correspondences(scene, min_matches=1), features)
-    with ThreadPoolExecutor(1) as pool:
-        structure.triangulate(model, np.arange(24), options, pool)
-        structure.filter_observations(model, options, pool)
+    structure.compile_kernels()
     rank_next_images(model, np.arange(3))
     solver.compile_kernels()
-    model.residuals_px()

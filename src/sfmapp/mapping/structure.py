@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,3 +80,14 @@ def _over_chunks(
     )  # fmt: skip
     chunks = [tracks[i : i + CHUNK] for i in range(0, len(tracks), CHUNK)]
     return sum(pool.map(lambda chunk: kernel(chunk, *arguments), chunks))
+
+
+def compile_kernels() -> None:
+    """Compile the kernels of triangulation, or load them from numba's cache."""
+    from sfmapp.scene.synthetic import make_scene
+
+    model, options = make_scene(0, 3, 24).observed, MappingOptions()
+    with ThreadPoolExecutor(1) as pool:
+        triangulate(model, np.arange(24), options, pool)
+        filter_observations(model, options, pool)
+    model.residuals_px()

@@ -19,7 +19,19 @@ from sfmapp.events import Events
 STAGE = "kernels"
 # in the order in which a run needs them
 MODULES = ("sfmapp.features.extract", "sfmapp.matching.stage", "sfmapp.mapping.incremental")
-ODOMETRY_MODULES = ("sfmapp.odometry.run",)
+ODOMETRY_MODULES = (
+    "sfmapp.odometry.small_image",
+    "sfmapp.odometry.corners",
+    "sfmapp.odometry.alignment",
+    "sfmapp.odometry.affine_alignment",
+    "sfmapp.odometry.epipolar_search",
+    "sfmapp.geometry.epipolar",
+    "sfmapp.mapping.structure",
+    "sfmapp.adjust.solver",
+    "sfmapp.odometry.relocalize",
+    "sfmapp.odometry.pose_graph",
+)
+INERTIAL_MODULES = ("sfmapp.odometry.inertial",)
 
 
 @contextmanager
@@ -35,13 +47,13 @@ def kernels_compiling(events: Events, usage: dict[str, dict[str, Any]]) -> Itera
         thread.join()
 
 
-def compile_odometry_kernels(events: Events) -> dict[str, Any]:
-    """Compile those of odometry; returns what it took.
+def compile_odometry_kernels(events: Events, *, inertial: bool = False) -> dict[str, Any]:
+    """Compile those of odometry, with or without those of inertial measurements; returns what it took.
 
     Raises:
         InterruptedRunError: ``events`` was asked to stop.
     """
-    took = _compile(events, ODOMETRY_MODULES)
+    took = _compile(events, ODOMETRY_MODULES + (INERTIAL_MODULES if inertial else ()))
     events.raise_if_cancelled()
     return took
 

@@ -134,7 +134,7 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
     if run.live is not None:
         run.live.begin(run.sequence)
     with run.stage("kernels"):
-        run.stages["kernels"] = compile_odometry_kernels(events)
+        run.stages["kernels"] = compile_odometry_kernels(events, inertial=bool(run.wish and run.wish.imu))
     with run.measured("odometry"):
         result = run_odometry(
             Watched(run.sequence, run), options.odometry, seed=options.seed, threads=run.threads, events=events.deaf()
