@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import epipolar, rigid3
+from sfmapp.geometry.planar_motion import estimate_planar_motion
 from sfmapp.matching.options import MatchingOptions
-from sfmapp.matching.two_view import Ransac, verify_pair
+from sfmapp.matching.two_view import Ransac, TwoViewGeometry, verify_pair
 from sfmapp.odometry.alignment import align_patches
 from sfmapp.odometry.corners import find_corners
 from sfmapp.odometry.options import OdometryOptions
@@ -122,8 +123,12 @@ class Beginning:
 
     def _two_views(self, track: NDArray[np.int64]) -> TwoViews | None:
         xy1, xy2 = self.corners[track], self.seen[-1][track]
-        options = MatchingOptions(max_error_px=max(1.0, 1e-3 * self.camera.width))
-        found = verify_pair(xy1, xy2, self.camera, self.camera, options, Ransac(2000, self.seed))
+        limit = max(1.0, 1e-3 * self.camera.width)
+        found = verify_pair(
+            xy1, xy2, self.camera, self.camera, MatchingOptions(max_error_px=limit), Ransac(2000, self.seed)
+        )
+        if self.options.motion == "planar" and found.config != TwoViewConfig.PANORAMIC:
+            self._hold_to_plane(found, xy1, xy2, limit)
         num = int(found.is_inlier.sum())
         usable = found.config in (TwoViewConfig.CALIBRATED, TwoViewConfig.PLANAR, TwoViewConfig.UNCALIBRATED)
         if not usable or not np.isfinite(found.cam2_from_cam1).all():
@@ -145,6 +150,17 @@ class Beginning:
         return TwoViews(
             pose, track[found.is_inlier][good], xyz[good], found.config, found.median_angle_deg, num, len(track)
         )
+
+    def _hold_to_plane(self, found: TwoViewGeometry, xy1: Array, xy2: Array, limit_px: float) -> None:
+        """Put a wheeled robot's motion in the place of a free one: two unknowns bear more outliers than five."""
+        xn1, xn2 = (pixels_to_normalized(self.camera, xy) for xy in (xy1, xy2))
+        planar = estimate_planar_motion(xn1, xn2, limit_px / self.camera.focal, seed=self.seed)
+        if planar is None:
+            return
+        found.cam2_from_cam1, found.is_inlier = planar
+        found.config = TwoViewConfig.CALIBRATED
+        _, angles = epipolar.ray_depths(found.cam2_from_cam1, xn1[found.is_inlier], xn2[found.is_inlier])
+        found.median_angle_deg = float(np.degrees(np.median(angles))) if len(angles) else 0.0
 
 
 def pose_between(first: Array, last: Array, share: float) -> Array:

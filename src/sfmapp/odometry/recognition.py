@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -27,12 +28,16 @@ _MIN_POINTS, _MIN_CORNERS = 15, 40
 # Corners of a lost frame; closer together than those that are tracked, as any of them may be a point of the map.
 _CORNERS, _CORNER_DISTANCE_PX = 1000, 5.0
 
+# Rolls at which a lost frame is looked at, one after the other: descriptors bear 15 degrees.
+_ROLLS_DEG = (0.0, 25.0, -25.0)
+
 
 class Recognition:
     """All places of all maps."""
 
     def __init__(self, seed: int) -> None:
         self._places, self._finder = Places(seed=seed), LoopFinder()
+        self._num_searches = 0
         self._last = np.zeros(0, np.int64)
 
     def remember(
@@ -43,10 +48,14 @@ class Recognition:
         Args:
             view: its frame. xy: (N, 2) pixels and ids: (N,) ascending, its triangulated points.
         """
-        if len(ids) < _MIN_POINTS or np.isin(ids, self._last, True).sum() > _NEW_PLACE * len(ids):
+        is_new = len(ids) >= _MIN_POINTS and np.isin(ids, self._last, True).sum() <= _NEW_PLACE * len(ids)
+        if is_new:
+            self._last = ids
+            seen = self._places.add(local.map_idx, view.frame_idx, view.images[0], xy, ids)
+        elif self._finder.is_suspicious:
+            seen = PlaceView(view.images[0], xy, ids)
+        else:
             return None
-        self._last = ids
-        seen = self._places.add(local.map_idx, view.frame_idx, view.images[0], xy, ids)
         keyframes = {number: other.keyframes for number, other in maps.items()}
         return self._finder.find(keyframes, local.map_idx, self._places, view.frame_idx, seen)
 
@@ -99,13 +108,14 @@ class Recognition:
         Returns:
             The map, the frame that it looks like, the pose (7,), and the points seen: ids (N,) and pixels (N, 2).
         """
-        if not len(self._places):
+        if len(self._places) == 0:
             return None
         corners = find_corners(view.pyramids[0], np.zeros((0, 2)), _CORNERS, min_distance_px=_CORNER_DISTANCE_PX)
         if len(corners) < _MIN_CORNERS:
             return None
         keyframes = {number: local.keyframes for number, local in maps.items()}
-        found = relocalize(keyframes, self._places, PlaceView(view.images[0], corners), RelocalizeOptions())
+        roll, self._num_searches = math.radians(_ROLLS_DEG[self._num_searches % 3]), self._num_searches + 1
+        found = relocalize(keyframes, self._places, PlaceView(view.images[0], corners), RelocalizeOptions(), roll)
         if found is None:
             return None
         located = found.located

@@ -14,6 +14,7 @@ from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Frame, Sequence
 from sfmapp.odometry.active_tracks import ActiveTracks
 from sfmapp.odometry.finish import conclude
+from sfmapp.odometry.inertial import imu_rotation
 from sfmapp.odometry.initialize import Beginning, TwoViews, pose_between
 from sfmapp.odometry.keyframe_map import KeyframeMap
 from sfmapp.odometry.local_map import LocalMap, View
@@ -29,6 +30,8 @@ Array = NDArray[np.float64]
 
 STAGE = "odometry"
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+# Frames are taken to come at a steady rate within this share of the time between them.
+_STEADY_SHARE = 0.2
 # Fewest points with depth that one look of a rig may begin a map with.
 _MIN_STEREO_POINTS = 40
 
@@ -47,6 +50,7 @@ class Odometry:
         self.waiting: list[tuple[FrameRecord, View]] = []
         self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
         self.pose, self.step = _IDENTITY, _IDENTITY
+        self.imu = sequence.imu
         self.previous: Pyramid | None = None
         self.num_mapped_at_keyframe = 0
         self.lost_since: float | None = None
@@ -152,7 +156,7 @@ class Odometry:
         if local is None or self.previous is None or self.lost_since is not None:
             return False
         self._take_over(local, number)
-        tracked = track(local, self.tracks, self.pose, self.step, self.previous, view.pyramids[0])
+        tracked = track(local, self.tracks, self.pose, self._predicted_step(), self.previous, view.pyramids[0])
         if tracked is None:
             self._lose(record)
             return False
@@ -164,6 +168,16 @@ class Odometry:
         else:
             self._make_keyframe(record, view, FrameState.TRACKED, reason)
         return True
+
+    def _predicted_step(self) -> Array:
+        """The motion since the last frame: steady, over the time that has passed; turned as a gyroscope says."""
+        if len(self.records) < 3:
+            return self.step
+        before, last, now = (record.timestamp_s for record in self.records[-3:])
+        share = (now - last) / (last - before)
+        step = pose_between(_IDENTITY, self.step, share) if abs(share - 1) > _STEADY_SHARE else self.step
+        turn = None if self.imu is None else imu_rotation(self.imu, last, now)
+        return step if turn is None else rigid3.from_matrix(turn, step[4:])
 
     def _make_keyframe(self, record: FrameRecord, view: View, state: FrameState, reason: str) -> None:
         local = self.local
