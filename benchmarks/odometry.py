@@ -250,7 +250,7 @@ def markdown(report: dict[str, Any]) -> str:
     ]
     for row in report["rows"]:
         truth = row["truth"] or {}
-        ate = f"{truth['ate_m']['rmse']:.3f} ({truth['ate_percent']:.2f} %) {truth['alignment']}" if truth else "-"
+        ate = f"{truth['ate_m']['rmse']:.3g} ({truth['ate_percent']:.2g} %) {truth['alignment']}" if truth else "-"
         drift = f"{truth['drift_percent']:.2f}, {truth['drift_deg_per_100m']:.2f}" if truth else "-"
         if truth and not truth["is_kitti_drift"]:
             drift += " *"
@@ -261,7 +261,7 @@ def markdown(report: dict[str, Any]) -> str:
         if row["num_failed"]:
             frames += f" ({row['num_failed']} runs FAILED)"
         lines.append(
-            f"| {name} | {frames} | {ate} | {_cell(row['live_ate_m'], '.3f')} | {drift} "
+            f"| {name} | {frames} | {ate} | {_cell(row['live_ate_m'], '.3g')} | {drift} "
             f"| {_cell(row['cpu_ms_per_frame'], '.1f')} ({_cell(row['process_cpu_ms_per_frame'], '.1f')}) "
             f"| {_cell(speed, '.1f')} | {_cell(row['peak_memory_mb'], '.0f')} | {same} |"
         )

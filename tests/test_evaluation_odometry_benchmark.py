@@ -58,7 +58,7 @@ def test_the_table(odometry: ModuleType) -> None:
     text = odometry.markdown(head | {"runs": runs, "rows": odometry.summaries(runs)})
     rows = [line for line in text.splitlines() if line.startswith("| ")]
     assert len({line.count("|") for line in rows}) == 1
-    assert "199 of 200 | 0.500 (0.25 %) sim3 | 0.625 | 1.50, 0.75 | 20.0 (40.0) | 10.0 | 300 | yes" in rows[1]
+    assert "199 of 200 | 0.5 (0.25 %) sim3 | 0.625 | 1.50, 0.75 | 20.0 (40.0) | 10.0 | 300 | yes" in rows[1]
     assert "1.50, 0.75 *" in rows[2]
     assert "FAILED" in rows[3]
 
