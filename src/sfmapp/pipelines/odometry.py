@@ -128,13 +128,13 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         if self_calibrate:
             from sfmapp.pipelines.self_calibrate import self_calibrated
 
-            options, run.stages["self_calibration"] = self_calibrated(run.source, options, run.threads, events)
+            options, run.stages["self_calibration"] = self_calibrated(run.source, options, events)
         run.sequence = open_sequence(run.source, options.sequence, events)
         run.wish = settled_wish(run.wish, options.scale.source is None, run.sequence)
     if run.live is not None:
         run.live.begin(run.sequence)
     with run.stage("kernels"):
-        run.stages["kernels"] = compile_odometry_kernels(events, inertial=bool(run.wish and run.wish.imu))
+        run.stages["kernels"] = compile_odometry_kernels(events, inertial=run.sequence.imu is not None)
     with run.measured("odometry"):
         result = run_odometry(
             Watched(run.sequence, run), options.odometry, seed=options.seed, threads=run.threads, events=events.deaf()

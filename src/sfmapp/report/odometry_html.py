@@ -32,7 +32,7 @@ def render_odometry_html(
         body.append("<h2>Frame by frame</h2>" + _plots(result, facts, against))
         body.append(_gaps(report["frames"]["gaps"]))
     body.append(_maps(report["maps"]) + _truth(report.get("truth")))
-    body.append(_loops(report) + _sequence(report["sequence"]))
+    body.append(_loops(report) + _sequence(report["sequence"], report["stages"]))
     body.append(_timing(report.get("timing")) + usage_table(report["usage"], report["run"]))
     body.append(log_table("Warnings", report["warnings"]) + log_table("Decisions", report["decisions"]))
     return render_page(f"sfmapp odometry: {report['run']['source']}", body)
@@ -205,10 +205,12 @@ def _loops(report: Mapping[str, Any]) -> str:
     return "<h2>Loops</h2>" + table([("", key.replace("_", " ")) for key in keys], rows)
 
 
-def _sequence(sequence: Mapping[str, Any]) -> str:
+def _sequence(sequence: Mapping[str, Any], stages: Mapping[str, Any]) -> str:
     if not sequence:
         return ""
     rows = [[("t", key.replace("_", " ")), ("w", _short(value))] for key, value in sequence.items() if key != "cameras"]
+    if calibration := stages.get("self_calibration"):
+        rows.append([("t", "calibrated with the first seconds"), ("w", calibration["text"])])
     head = [("", "camera"), ("t", "model"), ("", "size"), ("t", "parameters")]
     cameras = [
         [
