@@ -308,8 +308,8 @@ def _notes(result: Evaluation, options: EvaluateOptions) -> list[str]:
             notes.append(f"{(steps == 0).sum()} poses of the {name} have the timestamp of the one before")
     if result.truth.format == "euroc" and result.estimate.format != "euroc" and not result.truth.path.is_dir():
         notes.append(
-            "EuRoC's truth is of the IMU, whose axes are not the camera's: against it the rotations, RPE and drift of a "
-            "camera's trajectory say nothing, and the ATE holds the lever between the two; give the folder of the "
+            "EuRoC's truth is of the IMU, whose axes are not the camera's: against it the rotations, RPE and drift of "
+            "a camera's trajectory say nothing, and the ATE holds the lever between the two; give the folder of the "
             "sequence instead"
         )
     if {"sim3", "se3"} & set(result.errors) and is_straight(pairs):
