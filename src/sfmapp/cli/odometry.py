@@ -1,4 +1,4 @@
-"""``sfmapp odometry``: a sequence to a trajectory and a map."""
+"""``sfmapp odometry`` and ``sfmapp refine``: a sequence to a trajectory and a map, and the map once more."""
 
 from __future__ import annotations
 
@@ -51,13 +51,21 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     group = parser.add_argument_group("looking at it")
     group.add_argument("--view", action="store_true", help="watch in rerun while it runs")
     group.add_argument("--no-record", action="store_true", help="do not write recording.rrd, which replays the run")
-    group = parser.add_argument_group("options (later ones win: presets in order, then --set, then the flags)")
-    group.add_argument("--preset", metavar="NAME|FILE", action="append", default=[], help="may be repeated")
-    group.add_argument("--set", metavar="STAGE.OPTION=VALUE", action="append", default=[], help="may be repeated")
-    group.add_argument("--seed", metavar="N", help="start of every random choice; the same seed, the same bytes")
-    group.add_argument("--threads", metavar="N", help="workers; default: all cores. Results do not depend on it")
+    _add_option_flags(parser)
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_odometry, parser=parser)
+
+    parser = commands.add_parser(
+        "refine", help="adjust the map of an odometry run whole, and add photographs",
+        description="Adjust the maps of an odometry run whole, move its trajectory with them, and add photographs.",
+    )  # fmt: skip
+    parser.add_argument("run_folder", metavar="OUT", type=Path, help="folder of an odometry run; it is not changed")
+    parser.add_argument("-o", "--output", metavar="OUT2", type=Path, help="folder of the results; default: OUT/refined")
+    parser.add_argument("--add-photos", metavar="DIR", help="photographs to register in the largest map")
+    parser.add_argument("--free-intrinsics", action="store_true", help="refine the calibration of the sequence as well")
+    _add_option_flags(parser)
+    add_output_flags(parser, has_log=True)
+    parser.set_defaults(run=_refine, parser=parser)
 
 
 def _add_sequence_flags(parser: argparse.ArgumentParser) -> None:
@@ -73,6 +81,14 @@ def _add_sequence_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--step", metavar="N", help="play every N-th frame")
     group.add_argument("--reverse", action="store_true", help="play it backwards")
     group.add_argument("--fps", metavar="RATE", help="frames per second where the sequence does not tell")
+
+
+def _add_option_flags(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("options (later ones win: presets in order, then --set, then the flags)")
+    group.add_argument("--preset", metavar="NAME|FILE", action="append", default=[], help="may be repeated")
+    group.add_argument("--set", metavar="STAGE.OPTION=VALUE", action="append", default=[], help="may be repeated")
+    group.add_argument("--seed", metavar="N", help="start of every random choice; the same seed, the same bytes")
+    group.add_argument("--threads", metavar="N", help="workers; default: all cores. Results do not depend on it")
 
 
 def _options(args: argparse.Namespace) -> Options:
@@ -111,6 +127,50 @@ def _odometry(args: argparse.Namespace) -> int:
     if viewer is not None:
         viewer.wait()
     return 0
+
+
+def _refine(args: argparse.Namespace) -> int:
+    limit_library_threads()
+    from sfmapp.pipelines.options import load_options
+
+    flags = {"seed": args.seed, "threads": args.threads}
+    options = load_options(args.preset, [*args.set, *(f"{k}={v}" for k, v in flags.items() if v is not None)])
+    load_numba_without_blas()
+    from sfmapp.pipelines.refine import FOLDER, refine
+    from sfmapp.pipelines.usage import Stopwatch
+
+    watch, output = Stopwatch(whole_process=True), args.output or args.run_folder / FOLDER
+    with listening(args) as events:
+        result = refine(
+            args.run_folder, output, options, photos=args.add_photos, free_intrinsics=args.free_intrinsics,
+            events=events, watch=watch,
+        )  # fmt: skip
+    report = result.report
+    if args.json:
+        named = ("maps", "truth", "photographs", "run")
+        print_json({"exit_code": 0, "output": str(output), **{name: report[name] for name in named}})
+    elif not args.quiet:
+        _print_refined(output, report)
+    return 0
+
+
+def _print_refined(output: Path, report: dict[str, Any]) -> None:
+    for before, after in zip(report["maps"]["before"], report["maps"]["after"], strict=True):
+        print(
+            f"map {after['idx']}: {before['num_points']} to {after['num_points']} points, reprojection error"
+            f" {before['mean_reprojection_error_px']:.3f} to {after['mean_reprojection_error_px']:.3f} px"
+        )
+    for before, after in zip(report["truth"]["before"], report["truth"]["after"], strict=False):
+        errors = [row["ate_m"]["rmse"] for row in (before, after)]
+        print(f"  against the truth: {errors[0]:.4f} to {errors[1]:.4f} m rmse ({before['alignment'].upper()})")
+    photos, run = report["photographs"], report["run"]
+    if photos:
+        print(f"{sum(row['is_registered'] for row in photos)} of {len(photos)} photographs registered")
+        for row in photos:
+            if not row["is_registered"]:
+                print(f"  not registered: {row['name']}: {row['reason']}")
+    print(f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB")
+    print(f"model {output / 'sparse' / '0'}, trajectory {output / 'trajectory.tum'}, report {output / 'report.html'}")
 
 
 def _open_viewer(args: argparse.Namespace) -> LiveViewer | None:

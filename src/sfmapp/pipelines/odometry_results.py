@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfmapp.errors import NoReconstructionError
-from sfmapp.formats.trajectory import write_tum
-from sfmapp.odometry.result import FrameState, OdometryResult
+from sfmapp.errors import InputError, NoReconstructionError
+from sfmapp.formats.colmap import read_model
+from sfmapp.formats.trajectory import read_tum, write_tum
+from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.pipelines.odometry_timing import frame_statistics
 from sfmapp.pipelines.results import report_text
 from sfmapp.report.odometry_document import (
@@ -29,6 +31,8 @@ from sfmapp.report.odometry_html import render_odometry_html
 from sfmapp.scene.camera import PARAM_NAMES
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from sfmapp.images import sequence as sequences
     from sfmapp.pipelines.odometry import Tracking
     from sfmapp.pipelines.workspace import Workspace
@@ -62,7 +66,7 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
     return report
 
 
-def write_trajectories(workspace: Workspace, result: OdometryResult) -> None:
+def write_trajectories(workspace: Workspace, result: OdometryResult, *, live: bool = True) -> None:
     """A file of final poses for each map, the live poses of the largest, and the largest as KITTI has it.
 
     Maps have worlds of their own, so they cannot share a file. What an earlier run left is taken away.
@@ -80,14 +84,51 @@ def write_trajectories(workspace: Workspace, result: OdometryResult) -> None:
         name = "trajectory.tum" if m == 0 else f"trajectory-{m}.tum"
         write_tum(folder / name, result.timestamps_s, poses_of_map(result, m))
     if result.maps:
-        write_tum(folder / "trajectory_live.tum", result.timestamps_s, poses_of_map(result, 0, live=True))
-        write_kitti(folder / "trajectory.kitti", poses_of_map(result, 0))
+        if live:
+            write_tum(folder / "trajectory_live.tum", result.timestamps_s, poses_of_map(result, 0, live=True))
+        write_kitti(folder / "trajectory.kitti", poses_of_map(result, 0), result.frame_idx)
 
 
 def poses_of_map(result: OdometryResult, map_idx: int, *, live: bool = False) -> Any:
     """(F, 7) poses of the frames of one map, NaN for all others."""
     poses = result.live_cam_from_world if live else result.cam_from_world
     return np.where((result.frame_map == map_idx)[:, None], poses, np.nan)
+
+
+def read_odometry(folder: Path) -> OdometryResult:
+    """What :func:`write_odometry` has written of trajectories and maps; live poses and covariances are left out.
+
+    Raises:
+        InputError: a file is missing or is not what was written.
+    """
+    try:
+        with (folder / "frames.csv").open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        frame_map = np.array([int(row["map"] or -1) for row in rows], np.int32)
+        states = np.array([FrameState[row["state"].upper()] for row in rows], np.uint8)
+        indices = np.array([int(row["index"]) for row in rows], np.int64)
+        times = np.array([float(row["timestamp_s"]) for row in rows])
+        names = [row["name"] for row in rows]
+        known = json.loads((folder / "report.json").read_text(encoding="utf-8"))["maps"]
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{folder}: not the results of sfmapp odometry: {error}", "run it again") from error
+    poses = np.full((len(rows), 7), np.nan)
+    maps = []
+    position = {name: k for k, name in enumerate(names)}
+    for m, row in enumerate(known):
+        _, found = read_tum(folder / ("trajectory.tum" if m == 0 else f"trajectory-{m}.tum"))
+        if len(found) != (frame_map == m).sum():
+            raise InputError(
+                f"{folder}: frames.csv and the trajectory of map {m} disagree", "run sfmapp odometry again"
+            )
+        poses[frame_map == m] = found
+        model, _ = read_model(folder / "sparse" / str(m))
+        images = np.array([k for k, name in enumerate(model.image_names) if name in position], np.int64)
+        frames = np.array([indices[position[model.image_names[k]]] for k in images], np.int64)
+        order = np.argsort(frames, kind="stable")
+        source, sigma = row["scale_source"], row["scale_sigma"]
+        maps.append(MapResult(model, frames[order], images[order], scale_source=source, scale_sigma=sigma))
+    return OdometryResult(indices, names, times, poses, np.full_like(poses, np.nan), frame_map, states, maps)
 
 
 def _frames_csv(result: OdometryResult, facts: FrameFacts) -> str:

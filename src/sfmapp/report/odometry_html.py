@@ -28,7 +28,7 @@ def render_odometry_html(
     """The page of a report; ``against``: each map against the truth, empty without one."""
     body = [_headline(report), failure_box(report["outcome"]), check_table(report["checks"])]
     if result is not None and facts is not None and len(result.frame_idx):
-        body.append(_views(result, truth, against))
+        body.append(trajectory_views(result, truth, against))
         body.append("<h2>Frame by frame</h2>" + _plots(result, facts, against))
         body.append(_gaps(report["frames"]["gaps"]))
     body.append(_maps(report["maps"]) + _truth(report.get("truth")))
@@ -54,7 +54,7 @@ def _headline(report: Mapping[str, Any]) -> str:
     return f'<p class="dim">{escape("; ".join(parts))}</p>'
 
 
-def _views(result: OdometryResult, truth: Truth | None, against: Sequence[Against | None]) -> str:
+def trajectory_views(result: OdometryResult, truth: Truth | None, against: Sequence[Against | None]) -> str:
     """Each map from above; those that the truth joins share its frame but not one picture."""
     parts = []
     for map_idx in range(min(len(result.maps), MAX_VIEWS)):

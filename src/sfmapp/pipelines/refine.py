@@ -1,0 +1,287 @@
+"""An odometry map refined offline, as the reconstruction that it is: adjusted whole, and photographs added.
+
+:func:`refine` opens the workspaces and sees to it that every end is a clean one.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import sfmapp
+from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.errors import InputError, NoReconstructionError
+from sfmapp.events import Events
+from sfmapp.formats.sequences import open_sequence
+from sfmapp.geometry import rigid3, similarity
+from sfmapp.images.sequence import Sequence
+from sfmapp.mapping import structure
+from sfmapp.mapping.options import MappingOptions
+from sfmapp.odometry.result import MapResult, OdometryResult
+from sfmapp.pipelines.add_photos import PhotoResult, add_photos
+from sfmapp.pipelines.kernels import kernels_compiling
+from sfmapp.pipelines.listeners import DecisionLog, EventLog
+from sfmapp.pipelines.odometry_results import read_odometry, write_trajectories
+from sfmapp.pipelines.options import Options, options_from_dict, with_absolute_paths
+from sfmapp.pipelines.results import report_text
+from sfmapp.pipelines.run import Job
+from sfmapp.pipelines.usage import Stopwatch
+from sfmapp.pipelines.workspace import ODOMETRY, REFINE, open_workspace, read_manifest
+from sfmapp.report.odometry_document import against_truth, map_row, truth_row
+from sfmapp.report.refine_html import REFINE_FORMAT, render_refine_html
+from sfmapp.scene.reconstruction import Reconstruction
+
+Array = NDArray[np.float64]
+
+STAGE = "refinement"
+FOLDER = "refined"
+# How far a calibration may be off that is freed: as in the last adjustment of odometry.
+_FOCAL_SIGMA = 0.01
+_MAX_ROUNDS = 6
+# Residuals are not believed to be better than that, however well a synthetic sequence fits.
+_MIN_SIGMA_PX = 0.02
+# Nor is an observation refused for less than half a pixel.
+_MIN_LIMIT_PX = 0.5
+
+
+class RefineResult(NamedTuple):
+    """The refined maps and trajectory, and the report of it as in ``report.json``."""
+
+    odometry: OdometryResult
+    report: dict[str, Any]
+
+
+def refine(
+    output: str | os.PathLike[str],
+    refined: str | os.PathLike[str] | None = None,
+    options: Options | None = None,
+    *,
+    photos: str | os.PathLike[str] | None = None,
+    free_intrinsics: bool = False,
+    events: Events | None = None,
+    watch: Stopwatch | None = None,
+) -> RefineResult:
+    """Adjust the maps of an odometry run whole, reject what does not fit, and move the frames with their keyframes.
+
+    Args:
+        output: workspace of an odometry run; it is not changed.
+        refined: folder of the results; None: ``OUT/refined``.
+        options: of all stages; mapping and adjust count here, and with photographs images, features and matching.
+        photos: photographs to add to the largest map: a folder, a glob or a list.
+        free_intrinsics: refine the calibration of the sequence as well.
+        events: listens in, and can ask the run to stop.
+        watch: started earlier, if more is to be counted in the report than this call.
+
+    Raises:
+        UsageError: ``refined`` holds something else.
+        InputError: ``output`` is no workspace, or the photographs or, with them, the sequence cannot be read.
+        NoReconstructionError: there is no map in it.
+        InterruptedRunError: ``events`` was asked to stop.
+    """
+    from threadpoolctl import threadpool_limits
+
+    source, options, events = Path(output), with_absolute_paths(options or Options()), events or Events()
+    manifest = read_manifest(source, ODOMETRY)
+    before = read_odometry(source)
+    if not before.maps:
+        raise NoReconstructionError(f"{source} holds no map to refine", "run sfmapp odometry first")
+    threads = options.threads or len(os.sched_getaffinity(0))
+    with ExitStack() as stack:
+        workspace = stack.enter_context(open_workspace(Path(refined or source / FOLDER), REFINE))
+        event_log = stack.enter_context(EventLog(workspace.log, source=str(source), version=sfmapp.__version__))
+        stack.enter_context(threadpool_limits(1, "blas"))
+        job = Job(str(source), workspace, options, events, watch or Stopwatch(), DecisionLog(), threads)
+        for listener in (event_log, job.log):
+            events.subscribe(listener)
+        job.note_inputs({})
+        stack.enter_context(kernels_compiling(events, job.usage))
+        pool = stack.enter_context(ThreadPoolExecutor(threads))
+        sequence = _open_sequence(manifest, job, required=photos is not None)
+        after, added = _refined(job, before, sequence, photos, free_intrinsics, pool)
+        return RefineResult(after, _write(job, before, after, sequence, added))
+
+
+def _open_sequence(manifest: dict[str, Any], job: Job, *, required: bool) -> Sequence | None:
+    """The sequence of the run, for its truth and its images; None if it is gone and only the truth was wanted."""
+    wish = options_from_dict({"sequence": manifest["options"]["sequence"]}).sequence
+    try:
+        return open_sequence(manifest["source"], wish, job.events, require_camera=False)
+    except InputError as error:
+        if required:
+            raise
+        job.events.warned(STAGE, f"the sequence is not there any more, nor is its truth: {error}")
+        return None
+
+
+def _refined(
+    job: Job, before: OdometryResult, sequence: Sequence | None, photos: str | os.PathLike[str] | None,
+    free_intrinsics: bool, pool: Executor,
+) -> tuple[OdometryResult, PhotoResult | None]:  # fmt: skip
+    """All maps refined, the largest with photographs in it."""
+    options = job.options
+    maps = []
+    with job.stage("adjustment"):
+        job.events.started(STAGE, "adjusting maps", total=len(before.maps))
+        for entry in before.maps:
+            mapping = lenient(options.mapping, entry.reconstruction)
+            maps.append(adjusted(entry.reconstruction, mapping, options.adjust, free_intrinsics, pool, job.events))
+            job.events.advanced(STAGE)
+        job.events.finished(STAGE)
+    added = None
+    if photos is not None:
+        assert sequence is not None
+        with job.stage("photographs"):
+            # what the map was adjusted to stays: the photographs must not bend a calibration that was not to be freed
+            map_with_photos, added = add_photos(
+                maps[0], before, sequence, os.fspath(photos), options, lenient(options.mapping, maps[0]),
+                threads=job.threads, pool=pool, events=job.events,
+            )  # fmt: skip
+            maps[0] = map_with_photos
+    entries = [laid_back(entry, model) for entry, model in zip(before.maps, maps, strict=True)]
+    return moved_frames(before, entries), added
+
+
+def lenient(options: MappingOptions, model: Reconstruction) -> MappingOptions:
+    """Points of neighbouring frames are seen under small angles; with a rig, whose baseline is known, smaller ones."""
+    least = 0.2 if model.rig is not None else 1.0
+    return replace(options, min_triangulation_angle_deg=min(options.min_triangulation_angle_deg, least))
+
+
+def adjusted(
+    model: Reconstruction, mapping: MappingOptions, adjust: AdjustOptions, free_intrinsics: bool, pool: Executor,
+    events: Events,
+) -> Reconstruction:  # fmt: skip
+    """A copy, adjusted and filtered in turn until its observations settle."""
+    model = model.copy()
+    model.cameras = [replace(camera, is_fixed=not free_intrinsics) for camera in model.cameras]
+    priors = [replace(camera, focal_sigma=_FOCAL_SIGMA * camera.focal) for camera in model.cameras]
+    for _ in range(_MAX_ROUNDS):
+        used = model.obs_is_inlier.copy()
+        sigma_px = max(structure.residual_scale_px(model), _MIN_SIGMA_PX)
+        adjust_bundle(model, robust(adjust, sigma_px), prior_cameras=priors)
+        sigma_px = max(structure.residual_scale_px(model), _MIN_SIGMA_PX)
+        limit_px = mapping.max_reprojection_error_sigmas * sigma_px
+        limit_px = float(np.clip(limit_px, _MIN_LIMIT_PX, mapping.max_reprojection_error_px))
+        structure.filter_observations(model, mapping, pool, None, limit_px)
+        structure.triangulate(model, np.flatnonzero(~model.is_triangulated), mapping, pool, limit_px)
+        changed = int((used != model.obs_is_inlier).sum())
+        summary = model.summary()
+        text = f"{summary['num_points']} points, {summary['mean_reprojection_error_px']:.3f} px"
+        events.decided(STAGE, f"adjusted: {changed} observations changed sides; {text}", **summary)
+        events.raise_if_cancelled()
+        if changed <= 1e-3 * used.sum():
+            break
+    return model
+
+
+def robust(adjust: AdjustOptions, sigma_px: float) -> AdjustOptions:
+    """Tracks slide and slip: unless the user wants another, a loss that lets go of what is far off the noise."""
+    if adjust.loss != AdjustOptions().loss:
+        return adjust
+    return replace(adjust, loss="cauchy", loss_scale_px=2 * sigma_px)
+
+
+def laid_back(entry: MapResult, model: Reconstruction) -> MapResult:
+    """The refined map where the old one lay: an adjustment leaves place and, with one camera, size open.
+
+    Metres that came from outside stay what they were on average; a rig knows its own.
+    """
+    old = entry.reconstruction.cam_from_world[entry.keyframe_image_idx]
+    new = model.cam_from_world[entry.keyframe_image_idx]
+    known = np.isfinite(new[:, 0])
+    try:
+        old_from_new = similarity.align_poses(new[known], old[known]).b_from_a
+    except ValueError:  # all in one place
+        return replace(entry, reconstruction=model, covariance=None, gauge="")
+    if model.rig is not None:
+        rotation = rigid3.rotation_matrix(old_from_new)
+        shift = rigid3.center(old[known]).mean(0) - rotation @ rigid3.center(new[known]).mean(0)
+        old_from_new = similarity.from_parts(rotation, shift, 1.0)
+    model.cam_from_world[model.is_registered] = similarity.transform_poses(
+        old_from_new, model.cam_from_world[model.is_registered]
+    )
+    model.point_xyz = similarity.apply(old_from_new, model.point_xyz)
+    return replace(entry, reconstruction=model, covariance=None, gauge="")
+
+
+def moved_frames(before: OdometryResult, entries: list[MapResult]) -> OdometryResult:
+    """The trajectory with new maps: each frame moves as its two neighbouring keyframes do, by its distance in time."""
+    poses = before.cam_from_world.copy()
+    for m, (old, new) in enumerate(zip(before.maps, entries, strict=True)):
+        was = old.reconstruction.cam_from_world[old.keyframe_image_idx]
+        now = new.reconstruction.cam_from_world[new.keyframe_image_idx]
+        kept = np.flatnonzero(np.isfinite(now[:, 0]))
+        if not len(kept):
+            continue
+        mine = np.flatnonzero(before.frame_map == m)
+        times = before.timestamps_s[np.searchsorted(before.frame_idx, old.keyframe_frame_idx[kept])]
+        after = np.clip(np.searchsorted(times, before.timestamps_s[mine]), 0, len(kept) - 1)
+        ahead = np.maximum(after - 1, 0)
+        span = times[after] - times[ahead]
+        weight = np.where(span > 0, (before.timestamps_s[mine] - times[ahead]) / np.where(span > 0, span, 1.0), 1.0)
+        moved = [
+            rigid3.compose(rigid3.compose(poses[mine], rigid3.inverse(was[kept[k]])), now[kept[k]])
+            for k in (ahead, after)
+        ]
+        poses[mine] = between(moved[0], moved[1], np.clip(weight, 0.0, 1.0))
+    return replace(before, cam_from_world=poses, live_cam_from_world=before.live_cam_from_world, maps=entries)
+
+
+def between(first: Array, second: Array, weight: Array) -> Array:
+    """Poses (N, 7) a share (N,) of the way from the first to the second: centres and rotations apart."""
+    start, end = rigid3.rotation_matrix(first), rigid3.rotation_matrix(second)
+    turn = rigid3.log_so3(end @ start.swapaxes(-1, -2))
+    rotation = rigid3.exp_so3(weight[:, None] * turn) @ start
+    center = (1 - weight[:, None]) * rigid3.center(first) + weight[:, None] * rigid3.center(second)
+    return rigid3.from_matrix(rotation, -np.einsum("nij,nj->ni", rotation, center))
+
+
+def _write(
+    job: Job, before: OdometryResult, after: OdometryResult, sequence: Sequence | None, added: PhotoResult | None
+) -> dict[str, Any]:
+    """Models, trajectories and the report, which is returned."""
+    workspace, truth = job.workspace, sequence.truth if sequence is not None else None
+    with job.measured("output"):
+        workspace.write_models([entry.reconstruction for entry in after.maps])
+        write_trajectories(workspace, after, live=False)
+    fits = {
+        name: [against_truth(result, truth, m) for m in range(len(result.maps))] if truth is not None else []
+        for name, result in (("before", before), ("after", after))
+    }
+    report = {
+        "format": REFINE_FORMAT,
+        "outcome": {"exit_code": 0, "message": "", "advice": None},
+        "run": job.facts(),
+        "maps": {
+            name: [map_row(result, m) for m in range(len(result.maps))]
+            for name, result in (("before", before), ("after", after))
+        },
+        "cameras": {
+            name: [
+                {"model": camera.model.name, "params": camera.params.tolist()}
+                for camera in result.maps[0].reconstruction.cameras
+            ]
+            for name, result in (("before", before), ("after", after))
+        },
+        "truth": {
+            name: [{"map": m, **truth_row(fit)} for m, fit in enumerate(found) if fit is not None]
+            for name, found in fits.items()
+        },
+        "photographs": added.rows if added is not None else [],
+        "skipped": [{"name": name, "reason": reason} for name, reason in added.skipped] if added is not None else [],
+        "usage": job.usage,
+        "warnings": job.log.warnings,
+        "decisions": job.log.decisions,
+    }
+    workspace.write_text("report.html", render_refine_html(report, after, truth, fits["after"]))
+    workspace.write_text("report.json", report_text(report))
+    workspace.manifest["usage"] = job.usage
+    workspace.save()
+    return report
