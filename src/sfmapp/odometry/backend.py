@@ -54,22 +54,27 @@ class Job:
 def choose_window(
     keyframes: KeyframeMap, options: OdometryOptions, newest: int | None = None
 ) -> tuple[NDArray[np.int64], Mask]:
-    """The last keyframes, and the earlier ones that share the most points with them as unmoved anchors.
+    """A keyframe and those just before it, and the others that share the most points with them as unmoved anchors.
+
+    Args:
+        newest: the last keyframe of the window; None for the newest there is.
 
     Returns:
         (K,) ascending keyframe positions, (K,) which of them may move. The first keyframe never moves.
     """
-    newest = len(keyframes.keyframes) - 1 if newest is None else newest
-    window = np.arange(max(0, newest - options.window + 1), newest + 1)
+    all_keyframes = keyframes.keyframes
+    newest = len(all_keyframes) - 1 if newest is None else newest
+    first = max(0, newest - options.window + 1)
     seen = np.zeros(keyframes.num_points, bool)
-    for k in window:
-        seen[keyframes.keyframes[k].point_id] = True
+    for keyframe in all_keyframes[first : newest + 1]:
+        seen[keyframe.point_id] = True
     seen &= np.isfinite(keyframes.point_xyz[: keyframes.num_points, 0])
-    shared = np.array([np.count_nonzero(seen[keyframes.keyframes[k].point_id]) for k in range(window[0])], np.int64)
+    owner = np.repeat(np.arange(len(all_keyframes)), [len(k.point_id) for k in all_keyframes])
+    shared = np.bincount(owner[seen[np.concatenate([k.point_id for k in all_keyframes])]], minlength=len(all_keyframes))
+    shared[first : newest + 1] = 0
     best = np.argsort(-shared, kind="stable")[: options.window_anchors]
-    anchors = np.sort(best[shared[best] > 0])
-    chosen = np.concatenate([anchors, window])
-    return chosen, (chosen >= window[0]) & (chosen > 0)
+    chosen = np.sort(np.concatenate([best[shared[best] > 0], np.arange(first, newest + 1)]))
+    return chosen, (chosen >= first) & (chosen <= newest) & (chosen > 0)
 
 
 def make_job(keyframes: KeyframeMap, keyframe_idx: NDArray[np.int64], is_variable: Mask) -> Job:

@@ -15,6 +15,7 @@ from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.backend import Job, classify, make_job, take_over
 from sfmapp.odometry.keyframe_map import KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.sweep import is_too_large, sweep
 from sfmapp.scene.camera import Camera, CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig
@@ -32,6 +33,8 @@ _MAX_CHANGE_SIGMAS = 4.0
 # Covariances take two dense matrices over all poses.
 _MAX_COVARIANCE_KEYFRAMES = 400
 _MAX_STEPS = 30
+# Keyframes of a large map that its cameras are questioned on.
+_NUM_QUESTIONED = 100
 # Residuals are not believed to be better than that, however well a synthetic sequence fits.
 _MIN_SIGMA_PX = 0.02
 
@@ -53,6 +56,8 @@ class Conclusion:
 
 def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -> Conclusion:
     """Adjust all keyframes and points of a map, in place, and the cameras where the images contradict them."""
+    if is_too_large(keyframes):
+        return _conclude_large(keyframes, options, events)
     everything = np.arange(len(keyframes.keyframes))
     job = make_job(keyframes, everything, everything > 0)
     model, report = job.model, dict[str, Any]()
@@ -71,6 +76,23 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -
     if options.covariance and 1 < len(everything) <= _MAX_COVARIANCE_KEYFRAMES:
         covariance, gauge = _covariance(model, len(keyframes.rig.cameras))
     return Conclusion(covariance, gauge, report)
+
+
+def _conclude_large(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -> Conclusion:
+    """The same piece by piece, without covariances; the cameras are questioned on the newest keyframes alone."""
+    report: dict[str, Any] = {"is_piecewise": True}
+    if options.refine_camera:
+        num = len(keyframes.keyframes)
+        part = np.arange(num - _NUM_QUESTIONED, num)
+        job = make_job(keyframes, part, part > part[0])
+        sigma = max(residual_scale_px(job.model), _MIN_SIGMA_PX)
+        _adjust(job.model, sigma)
+        refined, report["camera"] = _question_cameras(job, sigma)
+        if refined is not None:
+            events.decided(STAGE, "the images contradict the given calibration, which is refined", **report["camera"])
+            keyframes.rig = Rig(tuple(refined.cameras), keyframes.rig.cam_from_rig)
+    sweep(keyframes, options, events)
+    return Conclusion(None, "", report)
 
 
 def _adjust(model: Reconstruction, sigma: float, given: list[Camera] | None = None) -> float:
@@ -119,6 +141,14 @@ def _with_distortion(camera: Camera) -> Camera:
 
 
 def _covariance(model: Reconstruction, num_sensors: int) -> tuple[Array, str]:
-    """(K, 6, 6) of the keyframes and what they are relative to."""
+    """(K, 6, 6) of the keyframes, NaN for those that no point holds, and what they are relative to.
+
+    The noise of the observations is taken to be independent and of the size that the residuals have, in which the few
+    large ones weigh as much as they are: see ``sfmapp.adjust.covariance``.
+    """
     found = estimate_covariances(model, AdjustOptions(loss="trivial", refine_focal=False, refine_distortion=False))
-    return found.poses[::num_sensors], "centroid, mean rotation" + ("" if num_sensors > 1 else " and spread")
+    covariance = np.full((len(model.image_names) // num_sensors, 6, 6), np.nan)
+    of_first = found.image_idx % num_sensors == 0
+    covariance[found.image_idx[of_first] // num_sensors] = found.poses[of_first]
+    covariance[~np.isfinite(covariance).all((1, 2))] = np.nan
+    return covariance, "centroid, mean rotation" + ("" if num_sensors > 1 else " and spread")

@@ -85,14 +85,19 @@ def essential_edges(keyframes: KeyframeMap) -> GraphEdges:
 
 def keyframe_depths(keyframes: KeyframeMap) -> Array:
     """(K,) median depth of the points of each keyframe; of keyframes without points that of the others, or one."""
-    depths = np.full(len(keyframes.keyframes), np.nan)
-    for k, keyframe in enumerate(keyframes.keyframes):
-        z = rigid3.apply(keyframe.rig_from_world, keyframes.point_xyz[keyframe.point_id])[:, 2]
-        z = z[z > 0]
-        if len(z):
-            depths[k] = np.median(z)
-    known = depths[np.isfinite(depths)]
-    return np.where(np.isfinite(depths), depths, np.median(known) if len(known) else 1.0)
+    poses = np.array([k.rig_from_world for k in keyframes.keyframes]).reshape(-1, 7)
+    ids = np.concatenate([k.point_id for k in keyframes.keyframes] or [np.zeros(0, np.int64)])
+    owner = np.repeat(np.arange(len(poses)), [len(k.point_id) for k in keyframes.keyframes])
+    axis, offset = rigid3.rotation_matrix(poses)[:, 2], poses[:, 6]
+    z = np.einsum("ni,ni->n", axis[owner], keyframes.point_xyz[ids]) + offset[owner]
+    seen = z > 0  # False for NaN
+    z, owner = z[seen], owner[seen]
+    order = np.lexsort((z, owner))
+    num = np.bincount(owner, minlength=len(poses))
+    middle = np.cumsum(num) - num + num // 2
+    depths = np.full(len(poses), np.nan)
+    depths[num > 0] = z[order][middle[num > 0]]
+    return np.where(num > 0, depths, np.nanmedian(depths) if len(z) else 1.0)
 
 
 def count_shared(keyframes: KeyframeMap) -> Ids:

@@ -31,6 +31,9 @@ _CORNERS, _CORNER_DISTANCE_PX = 1000, 5.0
 # Rolls at which a lost frame is looked at, one after the other: descriptors bear 15 degrees.
 _ROLLS_DEG = (0.0, 25.0, -25.0)
 
+# Keyframes after a loop before the next is looked for: what drifts in between is what a window can bear.
+_REST = 30
+
 
 class Recognition:
     """All places of all maps."""
@@ -38,6 +41,8 @@ class Recognition:
     def __init__(self, seed: int) -> None:
         self._places, self._finder = Places(seed=seed), LoopFinder()
         self._num_searches = 0
+        # keyframe of the current map up to which no loop is looked for
+        self._resting_until = 0
         self._last = np.zeros(0, np.int64)
 
     def remember(
@@ -56,6 +61,8 @@ class Recognition:
             seen = PlaceView(view.images[0], xy, ids)
         else:
             return None
+        if local.newest < self._resting_until:
+            return None
         keyframes = {number: other.keyframes for number, other in maps.items()}
         return self._finder.find(keyframes, local.map_idx, self._places, view.frame_idx, seen)
 
@@ -70,8 +77,17 @@ class Recognition:
             The map that holds the newest keyframe now, and the factor on its unit of length.
         """
         self._finder.reset()
-        if closure.old_map != closure.new_map:
-            return self._join(maps, records, closure)
+        local, scale = (
+            self._close(maps, records, closure)
+            if closure.old_map == closure.new_map
+            else self._join(maps, records, closure)
+        )
+        self._resting_until = local.newest + _REST
+        return local, scale
+
+    def _close(
+        self, maps: dict[int, LocalMap], records: Sequence[FrameRecord], closure: LoopClosure
+    ) -> tuple[LocalMap, float]:
         local = maps[closure.new_map]
         closed = apply_closure(local.keyframes, self._places, closure)
         become = _renaming(local.keyframes.num_points, closed.renamed)
