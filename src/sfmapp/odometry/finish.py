@@ -12,7 +12,7 @@ from sfmapp.adjust.covariance import estimate_covariances
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.events import Events
 from sfmapp.mapping.structure import residual_scale_px
-from sfmapp.odometry.backend import Job, classify, make_job, take_over
+from sfmapp.odometry.backend import classify, make_job, take_over
 from sfmapp.odometry.keyframe_map import KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.sweep import is_too_large, sweep
@@ -32,7 +32,7 @@ _MIN_EVIDENCE = 90.0
 _MAX_CHANGE_SIGMAS = 4.0
 # Covariances take two dense matrices over all poses.
 _MAX_COVARIANCE_KEYFRAMES = 400
-_MAX_STEPS = 30
+_FIRST_STEPS, _MAX_STEPS = 8, 30
 # Keyframes of a large map that its cameras are questioned on.
 _NUM_QUESTIONED = 100
 # Residuals are not believed to be better than that, however well a synthetic sequence fits.
@@ -61,15 +61,17 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -
     everything = np.arange(len(keyframes.keyframes))
     job = make_job(keyframes, everything, everything > 0)
     model, report = job.model, dict[str, Any]()
-    for _ in range(2):
-        _adjust(model, max(residual_scale_px(model), _MIN_SIGMA_PX))
-        report["sigma_px"] = classify(model, job.num_elsewhere)
+    for steps in (_FIRST_STEPS, _MAX_STEPS):  # which observations agree is clear long before all have settled
+        sigma = max(residual_scale_px(model), _MIN_SIGMA_PX)
+        cost = _adjust(model, sigma, max_steps=steps)
+        report["sigma_px"] = classify(model, job.num_elsewhere) if steps == _FIRST_STEPS else sigma
         events.raise_if_cancelled()
     if options.refine_camera:
-        refined, report["camera"] = _question_cameras(job, max(report["sigma_px"], _MIN_SIGMA_PX))
+        refined, report["camera"] = _question_cameras(job.model, cost, sigma)
         if refined is not None:
             events.decided(STAGE, "the images contradict the given calibration, which is refined", **report["camera"])
             job.model = model = refined
+    report["sigma_px"] = classify(model, job.num_elsewhere)
     take_over(job, keyframes)
     keyframes.rig = Rig(tuple(model.cameras), keyframes.rig.cam_from_rig)
     covariance, gauge = None, ""
@@ -86,8 +88,7 @@ def _conclude_large(keyframes: KeyframeMap, options: OdometryOptions, events: Ev
         part = np.arange(num - _NUM_QUESTIONED, num)
         job = make_job(keyframes, part, part > part[0])
         sigma = max(residual_scale_px(job.model), _MIN_SIGMA_PX)
-        _adjust(job.model, sigma)
-        refined, report["camera"] = _question_cameras(job, sigma)
+        refined, report["camera"] = _question_cameras(job.model, _adjust(job.model, sigma), sigma)
         if refined is not None:
             events.decided(STAGE, "the images contradict the given calibration, which is refined", **report["camera"])
             keyframes.rig = Rig(tuple(refined.cameras), keyframes.rig.cam_from_rig)
@@ -95,7 +96,9 @@ def _conclude_large(keyframes: KeyframeMap, options: OdometryOptions, events: Ev
     return Conclusion(None, "", report)
 
 
-def _adjust(model: Reconstruction, sigma: float, given: list[Camera] | None = None) -> float:
+def _adjust(
+    model: Reconstruction, sigma: float, given: list[Camera] | None = None, max_steps: int = _MAX_STEPS
+) -> float:
     """Adjust all, the cameras as well if they were given; returns the cost in units of the noise."""
     num_sensors = 1 if model.rig is None else len(model.rig.cam_from_rig)
     variable = np.ones(len(model.image_names), bool)
@@ -105,7 +108,7 @@ def _adjust(model: Reconstruction, sigma: float, given: list[Camera] | None = No
     result = adjust_bundle(
         model,
         AdjustOptions(
-            loss="cauchy", loss_scale_px=2 * sigma, max_iterations=_MAX_STEPS, relative_cost_tolerance=1e-5,
+            loss="cauchy", loss_scale_px=2 * sigma, max_iterations=max_steps, relative_cost_tolerance=1e-4,
             refine_focal=given is not None, refine_distortion=given is not None,
             distortion_sigma=_DISTORTION_SIGMA / sigma,
         ),
@@ -114,12 +117,18 @@ def _adjust(model: Reconstruction, sigma: float, given: list[Camera] | None = No
     return 2 * result.final_cost / sigma**2
 
 
-def _question_cameras(job: Job, sigma: float) -> tuple[Reconstruction | None, dict[str, Any]]:
-    """The model with refined cameras if they explain the same observations much better, and the numbers behind that."""
-    given = [_with_distortion(camera) for camera in job.model.cameras]
-    fixed, free = job.model.copy(), job.model.copy()
+def _question_cameras(
+    model: Reconstruction, before: float, sigma: float
+) -> tuple[Reconstruction | None, dict[str, Any]]:
+    """The model with refined cameras if they explain the same observations much better, and the numbers behind that.
+
+    Args:
+        model: adjusted with the cameras as they were given. before: its cost in units of the noise, sigma in pixels.
+    """
+    given = [_with_distortion(camera) for camera in model.cameras]
+    free = model.copy()
     free.cameras = list(given)
-    before, after = _adjust(fixed, sigma), _adjust(free, sigma, given)
+    after = _adjust(free, sigma, given)
     evidence = (before - after) / sum(len(camera.params) - 2 for camera in given)
     changes = [c.focal / g.focal - 1 for c, g in zip(free.cameras, given, strict=True)]
     accepted = evidence > _MIN_EVIDENCE and max(map(abs, changes)) < _MAX_CHANGE_SIGMAS * _FOCAL_SIGMA
@@ -128,8 +137,6 @@ def _question_cameras(job: Job, sigma: float) -> tuple[Reconstruction | None, di
         "focal_change": changes, "given": [c.params.tolist() for c in given],
         "refined": [c.params.tolist() for c in free.cameras],
     }  # fmt: skip
-    if accepted:
-        classify(free, job.num_elsewhere)
     return free if accepted else None, numbers
 
 
