@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from sfmapp.adjust.pose import refine_pose
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.resection import estimate_pose
-from sfmapp.odometry.active_tracks import ActiveTracks, follow
+from sfmapp.odometry.active_tracks import ActiveTracks, References, follow
+from sfmapp.odometry.chaining import chain_pose
 from sfmapp.odometry.local_map import LocalMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.pyramid import Pyramid
@@ -69,8 +70,11 @@ def track(
     """
     xyz, mapped = local.points_of(tracks)
     references = local.references(tracks)
+    most = (tracks, np.zeros(len(tracks), bool))
     for start, level in _predictions(local, pose, step, previous, pyramid):
         followed, found = follow(tracks, xyz, local.camera, start, references, local.images, pyramid, level)
+        if found.sum() > most[1].sum():
+            most = (followed, found)
         if found.sum() < _MIN_FOUND * len(tracks) and level == _NEAR_LEVEL:
             continue
         usable = found & mapped
@@ -78,13 +82,27 @@ def track(
         if measured is not None:
             break
     else:
-        return None
+        followed, found = most
+        measured = _chained(local.camera, followed.subset(found), references, xyz[found], mapped[found])
+        if measured is None:
+            return None
     tracks, mapped = followed.subset(found), mapped[found]
     new_pose, covariance, inlier, sigma = measured
     keep = np.ones(len(tracks), bool)
     keep[mapped] = inlier
     keep[~mapped] = _near_epipolar_lines(local, tracks.subset(~mapped), new_pose)
     return Tracked(new_pose, covariance, tracks.subset(keep), mapped[keep], int(mapped.sum()), int(inlier.sum()), sigma)
+
+
+def _chained(
+    camera: Camera, tracks: ActiveTracks, references: References, xyz: Array, mapped: Mask
+) -> tuple[Array, Array, Mask, float] | None:
+    """What :func:`measure_pose` returns, where too few points of the map are left for that."""
+    pose = chain_pose(camera, tracks, references, np.where(mapped[:, None], xyz, np.nan))
+    if pose is None:
+        return None
+    error = np.linalg.norm(project(camera, rigid3.apply(pose, xyz[mapped])) - tracks.xy[mapped], axis=1)
+    return pose, np.full((6, 6), np.inf), error < _OUTLIER_RANGE_PX[1], float("nan")
 
 
 def _predictions(
