@@ -22,4 +22,5 @@ class OdometryOptions:
     loops: bool = True  # look for places seen before, close loops and join maps
     final_adjustment: bool = True  # adjust all keyframes once at the end
     refine_camera: bool = True  # there, refine the calibration where the images clearly contradict it
+    smooth: bool = False  # also give the trajectory through an error-state filter: steadier, short gaps bridged
     covariance: bool = True  # covariances of the keyframes, at the end

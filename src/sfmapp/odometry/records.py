@@ -15,7 +15,7 @@ from sfmapp.odometry.tracker import measure_pose
 
 Array = NDArray[np.float64]
 
-_NO_POSE = np.full(7, np.nan)
+_NO_POSE, _NO_COVARIANCE = np.full(7, np.nan), np.full((6, 6), np.nan)
 
 
 @dataclass
@@ -27,6 +27,7 @@ class FrameRecord:
         keyframe: position in the map's keyframes. frame_from_keyframe: (7,), NaN without a pose.
         is_keyframe: it is that keyframe.
         live: (7,) cam_from_world as it was given out.
+        covariance: (6, 6) of the pose given the map, as of ``refine_pose``; NaN where it was not measured.
         point_id: (N,) int32 and xy: (N, 2) float32, the points that its pose was measured with.
         time_s: CPU time of tracking, without the back end.
     """
@@ -40,6 +41,7 @@ class FrameRecord:
     is_keyframe: bool = False
     frame_from_keyframe: Array = field(default_factory=_NO_POSE.copy)
     live: Array = field(default_factory=_NO_POSE.copy)
+    covariance: Array = field(default_factory=_NO_COVARIANCE.copy)
     point_id: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     xy: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     time_s: float = 0.0
@@ -51,18 +53,25 @@ class FrameRecord:
 
 
 def measure_again(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int) -> None:
-    """Poses of the frames between the keyframes of a map, from the points as they are in the end."""
+    """Poses of the frames between the keyframes of a map, from the points as they are in the end, and how well these
+    hold them. Keyframes stay where the adjustment has put them."""
     camera = keyframes.rig.cameras[0]
     for record in records:
-        if record.map_idx != map_idx or record.is_keyframe or not record.has_pose:
+        if record.map_idx != map_idx or not record.has_pose:
             continue
-        keyframe = keyframes.keyframes[record.keyframe].rig_from_world
-        start = rigid3.compose(record.frame_from_keyframe, keyframe)
-        xyz = keyframes.point_xyz[record.point_id]
+        keyframe = keyframes.keyframes[record.keyframe]
+        point_id, xy = record.point_id.astype(np.int64), record.xy.astype(np.float64)
+        if record.is_keyframe:
+            point_id, xy = keyframe.point_id[keyframe.is_inlier[:, 0]], keyframe.xy[keyframe.is_inlier[:, 0], 0]
+        xyz = keyframes.point_xyz[point_id]
         known = np.isfinite(xyz[:, 0])
-        measured = measure_pose(camera, start, xyz[known], record.xy[known].astype(np.float64))
-        if measured is not None:
-            record.frame_from_keyframe = rigid3.compose(measured[0], rigid3.inverse(keyframe))
+        start = rigid3.compose(record.frame_from_keyframe, keyframe.rig_from_world)
+        measured = measure_pose(camera, start, xyz[known], xy[known])
+        if measured is None:
+            continue
+        record.covariance = measured[1]
+        if not record.is_keyframe:
+            record.frame_from_keyframe = rigid3.compose(measured[0], rigid3.inverse(keyframe.rig_from_world))
 
 
 def gather(
@@ -82,6 +91,7 @@ def gather(
         np.array([r.frame_idx for r in records], np.int64), [r.name for r in records],
         np.array([r.timestamp_s for r in records]), poses, np.array([r.live for r in records]).reshape(-1, 7), place,
         np.array([r.state for r in records], np.uint8), [_map_result(maps[m], conclusions[m]) for m in order],
+        np.array([r.covariance for r in records]).reshape(-1, 6, 6),
     )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.odometry.smoothing import SmoothedTrajectory
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -59,6 +60,9 @@ class OdometryResult:
         frame_map: (F,) int32 position in ``maps``, -1 in gaps.
         frame_state: (F,) uint8 of :class:`FrameState`.
         maps: the largest (most frames) first; each has a world and, without a scale, a unit of its own.
+        covariance: (F, 6, 6) of the final poses given their map, over rotation (radians) and translation of
+            ``x_cam <- exp(w) x_cam + v``; NaN where not measured. None for a result read from files.
+        smoothed: for each map its frames as the error-state filter has them; empty if not asked for.
         report: counts, times and decisions, JSON-able.
     """
 
@@ -70,4 +74,6 @@ class OdometryResult:
     frame_map: NDArray[np.int32]
     frame_state: NDArray[np.uint8]
     maps: list[MapResult]
+    covariance: Array | None = None
+    smoothed: list[SmoothedTrajectory] = field(default_factory=list)
     report: dict[str, Any] = field(default_factory=dict)

@@ -23,6 +23,7 @@ from sfmapp.odometry.pyramid import Pyramid, build_pyramid
 from sfmapp.odometry.recognition import Recognition
 from sfmapp.odometry.records import FrameRecord, gather, measure_again
 from sfmapp.odometry.result import FrameState, OdometryResult
+from sfmapp.odometry.smoothing import smooth_trajectory
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
 from sfmapp.odometry.tracker import MIN_INLIERS, keyframe_reason, measure_pose, track
 
@@ -304,6 +305,10 @@ class Odometry:
             self.events.finished("adjustment", **conclusions[number].report)
         self.executor.shutdown()
         result = gather(self.records, maps, conclusions)
+        if self.options.smooth and result.covariance is not None:
+            for m in range(len(result.maps)):
+                poses = np.where((result.frame_map == m)[:, None], result.cam_from_world, np.nan)
+                result.smoothed.append(smooth_trajectory(result.timestamps_s, poses, result.covariance))
         result.report = self._report(result)
         return result
 

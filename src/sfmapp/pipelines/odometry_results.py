@@ -67,16 +67,21 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
 
 
 def write_trajectories(workspace: Workspace, result: OdometryResult, *, live: bool = True) -> None:
-    """A file of final poses for each map, the live poses of the largest, and the largest as KITTI has it.
+    """A file of final poses for each map, the live poses of the largest, and the largest as KITTI has it (and smoothed).
 
     Maps have worlds of their own, so they cannot share a file. What an earlier run left is taken away.
     """
     from sfmapp.formats.kitti import write_kitti
 
     folder = workspace.folder
-    kept = {"trajectory.tum", "trajectory_live.tum", *(f"trajectory-{m}.tum" for m in range(1, len(result.maps)))}
+    kept = {
+        "trajectory.tum",
+        "trajectory_live.tum",
+        *(["trajectory_smooth.tum"] if result.smoothed else []),
+        *(f"trajectory-{m}.tum" for m in range(1, len(result.maps))),
+    }
     for path in folder.glob("trajectory*"):
-        is_ours = path.name in ("trajectory.tum", "trajectory_live.tum", "trajectory.kitti")
+        is_ours = path.name.removeprefix("trajectory") in (".tum", "_live.tum", "_smooth.tum", ".kitti")
         number = path.name.removeprefix("trajectory-").removesuffix(".tum")
         if (is_ours or number.isdigit()) and (path.name not in kept or not result.maps):
             path.unlink()
@@ -86,6 +91,9 @@ def write_trajectories(workspace: Workspace, result: OdometryResult, *, live: bo
     if result.maps:
         if live:
             write_tum(folder / "trajectory_live.tum", result.timestamps_s, poses_of_map(result, 0, live=True))
+        if result.smoothed:
+            smooth = result.smoothed[0].cam_from_world
+            write_tum(folder / "trajectory_smooth.tum", result.timestamps_s, smooth)
         write_kitti(folder / "trajectory.kitti", poses_of_map(result, 0), result.frame_idx)
 
 
