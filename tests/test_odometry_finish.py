@@ -1,0 +1,141 @@
+"""The last word on a map: covariances that are as large as the errors, and calibrations that are questioned."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import odometry_sequences as played
+from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.errors import InterruptedRunError
+from sfmapp.events import Events
+from sfmapp.odometry.finish import conclude
+from sfmapp.odometry.keyframe_map import KeyframeMap
+from sfmapp.odometry.options import OdometryOptions
+from sfmapp.scene.camera import CameraModel, simple_camera
+from sfmapp.scene.rig import Rig
+from sfmapp.scene.synthetic import make_scene, synthetic_rig
+
+OPTIONS = OdometryOptions()
+CAMERA = simple_camera(CameraModel.PINHOLE, 640, 480, 525.0)
+
+
+def small_map(seed: int, rig: Rig, *, num_keyframes: int = 8, num_points: int = 150, sigma_px: float = 0.3,
+              outlier_ratio: float = 0.0) -> tuple[KeyframeMap, np.ndarray]:  # fmt: skip
+    """A map with independent noise, and the true poses of its keyframes."""
+    num_sensors = len(rig.cameras)
+    arguments = {"rig": rig} if num_sensors > 1 else {"cameras": rig.cameras[0]}
+    scene = make_scene(
+        seed, num_sensors * num_keyframes, num_points, sigma_px=sigma_px, layout="forward",
+        outlier_ratio=outlier_ratio, **arguments,
+    )  # fmt: skip
+    return played.keyframe_map(scene, rig), scene.truth.cam_from_world[::num_sensors]
+
+
+@pytest.mark.parametrize(("num_sensors", "num_freedoms"), [(1, 7), (2, 6)])
+def test_normalised_errors_are_one_under_independent_noise(num_sensors: int, num_freedoms: int) -> None:
+    rig = Rig.single(CAMERA) if num_sensors == 1 else synthetic_rig()
+    options, values = replace(OPTIONS, refine_camera=False), []
+    for seed in range(40):
+        keyframes, truth = small_map(seed, rig)
+        conclusion = conclude(keyframes, options, Events())
+        assert conclusion.covariance is not None
+        ours = np.array([k.rig_from_world for k in keyframes.keyframes])
+        errors = played.gauge_errors(ours, truth, num_freedoms)
+        values.append(played.normalized_errors(errors, conclusion.covariance).mean())
+    assert 0.8 < np.mean(values) < 1.25
+    assert conclusion.gauge == "centroid, mean rotation" + (" and spread" if num_sensors == 1 else "")
+
+
+def test_noise_and_covariance_have_the_size_of_what_was_drawn() -> None:
+    small, large = (small_map(0, Rig.single(CAMERA), sigma_px=sigma)[0] for sigma in (0.2, 0.6))
+    options = replace(OPTIONS, refine_camera=False)
+    one, other = conclude(small, options, Events()), conclude(large, options, Events())
+    assert 0.15 < one.report["sigma_px"] < 0.22
+    assert 0.45 < other.report["sigma_px"] < 0.66
+    assert one.covariance is not None
+    assert other.covariance is not None
+    traces = [np.trace(c.covariance, axis1=1, axis2=2).mean() for c in (one, other)]
+    assert 6.0 < traces[1] / traces[0] < 13.0
+
+
+def test_a_keyframe_without_points_has_no_covariance_and_the_others_keep_theirs() -> None:
+    keyframes, _ = small_map(1, Rig.single(CAMERA), num_keyframes=8)
+    whole = conclude(small_map(1, Rig.single(CAMERA), num_keyframes=8)[0], OPTIONS, Events()).covariance
+    blind = keyframes.keyframes[4]
+    blind.is_inlier[:] = False
+    blind.xy[:] = 1e6  # nowhere near: the last word must not take them back
+    found = conclude(keyframes, OPTIONS, Events()).covariance
+    assert whole is not None
+    assert found is not None
+    assert np.isnan(found[4]).all()
+    others = np.arange(8) != 4
+    assert np.isfinite(found[others]).all()
+    ratio = np.trace(found[others], axis1=1, axis2=2) / np.trace(whole[others], axis1=1, axis2=2)
+    assert (ratio > 0.3).all()  # each in its own place, about as sure as before
+    assert (ratio < 30).all()
+
+
+@pytest.mark.parametrize(("num_sensors", "sigma_px"), [(1, 0.1), (2, 0.3)])
+def test_a_wrong_focal_length_is_found_and_corrected(num_sensors: int, sigma_px: float) -> None:
+    rig = Rig.single(CAMERA) if num_sensors == 1 else synthetic_rig()
+    keyframes, _ = small_map(3, rig, num_keyframes=14, num_points=600, sigma_px=sigma_px)
+    wrong = tuple(replace(c, params=c.params * [1.02, 1.02, 1, 1]) for c in rig.cameras)
+    keyframes.rig = Rig(wrong, rig.cam_from_rig)
+    report = conclude(keyframes, OPTIONS, Events()).report["camera"]
+    assert report["is_refined"]
+    for camera, right, change in zip(keyframes.rig.cameras, rig.cameras, report["focal_change"], strict=True):
+        assert camera.focal == pytest.approx(right.focal, rel=0.004)
+        assert change == pytest.approx(1 / 1.02 - 1, abs=0.004)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_right_calibration_is_left_alone(seed: int) -> None:
+    rig = Rig.single(CAMERA) if seed % 2 else synthetic_rig()
+    keyframes, _ = small_map(seed, rig, num_keyframes=10, num_points=400, outlier_ratio=0.02)
+    report = conclude(keyframes, OPTIONS, Events()).report["camera"]
+    assert not report["is_refined"]
+    assert keyframes.rig.cameras == rig.cameras
+    assert report["evidence_per_parameter"] < 20  # far from the bound
+
+
+def test_outliers_are_told_from_points() -> None:
+    keyframes, truth = small_map(5, Rig.single(CAMERA), num_points=300, outlier_ratio=0.05)
+    clean, _ = small_map(5, Rig.single(CAMERA), num_points=300)
+    conclude(keyframes, OPTIONS, Events())
+    wrong, marked = 0, 0
+    for ours, right in zip(keyframes.keyframes, clean.keyframes, strict=True):
+        is_outlier = np.abs(ours.xy - right.xy).max((1, 2)) > 20
+        wrong += int(is_outlier.sum())
+        marked += int((is_outlier & ~ours.is_inlier[:, 0]).sum())
+    assert wrong > 30
+    assert marked > 0.95 * wrong
+    ours = np.array([k.rig_from_world for k in keyframes.keyframes])
+    errors = played.gauge_errors(ours, truth, 7)
+    assert np.degrees(np.linalg.norm(errors[:, :3], axis=1)).max() < 0.2
+
+
+def test_the_first_keyframe_stays_and_the_rest_is_at_a_minimum() -> None:
+    keyframes, _ = small_map(6, synthetic_rig())
+    first = keyframes.keyframes[0].rig_from_world.copy()
+    report = conclude(keyframes, replace(OPTIONS, refine_camera=False, covariance=False), Events()).report
+    np.testing.assert_array_equal(keyframes.keyframes[0].rig_from_world, first)
+    model, _ = keyframes.reconstruction(np.arange(8))
+    again = adjust_bundle(
+        model,
+        AdjustOptions(
+            loss="cauchy", loss_scale_px=2 * report["sigma_px"], refine_focal=False, refine_distortion=False,
+            relative_cost_tolerance=1e-10,
+        ),
+    )  # fmt: skip
+    assert again.final_cost > 0.98 * again.initial_cost
+
+
+def test_a_stopped_run_is_interrupted() -> None:
+    keyframes, _ = small_map(7, Rig.single(CAMERA))
+    events = Events()
+    events.cancel()
+    with pytest.raises(InterruptedRunError):
+        conclude(keyframes, OPTIONS, events)
