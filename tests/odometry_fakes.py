@@ -152,5 +152,5 @@ class FakeRunner:
         return OdometryResult(
             np.array([row[0] for row in rows], np.int64), [row[1] for row in rows], np.array([row[2] for row in rows]),
             poses, poses.copy(), np.array([place[row[4]] for row in rows], np.int32),
-            np.array([row[3] for row in rows], np.uint8), maps, {"num_keyframes": sum(map(len, (maps,)))},
+            np.array([row[3] for row in rows], np.uint8), maps, covariance=np.tile(1e-4 * np.eye(6), (len(rows), 1, 1)),
         )  # fmt: skip

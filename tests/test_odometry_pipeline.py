@@ -58,7 +58,16 @@ def finished(tmp_path: Path, monkeypatch: Patch) -> tuple[Path, TrackResult]:
 def test_all_files_are_written_and_nothing_else(finished: tuple[Path, TrackResult]) -> None:
     names = {path.name for path in finished[0].iterdir()}
     trajectories = {"trajectory.tum", "trajectory_live.tum", "trajectory.kitti", "trajectory.kitti.frames"}
-    others = {"frames.csv", "covariance.csv", "sparse", "report.json", "report.html", "log.jsonl", "run.json"}
+    others = {
+        "frames.csv",
+        "covariance.csv",
+        "frame_covariance.csv",
+        "sparse",
+        "report.json",
+        "report.html",
+        "log.jsonl",
+        "run.json",
+    }
     assert names == trajectories | others
     assert sorted(path.name for path in (finished[0] / "sparse").iterdir()) == ["0"]
 
@@ -94,6 +103,9 @@ def test_keyframes_have_covariances(finished: tuple[Path, TrackResult]) -> None:
     assert float(rows[0]["tz_tz"]) == 1e-4
     assert float(rows[0]["rx_tz"]) == 0
     assert len(rows[0]) == 4 + 21
+    of_frames = rows_of(finished[0] / "frame_covariance.csv")
+    assert [int(row["index"]) for row in of_frames] == [k for k in range(50) if not 20 <= k < 25]
+    assert float(of_frames[0]["ty_ty"]) == 1e-4
     sigma = finished[1].report["maps"][0]["position_sigma"]
     assert sigma["median"] == pytest.approx(np.sqrt(3e-4))
 

@@ -53,6 +53,7 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
         write_trajectories(workspace, result)
         workspace.write_text("frames.csv", _frames_csv(result, facts))
         workspace.write_text("covariance.csv", _covariance_csv(result))
+        workspace.write_text("frame_covariance.csv", _frame_covariance_csv(result))
         workspace.write_models([entry.reconstruction for entry in result.maps])
     against = [against_truth(result, truth, m) for m in range(len(result.maps))] if truth is not None else []
     with run.measured("recording"):
@@ -67,19 +68,16 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
 
 
 def write_trajectories(workspace: Workspace, result: OdometryResult, *, live: bool = True) -> None:
-    """A file of final poses for each map, the live poses of the largest, and the largest as KITTI has it (and smoothed).
+    """A file of final poses for each map; of the largest also as KITTI has it, live, and smoothed if that was asked for.
 
     Maps have worlds of their own, so they cannot share a file. What an earlier run left is taken away.
     """
     from sfmapp.formats.kitti import write_kitti
 
     folder = workspace.folder
-    kept = {
-        "trajectory.tum",
-        "trajectory_live.tum",
-        *(["trajectory_smooth.tum"] if result.smoothed else []),
-        *(f"trajectory-{m}.tum" for m in range(1, len(result.maps))),
-    }
+    kept = {"trajectory.tum", "trajectory_live.tum", *(f"trajectory-{m}.tum" for m in range(1, len(result.maps)))}
+    if result.smoothed:
+        kept.add("trajectory_smooth.tum")
     for path in folder.glob("trajectory*"):
         is_ours = path.name.removeprefix("trajectory") in (".tum", "_live.tum", "_smooth.tum", ".kitti")
         number = path.name.removeprefix("trajectory-").removesuffix(".tum")
@@ -136,7 +134,10 @@ def read_odometry(folder: Path) -> OdometryResult:
         order = np.argsort(frames, kind="stable")
         source, sigma = row["scale_source"], row["scale_sigma"]
         maps.append(MapResult(model, frames[order], images[order], scale_source=source, scale_sigma=sigma))
-    return OdometryResult(indices, names, times, poses, np.full_like(poses, np.nan), frame_map, states, maps)
+    unknown = np.full_like(poses, np.nan)
+    return OdometryResult(
+        indices, names, times, poses, unknown, frame_map, states, maps, covariance=np.full((len(rows), 6, 6), np.nan)
+    )
 
 
 def _frames_csv(result: OdometryResult, facts: FrameFacts) -> str:
@@ -155,17 +156,26 @@ def _frames_csv(result: OdometryResult, facts: FrameFacts) -> str:
 def _covariance_csv(result: OdometryResult) -> str:
     """The upper triangles of the keyframes' covariances; keyframes without one are left out."""
     position = {int(idx): k for k, idx in enumerate(result.frame_idx)}
-    upper = np.triu_indices(6)
     rows = []
     for m, entry in enumerate(result.maps):
         if entry.covariance is None:
             continue
         for frame_idx, covariance in zip(entry.keyframe_frame_idx.tolist(), entry.covariance, strict=True):
             if np.isfinite(covariance).all():
-                k = position[frame_idx]
-                values = [f"{value:.9e}" for value in covariance[upper]]
-                rows.append([m, frame_idx, repr(float(result.timestamps_s[k])), result.frame_names[k], *values])
+                rows.append(_covariance_row(result, m, position[frame_idx], covariance))
     return _csv(COVARIANCE_COLUMNS, rows)
+
+
+def _frame_covariance_csv(result: OdometryResult) -> str:
+    """The same of every frame's pose given its map: how well the frame was measured, not how well the map is known."""
+    known = np.flatnonzero(np.isfinite(result.covariance).all((1, 2)) & (result.frame_map >= 0))
+    rows = [_covariance_row(result, int(result.frame_map[k]), int(k), result.covariance[k]) for k in known]
+    return _csv(COVARIANCE_COLUMNS, rows)
+
+
+def _covariance_row(result: OdometryResult, map_idx: int, k: int, covariance: Any) -> list[Any]:
+    values = [f"{value:.9e}" for value in covariance[np.triu_indices(6)]]
+    return [map_idx, int(result.frame_idx[k]), repr(float(result.timestamps_s[k])), result.frame_names[k], *values]
 
 
 def _csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
