@@ -61,9 +61,24 @@ class Played:
         return replace(self, images=[self.images[i] for i in idx], timestamps_s=times, truth=truth, imu=None)
 
 
+# sequences that differ in some frames share the others
+_rendered: dict[tuple[bytes | int | float, ...], NDArray[np.uint8]] = {}
+
+
+def _image(sequence: RenderedSequence, frame: int, sensor: int) -> NDArray[np.uint8]:
+    key = (
+        id(sequence.worlds[sequence.place[frame]]), sensor, sequence.rig.cameras[sensor].params.tobytes(),
+        sequence.rig.cam_from_rig[sensor].tobytes(), sequence.seed, int(sequence.noise_key[frame]),
+        float(sequence.gain[frame]), sequence.cam_from_world[frame].tobytes(),
+    )  # fmt: skip
+    if key not in _rendered:
+        _rendered[key] = sequence.image(frame, sensor)
+    return _rendered[key]
+
+
 def play(sequence: RenderedSequence) -> Played:
-    """All of a rendered sequence, in metres."""
-    images = [tuple(sequence.image(f, s) for s in range(len(sequence.rig.cameras))) for f in range(len(sequence))]
+    """All of a rendered sequence, in metres. Nothing moves in the rooms, so the time of a frame does not count."""
+    images = [tuple(_image(sequence, f, s) for s in range(len(sequence.rig.cameras))) for f in range(len(sequence))]
     imu = None
     if sequence.imu is not None and sequence.imu_from_cam is not None:
         i = sequence.imu
@@ -84,9 +99,9 @@ def room_rig(is_stereo: bool) -> Rig:
 
 @cache
 def room_walk(num_frames: int = 80, is_stereo: bool = False, seed: int = 0) -> RenderedSequence:
-    """The first frames of the walk round the room, 30 frames a second."""
-    sequence = rendered.room(num_frames, seed, OPTICS, PINHOLE)
-    return replace(sequence, rig=room_rig(is_stereo))
+    """The first frames of the walk round the room, 30 frames a second, without motion blur."""
+    sequence = rendered.room(80, seed, OPTICS, PINHOLE)
+    return replace(sequence._take(np.arange(num_frames)), rig=room_rig(is_stereo))
 
 
 @cache
