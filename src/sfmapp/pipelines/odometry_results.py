@@ -68,7 +68,7 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
 
 
 def write_trajectories(workspace: Workspace, result: OdometryResult, *, live: bool = True) -> None:
-    """A file of final poses for each map; of the largest also as KITTI has it, live, and smoothed if that was asked for.
+    """A file of final poses for each map; of the largest also as KITTI has it, live, and smoothed if asked for.
 
     Maps have worlds of their own, so they cannot share a file. What an earlier run left is taken away.
     """
