@@ -20,7 +20,7 @@ from sfmapp.odometry.run import run_odometry
 from sfmapp.scene import rendered
 from sfmapp.scene.camera import Camera, CameraModel
 from sfmapp.scene.rendered import RenderedSequence
-from sfmapp.scene.rendering import Optics
+from sfmapp.scene.rendering import Optics, World
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.synthetic import SyntheticScene
 
@@ -62,6 +62,7 @@ class Played:
 
 
 # sequences that differ in some frames share the others
+_worlds: dict[bytes | int | float, World] = {}  # kept, so that their ids stay theirs
 _rendered: dict[tuple[bytes | int | float, ...], NDArray[np.uint8]] = {}
 
 
@@ -73,6 +74,7 @@ def _image(sequence: RenderedSequence, frame: int, sensor: int) -> NDArray[np.ui
     )  # fmt: skip
     if key not in _rendered:
         _rendered[key] = sequence.image(frame, sensor)
+        _worlds[key[0]] = sequence.worlds[sequence.place[frame]]
     return _rendered[key]
 
 
