@@ -134,10 +134,7 @@ def read_odometry(folder: Path) -> OdometryResult:
         order = np.argsort(frames, kind="stable")
         source, sigma = row["scale_source"], row["scale_sigma"]
         maps.append(MapResult(model, frames[order], images[order], scale_source=source, scale_sigma=sigma))
-    unknown = np.full_like(poses, np.nan)
-    return OdometryResult(
-        indices, names, times, poses, unknown, frame_map, states, maps, covariance=np.full((len(rows), 6, 6), np.nan)
-    )
+    return OdometryResult(indices, names, times, poses, np.full_like(poses, np.nan), frame_map, states, maps)
 
 
 def _frames_csv(result: OdometryResult, facts: FrameFacts) -> str:
@@ -168,8 +165,10 @@ def _covariance_csv(result: OdometryResult) -> str:
 
 def _frame_covariance_csv(result: OdometryResult) -> str:
     """The same of every frame's pose given its map: how well the frame was measured, not how well the map is known."""
-    known = np.flatnonzero(np.isfinite(result.covariance).all((1, 2)) & (result.frame_map >= 0))
-    rows = [_covariance_row(result, int(result.frame_map[k]), int(k), result.covariance[k]) for k in known]
+    rows = []
+    if (covariances := result.covariance) is not None:
+        known = np.flatnonzero(np.isfinite(covariances).all((1, 2)) & (result.frame_map >= 0))
+        rows = [_covariance_row(result, int(result.frame_map[k]), int(k), covariances[k]) for k in known]
     return _csv(COVARIANCE_COLUMNS, rows)
 
 

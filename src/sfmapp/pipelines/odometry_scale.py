@@ -135,7 +135,8 @@ def rescale(result: OdometryResult, map_idx: int, found: ScaleEstimate) -> None:
     )  # fmt: skip
     result.cam_from_world[mine, 4:] *= found.scale
     result.live_cam_from_world[mine, 4:] *= found.scale
-    result.covariance[mine] = scale_covariance(result.covariance[mine], found.scale)
+    if result.covariance is not None:
+        result.covariance[mine] = scale_covariance(result.covariance[mine], found.scale)
     if result.smoothed:
         smooth = result.smoothed[map_idx]
         poses = np.concatenate([smooth.cam_from_world[:, :4], found.scale * smooth.cam_from_world[:, 4:]], 1)
