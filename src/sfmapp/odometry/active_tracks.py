@@ -61,6 +61,10 @@ class ActiveTracks:
         """The same tracks at other places (N, 2)."""
         return replace(self, xy=xy)
 
+    def after_removal(self, keyframe: int) -> ActiveTracks:
+        """The same tracks once a keyframe that none of them refers to is dropped."""
+        return replace(self, reference=self.reference - (self.reference > keyframe))
+
     def joined(self, other: ActiveTracks) -> ActiveTracks:
         """These tracks and others, sorted by point."""
         both = ActiveTracks(

@@ -62,6 +62,12 @@ class KeyframeMap:
         """Points (N,), each at most once, are seen so many times more."""
         self._num_observations[point_id] += observations.astype(np.int32)
 
+    def remove(self, position: int) -> Keyframe:
+        """Drop a keyframe; those after it move up. What it saw of points that others see stays in the map."""
+        keyframe = self.keyframes.pop(position)
+        self.count(keyframe.point_id, -np.isfinite(keyframe.xy[:, :, 0]).sum(1))
+        return keyframe
+
     def recount(self) -> None:
         """Count afresh how often points are seen, after ids have changed."""
         self._num_observations = np.zeros(len(self.point_xyz), np.int32)

@@ -84,6 +84,22 @@ class LocalMap:
         xyz[~mapped] = guessed.world_points(self.references(guessed))
         return xyz, mapped
 
+    def redundant_keyframe(self) -> int | None:
+        """The keyframe whose image was dropped last, if others see nearly all that it sees (Mur-Artal et al.,
+        "ORB-SLAM", 2015, section VI-E)."""
+        position = self.newest - _KEPT_IMAGES
+        if position <= 0 or self.options.cull_seen >= 1:
+            return None
+        keyframe = self.keyframes.keyframes[position]
+        ids = keyframe.point_id[keyframe.is_inlier[:, 0] & self.keyframes.is_triangulated(keyframe.point_id)]
+        others = self.keyframes.num_observations(ids) // len(self.rig.cameras) - 1
+        return position if (others >= 3).mean() > self.options.cull_seen else None
+
+    def remove_keyframe(self, position: int) -> Keyframe:
+        """Drop a keyframe without an image; no adjustment may be under way."""
+        self.images = {k - 1: image for k, image in self.images.items()}
+        return self.keyframes.remove(position)
+
     def begin(self, view: View, corners: Array) -> ActiveTracks:
         """Make the first keyframe of a map, at the identity, of corners (N, 2) without depth; returns their tracks."""
         self.images[0] = view.pyramids[0]

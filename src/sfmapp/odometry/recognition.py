@@ -66,6 +66,15 @@ class Recognition:
         keyframes = {number: other.keyframes for number, other in maps.items()}
         return self._finder.find(keyframes, local.map_idx, self._places, view.frame_idx, seen)
 
+    def forget(self, frame_idx: int) -> bool:
+        """Let go of a keyframe that is to be dropped; False if it is needed to confirm a loop."""
+        if self._finder.is_suspicious:
+            return False
+        if frame_idx in self._places:
+            self._places.remove(frame_idx)
+        self._resting_until -= 1
+        return True
+
     def close(
         self, maps: dict[int, LocalMap], records: Sequence[FrameRecord], closure: LoopClosure
     ) -> tuple[LocalMap, float]:

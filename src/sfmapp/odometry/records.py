@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.finish import Conclusion
-from sfmapp.odometry.keyframe_map import KeyframeMap
+from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.odometry.tracker import measure_pose
 
@@ -50,6 +50,24 @@ class FrameRecord:
     def has_pose(self) -> bool:
         """Whether the frame has a place in its map."""
         return bool(np.isfinite(self.frame_from_keyframe[0]))
+
+
+def leave_keyframe(
+    records: list[FrameRecord], map_idx: int, position: int, dropped: Keyframe, before: Keyframe
+) -> None:
+    """Tie the frames of a dropped keyframe to the one before it, and its own frame with what it saw."""
+    change = rigid3.compose(dropped.rig_from_world, rigid3.inverse(before.rig_from_world))
+    for record in records:
+        if record.map_idx != map_idx or record.keyframe < position:
+            continue
+        if record.keyframe == position:
+            record.frame_from_keyframe = rigid3.compose(record.frame_from_keyframe, change)
+            if record.is_keyframe:
+                good = dropped.is_inlier[:, 0]
+                record.is_keyframe = False
+                record.point_id = dropped.point_id[good].astype(np.int32)
+                record.xy = dropped.xy[good, 0].astype(np.float32)
+        record.keyframe -= 1
 
 
 def measure_again(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int) -> None:

@@ -21,7 +21,7 @@ from sfmapp.odometry.local_map import LocalMap, View
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.pyramid import Pyramid, build_pyramid
 from sfmapp.odometry.recognition import Recognition
-from sfmapp.odometry.records import FrameRecord, gather, measure_again
+from sfmapp.odometry.records import FrameRecord, gather, leave_keyframe, measure_again
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.smoothing import smooth_trajectory
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
@@ -55,7 +55,7 @@ class Odometry:
         self.previous: Pyramid | None = None
         self.num_mapped_at_keyframe = 0
         self.lost_since: float | None = None
-        self.counts = {"relocalizations": 0, "losses": 0, "loops": 0}
+        self.counts = {"relocalizations": 0, "losses": 0, "loops": 0, "keyframes_culled": 0}
 
     def process(self, frame: Frame) -> FrameRecord:
         """Find the pose of the next frame."""
@@ -184,11 +184,23 @@ class Odometry:
         local = self.local
         assert local is not None
         self._take_over(local, None)
+        self._cull(local)
         self.tracks = local.add_keyframe(view, self.pose, self.tracks, len(self.records))
         self._count_mapped()
         self._settle(record, state, self.pose, is_keyframe=True)
         self._remember(view)
         self._tell(reason, num_tracks=len(self.tracks), num_mapped=self.num_mapped_at_keyframe)
+
+    def _cull(self, local: LocalMap) -> None:
+        """Drop a keyframe that adds nothing, once it has left the window."""
+        position = local.redundant_keyframe()
+        if position is None or not self.recognition.forget(local.keyframes.keyframes[position].frame_idx):
+            return
+        dropped = local.remove_keyframe(position)
+        before = local.keyframes.keyframes[position - 1]
+        leave_keyframe(self.records, local.map_idx, position, dropped, before)
+        self.tracks = self.tracks.after_removal(position)
+        self.counts["keyframes_culled"] += 1
 
     def _take_over(self, local: LocalMap, number: int | None) -> None:
         """Let a finished adjustment count, and carry the current pose along with its keyframe."""
