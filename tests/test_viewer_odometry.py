@@ -151,6 +151,22 @@ def test_a_new_unit_of_length_holds_for_the_path_as_well() -> None:
     assert np.allclose(scene.frame_poses(), scaled, atol=1e-9)
 
 
+def test_a_joined_map_goes_on_in_the_other() -> None:
+    poses = path(30)
+    first, second = LiveMap(rigid3.IDENTITY), LiveMap(rigid3.IDENTITY)
+    in_second = poses.copy()
+    in_second[:, 4:] *= 0.2  # a unit of its own
+    for k in range(30):
+        scene, known = (first, poses) if k < 12 else (second, in_second)
+        if k % 6 == 0:
+            scene.change(keyframes_of(known, k))
+        scene.add_frame(k, k / 10, known[k])
+    first.change(keyframes_of(poses, *range(0, 30, 6), complete=True))
+    first.absorb(second)
+    assert np.allclose(first.frame_poses(), poses, atol=1e-9)
+    assert first.frame_numbers.tolist() == list(range(30))
+
+
 def test_points_are_kept_in_blocks_and_take_the_grey_of_their_keyframe() -> None:
     pose = path(1)[0]
     scene = LiveMap(rigid3.IDENTITY)

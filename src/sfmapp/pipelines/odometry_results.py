@@ -28,7 +28,7 @@ from sfmapp.report.odometry_document import (
     truth_row,
 )
 from sfmapp.report.odometry_html import render_odometry_html
-from sfmapp.scene.camera import PARAM_NAMES
+from sfmapp.scene.camera import PARAM_NAMES, Camera
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -215,7 +215,7 @@ def make_report(
         "format": FORMAT,
         "outcome": _outcome(run, failure),
         "run": run.facts(),
-        "sequence": describe_sequence(run.sequence),
+        "sequence": describe_sequence(run.sequence, result),
         "frames": frames,
         "maps": maps,
         "truth": _truth_rows(run, result, against),
@@ -248,19 +248,15 @@ def _truth_rows(run: Tracking, result: OdometryResult, against: Sequence[Against
     return rows
 
 
-def describe_sequence(sequence: sequences.Sequence) -> Mapping[str, Any]:
-    """What was played, in plain values."""
-    cameras = [
-        {
-            "model": camera.model.name,
-            "width": camera.width,
-            "height": camera.height,
-            "params": dict(zip(PARAM_NAMES[camera.model], map(float, camera.params), strict=True)),
-            "focal_sigma_px": camera.focal_sigma,
-            "source": camera.focal_source,
-        }
-        for camera in sequence.rig.cameras
-    ]
+def describe_sequence(sequence: sequences.Sequence, result: OdometryResult) -> Mapping[str, Any]:
+    """What was played, in plain values, and how its cameras were changed in the end."""
+    cameras = []
+    for k, camera in enumerate(sequence.rig.cameras):
+        row: dict[str, Any] = {"width": camera.width, "height": camera.height, **_camera_row(camera)}
+        row |= {"focal_sigma_px": camera.focal_sigma, "source": camera.focal_source, "refined": None}
+        if result.maps and _camera_row(last := result.maps[0].reconstruction.cameras[k]) != _camera_row(camera):
+            row["refined"] = _camera_row(last)
+        cameras.append(row)
     return {
         "kind": sequence.kind,
         "num_frames": sequence.num_frames,
@@ -270,3 +266,8 @@ def describe_sequence(sequence: sequences.Sequence) -> Mapping[str, Any]:
         "truth": sequence.truth is not None,
         "cameras": cameras,
     }
+
+
+def _camera_row(camera: Camera) -> dict[str, Any]:
+    params = dict(zip(PARAM_NAMES[camera.model], map(float, camera.params), strict=True))
+    return {"model": camera.model.name, "params": params}

@@ -32,7 +32,7 @@ def render_odometry_html(
         body.append("<h2>Frame by frame</h2>" + _plots(result, facts, against))
         body.append(_gaps(report["frames"]["gaps"]))
     body.append(_maps(report["maps"]) + _truth(report.get("truth")))
-    body.append(_loops(report) + _sequence(report["sequence"], report["stages"]))
+    body.append(_loops(report["decisions"]) + _sequence(report["sequence"], report["stages"]))
     body.append(_timing(report.get("timing")) + usage_table(report["usage"], report["run"]))
     body.append(log_table("Warnings", report["warnings"]) + log_table("Decisions", report["decisions"]))
     return render_page(f"sfmapp odometry: {report['run']['source']}", body)
@@ -193,16 +193,21 @@ def _truth(rows: Sequence[Mapping[str, Any]] | None) -> str:
     return "<h2>Against the truth</h2>" + table(head, cells)
 
 
-def _loops(report: Mapping[str, Any]) -> str:
-    loops = (report["stages"].get("odometry") or {}).get("loops")
-    if not loops:
-        return ""
-    if not isinstance(loops, list):
-        text = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in dict(loops).items())
-        return f"<h2>Loops</h2><p>{escape(text)}</p>"
-    keys = list(dict.fromkeys(key for row in loops for key in row))
-    rows = [[("", _short(row.get(key))) for key in keys] for row in loops]
-    return "<h2>Loops</h2>" + table([("", key.replace("_", " ")) for key in keys], rows)
+def _loops(decisions: Iterable[Mapping[str, Any]]) -> str:
+    """The decisions that laid one part of a map on another."""
+    head = [
+        ("", "frame"), ("t", "what"), ("", "shift, depths of the scene"), ("", "turn deg"), ("", "scale"),
+        ("", "inliers"), ("", "rms px"),
+    ]  # fmt: skip
+    rows = []
+    for line in decisions:
+        data = line.get("data", {})
+        if "shift_in_depths" in data:
+            numbers = [f"{data['shift_in_depths']:.3g}", f"{data['rotation_deg']:.2f}", f"{data['scale']:.4f}"]
+            inliers = ", ".join(map(str, np.atleast_1d(data["num_inliers"])))
+            texts = [*numbers, inliers, f"{data['rms_px']:.2f}"]
+            rows.append([("", data["frame_idx"]), ("t", line["message"]), *(("", text) for text in texts)])
+    return "<h2>Loops and joined maps</h2>" + table(head, rows) if rows else ""
 
 
 def _sequence(sequence: Mapping[str, Any], stages: Mapping[str, Any]) -> str:
@@ -211,15 +216,22 @@ def _sequence(sequence: Mapping[str, Any], stages: Mapping[str, Any]) -> str:
     rows = [[("t", key.replace("_", " ")), ("w", _short(value))] for key, value in sequence.items() if key != "cameras"]
     if calibration := stages.get("self_calibration"):
         rows.append([("t", "calibrated with the first seconds"), ("w", calibration["text"])])
-    head = [("", "camera"), ("t", "model"), ("", "size"), ("t", "parameters")]
+    head = [("", "camera"), ("t", "model"), ("", "size"), ("t", "parameters"), ("t", "refined in the end")]
     cameras = [
         [
             ("", k), ("t", camera["model"]), ("", f"{camera['width']} x {camera['height']}"),
-            ("w", ", ".join(f"{name} {value:.6g}" for name, value in camera["params"].items())),
+            ("w", ", ".join(f"{name} {value:.6g}" for name, value in camera["params"].items())), ("w", refined(camera)),
         ]
         for k, camera in enumerate(sequence.get("cameras", ()))
     ]  # fmt: skip
     return "<h2>Sequence</h2>" + table([("t", ""), ("t", "")], rows) + (table(head, cameras) if cameras else "")
+
+
+def refined(camera: Mapping[str, Any]) -> str:
+    """Model and parameters that the last adjustment changed a camera to, in words."""
+    if not (found := camera.get("refined")):
+        return ""
+    return f"{found['model']}: " + ", ".join(f"{name} {value:.6g}" for name, value in found["params"].items())
 
 
 def _timing(timing: Mapping[str, Any] | None) -> str:

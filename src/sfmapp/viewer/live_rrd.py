@@ -126,6 +126,8 @@ class LiveDrawing:
         map_idx = message["map_idx"]
         ours = self._map_of(map_idx)
         ours.change(message)
+        if message["is_complete"]:
+            self._join(ours, map_idx)
         newest = self._newest
         if newest is not None and newest["frame_idx"] == message["frame_idx"] and newest["image"] is not None:
             ours.colour(self._camera, newest["cam_from_world"], newest["image"])
@@ -134,6 +136,14 @@ class LiveDrawing:
             self._draw_map(ours, map_idx)
             if self._truth is not None:
                 self._draw_truth(ours, map_idx)
+
+    def _join(self, ours: LiveMap, map_idx: int) -> None:
+        """Maps whose keyframes are in this one now are drawn no more."""
+        for other_idx, other in list(self._maps.items()):
+            if other is not ours and other.keyframes and other.keyframes.keys() <= ours.keyframes.keys():
+                ours.absorb(other)
+                del self._maps[other_idx]
+                self._recording.log(f"{_LIVE}/map{other_idx}", rr.Clear(recursive=True))
 
     def _draw_map(self, ours: LiveMap, map_idx: int) -> None:
         changed, ours.changed = ours.changed, Changed()

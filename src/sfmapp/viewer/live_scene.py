@@ -110,6 +110,27 @@ class LiveMap:
         column, row = xy[inside].astype(np.int64).T
         self.point_grey[ids[inside]] = image[row, column]
 
+    def absorb(self, other: LiveMap) -> None:
+        """Take over the path of a map that was joined to this one, whose keyframes are in this one now."""
+        shared = [idx for idx in other.keyframes if idx in self.keyframes]
+        pair = (np.array([keyframes[idx] for idx in shared]) for keyframes in (other.keyframes, self.keyframes))
+        scale = _scale_between(*pair) if len(shared) > 1 else 1.0
+        entries = [
+            *zip(self._frame_number, self._frame_keyframe, self._frame_pose, self._time, strict=True),
+            *(
+                (number, keyframe, np.concatenate([pose[:4], scale * pose[4:]]), time_s)
+                for number, keyframe, pose, time_s in zip(
+                    other._frame_number, other._frame_keyframe, other._frame_pose, other._time, strict=True
+                )
+            ),
+        ]
+        entries.sort(key=lambda entry: entry[0])
+        self._frame_number = [entry[0] for entry in entries]
+        self._frame_keyframe = [entry[1] for entry in entries]
+        self._frame_pose = [entry[2] for entry in entries]
+        self._time = [entry[3] for entry in entries]
+        self.changed.frames |= set(range(-(-len(entries) // FRAME_BLOCK)))
+
     def _forget(self, frames: list[int], poses: Array, changed: Changed) -> None:
         """All keyframes and points are told anew: the others are gone, and the unit of length may be another."""
         old = [(self.keyframes[idx], pose) for idx, pose in zip(frames, poses, strict=True) if idx in self.keyframes]
