@@ -168,8 +168,8 @@ def make_engine(
         extras = ExtraFactors(extra_factors)
     problem = make_problem(
         reconstruction, refine=options.refine, variable_images=variable_images, variable_cameras=variable_cameras,
-        variable_centers=variable_centers, points=points, constant_points=constant_points, extra_images=extras.images if extras else (),
-        extra_cameras=extras.cameras if extras else (),
+        variable_centers=variable_centers, points=points, constant_points=constant_points,
+        extra_images=extras.images if extras else (), extra_cameras=extras.cameras if extras else (),
     )  # fmt: skip
     if extras is not None:
         extras.attach(problem)

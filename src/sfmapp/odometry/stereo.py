@@ -91,8 +91,8 @@ def _lines(rig: Rig, rays: Array, xy: Array) -> tuple[Array, Array]:
 def turn_of_rig(rig: Rig, xy1: Array, xy2: Array, sigma_deg: float) -> Array:
     """How the second camera is turned against what is known, from matches (N, 2) that miss their epipolar lines.
 
-    With the second camera turned by exp(w), its lines l turn along: a match h is off by ``l.h + w.(l x h)``. Lenses that
-    are not equally long are told apart from a turn by a fourth unknown.
+    With the second camera turned by exp(w), its lines l turn along: a match h is off by ``l.h + w.(l x h)``. Lenses
+    that are not equally long are told apart from a turn by a fourth unknown.
 
     Args:
         sigma_deg: what the rig may be turned by.
