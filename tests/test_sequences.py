@@ -436,7 +436,8 @@ def test_euroc_tolerates_missing_partners_and_lists(tmp_path: Path, told: Told) 
     (tmp_path / "mav0/cam1/data.csv").write_text("".join(lines[:3] + lines[4:]))
     (tmp_path / f"mav0/cam0/data/{NANOSECONDS[5]}.png").unlink()
     sequence = open_sequence(tmp_path, SequenceOptions(), told.events)
-    assert sequence.num_frames == 4
+    assert sequence.num_frames == 5
+    assert [len(frame.images) for frame in sequence.frames()] == [2, 2, 1, 2, 2]
     assert any("no partner" in text and str(NANOSECONDS[2]) in text for text in told.of("warned"))
     assert any("not there" in text and str(NANOSECONDS[5]) in text for text in told.of("warned"))
     for camera in ("cam0", "cam1"):

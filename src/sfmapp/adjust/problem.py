@@ -110,6 +110,7 @@ def make_problem(
     refine: tuple[bool, bool, bool],
     variable_images: Mask | None = None,
     variable_cameras: Mask | None = None,
+    variable_centers: Mask | None = None,
     points: Mask | None = None,
     constant_points: Mask | None = None,
     extra_images: Sequence[int] = (),
@@ -151,7 +152,9 @@ def make_problem(
     camera_idx = np.unique(np.concatenate([reconstruction.image_camera_idx[image_idx], known_cameras]).astype(np.int64))
     image_camera = np.searchsorted(camera_idx, reconstruction.image_camera_idx[image_idx]).astype(np.int32)
     cameras = [reconstruction.cameras[c] for c in camera_idx]
-    params = [free_params(camera, *refine) for camera in cameras]
+    focal, distortion, center = refine
+    moves = np.full(len(reconstruction.cameras), center) if variable_centers is None else variable_centers & center
+    params = [free_params(reconstruction.cameras[c], focal, distortion, bool(moves[c])) for c in camera_idx]
     if variable_cameras is not None:
         params = [p if variable_cameras[c] else p[:0] for p, c in zip(params, camera_idx, strict=True)]
     poses, pose_of_image = reconstruction.distinct_poses(image_idx)

@@ -42,6 +42,7 @@ def adjust_with_gtsam(
     *,
     variable_images: Mask | None = None,
     variable_cameras: Mask | None = None,
+    variable_centers: Mask | None = None,
     points: Mask | None = None,
     constant_points: Mask | None = None,
     prior_cameras: Sequence[Camera] | None = None,
@@ -55,8 +56,8 @@ def adjust_with_gtsam(
     extras = ExtraFactors(extra_factors) if extra_factors is not None else None
     problem = make_problem(
         reconstruction, refine=options.refine, variable_images=variable_images, variable_cameras=variable_cameras,
-        points=points, constant_points=constant_points, extra_images=extras.images if extras else (),
-        extra_cameras=extras.cameras if extras else (),
+        variable_centers=variable_centers, points=points, constant_points=constant_points,
+        extra_images=extras.images if extras else (), extra_cameras=extras.cameras if extras else (),
     )  # fmt: skip
     if problem.num_observations == 0:
         return AdjustReport("nothing", solver="gtsam")

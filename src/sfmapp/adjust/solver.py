@@ -85,6 +85,7 @@ def adjust_bundle(
     *,
     variable_images: Mask | None = None,
     variable_cameras: Mask | None = None,
+    variable_centers: Mask | None = None,
     points: Mask | None = None,
     constant_points: Mask | None = None,
     prior_cameras: Sequence[Camera] | None = None,
@@ -103,6 +104,8 @@ def adjust_bundle(
             pose (``reconstruction.rig``) move together: those that take part must all be marked or none.
         variable_cameras: (C,) bool, which intrinsics may change, beside ``options.refine_*``; cameras with ``is_fixed``
             never do. None for all.
+        variable_centers: (C,) bool, of which cameras the principal points may change where the options let them; None
+            for all. In a rig, that of another camera than the first stands for how it is turned.
         points: (T,) bool, which points take part and vary; None for those that a variable image observes.
         constant_points: (T,) bool, which of the points take part without moving.
         prior_cameras: (C,) cameras as they were known beforehand: Gaussian priors around their parameters, with
@@ -122,12 +125,14 @@ def adjust_bundle(
         from sfmapp.adjust.reference import adjust_with_gtsam
 
         return adjust_with_gtsam(
-            reconstruction, options, variable_images=variable_images, variable_cameras=variable_cameras, points=points,
-            constant_points=constant_points, prior_cameras=prior_cameras, extra_factors=extra_factors, events=events,
+            reconstruction, options, variable_images=variable_images, variable_cameras=variable_cameras,
+            variable_centers=variable_centers, points=points, constant_points=constant_points,
+            prior_cameras=prior_cameras, extra_factors=extra_factors, events=events,
         )  # fmt: skip
     engine = make_engine(
-        reconstruction, options, variable_images=variable_images, variable_cameras=variable_cameras, points=points,
-        constant_points=constant_points, prior_cameras=prior_cameras, extra_factors=extra_factors,
+        reconstruction, options, variable_images=variable_images, variable_cameras=variable_cameras,
+        variable_centers=variable_centers, points=points, constant_points=constant_points,
+        prior_cameras=prior_cameras, extra_factors=extra_factors,
     )  # fmt: skip
     problem = engine.problem
     workers = min(threads, engine.num_chunks)
@@ -149,6 +154,7 @@ def make_engine(
     *,
     variable_images: Mask | None,
     variable_cameras: Mask | None,
+    variable_centers: Mask | None = None,
     points: Mask | None,
     constant_points: Mask | None,
     prior_cameras: Sequence[Camera] | None,
@@ -162,8 +168,8 @@ def make_engine(
         extras = ExtraFactors(extra_factors)
     problem = make_problem(
         reconstruction, refine=options.refine, variable_images=variable_images, variable_cameras=variable_cameras,
-        points=points, constant_points=constant_points, extra_images=extras.images if extras else (),
-        extra_cameras=extras.cameras if extras else (),
+        variable_centers=variable_centers, points=points, constant_points=constant_points,
+        extra_images=extras.images if extras else (), extra_cameras=extras.cameras if extras else (),
     )  # fmt: skip
     if extras is not None:
         extras.attach(problem)

@@ -70,14 +70,16 @@ def read_euroc_sequence(mav: Path, events: Events, only: str | None = None) -> R
     if len(tables) == 2 and not tables[0].keys() & tables[1].keys():
         events.warned(STAGE, f"{mav / 'cam1'} is not used: no time in it is a time of cam0")
         cameras, tables = cameras[:1], tables[:1]
-    stamps = [stamp for stamp in tables[0] if all(stamp in table for table in tables)]
+    stamps = list(tables[0])
     if len(tables) == 2:
         lonely = [tables[0][stamp].name for stamp in tables[0] if stamp not in tables[1]]
         warn_of_missing(events, "frames of cam0 have no partner of the same time in cam1", lonely)
-    frames = [tuple(table[stamp] for table in tables) for stamp in stamps]
+    # V2_03_difficult lacks a tenth of cam1: such a frame is played with cam0 alone
+    frames = [tuple(table[stamp] for table in tables if stamp in table) for stamp in stamps]
     first = [frame[0] for frame in frames]
     sizes = tuple(
-        common_size([frame[i] for frame in frames], str(mav / name / "data")) for i, name in enumerate(cameras)
+        common_size([frame[i] for frame in frames if i < len(frame)], str(mav / name / "data"))
+        for i, name in enumerate(cameras)
     )
     calibration = _read_rig(mav, cameras, sizes)
     body_from_cam = calibration.body_from_cam if calibration else None

@@ -42,7 +42,7 @@ class Recording:
         kind, root: layout, and the folder that names are relative to.
         names: N names of frames.
         timestamps_s: (N,) as they are written, not yet in order; None where nothing tells.
-        paths: for each frame one file, or two of a pair.
+        paths: for each frame one file, or two of a pair; one as well where a pair lacks the second.
         sizes: (width, height) of the images of each camera.
         calibration: None if there is none.
         imu, truth: None where there is none, or where the files that may hold the truth are ``truth_paths``; poses are

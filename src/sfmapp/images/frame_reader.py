@@ -215,7 +215,7 @@ class FileSequence:
     Attributes:
         names: N names of frames.
         timestamps_s: (N,) strictly ascending.
-        paths: for each frame, one file for each camera of the rig.
+        paths: for each frame, one file for each camera of the rig; that of the first alone where the others lack it.
         sampling: for each camera, where the pixels of its frames are found in the files, see :func:`resampled`.
         events: told about frames that are left out.
     """

@@ -65,7 +65,7 @@ class Frame:
         idx: position among the frames that are played, those that could not be read counted as well.
         name: the file of the first camera relative to the sequence, or ``000123`` in a video.
         timestamp_s: seconds, strictly ascending.
-        images: one (H, W) uint8 grey image for each camera of the rig.
+        images: one (H, W) uint8 grey image for each camera of the rig; the first alone where the others lack it.
     """
 
     idx: int

@@ -143,7 +143,7 @@ class LocalMap:
         tracks = self._renew_references(tracks, number, pose)
         tracks = tracks.joined(self._new_corners(tracks, pyramid, number))
         self._append(view, pose, tracks)
-        if self.rig.is_stereo:
+        if len(view.pyramids) > 1:
             self._match_stereo(view, tracks)
         self.backend.finish(self.keyframes)
         self._adjust(tracks, frame_number)

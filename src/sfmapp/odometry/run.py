@@ -61,7 +61,11 @@ class Odometry:
         """Find the pose of the next frame."""
         start = time.thread_time()
         view = View(
-            frame.idx, frame.timestamp_s, frame.name, frame.images, tuple(build_pyramid(i) for i in frame.images)
+            frame.idx,
+            frame.timestamp_s,
+            frame.name,
+            frame.images,
+            tuple(build_pyramid(i) for i in frame.images[: len(self.rig.cameras)]),
         )
         record = FrameRecord(frame.idx, frame.name, frame.timestamp_s)
         self.records.append(record)
