@@ -193,6 +193,7 @@ def test_separate_maps_get_files_of_their_own_and_old_ones_vanish(tmp_path: Path
     assert [row["num_frames"] for row in report["maps"]] == [30, 18]
     assert len(read_tum(tmp_path / "out" / "trajectory.tum")[0]) == 30
     assert len(read_tum(tmp_path / "out" / "trajectory-1.tum")[0]) == 18
+    assert len(read_tum(tmp_path / "out" / "trajectory_live-1.tum")[0]) == 18
     assert (tmp_path / "out" / "sparse" / "1" / "images.bin").is_file()
     assert {row["map"] for row in rows_of(tmp_path / "out" / "frames.csv")} == {"0", "1", ""}
     assert report["frames"]["gaps"][0]["map_before"] == 1
@@ -202,7 +203,7 @@ def test_separate_maps_get_files_of_their_own_and_old_ones_vanish(tmp_path: Path
     run(tmp_path / "out")
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert "trajectory-mine.tum" in names
-    assert not {"trajectory-1.tum", "trajectory.kitti.frames"} & names
+    assert not {"trajectory-1.tum", "trajectory_live-1.tum", "trajectory.kitti.frames"} & names
     assert not (tmp_path / "out" / "sparse" / "1").exists()
 
 

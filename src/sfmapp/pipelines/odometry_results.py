@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ from sfmapp.report.odometry_document import (
     against_truth,
     errors_of_frames,
     frame_summary,
+    live_against_truth,
     make_checks,
     map_row,
     truth_row,
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
     from sfmapp.pipelines.odometry import Tracking
     from sfmapp.pipelines.workspace import Workspace
 
+_OUR_TRAJECTORY = re.compile(r"trajectory(_live)?(-\d+)?\.tum|trajectory_smooth\.tum|trajectory\.kitti(\.frames)?")
 _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 FRAME_COLUMNS = ("index", "timestamp_s", "name", "state", "map", "tracked_points", "mapped_points", "tracking_ms")
 COVARIANCE_COLUMNS = (
@@ -50,7 +53,7 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
     workspace, truth = run.workspace, run.sequence.truth
     facts = run.frames.facts(result.frame_idx)
     with run.measured("output"):
-        write_trajectories(workspace, result)
+        write_trajectories(workspace, result, facts)
         workspace.write_text("frames.csv", _frames_csv(result, facts))
         workspace.write_text("covariance.csv", _covariance_csv(result))
         workspace.write_text("frame_covariance.csv", _frame_covariance_csv(result))
@@ -67,38 +70,40 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
     return report
 
 
-def write_trajectories(workspace: Workspace, result: OdometryResult, *, live: bool = True) -> None:
-    """A file of final poses for each map; of the largest also as KITTI has it, live, and smoothed if asked for.
+def write_trajectories(workspace: Workspace, result: OdometryResult, facts: FrameFacts | None = None) -> None:
+    """A file of final poses for each map, and one of live poses; the largest map also as KITTI has it, and smoothed.
 
     Maps have worlds of their own, so they cannot share a file. What an earlier run left is taken away.
+
+    Args:
+        facts: tell of the maps as they were when the live poses were given out; None: no live poses are written.
     """
     from sfmapp.formats.kitti import write_kitti
 
     folder = workspace.folder
-    kept = {"trajectory.tum", "trajectory_live.tum", *(f"trajectory-{m}.tum" for m in range(1, len(result.maps)))}
+    files = {_numbered("trajectory", m): poses_of_map(result, m) for m in range(len(result.maps))}
+    if facts is not None:
+        for place, live_map in enumerate(facts.live_maps()):
+            mine = (facts.live_map == live_map)[:, None]
+            files[_numbered("trajectory_live", place)] = np.where(mine, result.live_cam_from_world, np.nan)
     if result.smoothed:
-        kept.add("trajectory_smooth.tum")
+        files["trajectory_smooth.tum"] = result.smoothed[0].cam_from_world
     for path in folder.glob("trajectory*"):
-        is_ours = path.name.removeprefix("trajectory") in (".tum", "_live.tum", "_smooth.tum", ".kitti")
-        number = path.name.removeprefix("trajectory-").removesuffix(".tum")
-        if (is_ours or number.isdigit()) and (path.name not in kept or not result.maps):
+        if _OUR_TRAJECTORY.fullmatch(path.name) and path.name not in files:
             path.unlink()
-    for m in range(len(result.maps)):
-        name = "trajectory.tum" if m == 0 else f"trajectory-{m}.tum"
-        write_tum(folder / name, result.timestamps_s, poses_of_map(result, m))
+    for name, poses in files.items():
+        write_tum(folder / name, result.timestamps_s, poses)
     if result.maps:
-        if live:
-            write_tum(folder / "trajectory_live.tum", result.timestamps_s, poses_of_map(result, 0, live=True))
-        if result.smoothed:
-            smooth = result.smoothed[0].cam_from_world
-            write_tum(folder / "trajectory_smooth.tum", result.timestamps_s, smooth)
         write_kitti(folder / "trajectory.kitti", poses_of_map(result, 0), result.frame_idx)
 
 
-def poses_of_map(result: OdometryResult, map_idx: int, *, live: bool = False) -> Any:
-    """(F, 7) poses of the frames of one map, NaN for all others."""
-    poses = result.live_cam_from_world if live else result.cam_from_world
-    return np.where((result.frame_map == map_idx)[:, None], poses, np.nan)
+def _numbered(stem: str, number: int) -> str:
+    return f"{stem}.tum" if number == 0 else f"{stem}-{number}.tum"
+
+
+def poses_of_map(result: OdometryResult, map_idx: int) -> Any:
+    """(F, 7) final poses of the frames of one map, NaN for all others."""
+    return np.where((result.frame_map == map_idx)[:, None], result.cam_from_world, np.nan)
 
 
 def read_odometry(folder: Path) -> OdometryResult:
@@ -122,7 +127,7 @@ def read_odometry(folder: Path) -> OdometryResult:
     maps = []
     position = {name: k for k, name in enumerate(names)}
     for m, row in enumerate(known):
-        _, found = read_tum(folder / ("trajectory.tum" if m == 0 else f"trajectory-{m}.tum"))
+        _, found = read_tum(folder / _numbered("trajectory", m))
         if len(found) != (frame_map == m).sum():
             raise InputError(
                 f"{folder}: frames.csv and the trajectory of map {m} disagree", "run sfmapp odometry again"
@@ -218,7 +223,7 @@ def make_report(
         "sequence": describe_sequence(run.sequence, result),
         "frames": frames,
         "maps": maps,
-        "truth": _truth_rows(run, result, against),
+        "truth": _truth_rows(run, result, facts, against),
         "timing": timing,
         "checks": make_checks(frames, maps, timing, facts) if maps else [],
         "usage": run.usage,
@@ -237,14 +242,14 @@ def _outcome(run: Tracking, failure: NoReconstructionError | None) -> dict[str, 
     return {"exit_code": 0, "message": "", "advice": None}
 
 
-def _truth_rows(run: Tracking, result: OdometryResult, against: Sequence[Against | None]) -> list[dict[str, Any]]:
-    """The error of each map, and of the live poses of the largest."""
+def _truth_rows(
+    run: Tracking, result: OdometryResult, facts: FrameFacts, against: Sequence[Against | None]
+) -> list[dict[str, Any]]:
+    """The error of each map, and of the live poses of the longest live map."""
     assert run.sequence is not None
     rows = [{"map": m, "poses": "final", **truth_row(fit)} for m, fit in enumerate(against) if fit is not None]
-    if run.sequence.truth is not None and result.maps:
-        live = against_truth(result, run.sequence.truth, 0, live=True)
-        if live is not None:
-            rows.insert(1, {"map": 0, "poses": "live", **truth_row(live)})
+    if run.sequence.truth is not None and (live := live_against_truth(result, run.sequence.truth, facts)) is not None:
+        rows.insert(1, {"map": 0, "poses": "live", **truth_row(live)})
     return rows
 
 

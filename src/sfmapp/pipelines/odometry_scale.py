@@ -126,7 +126,7 @@ def scale_maps(
 
 
 def rescale(result: OdometryResult, map_idx: int, found: ScaleEstimate) -> None:
-    """A map and its part of the trajectory in metres."""
+    """A map and its part of the trajectory in metres; live poses stay what they were, in the unit of their time."""
     entry, mine = result.maps[map_idx], result.frame_map == map_idx
     covariance = None if entry.covariance is None else scale_covariance(entry.covariance, found.scale)
     result.maps[map_idx] = replace(
@@ -134,7 +134,6 @@ def rescale(result: OdometryResult, map_idx: int, found: ScaleEstimate) -> None:
         scale_source=found.source, scale_sigma=found.sigma_relative,
     )  # fmt: skip
     result.cam_from_world[mine, 4:] *= found.scale
-    result.live_cam_from_world[mine, 4:] *= found.scale
     if result.covariance is not None:
         result.covariance[mine] = scale_covariance(result.covariance[mine], found.scale)
     if result.smoothed:

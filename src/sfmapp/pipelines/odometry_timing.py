@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Event
+from sfmapp.odometry.result import FrameState
 from sfmapp.odometry.snapshot import FrameSnapshot
 from sfmapp.report.odometry_document import FrameFacts
 
@@ -23,12 +24,16 @@ class FrameLog:
     """Listener that keeps a few numbers of each frame; of its arrays nothing."""
 
     def __init__(self) -> None:
-        self._rows: dict[int, tuple[int, int, float]] = {}
+        self._rows: dict[int, tuple[int, int, float, int]] = {}
 
     def __call__(self, event: Event) -> None:
         seen = event.data.get("snapshot")
         if isinstance(seen, FrameSnapshot):
-            self._rows[seen.frame_idx] = (len(seen.xy), int(np.count_nonzero(seen.is_mapped)), seen.time_s)
+            # what was tracked before a loss is not tracked any more
+            is_lost = seen.state == FrameState.LOST
+            counts = (0, 0) if is_lost else (len(seen.xy), int(np.count_nonzero(seen.is_mapped)))
+            has_pose = bool(np.isfinite(seen.cam_from_world[0]))
+            self._rows[seen.frame_idx] = (*counts, seen.time_s, seen.map_idx if has_pose else -1)
 
     @property
     def tracking_s(self) -> float:
@@ -37,9 +42,9 @@ class FrameLog:
 
     def facts(self, frame_idx: NDArray[np.int64]) -> FrameFacts:
         """Of the given frames (F,)."""
-        nothing = (np.nan, np.nan, np.nan)
-        table = np.array([self._rows.get(int(idx), nothing) for idx in frame_idx], np.float64).reshape(-1, 3)
-        return FrameFacts(table[:, 0], table[:, 1], 1e3 * table[:, 2])
+        nothing = (np.nan, np.nan, np.nan, -1)
+        table = np.array([self._rows.get(int(idx), nothing) for idx in frame_idx], np.float64).reshape(-1, 4)
+        return FrameFacts(table[:, 0], table[:, 1], 1e3 * table[:, 2], table[:, 3].astype(np.int64))
 
 
 class ThreadTimes:

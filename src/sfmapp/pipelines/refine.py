@@ -250,7 +250,7 @@ def _write(
     workspace, truth = job.workspace, sequence.truth if sequence is not None else None
     with job.measured("output"):
         workspace.write_models([entry.reconstruction for entry in after.maps])
-        write_trajectories(workspace, after, live=False)
+        write_trajectories(workspace, after)
     fits = {
         name: [against_truth(result, truth, m) for m in range(len(result.maps))] if truth is not None else []
         for name, result in (("before", before), ("after", after))

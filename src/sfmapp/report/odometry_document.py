@@ -35,11 +35,18 @@ class FrameFacts:
     Attributes:
         num_tracked, num_mapped: (F,) float64 points followed, and those that the pose was measured with.
         time_ms: (F,) CPU milliseconds of tracking, back end not included.
+        live_map: (F,) int64, the map whose world its live pose is in, as maps were counted then; -1 without one.
     """
 
     num_tracked: Array
     num_mapped: Array
     time_ms: Array
+    live_map: NDArray[np.int64]
+
+    def live_maps(self) -> list[int]:
+        """Numbers of the live maps, the one with the most frames first. Each had a world of its own."""
+        numbers, counts = np.unique(self.live_map[self.live_map >= 0], return_counts=True)
+        return [int(number) for number in numbers[np.argsort(-counts, kind="stable")]]
 
 
 @dataclass(frozen=True)
@@ -139,20 +146,35 @@ def _uncertainty(entry: MapResult) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def against_truth(result: OdometryResult, truth: Truth, map_idx: int, *, live: bool = False) -> Against | None:
-    """A map's final (or live) poses after an alignment to the truth: with a scale of its own where that is unknown.
+def against_truth(result: OdometryResult, truth: Truth, map_idx: int) -> Against | None:
+    """A map's poses after an alignment to the truth: with a scale of its own where that is unknown.
 
     None if the two have too little in common.
     """
-    poses = result.live_cam_from_world if live else result.cam_from_world
-    mine = np.where((result.frame_map == map_idx)[:, None], poses, np.nan)
-    alignment: Alignment = "sim3" if unit_of(result.maps[map_idx]) == "" else "se3"
+    is_metric = unit_of(result.maps[map_idx]) != ""
+    return _against(
+        result, np.where((result.frame_map == map_idx)[:, None], result.cam_from_world, np.nan), truth, is_metric
+    )
+
+
+def live_against_truth(result: OdometryResult, truth: Truth, facts: FrameFacts) -> Against | None:
+    """The same of the live poses of the longest live map. Metres from anywhere but a rig are known only in the end."""
+    maps = facts.live_maps()
+    if not maps:
+        return None
+    is_metric = any(entry.scale_source == "stereo" for entry in result.maps)
+    poses = np.where((facts.live_map == maps[0])[:, None], result.live_cam_from_world, np.nan)
+    return _against(result, poses, truth, is_metric)
+
+
+def _against(result: OdometryResult, poses: Array, truth: Truth, is_metric: bool) -> Against | None:
+    alignment: Alignment = "se3" if is_metric else "sim3"
     times = truth.timestamps_s
     # nearer than half a frame: a truth that is sampled more sparsely than the frames still names its own
     step = float(np.median(np.diff(result.timestamps_s))) if len(result.timestamps_s) > 1 else 0.02
     try:
         pairs = associate(
-            Trajectory.from_cam_from_world(mine, result.timestamps_s),
+            Trajectory.from_cam_from_world(poses, result.timestamps_s),
             Trajectory.from_cam_from_world(truth.cam_from_world, times),
             max_difference_s=step / 2,
         )

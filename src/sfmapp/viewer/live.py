@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Event
+from sfmapp.odometry.result import FrameState
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
 from sfmapp.viewer.listener import MAX_MESSAGES
 
@@ -143,11 +144,14 @@ class LiveView:
         self._count += 1
         waiting = self._outbox.num_bytes
         image = seen.image if is_shown and waiting < MAX_IMAGE_BYTES else None
-        has_points = is_shown and waiting < MAX_POINT_BYTES
+        # what was tracked before a loss is not tracked any more
+        is_lost = seen.state == FrameState.LOST
+        has_points = is_shown and waiting < MAX_POINT_BYTES and not is_lost
         self._send(
             "frame", frame_idx=seen.frame_idx, timestamp_s=seen.timestamp_s, state=int(seen.state), image=image,
             xy=seen.xy if has_points else None, is_mapped=seen.is_mapped if has_points else None,
-            num_tracked=len(seen.xy), num_mapped=int(np.count_nonzero(seen.is_mapped)), map_idx=seen.map_idx,
+            num_tracked=0 if is_lost else len(seen.xy),
+            num_mapped=0 if is_lost else int(np.count_nonzero(seen.is_mapped)), map_idx=seen.map_idx,
             cam_from_world=seen.cam_from_world, time_s=seen.time_s,
         )  # fmt: skip
         self._send_decisions()

@@ -56,6 +56,7 @@ class LiveDrawing:
         self._truth: Trajectory | None = None
         self._alignment: Alignment = "sim3"
         self._count = self._drawn_at = 0
+        self._is_lost = False
         self._begin_s = 0.0
         self._last = rigid3.IDENTITY
         self._newest: Mapping[str, Any] | None = None
@@ -245,16 +246,16 @@ class LiveDrawing:
         height, width = message["image"].shape
         data, (shown_width, _) = shrunk_jpeg(message["image"], _IMAGE_SIDE_PX, _IMAGE_QUALITY)
         recording.log("image", rr.EncodedImage(contents=data, media_type="image/jpeg"))
-        if message["xy"] is None:
-            return
-        xy, is_mapped = message["xy"] * (shown_width / width), message["is_mapped"]
+        if (message["state"] == FrameState.LOST) != self._is_lost:
+            self._is_lost = not self._is_lost
+            shown = [[shown_width, height * shown_width / width]]
+            frame = rr.Boxes2D(mins=[[0.0, 0.0]], sizes=shown, colors=_RED, radii=3.0)
+            recording.log("image/lost", frame if self._is_lost else rr.Clear(recursive=False))
+        empty = np.zeros((0, 2), np.float32)
+        xy, is_mapped = (empty, np.zeros(0, bool)) if message["xy"] is None else (message["xy"], message["is_mapped"])
+        xy = xy * (shown_width / width)
         recording.log("image/mapped", rr.Points2D.from_fields(positions=xy[is_mapped]))
         recording.log("image/tracked", rr.Points2D.from_fields(positions=xy[~is_mapped]))
-        state = FrameState(message["state"])
-        if state in (FrameState.LOST, FrameState.RELOCALIZED):
-            where = np.array([[0.0, 0.0]])
-            shown = rr.Boxes2D(mins=where, sizes=[[shown_width, height * shown_width / width]], colors=_RED, radii=3.0)
-            recording.log("image/lost", shown if state == FrameState.LOST else rr.Clear(recursive=False))
 
     def _draw_points(self, map_idx: int, blocks: set[int]) -> None:
         for block in sorted(blocks):
