@@ -5,22 +5,40 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sfmapp.pipelines.odometry import TrackResult, track_sequence
     from sfmapp.pipelines.options import Options, load_options
     from sfmapp.pipelines.reconstruct import RunResult, reconstruct
+    from sfmapp.pipelines.refine import RefineResult, refine
     from sfmapp.scene.camera import Camera, CameraModel
     from sfmapp.scene.reconstruction import Reconstruction
 
 __version__ = "0.1.0"
-__all__ = ["Camera", "CameraModel", "Options", "Reconstruction", "RunResult", "load_options", "reconstruct"]
+__all__ = [
+    "Camera",
+    "CameraModel",
+    "Options",
+    "Reconstruction",
+    "RefineResult",
+    "RunResult",
+    "TrackResult",
+    "load_options",
+    "reconstruct",
+    "refine",
+    "track_sequence",
+]
 
 _HOMES = {
     "Camera": "sfmapp.scene.camera",
     "CameraModel": "sfmapp.scene.camera",
     "Options": "sfmapp.pipelines.options",
     "Reconstruction": "sfmapp.scene.reconstruction",
+    "RefineResult": "sfmapp.pipelines.refine",
     "RunResult": "sfmapp.pipelines.reconstruct",
+    "TrackResult": "sfmapp.pipelines.odometry",
     "load_options": "sfmapp.pipelines.options",
     "reconstruct": "sfmapp.pipelines.reconstruct",
+    "refine": "sfmapp.pipelines.refine",
+    "track_sequence": "sfmapp.pipelines.odometry",
 }
 
 

@@ -38,7 +38,7 @@ def _view(args: argparse.Namespace) -> int:
     read_manifest(args.output)
     recording = args.output / "recording.rrd"
     if not recording.is_file():
-        raise InputError(f"{recording} does not exist", "run sfmapp reconstruct again without --no-recording")
+        raise InputError(f"{recording} does not exist", "run it again with a recording")
     view(recording, serve=args.serve or None, web_port=args.port, tell=lambda line: print(line, flush=True))
     return 0
 

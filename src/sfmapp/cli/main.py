@@ -18,7 +18,7 @@ INTERRUPTED = 130
 
 EXIT_CODES = """\
 exit codes: 0 done, 1 a bug, 2 usage, 3 bad input, 4 no reconstruction (the report is still written),
-            5 fewer images than asked for, 130 interrupted (the same command resumes)"""
+            5 fewer images than asked for, 130 interrupted (reconstruct resumes)"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
