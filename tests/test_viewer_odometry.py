@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -21,6 +22,7 @@ from sfmapp.scene.camera import CameraModel, project, simple_camera
 from sfmapp.viewer import live as live_module
 from sfmapp.viewer.live import LiveView, Outbox, read_message, thinned_stride, write_message
 from sfmapp.viewer.live_scene import POINT_BLOCK, LiveMap, frustum_lines, unbroken
+from sfmapp.viewer.view import open_live_viewer, server_command, window_command
 
 CAMERA = simple_camera(CameraModel.PINHOLE, WIDTH, HEIGHT, 120.0)
 
@@ -288,3 +290,36 @@ def test_drawing_does_not_load_rerun_here() -> None:
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert done.stdout.strip() == "False"
+
+
+# ---------------------------------------------------------------------------------------------------------- live viewer
+
+
+def test_a_live_viewer_is_for_this_machine_alone_and_ends_whole(tmp_path: Path) -> None:
+    said: list[str] = []
+    viewer = open_live_viewer(tell=said.append, serve=True)
+    try:
+        assert viewer.screen.url.startswith("rerun+http://127.0.0.1:")
+        assert said[0].startswith("watch it at http://127.0.0.1:")
+        sequence = FakeSequence(length=12, num_frames=12)
+        with LiveView(tmp_path / "recording.rrd", viewer.screen) as view:
+            view.begin(sequence)
+            result = FakeRunner()(sequence, OdometryOptions(), seed=0, threads=1, events=Events(view))
+            assert view.end(result, [], np.full(12, np.nan)) == ""
+        assert rows_of(tmp_path / "recording.rrd")["/image"] == 12
+    finally:
+        viewer.leave()
+    port = int(viewer.screen.url.rpartition(":")[2].partition("/")[0])
+    ended = time.monotonic()
+    while time.monotonic() - ended < 10:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)):
+                return
+        time.sleep(0.1)
+    pytest.fail("something still listens")
+
+
+def test_the_commands_of_live_viewers_listen_on_this_machine_alone() -> None:
+    for command in (window_command(None, "1234"), server_command(None, 9090, 9876)):
+        assert command[command.index("--bind") + 1] == "127.0.0.1"
+        assert not any(word.endswith(".rrd") for word in command)

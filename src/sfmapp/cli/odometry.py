@@ -115,11 +115,16 @@ def _odometry(args: argparse.Namespace) -> int:
     from sfmapp.pipelines.usage import Stopwatch
 
     watch, viewer = Stopwatch(whole_process=True), _open_viewer(args)
-    with listening(args) as events:
-        result = track_sequence(
-            args.sequence, args.output, options, events=events, record=not args.no_record,
-            screen=viewer.screen if viewer else None, self_calibrate=args.self_calibrate, watch=watch,
-        )  # fmt: skip
+    try:
+        with listening(args) as events:
+            result = track_sequence(
+                args.sequence, args.output, options, events=events, record=not args.no_record,
+                screen=viewer.screen if viewer else None, self_calibrate=args.self_calibrate, watch=watch,
+            )  # fmt: skip
+    except BaseException:
+        if viewer is not None:
+            viewer.leave()
+        raise
     if args.json:
         print_json({"exit_code": 0, **summary(args.output, result.report)})
     elif not args.quiet:

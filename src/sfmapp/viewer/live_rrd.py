@@ -315,7 +315,8 @@ class LiveDrawing:
             recording.log(f"{root}/keyframes", rr.LineStrips3D(frusta, colors=_BLUE, radii=rr.Radius.ui_points(0.7)))
             path = unbroken(rigid3.center(poses), np.arange(len(poses)))
             recording.log(f"{root}/path", rr.LineStrips3D(path, colors=_ORANGE, radii=rr.Radius.ui_points(1.6)))
-            if self._truth is not None and (fit := message["truth_from_map"][m]) is not None:
+            fits = message["truth_from_map"]
+            if self._truth is not None and m < len(fits) and (fit := fits[m]) is not None:
                 self._draw_final_truth(root, similarity.compose(place, similarity.inverse(fit)), message, known)
             bodies.append(body_of(rigid3.center(poses[known]), xyz))
             headings.append(rigid3.rotation_matrix(poses[known])[:, 2])

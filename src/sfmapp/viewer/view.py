@@ -75,7 +75,15 @@ class LiveViewer:
     def wait(self) -> None:
         """A window stays by itself; a server until it is stopped with Ctrl-C."""
         if self._is_server:
-            _wait(self._process)
+            try:
+                self._process.wait()
+            except KeyboardInterrupt:
+                self.close()
+
+    def leave(self) -> None:
+        """After a run that failed: a window stays with what was shown, a server would run for ever."""
+        if self._is_server:
+            self.close()
 
     def close(self) -> None:
         """End it, and what it has started."""
@@ -99,7 +107,8 @@ def open_live_viewer(*, tell: Callable[[str], None], serve: bool | None = None) 
         command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
     )
     if serve:
-        tell(f"watch it at {server_url(web_port, data_port)} in a browser on this machine")
+        url = server_url(web_port, data_port)
+        tell(f"watch it at {url} in a browser on this machine; when the run is done, Ctrl-C ends it")
     return LiveViewer(Screen(f"rerun+http://{HOST}:{data_port}/proxy"), process, serve)
 
 
@@ -150,10 +159,7 @@ def _open_window(recording: Path) -> bool:
 
 def _run(command: Sequence[str]) -> int:
     """Run to the end; Ctrl-C reaches the child as well, and is its business."""
-    return _wait(subprocess.Popen(command, stdin=subprocess.DEVNULL))
-
-
-def _wait(process: subprocess.Popen[bytes]) -> int:
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     while True:
         try:
             return process.wait()
