@@ -88,17 +88,18 @@ class Odometry:
             record.state = FrameState.LOST
             if record.timestamp_s == self.lost_since:
                 self.events.warned(STAGE, f"{record.name}: tracking is lost", frame_idx=record.frame_idx)
-            if record.timestamp_s - self.lost_since < self.options.max_lost_s:
-                return
-        self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
+        is_open = self.lost_since is None or record.timestamp_s - self.lost_since >= self.options.max_lost_s
+        if is_open:
+            self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
         if self.rig.is_stereo:
-            self._begin_stereo(record, view)
+            if is_open:
+                self._begin_stereo(record, view)
             return
         views = self.beginning.add(view.pyramids[0])
         if len(self.beginning.seen) == 1:
             self.waiting.clear()  # a new first view: what was before it has no pose
         self.waiting.append((record, view))
-        if views is not None:
+        if views is not None and is_open:
             self._begin_from_two_views(views)
 
     def _begin_stereo(self, record: FrameRecord, view: View) -> None:
@@ -232,7 +233,7 @@ class Odometry:
         if local is None or self.previous is None:
             return False
         self._take_over(local, None)
-        if len(self.tracks) >= MIN_INLIERS and not self.waiting:
+        if len(self.tracks) >= MIN_INLIERS:
             tracked = track(local, self.tracks, self.pose, _IDENTITY, self.previous, view.pyramids[0])
             if tracked is not None and tracked.num_inliers > 0.5 * tracked.num_found:
                 self.pose, self.tracks, self.lost_since = tracked.pose, tracked.tracks, None
