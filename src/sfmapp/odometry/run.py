@@ -23,6 +23,7 @@ from sfmapp.odometry.pyramid import Pyramid, build_pyramid
 from sfmapp.odometry.recognition import Recognition
 from sfmapp.odometry.records import FrameRecord, gather, leave_keyframe, measure_again
 from sfmapp.odometry.result import FrameState, OdometryResult
+from sfmapp.odometry.shutter import straighten
 from sfmapp.odometry.smoothing import smooth_trajectory
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
 from sfmapp.odometry.tracker import MIN_INLIERS, keyframe_reason, measure_pose, track
@@ -317,7 +318,9 @@ class Odometry:
             local.backend.finish(local.keyframes)
             maps[number] = local.keyframes
             self.events.started("adjustment", f"adjusting {local.newest + 1} keyframes together")
+            straightened = self._straighten(local)
             conclusions[number] = conclude(local.keyframes, self.options, self.events)
+            conclusions[number].report["shutter"] = straightened
             measure_again(self.records, local.keyframes, number)
             self.events.finished("adjustment", **conclusions[number].report)
         self.executor.shutdown()
@@ -328,6 +331,16 @@ class Odometry:
                 result.smoothed.append(smooth_trajectory(result.timestamps_s, poses, result.covariance))
         result.report = self._report(result)
         return result
+
+    def _straighten(self, local: LocalMap) -> dict[str, Any]:
+        """Undo a rolling shutter where the images clearly show one; the numbers behind that."""
+        if self.rig.is_stereo or not self.options.refine_camera:
+            return {}
+        numbers = straighten(self.records, local.keyframes, local.map_idx)
+        self.events.raise_if_cancelled()
+        if numbers["readout"]:
+            self.events.decided("adjustment", "the images show a rolling shutter, which is undone", **numbers)
+        return numbers
 
     def _report(self, result: OdometryResult) -> dict[str, Any]:
         tracked = np.isfinite(result.cam_from_world[:, 0])
