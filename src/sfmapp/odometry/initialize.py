@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.geometry import epipolar, rigid3
+from sfmapp.adjust.pose import refine_pose
+from sfmapp.geometry import epipolar, homography, rigid3
 from sfmapp.geometry.planar_motion import estimate_planar_motion
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.two_view import Ransac, TwoViewGeometry, verify_pair
@@ -30,6 +31,14 @@ _MIN_FLOW = 0.01
 _MIN_POINTS = 40
 # A first map needs a median angle that bounds its depth errors to a few percent at a quarter pixel of noise.
 _MIN_MEDIAN_ANGLE_DEG = 0.8
+# A rolling shutter that turns ever faster bends two images so that depths explain it, but not the frames in between,
+# which had no say: there, what is left beside the points may be this share of what is left beside a mere turn. At that
+# share depth explains 95 % of the squared motion. Asked are the frames at which corners had moved about these shares.
+_MAX_LEFT_SHARE, _WITNESSES_AT = 0.22, (0.25, 0.5, 0.75)
+# Corners are located to that anyway.
+_NOISE_PX = 0.2
+# Without a frame in between, a mere turn has to leave this share of the displacement.
+_MIN_NOT_TURNED = 0.5
 
 
 @dataclass(frozen=True)
@@ -143,13 +152,44 @@ class Beginning:
         if good.sum() < _MIN_POINTS:
             self.reason = f"{int(good.sum())} points with depth"
             return None
+        shown = np.column_stack([xn1, np.ones(len(xn1))]) * depths[:, :1]
+        if not self._is_confirmed(found.cam2_from_cam1, track[found.is_inlier][good], shown[good]):
+            self.reason = "the frames in between do not show the same depths"
+            return None
         unit = 1.0 / float(np.median(depths[good, 0]))
         pose = found.cam2_from_cam1.copy()
         pose[4:] *= unit
-        xyz = np.column_stack([xn1, np.ones(len(xn1))]) * (unit * depths[:, :1])
         return TwoViews(
-            pose, track[found.is_inlier][good], xyz[good], found.config, found.median_angle_deg, num, len(track)
+            pose,
+            track[found.is_inlier][good],
+            unit * shown[good],
+            found.config,
+            found.median_angle_deg,
+            num,
+            len(track),
         )
+
+    def _is_confirmed(self, last_from_first: Array, track: NDArray[np.int64], xyz: Array) -> bool:
+        """Whether points (N, 3) made of the first and the last view explain the views between them."""
+        last, camera = len(self.seen) - 1, self.camera
+        first_xy, last_xy = self.corners[track], self.seen[-1][track]
+        flow = float(np.median(np.linalg.norm(last_xy - first_xy, axis=1)))
+        if last == 1:
+            return _left_by_turn(camera, first_xy, last_xy) > _MIN_NOT_TURNED * flow
+        moved = np.array([np.nanmedian(np.linalg.norm(xy[track] - first_xy, axis=1)) for xy in self.seen[1:last]])
+        witnesses = {1 + int(np.argmin(np.abs(moved - share * flow))) for share in _WITNESSES_AT}
+        left, turned = 0.0, 0.0
+        for n in sorted(witnesses):
+            xy = self.seen[n][track]
+            known = np.isfinite(xy[:, 0])
+            if known.sum() < _MIN_POINTS:
+                continue
+            start = pose_between(np.array([0.0, 0, 0, 1, 0, 0, 0]), last_from_first, n / last)
+            pose = refine_pose(camera.canonical, camera.is_fisheye, start, xyz[known], xy[known]).cam_from_world
+            error = np.linalg.norm(project(camera, rigid3.apply(pose, xyz[known])) - xy[known], axis=1)
+            left += max(0.0, float(np.nanmedian(error)) ** 2 - _NOISE_PX**2)
+            turned += _left_by_turn(camera, first_xy[known], xy[known]) ** 2
+        return left < _MAX_LEFT_SHARE**2 * turned
 
     def _hold_to_plane(self, found: TwoViewGeometry, xy1: Array, xy2: Array, limit_px: float) -> None:
         """Put a wheeled robot's motion in the place of a free one: two unknowns bear more outliers than five."""
@@ -161,6 +201,19 @@ class Beginning:
         found.config = TwoViewConfig.CALIBRATED
         _, angles = epipolar.ray_depths(found.cam2_from_cam1, xn1[found.is_inlier], xn2[found.is_inlier])
         found.median_angle_deg = float(np.degrees(np.median(angles))) if len(angles) else 0.0
+
+
+def _left_by_turn(camera: Camera, xy1: Array, xy2: Array) -> float:
+    """Median distance in pixels between (N, 2) corners in a view and where the best turn alone takes them."""
+    rays1, rays2 = pixels_to_normalized(camera, xy1), pixels_to_normalized(camera, xy2)
+    weights = np.ones(len(xy1))
+    for _ in range(4):
+        rotation = homography.rotation_from_rays(rays1, rays2, weights)
+        turned = project(camera, np.column_stack([rays1, np.ones(len(rays1))]) @ rotation.T)
+        error = np.nan_to_num(np.linalg.norm(turned - xy2, axis=1), nan=camera.width)
+        median = float(np.median(error))
+        weights = 1.0 / (1.0 + (error / max(median, 1e-9)) ** 2)
+    return median
 
 
 def pose_between(first: Array, last: Array, share: float) -> Array:

@@ -23,6 +23,7 @@ from sfmapp.odometry.pyramid import Pyramid, build_pyramid
 from sfmapp.odometry.recognition import Recognition
 from sfmapp.odometry.records import FrameRecord, gather, leave_keyframe, measure_again
 from sfmapp.odometry.result import FrameState, OdometryResult
+from sfmapp.odometry.shutter import straighten
 from sfmapp.odometry.smoothing import smooth_trajectory
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
 from sfmapp.odometry.tracker import MIN_INLIERS, keyframe_reason, measure_pose, track
@@ -88,17 +89,18 @@ class Odometry:
             record.state = FrameState.LOST
             if record.timestamp_s == self.lost_since:
                 self.events.warned(STAGE, f"{record.name}: tracking is lost", frame_idx=record.frame_idx)
-            if record.timestamp_s - self.lost_since < self.options.max_lost_s:
-                return
-        self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
+        is_open = self.lost_since is None or record.timestamp_s - self.lost_since >= self.options.max_lost_s
+        if is_open:
+            self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
         if self.rig.is_stereo:
-            self._begin_stereo(record, view)
+            if is_open:
+                self._begin_stereo(record, view)
             return
         views = self.beginning.add(view.pyramids[0])
         if len(self.beginning.seen) == 1:
             self.waiting.clear()  # a new first view: what was before it has no pose
         self.waiting.append((record, view))
-        if views is not None:
+        if views is not None and is_open:
             self._begin_from_two_views(views)
 
     def _begin_stereo(self, record: FrameRecord, view: View) -> None:
@@ -232,7 +234,7 @@ class Odometry:
         if local is None or self.previous is None:
             return False
         self._take_over(local, None)
-        if len(self.tracks) >= MIN_INLIERS and not self.waiting:
+        if len(self.tracks) >= MIN_INLIERS:
             tracked = track(local, self.tracks, self.pose, _IDENTITY, self.previous, view.pyramids[0])
             if tracked is not None and tracked.num_inliers > 0.5 * tracked.num_found:
                 self.pose, self.tracks, self.lost_since = tracked.pose, tracked.tracks, None
@@ -316,7 +318,9 @@ class Odometry:
             local.backend.finish(local.keyframes)
             maps[number] = local.keyframes
             self.events.started("adjustment", f"adjusting {local.newest + 1} keyframes together")
+            straightened = self._straighten(local)
             conclusions[number] = conclude(local.keyframes, self.options, self.events)
+            conclusions[number].report["shutter"] = straightened
             measure_again(self.records, local.keyframes, number)
             self.events.finished("adjustment", **conclusions[number].report)
         self.executor.shutdown()
@@ -327,6 +331,16 @@ class Odometry:
                 result.smoothed.append(smooth_trajectory(result.timestamps_s, poses, result.covariance))
         result.report = self._report(result)
         return result
+
+    def _straighten(self, local: LocalMap) -> dict[str, Any]:
+        """Undo a rolling shutter where the images clearly show one; the numbers behind that."""
+        if self.rig.is_stereo or not self.options.refine_camera:
+            return {}
+        numbers = straighten(self.records, local.keyframes, local.map_idx)
+        self.events.raise_if_cancelled()
+        if numbers["readout"]:
+            self.events.decided("adjustment", "the images show a rolling shutter, which is undone", **numbers)
+        return numbers
 
     def _report(self, result: OdometryResult) -> dict[str, Any]:
         tracked = np.isfinite(result.cam_from_world[:, 0])

@@ -1,0 +1,149 @@
+"""A rolling shutter reads the rows of an image one after the other: how fast, and where points would be had it not.
+
+A point of row y is seen at the time ``readout (y / height - 1/2)`` from the middle of the image. How fast it moves in
+the image there follows from the map itself: it is projected with the poses of the frames before and after. So the
+readout, as a share of the time between frames, is the only unknown. Adjustments with three values of it tell where the
+cost is least, and whether the images care at all: a global shutter, or a camera that hardly moves, leaves it at zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.geometry import rigid3
+from sfmapp.mapping.structure import residual_scale_px
+from sfmapp.odometry.backend import Job, make_job, take_over
+from sfmapp.odometry.keyframe_map import KeyframeMap
+from sfmapp.odometry.records import FrameRecord, measure_again
+from sfmapp.scene.camera import project
+from sfmapp.scene.reconstruction import Reconstruction
+
+Array = NDArray[np.float64]
+
+# Steps, as shares of the time between frames, in which the least cost is looked for, first far and then near: the
+# motion is known the better the straighter its images are. No camera reads longer than one frame; one that reads from
+# the bottom up is mounted upside down.
+_STRIDES, _MAX_READOUT = (0.25, 0.1), 1.0
+# A sensor that reads within so small a share is as good as a global shutter: what is found is some other error.
+_MIN_READOUT = 0.05
+# The least gain in cost, in squares of the noise: as for a changed calibration.
+_MIN_EVIDENCE = 90.0
+# Frames that are farther apart than that many steady steps say nothing about the motion in between.
+_MAX_GAP = 2.5
+# Residuals are not believed to be better than that, however well a synthetic sequence fits.
+_MIN_SIGMA_PX = 0.02
+_STEPS = 12  # of each adjustment: the last one has brought the map close to its minimum
+
+
+def straighten(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int) -> dict[str, Any]:
+    """Find the readout of the camera of a map, and move what its frames saw to where a global shutter had seen it.
+
+    Where that is worth it, the map is adjusted, and observations and poses are changed in place. Else nothing is.
+
+    Returns:
+        The numbers behind the decision; ``readout``: time from the first row to the last as a share of the time between
+        frames, 0 where nothing was changed.
+    """
+    total, report = 0.0, dict[str, Any]()
+    for stride in _STRIDES:
+        readout, evidence, job = _search(records, keyframes, map_idx, stride)
+        if stride == _STRIDES[0]:
+            report = {"evidence": evidence, "min_evidence": _MIN_EVIDENCE, "first_readout": readout}
+            if evidence < _MIN_EVIDENCE or abs(readout) < _MIN_READOUT:
+                break
+        if job is None:
+            break
+        total += readout
+        _move(records, keyframes, map_idx, readout)
+        take_over(job, keyframes)
+        measure_again(records, keyframes, map_idx)
+    return report | {"readout": total}
+
+
+def _search(
+    records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, stride: float
+) -> tuple[float, float, Job | None]:
+    """The readout of least cost in steps of a stride, what it gains, and the map adjusted with it."""
+    everything = np.arange(len(keyframes.keyframes))
+    job = make_job(keyframes, everything, everything > 0)
+    model, tracks = job.model, job.model.tracks
+    shifts = np.zeros_like(tracks.obs_xy)
+    shift_of = _RowShift(records, keyframes, map_idx)
+    for k, keyframe in enumerate(keyframes.keyframes):
+        obs = tracks.observations_of_image(k)
+        shifts[obs] = shift_of(keyframe.frame_idx, model.point_xyz[tracks.obs_track_idx[obs]], tracks.obs_xy[obs])
+    if not shifts.any():
+        return 0.0, 0.0, None
+    sigma = max(residual_scale_px(model), _MIN_SIGMA_PX)
+    costs = {n: _adjusted(job, shifts, n * stride, sigma)[0] for n in (-1, 0, 1)}
+    best = min(costs, key=lambda n: (costs[n], abs(n)))
+    while {best - 1, best + 1} - set(costs) and (abs(best) + 1) * stride <= _MAX_READOUT:
+        beyond = best + (1 if best > 0 else -1)
+        costs[beyond] = _adjusted(job, shifts, beyond * stride, sigma)[0]
+        if costs[beyond] >= costs[best]:
+            break
+        best = beyond
+    if best - 1 in costs and best + 1 in costs:
+        bend = costs[best - 1] + costs[best + 1] - 2 * costs[best]
+        readout = stride * (best + 0.5 * (costs[best - 1] - costs[best + 1]) / max(bend, 1e-9))
+    else:
+        readout = stride * best
+    cost, model = _adjusted(job, shifts, readout, sigma)
+    job.model = model
+    return readout, costs[0] - cost, job
+
+
+def _move(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, readout: float) -> None:
+    """Take what a readout adds from all observations."""
+    shift_of = _RowShift(records, keyframes, map_idx)
+    for keyframe in keyframes.keyframes:
+        xy = keyframe.xy[:, 0]
+        keyframe.xy[:, 0] = xy - readout * shift_of(keyframe.frame_idx, keyframes.point_xyz[keyframe.point_id], xy)
+    for record in records:
+        if record.map_idx == map_idx and len(record.xy):
+            xy = record.xy.astype(np.float64)
+            shift = shift_of(record.frame_idx, keyframes.point_xyz[record.point_id], xy)
+            record.xy = (xy - readout * shift).astype(np.float32)
+
+
+class _RowShift:
+    """How far points move in the image between the middle of a readout of a whole frame and their rows."""
+
+    def __init__(self, records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int) -> None:
+        rows = [r for r in records if r.map_idx == map_idx and r.has_pose]
+        self._camera = keyframes.rig.cameras[0]
+        self._poses = [
+            rigid3.compose(r.frame_from_keyframe, keyframes.keyframes[r.keyframe].rig_from_world) for r in rows
+        ]
+        self._position = {r.frame_idx: n for n, r in enumerate(rows)}
+        self._times = np.array([r.timestamp_s for r in rows])
+        self._unit = float(np.median(np.diff(self._times))) if len(rows) > 1 else 0.0
+
+    def __call__(self, frame_idx: int, xyz: Array, xy: Array) -> Array:
+        """(N, 2) pixels for points seen at pixels in a frame; zero where the motion is not known."""
+        n = self._position.get(frame_idx, -1)
+        before, after = max(n - 1, 0), min(n + 1, len(self._poses) - 1)
+        if n < 0 or after == before:
+            return np.zeros_like(xy)
+        gap = float(self._times[after] - self._times[before]) / self._unit
+        if gap > _MAX_GAP:
+            return np.zeros_like(xy)
+        first, last = (project(self._camera, rigid3.apply(self._poses[k], xyz)) for k in (before, after))
+        shift = (last - first) / gap * (xy[:, 1] / self._camera.height - 0.5)[:, None]
+        return np.where(np.isfinite(shift), shift, 0.0)
+
+
+def _adjusted(job: Job, shifts: Array, readout: float, sigma: float) -> tuple[float, Reconstruction]:
+    """The map adjusted with a readout and its cost in squares of the noise."""
+    model: Reconstruction = job.model.copy()
+    model.tracks = replace(model.tracks, obs_xy=model.tracks.obs_xy - readout * shifts)
+    options = AdjustOptions(
+        loss="cauchy", loss_scale_px=2 * sigma, max_iterations=_STEPS, relative_cost_tolerance=1e-5,
+        refine_focal=False, refine_distortion=False,
+    )  # fmt: skip
+    return 2 * adjust_bundle(model, options, variable_images=job.is_variable).final_cost / sigma**2, model
