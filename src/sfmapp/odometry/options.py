@@ -21,7 +21,6 @@ class OdometryOptions:
     max_lost_s: float = 1.0  # seconds without relocalisation after which a new map is begun
     motion: Literal["free", "planar"] = "free"  # planar: a wheeled robot on level ground, for the first two views
     loops: bool = True  # look for places seen before, close loops and join maps
-    final_adjustment: bool = True  # adjust all keyframes once at the end
     refine_camera: bool = True  # there, refine the calibration where the images clearly contradict it
     smooth: bool = False  # also give the trajectory through an error-state filter: steadier, short gaps bridged
     covariance: bool = True  # covariances of the keyframes, at the end

@@ -26,6 +26,7 @@ from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.shutter import straighten
 from sfmapp.odometry.smoothing import smooth_trajectory
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
+from sfmapp.odometry.sweep import is_too_large
 from sfmapp.odometry.tracker import MIN_INLIERS, keyframe_reason, measure_pose, track
 
 Array = NDArray[np.float64]
@@ -334,7 +335,7 @@ class Odometry:
 
     def _straighten(self, local: LocalMap) -> dict[str, Any]:
         """Undo a rolling shutter where the images clearly show one; the numbers behind that."""
-        if self.rig.is_stereo or not self.options.refine_camera:
+        if self.rig.is_stereo or not self.options.refine_camera or is_too_large(local.keyframes):
             return {}
         numbers = straighten(self.records, local.keyframes, local.map_idx)
         self.events.raise_if_cancelled()
