@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 STAGE = "odometry"
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 # Frames are taken to come at a steady rate within this share of the time between them.
-_STEADY_SHARE = 0.2
+_STEADY_SHARE, _MAX_STEADY_SHARE = 0.2, 3.0
 # Fewest points with depth that one look of a rig may begin a map with.
 _MIN_STEREO_POINTS = 40
 
@@ -182,7 +182,8 @@ class Odometry:
         if len(self.records) < 3:
             return self.step
         before, last, now = (record.timestamp_s for record in self.records[-3:])
-        share = (now - last) / (last - before)
+        # after a pause nobody knows: what has moved on so far would be nearly out of sight
+        share = min((now - last) / (last - before), _MAX_STEADY_SHARE)
         step = pose_between(_IDENTITY, self.step, share) if abs(share - 1) > _STEADY_SHARE else self.step
         turn = None if self.imu is None else imu_rotation(self.imu, last, now)
         return step if turn is None else rigid3.from_matrix(turn, step[4:])
