@@ -35,6 +35,9 @@ _RAY_SIGMA = 1e-3
 # Least baseline over depth that the scale of an edge is believed to come from: points have a degree of parallax.
 _MIN_BASELINE = 0.02
 
+# Points of a keyframe that its depth is the median of.
+_DEPTH_SAMPLE = 64
+
 
 @dataclass(frozen=True)
 class GraphEdges:
@@ -86,8 +89,10 @@ def essential_edges(keyframes: KeyframeMap) -> GraphEdges:
 def keyframe_depths(keyframes: KeyframeMap) -> Array:
     """(K,) median depth of the points of each keyframe; of keyframes without points that of the others, or one."""
     poses = np.array([k.rig_from_world for k in keyframes.keyframes]).reshape(-1, 7)
-    ids = np.concatenate([k.point_id for k in keyframes.keyframes] or [np.zeros(0, np.int64)])
-    owner = np.repeat(np.arange(len(poses)), [len(k.point_id) for k in keyframes.keyframes])
+    # a sample is enough for a measure of length, and there may be a thousand keyframes
+    seen_ids = [k.point_id[:: 1 + len(k.point_id) // _DEPTH_SAMPLE] for k in keyframes.keyframes]
+    ids = np.concatenate(seen_ids or [np.zeros(0, np.int64)])
+    owner = np.repeat(np.arange(len(poses)), [len(i) for i in seen_ids])
     axis, offset = rigid3.rotation_matrix(poses)[:, 2], poses[:, 6]
     z = np.einsum("ni,ni->n", axis[owner], keyframes.point_xyz[ids]) + offset[owner]
     seen = z > 0  # False for NaN
