@@ -123,8 +123,8 @@ class Told(list[Event]):
         return [event.message for event in self if event.kind == kind]
 
 
-def run(sequence: Played, options: OdometryOptions | None = None, seed: int = 0) -> OdometryResult:
-    return run_odometry(sequence, options or OdometryOptions(), seed=seed)  # type: ignore[arg-type]
+def run(sequence: Played, options: OdometryOptions | None = None, seed: int = 0, threads: int = 2) -> OdometryResult:
+    return run_odometry(sequence, options or OdometryOptions(), seed=seed, threads=threads)  # type: ignore[arg-type]
 
 
 def centers_and_truth(result: OdometryResult, sequence: Played, map_idx: int = 0) -> tuple[Array, Array]:

@@ -129,9 +129,9 @@ def take_over(job: Job, keyframes: KeyframeMap) -> None:
 
 
 class Backend:
-    """At most one adjustment at a time, in a thread."""
+    """At most one adjustment at a time, in a thread beside the tracking, or in its own where there is no executor."""
 
-    def __init__(self, executor: Executor) -> None:
+    def __init__(self, executor: Executor | None) -> None:
         self._executor = executor
         self._future: Future[Job] | None = None
         self._due = 0
@@ -141,7 +141,12 @@ class Backend:
     def begin(self, job: Job, frame_number: int) -> None:
         """Start a job. The last one must have been taken over."""
         assert self._future is None
-        self._future, self._due = self._executor.submit(run_job, job), frame_number + LAG
+        self._due = frame_number + LAG
+        if self._executor is not None:
+            self._future = self._executor.submit(run_job, job)
+        else:
+            self._future = Future()
+            self._future.set_result(run_job(job))
         self.num_jobs += 1
 
     def finish(self, keyframes: KeyframeMap, frame_number: int | None = None) -> bool:

@@ -51,7 +51,7 @@ class View:
 class LocalMap:
     """Keyframes, points and the images that points are looked for with."""
 
-    def __init__(self, rig: Rig, options: OdometryOptions, executor: Executor, map_idx: int) -> None:
+    def __init__(self, rig: Rig, options: OdometryOptions, executor: Executor | None, map_idx: int) -> None:
         self.rig, self.options, self.map_idx = rig, options, map_idx
         self.keyframes = KeyframeMap(rig)
         self.backend = Backend(executor)

@@ -42,9 +42,11 @@ _MIN_STEREO_POINTS = 40
 class Odometry:
     """The state between two frames. Push frames with :meth:`process`, then call :meth:`finish` once."""
 
-    def __init__(self, sequence: Sequence, options: OdometryOptions, *, seed: int, events: Events) -> None:
+    def __init__(
+        self, sequence: Sequence, options: OdometryOptions, *, seed: int, threads: int, events: Events
+    ) -> None:
         self.rig, self.options, self.seed, self.events = sequence.rig, options, seed, events
-        self.executor = ThreadPoolExecutor(1, "adjust")
+        self.executor = ThreadPoolExecutor(1, "adjust") if threads > 1 else None
         self.records: list[FrameRecord] = []
         self.maps: dict[int, LocalMap] = {}
         self.local: LocalMap | None = None
@@ -325,7 +327,8 @@ class Odometry:
             conclusions[number].report["shutter"] = straightened
             measure_again(self.records, local.keyframes, number)
             self.events.finished("adjustment", **conclusions[number].report)
-        self.executor.shutdown()
+        if self.executor is not None:
+            self.executor.shutdown()
         result = gather(self.records, maps, conclusions)
         if self.options.smooth and result.covariance is not None:
             for m in range(len(result.maps)):
@@ -362,7 +365,7 @@ def run_odometry(
     Args:
         sequence: frames and the rig that took them.
         seed: of everything that is drawn.
-        threads: the result does not depend on it.
+        threads: with more than one the local adjustment runs beside the tracking. The result does not depend on it.
         events: told of every frame (``advanced`` with a FrameSnapshot) and of every change of the map (``decided`` with
             a MapSnapshot).
 
@@ -370,7 +373,7 @@ def run_odometry(
         InterruptedRunError: on cancellation.
     """
     events = events or Events()
-    odometry = Odometry(sequence, options, seed=seed, events=events)
+    odometry = Odometry(sequence, options, seed=seed, threads=threads, events=events)
     events.started(STAGE, total=sequence.num_frames)
     for frame in sequence.frames():
         odometry.process(frame)
