@@ -37,7 +37,9 @@ _MIN_EVIDENCE = 90.0
 _MAX_GAP = 2.5
 # Residuals are not believed to be better than that, however well a synthetic sequence fits.
 _MIN_SIGMA_PX = 0.02
-_STEPS = 12  # of each adjustment: the last one has brought the map close to its minimum
+# Of each adjustment, the last one having brought the map close to its minimum; and of a first glance, which spares all
+# else where there is no sign of a rolling shutter.
+_STEPS, _GLANCE_STEPS = 12, 3
 
 
 def straighten(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int) -> dict[str, Any]:
@@ -80,6 +82,9 @@ def _search(
     if not shifts.any():
         return 0.0, 0.0, None
     sigma = max(residual_scale_px(model), _MIN_SIGMA_PX)
+    glance = [_adjusted(job, shifts, n * stride, sigma, _GLANCE_STEPS)[0] for n in (-1, 0, 1)]
+    if abs(_vertex(*glance)) * stride < 0.5 * _MIN_READOUT:
+        return 0.0, 0.0, None
     costs = {n: _adjusted(job, shifts, n * stride, sigma)[0] for n in (-1, 0, 1)}
     best = min(costs, key=lambda n: (costs[n], abs(n)))
     while {best - 1, best + 1} - set(costs) and (abs(best) + 1) * stride <= _MAX_READOUT:
@@ -89,13 +94,20 @@ def _search(
             break
         best = beyond
     if best - 1 in costs and best + 1 in costs:
-        bend = costs[best - 1] + costs[best + 1] - 2 * costs[best]
-        readout = stride * (best + 0.5 * (costs[best - 1] - costs[best + 1]) / max(bend, 1e-9))
+        readout = stride * (best + _vertex(costs[best - 1], costs[best], costs[best + 1]))
     else:
         readout = stride * best
     cost, model = _adjusted(job, shifts, readout, sigma)
     job.model = model
     return readout, costs[0] - cost, job
+
+
+def _vertex(before: float, here: float, after: float) -> float:
+    """Where a parabola through three costs at -1, 0 and 1 is least; beyond them if it bends the wrong way."""
+    bend = before + after - 2 * here
+    if bend <= 0:
+        return 1.0 if after < before else -1.0
+    return 0.5 * (before - after) / bend
 
 
 def _move(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, readout: float) -> None:
@@ -138,12 +150,14 @@ class _RowShift:
         return np.where(np.isfinite(shift), shift, 0.0)
 
 
-def _adjusted(job: Job, shifts: Array, readout: float, sigma: float) -> tuple[float, Reconstruction]:
+def _adjusted(
+    job: Job, shifts: Array, readout: float, sigma: float, steps: int = _STEPS
+) -> tuple[float, Reconstruction]:
     """The map adjusted with a readout and its cost in squares of the noise."""
     model: Reconstruction = job.model.copy()
     model.tracks = replace(model.tracks, obs_xy=model.tracks.obs_xy - readout * shifts)
     options = AdjustOptions(
-        loss="cauchy", loss_scale_px=2 * sigma, max_iterations=_STEPS, relative_cost_tolerance=1e-5,
+        loss="cauchy", loss_scale_px=2 * sigma, max_iterations=steps, relative_cost_tolerance=1e-5,
         refine_focal=False, refine_distortion=False,
     )  # fmt: skip
     return 2 * adjust_bundle(model, options, variable_images=job.is_variable).final_cost / sigma**2, model
