@@ -12,7 +12,7 @@ class OdometryOptions:
 
     max_tracks: int = 600  # corners followed at a time, spread over the image
     keyframe_parallax: float = 0.02  # median shift beyond rotation since the last keyframe, share of the image width
-    keyframe_loss: float = 0.75  # a keyframe is due when fewer than this share of its mapped points is still tracked
+    keyframe_loss: float = 0.65  # a keyframe is due when fewer than this share of its mapped points is still tracked
     cull_seen: float = 0.95  # a keyframe is dropped once this share of its points is seen by three others; 1 for never
     window: int = 10  # keyframes whose poses the local adjustment may change
     window_anchors: int = 10  # earlier keyframes that take part unchanged, those that share the most points
