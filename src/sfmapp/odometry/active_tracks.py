@@ -148,14 +148,37 @@ def follow(
     usable = np.isfinite(guess[:, 0]) & (ratio > _MIN_SCALE) & (ratio < 1 / _MIN_SCALE)
     rotation = references.camera_from(predicted)[0]
     warp = patch_warp(rotation[k], tracks.reference_ray, ratio)
+    chosen = np.flatnonzero(usable)
     xy, zncc, found = tracks.xy.copy(), tracks.zncc.copy(), np.zeros(len(tracks), bool)
-    for n, keyframe in enumerate(references.keyframe):
-        mine = np.flatnonzero(usable & (k == n))
-        if len(mine):
-            aligned = align_patches(
-                images[int(keyframe)], tracks.reference_xy[mine], pyramid, guess[mine], affine=warp[mine],
-                coarsest_level=coarsest_level,
-            )  # fmt: skip
-            xy[mine], zncc[mine], found[mine] = aligned.xy, aligned.zncc, aligned.is_converged
+    xy[chosen], zncc[chosen], found[chosen] = align_to_references(
+        tracks.subset(chosen), images, pyramid, guess[chosen], warp[chosen], coarsest_level
+    )
     found &= zncc > _MIN_LIKENESS
     return replace(tracks, xy=xy, zncc=zncc), found
+
+
+def align_to_references(
+    tracks: ActiveTracks,
+    images: Mapping[int, Pyramid],
+    pyramid: Pyramid,
+    guess: Array,
+    warp: Array,
+    coarsest_level: int,
+) -> tuple[Array, NDArray[np.float32], Mask]:
+    """Look for the patches of tracks, each as its reference keyframe saw it.
+
+    Args:
+        guess: (N, 2) pixels where they are expected. warp: (N, 2, 2) of :func:`patch_warp`.
+
+    Returns:
+        (N, 2) pixels, (N,) likeness, (N,) which alignments have converged.
+    """
+    xy, zncc, found = guess.copy(), np.zeros(len(tracks), np.float32), np.zeros(len(tracks), bool)
+    for keyframe in np.unique(tracks.reference):
+        mine = np.flatnonzero(tracks.reference == keyframe)
+        aligned = align_patches(
+            images[int(keyframe)], tracks.reference_xy[mine], pyramid, guess[mine], affine=warp[mine],
+            coarsest_level=coarsest_level,
+        )  # fmt: skip
+        xy[mine], zncc[mine], found[mine] = aligned.xy, aligned.zncc, aligned.is_converged
+    return xy, zncc, found

@@ -34,7 +34,7 @@ _TURN_SIGMA_DEG = 0.05
 # A changed calibration has to explain this much, in units of the noise, per free parameter. Independent noise alone
 # explains 1; errors of patches are not independent, and exact cameras of rendered sequences show up to 30. Rectified
 # images of a real car show a thousand.
-_MIN_EVIDENCE = 90.0
+MIN_EVIDENCE = 90.0
 # A map whose poses leave the calibration open must not decide on it: the largest change in sigmas of what was given.
 _MAX_CHANGE_SIGMAS = 4.0
 # Covariances take two dense matrices over all poses.
@@ -43,7 +43,7 @@ _FIRST_STEPS, _MAX_STEPS = 8, 30
 # Keyframes of a large map that its cameras are questioned on.
 _NUM_QUESTIONED = 100
 # Residuals are not believed to be better than that, however well a synthetic sequence fits.
-_MIN_SIGMA_PX = 0.02
+MIN_SIGMA_PX = 0.02
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,10 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -
     job = make_job(keyframes, everything, everything > 0)
     model, report = job.model, dict[str, Any]()
     for steps in (_FIRST_STEPS, _MAX_STEPS):  # which observations agree is clear long before all have settled
-        sigma = max(residual_scale_px(model), _MIN_SIGMA_PX)
+        sigma = max(residual_scale_px(model), MIN_SIGMA_PX)
         cost = _adjust(model, sigma, max_steps=steps)
-        report["sigma_px"] = classify(model, job.num_elsewhere) if steps == _FIRST_STEPS else sigma
+        if steps == _FIRST_STEPS:
+            classify(model, job.num_elsewhere)
         events.raise_if_cancelled()
     if options.refine_camera:
         refined, report["camera"] = _question_cameras(job.model, cost, sigma)
@@ -94,7 +95,7 @@ def _conclude_large(keyframes: KeyframeMap, options: OdometryOptions, events: Ev
         num = len(keyframes.keyframes)
         part = np.arange(num - _NUM_QUESTIONED, num)
         job = make_job(keyframes, part, part > part[0])
-        sigma = max(residual_scale_px(job.model), _MIN_SIGMA_PX)
+        sigma = max(residual_scale_px(job.model), MIN_SIGMA_PX)
         refined, report["camera"] = _question_cameras(job.model, _adjust(job.model, sigma), sigma)
         if refined is not None:
             events.decided(STAGE, "the images contradict the given calibration, which is refined", **report["camera"])
@@ -145,9 +146,9 @@ def _question_cameras(
     after = _adjust(free, sigma, given)
     evidence = (before - after) / (sum(len(camera.params) for camera in given) - 2)
     changes = [c.focal / g.focal - 1 for c, g in zip(free.cameras, given, strict=True)]
-    accepted = evidence > _MIN_EVIDENCE and max(map(abs, changes)) < _MAX_CHANGE_SIGMAS * _FOCAL_SIGMA
+    accepted = evidence > MIN_EVIDENCE and max(map(abs, changes)) < _MAX_CHANGE_SIGMAS * _FOCAL_SIGMA
     numbers = {
-        "is_refined": bool(accepted), "evidence_per_parameter": evidence, "min_evidence": _MIN_EVIDENCE,
+        "is_refined": bool(accepted), "evidence_per_parameter": evidence, "min_evidence": MIN_EVIDENCE,
         "focal_change": changes, "turn_deg": turn_deg, "given": [c.params.tolist() for c in given],
         "refined": [c.params.tolist() for c in free.cameras],
     }  # fmt: skip

@@ -184,7 +184,7 @@ class Beginning:
             known = np.isfinite(xy[:, 0])
             if known.sum() < _MIN_POINTS:
                 continue
-            start = pose_between(np.array([0.0, 0, 0, 1, 0, 0, 0]), last_from_first, n / last)
+            start = pose_between(rigid3.IDENTITY, last_from_first, n / last)
             pose = refine_pose(camera.canonical, camera.is_fisheye, start, xyz[known], xy[known]).cam_from_world
             error = np.linalg.norm(project(camera, rigid3.apply(pose, xyz[known])) - xy[known], axis=1)
             left += max(0.0, float(np.nanmedian(error)) ** 2 - _NOISE_PX**2)

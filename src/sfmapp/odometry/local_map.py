@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.triangulation import triangulate_tracks
-from sfmapp.odometry.active_tracks import ActiveTracks, References, patch_warp
-from sfmapp.odometry.alignment import align_patches
+from sfmapp.odometry.active_tracks import ActiveTracks, References, align_to_references, patch_warp
 from sfmapp.odometry.backend import Backend, Job, choose_window, make_job
 from sfmapp.odometry.corners import find_corners
 from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
@@ -56,7 +55,6 @@ class LocalMap:
         self.keyframes = KeyframeMap(rig)
         self.backend = Backend(executor)
         self.images: dict[int, Pyramid] = {}
-        self.counts = {"points_found_again": 0, "triangulated": 0, "stereo_matches": 0}
 
     @property
     def camera(self) -> Camera:
@@ -104,7 +102,7 @@ class LocalMap:
         """Make the first keyframe of a map, at the identity, of corners (N, 2) without depth; returns their tracks."""
         self.images[0] = view.pyramids[0]
         tracks = self.start_tracks(corners, 0, ActiveTracks.none())
-        self._append(view, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), tracks)
+        self._append(view, rigid3.IDENTITY, tracks)
         return tracks
 
     def tracks_of_newest(self) -> ActiveTracks:
@@ -177,7 +175,6 @@ class LocalMap:
             math.radians(smallest), model.point_xyz, model.obs_is_inlier,
         )  # fmt: skip
         self.keyframes.point_xyz[job.point_id[new]] = model.point_xyz[new]
-        self.counts["triangulated"] += int(np.isfinite(model.point_xyz[new, 0]).sum())
 
     def _find_again(self, tracks: ActiveTracks, pyramid: Pyramid, pose: Array) -> ActiveTracks:
         """Look for points of recent keyframes that are not tracked any more."""
@@ -197,16 +194,8 @@ class LocalMap:
             lost.subset(near), reference_ray=in_reference[near, :2] / depth[:, None], inverse_depth=1 / depth
         )
         warp = patch_warp(references.camera_from(pose)[0][k], lost.reference_ray, ratio)
-        xy, zncc, found = guess.copy(), lost.zncc.copy(), np.zeros(len(lost), bool)
-        for reference in np.unique(lost.reference):
-            mine = np.flatnonzero(lost.reference == reference)
-            aligned = align_patches(
-                self.images[int(reference)], lost.reference_xy[mine], pyramid, guess[mine], affine=warp[mine],
-                coarsest_level=1,
-            )  # fmt: skip
-            xy[mine], zncc[mine], found[mine] = aligned.xy, aligned.zncc, aligned.is_converged
+        xy, zncc, found = align_to_references(lost, self.images, pyramid, guess, warp, coarsest_level=1)
         found &= (np.linalg.norm(xy - guess, axis=1) < _FOUND_PX) & (zncc > _FOUND_LIKENESS)
-        self.counts["points_found_again"] += int(found.sum())
         return replace(lost, xy=xy, zncc=zncc).subset(found)
 
     def _lost_points(self, tracks: ActiveTracks) -> ActiveTracks:
@@ -292,4 +281,3 @@ class LocalMap:
         keyframe.xy[:, 1] = match_stereo(self.rig, view.pyramids, tracks.xy, depth)
         keyframe.is_inlier[:, 1] = np.isfinite(keyframe.xy[:, 1, 0])
         self.keyframes.count(keyframe.point_id, keyframe.is_inlier[:, 1])
-        self.counts["stereo_matches"] += int(keyframe.is_inlier[:, 1].sum())

@@ -32,7 +32,6 @@ from sfmapp.odometry.tracker import MIN_INLIERS, keyframe_reason, measure_pose, 
 Array = NDArray[np.float64]
 
 STAGE = "odometry"
-_IDENTITY = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 # Frames are taken to come at a steady rate within this share of the time between them.
 _STEADY_SHARE, _MAX_STEADY_SHARE = 0.2, 3.0
 # Fewest points with depth that one look of a rig may begin a map with.
@@ -54,7 +53,7 @@ class Odometry:
         self.beginning = Beginning(self.rig.cameras[0], options, seed)
         self.waiting: list[tuple[FrameRecord, View]] = []
         self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
-        self.pose, self.step = _IDENTITY, _IDENTITY
+        self.pose, self.step = rigid3.IDENTITY, rigid3.IDENTITY
         self.imu = sequence.imu
         self.previous: Pyramid | None = None
         self.num_mapped_at_keyframe = 0
@@ -108,13 +107,13 @@ class Odometry:
 
     def _begin_stereo(self, record: FrameRecord, view: View) -> None:
         local = self._new_map()
-        tracks = local.add_keyframe(view, _IDENTITY, ActiveTracks.none(), len(self.records))
+        tracks = local.add_keyframe(view, rigid3.IDENTITY, ActiveTracks.none(), len(self.records))
         if local.points_of(tracks)[1].sum() < _MIN_STEREO_POINTS:
             del self.maps[local.map_idx]
             local.backend.finish(local.keyframes)
             return
-        self._enter(local, tracks, _IDENTITY)
-        self._settle(record, FrameState.TRACKED, _IDENTITY, is_keyframe=True)
+        self._enter(local, tracks, rigid3.IDENTITY)
+        self._settle(record, FrameState.TRACKED, rigid3.IDENTITY, is_keyframe=True)
         self._remember(view)
         self._tell("a map begins with one look of the rig", num_mapped=self.num_mapped_at_keyframe)
 
@@ -154,7 +153,7 @@ class Odometry:
 
     def _enter(self, local: LocalMap, tracks: ActiveTracks, pose: Array) -> None:
         """Go on from the newest keyframe of a map."""
-        self.local, self.tracks, self.pose, self.step = local, tracks, pose, _IDENTITY
+        self.local, self.tracks, self.pose, self.step = local, tracks, pose, rigid3.IDENTITY
         self.lost_since = None
         self._count_mapped()
 
@@ -186,7 +185,7 @@ class Odometry:
         before, last, now = (record.timestamp_s for record in self.records[-3:])
         # after a pause nobody knows: what has moved on so far would be nearly out of sight
         share = min((now - last) / (last - before), _MAX_STEADY_SHARE)
-        step = pose_between(_IDENTITY, self.step, share) if abs(share - 1) > _STEADY_SHARE else self.step
+        step = pose_between(rigid3.IDENTITY, self.step, share) if abs(share - 1) > _STEADY_SHARE else self.step
         turn = None if self.imu is None else imu_rotation(self.imu, last, now)
         return step if turn is None else rigid3.from_matrix(turn, step[4:])
 
@@ -228,7 +227,7 @@ class Odometry:
     def _lose(self, record: FrameRecord) -> None:
         self.lost_since = record.timestamp_s
         self.counts["losses"] += 1
-        self.step = _IDENTITY
+        self.step = rigid3.IDENTITY
         self.beginning = Beginning(self.rig.cameras[0], self.options, self.seed)
         self.waiting.clear()
 
@@ -239,7 +238,7 @@ class Odometry:
             return False
         self._take_over(local, None)
         if len(self.tracks) >= MIN_INLIERS:
-            tracked = track(local, self.tracks, self.pose, _IDENTITY, self.previous, view.pyramids[0])
+            tracked = track(local, self.tracks, self.pose, rigid3.IDENTITY, self.previous, view.pyramids[0])
             if tracked is not None and tracked.num_inliers > 0.5 * tracked.num_found:
                 self.pose, self.tracks, self.lost_since = tracked.pose, tracked.tracks, None
                 self._make_keyframe(record, view, FrameState.RELOCALIZED, "the tracks are found again")
@@ -248,7 +247,7 @@ class Odometry:
         if found is None:
             return False
         self.local, frame_idx, self.pose, point_id, xy = found
-        self.step, self.lost_since = _IDENTITY, None
+        self.step, self.lost_since = rigid3.IDENTITY, None
         self.tracks = self.local.tracks_at(point_id, xy, self.pose)
         self.counts["relocalizations"] += 1
         self.waiting.clear()

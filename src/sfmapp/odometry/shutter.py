@@ -18,6 +18,7 @@ from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.geometry import rigid3
 from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.backend import Job, make_job, take_over
+from sfmapp.odometry.finish import MIN_EVIDENCE, MIN_SIGMA_PX
 from sfmapp.odometry.keyframe_map import KeyframeMap
 from sfmapp.odometry.records import FrameRecord, measure_again
 from sfmapp.scene.camera import project
@@ -31,12 +32,8 @@ Array = NDArray[np.float64]
 _STRIDES, _MAX_READOUT = (0.25, 0.1), 1.0
 # A sensor that reads within so small a share is as good as a global shutter: what is found is some other error.
 _MIN_READOUT = 0.05
-# The least gain in cost, in squares of the noise: as for a changed calibration.
-_MIN_EVIDENCE = 90.0
 # Frames that are farther apart than that many steady steps say nothing about the motion in between.
 _MAX_GAP = 2.5
-# Residuals are not believed to be better than that, however well a synthetic sequence fits.
-_MIN_SIGMA_PX = 0.02
 # Of each adjustment, the last one having brought the map close to its minimum; and of a first glance, which spares all
 # else where there is no sign of a rolling shutter.
 _STEPS, _GLANCE_STEPS = 12, 3
@@ -55,8 +52,8 @@ def straighten(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int)
     for stride in _STRIDES:
         readout, evidence, job = _search(records, keyframes, map_idx, stride)
         if stride == _STRIDES[0]:
-            report = {"evidence": evidence, "min_evidence": _MIN_EVIDENCE, "first_readout": readout}
-            if evidence < _MIN_EVIDENCE or abs(readout) < _MIN_READOUT:
+            report = {"evidence": evidence, "min_evidence": MIN_EVIDENCE, "first_readout": readout}
+            if evidence < MIN_EVIDENCE or abs(readout) < _MIN_READOUT:
                 break
         if job is None:
             break
@@ -81,7 +78,7 @@ def _search(
         shifts[obs] = shift_of(keyframe.frame_idx, model.point_xyz[tracks.obs_track_idx[obs]], tracks.obs_xy[obs])
     if not shifts.any():
         return 0.0, 0.0, None
-    sigma = max(residual_scale_px(model), _MIN_SIGMA_PX)
+    sigma = max(residual_scale_px(model), MIN_SIGMA_PX)
     glance = [_adjusted(job, shifts, n * stride, sigma, _GLANCE_STEPS)[0] for n in (-1, 0, 1)]
     if abs(_vertex(*glance)) * stride < 0.5 * _MIN_READOUT:
         return 0.0, 0.0, None
