@@ -22,6 +22,8 @@ FLOORS = (
     ("pipelines",),
     ("report", "viewer"),
     ("odometry",),
+    ("surface",),
+    ("dense",),
     ("mapping",),
     ("adjust",),
     ("matching",),
@@ -39,7 +41,7 @@ ALLOWED = {
     "rerun": {"viewer"},
     "gtsam": {"adjust", "odometry"},
     "pycolmap": {"formats", "evaluation"},
-    "open3d": set(),
+    "open3d": {"surface"},
     "rich": {"cli"},
     "argparse": {"cli", "evaluation", "viewer"},
 }
