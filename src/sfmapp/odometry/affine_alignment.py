@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.lanes import offset, pointer
-from sfmapp.odometry import lanes
+from sfmapp.geometry import lanes
 from sfmapp.odometry.alignment import (
     GRADED,
     MAX_HALF_WIDTH,
