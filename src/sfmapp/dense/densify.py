@@ -1,0 +1,185 @@
+"""Views with known cameras to patches: match, expand, filter, from coarse to fine (Furukawa and Ponce, PAMI 2010)."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.dense.arrays import Limits, Store
+from sfmapp.dense.growth import Growth
+from sfmapp.dense.options import DenseOptions
+from sfmapp.dense.pyramid import Frame, frame_of, gray_pyramids, make_images
+from sfmapp.dense.scene import DenseScene, DenseView, Patches
+from sfmapp.dense.seeds import corners
+from sfmapp.events import Events
+from sfmapp.geometry import rigid3
+
+STAGE = "dense"
+# the longer side of the coarsest level is at least half of this
+COARSEST_PX = 256
+# a corner for each block of so many pixels
+BLOCK_PX = 6
+TRUSTED, PROMISING, MAX_REFINED = 0.7, 0.4, 4
+
+
+def densify(
+    scene: DenseScene, options: DenseOptions, *, threads: int = 1, events: Events | None = None
+) -> tuple[Patches, dict[str, Any]]:
+    """Reconstruct oriented patches all over the surfaces that the views show.
+
+    Args:
+        scene: views, their neighbours and sparse points, which may be none.
+        options: cells, views that have to agree.
+        threads: workers; the result does not depend on their number.
+        events: progress and cancellation.
+
+    Returns:
+        The patches, and the report: ``num_patches``, ``waves``, ``levels``, ``funnel``, ``seeds``.
+
+    Raises:
+        InterruptedRunError: ``events`` was asked to stop.
+    """
+    events = events or Events()
+    longest = max(max(view.width, view.height) for view in scene.views)
+    num_levels = 1
+    while longest / 2**num_levels >= COARSEST_PX / 2:
+        num_levels += 1
+    events.started(STAGE, "patches", total=2 * len(scene.views) * sum(4**level for level in range(num_levels)))
+    patches, report = _coarse_to_fine(scene, options, num_levels, threads, events)
+    events.finished(STAGE, f"{len(patches)} patches", num_patches=len(patches))
+    return patches, report
+
+
+def _coarse_to_fine(
+    scene: DenseScene, options: DenseOptions, num_levels: int, threads: int, events: Events
+) -> tuple[Patches, dict[str, Any]]:
+    frame = frame_of(scene)
+    grays = gray_pyramids(scene.views, num_levels, threads)
+    limits = Limits(options.min_views, TRUSTED, PROMISING, MAX_REFINED)
+    points, depth_range = _sparse_points(scene, frame), _depth_ranges(scene, frame)
+    rows: list[dict[str, Any]] = []
+    waves: list[dict[str, int]] = []
+    growth: Growth | None = None
+    for level in range(num_levels - 1, -1, -1):
+        wall, cpu = time.monotonic(), time.process_time()
+        steps = 4 ** (num_levels - 1 - level)
+        images = make_images(scene, grays[level], frame, options.cell_px)
+        coarser, growth = growth, Growth(images, limits, threads, growth.wave if growth else 0)
+        row: dict[str, Any] = {"level": level, "marks": []}
+        def mark(name):
+            row["marks"].append((name, round(time.process_time() - cpu, 2)))
+        if coarser is not None:
+            row["carried"] = growth.refine_coarser(coarser, lambda: events.advanced(STAGE, steps))
+            coarser.close()
+            mark("carry")
+        row["points"] = growth.seed_points(points)
+        row["expanded"] = growth.expand(events)
+        mark("expand")
+        found = [corners(gray, BLOCK_PX, float(images.noise[m])) for m, gray in enumerate(grays[level])]
+        row["corners"] = growth.seed_corners(found, depth_range, everywhere=coarser is None)
+        mark("corners")
+        row["expanded"] += growth.expand(events)
+        mark("expand")
+        events.advanced(STAGE, steps * len(scene.views) * (2 if coarser is None else 1))
+        row["accepted"] = growth.count
+        row |= growth.filter()
+        mark("filter")
+        rows.append(row | {
+            "patches": growth.count,
+            "seconds": round(time.monotonic() - wall, 3), "cpu_s": round(time.process_time() - cpu, 3),
+        })  # fmt: skip
+        waves += growth.waves
+    assert growth is not None
+    growth.close()
+    patches = _patches(scene, growth, frame)
+    return patches, _report(rows, waves, len(patches))
+
+
+def _report(rows: list[dict[str, Any]], waves: list[dict[str, int]], num_patches: int) -> dict[str, Any]:
+    last = rows[-1]
+    funnel = [{"name": "accepted", "count": last["accepted"]}]
+    for name in ("contradicted", "without neighbours", "in small groups"):
+        funnel.append({"name": name, "count": last[name]})
+    return {
+        "num_patches": num_patches,
+        "levels": rows,
+        "waves": waves,
+        "seeds": {name: last.get(name, 0) for name in ("carried", "points", "corners")},
+        "funnel": [*funnel, {"name": "patches", "count": num_patches}],
+    }
+
+
+def compile_kernels() -> None:
+    """Compile, or load from the cache, what densification runs: on three views of a textured wall."""
+    rng = np.random.default_rng(0)
+    wall = rng.integers(0, 255, (56, 80, 3)).astype(np.uint8)
+    views = tuple(
+        DenseView(
+            str(m), wall[:, 8 * m : 8 * m + 64], None, np.array([64.0, 64.0, 32.0, 28.0]),
+            np.array([0.0, 0.0, 0.0, 1.0, -0.125 * m, 0.0, 0.0]),
+        )
+        for m in range(3)
+    )  # fmt: skip
+    others = np.array([[1, 2], [0, 2], [1, 0]], np.int32)
+    point = np.array([[0.125, 0.0, 1.0]])
+    scene = DenseScene(views, others, point, np.array([0, 3]), np.arange(3, dtype=np.int32))
+    _coarse_to_fine(scene, DenseOptions(), 2, 1, Events())
+
+
+def _sparse_points(scene: DenseScene, frame: Frame) -> Store:
+    """The sparse points as a store: the views that see each, the one that sees it most from the front first."""
+    count = len(scene.point_xyz)
+    num_neighbors = scene.neighbors.shape[1]
+    points = Store.of_capacity(count, num_neighbors)
+    points.xyz[:] = (scene.point_xyz - frame.origin) * frame.scale
+    centers = scene.centers
+    for p in range(count):
+        seen = scene.point_view_idx[scene.point_ptr[p] : scene.point_ptr[p + 1]]
+        rays = centers[seen] - scene.point_xyz[p]
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        order = np.argsort(-(rays @ rays.mean(axis=0)), kind="stable")
+        kept = seen[order][: num_neighbors + 1]
+        points.views[p, : len(kept)] = kept
+        points.num_views[p] = len(kept)
+    return points
+
+
+def _depth_ranges(scene: DenseScene, frame: Frame) -> NDArray[np.float64]:
+    """(V, 2) smallest and largest inverse depth to search, from the sparse points of each view; anything without."""
+    ranges = np.tile([1e-6, 1e6], (len(scene.views), 1))
+    pose = scene.cam_from_world
+    rotation = rigid3.rotation_matrix(pose)
+    point_idx = np.repeat(np.arange(len(scene.point_xyz)), np.diff(scene.point_ptr))
+    for m in range(len(scene.views)):
+        mine = point_idx[scene.point_view_idx == m]
+        depth = (scene.point_xyz[mine] @ rotation[m, 2] + pose[m, 6]) * frame.scale
+        depth = depth[depth > 0.0]
+        if len(depth) >= 20:
+            near, far = np.quantile(depth, [0.01, 0.99])
+            ranges[m] = 1.0 / (1.5 * far), 1.0 / (near / 1.5)
+    return ranges
+
+
+def _patches(scene: DenseScene, growth: Growth, frame: Frame) -> Patches:
+    """Back to the world, with colours."""
+    n, store = growth.count, growth.store
+    reference = store.views[:n, 0]
+    rgb = np.zeros((n, 3), np.uint8)
+    xyz = store.xyz[:n].astype(np.float64) / frame.scale + frame.origin
+    for m, view in enumerate(scene.views):
+        mine = np.flatnonzero(reference == m)
+        r, t = growth.images.rotation[m], growth.images.translation[m]
+        seen = store.xyz[mine].astype(np.float64) @ r.T + t
+        x = (seen[:, 0] / seen[:, 2] * view.k[0] + view.k[2]).astype(np.int64).clip(0, view.width - 1)
+        y = (seen[:, 1] / seen[:, 2] * view.k[1] + view.k[3]).astype(np.int64).clip(0, view.height - 1)
+        rgb[mine] = view.rgb[y, x]
+    counts = store.num_views[:n].astype(np.int64)
+    is_view = np.arange(store.views.shape[1]) < counts[:, None]
+    return Patches(
+        xyz, store.normal[:n].copy(), rgb, store.score[:n].copy(),
+        store.sigma[:n] / np.float32(frame.scale), store.size[:n] / np.float32(frame.scale), store.wave[:n].copy(),
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), store.views[:n][is_view].astype(np.int32),
+    )  # fmt: skip

@@ -1,0 +1,305 @@
+"""Waves: patches grow into the empty cells beside them, all cells of a view at once.
+
+Furukawa and Ponce expand from a queue, one patch after the other. Here the cells that border on new patches are tried
+together, each by itself, from the state at the beginning of the wave, and what was found is entered in the order of
+the cells: threads share the work, and the result does not depend on how many there are.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numba import float32 as f32
+
+from sfmapp.adjust.lanes import offset, pointer
+from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
+from sfmapp.dense.patch_kernels import cell_of, judge, measure, plane_in_view, project, refine
+from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
+
+CANDIDATES = 3
+# a cell that has failed so often is left alone until the next round
+MOST_TRIES = 3
+WAITING = np.uint8(128)
+# how far two patches may lie off each other's planes to be of one surface, in cells
+NEAR = 1.5
+# and how far they have to lie off them to be two surfaces, one behind the other
+APART = 8.0
+# NCC of what is in a cell from which no second layer is looked for, and by how much that has to be better
+CONTENT, BETTER = f32(0.85), f32(0.05)
+# planes that differ by less than this across the window are one candidate
+SAME_PX = f32(0.15)
+# images that choose between candidates
+NUM_CHOOSING = 3
+# a pixel of the window has half the weight of the centre where it differs from it by this many deviations of the
+# noise, and by this many grey levels more
+CONTRAST, LEAST_CONTRAST = 6.0, 20.0
+# deviation of a window, in those of the noise, below which it shows nothing
+LEAST_DEVIATION = 1.0
+
+
+@numba.njit(cache=True, nogil=True)
+def off_planes(store, p, other, q):  # type: ignore[no-untyped-def]
+    """How far patch p of one store and q of another lie off each other's planes, in all (Furukawa and Ponce, eq. 6)."""
+    x, n = offset(store.xyz, 3 * p), offset(store.normal, 3 * p)
+    y, o = offset(other.xyz, 3 * q), offset(other.normal, 3 * q)
+    d0, d1, d2 = y[0] - x[0], y[1] - x[1], y[2] - x[2]
+    return abs(d0 * n[0] + d1 * n[1] + d2 * n[2]) + abs(d0 * o[0] + d1 * o[1] + d2 * o[2])
+
+
+@numba.njit(cache=True, nogil=True)
+def cell_size(images, store, p):  # type: ignore[no-untyped-def]
+    """What a cell measures at a patch."""
+    return store.size[p] * f32(images.cell_px)
+
+
+@numba.njit(cache=True, nogil=True)
+def frontier(image_arrays, store_arrays, cell_arrays, m, fresh, num_fresh, places, candidates):  # type: ignore[no-untyped-def]
+    """Cells of view m to try next to cells that were filled: pixels to ``places``, patches to grow to ``candidates``.
+
+    ``fresh[:num_fresh]``: filled cells, counted within the view; num_fresh < 0: all cells with filled neighbours are
+    looked for. Returns their number.
+    """
+    images, store, cells = image_pointers(image_arrays), store_pointers(store_arrays), cell_pointers(cell_arrays)
+    start, columns, rows = images.cell_start[m], np.int64(images.columns[m]), np.int64(images.rows[m])
+    places_, candidates_ = pointer(places), pointer(candidates)
+    n = 0
+    if num_fresh < 0:
+        for y in range(rows):
+            for x in range(columns):
+                if _may_be_tried(images, cells, m, x, y):
+                    n += _offer(images, store, cells, m, x, y, offset(places_, 2 * n), offset(candidates_, CANDIDATES * n))
+        return n
+    for i in range(num_fresh):
+        cy = fresh[i] // columns
+        cx = fresh[i] - cy * columns
+        for y in range(max(cy - 1, 0), min(cy + 2, rows)):
+            for x in range(max(cx - 1, 0), min(cx + 2, columns)):
+                g = start + y * columns + x
+                if cells.tried[g] < WAITING and _may_be_tried(images, cells, m, x, y):
+                    if _offer(images, store, cells, m, x, y, offset(places_, 2 * n), offset(candidates_, CANDIDATES * n)):
+                        cells.tried[g] |= WAITING
+                        n += 1
+    for i in range(n):
+        g = start + np.int64(places[i, 1] // images.cell_px) * columns + places[i, 0] // images.cell_px
+        cells.tried[g] &= ~WAITING
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def _may_be_tried(images, cells, m, x, y):  # type: ignore[no-untyped-def]
+    """The cell has room for a patch, its window lies in the image, and it has not failed too often."""
+    g = images.cell_start[m] + y * images.columns[m] + x
+    if images.closed[g] != 0 or cells.patch[LAYERS * g + LAYERS - 1] >= 0 or (cells.tried[g] & ~WAITING) >= MOST_TRIES:
+        return False
+    u, v = x * images.cell_px + images.cell_px // 2, y * images.cell_px + images.cell_px // 2
+    return u >= HALF and v >= HALF and u < images.width[m] - HALF - 1 and v < images.height[m] - HALF - 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _offer(images, store, cells, m, x, y, place, row):  # type: ignore[no-untyped-def]
+    """Enter a cell as one to be tried if a patch beside it can grow into it: the best-scored candidates first."""
+    start, columns, rows = images.cell_start[m], np.int64(images.columns[m]), np.int64(images.rows[m])
+    g = start + y * columns + x
+    there = cells.patch[LAYERS * g]
+    count = 0
+    for ny in range(max(y - 1, 0), min(y + 2, rows)):
+        for nx in range(max(x - 1, 0), min(x + 2, columns)):
+            if nx == x and ny == y:
+                continue
+            for layer in range(LAYERS):
+                p = cells.patch[LAYERS * (start + ny * columns + nx) + layer]
+                if p < 0:
+                    break
+                # what grows is the surface that is not in the cell yet
+                if there >= 0 and off_planes(store, p, store, there) < f32(APART) * cell_size(images, store, p):
+                    continue
+                count = _insert(store, row, count, p)
+    if count == 0:
+        return 0
+    for j in range(count, CANDIDATES):
+        row[j] = -1
+    place[0], place[1] = x * images.cell_px + images.cell_px // 2, y * images.cell_px + images.cell_px // 2
+    cells.tried[g] += 1
+    return 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _insert(store, row, count, p):  # type: ignore[no-untyped-def]
+    """Keep the best CANDIDATES patches of a row sorted by score; their new number."""
+    for j in range(count):
+        if row[j] == p:
+            return count
+    j = min(count, CANDIDATES - 1)
+    if count == CANDIDATES and store.score[row[j]] >= store.score[p]:
+        return count
+    while j > 0 and store.score[row[j - 1]] < store.score[p]:
+        row[j] = row[j - 1]
+        j -= 1
+    row[j] = p
+    return min(count + 1, CANDIDATES)
+
+
+@numba.njit(cache=True, nogil=True)
+def try_cells(  # type: ignore[no-untyped-def]
+    image_arrays, store_arrays, cell_arrays, m, places, candidates, first, last, limits, wave, scratch, found_arrays
+):
+    """Grow patches into cells ``first`` to ``last`` of view m; results at the same positions of what is found.
+
+    With a negative wave the patches are those of a coarser level, and their own waves are passed on.
+    """
+    images, store, found = image_pointers(image_arrays), store_pointers(store_arrays), store_pointers(found_arrays)
+    cells = cell_pointers(cell_arrays)
+    slot_array, work = np.empty(MOST_SLOTS, np.int64), pointer(scratch)
+    slots, rhos, best = pointer(slot_array), offset(work, RHOS), offset(work, BEST)
+    quads, width = offset(images.quads, images.start[m]), images.width[m]
+    contrast = f32(CONTRAST) * images.noise[m] + f32(LEAST_CONTRAST)
+    for i in range(first, last):
+        found.num_views[i] = 0
+        u, v = places[i, 0], places[i, 1]
+        deviation = read_reference(quads, width, u, v, contrast, work)
+        if deviation < f32(LEAST_DEVIATION) * images.noise[m]:
+            continue
+        uf, vf = f32(u), f32(v)
+        there = cells.patch[LAYERS * cell_of(images, m, u, v)] if wave >= 0 else np.int32(-1)
+        known = _likeness(images, store, m, uf, vf, there, work) if there >= 0 else f32(-1.0)
+        if known > CONTENT:
+            continue
+        parent = choose(images, store, m, uf, vf, offset(pointer(candidates), CANDIDATES * i), work)
+        if parent < 0:
+            continue
+        n = slots_of(images, store, m, parent, slots, limits.max_refined)
+        if n < limits.min_views - 1:
+            continue
+        n, sigma = refine(images, m, uf, vf, best, slots, rhos, n, limits, work)
+        if n == 0 or not judge(images, m, uf, vf, best, slots, rhos, n, sigma, limits, work, found, i):
+            continue
+        found.wave[i] = wave if wave >= 0 else store.wave[parent]
+        # a second layer has to explain the pixel better than the first, and must not have slid back onto it
+        if there >= 0 and (
+            found.score[i] < known + BETTER
+            or off_planes(found, i, store, there) < f32(APART) * cell_size(images, found, i)
+        ):
+            found.num_views[i] = 0
+    slot_array[0] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def slots_of(images, store, m, p, slots, most):  # type: ignore[no-untyped-def]
+    """Slots of view m that trust patch p, best first, filled up with its best neighbours; their number."""
+    n = 0
+    for j in range(store.num_views[p]):
+        s = np.int64(store.views[p * store.row + j])
+        if s != m and n < most and images.slot[m * images.num_views + s] >= 0:
+            slots[n] = images.slot[m * images.num_views + s]
+            n += 1
+    for slot in range(images.num_slots):
+        if n >= most or images.neighbors[m * images.num_slots + slot] < 0:
+            break
+        is_there = False
+        for j in range(n):
+            is_there = is_there or slots[j] == slot
+        if not is_there:
+            slots[n] = slot
+            n += 1
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def choose(images, store, m, u, v, row, work):  # type: ignore[no-untyped-def]
+    """The candidate whose plane, carried on to (u, v), the images like best; its plane at BEST; -1 for none."""
+    chosen, liking = -1, f32(-2.0)
+    best = offset(work, BEST)
+    is_alone = row[1] < 0
+    for j in range(CANDIDATES):
+        p = row[j]
+        if p < 0:
+            break
+        wu, wv, w = plane_in_view(images, m, offset(store.xyz, 3 * p), offset(store.normal, 3 * p))
+        w0, wx, wy = f32(wu * u + wv * v + w), f32(wu), f32(wv)
+        if not w0 > f32(0.0):
+            continue
+        if not is_alone:
+            if chosen >= 0:
+                # relative differences of inverse depth, in pixels by way of the focal length
+                off = abs(w0 - best[0]) + f32(HALF) * (abs(wx - best[1]) + abs(wy - best[2]))
+                if off * f32(images.k[4 * m]) < SAME_PX * w0:
+                    continue
+            like = _liking(images, store, m, u, v, p, w0, wx, wy, work)
+            if not like > liking:
+                continue
+            liking = like
+        chosen = p
+        best[0], best[1], best[2] = w0, wx, wy
+        if liking > CONTENT:
+            break
+    return chosen
+
+
+@numba.njit(cache=True, nogil=True)
+def _likeness(images, store, m, u, v, p, work):  # type: ignore[no-untyped-def]
+    """Mean NCC of a patch, seen from view m at (u, v), with the first images that trust it."""
+    wu, wv, w = plane_in_view(images, m, offset(store.xyz, 3 * p), offset(store.normal, 3 * p))
+    w0 = f32(wu * u + wv * v + w)
+    return _liking(images, store, m, u, v, p, w0, f32(wu), f32(wv), work) if w0 > f32(0.0) else f32(-1.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _liking(images, store, m, u, v, p, w0, wx, wy, work):  # type: ignore[no-untyped-def]
+    """Mean NCC of a plane with the first images that trust its patch; -1 if none is a neighbour of view m."""
+    total, asked = f32(0.0), 0
+    for i in range(store.num_views[p]):
+        s = np.int64(store.views[p * store.row + i])
+        if s == m or images.slot[m * images.num_views + s] < 0:
+            continue
+        total += measure(images, m, np.int64(images.slot[m * images.num_views + s]), u, v, w0, wx, wy, work)
+        asked += 1
+        if asked == NUM_CHOOSING:
+            break
+    return total / f32(asked) if asked > 0 else f32(-1.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def enter(image_arrays, store_arrays, cell_arrays, count, found, num_found, fresh, num_fresh):  # type: ignore[no-untyped-def]
+    """Append what was found to the store, and to the cells of all images that trust it; returns the new count.
+
+    Newly filled cells are noted in ``fresh`` (V, room), ``num_fresh`` (V,): -1 there means that there was no room.
+    """
+    images, store, cells = image_pointers(image_arrays), store_pointers(store_arrays), cell_pointers(cell_arrays)
+    for i in range(num_found):
+        if found.num_views[i] == 0:
+            continue
+        p = count
+        for j in range(3):
+            store.xyz[3 * p + j], store.normal[3 * p + j] = found.xyz[i, j], found.normal[i, j]
+        store.score[p], store.sigma[p], store.size[p] = found.score[i], found.sigma[i], found.size[i]
+        store.num_views[p], store.wave[p] = found.num_views[i], found.wave[i]
+        for j in range(store.row):
+            store.views[p * store.row + j] = found.views[i, j]
+        place(images, store, cells, p, fresh, num_fresh)
+        count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def place(images, store, cells, p, fresh, num_fresh):  # type: ignore[no-untyped-def]
+    """Put a patch into the cells of the images that trust it, where none of its surface is."""
+    reach = f32(APART) * cell_size(images, store, p)
+    for j in range(store.num_views[p]):
+        m = np.int64(store.views[p * store.row + j])
+        u, v, z = project(images, m, offset(store.xyz, 3 * p))
+        g = cell_of(images, m, u, v) if z > 0.0 else np.int64(-1)
+        if g < 0:
+            continue
+        for layer in range(LAYERS):
+            q = cells.patch[LAYERS * g + layer]
+            if q < 0:
+                cells.patch[LAYERS * g + layer] = p
+                if num_fresh[m] >= 0:
+                    if num_fresh[m] < fresh.shape[1]:
+                        fresh[m, num_fresh[m]] = g - images.cell_start[m]
+                        num_fresh[m] += 1
+                    else:
+                        num_fresh[m] = -1
+                break
+            if q == p or off_planes(store, p, store, q) < reach:
+                break

@@ -1,0 +1,141 @@
+"""Which patches stay: those that agree with what other images see, and that belong to a surface (Furukawa and Ponce, 4).
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numba import float32 as f32
+
+from sfmapp.adjust.lanes import offset
+from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
+from sfmapp.dense.expand import NEAR, cell_size, off_planes, place
+from sfmapp.dense.patch_kernels import cell_of, project
+
+# cells to each side that are asked for patches of the same surface, and how many of them have to have one
+ASKED_CELLS = 2
+LEAST_SUPPORT = 4
+# patches that hang together; fewer are no surface
+SMALLEST_GROUP = 24
+
+
+@numba.njit(cache=True, nogil=True)
+def refill(image_arrays, store_arrays, cell_arrays, order, fresh, num_fresh):  # type: ignore[no-untyped-def]
+    """Empty the cells and put the patches of ``order`` back, the first of a surface in a cell stays."""
+    cell_arrays.patch[:] = -1
+    images, store, cells = image_pointers(image_arrays), store_pointers(store_arrays), cell_pointers(cell_arrays)
+    for i in range(order.shape[0]):
+        place(images, store, cells, order[i], fresh, num_fresh)
+
+
+@numba.njit(cache=True, nogil=True)
+def judge_patches(image_arrays, store_arrays, cell_arrays, first, last, keep):  # type: ignore[no-untyped-def]
+    """Fill ``keep[first:last]``: 0 kept, 1 contradicted by what images see, 2 without neighbours of its surface."""
+    images, store, cells = image_pointers(image_arrays), store_pointers(store_arrays), cell_pointers(cell_arrays)
+    for p in range(first, last):
+        keep[p] = 0
+        reach = f32(2.0 * NEAR) * cell_size(images, store, p)
+        against = f32(0.0)
+        r = np.int64(store.views[p * store.row])
+        for j in range(-1, images.num_slots):
+            m = r if j < 0 else np.int64(images.neighbors[r * images.num_slots + j])
+            if m < 0:
+                break
+            against += _contradiction(images, store, cells, p, m, reach)
+        if against > f32(store.num_views[p]) * store.score[p]:
+            keep[p] = 1
+        elif _support(images, store, cells, p, r, reach) < LEAST_SUPPORT:
+            keep[p] = 2
+
+
+@numba.njit(cache=True, nogil=True)
+def _contradiction(images, store, cells, p, m, reach):  # type: ignore[no-untyped-def]
+    """Scores of the patches in p's cell of view m that p would hide, or that would hide p although m trusts it."""
+    u, v, z = project(images, m, offset(store.xyz, 3 * p))
+    g = cell_of(images, m, u, v) if z > 0.0 else np.int64(-1)
+    if g < 0:
+        return f32(0.0)
+    against = f32(0.0)
+    for layer in range(LAYERS):
+        q = cells.patch[LAYERS * g + layer]
+        if q < 0:
+            break
+        if q == p or off_planes(store, p, store, q) < f32(2.0) * reach:
+            continue
+        _, _, depth = project(images, m, offset(store.xyz, 3 * q))
+        is_seen = False
+        for j in range(store.num_views[p]):
+            is_seen = is_seen or store.views[p * store.row + j] == m
+        if z < depth or is_seen:
+            against += store.score[q]
+    return against
+
+
+@numba.njit(cache=True, nogil=True)
+def _support(images, store, cells, p, r, reach):  # type: ignore[no-untyped-def]
+    """Cells around p in its reference image that hold a patch of its surface."""
+    u, v, z = project(images, r, offset(store.xyz, 3 * p))
+    g = cell_of(images, r, u, v)
+    if g < 0:
+        return 0
+    columns, start = np.int64(images.columns[r]), images.cell_start[r]
+    cy = (g - start) // columns
+    cx = (g - start) - cy * columns
+    support = 0
+    for y in range(max(cy - ASKED_CELLS, 0), min(cy + ASKED_CELLS + 1, images.rows[r])):
+        for x in range(max(cx - ASKED_CELLS, 0), min(cx + ASKED_CELLS + 1, columns)):
+            for layer in range(LAYERS):
+                q = cells.patch[LAYERS * (start + y * columns + x) + layer]
+                if q < 0:
+                    break
+                if q != p and off_planes(store, p, store, q) < f32(1.5) * reach:
+                    support += 1
+                    break
+    return support
+
+
+@numba.njit(cache=True, nogil=True)
+def group_sizes(image_arrays, store_arrays, cell_arrays, count):  # type: ignore[no-untyped-def]
+    """(N,) int64 size of the group of each patch: patches in adjacent cells of one surface hang together."""
+    images, store, cells = image_pointers(image_arrays), store_pointers(store_arrays), cell_pointers(cell_arrays)
+    parent = np.arange(count)
+    for m in range(images.num_views):
+        start, columns, rows = images.cell_start[m], np.int64(images.columns[m]), np.int64(images.rows[m])
+        for y in range(rows):
+            for x in range(columns):
+                for layer in range(LAYERS):
+                    p = cells.patch[LAYERS * (start + y * columns + x) + layer]
+                    if p < 0:
+                        break
+                    if x + 1 < columns:
+                        _join(images, store, cells, parent, p, start + y * columns + x + 1)
+                    if y + 1 < rows:
+                        _join(images, store, cells, parent, p, start + (y + 1) * columns + x)
+    sizes = np.zeros(count, np.int64)
+    for p in range(count):
+        sizes[_root(parent, p)] += 1
+    out = np.empty(count, np.int64)
+    for p in range(count):
+        out[p] = sizes[_root(parent, p)]
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _join(images, store, cells, parent, p, g):  # type: ignore[no-untyped-def]
+    for layer in range(LAYERS):
+        q = cells.patch[LAYERS * g + layer]
+        if q < 0:
+            return
+        size = max(cell_size(images, store, p), cell_size(images, store, q))
+        if q != p and off_planes(store, p, store, q) < f32(2.0 * NEAR) * size:
+            a, b = _root(parent, p), _root(parent, q)
+            if a != b:
+                parent[max(a, b)] = min(a, b)
+
+
+@numba.njit(cache=True, nogil=True)
+def _root(parent, p):  # type: ignore[no-untyped-def]
+    while parent[p] != p:
+        parent[p] = parent[parent[p]]
+        p = parent[p]
+    return p

@@ -1,0 +1,211 @@
+"""One level of the pyramid under way: its patches, its cells, and the steps that add patches and take them away."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.dense import filters, seeds
+from sfmapp.dense.arrays import LAYERS, Cells, Images, Limits, Store
+from sfmapp.dense.expand import CANDIDATES, enter, frontier, try_cells
+from sfmapp.dense.window import make_scratch
+from sfmapp.events import Events
+
+# cells of a batch that one thread works on at least: below, handing them over costs more than the work
+SMALLEST_CHUNK = 64
+CHUNKS_PER_THREAD = 4
+
+
+class Growth:
+    """Patches of one level."""
+
+    def __init__(self, images: Images, limits: Limits, threads: int, first_wave: int = 0) -> None:
+        self.images, self.limits = images, limits
+        self.wave = first_wave
+        self.count = 0
+        self.waves: list[dict[str, int]] = []
+        num_cells = len(images.closed)
+        self.cells = Cells(np.full((num_cells, LAYERS), -1, np.int32), np.zeros(num_cells, np.uint8))
+        self.num_neighbors = images.neighbors.shape[1]
+        self.store = Store.of_capacity(max(num_cells // 8, 1024), self.num_neighbors)
+        self.num_views = len(images.width)
+        most = int((images.columns.astype(np.int64) * images.rows).max())
+        self._places = np.zeros((most, 2), np.int32)
+        self._candidates = np.full((most, CANDIDATES), -1, np.int32)
+        self._found = Store.of_capacity(1024, self.num_neighbors)
+        self._fresh = np.zeros((self.num_views, max(most // 4, 256)), np.int32)
+        self._num_fresh = np.full(self.num_views, -1, np.int64)
+        self._threads = threads
+        self._pool = ThreadPoolExecutor(threads)
+        self._work = [make_scratch() for _ in range(threads * CHUNKS_PER_THREAD)]
+
+    def close(self) -> None:
+        """Let the threads go and keep only the patches and their cells."""
+        self._pool.shutdown()
+        self._places = self._candidates = self._fresh = np.zeros((0, 0), np.int32)
+        self._found = Store.of_capacity(0, self.num_neighbors)
+
+    # ------------------------------------------------------------------------------------------------------------ seeds
+
+    def seed_points(self, points: Store) -> int:
+        """Patches at sparse points, each in its reference image; how many."""
+        before = self.count
+        reference = points.views[:, 0]
+        for m in range(self.num_views):
+            mine = np.flatnonzero(reference == m)
+            if not len(mine):
+                continue
+            seen = points.xyz[mine].astype(np.float64) @ self.images.rotation[m].T + self.images.translation[m]
+            focal, middle = self.images.k[m, :2], self.images.k[m, 2:]
+            # points that are not in front of the camera land outside of any image
+            places = np.where(seen[:, 2:] > 0.0, seen[:, :2] / np.maximum(seen[:, 2:], 1e-9) * focal + middle, -1e6)
+            subset = Store(*(array[mine] for array in points))
+            self._batch(m, np.rint(places.clip(-1e6, 1e6)).astype(np.int32), seeds.try_points, subset)
+        return self.count - before
+
+    def seed_corners(
+        self, corners: list[NDArray[np.int32]], depth_range: NDArray[np.float64], *, everywhere: bool
+    ) -> int:
+        """Match corners of each view (N, 2) whose cells are empty; ``everywhere``: not just with other corners."""
+        images, before = self.images, self.count
+        has_corner = np.full(len(images.closed), everywhere)
+        cell_of = []
+        for m, xy in enumerate(corners):
+            cell = (xy // images.cell_px[0]).astype(np.int64)
+            cell = np.minimum(cell, [images.columns[m] - 1, images.rows[m] - 1])
+            cell_of.append(images.cell_start[m] + cell[:, 1] * images.columns[m] + cell[:, 0])
+            has_corner[cell_of[m]] = True
+        for m, xy in enumerate(corners):
+            is_open = (self.cells.patch[cell_of[m], 0] < 0) & (images.closed[cell_of[m]] == 0)
+            self._batch(m, xy[is_open], seeds.match_corners, has_corner, depth_range)
+        return self.count - before
+
+    def refine_coarser(self, coarser: Growth, advanced: Callable[[], None]) -> int:
+        """Carry the patches of the coarser level over, a cell at a time; how many. ``advanced``: after each view."""
+        before = self.count
+        for m in range(self.num_views):
+            n = seeds.finer_cells(
+                self.images, self.cells, m, coarser.images, coarser.cells, self._places, self._candidates
+            )
+            self._grow(m, n, coarser.store, -1)
+            advanced()
+        return self.count - before
+
+    # ------------------------------------------------------------------------------------------------------------ waves
+
+    def expand(self, events: Events) -> int:
+        """Waves until none finds anything; how many patches they added."""
+        before = self.count
+        is_first = True
+        while True:
+            self.wave += 1
+            tried, start = 0, self.count
+            for m in range(self.num_views):
+                n = self._frontier(m, everywhere=is_first)
+                tried += n
+                self._grow(m, n, self.store, self.wave)
+            if tried:
+                self.waves.append({"wave": self.wave, "tried": tried, "accepted": self.count - start})
+            events.raise_if_cancelled()
+            if self.count == start:
+                return self.count - before
+            is_first = False
+
+    def _frontier(self, m: int, *, everywhere: bool) -> int:
+        num_fresh = -1 if everywhere else int(self._num_fresh[m])
+        n = frontier(
+            self.images, self.store, self.cells, m, self._fresh[m], num_fresh, self._places, self._candidates
+        )
+        self._num_fresh[m] = 0
+        return int(n)
+
+    def _grow(self, m: int, n: int, parents: Store, wave: int) -> None:
+        """Try the cells that wait in ``_places`` with the candidates beside them."""
+        self._reserve(n)
+        places, candidates = self._places, self._candidates
+
+        def work(first: int, last: int, number: int) -> None:
+            try_cells(
+                self.images, parents, self.cells, m, places, candidates, first, last, self.limits, wave,
+                self._work[number], self._found,
+            )  # fmt: skip
+
+        self._in_chunks(n, work)
+        self._enter(n)
+
+    def _batch(self, m: int, places: NDArray[np.int32], kernel: Callable[..., None], *arguments: object) -> None:
+        """Run a kernel of seeds over pixels of one view."""
+        n = len(places)
+        spare = n + np.arange(len(self._work))
+        self._reserve(n + len(self._work))
+        places = np.ascontiguousarray(places, np.int32)
+
+        def work(first: int, last: int, number: int) -> None:
+            more = (spare[number],) if kernel is seeds.match_corners else ()
+            kernel(
+                self.images, m, places, *arguments, first, last, self.limits, self._work[number], self._found, *more
+            )  # fmt: skip
+
+        self._in_chunks(n, work)
+        self._enter(n)
+
+    def _in_chunks(self, n: int, work: Callable[[int, int, int], None]) -> None:
+        """Share the range 0 to n among the threads; what is made does not depend on where it is cut."""
+        if n == 0:
+            return
+        num_chunks = min(len(self._work), max(n // SMALLEST_CHUNK, 1)) if self._threads > 1 else 1
+        cuts = np.linspace(0, n, num_chunks + 1).astype(np.int64)
+        if num_chunks == 1:
+            work(0, n, 0)
+        else:
+            list(self._pool.map(work, cuts[:-1], cuts[1:], range(num_chunks)))
+
+    def _reserve(self, n: int) -> None:
+        if len(self._found.score) < n:
+            self._found = Store.of_capacity(n + n // 4, self.num_neighbors)
+        if len(self.store.score) < self.count + n:
+            self.store = self.store.grown(self.count + n + self.count // 2)
+
+    def _enter(self, n: int) -> None:
+        self.count = enter(
+            self.images, self.store, self.cells, self.count, self._found, n, self._fresh, self._num_fresh
+        )
+
+    # ---------------------------------------------------------------------------------------------------------- filters
+
+    def filter(self) -> dict[str, int]:
+        """Take away what other images contradict, what stands alone and what hangs together in too small groups."""
+        contradicted = alone = 0
+        self._refill()
+        keep = np.zeros(self.count, np.uint8)
+
+        def work(first: int, last: int, _: int) -> None:
+            filters.judge_patches(self.images, self.store, self.cells, first, last, keep)
+
+        self._in_chunks(self.count, work)
+        contradicted, alone = int((keep == 1).sum()), int((keep == 2).sum())
+        self._compact(keep == 0)
+        self._refill()
+        sizes = filters.group_sizes(self.images, self.store, self.cells, self.count)
+        in_small_groups = int((sizes < filters.SMALLEST_GROUP).sum())
+        if in_small_groups:
+            self._compact(sizes >= filters.SMALLEST_GROUP)
+            self._refill()
+        self.cells.tried[:] = 0
+        return {"contradicted": contradicted, "without neighbours": alone, "in small groups": in_small_groups}
+
+    def _refill(self) -> None:
+        n = self.count
+        quality = self.store.score[:n] * self.store.num_views[:n]
+        order = np.argsort(-quality, kind="stable")
+        self._num_fresh[:] = -1
+        filters.refill(self.images, self.store, self.cells, order, self._fresh, self._num_fresh)
+
+    def _compact(self, kept: NDArray[np.bool_]) -> None:
+        idx = np.flatnonzero(kept)
+        for array in self.store:
+            array[: len(idx)] = array[idx]
+        self.count = len(idx)

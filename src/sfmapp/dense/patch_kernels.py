@@ -1,0 +1,255 @@
+"""One patch: its plane in different frames, its refinement on a few images, and the verdict of all of them."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numba import float32 as f32
+
+from sfmapp.adjust.lanes import offset
+from sfmapp.dense.window import KEPT, NUM_PIXELS, NUM_SUMS, SUMS, TRIAL, correlate, correlate_with_terms, solve3, warp
+
+MAX_STEPS = 4
+# of the mean NCC; less is not worth another step
+LEAST_GAIN = f32(0.001)
+LONGEST_STEP_PX, SHORTEST_STEP_PX = f32(1.5), f32(0.02)
+DAMPING = f32(0.01)
+# pull of the slopes towards where they began, in units of the information on the depth
+SLOPE_PRIOR = f32(0.04)
+# cosine between normal and line of sight below which a patch is too oblique to be judged in a window of this size
+LEAST_COSINE = 0.25
+# of the widest angle between the lines of sight; below about 2.5 degrees depth is noise
+LARGEST_COSINE_OF_ANGLE = math.cos(math.radians(2.5))
+
+
+@numba.njit(cache=True, nogil=True)
+def plane_in_view(images, m, xyz, normal):  # type: ignore[no-untyped-def]
+    """Plane through a place with a normal, seen by view m: inverse depth ``wu u + wv v + w`` as (wu, wv, w)."""
+    r, t, k = offset(images.rotation, 9 * m), offset(images.translation, 3 * m), offset(images.k, 4 * m)
+    n0 = r[0] * normal[0] + r[1] * normal[1] + r[2] * normal[2]
+    n1 = r[3] * normal[0] + r[4] * normal[1] + r[5] * normal[2]
+    n2 = r[6] * normal[0] + r[7] * normal[1] + r[8] * normal[2]
+    x = r[0] * xyz[0] + r[1] * xyz[1] + r[2] * xyz[2] + t[0]
+    y = r[3] * xyz[0] + r[4] * xyz[1] + r[5] * xyz[2] + t[1]
+    z = r[6] * xyz[0] + r[7] * xyz[1] + r[8] * xyz[2] + t[2]
+    distance = n0 * x + n1 * y + n2 * z
+    if abs(distance) < 1e-12:
+        return 0.0, 0.0, -1.0
+    wu, wv = n0 / (distance * k[0]), n1 / (distance * k[1])
+    return wu, wv, n2 / distance - wu * k[2] - wv * k[3]
+
+
+@numba.njit(cache=True, nogil=True)
+def project(images, m, xyz):  # type: ignore[no-untyped-def]
+    """Pixel and depth (u, v, z) of a place in view m; z <= 0 behind it."""
+    r, t, k = offset(images.rotation, 9 * m), offset(images.translation, 3 * m), offset(images.k, 4 * m)
+    z = r[6] * xyz[0] + r[7] * xyz[1] + r[8] * xyz[2] + t[2]
+    if z <= 1e-9:
+        return 0.0, 0.0, 0.0
+    x = r[0] * xyz[0] + r[1] * xyz[1] + r[2] * xyz[2] + t[0]
+    y = r[3] * xyz[0] + r[4] * xyz[1] + r[5] * xyz[2] + t[1]
+    return k[0] * x / z + k[2], k[1] * y / z + k[3], z
+
+
+@numba.njit(cache=True, nogil=True)
+def cell_of(images, m, u, v):  # type: ignore[no-untyped-def]
+    """Cell of a pixel in view m; -1 outside of the grid."""
+    side = images.cell_px
+    x, y = math.floor((u + 0.5) / side), math.floor((v + 0.5) / side)
+    if x < 0 or y < 0 or x >= images.columns[m] or y >= images.rows[m]:
+        return -1
+    return images.cell_start[m] + np.int64(y) * images.columns[m] + np.int64(x)
+
+
+@numba.njit(cache=True, nogil=True)
+def measure(images, m, slot, u, v, w0, wx, wy, work):  # type: ignore[no-untyped-def]
+    """NCC of the reference in the scratch, of view m about (u, v), with the neighbour in a slot; -1 where unseen."""
+    pair = np.int64(m) * images.num_slots + slot
+    s = images.neighbors[pair]
+    a, b = offset(images.a, 9 * pair), offset(images.b, 3 * pair)
+    inside, x, y, xu, yu, xv, yv, _, _ = warp(a, b, u, v, w0, wx, wy, images.width[s], images.height[s])
+    if not inside:
+        return f32(-1.0)
+    quads = offset(images.quads, images.start[s])
+    return correlate(quads, images.width[s], x, y, xu, yu, xv, yv, work)
+
+
+@numba.njit(cache=True, nogil=True)
+def _terms(images, m, slot, u, v, w0, wx, wy, work):  # type: ignore[no-untyped-def]
+    """As :func:`measure`, adding to the sums of the scratch; also the pixels that the image moves per inverse depth."""
+    pair = np.int64(m) * images.num_slots + slot
+    s = images.neighbors[pair]
+    a, b = offset(images.a, 9 * pair), offset(images.b, 3 * pair)
+    inside, x, y, xu, yu, xv, yv, ex, ey = warp(a, b, u, v, w0, wx, wy, images.width[s], images.height[s])
+    if not inside:
+        return f32(-1.0), f32(0.0)
+    quads = offset(images.quads, images.start[s])
+    rho = correlate_with_terms(quads, images.width[s], x, y, xu, yu, xv, yv, ex, ey, work)
+    return rho, f32(math.sqrt(ex * ex + ey * ey))
+
+
+@numba.njit(cache=True, nogil=True)
+def _step(work, shift1, shift2):  # type: ignore[no-untyped-def]
+    """Step of Gauss-Newton from the sums; the shifts are how far the slopes lie from where they began."""
+    pull = SLOPE_PRIOR * work[SUMS]
+    more = f32(1.0) + DAMPING
+    n = (
+        work[SUMS] * more, work[SUMS + 1], work[SUMS + 2],
+        work[SUMS + 3] * more + pull, work[SUMS + 4], work[SUMS + 5] * more + pull,
+    )  # fmt: skip
+    return solve3(n, work[SUMS + 6], work[SUMS + 7] + pull * shift1, work[SUMS + 8] + pull * shift2)
+
+
+@numba.njit(cache=True, nogil=True)
+def refine(images, m, u, v, plane, slots, rhos, n, limits, work):  # type: ignore[no-untyped-def]
+    """Gauss-Newton on the mean NCC over neighbours ``slots[:n]``, which are sifted by what they see at the start.
+
+    ``plane``: (3,) float32 w0, wx, wy, in place. Returns the number of slots left, with their NCC in ``rhos``, and the
+    standard deviation of w0; 0 slots if fewer than ``limits.min_views - 1`` are promising.
+    """
+    s0, s1, s2 = plane[0], plane[1], plane[2]
+    step0, step1, step2 = f32(0.0), f32(0.0), f32(0.0)
+    first1, first2 = plane[1], plane[2]
+    best, reach, sigma = f32(-2.0), f32(0.0), f32(0.0)
+    for it in range(MAX_STEPS + 1):
+        for j in range(NUM_SUMS):
+            work[SUMS + j] = f32(0.0)
+        total, left = f32(0.0), 0
+        for j in range(n):
+            for i in range(NUM_SUMS):
+                work[KEPT + i] = work[SUMS + i]
+            rho, moves = _terms(images, m, slots[j], u, v, s0, s1, s2, work)
+            if it == 0 and rho < f32(limits.promising):
+                for i in range(NUM_SUMS):
+                    work[SUMS + i] = work[KEPT + i]
+                continue
+            reach = max(reach, moves)
+            slots[left], work[TRIAL + left] = slots[j], rho
+            total += rho
+            left += 1
+        if it == 0:
+            n = left
+            if n < limits.min_views - 1:
+                return 0, sigma
+        mean = total / f32(n)
+        if mean > best:
+            gain, best = mean - best, mean
+            plane[0], plane[1], plane[2] = s0, s1, s2
+            for j in range(n):
+                rhos[j] = work[TRIAL + j]
+            step0, step1, step2, is_regular = _step(work, first1 - s1, first2 - s2)
+            if not is_regular:
+                return 0, sigma
+            sigma = _sigma(work, best)
+            if it == MAX_STEPS or (it > 0 and gain < LEAST_GAIN):
+                break
+            length = abs(step0) * reach
+            if length > LONGEST_STEP_PX:
+                shorter = LONGEST_STEP_PX / length
+                step0, step1, step2 = step0 * shorter, step1 * shorter, step2 * shorter
+        else:
+            step0, step1, step2 = step0 * f32(0.35), step1 * f32(0.35), step2 * f32(0.35)
+            if abs(step0) * reach < SHORTEST_STEP_PX:
+                break
+        s0, s1, s2 = plane[0] + step0, plane[1] + step1, plane[2] + step2
+        if not s0 > f32(0.0):
+            break
+    return n, sigma
+
+
+@numba.njit(cache=True, nogil=True)
+def _sigma(work, mean):  # type: ignore[no-untyped-def]
+    """Standard deviation of w0: the mean square residual is 2 (1 - NCC), and the window has so many pixels."""
+    n = (work[SUMS], work[SUMS + 1], work[SUMS + 2], work[SUMS + 3], work[SUMS + 4], work[SUMS + 5])
+    pull = SLOPE_PRIOR * work[SUMS]
+    n = (n[0], n[1], n[2], n[3] + pull, n[4], n[5] + pull)
+    variance, _, _, is_regular = solve3(n, f32(1.0), f32(0.0), f32(0.0))
+    if not is_regular or not variance > f32(0.0):
+        return f32(0.0)
+    return f32(math.sqrt(variance * f32(2.0) * max(f32(1.0) - mean, f32(1e-4)) / f32(NUM_PIXELS)))
+
+
+@numba.njit(cache=True, nogil=True)
+def judge(images, m, u, v, plane, slots, rhos, n, sigma, limits, work, found, i):  # type: ignore[no-untyped-def]
+    """Ask the images that took no part, and enter the patch at ``found[i]`` if enough trust it; says whether it was.
+
+    ``slots[:n]`` are those that did take part, with their ``rhos``.
+    """
+    found.num_views[i] = 0
+    num_asked = n
+    for slot in range(images.num_slots):
+        if images.neighbors[m * images.num_slots + slot] < 0:
+            break
+        was_asked = False
+        for j in range(n):
+            was_asked = was_asked or slots[j] == slot
+        if not was_asked:
+            slots[num_asked] = slot
+            rhos[num_asked] = measure(images, m, slot, u, v, plane[0], plane[1], plane[2], work)
+            num_asked += 1
+    # insertion sort, best first: few
+    for j in range(1, num_asked):
+        slot, rho = slots[j], rhos[j]
+        k = j - 1
+        while k >= 0 and rhos[k] < rho:
+            slots[k + 1], rhos[k + 1] = slots[k], rhos[k]
+            k -= 1
+        slots[k + 1], rhos[k + 1] = slot, rho
+    if num_asked < limits.min_views - 1 or not rhos[limits.min_views - 2] >= f32(limits.trusted):
+        return False
+    return _enter(images, m, u, v, plane, slots, rhos, num_asked, sigma, limits, found, i)
+
+
+@numba.njit(cache=True, nogil=True)
+def _enter(images, m, u, v, plane, slots, rhos, num_asked, sigma, limits, found, i):  # type: ignore[no-untyped-def]
+    """Check the geometry of a patch that enough images trust, and write it down."""
+    k, r, t = offset(images.k, 4 * m), offset(images.rotation, 9 * m), offset(images.translation, 3 * m)
+    center = offset(images.center, 3 * m)
+    w0 = np.float64(plane[0])
+    rx, ry = (u - k[2]) / k[0], (v - k[3]) / k[1]
+    n0, n1 = plane[1] * k[0], plane[2] * k[1]
+    n2 = w0 - n0 * rx - n1 * ry
+    # the inverse depth along a ray is the normal over the distance of the plane, times the ray: away from the camera
+    steep = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+    ray = math.sqrt(rx * rx + ry * ry + 1.0)
+    if w0 / (steep * ray) < LEAST_COSINE:
+        return False
+    z = 1.0 / w0
+    x0, x1, x2 = rx * z - t[0], ry * z - t[1], z - t[2]
+    xyz, normal = offset(found.xyz, 3 * i), offset(found.normal, 3 * i)
+    for j in range(3):
+        xyz[j] = r[j] * x0 + r[3 + j] * x1 + r[6 + j] * x2
+        normal[j] = -(r[j] * n0 + r[3 + j] * n1 + r[6 + j] * n2) / steep
+    d0, d1, d2 = center[0] - xyz[0], center[1] - xyz[1], center[2] - xyz[2]
+    distance = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+    views = offset(found.views, i * found.row)
+    num, total, widest = 1, f32(0.0), 1.0
+    for j in range(num_asked):
+        if not rhos[j] >= f32(limits.trusted):
+            break
+        s = np.int64(images.neighbors[m * images.num_slots + slots[j]])
+        su, sv, _ = project(images, s, xyz)
+        cell = cell_of(images, s, su, sv)
+        if cell >= 0 and images.closed[cell] != 0:
+            continue
+        eye = offset(images.center, 3 * s)
+        e0, e1, e2 = eye[0] - xyz[0], eye[1] - xyz[1], eye[2] - xyz[2]
+        length = math.sqrt(e0 * e0 + e1 * e1 + e2 * e2)
+        if e0 * normal[0] + e1 * normal[1] + e2 * normal[2] < 0.5 * LEAST_COSINE * length:
+            continue
+        widest = min(widest, (d0 * e0 + d1 * e1 + d2 * e2) / (distance * length))
+        views[num] = s
+        total += rhos[j]
+        num += 1
+    if num < limits.min_views or widest > LARGEST_COSINE_OF_ANGLE:
+        return False
+    views[0] = m
+    for j in range(num, found.row):
+        views[j] = -1
+    found.score[i] = total / f32(num - 1)
+    found.size[i] = z / (0.5 * (k[0] + k[1]))
+    found.sigma[i] = sigma * z * z * ray
+    found.num_views[i] = num
+    return True

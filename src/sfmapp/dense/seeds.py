@@ -1,0 +1,242 @@
+"""The first patches: corners matched along epipolar lines, sparse points, and the patches of the level before.
+
+A corner of one image is looked for along its epipolar line in the next few, a pixel at a time, where the other image
+has a corner as well. Places that correlate there and in a second image are refined, and the best one stays.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numba import float32 as f32
+from numpy.typing import NDArray
+
+from sfmapp.adjust.lanes import offset, pointer
+from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
+from sfmapp.dense.expand import CANDIDATES, CONTRAST, LEAST_CONTRAST, slots_of
+from sfmapp.dense.patch_kernels import judge, measure, project, refine
+from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
+
+# images that a corner is looked for in
+NUM_SEARCHED = 4
+# NCC of a fronto-parallel window with one image, and on average with two, from which a place is worth refining
+LEAST_LIKENESS, LEAST_SUPPORT = f32(0.55), f32(0.5)
+NUM_KEPT = 3
+
+
+def corners(gray: NDArray[np.uint8], block_px: int, noise: float) -> NDArray[np.int32]:
+    """(N, 2) int32 pixels x, y of the strongest corner in each block of so many pixels, where it stands above noise."""
+    import cv2
+
+    # three pixels: the window of the smaller eigenvalue (Shi and Tomasi, CVPR 1994)
+    strength = cv2.cornerMinEigenVal(cv2.GaussianBlur(gray, (0, 0), 0.8).astype(np.float32), 3)
+    border = HALF + 1
+    height, width = (side // block_px for side in gray.shape)
+    if height == 0 or width == 0:
+        return np.zeros((0, 2), np.int32)
+    strength[:border] = strength[-border:] = strength[:, :border] = strength[:, -border:] = 0.0
+    blocks = strength[: height * block_px, : width * block_px].reshape(height, block_px, width, block_px)
+    blocks = blocks.transpose(0, 2, 1, 3).reshape(height * width, block_px * block_px)
+    best = blocks.argmax(axis=1)
+    y, x = np.divmod(np.arange(height * width), width)
+    places = np.stack([x * block_px + best % block_px, y * block_px + best // block_px], 1)
+    # what the noise alone would make of the smaller eigenvalue; Sobel's mask of OpenCV divides by its sum of weights
+    floor = (noise / 12.0) ** 2
+    return places[blocks.max(axis=1) > floor].astype(np.int32)
+
+
+@numba.njit(cache=True, nogil=True)
+def match_corners(image_arrays, m, places, has_corner, depth_range, first, last, limits, scratch, found_arrays, spare):  # type: ignore[no-untyped-def]
+    """Look for corners ``first`` to ``last`` of view m in its neighbours; patches at the same positions of ``found``.
+
+    ``has_corner``: (G,) bool, the cells of all views where a match may lie. ``depth_range``: (V, 2) float64 smallest
+    and largest inverse depth. ``spare``: a position of ``found`` that nobody else uses.
+    """
+    images, found = image_pointers(image_arrays), store_pointers(found_arrays)
+    slot_array, work = np.empty(MOST_SLOTS, np.int64), pointer(scratch)
+    slots, rhos, plane = pointer(slot_array), offset(work, RHOS), offset(work, BEST)
+    quads, width = offset(images.quads, images.start[m]), images.width[m]
+    likes, depths = np.empty(NUM_KEPT, np.float32), np.empty(NUM_KEPT, np.float32)
+    contrast = f32(CONTRAST) * images.noise[m] + f32(LEAST_CONTRAST)
+    for i in range(first, last):
+        found.num_views[i] = 0
+        u, v = places[i, 0], places[i, 1]
+        if u < HALF or v < HALF or u >= width - HALF - 1 or v >= images.height[m] - HALF - 1:
+            continue
+        deviation = read_reference(quads, width, u, v, contrast, work)
+        if deviation < f32(2.0) * images.noise[m]:
+            continue
+        likes[:] = LEAST_SUPPORT
+        depths[:] = f32(-1.0)
+        for slot in range(min(images.num_slots, NUM_SEARCHED)):
+            if images.neighbors[m * images.num_slots + slot] < 0:
+                break
+            _search(images, m, slot, f32(u), f32(v), has_corner, depth_range[m], likes, depths, work)
+        best = f32(-1.0)
+        for j in range(NUM_KEPT):
+            if depths[j] <= f32(0.0):
+                break
+            plane[0], plane[1], plane[2] = depths[j], f32(0.0), f32(0.0)
+            n = 0
+            for slot in range(images.num_slots):
+                if images.neighbors[m * images.num_slots + slot] >= 0 and n < limits.max_refined:
+                    slots[n] = slot
+                    n += 1
+            n, sigma = refine(images, m, f32(u), f32(v), plane, slots, rhos, n, limits, work)
+            if n > 0 and judge(images, m, f32(u), f32(v), plane, slots, rhos, n, sigma, limits, work, found, spare):
+                quality = found.score[spare] * f32(found.num_views[spare])
+                if quality > best:
+                    best = quality
+                    _copy(found_arrays, spare, i)
+    slot_array[0] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _copy(found, source, target):  # type: ignore[no-untyped-def]
+    found.xyz[target], found.normal[target] = found.xyz[source], found.normal[source]
+    found.score[target], found.sigma[target] = found.score[source], found.sigma[source]
+    found.size[target], found.views[target] = found.size[source], found.views[source]
+    found.num_views[target], found.wave[target] = found.num_views[source], 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _search(images, m, slot, u, v, has_corner, depth_range, likes, depths, work):  # type: ignore[no-untyped-def]
+    """Walk the epipolar line of (u, v) in one neighbour, and keep the best places in ``likes`` and ``depths``."""
+    pair = m * images.num_slots + slot
+    a, b, s = offset(images.a, 9 * pair), offset(images.b, 3 * pair), images.neighbors[pair]
+    q0, q1, q2 = a[0] * u + a[1] * v + a[2], a[3] * u + a[4] * v + a[5], a[6] * u + a[7] * v + a[8]
+    low, high = _visible_range(q0, q1, q2, b, depth_range[0], depth_range[1], images.width[s], images.height[s])
+    if not low < high:
+        return
+    w, side = low, images.cell_px
+    while w < high:
+        scale = q2 + b[2] * w
+        x, y = (q0 + b[0] * w) / scale, (q1 + b[1] * w) / scale
+        # one pixel further along the line
+        ex, ey = (b[0] - x * b[2]) / scale, (b[1] - y * b[2]) / scale
+        step = 1.0 / max(math.sqrt(ex * ex + ey * ey), 1e-12)
+        at = w
+        w += step
+        cx, cy = int((x + 0.5) / side), int((y + 0.5) / side)
+        if cx < 0 or cy < 0 or cx >= images.columns[s] or cy >= images.rows[s]:
+            continue
+        if not has_corner[images.cell_start[s] + np.int64(cy) * images.columns[s] + cx]:
+            continue
+        like = measure(images, m, slot, u, v, f32(at), f32(0.0), f32(0.0), work)
+        if like < LEAST_LIKENESS:
+            continue
+        second = f32(-1.0)
+        for other in range(images.num_slots):
+            if other != slot and images.neighbors[m * images.num_slots + other] >= 0:
+                second = max(second, measure(images, m, other, u, v, f32(at), f32(0.0), f32(0.0), work))
+        _keep(f32(0.5) * (like + second), f32(at), likes, depths)
+
+
+@numba.njit(cache=True, nogil=True)
+def _visible_range(q0, q1, q2, b, low, high, width, height):  # type: ignore[no-untyped-def]
+    """The part of a range of inverse depth in which ``q + b w`` lies in front of the camera and inside its image."""
+    # q2 + b2 w > 0, q0 + b0 w > 0, (W - 1) (q2 + b2 w) - (q0 + b0 w) > 0 and so on: each cuts off one side
+    for n in range(5):
+        if n == 0:
+            c, d = q2, b[2]
+        elif n == 1:
+            c, d = q0, b[0]
+        elif n == 2:
+            c, d = q1, b[1]
+        elif n == 3:
+            c, d = (width - 1) * q2 - q0, (width - 1) * b[2] - b[0]
+        else:
+            c, d = (height - 1) * q2 - q1, (height - 1) * b[2] - b[1]
+        if d > 0.0:
+            low = max(low, -c / d)
+        elif d < 0.0:
+            high = min(high, -c / d)
+        elif c <= 0.0:
+            return 1.0, 0.0
+    return low + 1e-9, high - 1e-9
+
+
+@numba.njit(cache=True, nogil=True)
+def _keep(like, depth, likes, depths):  # type: ignore[no-untyped-def]
+    """Insert a place among the best few, sorted."""
+    for j in range(likes.shape[0]):
+        if like > likes[j]:
+            for k in range(likes.shape[0] - 1, j, -1):
+                likes[k], depths[k] = likes[k - 1], depths[k - 1]
+            likes[j], depths[j] = like, depth
+            return
+
+
+@numba.njit(cache=True, nogil=True)
+def try_points(image_arrays, m, places, point_arrays, first, last, limits, scratch, found_arrays):  # type: ignore[no-untyped-def]
+    """Patches at sparse points ``first`` to ``last``, given as a store, in the pixels of view m where they are seen."""
+    images, found = image_pointers(image_arrays), store_pointers(found_arrays)
+    slot_array, work = np.empty(MOST_SLOTS, np.int64), pointer(scratch)
+    slots, rhos, plane = pointer(slot_array), offset(work, RHOS), offset(work, BEST)
+    quads, width = offset(images.quads, images.start[m]), images.width[m]
+    points = store_pointers(point_arrays)
+    contrast = f32(CONTRAST) * images.noise[m] + f32(LEAST_CONTRAST)
+    for i in range(first, last):
+        found.num_views[i] = 0
+        u, v = places[i, 0], places[i, 1]
+        if u < HALF or v < HALF or u >= width - HALF - 1 or v >= images.height[m] - HALF - 1:
+            continue
+        deviation = read_reference(quads, width, u, v, contrast, work)
+        if deviation < f32(2.0) * images.noise[m]:
+            continue
+        _, _, z = project(images, m, offset(points.xyz, 3 * i))
+        n = slots_of(images, points, m, i, slots, limits.max_refined)
+        if z <= 0.0 or n < limits.min_views - 1:
+            continue
+        plane[0], plane[1], plane[2] = f32(1.0 / z), f32(0.0), f32(0.0)
+        n, sigma = refine(images, m, f32(u), f32(v), plane, slots, rhos, n, limits, work)
+        if n > 0 and judge(images, m, f32(u), f32(v), plane, slots, rhos, n, sigma, limits, work, found, i):
+            found.wave[i] = 0
+    slot_array[0] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def finer_cells(images, cells, m, coarse_images, coarse_cells, places, candidates):  # type: ignore[no-untyped-def]
+    """Empty cells of view m where the coarser level has patches: pixels to ``places``, patches to ``candidates``."""
+    start, columns, rows, side = images.cell_start[m], images.columns[m], images.rows[m], images.cell_px[0]
+    coarse_start, coarse_columns, coarse_rows = (
+        coarse_images.cell_start[m], coarse_images.columns[m], coarse_images.rows[m],
+    )  # fmt: skip
+    per_x = coarse_images.width[m] / images.width[m] / coarse_images.cell_px[0]
+    per_y = coarse_images.height[m] / images.height[m] / coarse_images.cell_px[0]
+    n = 0
+    for y in range(rows):
+        v = y * side + side // 2
+        if v < HALF or v >= images.height[m] - HALF - 1:
+            continue
+        cy = min(int((v + 0.5) * per_y), coarse_rows - 1)
+        for x in range(columns):
+            u = x * side + side // 2
+            g = start + np.int64(y) * columns + x
+            if u < HALF or u >= images.width[m] - HALF - 1 or images.closed[g] != 0 or cells.patch[g, 0] >= 0:
+                continue
+            cx = min(int((u + 0.5) * per_x), coarse_columns - 1)
+            count = 0
+            # the patches of the cell itself come first, those beside it fill up
+            for layer in range(LAYERS):
+                p = coarse_cells.patch[coarse_start + np.int64(cy) * coarse_columns + cx, layer]
+                if p >= 0:
+                    candidates[n, count] = p
+                    count += 1
+            for step in range(4):
+                nx, ny = cx + (step == 0) - (step == 1), cy + (step == 2) - (step == 3)
+                if count == CANDIDATES or nx < 0 or ny < 0 or nx >= coarse_columns or ny >= coarse_rows:
+                    continue
+                p = coarse_cells.patch[coarse_start + np.int64(ny) * coarse_columns + nx, 0]
+                if p >= 0 and (count == 0 or candidates[n, count - 1] != p):
+                    candidates[n, count] = p
+                    count += 1
+            if count == 0:
+                continue
+            for j in range(count, CANDIDATES):
+                candidates[n, j] = -1
+            places[n, 0], places[n, 1] = u, v
+            n += 1
+    return n
