@@ -33,7 +33,8 @@ class Images(NamedTuple):
         slot: (V, V) int8, where among the neighbours of the first view the second stands; -1 if it is none.
         a, b: (V, K, 9) and (V, K, 3) float32 of the warps from a view into its neighbours.
         cell_px: (1,) int32 side of a cell.
-        cell_start: (V,) int64, columns, rows: (V,) int32. Cell (x, y) of view m is ``cell_start[m] + y columns[m] + x``.
+        cell_start: (V,) int64, columns, rows: (V,) int32. Cell (x, y) of view m is ``cell_start[m] + y columns[m]
+            + x``.
         closed: (G,) uint8, not 0 in cells outside the masks.
         noise: (V,) float32 standard deviation of the noise in grey.
     """
@@ -91,9 +92,17 @@ class Store(NamedTuple):
     def grown(self, capacity: int) -> Store:
         """A copy with more room."""
         other = Store.of_capacity(capacity, self.views.shape[1] - 1)
-        for new, old in zip(other, self, strict=True):
-            new[: len(old)] = old
+        for name in self._fields:
+            old = getattr(self, name)
+            getattr(other, name)[: len(old)] = old
         return other
+
+    def taken(self, idx: NDArray[np.intp]) -> Store:
+        """A copy of the patches at some positions."""
+        return Store(
+            self.xyz[idx], self.normal[idx], self.score[idx], self.sigma[idx], self.size[idx],
+            self.views[idx], self.num_views[idx], self.wave[idx],
+        )  # fmt: skip
 
 
 class Cells(NamedTuple):
@@ -174,7 +183,7 @@ def image_pointers(images):  # type: ignore[no-untyped-def]
         pointer(images.k), pointer(images.rotation), pointer(images.translation), pointer(images.center),
         pointer(images.neighbors), pointer(images.slot), pointer(images.a), pointer(images.b),
         pointer(images.cell_start), pointer(images.columns), pointer(images.rows), pointer(images.closed),
-        pointer(images.noise), np.int64(images.cell_px[0]), images.neighbors.shape[0], images.neighbors.shape[1],
+        pointer(images.noise), images.cell_px[0], images.neighbors.shape[0], images.neighbors.shape[1],
     )  # fmt: skip
 
 

@@ -64,38 +64,47 @@ def _coarse_to_fine(
     waves: list[dict[str, int]] = []
     growth: Growth | None = None
     for level in range(num_levels - 1, -1, -1):
-        wall, cpu = time.monotonic(), time.process_time()
-        steps = 4 ** (num_levels - 1 - level)
         images = make_images(scene, grays[level], frame, options.cell_px)
         coarser, growth = growth, Growth(images, limits, threads, growth.wave if growth else 0)
-        row: dict[str, Any] = {"level": level, "marks": []}
-        def mark(name):
-            row["marks"].append((name, round(time.process_time() - cpu, 2)))
-        if coarser is not None:
-            row["carried"] = growth.refine_coarser(coarser, lambda: events.advanced(STAGE, steps))
-            coarser.close()
-            mark("carry")
-        row["points"] = growth.seed_points(points)
-        row["expanded"] = growth.expand(events)
-        mark("expand")
         found = [corners(gray, BLOCK_PX, float(images.noise[m])) for m, gray in enumerate(grays[level])]
-        row["corners"] = growth.seed_corners(found, depth_range, everywhere=coarser is None)
-        mark("corners")
-        row["expanded"] += growth.expand(events)
-        mark("expand")
-        events.advanced(STAGE, steps * len(scene.views) * (2 if coarser is None else 1))
-        row["accepted"] = growth.count
-        row |= growth.filter()
-        mark("filter")
-        rows.append(row | {
-            "patches": growth.count,
-            "seconds": round(time.monotonic() - wall, 3), "cpu_s": round(time.process_time() - cpu, 3),
-        })  # fmt: skip
+        steps = 4 ** (num_levels - 1 - level)
+        rows.append({"level": level} | _grow(growth, coarser, points, found, depth_range, steps, events))
         waves += growth.waves
     assert growth is not None
     growth.close()
     patches = _patches(scene, growth, frame)
     return patches, _report(rows, waves, len(patches))
+
+
+def _grow(
+    growth: Growth,
+    coarser: Growth | None,
+    points: Store,
+    found: list[NDArray[np.int32]],
+    depth_range: NDArray[np.float64],
+    steps: int,
+    events: Events,
+) -> dict[str, Any]:
+    """Work on one level, from the patches of the coarser one, sparse points and corners; what came of it.
+
+    ``steps``: of progress that a view of this level is worth.
+    """
+    wall, cpu = time.monotonic(), time.process_time()
+    row: dict[str, Any] = {}
+    if coarser is not None:
+        row["carried"] = growth.refine_coarser(coarser, lambda: events.advanced(STAGE, steps))
+        coarser.close()
+    row["points"] = growth.seed_points(points)
+    row["expanded"] = growth.expand(events)
+    row["corners"] = growth.seed_corners(found, depth_range, everywhere=coarser is None)
+    row["expanded"] += growth.expand(events)
+    events.advanced(STAGE, steps * growth.num_views * (2 if coarser is None else 1))
+    row["accepted"] = growth.count
+    row |= growth.filter()
+    growth.settle()
+    row["patches"] = growth.count
+    took = {"seconds": round(time.monotonic() - wall, 3), "cpu_s": round(time.process_time() - cpu, 3)}
+    return row | took
 
 
 def _report(rows: list[dict[str, Any]], waves: list[dict[str, int]], num_patches: int) -> dict[str, Any]:

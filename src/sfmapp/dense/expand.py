@@ -67,7 +67,8 @@ def frontier(image_arrays, store_arrays, cell_arrays, m, fresh, num_fresh, place
         for y in range(rows):
             for x in range(columns):
                 if _may_be_tried(images, cells, m, x, y):
-                    n += _offer(images, store, cells, m, x, y, offset(places_, 2 * n), offset(candidates_, CANDIDATES * n))
+                    place, row = offset(places_, 2 * n), offset(candidates_, CANDIDATES * n)
+                    n += _offer(images, store, cells, m, x, y, place, row)
         return n
     for i in range(num_fresh):
         cy = fresh[i] // columns
@@ -75,10 +76,12 @@ def frontier(image_arrays, store_arrays, cell_arrays, m, fresh, num_fresh, place
         for y in range(max(cy - 1, 0), min(cy + 2, rows)):
             for x in range(max(cx - 1, 0), min(cx + 2, columns)):
                 g = start + y * columns + x
-                if cells.tried[g] < WAITING and _may_be_tried(images, cells, m, x, y):
-                    if _offer(images, store, cells, m, x, y, offset(places_, 2 * n), offset(candidates_, CANDIDATES * n)):
-                        cells.tried[g] |= WAITING
-                        n += 1
+                if cells.tried[g] >= WAITING or not _may_be_tried(images, cells, m, x, y):
+                    continue
+                place, row = offset(places_, 2 * n), offset(candidates_, CANDIDATES * n)
+                if _offer(images, store, cells, m, x, y, place, row):
+                    cells.tried[g] |= WAITING
+                    n += 1
     for i in range(n):
         g = start + np.int64(places[i, 1] // images.cell_px) * columns + places[i, 0] // images.cell_px
         cells.tried[g] &= ~WAITING

@@ -1,5 +1,4 @@
-"""Which patches stay: those that agree with what other images see, and that belong to a surface (Furukawa and Ponce, 4).
-"""
+"""Which patches stay: those that agree with what other images see and that belong to a surface (the paper's part 4)."""
 
 from __future__ import annotations
 
@@ -74,7 +73,7 @@ def _contradiction(images, store, cells, p, m, reach):  # type: ignore[no-untype
 @numba.njit(cache=True, nogil=True)
 def _support(images, store, cells, p, r, reach):  # type: ignore[no-untyped-def]
     """Cells around p in its reference image that hold a patch of its surface."""
-    u, v, z = project(images, r, offset(store.xyz, 3 * p))
+    u, v, _ = project(images, r, offset(store.xyz, 3 * p))
     g = cell_of(images, r, u, v)
     if g < 0:
         return 0

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sfmapp.dense import filters, seeds
 from sfmapp.dense.arrays import LAYERS, Cells, Images, Limits, Store
 from sfmapp.dense.expand import CANDIDATES, enter, frontier, try_cells
+from sfmapp.dense.settle import settle
 from sfmapp.dense.window import make_scratch
 from sfmapp.events import Events
 
@@ -62,7 +63,7 @@ class Growth:
             focal, middle = self.images.k[m, :2], self.images.k[m, 2:]
             # points that are not in front of the camera land outside of any image
             places = np.where(seen[:, 2:] > 0.0, seen[:, :2] / np.maximum(seen[:, 2:], 1e-9) * focal + middle, -1e6)
-            subset = Store(*(array[mine] for array in points))
+            subset = points.taken(mine)
             self._batch(m, np.rint(places.clip(-1e6, 1e6)).astype(np.int32), seeds.try_points, subset)
         return self.count - before
 
@@ -116,9 +117,7 @@ class Growth:
 
     def _frontier(self, m: int, *, everywhere: bool) -> int:
         num_fresh = -1 if everywhere else int(self._num_fresh[m])
-        n = frontier(
-            self.images, self.store, self.cells, m, self._fresh[m], num_fresh, self._places, self._candidates
-        )
+        n = frontier(self.images, self.store, self.cells, m, self._fresh[m], num_fresh, self._places, self._candidates)
         self._num_fresh[m] = 0
         return int(n)
 
@@ -196,6 +195,17 @@ class Growth:
             self._refill()
         self.cells.tried[:] = 0
         return {"contradicted": contradicted, "without neighbours": alone, "in small groups": in_small_groups}
+
+    def settle(self) -> None:
+        """Let each patch settle on the plane of its neighbours."""
+        n, store = self.count, self.store
+        xyz, normal, sigma = store.xyz[:n].copy(), store.normal[:n].copy(), store.sigma[:n].copy()
+
+        def work(first: int, last: int, _: int) -> None:
+            settle(self.images, store, self.cells, first, last, xyz, normal, sigma)
+
+        self._in_chunks(n, work)
+        store.xyz[:n], store.normal[:n], store.sigma[:n] = xyz, normal, sigma
 
     def _refill(self) -> None:
         n = self.count

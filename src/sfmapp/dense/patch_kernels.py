@@ -17,7 +17,7 @@ LEAST_GAIN = f32(0.001)
 LONGEST_STEP_PX, SHORTEST_STEP_PX = f32(1.5), f32(0.02)
 DAMPING = f32(0.01)
 # pull of the slopes towards where they began, in units of the information on the depth
-SLOPE_PRIOR = f32(0.04)
+SLOPE_PRIOR = f32(0.3)
 # cosine between normal and line of sight below which a patch is too oblique to be judged in a window of this size
 LEAST_COSINE = 0.25
 # of the widest angle between the lines of sight; below about 2.5 degrees depth is noise

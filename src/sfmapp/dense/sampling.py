@@ -1,7 +1,7 @@
 """Sixteen bilinear samples at a time, with their slopes, from images packed so that one load fetches four pixels.
 
-The word of pixel (x, y) holds ``I(x, y)``, ``I(x + 1, y)``, ``I(x, y + 1)`` and ``I(x + 1, y + 1)`` from its lowest byte
-to its highest. All views of a level lie in one array of words, one after the other.
+The word of pixel (x, y) holds ``I(x, y)``, ``I(x + 1, y)``, ``I(x, y + 1)`` and ``I(x + 1, y + 1)`` from its lowest
+byte to its highest. All views of a level lie in one array of words, one after the other.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from numba import float32 as f32
 from numpy.typing import NDArray
 
 from sfmapp.adjust.lanes import offset, pointer
-from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
+from sfmapp.dense.arrays import LAYERS, image_pointers, store_pointers
 from sfmapp.dense.expand import CANDIDATES, CONTRAST, LEAST_CONTRAST, slots_of
 from sfmapp.dense.patch_kernels import judge, measure, project, refine
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference

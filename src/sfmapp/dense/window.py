@@ -1,18 +1,19 @@
 """The photometric kernels: a window of the reference image, its warp into a source image, and how well the two agree.
 
-A patch is a plane whose inverse depth is linear in the pixels (u, v) of its reference image, ``w = w0 + wx (u - u0) + wy
-(v - v0)``. With A = Ks R Kr^-1 and b = Ks t of the relative pose it is seen in a source image at ``q = A (u, v, 1) + b w``,
-``x = q[:2] / q[2]``, linearised at the centre of the window. All that the plane can change is w, and ``dx/dw`` is one
-direction, that of the epipolar line; so Gauss-Newton on the zero-mean normalised cross-correlation (NCC) needs only the
-slope of the source image along it, and costs little more than the correlation itself.
+A patch is a plane whose inverse depth is linear in the pixels (u, v) of its reference image,
+``w = w0 + wx (u - u0) + wy (v - v0)``. With A = Ks R Kr^-1 and b = Ks t of the relative pose it is seen in a source
+image at ``q = A (u, v, 1) + b w``, ``x = q[:2] / q[2]``, linearised at the centre of the window. All that the plane can
+change is w, and ``dx/dw`` is one direction, that of the epipolar line; so Gauss-Newton on the zero-mean normalised
+cross-correlation (NCC) needs only the slope of the source image along it, and costs little more than the correlation
+itself.
 
 The window is the 45 pixels of a 7 x 7 square without its corners, weighted: a pixel counts less the more it differs
 from the centre, so that a window across the edge of an object follows what its centre shows (as in Yoon and Kweon, PAMI
 2006). Sums are over three rows of 16; the last three lanes weigh nothing.
 
 ``work`` is a scratch of SCRATCH floats: the offsets of the pixels, the weights, weights times the normalised reference,
-the sums of Gauss-Newton, a copy of them, the NCC of up to 16 images twice, and
-a plane. Coordinates here are index coordinates: the centre of the top-left pixel is (0, 0).
+the sums of Gauss-Newton, a copy of them, the NCC of up to 16 images twice, and a plane. Coordinates here are index
+coordinates: the centre of the top-left pixel is (0, 0).
 """
 
 from __future__ import annotations
@@ -150,9 +151,7 @@ def correlate_with_terms(quads, width, x, y, xu, yu, xv, yv, ex, ey, work):  # t
     n00 = n01 = n02 = n11 = n12 = n22 = zero
     for k in range(0, SIZE, 16):
         du, dv = load(work, DX + k), load(work, DY + k)
-        value, gx, gy = sample_with_slopes(
-            quads, width, fma(dv, xv_, fma(du, xu_, x0)), fma(dv, yv_, fma(du, yu_, y0))
-        )
+        value, gx, gy = sample_with_slopes(quads, width, fma(dv, xv_, fma(du, xu_, x0)), fma(dv, yv_, fma(du, yu_, y0)))
         slope = fma(gx, ex_, multiply(gy, ey_))
         weight, reference = load(work, WEIGHT + k), load(work, REFERENCE + k)
         weighted = multiply(weight, value)
@@ -200,5 +199,3 @@ def solve3(n, g0, g1, g2):  # type: ignore[no-untyped-def]
     x1 = (c01 * g0 + c11 * g1 + c12 * g2) * over
     x2 = (c02 * g0 + c12 * g1 + c22 * g2) * over
     return x0, x1, x2, True
-
-
