@@ -1,0 +1,121 @@
+"""Oriented patches to a mesh: Poisson, then away with what no patch and no camera vouches for."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.dense.scene import DenseScene
+from sfmapp.errors import NoReconstructionError
+from sfmapp.events import Events
+from sfmapp.scene.mesh import Mesh, vertex_normals
+from sfmapp.surface.options import SurfaceOptions
+from sfmapp.surface.patch_cloud import make_patch_cloud
+from sfmapp.surface.poisson import ClosedSurface, depth_for, poisson
+from sfmapp.surface.trim import Surroundings, in_view, look_around, rim, with_holes_closed, without_islands
+
+STAGE = "mesh"
+
+
+def make_mesh(
+    xyz: NDArray[np.float64],
+    normal: NDArray[np.float32],
+    rgb: NDArray[np.uint8],
+    size: NDArray[np.float32],
+    scene: DenseScene | None,
+    options: SurfaceOptions,
+    *,
+    threads: int = 1,
+    events: Events | None = None,
+) -> tuple[Mesh, dict[str, Any]]:
+    """Reconstruct the surface that oriented patches lie on.
+
+    Args:
+        xyz: (N, 3) places of the patches, world.
+        normal: (N, 3) unit normals, outward.
+        rgb: (N, 3).
+        size: (N,) what a pixel measures at each patch, world units.
+        scene: the views; what none of them can show is cut off. None: no such trimming.
+        options: depth and trimming.
+        threads: workers of the searches; the result does not depend on their number.
+        events: progress and cancellation.
+
+    Returns:
+        The mesh, and the report: ``depth``, ``spacing`` (of the patches, world units), ``num_vertices``, ``num_faces``,
+        ``num_rim_edges`` (0 for a closed mesh), ``funnel`` (faces after each step), ``poisson`` (seconds, CPU seconds
+        and peak memory of the child process), ``seconds``, ``cpu_s`` (child included).
+
+    Raises:
+        NoReconstructionError: too few patches, Poisson failed in its process, or nothing is left after trimming.
+        InterruptedRunError: ``events`` was asked to stop.
+    """
+    events = events or Events()
+    wall, cpu = time.monotonic(), time.process_time()
+    events.started(STAGE, "surface", total=4)
+    patches = make_patch_cloud(xyz, normal, rgb, size, threads)
+    depth = options.depth or depth_for(xyz, patches.median_spacing)
+    events.advanced(STAGE, message=f"Poisson, depth {depth}")
+    surface = poisson(xyz, normal, depth, events)
+    events.advanced(STAGE, message="trimming")
+    around = look_around(surface.xyz, vertex_normals(surface.xyz, surface.faces), patches, threads)
+    events.advanced(STAGE)
+    kept, funnel = _trim(surface, around, scene, options)
+    mesh = _cut(surface, around, kept)
+    report = {
+        "depth": depth,
+        "spacing": patches.median_spacing,
+        "num_vertices": len(mesh.xyz),
+        "num_faces": len(mesh.faces),
+        "num_rim_edges": len(rim(mesh.faces)),
+        "funnel": funnel,
+        "poisson": {
+            "seconds": round(surface.usage.wall_s, 3),
+            "cpu_s": round(surface.usage.cpu_s, 3),
+            "peak_memory_mb": round(surface.usage.peak_memory_mb, 1),
+        },
+        "seconds": round(time.monotonic() - wall, 3),
+        "cpu_s": round(time.process_time() - cpu + surface.usage.cpu_s, 3),
+    }
+    events.advanced(STAGE)
+    events.finished(STAGE, f"{len(mesh.faces)} triangles", **report)
+    return mesh, report
+
+
+def _trim(
+    surface: ClosedSurface, around: Surroundings, scene: DenseScene | None, options: SurfaceOptions
+) -> tuple[NDArray[np.bool_], list[dict[str, Any]]]:
+    """The faces to keep (F,), and how many were left after each step."""
+    faces = surface.faces
+    funnel = [{"name": "Poisson", "count": len(faces)}]
+
+    def keep(name: str, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        funnel.append({"name": name, "count": int(kept.sum())})
+        if not kept.any():
+            raise NoReconstructionError(
+                f"surface: nothing is left of {len(faces)} triangles after trimming ({name})",
+                "try a larger surface.trim_distance",
+            )
+        return kept
+
+    kept = np.ones(len(faces), np.bool_)
+    if options.trim_density > 0.0:
+        dense = np.asarray(surface.density >= np.quantile(surface.density, options.trim_density))
+        kept = keep("dense enough", dense[faces].all(axis=1))
+    near = np.asarray(around.distance <= options.trim_distance)
+    kept = keep("near patches", kept & near[faces].all(axis=1))
+    kept = keep("on the side of the patches", kept & ~around.is_backside[faces].all(axis=1))
+    if scene is not None:
+        kept = keep("in view", kept & in_view(surface.xyz, faces, scene))
+    kept = keep("not in islands", without_islands(surface.xyz, faces, kept, options.min_island))
+    return keep("holes closed", with_holes_closed(surface.xyz, faces, kept, options.max_hole)), funnel
+
+
+def _cut(surface: ClosedSurface, around: Surroundings, kept: NDArray[np.bool_]) -> Mesh:
+    """The kept faces (F,) with the vertices they need."""
+    used, corners = np.unique(surface.faces[kept], return_inverse=True)
+    faces = corners.reshape(-1, 3).astype(np.int32)
+    xyz = surface.xyz[used]
+    return Mesh(xyz, faces, vertex_normals(xyz, faces), around.rgb[used])

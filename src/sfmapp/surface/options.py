@@ -1,0 +1,49 @@
+"""Options of meshing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sfmapp.errors import UsageError
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """What ``sfmapp mesh`` obeys.
+
+    Attributes:
+        depth: of the octree: the scene's box is divided 2^depth times a side; None: cells of about two patch spacings.
+        trim_distance: surface is cut off that is farther than this from every patch, in spacings of the patches there.
+            At 3, of the distances and density quantiles tried on a rendered scene, accuracy and completeness were both
+            best.
+        trim_density: share of the vertices, those with the fewest patches around them, that is cut off before; 0: none.
+        max_hole: gaps that come of trimming are closed again as Poisson closed them if their share of the surface's
+            area is no more than this: all-round captures stay closed where nothing was matched; 0: none.
+        min_island: pieces that hold less than this share of the surface's area are dropped.
+        texture: unwrap the surface and project the photographs onto it.
+        texture_px: side of the square texture.
+        texture_faces: the surface is simplified to so many triangles before it is unwrapped.
+    """
+
+    depth: int | None = None
+    trim_distance: float = 3.0
+    trim_density: float = 0.0
+    max_hole: float = 0.02
+    min_island: float = 0.005
+    texture: bool = False
+    texture_px: int = 4096
+    texture_faces: int = 200_000
+
+    def __post_init__(self) -> None:
+        if self.depth is not None and not 4 <= self.depth <= 13:
+            raise UsageError(f"surface.depth: expected 4 to 13, got {self.depth}")
+        if not 0.5 <= self.trim_distance <= 1000.0:
+            raise UsageError(f"surface.trim_distance: expected 0.5 to 1000 patch spacings, got {self.trim_distance:g}")
+        for name in ("trim_density", "max_hole", "min_island"):
+            share = getattr(self, name)
+            if not 0.0 <= share < 1.0:
+                raise UsageError(f"surface.{name}: expected a share from 0 to less than 1, got {share:g}")
+        if not 256 <= self.texture_px <= 16384:
+            raise UsageError(f"surface.texture_px: expected 256 to 16384, got {self.texture_px}")
+        if not 100 <= self.texture_faces <= 2_000_000:
+            raise UsageError(f"surface.texture_faces: expected 100 to 2000000, got {self.texture_faces}")

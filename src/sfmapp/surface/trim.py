@@ -1,0 +1,127 @@
+"""What of a closed Poisson surface is real: close to patches, in view of a camera, not a loose scrap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.dense.scene import DenseScene
+from sfmapp.geometry import rigid3
+from sfmapp.scene.mesh import face_vectors
+from sfmapp.surface.patch_cloud import CHUNK, PatchCloud
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What the patches say of the vertices (N) of a surface.
+
+    Attributes:
+        distance: (N,) float32 distance to the nearest patch, in spacings of the patches there.
+        is_backside: (N,) bool, True where all the nearest patches look the other way.
+        rgb: (N, 3) uint8 colour of the nearest patches.
+    """
+
+    distance: NDArray[np.float32]
+    is_backside: NDArray[np.bool_]
+    rgb: NDArray[np.uint8]
+
+
+def look_around(
+    xyz: NDArray[np.float64], normal: NDArray[np.float32], patches: PatchCloud, threads: int
+) -> Surroundings:
+    """Ask the patches nearest to each vertex (N, 3) with its normal (N, 3).
+
+    Colours are weighted by the inverse of the distance (Shepard 1968), as if none were nearer than half a spacing.
+    """
+    found = Surroundings(
+        np.empty(len(xyz), np.float32), np.empty(len(xyz), np.bool_), np.empty((len(xyz), 3), np.uint8)
+    )
+    for start in range(0, len(xyz), CHUNK):
+        part = slice(start, start + CHUNK)
+        distance, idx = patches.nearest(xyz[part], threads)
+        spacing = patches.spacing[idx]
+        found.distance[part] = distance[:, 0] / spacing[:, 0]
+        facing = np.einsum("nkc,nc->nk", patches.normal[idx], normal[part])
+        found.is_backside[part] = (facing < 0.0).all(axis=1)
+        weight = 1.0 / np.maximum(distance, 0.5 * spacing)
+        color = np.einsum("nk,nkc->nc", weight / weight.sum(axis=1, keepdims=True), patches.rgb[idx])
+        found.rgb[part] = np.rint(color).astype(np.uint8)
+    return found
+
+
+def in_view(xyz: NDArray[np.float64], faces: NDArray[np.int32], scene: DenseScene) -> NDArray[np.bool_]:
+    """(F,) bool, True for faces of which a view shows the centre, and their front. What hides what is not asked."""
+    vectors = face_vectors(xyz, faces)
+    centers = xyz[faces].mean(axis=1)
+    seen = np.zeros(len(faces), np.bool_)
+    rotation, camera = rigid3.rotation_matrix(scene.cam_from_world), scene.centers
+    for m, view in enumerate(scene.views):
+        open_idx = np.flatnonzero(~seen)
+        ray = centers[open_idx] - camera[m]
+        in_cam = ray @ rotation[m].T
+        depth = np.where(in_cam[:, 2] > 0.0, in_cam[:, 2], np.inf)
+        x = view.k[0] * in_cam[:, 0] / depth + view.k[2]
+        y = view.k[1] * in_cam[:, 1] / depth + view.k[3]
+        inside = np.isfinite(depth) & (x >= 0.0) & (x < view.width) & (y >= 0.0) & (y < view.height)
+        seen[open_idx[inside & (np.einsum("fc,fc->f", ray, vectors[open_idx]) < 0.0)]] = True
+    return seen
+
+
+def pieces(faces: NDArray[np.int32], num_vertices: int) -> NDArray[np.int32]:
+    """(F,) number of the piece that each face belongs to: faces hang together that share a vertex."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    start, end = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
+    graph = coo_array((np.ones(len(start), np.bool_), (start, end)), (num_vertices, num_vertices))
+    return np.asarray(connected_components(graph, directed=False)[1][faces[:, 0]], np.int32)
+
+
+def without_islands(
+    xyz: NDArray[np.float64], faces: NDArray[np.int32], kept: NDArray[np.bool_], smallest_share: float
+) -> NDArray[np.bool_]:
+    """``kept`` (F,) without the pieces that have less than a share of the area of all that is kept."""
+    idx = np.flatnonzero(kept)
+    if not len(idx):
+        return kept
+    piece = pieces(faces[idx], len(xyz))
+    area = np.linalg.norm(face_vectors(xyz, faces[idx]), axis=1)
+    piece_area = np.bincount(piece, area)
+    out = np.zeros_like(kept)
+    out[idx] = piece_area[piece] >= smallest_share * area.sum()
+    return out
+
+
+def with_holes_closed(
+    xyz: NDArray[np.float64], faces: NDArray[np.int32], kept: NDArray[np.bool_], largest_share: float
+) -> NDArray[np.bool_]:
+    """``kept`` (F,) with the gaps in it that have at most a share of its area: where Poisson closed an all-round
+    capture it stays closed, while the balloon behind an open surface, which is about as large, does not come back.
+
+    A gap is a piece of what was cut off that meets nothing but what is kept: not the edge of the octree's box.
+    """
+    idx = np.flatnonzero(~kept)
+    if not len(idx) or largest_share == 0.0:
+        return kept
+    piece = pieces(faces[idx], len(xyz))
+    num_pieces = int(piece.max()) + 1
+    area = np.bincount(piece, np.linalg.norm(face_vectors(xyz, faces[idx]), axis=1), num_pieces)
+    kept_area = float(np.linalg.norm(face_vectors(xyz, faces[kept]), axis=1).sum())
+    is_kept, is_rim = np.zeros(len(xyz), np.bool_), np.zeros(len(xyz), np.bool_)
+    is_kept[faces[kept]] = True
+    is_rim[rim(faces)] = True
+    meets = np.bincount(piece, is_kept[faces[idx]].any(axis=1), num_pieces) > 0
+    at_rim = np.bincount(piece, is_rim[faces[idx]].any(axis=1), num_pieces) > 0
+    out = kept.copy()
+    out[idx] = (meets & ~at_rim & (area <= largest_share * kept_area))[piece]
+    return out
+
+
+def rim(faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    """(R, 2) edges, as pairs of vertices, that have a face on one side only."""
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    key = edges[:, 0].astype(np.int64) << 32 | edges[:, 1]
+    _, first, counts = np.unique(key, return_index=True, return_counts=True)
+    return np.asarray(edges[first[counts == 1]])
