@@ -521,26 +521,28 @@ def sky(rng: np.random.Generator) -> dict[str, Any]:
 
 
 # ---------------------------------------------------------------- cameras
-def make_cameras(seed: int = 11) -> list[tuple[Array, Array]]:
+def make_cameras(seed: int = 11, num_views: int = NUM_VIEWS) -> list[tuple[Array, Array]]:
     """World-to-camera (R, t) of every view, x right, y down, z forward: an unsteady walk around the fountain."""
     rng = np.random.default_rng(seed)
     views = []
-    for k in range(NUM_VIEWS):
-        share = k / (NUM_VIEWS - 1)
+    for k in range(num_views):
+        share = k / (num_views - 1)
         azimuth = np.radians(-4 + 98 * share + rng.normal(0, 1.2))
         distance = 4.75 + 0.65 * np.sin(2.1 * k + 0.5) + rng.normal(0, 0.12)
         height = 1.65 + 0.5 * np.sin(1.3 * k + 1.0) + rng.normal(0, 0.06)
         centre = np.array([2.75 + distance * np.cos(azimuth), 2.75 + distance * np.sin(azimuth), height])
-        forward = TARGET + rng.normal(0, 0.16, 3) - centre
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        down = np.cross(forward, right)
-        roll = np.radians(rng.normal(0, 1.6))
-        x = np.cos(roll) * right + np.sin(roll) * down
-        rotation = np.stack([x, np.cross(forward, x), forward])
-        views.append((rotation, -rotation @ centre))
+        views.append(look_at(centre, TARGET + rng.normal(0, 0.16, 3), np.radians(rng.normal(0, 1.6))))
     return views
+
+
+def look_at(centre: Array, target: Array, roll_rad: float = 0.0) -> tuple[Array, Array]:
+    """World-to-camera (R, t) of a camera at a point that looks at another, level but for its roll."""
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    x = np.cos(roll_rad) * right + np.sin(roll_rad) * np.cross(forward, right)
+    rotation = np.stack([x, np.cross(forward, x), forward])
+    return rotation, -rotation @ centre
 
 
 def undistort(x: Array, y: Array) -> tuple[Array, Array]:
