@@ -11,8 +11,9 @@ from sfmapp.cli.common import add_output_flags, listening, print_json
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the commands of this family to the parser."""
     parser = commands.add_parser(
-        "view", help="open the recording of a run in rerun",
-        description="Open OUT/recording.rrd in rerun's viewer; serve it on 127.0.0.1 where there is no display.",
+        "view", help="open the recordings of a run in rerun",
+        description="Open OUT/recording.rrd and OUT/dense/recording.rrd, as far as they are there, in rerun's viewer;"
+        " serve them on 127.0.0.1 where there is no display.",
     )  # fmt: skip
     parser.add_argument("output", metavar="OUT", type=Path, help="folder of a run")
     parser.add_argument("--serve", action="store_true", help="for a browser on this machine, even if there is a screen")
@@ -36,10 +37,11 @@ def _view(args: argparse.Namespace) -> int:
     from sfmapp.viewer.view import view
 
     read_manifest(args.output)
-    recording = args.output / "recording.rrd"
-    if not recording.is_file():
-        raise InputError(f"{recording} does not exist", "run it again with a recording")
-    view(recording, serve=args.serve or None, web_port=args.port, tell=lambda line: print(line, flush=True))
+    first = args.output / "recording.rrd"
+    recordings = [path for path in (first, args.output / "dense" / "recording.rrd") if path.is_file()]
+    if not recordings:
+        raise InputError(f"{first} does not exist", "run it again with a recording")
+    view(*recordings, serve=args.serve or None, web_port=args.port, tell=lambda line: print(line, flush=True))
     return 0
 
 

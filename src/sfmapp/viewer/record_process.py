@@ -1,4 +1,4 @@
-"""Draws a recording in a process of its own: ``python -m sfmapp.viewer.record_process FOLDER OUTPUT THREADS``.
+"""Draws a recording in a process of its own: ``python -m sfmapp.viewer.record_process KIND FOLDER OUTPUT THREADS``.
 
 rerun takes half a second and a hundred megabytes to load; here they, and whatever may go wrong in it, stay away from
 the run.
@@ -10,8 +10,14 @@ import sys
 from pathlib import Path
 
 
-def main(folder: str, output: str, threads: str) -> None:
-    """Draw the replay that lies in folder."""
+def main(kind: str, folder: str, output: str, threads: str) -> None:
+    """Draw what lies in folder: the replay of a run, or a dense result."""
+    if kind == "dense":
+        from sfmapp.viewer.dense_replay import DenseReplay
+        from sfmapp.viewer.dense_rrd import write_dense_rrd
+
+        write_dense_rrd(DenseReplay.load(Path(folder)), Path(output))
+        return
     from sfmapp.viewer.replay import Replay
     from sfmapp.viewer.rrd import write_rrd
 

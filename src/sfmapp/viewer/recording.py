@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from sfmapp.scene.features import Features
     from sfmapp.scene.reconstruction import Reconstruction
 
-__all__ = ["Message", "RecordingListener", "RecordingReport", "Step", "write_recording"]
+Kind = Literal["run", "dense"]
+
+__all__ = ["Message", "RecordingListener", "RecordingReport", "Step", "draw_in_child", "write_recording"]
 
 
 @dataclass(frozen=True)
@@ -62,14 +64,15 @@ def write_recording(
     start = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
         make_replay(image_set, features, reconstructions, steps, messages, title=title, up=up).save(Path(name))
-        problem = _draw(Path(name), path.absolute(), threads, timeout_s)
+        problem = draw_in_child("run", Path(name), path, threads, timeout_s)
     size = path.stat().st_size if not problem else 0
     return RecordingReport(None if problem else path, size, time.monotonic() - start, problem)
 
 
-def _draw(folder: Path, path: Path, threads: int, timeout_s: float) -> str:
-    """Run the child; returns what went wrong, empty for nothing."""
-    command = [sys.executable, "-m", "sfmapp.viewer.record_process", str(folder.absolute()), str(path), str(threads)]
+def draw_in_child(kind: Kind, folder: Path, path: Path, threads: int, timeout_s: float) -> str:
+    """Draw what lies in folder into the file path; returns what went wrong, empty for nothing."""
+    arguments = [kind, str(folder.absolute()), str(path.absolute()), str(threads)]
+    command = [sys.executable, "-m", "sfmapp.viewer.record_process", *arguments]
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,

@@ -45,7 +45,7 @@ def set_stage(replay: Replay) -> Stage:
     direction = eye_direction(forward.mean(0))
     right = np.array([-direction[1], direction[0], 0.0])
     right /= np.linalg.norm(right)
-    bodies = [_body(replay, m, rotation) for m in range(num_models)]
+    bodies = [body_of(*_model(replay, m), rotation) for m in range(num_models)]
     size = float(np.linalg.norm(np.ptp(bodies[0], axis=0)))
     scale, shift = np.ones(num_models), np.zeros((num_models, 3))
     edge = float((bodies[0] @ right).max())
@@ -59,7 +59,7 @@ def set_stage(replay: Replay) -> Stage:
         bodies[m] = bodies[m] + shift[m]
         edge = float((bodies[m] @ right).max())
     eye, target = frame_view(np.concatenate(bodies), direction)
-    return Stage(rotation, scale, shift, _frustum_length(replay), eye, target)
+    return Stage(rotation, scale, shift, frustum_length(*_model(replay, 0)), eye, target)
 
 
 def _poses(replay: Replay, m: int) -> Array:
@@ -67,20 +67,23 @@ def _poses(replay: Replay, m: int) -> Array:
     return poses[~np.isnan(poses[:, 0])]
 
 
-def _body(replay: Replay, m: int, rotation: Array) -> Array:
-    """(N, 3) a model's cameras and the points of the box that holds 90 % of them along each axis, turned upright."""
-    centers = rigid3.center(_poses(replay, m)) @ rotation.T
-    xyz = replay.model_xyz[replay.model_ptr[m] : replay.model_ptr[m + 1]].astype(np.float64) @ rotation.T
+def _model(replay: Replay, m: int) -> tuple[Array, Array]:
+    """Centres of the cameras (R, 3) and points (N, 3) of a model."""
+    xyz = replay.model_xyz[replay.model_ptr[m] : replay.model_ptr[m + 1]].astype(np.float64)
+    return rigid3.center(_poses(replay, m)), xyz
+
+
+def body_of(centers: Array, xyz: Array, rotation: Array) -> Array:
+    """(N, 3) cameras and the points of the box that holds 90 % of them along each axis, turned upright."""
+    centers, xyz = centers @ rotation.T, xyz @ rotation.T
     if not len(xyz):
         return centers
     low, high = np.percentile(xyz, [5, 95], axis=0)
     return np.concatenate([centers, xyz[((xyz >= low) & (xyz <= high)).all(1)]])
 
 
-def _frustum_length(replay: Replay) -> float:
+def frustum_length(centers: Array, xyz: Array) -> float:
     """Neighbours should not hide each other, but neither should the cameras of a video be too small to see."""
-    centers = rigid3.center(_poses(replay, 0))
-    xyz = replay.model_xyz[: replay.model_ptr[1]].astype(np.float64)
     middle = np.median(xyz, axis=0) if len(xyz) else centers.mean(0)
     depth = float(np.median(np.linalg.norm(centers - middle, axis=1)))
     chosen = centers[:: max(1, len(centers) // 500)]
