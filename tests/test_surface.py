@@ -7,21 +7,24 @@ import signal
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
-from sfmapp.dense.scene import DenseScene, DenseView
+from sfmapp.dense.scene import DenseScene, DenseView, Region
 from sfmapp.errors import InterruptedRunError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.scene.mesh import face_vectors
-from sfmapp.surface import child, poisson, trim
+from sfmapp.scene.mesh import Mesh, face_vectors
+from sfmapp.surface import child, gaps, poisson, trim
 from sfmapp.surface.mesh import make_mesh
 from sfmapp.surface.options import SurfaceOptions
 from sfmapp.surface.patch_cloud import make_patch_cloud
+from sfmapp.surface.shade import shade
 
 SPACING = 0.1
 
@@ -95,16 +98,35 @@ def test_half_a_sphere_stays_open_and_ends_at_its_patches() -> None:
     assert np.abs(np.linalg.norm(mesh.xyz[mesh.xyz[:, 2] > 0.0], axis=1) - np.linalg.norm(xyz[0])).max() < SPACING
 
 
-def test_a_small_gap_is_closed_and_a_wide_one_stays_if_told_so() -> None:
+# away from the sides of the octree's box, and at one of them, where Poisson's surface leaves it
+@pytest.mark.parametrize("toward", [np.full(3, 3.0**-0.5), np.array([0.0, 0.0, -1.0])])
+def test_a_small_gap_is_closed_and_a_wide_one_stays_if_told_so(toward: NDArray) -> None:
     xyz, normal, rgb, size = sphere()
-    corner = np.full(3, 3.0**-0.5)  # away from the sides of the octree's box
-    gap = xyz @ corner > 0.94 * np.linalg.norm(xyz[0])  # 3 % of the sphere
-    args = (xyz[~gap], normal[~gap], rgb[~gap], size[~gap], None)
-    closed, report = make_mesh(*args, SurfaceOptions(max_hole=0.05))
+    radius = np.linalg.norm(xyz[0])
+    gap = xyz @ toward > 0.9 * radius  # 5 % of the sphere
+    args = (xyz[~gap], normal[~gap], rgb[~gap], size[~gap])
+    closed, report = make_mesh(*args, None, SurfaceOptions())
     assert report["num_rim_edges"] == 0
-    assert (closed.xyz @ corner).max() > 0.9 * np.linalg.norm(xyz[0])
-    _, report = make_mesh(*args, SurfaceOptions(max_hole=0.0))
+    assert 0.89 * radius < (closed.xyz @ toward).max() < 1.1 * radius
+    _, report = make_mesh(*args, None, SurfaceOptions(max_hole=0.0))
     assert report["num_rim_edges"] > 0
+    # a camera that looks into the gap would have shown what is there
+    facing = scene_of(*(looking_at(6.0 * side, np.zeros(3)) for side in (*np.eye(3), *-np.eye(3), toward)))
+    _, report = make_mesh(*args, facing, SurfaceOptions(max_hole=0.1))
+    assert report["num_rim_edges"] > 0
+
+
+def test_nothing_stands_out_of_the_region() -> None:
+    xyz, normal, rgb, size = sphere()
+    low, high = xyz.min(axis=0) - 1.0, xyz.max(axis=0) + 1.0
+    high[2] = 0.7 * xyz[:, 2].max()
+    region = Region(low, high)
+    kept = region.holds(xyz)
+    views = (looking_at(6.0 * side, np.zeros(3)) for side in (*np.eye(3), *-np.eye(3)))
+    scene = replace(scene_of(*views), region=region)
+    mesh, _ = make_mesh(xyz[kept], normal[kept], rgb[kept], size[kept], scene, SurfaceOptions())
+    assert region.holds(mesh.xyz).all()
+    assert mesh.xyz[:, 2].max() > high[2] - 1e-9
 
 
 def test_islands_are_dropped() -> None:
@@ -206,12 +228,68 @@ def test_the_result_does_not_depend_on_threads() -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
+def test_shading_shows_the_side_in_the_light() -> None:
+    xyz, normal, rgb, _ = sphere(2000)
+    hull_faces = ConvexHull(xyz).simplices.astype(np.int32)
+    inward = np.einsum("fc,fc->f", face_vectors(xyz, hull_faces), xyz[hull_faces].mean(axis=1)) < 0.0
+    hull_faces[inward] = hull_faces[inward][:, ::-1]
+    mesh = Mesh(xyz + 1e5, hull_faces, normal, rgb)
+    view = looking_at(np.array([0.0, -4.0, 0.0]), np.zeros(3))
+    pose = rigid3.compose(view.cam_from_world, rigid3.from_matrix(np.eye(3), [-1e5] * 3))
+    image = shade(mesh, view.k, pose, 64, 64)
+    radius = np.linalg.norm(xyz[0])
+    covered = (image < 255).any(axis=2).sum()
+    # the outline of a sphere is a circle: the cone that touches it, cut at the focal length
+    assert covered == pytest.approx(np.pi * (64.0 * radius / np.sqrt(16.0 - radius**2)) ** 2, rel=0.04)
+    assert (image[0, 0] == 255).all()
+    assert image[24, 24, 0] > image[32, 32, 0] > image[44, 44, 0]
+    colored = shade(mesh, view.k, pose, 64, 64, colored=True)
+    np.testing.assert_array_equal(colored[24, 32], [200, 100, 0])
+    np.testing.assert_array_equal(colored[40, 32], [0, 100, 200])
+
+
 def test_open3d_stays_out_of_this_process() -> None:
     code = (
         "import sys; import sfmapp.surface.mesh, sfmapp.formats.glb, sfmapp.formats.mesh_ply;"
         "sys.exit('open3d' in sys.modules)"
     )
     assert os.spawnv(os.P_WAIT, sys.executable, [sys.executable, "-c", code]) == 0
+
+
+def tube(height: float, step: float = 0.1) -> tuple[NDArray, NDArray]:
+    """A round tube of radius 1 from z = 0 up, with a roof: as triangles of about ``step``, open below."""
+    num, rings = round(2 * np.pi / step), round(height / step)
+    angle = np.arange(num) * 2 * np.pi / num
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(num)], axis=1)
+    xyz = np.concatenate([ring + np.array([0, 0, z]) for z in np.linspace(0.0, height, rings + 1)] + [[[0, 0, height]]])
+    i = np.arange(num * rings)
+    right = i - i % num + (i + 1) % num
+    top = np.arange(num * rings, num * (rings + 1))
+    roof = np.stack([top, np.roll(top, -1), np.full(num, len(xyz) - 1)], axis=1)
+    walls = [np.stack([i, right, right + num], axis=1), np.stack([i, right + num, i + num], axis=1)]
+    return xyz, np.concatenate([*walls, roof]).astype(np.int32)
+
+
+def test_a_tall_balloon_becomes_a_flat_lid() -> None:
+    xyz, faces = tube(5.0)
+    kept = (xyz[faces][:, :, 2] < 3.0 + 1e-9).all(axis=1)  # 6 pi of wall, and 5 pi of balloon over an opening of pi
+    moved, closed = gaps.close_gaps(xyz, faces, kept, None, 0.2)
+    assert closed.all()
+    np.testing.assert_array_equal(moved[np.unique(faces[kept])], xyz[np.unique(faces[kept])])
+    np.testing.assert_allclose(moved[:, 2].max(), 3.0, atol=1e-6)
+    assert np.linalg.norm(face_vectors(moved, faces[~kept]), axis=1).sum() == pytest.approx(np.pi, rel=0.01)
+    # too large a share; nothing is closed
+    moved, closed = gaps.close_gaps(xyz, faces, kept, None, 0.15)
+    np.testing.assert_array_equal(moved, xyz)
+    np.testing.assert_array_equal(closed, kept)
+
+
+def test_a_dome_stays_a_dome() -> None:
+    xyz, faces = tube(3.3)
+    kept = (xyz[faces][:, :, 2] < 3.0 + 1e-9).all(axis=1)
+    moved, closed = gaps.close_gaps(xyz, faces, kept, None, 0.2)
+    assert closed.all()
+    np.testing.assert_array_equal(moved, xyz)  # 1.6 pi over pi
 
 
 @pytest.mark.parametrize(

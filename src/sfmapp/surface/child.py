@@ -39,7 +39,8 @@ def run_child(
     with tempfile.TemporaryDirectory(prefix="sfmapp-surface-") as name:
         source, target, log = (Path(name) / file for file in ("input.npz", "output.npz", "log"))
         np.savez(source, allow_pickle=False, **arrays)
-        command = [sys.executable, "-m", module, str(source), str(target), *map(str, arguments)]
+        # -P: whatever lies in the working folder is not imported
+        command = [sys.executable, "-P", "-m", module, str(source), str(target), *map(str, arguments)]
         try:
             usage = run_measured(command, log, on_tick=events.raise_if_cancelled)
         except OSError as error:

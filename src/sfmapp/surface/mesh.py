@@ -12,10 +12,11 @@ from sfmapp.dense.scene import DenseScene
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.scene.mesh import Mesh, vertex_normals
+from sfmapp.surface.gaps import close_gaps
 from sfmapp.surface.options import SurfaceOptions
 from sfmapp.surface.patch_cloud import make_patch_cloud
 from sfmapp.surface.poisson import ClosedSurface, depth_for, poisson
-from sfmapp.surface.trim import Surroundings, in_view, look_around, rim, with_holes_closed, without_islands
+from sfmapp.surface.trim import Surroundings, in_view, look_around, rim, without_islands
 
 STAGE = "mesh"
 
@@ -62,8 +63,11 @@ def make_mesh(
     events.advanced(STAGE, message="trimming")
     around = look_around(surface.xyz, vertex_normals(surface.xyz, surface.faces), patches, threads)
     events.advanced(STAGE)
-    kept, funnel = _trim(surface, around, scene, options)
-    mesh = _cut(surface, around, kept)
+    moved, kept, funnel = _trim(surface, around, scene, options)
+    if scene is not None and scene.region is not None:
+        # what bulges out of the region is pressed flat onto its sides: a closed surface stays closed
+        moved = moved.clip(scene.region.low, scene.region.high)
+    mesh = _cut(moved, surface.faces, around, kept)
     report = {
         "depth": depth,
         "spacing": patches.median_spacing,
@@ -86,8 +90,8 @@ def make_mesh(
 
 def _trim(
     surface: ClosedSurface, around: Surroundings, scene: DenseScene | None, options: SurfaceOptions
-) -> tuple[NDArray[np.bool_], list[dict[str, Any]]]:
-    """The faces to keep (F,), and how many were left after each step."""
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[dict[str, Any]]]:
+    """Where the vertices go (N, 3), the faces to keep (F,), and how many were left after each step."""
     faces = surface.faces
     funnel = [{"name": "Poisson", "count": len(faces)}]
 
@@ -100,22 +104,22 @@ def _trim(
             )
         return kept
 
-    kept = np.ones(len(faces), np.bool_)
+    kept: NDArray[np.bool_] = np.ones(len(faces), np.bool_)
     if options.trim_density > 0.0:
-        dense = np.asarray(surface.density >= np.quantile(surface.density, options.trim_density))
-        kept = keep("dense enough", dense[faces].all(axis=1))
-    near = np.asarray(around.distance <= options.trim_distance)
-    kept = keep("near patches", kept & near[faces].all(axis=1))
+        sparse = surface.density < np.quantile(surface.density, options.trim_density)
+        kept = keep("dense enough", kept & ~sparse[faces].any(axis=1))
+    far = around.distance > options.trim_distance
+    kept = keep("near patches", kept & ~far[faces].any(axis=1))
     kept = keep("on the side of the patches", kept & ~around.is_backside[faces].all(axis=1))
     if scene is not None:
         kept = keep("in view", kept & in_view(surface.xyz, faces, scene))
     kept = keep("not in islands", without_islands(surface.xyz, faces, kept, options.min_island))
-    return keep("holes closed", with_holes_closed(surface.xyz, faces, kept, options.max_hole)), funnel
+    xyz, kept = close_gaps(surface.xyz, faces, kept, scene, options.max_hole)
+    return xyz, keep("gaps closed", kept), funnel
 
 
-def _cut(surface: ClosedSurface, around: Surroundings, kept: NDArray[np.bool_]) -> Mesh:
+def _cut(xyz: NDArray[np.float64], faces: NDArray[np.int32], around: Surroundings, kept: NDArray[np.bool_]) -> Mesh:
     """The kept faces (F,) with the vertices they need."""
-    used, corners = np.unique(surface.faces[kept], return_inverse=True)
-    faces = corners.reshape(-1, 3).astype(np.int32)
-    xyz = surface.xyz[used]
-    return Mesh(xyz, faces, vertex_normals(xyz, faces), around.rgb[used])
+    used, corners = np.unique(faces[kept], return_inverse=True)
+    kept_faces = corners.reshape(-1, 3).astype(np.int32)
+    return Mesh(xyz[used], kept_faces, vertex_normals(xyz[used], kept_faces), around.rgb[used])

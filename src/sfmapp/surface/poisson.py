@@ -11,6 +11,7 @@ from sfmapp.errors import NoReconstructionError
 from sfmapp.evaluation.measured import ProcessUsage
 from sfmapp.events import Events
 from sfmapp.surface.child import run_child
+from sfmapp.surface.trim import pieces, rim
 
 # open3d's Poisson has crashed with more than one
 THREADS = 1
@@ -23,7 +24,7 @@ ADVICE = "try a smaller surface.depth or fewer patches (a coarser dense.level)"
 
 @dataclass(frozen=True)
 class ClosedSurface:
-    """What Poisson makes, hallucinated parts and all.
+    """What Poisson makes, hallucinated parts and all, without any rim.
 
     Attributes:
         xyz: (N, 3) float64, world.
@@ -73,8 +74,22 @@ def poisson(
     arrays = {"xyz": ((xyz - center) / scale).astype(np.float32), "normal": np.asarray(normal, np.float32)}
     module = "sfmapp.surface.poisson_child"
     found, usage = run_child(
-        module, "Poisson reconstruction", arrays, (depth, THREADS), ADVICE, events or Events()
+        module, "Poisson reconstruction", arrays, (depth, BOX_SCALE, THREADS), ADVICE, events or Events()
     )  # fmt: skip
     if len(found["faces"]) == 0:
         raise NoReconstructionError("Poisson reconstruction: found no surface", ADVICE)
-    return ClosedSurface(found["xyz"] * scale + center, found["faces"], found["density"], usage)
+    xyz, faces = _with_lids(found["xyz"] * scale + center, found["faces"])
+    density = np.pad(found["density"], (0, len(xyz) - len(found["xyz"])))
+    return ClosedSurface(xyz, faces, density, usage)
+
+
+def _with_lids(xyz: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """The surface closed where it leaves the octree's box: each loop of its rim gets a fan about its centre."""
+    edges = rim(faces)
+    if not len(edges):
+        return xyz, faces
+    loop = pieces(edges, len(xyz))
+    counts = np.bincount(loop)
+    centers = np.stack([np.bincount(loop, xyz[edges[:, 0], axis]) / counts for axis in range(3)], axis=1)
+    fans = np.column_stack([edges[:, ::-1], len(xyz) + loop])
+    return np.concatenate([xyz, centers]), np.concatenate([faces, fans]).astype(np.int32)

@@ -1,4 +1,4 @@
-"""Screened Poisson in a process of its own: ``python -m sfmapp.surface.poisson_child INPUT OUTPUT DEPTH THREADS``.
+"""Screened Poisson in a process of its own, ``python -m sfmapp.surface.poisson_child`` with the arguments of its main.
 
 open3d's Poisson has ended its whole process for some inputs; here that is an exit code. The files are npz (see
 :mod:`sfmapp.surface.poisson`).
@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 
 
-def main(source: str, target: str, depth: str, threads: str) -> None:
+def main(source: str, target: str, depth: str, scale: str, threads: str) -> None:
     """From oriented points to a surface, whole and untrimmed."""
     import numpy as np
 
@@ -24,7 +24,7 @@ def main(source: str, target: str, depth: str, threads: str) -> None:
     cloud.normals = open3d.utility.Vector3dVector(np.asarray(normal, np.float64))
     del xyz, normal
     surface, density = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
-        cloud, depth=int(depth), n_threads=int(threads)
+        cloud, depth=int(depth), scale=float(scale), n_threads=int(threads)
     )
     np.savez(
         target, allow_pickle=False, xyz=np.asarray(surface.vertices), faces=np.asarray(surface.triangles, np.int32),

@@ -70,13 +70,15 @@ def in_view(xyz: NDArray[np.float64], faces: NDArray[np.int32], scene: DenseScen
 
 
 def pieces(faces: NDArray[np.int32], num_vertices: int) -> NDArray[np.int32]:
-    """(F,) number of the piece that each face belongs to: faces hang together that share a vertex."""
+    """(F,) number of the piece that each face (F, 3), or edge (F, 2), belongs to: those hang together that share a
+    vertex."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    start, end = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
+    start, end = faces[:, :-1].ravel(), faces[:, 1:].ravel()
     graph = coo_array((np.ones(len(start), np.bool_), (start, end)), (num_vertices, num_vertices))
-    return np.asarray(connected_components(graph, directed=False)[1][faces[:, 0]], np.int32)
+    labels = connected_components(graph, directed=False)[1][faces[:, 0]]
+    return np.unique(labels, return_inverse=True)[1].astype(np.int32)
 
 
 def without_islands(
@@ -94,34 +96,9 @@ def without_islands(
     return out
 
 
-def with_holes_closed(
-    xyz: NDArray[np.float64], faces: NDArray[np.int32], kept: NDArray[np.bool_], largest_share: float
-) -> NDArray[np.bool_]:
-    """``kept`` (F,) with the gaps in it that have at most a share of its area: where Poisson closed an all-round
-    capture it stays closed, while the balloon behind an open surface, which is about as large, does not come back.
-
-    A gap is a piece of what was cut off that meets nothing but what is kept: not the edge of the octree's box.
-    """
-    idx = np.flatnonzero(~kept)
-    if not len(idx) or largest_share == 0.0:
-        return kept
-    piece = pieces(faces[idx], len(xyz))
-    num_pieces = int(piece.max()) + 1
-    area = np.bincount(piece, np.linalg.norm(face_vectors(xyz, faces[idx]), axis=1), num_pieces)
-    kept_area = float(np.linalg.norm(face_vectors(xyz, faces[kept]), axis=1).sum())
-    is_kept, is_rim = np.zeros(len(xyz), np.bool_), np.zeros(len(xyz), np.bool_)
-    is_kept[faces[kept]] = True
-    is_rim[rim(faces)] = True
-    meets = np.bincount(piece, is_kept[faces[idx]].any(axis=1), num_pieces) > 0
-    at_rim = np.bincount(piece, is_rim[faces[idx]].any(axis=1), num_pieces) > 0
-    out = kept.copy()
-    out[idx] = (meets & ~at_rim & (area <= largest_share * kept_area))[piece]
-    return out
-
-
 def rim(faces: NDArray[np.int32]) -> NDArray[np.int32]:
-    """(R, 2) edges, as pairs of vertices, that have a face on one side only."""
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    key = edges[:, 0].astype(np.int64) << 32 | edges[:, 1]
-    _, first, counts = np.unique(key, return_index=True, return_counts=True)
+    """(R, 2) edges, as pairs of vertices in the order of their face, that have a face on one side only."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    _, first, counts = np.unique(low.astype(np.int64) << 32 | high, return_index=True, return_counts=True)
     return np.asarray(edges[first[counts == 1]])
