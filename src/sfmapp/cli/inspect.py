@@ -23,10 +23,22 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
     parser = commands.add_parser(
         "validate", help="compare with pycolmap on the same photographs, and with the truth",
-        description="Run pycolmap on the same photographs and print both results side by side.",
+        description="Run pycolmap on the same photographs and print both results side by side; with --truth-cloud, "
+        "score the dense cloud and the mesh instead.",
     )  # fmt: skip
-    parser.add_argument("output", metavar="OUT", type=Path, help="folder of a run")
+    parser.add_argument("output", metavar="OUT", type=Path, help="folder of a run; with --truth-cloud also a PLY")
     parser.add_argument("--truth", metavar="FILE", type=Path, help="COLMAP model, cameras.json or TUM trajectory")
+    parser.add_argument(
+        "--truth-cloud", metavar="PLY", type=Path,
+        help="true cloud or mesh: accuracy, completeness and F-score at 1, 2 and 5 times a distance; with --truth the "
+        "result is first aligned by its cameras",
+    )  # fmt: skip
+    parser.add_argument(
+        "--distance",
+        metavar="D",
+        type=float,
+        help="in units of the true cloud; default: a pixel at the patches, median",
+    )
     add_output_flags(parser)
     parser.set_defaults(run=_validate)
 
@@ -46,10 +58,20 @@ def _view(args: argparse.Namespace) -> int:
 
 
 def _validate(args: argparse.Namespace) -> int:
-    from sfmapp.pipelines.validate import validate
+    from sfmapp.errors import UsageError
+    from sfmapp.pipelines.validate import Validation, validate
+    from sfmapp.pipelines.validate_cloud import CloudValidation, validate_cloud
 
+    if args.distance is not None and args.truth_cloud is None:
+        raise UsageError("--distance is of no use without --truth-cloud")
     with listening(args) as events:
-        result = validate(args.output, args.truth, events=events)
+        result: Validation | CloudValidation
+        if args.truth_cloud is not None:
+            result = validate_cloud(
+                args.output, args.truth_cloud, truth_poses=args.truth, distance=args.distance, events=events
+            )
+        else:
+            result = validate(args.output, args.truth, events=events)
     if args.json:
         print_json({"exit_code": 0, **result.to_dict()})
     else:
