@@ -6,10 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
+from sfmapp.report.dense_html import dense_section
 from sfmapp.report.page import check_table, failure_box, log_table, render_page, table, usage_table
 from sfmapp.report.top_view import top_view_svg
 
 if TYPE_CHECKING:
+    from sfmapp.report.dense_pictures import PictureRow
     from sfmapp.scene.reconstruction import Reconstruction
 
 FUNNEL = (
@@ -24,12 +26,23 @@ FUNNEL = (
 )
 
 
-def render_html(report: Mapping[str, Any], model: Reconstruction | None) -> str:
-    """The page of a report; with the largest model it shows a view from above."""
+def render_html(
+    report: Mapping[str, Any], model: Reconstruction | None, dense_pictures: Sequence[PictureRow] = ()
+) -> str:
+    """The page of a report.
+
+    Args:
+        report: as the run writes it; where it has an entry ``dense``, of
+            :func:`~sfmapp.report.dense_document.dense_document`, the page has a part on it.
+        model: the largest model, for a view from above.
+        dense_pictures: of the patches.
+    """
     body = [_headline(report), failure_box(report["outcome"]), check_table(report["checks"])]
     if model is not None:
         note = "Points and cameras of the largest model; each triangle opens where its camera looks."
         body.append(f'<h2>From above</h2>{top_view_svg(model)}<p class="dim">{note}</p>')
+    if report.get("dense") is not None:
+        body.append(dense_section(report["dense"], dense_pictures))
     body.append(_failed(report["images"]) + _skipped(report["skipped"]))
     body.append("<h2>Images</h2>" + _images(report["images"]))
     body.append("<h2>Cameras</h2>" + _cameras(report["cameras"]))

@@ -16,13 +16,16 @@ h1{font-size:1.5rem;margin-bottom:.2rem}h2{font-size:1.1rem;margin-top:2rem}h3{f
 table{border-collapse:collapse;font-size:.88rem;font-variant-numeric:tabular-nums}
 .wide{overflow-x:auto}
 th,td{padding:.25rem .6rem;border-bottom:1px solid #8884;text-align:right;white-space:nowrap}
-th{font-weight:600;vertical-align:bottom}td.t,th.t{text-align:left}td.w{text-align:left;white-space:normal;min-width:18rem}
+th{font-weight:600;vertical-align:bottom;white-space:normal}td.t,th.t{text-align:left}td.w{text-align:left;white-space:normal;min-width:18rem}
 .green::before,.amber::before,.red::before{content:"";display:inline-block;width:.75rem;height:.75rem;
 border-radius:50%;margin-right:.5rem}
 .green::before{background:#2a9d4a}.amber::before{background:#e0a100}.red::before{background:#d1372c}
 .failure{border-left:.3rem solid #d1372c;padding:.3rem 1rem;background:#d1372c18}
 .dim{color:#888}svg{width:100%;max-height:32rem;border:1px solid #8884}details{margin:.5rem 0}
 .plot{max-height:none}.plot text,.view text{fill:currentColor;font-size:13px}.grid{stroke:#8884}
+.bar{fill:#4a7fd4}.row{display:grid;grid-template-columns:repeat(auto-fit,minmax(16rem,1fr));gap:.8rem}
+.row h3{margin:.4rem 0}.large{grid-template-columns:repeat(auto-fit,minmax(28rem,1fr))}
+figure{margin:0}figure img{width:100%;display:block}figcaption{font-size:.85rem;color:#888;padding:.2rem 0}
 """
 
 

@@ -64,6 +64,41 @@ def plot_svg(x: Array, curves: Sequence[Curve], gaps: Sequence[tuple[float, floa
     return f'<svg class="plot" viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}">{"".join(parts)}</svg>'
 
 
+def bars_svg(edges: Sequence[float], counts: Sequence[int], x_label: str) -> str:
+    """A histogram of counts (N) between ascending edges (N + 1), a third of a page wide."""
+    width, height, left, bottom = 360.0, 190.0, 56.0, 36.0
+    low, span = edges[0], (edges[-1] - edges[0]) or 1.0
+    y_ticks = [tick for tick in ticks(0.0, float(max([*counts, 1])), 3) if tick == int(tick)]
+    top = max(float(max([*counts, 1])), y_ticks[-1])
+
+    def page_x(value: float) -> float:
+        return left + (value - low) / span * (width - left - 10.0)
+
+    def page_y(value: float) -> float:
+        return height - bottom - value / top * (height - bottom - TOP)
+
+    parts = []
+    for tick in y_ticks:
+        parts.append(f'<path class="grid" d="M{left} {page_y(tick):.1f}H{width - 10.0}"/>')
+        parts.append(f'<text x="{left - 6}" y="{page_y(tick) + 4:.1f}" text-anchor="end">{_short(tick)}</text>')
+    for first, last, count in zip(edges[:-1], edges[1:], counts, strict=True):
+        x, y = page_x(first), page_y(count)
+        shape = f'x="{x:.1f}" y="{y:.1f}" width="{page_x(last) - x - 1.0:.1f}" height="{page_y(0.0) - y:.1f}"'
+        parts.append(f'<rect class="bar" {shape}><title>{count}</title></rect>')
+    for tick in ticks(low, edges[-1], 6):
+        parts.append(f'<text x="{page_x(tick):.1f}" y="{height - 20:.0f}" text-anchor="middle">{tick:g}</text>')
+    parts.append(f'<text x="{width - 10}" y="{height - 4:.0f}" text-anchor="end">{escape(x_label)}</text>')
+    return f'<svg class="plot" viewBox="0 0 {width:.0f} {height:.0f}">{"".join(parts)}</svg>'
+
+
+def _short(count: float) -> str:
+    """A round number in the fewest characters: 200k, 1.5M."""
+    for factor, letter in ((1e6, "M"), (1e3, "k")):
+        if count >= factor:
+            return f"{count / factor:g}{letter}"
+    return f"{count:g}"
+
+
 def ticks(low: float, high: float, about: int) -> list[float]:
     """Round numbers from low to high, about so many: steps of 1, 2 or 5 times a power of ten."""
     span = high - low

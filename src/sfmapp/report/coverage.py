@@ -1,0 +1,137 @@
+"""How much of each photograph patches cover, and why the rest is bare."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.dense.scene import DenseScene, DenseView, Patches
+from sfmapp.geometry import rigid3
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+# grey values of a block that vary less, as a standard deviation, are plain to the eye and to correlation
+PLAIN = 3.0
+REASONS = {
+    "out_of_sight": "other photographs do not show it",
+    "plain": "plain: nothing there to match",
+    "unmatched": "seen but not matched: hidden, glossy or moving, or at too flat an angle",
+}
+# photographs below are listed with what is missing
+GOOD_SHARE = 0.8
+
+
+def coverage(scene: DenseScene, patches: Patches, *, block_px: int = 4, min_views: int = 3) -> list[dict[str, Any]]:
+    """What share of each photograph's blocks holds a patch that trusts it, and what became of the others.
+
+    Args:
+        scene: the views; what their masks leave out does not count.
+        patches: of them.
+        block_px: side of the square blocks, in pixels of the views: several cells, so that a gap is no accident.
+        min_views: photographs that have to show a place.
+
+    Returns:
+        A row for each view: ``name``, ``num_neighbors``, ``num_patches`` (whose reference it is), ``num_trusting``
+        (patches that trust it), ``coverage``, the shares ``out_of_sight``, ``plain`` and ``unmatched``, which add up
+        to one with it, and ``reason``, the largest of these three in words, empty where the photograph is well covered.
+    """
+    poses = scene.cam_from_world
+    trusting = np.repeat(np.arange(len(patches)), patches.num_views)
+    rows = []
+    for v, view in enumerate(scene.views):
+        mine = trusting[patches.view_idx == v]
+        wanted, covered, depth = _blocks(view, patches.xyz[mine], block_px)
+        is_plain = _deviation(view, block_px) < PLAIN
+        seen_by = 1 + _num_seeing(scene, poses, v, depth, block_px)
+        out_of_sight = wanted & ~covered & (seen_by < min_views)
+        plain = wanted & ~covered & ~out_of_sight & is_plain
+        count = max(1, int(wanted.sum()))
+        shares = {
+            "coverage": float((wanted & covered).sum() / count),
+            "out_of_sight": float(out_of_sight.sum() / count),
+            "plain": float(plain.sum() / count),
+            "unmatched": float((wanted & ~covered & ~out_of_sight & ~plain).sum() / count),
+        }
+        rows.append(
+            {
+                "name": view.name,
+                "num_neighbors": int((scene.neighbors[v] >= 0).sum()),
+                "num_patches": int((patches.reference_idx == v).sum()),
+                "num_trusting": len(mine),
+                **shares,
+                "reason": _reason(shares),
+            }
+        )
+    return rows
+
+
+def _reason(shares: dict[str, float]) -> str:
+    if shares["coverage"] >= GOOD_SHARE:
+        return ""
+    return REASONS[max(REASONS, key=lambda name: shares[name])]
+
+
+def _blocks(view: DenseView, xyz: Array, block_px: int) -> tuple[Bools, Bools, Array]:
+    """Of each block (R, C): whether it counts, whether it is covered, and its depth or that of the nearest covered."""
+    import cv2
+
+    shape = (-(-view.height // block_px), -(-view.width // block_px))
+    wanted = np.ones(shape, np.bool_) if view.mask is None else _block_means(view.mask, block_px) > 0.5
+    rotation = rigid3.rotation_matrix(view.cam_from_world)
+    place = xyz @ rotation.T + view.cam_from_world[4:]
+    place = place[place[:, 2] > 0.0]
+    column = np.floor((place[:, 0] / place[:, 2] * view.k[0] + view.k[2]) / block_px).astype(np.int64)
+    row = np.floor((place[:, 1] / place[:, 2] * view.k[1] + view.k[3]) / block_px).astype(np.int64)
+    inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
+    depth = np.full(shape, np.nan)
+    depth[row[inside], column[inside]] = place[inside, 2]
+    covered = np.isfinite(depth)
+    if not covered.any():
+        return wanted, covered, depth
+    # labels number the covered blocks, which are the zeros of the image
+    free = (~covered).astype(np.uint8)
+    label = cv2.distanceTransformWithLabels(free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
+    of_label = np.zeros(label.max() + 1)
+    of_label[label[covered]] = depth[covered]
+    return wanted, covered, of_label[label]
+
+
+def _num_seeing(scene: DenseScene, poses: Array, v: int, depth: Array, block_px: int) -> NDArray[np.int64]:
+    """(R, C) neighbours of view v whose pictures the middle of each block falls into, at the depth (R, C) it has."""
+    count = np.zeros(depth.shape, np.int64)
+    if np.isnan(depth).any():
+        return count
+    fx, fy, cx, cy = scene.views[v].k
+    y, x = (np.indices(depth.shape) + 0.5) * block_px
+    place = np.stack([(x - cx) / fx * depth, (y - cy) / fy * depth, depth], axis=-1)
+    world = rigid3.apply(rigid3.inverse(poses[v]), place.reshape(-1, 3))
+    for m in scene.neighbors[v][scene.neighbors[v] >= 0]:
+        other = scene.views[m]
+        seen = rigid3.apply(poses[m], world)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = seen[:, 0] / seen[:, 2] * other.k[0] + other.k[2]
+            w = seen[:, 1] / seen[:, 2] * other.k[1] + other.k[3]
+        inside = (seen[:, 2] > 0.0) & (u >= 0.0) & (u < other.width) & (w >= 0.0) & (w < other.height)
+        count += inside.reshape(depth.shape)
+    return count
+
+
+def _deviation(view: DenseView, block_px: int) -> Array:
+    """(R, C) standard deviation of the grey values in and right around each block."""
+    import cv2
+
+    grey = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY).astype(np.float64)
+    side = (2 * block_px + 1,) * 2
+    mean, square = cv2.blur(grey, side), cv2.blur(grey * grey, side)
+    return np.sqrt(np.maximum(_block_means(square - mean * mean, block_px), 0.0))
+
+
+def _block_means(values: NDArray[Any], block_px: int) -> Array:
+    """(R, C) means of an image (H, W) over blocks; those at the right and lower edges may be smaller."""
+    rows, columns = (np.arange(0, side, block_px) for side in values.shape)
+    total = np.add.reduceat(np.add.reduceat(values.astype(np.float64), rows, axis=0), columns, axis=1)
+    sizes = [np.diff(np.append(edge, side)) for edge, side in zip((rows, columns), values.shape, strict=True)]
+    return np.asarray(total / np.outer(*sizes))
