@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sfmapp.cli.main import main
 from sfmapp.dense.scene import DenseScene, DenseView, Patches
 from sfmapp.geometry import rigid3
 from sfmapp.scene.mesh import Mesh, vertex_normals
+from sfmapp.viewer import view as view_module
 from sfmapp.viewer.dense_recording import record_dense
 from sfmapp.viewer.dense_replay import MAX_STEPS, make_dense_replay, thinned, wave_steps
 
@@ -202,3 +204,19 @@ def test_photographs_are_shrunk_with_their_cameras() -> None:
     )
     assert replay.view_size.tolist() == [[640, 384]] * 4
     np.testing.assert_allclose(replay.view_k[0], 3.2 * scene.views[0].k)
+
+
+def test_view_shows_the_surface_where_there_is_one_and_names_the_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown: list[Path] = []
+    monkeypatch.setattr(view_module, "view", lambda recording, **_: shown.append(recording))
+    sparse, dense = tmp_path / "recording.rrd", tmp_path / "dense" / "recording.rrd"
+    sparse.touch()
+    assert main(["view", str(tmp_path)]) == 0
+    dense.parent.mkdir()
+    dense.touch()
+    assert main(["view", str(tmp_path)]) == 0
+    assert f"sfmapp view {sparse}" in capsys.readouterr().out
+    assert main(["view", str(sparse)]) == 0
+    assert shown == [sparse, dense, sparse]

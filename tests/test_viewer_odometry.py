@@ -320,6 +320,6 @@ def test_a_live_viewer_is_for_this_machine_alone_and_ends_whole(tmp_path: Path) 
 
 
 def test_the_commands_of_live_viewers_listen_on_this_machine_alone() -> None:
-    for command in (window_command(port="1234"), server_command(web_port=9090, data_port=9876)):
+    for command in (window_command(None, "1234"), server_command(None, 9090, 9876)):
         assert command[command.index("--bind") + 1] == "127.0.0.1"
         assert not any(word.endswith(".rrd") for word in command)

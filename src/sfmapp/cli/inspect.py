@@ -11,11 +11,11 @@ from sfmapp.cli.common import add_output_flags, listening, print_json
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the commands of this family to the parser."""
     parser = commands.add_parser(
-        "view", help="open the recordings of a run in rerun",
-        description="Open OUT/recording.rrd and OUT/dense/recording.rrd, as far as they are there, in rerun's viewer;"
-        " serve them on 127.0.0.1 where there is no display.",
+        "view", help="open the recording of a run in rerun",
+        description="Open OUT/dense/recording.rrd or, where there is none, OUT/recording.rrd in rerun's viewer; serve "
+        "it on 127.0.0.1 where there is no display.",
     )  # fmt: skip
-    parser.add_argument("output", metavar="OUT", type=Path, help="folder of a run")
+    parser.add_argument("output", metavar="OUT", type=Path, help="folder of a run, or a recording in it (.rrd)")
     parser.add_argument("--serve", action="store_true", help="for a browser on this machine, even if there is a screen")
     parser.add_argument("--port", metavar="N", type=int, default=9090, help="where to serve; default: 9090")
     add_output_flags(parser)
@@ -44,17 +44,27 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _view(args: argparse.Namespace) -> int:
-    from sfmapp.errors import InputError
-    from sfmapp.pipelines.workspace import read_manifest
     from sfmapp.viewer.view import view
 
-    read_manifest(args.output)
-    first = args.output / "recording.rrd"
-    recordings = [path for path in (first, args.output / "dense" / "recording.rrd") if path.is_file()]
-    if not recordings:
-        raise InputError(f"{first} does not exist", "run it again with a recording")
-    view(*recordings, serve=args.serve or None, web_port=args.port, tell=lambda line: print(line, flush=True))
+    recording, *others = _recordings(args.output)
+    for other in others:
+        print(f"there is another: sfmapp view {other}", flush=True)
+    view(recording, serve=args.serve or None, web_port=args.port, tell=lambda line: print(line, flush=True))
     return 0
+
+
+def _recordings(output: Path) -> list[Path]:
+    """A recording that is named, or those of a run, the one that shows most of it first."""
+    from sfmapp.errors import InputError
+    from sfmapp.pipelines.workspace import read_manifest
+
+    if output.suffix == ".rrd":
+        return [output]
+    found = [path for path in (output / "dense" / "recording.rrd", output / "recording.rrd") if path.is_file()]
+    if not found:
+        read_manifest(output)
+        raise InputError(f"{output / 'recording.rrd'} does not exist", "run it again with a recording")
+    return found
 
 
 def _validate(args: argparse.Namespace) -> int:

@@ -25,41 +25,39 @@ _NEVER_OPENED_S = 10.0
 
 
 def view(
-    *recordings: Path, serve: bool | None = None, web_port: int = WEB_PORT, tell: Callable[[str], None] | None = None
+    recording: Path, *, serve: bool | None = None, web_port: int = WEB_PORT, tell: Callable[[str], None] | None = None
 ) -> None:
-    """Show recordings and wait until the viewer is closed, or the server stopped with Ctrl-C.
+    """Show a recording and wait until the viewer is closed, or the server stopped with Ctrl-C.
 
     Nothing is reachable from other machines either way. Over ssh: ``ssh -L 9090:127.0.0.1:9090 -L
     9876:127.0.0.1:9876 MACHINE`` there, then the address that is told here.
 
     Args:
-        recordings: ``.rrd`` files; the viewer has a list of them.
+        recording: a ``.rrd`` file.
         serve: for a browser instead of in a window; None: if there is no screen, or no window could be opened on it.
         web_port: where to serve it; another free one is taken if it is in use.
         tell: given a line on how to reach it.
 
     Raises:
-        InputError: a file does not exist.
+        InputError: the file does not exist.
         SfmError: the viewer failed.
     """
-    for recording in recordings:
-        if not recording.is_file():
-            raise InputError(f"{recording} does not exist")
+    if not recording.is_file():
+        raise InputError(f"{recording} does not exist")
     if serve is None:
         serve = not has_screen()
-        if not serve and _open_window(recordings):
+        if not serve and _open_window(recording):
             return
     elif not serve:
-        if not _open_window(recordings):
+        if not _open_window(recording):
             raise SfmError("rerun could not open a window", "look at it in a browser: serve it")
         return
     web_port, data_port = free_port(web_port), free_port(DATA_PORT)
     if tell is not None:
-        names = ", ".join(map(str, recordings))
-        tell(f"serving {names} at {server_url(web_port, data_port)} for browsers on this machine; Ctrl-C ends it")
-    code = _run(server_command(*recordings, web_port=web_port, data_port=data_port))
+        tell(f"serving {recording} at {server_url(web_port, data_port)} for browsers on this machine; Ctrl-C ends it")
+    code = _run(server_command(recording, web_port, data_port))
     if code not in (0, -signal.SIGINT, 130):
-        raise SfmError(f"rerun ended with code {code}", f"try: rerun {' '.join(map(str, recordings))}")
+        raise SfmError(f"rerun ended with code {code}", f"try: rerun {recording}")
 
 
 @dataclass
@@ -103,7 +101,7 @@ def open_live_viewer(*, tell: Callable[[str], None], serve: bool | None = None) 
     """
     serve = not has_screen() if serve is None else serve
     data_port, web_port = free_port(DATA_PORT), free_port(WEB_PORT)
-    command = server_command(web_port=web_port, data_port=data_port) if serve else window_command(port=str(data_port))
+    command = server_command(None, web_port, data_port) if serve else window_command(None, str(data_port))
     # a session of its own: the window outlives the run, and a Ctrl-C for the run is none for the viewer
     process = subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
@@ -119,15 +117,15 @@ def has_screen() -> bool:
     return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def window_command(*recordings: Path, port: str = "auto") -> list[str]:
+def window_command(recording: Path | None, port: str = "auto") -> list[str]:
     """The native viewer. It, too, listens for data: on this machine only, on any free port."""
-    return [*_RERUN, "--bind", HOST, "--port", port, *map(str, recordings)]
+    return [*_RERUN, "--bind", HOST, "--port", port, *([str(recording)] if recording else [])]
 
 
-def server_command(*recordings: Path, web_port: int, data_port: int) -> list[str]:
+def server_command(recording: Path | None, web_port: int, data_port: int) -> list[str]:
     """The web viewer and the data it fetches, each on a port of this machine only."""
     ports = ["--web-viewer-port", str(web_port), "--port", str(data_port)]
-    return [*_RERUN, "--serve-web", "--bind", HOST, *ports, *map(str, recordings)]
+    return [*_RERUN, "--serve-web", "--bind", HOST, *ports, *([str(recording)] if recording else [])]
 
 
 def server_url(web_port: int, data_port: int) -> str:
@@ -152,10 +150,10 @@ def free_port(preferred: int) -> int:
 _RERUN = (sys.executable, "-m", "rerun_cli")
 
 
-def _open_window(recordings: Sequence[Path]) -> bool:
-    """Show them in a window until that is closed; False if there was none."""
+def _open_window(recording: Path) -> bool:
+    """Show it in a window until that is closed; False if there was none."""
     start = time.monotonic()
-    code = _run(window_command(*recordings))
+    code = _run(window_command(recording))
     return code in (0, -signal.SIGINT, 130) or time.monotonic() - start > _NEVER_OPENED_S
 
 
