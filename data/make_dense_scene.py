@@ -17,7 +17,7 @@ a PINHOLE of 1600x1200; the photographs are noisy (3 grey levels) JPEGs. OUT rec
                        its label (red: 1 railing, 0 rest) and the bar's width in pixels (green)
     scene.json         gsd: metres per pixel at the median depth of the median view; bbox: [low, high]
 
-See make_sample.py for what mitsuba needs. About six CPU minutes each.
+See make_sample.py for what mitsuba needs. Six to ten CPU minutes each.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ from sfmapp.dense.patch_kernels import cell_of, plane_in_view, project
 RADIUS_CELLS, FALL_OFF_PX = 3, 1.5
 # no neighbour is trusted further than this share of a pixel of depth, whatever its own deviation says
 FLOOR_PX = 0.05
+LEAST_FLOOR = 0.01
 # slopes of the patch itself count as if measured over this many pixels
 SLOPE_BASE_PX = 1.5
 
@@ -64,7 +65,8 @@ def _fit(images, store, cells, p, r, g, u, v, z, wu, wv):  # type: ignore[no-unt
     reach = f32(2.0 * NEAR) * cell_size(images, store, p)
     # what a pixel along the surface is in inverse depth
     floor = FLOOR_PX * np.float64(store.size[p]) / (z * z)
-    own = _deviation(images, store, p, r, u, v, 1.0 / z)
+    # photographs without noise tell a deviation of nothing, which is nothing to divide by
+    own = max(_deviation(images, store, p, r, u, v, 1.0 / z), LEAST_FLOOR * floor)
     slope = SLOPE_BASE_PX * SLOPE_BASE_PX / (own * own + floor * floor)
     n00 = n01 = n02 = g0 = 0.0
     n11 = n22 = slope
