@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.dense.arrays import Limits, Store
-from sfmapp.dense.growth import Growth
+from sfmapp.dense.growth import Growth, inverse_depth_range
 from sfmapp.dense.options import DenseOptions
 from sfmapp.dense.pyramid import Frame, frame_of, gray_pyramids, make_images
 from sfmapp.dense.scene import DenseScene, DenseView, Patches
@@ -95,9 +95,11 @@ def _grow(
         row["carried"] = growth.refine_coarser(coarser, lambda: events.advanced(STAGE, steps))
         coarser.close()
     row["points"] = growth.seed_points(points)
-    row["expanded"] = growth.expand(events)
+    row["expanded"] = growth.expand(events, everywhere=True)
+    if coarser is not None:
+        depth_range = growth.depth_ranges(depth_range)
     row["corners"] = growth.seed_corners(found, depth_range, everywhere=coarser is None)
-    row["expanded"] += growth.expand(events)
+    row["expanded"] += growth.expand(events, everywhere=False)
     events.advanced(STAGE, steps * growth.num_views * (2 if coarser is None else 1))
     row["accepted"] = growth.count
     row |= growth.filter()
@@ -123,8 +125,11 @@ def _report(rows: list[dict[str, Any]], waves: list[dict[str, int]], num_patches
 
 def compile_kernels() -> None:
     """Compile, or load from the cache, what densification runs: on three views of a textured wall."""
-    rng = np.random.default_rng(0)
-    wall = rng.integers(0, 255, (56, 80, 3)).astype(np.uint8)
+    import cv2
+
+    # smooth, so that not all of it is taken for noise
+    spots = np.random.default_rng(0).integers(0, 255, (28, 40, 3)).astype(np.uint8)
+    wall = np.asarray(cv2.resize(spots, (80, 56), interpolation=cv2.INTER_CUBIC), np.uint8)
     views = tuple(
         DenseView(
             str(m), wall[:, 8 * m : 8 * m + 64], None, np.array([64.0, 64.0, 32.0, 28.0]),
@@ -165,10 +170,7 @@ def _depth_ranges(scene: DenseScene, frame: Frame) -> NDArray[np.float64]:
     for m in range(len(scene.views)):
         mine = point_idx[scene.point_view_idx == m]
         depth = (scene.point_xyz[mine] @ rotation[m, 2] + pose[m, 6]) * frame.scale
-        depth = depth[depth > 0.0]
-        if len(depth) >= 20:
-            near, far = np.quantile(depth, [0.01, 0.99])
-            ranges[m] = 1.0 / (1.5 * far), 1.0 / (near / 1.5)
+        ranges[m] = inverse_depth_range(depth, ranges[m])
     return ranges
 
 

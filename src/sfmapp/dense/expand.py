@@ -30,8 +30,8 @@ CONTENT, BETTER = f32(0.85), f32(0.05)
 SAME_PX = f32(0.15)
 # images that choose between candidates
 NUM_CHOOSING = 3
-# a pixel of the window has half the weight of the centre where it differs from it by this many deviations of the
-# noise, and by this many grey levels more
+# a pixel of the window has a quarter of the weight of the centre where it differs from it by this many deviations of
+# the noise, and by this many grey levels more
 CONTRAST, LEAST_CONTRAST = 6.0, 20.0
 # deviation of a window, in those of the noise, below which it shows nothing
 LEAST_DEVIATION = 1.0

@@ -28,6 +28,22 @@ def refill(image_arrays, store_arrays, cell_arrays, order, fresh, num_fresh):  #
 
 
 @numba.njit(cache=True, nogil=True)
+def renumber(cell_arrays, new_idx):  # type: ignore[no-untyped-def]
+    """Give the patches in the cells their new positions; -1 takes a patch out, and what is behind it moves up."""
+    cells = cell_pointers(cell_arrays)
+    for g in range(cell_arrays.patch.shape[0]):
+        num_left = 0
+        for layer in range(LAYERS):
+            p = cells.patch[LAYERS * g + layer]
+            if p < 0:
+                break
+            cells.patch[LAYERS * g + layer] = np.int32(-1)
+            if new_idx[p] >= 0:
+                cells.patch[LAYERS * g + num_left] = new_idx[p]
+                num_left += 1
+
+
+@numba.njit(cache=True, nogil=True)
 def judge_patches(image_arrays, store_arrays, cell_arrays, first, last, keep):  # type: ignore[no-untyped-def]
     """Fill ``keep[first:last]``: 0 kept, 1 contradicted by what images see, 2 without neighbours of its surface."""
     images, store, cells = image_pointers(image_arrays), store_pointers(store_arrays), cell_pointers(cell_arrays)

@@ -18,6 +18,22 @@ from sfmapp.events import Events
 # cells of a batch that one thread works on at least: below, handing them over costs more than the work
 SMALLEST_CHUNK = 64
 CHUNKS_PER_THREAD = 4
+# share of the depths of a view at either end that may be wrong, how many it takes to tell, and how far beyond the
+# others corners are looked for
+OUTSIDE, LEAST_DEPTHS, MARGIN = 0.002, 20, 2.0
+
+
+def inverse_depth_range(depth: NDArray[np.float64], otherwise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(2,) smallest and largest inverse depth to search in a view where such depths (N,) are known."""
+    depth = depth[depth > 0.0]
+    if len(depth) < LEAST_DEPTHS:
+        return otherwise
+    near, far = np.quantile(depth, [OUTSIDE, 1.0 - OUTSIDE])
+    return np.array([1.0 / (MARGIN * far), MARGIN / near])
+
+
+# neighbours in which a corner is looked for, on the coarsest level and where that left gaps
+SEARCHED_EVERYWHERE, SEARCHED_IN_GAPS = 4, 2
 
 
 class Growth:
@@ -72,6 +88,7 @@ class Growth:
     ) -> int:
         """Match corners of each view (N, 2) whose cells are empty; ``everywhere``: not just with other corners."""
         images, before = self.images, self.count
+        num_searched = SEARCHED_EVERYWHERE if everywhere else SEARCHED_IN_GAPS
         has_corner = np.full(len(images.closed), everywhere)
         cell_of = []
         for m, xy in enumerate(corners):
@@ -81,8 +98,21 @@ class Growth:
             has_corner[cell_of[m]] = True
         for m, xy in enumerate(corners):
             is_open = (self.cells.patch[cell_of[m], 0] < 0) & (images.closed[cell_of[m]] == 0)
-            self._batch(m, xy[is_open], seeds.match_corners, has_corner, depth_range)
+            self._batch(m, xy[is_open], seeds.match_corners, num_searched, has_corner, depth_range)
         return self.count - before
+
+    def depth_ranges(self, otherwise: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(V, 2) inverse depths to search, from the patches that each view shows."""
+        ranges = otherwise.copy()
+        ends = np.append(self.images.cell_start[1:], len(self.images.closed))
+        for m in range(self.num_views):
+            shown = self.cells.patch[self.images.cell_start[m] : ends[m], 0]
+            shown = shown[shown >= 0]
+            depth = (
+                self.store.xyz[shown].astype(np.float64) @ self.images.rotation[m, 2] + self.images.translation[m, 2]
+            )
+            ranges[m] = inverse_depth_range(depth, otherwise[m])
+        return ranges
 
     def refine_coarser(self, coarser: Growth, advanced: Callable[[], None]) -> int:
         """Carry the patches of the coarser level over, a cell at a time; how many. ``advanced``: after each view."""
@@ -97,10 +127,13 @@ class Growth:
 
     # ------------------------------------------------------------------------------------------------------------ waves
 
-    def expand(self, events: Events) -> int:
-        """Waves until none finds anything; how many patches they added."""
+    def expand(self, events: Events, *, everywhere: bool) -> int:
+        """Waves until none finds anything; how many patches they added.
+
+        ``everywhere``: the first wave looks at all cells, not just at those beside patches of which no wave knows yet.
+        """
         before = self.count
-        is_first = True
+        is_first = everywhere
         while True:
             self.wave += 1
             tried, start = 0, self.count
@@ -187,13 +220,9 @@ class Growth:
         self._in_chunks(self.count, work)
         contradicted, alone = int((keep == 1).sum()), int((keep == 2).sum())
         self._compact(keep == 0)
-        self._refill()
         sizes = filters.group_sizes(self.images, self.store, self.cells, self.count)
         in_small_groups = int((sizes < filters.SMALLEST_GROUP).sum())
-        if in_small_groups:
-            self._compact(sizes >= filters.SMALLEST_GROUP)
-            self._refill()
-        self.cells.tried[:] = 0
+        self._compact(sizes >= filters.SMALLEST_GROUP)
         return {"contradicted": contradicted, "without neighbours": alone, "in small groups": in_small_groups}
 
     def settle(self) -> None:
@@ -219,3 +248,4 @@ class Growth:
         for array in self.store:
             array[: len(idx)] = array[idx]
         self.count = len(idx)
+        filters.renumber(self.cells, np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32))

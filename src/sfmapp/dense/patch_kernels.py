@@ -9,13 +9,26 @@ import numpy as np
 from numba import float32 as f32
 
 from sfmapp.adjust.lanes import offset
-from sfmapp.dense.window import KEPT, NUM_PIXELS, NUM_SUMS, SUMS, TRIAL, correlate, correlate_with_terms, solve3, warp
+from sfmapp.dense.window import (
+    KEPT,
+    NUM_EFFECTIVE,
+    NUM_SUMS,
+    SUMS,
+    TRIAL,
+    correlate,
+    correlate_with_terms,
+    solve3,
+    warp,
+)
 
 MAX_STEPS = 4
 # of the mean NCC; less is not worth another step
 LEAST_GAIN = f32(0.001)
 LONGEST_STEP_PX, SHORTEST_STEP_PX = f32(1.5), f32(0.02)
 DAMPING = f32(0.01)
+# how far from the centre of the window what tells its depth may lie on average: beyond, depth is guessed, as it is
+# beside the edge of an object before a blank background
+LARGEST_LEAN_PX = 2.0
 # pull of the slopes towards where they began, in units of the information on the depth
 SLOPE_PRIOR = f32(0.3)
 # cosine between normal and line of sight below which a patch is too oblique to be judged in a window of this size
@@ -112,7 +125,7 @@ def refine(images, m, u, v, plane, slots, rhos, n, limits, work):  # type: ignor
     s0, s1, s2 = plane[0], plane[1], plane[2]
     step0, step1, step2 = f32(0.0), f32(0.0), f32(0.0)
     first1, first2 = plane[1], plane[2]
-    best, reach, sigma = f32(-2.0), f32(0.0), f32(0.0)
+    best, reach, sigma, lean = f32(-2.0), f32(0.0), f32(0.0), 0.0
     for it in range(MAX_STEPS + 1):
         for j in range(NUM_SUMS):
             work[SUMS + j] = f32(0.0)
@@ -142,7 +155,8 @@ def refine(images, m, u, v, plane, slots, rhos, n, limits, work):  # type: ignor
             step0, step1, step2, is_regular = _step(work, first1 - s1, first2 - s2)
             if not is_regular:
                 return 0, sigma
-            sigma = _sigma(work, best)
+            sigma = _sigma(work, best, n)
+            lean = math.sqrt(work[SUMS + 1] ** 2 + work[SUMS + 2] ** 2) / max(work[SUMS], f32(1e-30))
             if it == MAX_STEPS or (it > 0 and gain < LEAST_GAIN):
                 break
             length = abs(step0) * reach
@@ -156,19 +170,28 @@ def refine(images, m, u, v, plane, slots, rhos, n, limits, work):  # type: ignor
         s0, s1, s2 = plane[0] + step0, plane[1] + step1, plane[2] + step2
         if not s0 > f32(0.0):
             break
+    if lean > LARGEST_LEAN_PX:
+        return 0, sigma
     return n, sigma
 
 
 @numba.njit(cache=True, nogil=True)
-def _sigma(work, mean):  # type: ignore[no-untyped-def]
-    """Standard deviation of w0: the mean square residual is 2 (1 - NCC), and the window has so many pixels."""
-    n = (work[SUMS], work[SUMS + 1], work[SUMS + 2], work[SUMS + 3], work[SUMS + 4], work[SUMS + 5])
+def _sigma(work, mean, num):  # type: ignore[no-untyped-def]
+    """Standard deviation of w0 from the sums over so many images.
+
+    A residual, the difference of two normalised windows, has the mean square 2 (1 - NCC), half of it from each. The
+    half of the reference is the same for all images and does not average out among them.
+    """
     pull = SLOPE_PRIOR * work[SUMS]
-    n = (n[0], n[1], n[2], n[3] + pull, n[4], n[5] + pull)
+    n = (
+        work[SUMS], work[SUMS + 1], work[SUMS + 2],
+        work[SUMS + 3] + pull, work[SUMS + 4], work[SUMS + 5] + pull,
+    )  # fmt: skip
     variance, _, _, is_regular = solve3(n, f32(1.0), f32(0.0), f32(0.0))
     if not is_regular or not variance > f32(0.0):
         return f32(0.0)
-    return f32(math.sqrt(variance * f32(2.0) * max(f32(1.0) - mean, f32(1e-4)) / f32(NUM_PIXELS)))
+    square = f32(num + 1) * max(f32(1.0) - mean, f32(1e-4))
+    return f32(math.sqrt(variance * square / work[NUM_EFFECTIVE]))
 
 
 @numba.njit(cache=True, nogil=True)

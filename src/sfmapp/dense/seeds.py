@@ -19,8 +19,6 @@ from sfmapp.dense.expand import CANDIDATES, CONTRAST, LEAST_CONTRAST, slots_of
 from sfmapp.dense.patch_kernels import judge, measure, project, refine
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
 
-# images that a corner is looked for in
-NUM_SEARCHED = 4
 # NCC of a fronto-parallel window with one image, and on average with two, from which a place is worth refining
 LEAST_LIKENESS, LEAST_SUPPORT = f32(0.55), f32(0.5)
 NUM_KEPT = 3
@@ -48,11 +46,14 @@ def corners(gray: NDArray[np.uint8], block_px: int, noise: float) -> NDArray[np.
 
 
 @numba.njit(cache=True, nogil=True)
-def match_corners(image_arrays, m, places, has_corner, depth_range, first, last, limits, scratch, found_arrays, spare):  # type: ignore[no-untyped-def]
+def match_corners(  # type: ignore[no-untyped-def]
+    image_arrays, m, places, num_searched, has_corner, depth_range, first, last, limits, scratch, found_arrays, spare
+):
     """Look for corners ``first`` to ``last`` of view m in its neighbours; patches at the same positions of ``found``.
 
-    ``has_corner``: (G,) bool, the cells of all views where a match may lie. ``depth_range``: (V, 2) float64 smallest
-    and largest inverse depth. ``spare``: a position of ``found`` that nobody else uses.
+    ``num_searched``: in so many of them. ``has_corner``: (G,) bool, the cells of all views where a match may lie.
+    ``depth_range``: (V, 2) float64 smallest and largest inverse depth. ``spare``: a position of ``found`` that nobody
+    else uses.
     """
     images, found = image_pointers(image_arrays), store_pointers(found_arrays)
     slot_array, work = np.empty(MOST_SLOTS, np.int64), pointer(scratch)
@@ -70,7 +71,7 @@ def match_corners(image_arrays, m, places, has_corner, depth_range, first, last,
             continue
         likes[:] = LEAST_SUPPORT
         depths[:] = f32(-1.0)
-        for slot in range(min(images.num_slots, NUM_SEARCHED)):
+        for slot in range(min(images.num_slots, num_searched)):
             if images.neighbors[m * images.num_slots + slot] < 0:
                 break
             _search(images, m, slot, f32(u), f32(v), has_corner, depth_range[m], likes, depths, work)

@@ -19,10 +19,11 @@ from sfmapp.dense.expand import NEAR, cell_size, off_planes
 from sfmapp.dense.patch_kernels import cell_of, plane_in_view, project
 
 # cells to each side that take part, and the pixels over which their weight falls off
-RADIUS_CELLS, FALL_OFF_PX = 3, 1.5
+RADIUS_CELLS, FALL_OFF_PX = 4, 3.0
+# how far a surface bends away from its tangent over one pixel, in pixels: a ball of 50 pixels' radius
+BEND_PX = 0.01
 # no neighbour is trusted further than this share of a pixel of depth, whatever its own deviation says
 FLOOR_PX = 0.05
-LEAST_FLOOR = 0.01
 # slopes of the patch itself count as if measured over this many pixels
 SLOPE_BASE_PX = 1.5
 
@@ -64,9 +65,9 @@ def _fit(images, store, cells, p, r, g, u, v, z, wu, wv):  # type: ignore[no-unt
     cx = (g - start) - cy * columns
     reach = f32(2.0 * NEAR) * cell_size(images, store, p)
     # what a pixel along the surface is in inverse depth
-    floor = FLOOR_PX * np.float64(store.size[p]) / (z * z)
-    # photographs without noise tell a deviation of nothing, which is nothing to divide by
-    own = max(_deviation(images, store, p, r, u, v, 1.0 / z), LEAST_FLOOR * floor)
+    unit = np.float64(store.size[p]) / (z * z)
+    floor = FLOOR_PX * unit
+    own = _deviation(images, store, p, r, u, v, 1.0 / z)
     slope = SLOPE_BASE_PX * SLOPE_BASE_PX / (own * own + floor * floor)
     n00 = n01 = n02 = g0 = 0.0
     n11 = n22 = slope
@@ -84,9 +85,10 @@ def _fit(images, store, cells, p, r, g, u, v, z, wu, wv):  # type: ignore[no-unt
                 du, dv, w = uq - u, vq - v, 1.0 / zq
                 deviation = _deviation(images, store, q, r, uq, vq, w)
                 off = w - (1.0 / z + wu * du + wv * dv)
-                doubt = 1.0 + off * off / (9.0 * (deviation * deviation + own * own))
+                doubt = 1.0 + off * off / (9.0 * (deviation * deviation + own * own + floor * floor))
                 fall = math.exp(-(du * du + dv * dv) / (2.0 * FALL_OFF_PX * FALL_OFF_PX))
-                weight = fall / ((deviation * deviation + floor * floor) * doubt)
+                bend = unit * BEND_PX * (du * du + dv * dv)
+                weight = fall / ((deviation * deviation + floor * floor + bend * bend) * doubt)
                 n00 += weight
                 n01 += weight * du
                 n02 += weight * dv

@@ -35,6 +35,8 @@ SIZE = 48
 DX, DY, WEIGHT, REFERENCE, SUMS = 0, SIZE, 2 * SIZE, 3 * SIZE, 4 * SIZE
 NUM_SUMS = 9
 KEPT, TRIAL, RHOS, BEST = SUMS + 16, SUMS + 32, SUMS + 48, SUMS + 64
+# pixels of even weight that say as much as those of the window
+NUM_EFFECTIVE = SUMS + 67
 SCRATCH = SUMS + 72
 # neighbours that a view can have
 MOST_SLOTS = 16
@@ -60,7 +62,7 @@ def make_scratch() -> NDArray[np.float32]:
 def read_reference(quads, width, u, v, contrast, work):  # type: ignore[no-untyped-def]
     """Fill weights and reference of the scratch from the window about pixel (u, v); its standard deviation in grey.
 
-    ``contrast``: the difference in grey at which a pixel's weight has fallen to one half. Zero if the window is flat.
+    ``contrast``: the difference in grey at which a pixel's weight has fallen to one quarter. Zero if it is flat.
     """
     base = offset(quads, np.int64(v) * width + u)
     center = splat(f32(np.int32(base[0] & np.uint32(255))))
@@ -70,6 +72,7 @@ def read_reference(quads, width, u, v, contrast, work):  # type: ignore[no-untyp
         value = pixels(base, width, load(work, DX + k), load(work, DY + k))
         difference = multiply(subtract(value, center), scale)
         weight = divide(one, fma(difference, difference, one))
+        weight = multiply(weight, weight)
         store(work, WEIGHT + k, weight)
         store(work, REFERENCE + k, value)
     for k in range(NUM_PIXELS, SIZE):
@@ -84,11 +87,14 @@ def read_reference(quads, width, u, v, contrast, work):  # type: ignore[no-untyp
     if variance < FLAT_VARIANCE:
         return f32(0.0)
     deviation = f32(math.sqrt(variance))
+    crowd = splat(f32(0.0))
     unit, middle, over = splat(scale_of_weights), splat(m), splat(f32(1.0) / deviation)
     for k in range(0, SIZE, 16):
         weight = multiply(load(work, WEIGHT + k), unit)
+        crowd = fma(weight, weight, crowd)
         store(work, WEIGHT + k, weight)
         store(work, REFERENCE + k, multiply(weight, multiply(subtract(load(work, REFERENCE + k), middle), over)))
+    work[NUM_EFFECTIVE] = f32(1.0) / total(crowd)
     return deviation
 
 
