@@ -15,6 +15,7 @@ from PIL import Image
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.geometry.upright import up_direction
 from sfmapp.images.image_set import ImageRecord, ImageSet
 from sfmapp.scene.camera import CameraModel, simple_camera
 from sfmapp.scene.features import Features
@@ -25,7 +26,7 @@ from sfmapp.viewer import view as view_module
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.viewer.photos import load_screen_photo
 from sfmapp.viewer.recording import write_recording
-from sfmapp.viewer.replay import Replay, make_replay, up_direction
+from sfmapp.viewer.replay import Replay, make_replay
 from sfmapp.viewer.stage import set_stage
 from sfmapp.viewer.view import free_port, server_command, server_url, view, window_command
 

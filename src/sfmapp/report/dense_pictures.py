@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sfmapp.dense.scene import DenseScene, DenseView, Patches
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.upright import up_direction
 from sfmapp.report.preview import Eye, picture_of_mesh, picture_of_patches
 from sfmapp.scene.mesh import Mesh
 
@@ -84,11 +85,9 @@ def _eye_of(view: DenseView) -> Eye:
 def turned_eye(scene: DenseScene, patches: Patches, v: int) -> Eye:
     """The eye of view v, turned around what it sees to the side and up, at a distance from which all of that shows."""
     eye = _eye_of(scene.views[v])
-    rotation = rigid3.rotation_matrix(scene.cam_from_world)
     body = _middle_points(patches.xyz)
     target = np.median(body, axis=0)
-    up = -rotation[:, 1].mean(axis=0)
-    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else -rotation[v, 1]
+    up = up_direction(scene.cam_from_world)
     back = scene.centers[v] - target
     # to the side on which the other cameras are: what is seen from there is known
     side = np.cross(up, back)

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from sfmapp.dense.scene import DenseScene, Patches
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.upright import up_direction
 from sfmapp.scene.mesh import Mesh
 from sfmapp.viewer.photos import shrunk_jpeg
-from sfmapp.viewer.replay import up_direction
 
 Ints = NDArray[np.int64]
 Float32 = NDArray[np.float32]

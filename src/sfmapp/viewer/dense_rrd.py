@@ -38,6 +38,8 @@ _PLAYED_S = 8.0
 _LEGEND_PX = (520, 96)
 # the eye is placed by so many of the points
 _FRAMED_POINTS = 20_000
+# and by the cameras, as if they were no farther from the middle than so many radii of what they look at
+_CAMERA_RADII = 2.0
 
 
 @dataclass(frozen=True)
@@ -196,12 +198,26 @@ def _legend(scales: list[_Scale]) -> NDArray[np.uint8]:
     return image
 
 
+def _framed(
+    centers: NDArray[np.float64], xyz: NDArray[np.float64], rotation: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(N, 3) what the first view has to hold, turned upright: the surface, and cameras (V, 3) unless they are far."""
+    if not len(xyz):
+        return body_of(centers, xyz, rotation)
+    surface = body_of(centers[:0], xyz, rotation)
+    middle = np.median(surface, axis=0)
+    away = centers @ rotation.T - middle
+    farthest = _CAMERA_RADII * 0.5 * float(np.linalg.norm(np.ptp(surface, axis=0)))
+    distance = np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    return np.concatenate([surface, middle + away * np.minimum(1.0, farthest / distance)])
+
+
 def _blueprint(replay: DenseReplay, scales: list[_Scale]) -> rrb.Blueprint:
     rotation = turn_to_z(replay.up)
     centers = rigid3.center(replay.cam_from_world)
     forward = rigid3.rotation_matrix(replay.cam_from_world)[:, 2] @ rotation.T
     sample = replay.xyz[:: max(1, len(replay.xyz) // _FRAMED_POINTS)].astype(np.float64)
-    eye, target = frame_view(body_of(centers, sample, rotation), eye_direction(forward.mean(0)))
+    eye, target = frame_view(_framed(centers, sample, rotation), eye_direction(forward.mean(0)))
     controls = rrb.EyeControls3D(position=eye, look_target=target, eye_up=(0.0, 0.0, 1.0))
     shown = [("patches", "Patch wave"), *((scale.name, f"By {scale.name}") for scale in scales)]
     shown += [("mesh", "Mesh")] if len(replay.mesh_faces) else []

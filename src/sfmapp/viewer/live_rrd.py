@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 
 from sfmapp.evaluation.trajectory import Alignment, Trajectory
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.geometry.upright import up_direction
 from sfmapp.odometry.result import FrameState
 from sfmapp.viewer.live_scene import FRUSTUM_SHARE, Changed, LiveMap, frustum_lines, unbroken
 from sfmapp.viewer.photos import shrunk_jpeg
-from sfmapp.viewer.replay import up_direction
 from sfmapp.viewer.stage import eye_direction, frame_view, turn_to_z
 
 Array = NDArray[np.float64]
