@@ -26,17 +26,17 @@ PIXEL_M = DISTANCE / FOCAL
 
 @cache
 def wall_with_box_and_bars() -> World:
-    """A textured wall at y = 0 that faces the cameras at y < 0, a box before it, and bars of some four pixels."""
+    """A textured wall at y = 0 that faces the cameras at y < 0, a box before it, and bars of some six pixels."""
     rng = np.random.default_rng(4)
     build = WorldBuilder(rng)
-    box, bars = build.texture(textures.leaves(rng)), build.texture(textures.leaves(rng))
+    box = build.texture(textures.leaves(rng))
     # spots of some six pixels and larger ones
     spots = 128 + 90 * textures.noise(rng, 512, 32, 3)
     wall = build.texture(np.clip(np.rint(spots), 0, 255).astype(np.uint8))
     build.wall([0, 0, 0], [0, -1, 0], 8.0, 6.0, Skin(wall, 2.0))
     build.box([-0.5, -0.5, -0.4], [0.5, 0.3, 0.8], Skin(box, 0.8))
     for x in (0.25, 0.55, 0.85):
-        build.cylinder([x, -0.7, -0.6], 0.018, 1.2, Skin(bars, 0.3), 8)
+        build.cylinder([x, -0.7, -0.6], 0.024, 1.2, Skin(wall, 1.0), 8)
     return build.build()
 
 

@@ -1,0 +1,192 @@
+"""Densification on rendered scenes: where patches lie, what is kept, and that threads do not matter."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dense_scenes import (
+    HEIGHT,
+    PIXEL_M,
+    WIDTH,
+    depth_errors,
+    project,
+    scene_of,
+    wall_with_box_and_bars,
+)
+from sfmapp.dense.densify import densify
+from sfmapp.dense.growth import Growth
+from sfmapp.dense.options import DenseOptions
+from sfmapp.dense.scene import DenseScene, Patches
+from sfmapp.errors import InterruptedRunError
+from sfmapp.events import Events
+
+NUM_VIEWS = 7
+
+
+@cache
+def rendered(noise: float) -> tuple[DenseScene, list[NDArray[np.float32]], list[NDArray[np.int32]]]:
+    return scene_of(wall_with_box_and_bars(), NUM_VIEWS, noise)
+
+
+@cache
+def patches_of(noise: float, cell_px: int = 1) -> Patches:
+    return densify(rendered(noise)[0], DenseOptions(cell_px=cell_px))[0]
+
+
+def covered(patches: Patches, m: int, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(H, W) bool: pixels of view m within one pixel of a patch of those chosen that this view trusts."""
+    scene, depths, _ = rendered(0.0)
+    pixels, depth = project(scene.views[m], patches.xyz[chosen])
+    column, row = pixels.astype(np.int64).T
+    inside = (column >= 1) & (row >= 1) & (column < WIDTH - 1) & (row < HEIGHT - 1) & (depth > 0.0)
+    out = np.zeros((HEIGHT, WIDTH), bool)
+    for dx in (-1, 0, 1):
+        for dy in (-1, 0, 1):
+            x, y = column[inside] + dx, row[inside] + dy
+            near = np.abs(depths[m][y, x] - depth[inside]) < 0.06
+            out[y[near], x[near]] = True
+    return out
+
+
+@pytest.mark.parametrize(("noise", "most_median", "least_share"), [(0.0, 0.25, 0.97), (3.0, 0.6, 0.95)])
+def test_patches_lie_on_the_surfaces(noise: float, most_median: float, least_share: float) -> None:
+    scene, depths, _ = rendered(noise)
+    patches = patches_of(noise)
+    errors = depth_errors(scene, depths, patches.xyz, patches.reference_idx) / PIXEL_M
+    assert len(patches) > 0.8 * WIDTH * HEIGHT
+    assert np.median(errors) < most_median
+    # five pixels: a patch beyond is on another surface
+    assert (errors < 5.0).mean() > least_share
+    # and an error is not free: with noise it grows
+    assert np.median(errors) > 0.005
+
+
+def test_most_of_what_three_views_see_is_covered() -> None:
+    patches = patches_of(0.0)
+    everywhere = np.ones(len(patches), bool)
+    # twelve pixels at the border are seen by too few
+    inner = covered(patches, 3, everywhere)[12:-12, 30:-30]
+    assert inner.mean() > 0.95
+
+
+def test_bars_and_the_wall_behind_are_both_kept() -> None:
+    patches = patches_of(0.0)
+    is_bar = (patches.xyz[:, 1] < -0.6) & (patches.xyz[:, 0] > 0.1)
+    _, depths, surfaces = rendered(0.0)
+    bars = (depths[3] < 2.5) & (np.arange(WIDTH) > WIDTH // 2)
+    assert covered(patches, 3, is_bar)[bars].mean() > 0.8
+    # the wall within three pixels of a bar in the middle view
+    near = np.zeros_like(bars)
+    for shift in (-3, -2, -1, 1, 2, 3):
+        near |= np.roll(bars, shift, axis=1)
+    near &= ~bars & (surfaces[3] == surfaces[3][HEIGHT // 2, WIDTH // 2 + 2])
+    assert covered(patches, 3, ~is_bar)[near].mean() > 0.8
+
+
+def test_normals_face_the_cameras_and_are_those_of_the_wall() -> None:
+    patches = patches_of(0.0)
+    wall = (np.abs(patches.xyz[:, 1]) < 0.03) & (np.abs(patches.xyz[:, 2]) < 0.7) & (np.abs(patches.xyz[:, 0]) < 1.2)
+    np.testing.assert_allclose(np.linalg.norm(patches.normal, axis=1), 1.0, atol=1e-4)
+    angle = np.degrees(np.arccos(np.clip(-patches.normal[wall, 1], -1.0, 1.0)))
+    assert np.median(angle) < 8.0
+    eye = rendered(0.0)[0].centers[patches.reference_idx]
+    assert (np.einsum("ij,ij->i", eye - patches.xyz, patches.normal) > 0.0).all()
+
+
+def test_every_patch_is_seen_by_enough_distinct_views() -> None:
+    patches = patches_of(0.0)
+    assert patches.num_views.min() >= 3
+    owner = np.repeat(np.arange(len(patches)), patches.num_views)
+    assert len(np.unique(owner * NUM_VIEWS + patches.view_idx)) == len(owner)
+    assert ((patches.score >= 0.7) & (patches.score <= 1.0)).all()
+    assert (patches.sigma > 0.0).mean() > 0.999
+
+
+def test_the_deviation_tells_how_far_off_a_patch_is() -> None:
+    scene, depths, _ = rendered(3.0)
+    patches = patches_of(3.0)
+    ratio = depth_errors(scene, depths, patches.xyz, patches.reference_idx) / np.maximum(patches.sigma, 1e-9)
+    # half of a normal distribution lies within 0.67 deviations; neighbours share pixels, which the deviation leaves out
+    assert 0.3 < np.median(ratio) < 2.5
+    order = np.argsort(patches.sigma)
+    errors = depth_errors(scene, depths, patches.xyz, patches.reference_idx)[order]
+    quarter = len(errors) // 4
+    assert np.median(errors[-quarter:]) > 1.5 * np.median(errors[:quarter])
+
+
+def test_threads_change_nothing() -> None:
+    scene, _, _ = rendered(3.0)
+    one, report = densify(scene, DenseOptions(cell_px=2), threads=1)
+    two, _ = densify(scene, DenseOptions(cell_px=2), threads=2)
+    for name in ("xyz", "normal", "rgb", "score", "sigma", "size", "wave", "view_ptr", "view_idx"):
+        assert getattr(one, name).tobytes() == getattr(two, name).tobytes(), name
+    assert report["num_patches"] == len(one)
+    removed = sum(step["count"] for step in report["funnel"][1:-1])
+    assert report["funnel"][0]["count"] - removed == report["funnel"][-1]["count"] == len(one)
+
+
+def test_two_pixel_cells_hold_a_quarter_of_the_patches() -> None:
+    assert 0.2 < len(patches_of(0.0, 2)) / len(patches_of(0.0, 1)) < 0.35
+
+
+def test_nothing_grows_where_there_is_no_texture_but_noise() -> None:
+    scene, _, _ = rendered(0.0)
+    rng = np.random.default_rng(1)
+    views = []
+    for view in scene.views:
+        gray = np.clip(np.rint(120.0 + 3.0 * rng.standard_normal(view.rgb.shape[:2])), 0, 255).astype(np.uint8)
+        views.append(type(view)(view.name, np.repeat(gray[:, :, None], 3, axis=2), None, view.k, view.cam_from_world))
+    blank = DenseScene(tuple(views), scene.neighbors, scene.point_xyz, scene.point_ptr, scene.point_view_idx)
+    assert len(densify(blank, DenseOptions())[0]) < 0.002 * WIDTH * HEIGHT
+
+
+def test_masks_keep_patches_out() -> None:
+    mask = np.ones((HEIGHT, WIDTH), bool)
+    mask[:, : WIDTH // 2] = False
+    scene, _, _ = scene_of(wall_with_box_and_bars(), NUM_VIEWS, masks=[mask] * NUM_VIEWS)
+    patches, _ = densify(scene, DenseOptions(cell_px=2))
+    assert len(patches) > 1000
+    for p, m in ((np.arange(len(patches)), patches.reference_idx),):
+        for view_idx, view in enumerate(scene.views):
+            mine = p[m == view_idx]
+            pixels, _ = project(view, patches.xyz[mine])
+            assert (pixels[:, 0] > WIDTH // 2 - 1.0).all()
+
+
+def test_what_other_images_contradict_is_taken_away() -> None:
+    scene, _, _ = rendered(0.0)
+    grown: list[Growth] = []
+    planted = 0
+    original = Growth.filter
+
+    def with_outliers(self: Growth) -> dict[str, int]:
+        nonlocal planted
+        # some patches are moved a quarter of the way towards their reference camera, in front of the wall
+        rng = np.random.default_rng(0)
+        chosen = rng.choice(self.count, self.count // 50, replace=False)
+        eye = self.images.center[self.store.views[chosen, 0]]
+        self.store.xyz[chosen] += (0.25 * (eye - self.store.xyz[chosen])).astype(np.float32)
+        self.store.wave[chosen] = 100000
+        planted = len(chosen)
+        grown.append(self)
+        return original(self)
+
+    Growth.filter = with_outliers  # type: ignore[method-assign]
+    try:
+        patches, _ = densify(scene, DenseOptions(cell_px=2))
+    finally:
+        Growth.filter = original  # type: ignore[method-assign]
+    assert planted > 300
+    assert (patches.wave == 100000).sum() < 0.02 * planted
+    assert len(patches) > 0.8 * len(patches_of(0.0, 2))
+
+
+def test_a_run_can_be_stopped() -> None:
+    events = Events()
+    events.cancel()
+    with pytest.raises(InterruptedRunError):
+        densify(rendered(0.0)[0], DenseOptions(cell_px=4), events=events)
