@@ -42,6 +42,7 @@ ALLOWED = {
     "gtsam": {"adjust", "odometry"},
     "pycolmap": {"formats", "evaluation"},
     "open3d": {"surface"},
+    "xatlas": {"surface"},
     "rich": {"cli"},
     "argparse": {"cli", "evaluation", "viewer"},
 }

@@ -296,7 +296,7 @@ def test_a_dome_stays_a_dome() -> None:
     ("field", "value"),
     [
         ("depth", 3), ("depth", 20), ("trim_distance", 0.0), ("trim_distance", float("nan")), ("trim_density", 1.0),
-        ("min_island", -0.1), ("max_hole", float("nan")), ("texture_px", 10), ("texture_faces", 1),
+        ("min_island", -0.1), ("max_hole", float("nan")), ("texture_px", 10),
     ],
 )  # fmt: skip
 def test_impossible_options_are_named(field: str, value: float) -> None:

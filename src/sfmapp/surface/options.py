@@ -22,9 +22,8 @@ class SurfaceOptions:
             0: none. At 0.2 there is room on both sides: the unseen base of a small temple is 0.15, what would close the
             outline of a wall about 1.
         min_island: pieces that hold less than this share of the surface's area are dropped.
-        texture: unwrap the surface and project the photographs onto it.
-        texture_px: side of the square texture.
-        texture_faces: the surface is simplified to so many triangles before it is unwrapped.
+        texture: give ``mesh.glb`` the photographs as a texture (:func:`~sfmapp.surface.texture.texture_mesh`).
+        texture_px: longest side of the texture; it is smaller where the photographs have less to show.
     """
 
     depth: int | None = None
@@ -34,7 +33,6 @@ class SurfaceOptions:
     min_island: float = 0.005
     texture: bool = False
     texture_px: int = 4096
-    texture_faces: int = 200_000
 
     def __post_init__(self) -> None:
         if self.depth is not None and not 4 <= self.depth <= 13:
@@ -47,5 +45,3 @@ class SurfaceOptions:
                 raise UsageError(f"surface.{name}: expected a share from 0 to less than 1, got {share:g}")
         if not 256 <= self.texture_px <= 16384:
             raise UsageError(f"surface.texture_px: expected 256 to 16384, got {self.texture_px}")
-        if not 100 <= self.texture_faces <= 2_000_000:
-            raise UsageError(f"surface.texture_faces: expected 100 to 2000000, got {self.texture_faces}")
