@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 
 import sfmapp
-from sfmapp.cli import convert, evaluate, inspect, odometry, reconstruct
+from sfmapp.cli import convert, dense, evaluate, inspect, odometry, reconstruct
 from sfmapp.errors import SfmError
 
 BUG = 1
@@ -55,7 +55,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"sfmapp {sfmapp.__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for family in (reconstruct, odometry, evaluate, inspect, convert):
+    for family in (reconstruct, dense, odometry, evaluate, inspect, convert):
         family.add_commands(commands)
     return parser
 

@@ -11,7 +11,7 @@ import os
 import stat
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -94,6 +94,29 @@ def load_images(
     report["seconds"] = round(time.monotonic() - start, 3)
     events.finished(STAGE, f"{len(images)} images, {len(cameras)} cameras, {len(skipped)} files skipped", **report)
     return image_set, report
+
+
+def describe_images(
+    root: str | os.PathLike[str], names: Sequence[str], options: ImageOptions, *, threads: int | None = None
+) -> tuple[list[ImageRecord | None], list[tuple[str, str]]]:
+    """Describe photographs that are known by name, such as those of a model.
+
+    Args:
+        root: folder that the names are relative to.
+        names: of N photographs, with forward slashes.
+        options: masks and limits; nothing is said about cameras.
+        threads: how many files are read at a time.
+
+    Returns:
+        N records, None for a file that cannot be used, and (name, reason) of those.
+    """
+    folder = Path(root).absolute()
+    mask_root = Path(options.mask_path).absolute() if options.mask_path is not None else None
+    with ThreadPoolExecutor(threads or min(8, os.cpu_count() or 1)) as pool:
+        outcomes = list(pool.map(lambda name: _scan(folder / name, folder, mask_root, options), names))
+    records = [outcome.record if isinstance(outcome, _Scan) else None for outcome in outcomes]
+    reasons = [(name, o[1]) for name, o in zip(names, outcomes, strict=True) if not isinstance(o, _Scan)]
+    return records, reasons
 
 
 # ------------------------------------------------------------------------------------------------ looking into files

@@ -49,6 +49,21 @@ def read_picture(record: ImageRecord) -> Picture:
     return Picture(_as_rgb(stored), _as_gray(stored), _combine(_read_mask_file(record), mask))
 
 
+def read_on_white(record: ImageRecord) -> tuple[Pixels, NDArray[np.bool_] | None]:
+    """(H, W, 3) uint8 colours, transparent parts blended with white, and the mask (H, W) as in :class:`Picture`.
+
+    Raises:
+        InputError: as :func:`read_picture`.
+    """
+    stored, alpha = _decode(record)
+    rgb, alpha = _as_rgb(_upright(stored, record.orientation)), _upright(alpha, record.orientation)
+    mask = _alpha_mask(alpha) if record.has_alpha else None
+    if mask is not None:
+        opacity = alpha[..., None].astype(np.uint16)
+        rgb = ((rgb * opacity + 255 * (255 - opacity) + 127) // 255).astype(np.uint8)
+    return rgb, _combine(_read_mask_file(record), mask)
+
+
 def read_rgb(record: ImageRecord) -> Pixels:
     """(H, W, 3) uint8 colours of a photograph, upright. Raises InputError as :func:`read_picture` does."""
     return _as_rgb(_upright(_decode(record)[0], record.orientation))

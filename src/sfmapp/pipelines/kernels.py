@@ -31,6 +31,7 @@ ODOMETRY_MODULES = (
     "sfmapp.odometry.relocalize",
     "sfmapp.odometry.pose_graph",
 )
+DENSE_MODULES = ("sfmapp.dense.densify",)
 INERTIAL_MODULES = ("sfmapp.odometry.inertial",)
 
 
@@ -54,6 +55,17 @@ def compile_odometry_kernels(events: Events, *, inertial: bool = False) -> dict[
         InterruptedRunError: ``events`` was asked to stop.
     """
     took = _compile(events, ODOMETRY_MODULES + (INERTIAL_MODULES if inertial else ()))
+    events.raise_if_cancelled()
+    return took
+
+
+def compile_dense_kernels(events: Events) -> dict[str, Any]:
+    """Compile those of densification; returns what it took.
+
+    Raises:
+        InterruptedRunError: ``events`` was asked to stop.
+    """
+    took = _compile(events, DENSE_MODULES)
     events.raise_if_cancelled()
     return took
 

@@ -32,7 +32,7 @@ class StageKeys:
 def stage_keys(options: Options, image_set: ImageSet) -> StageKeys:
     """Keys of all stages for these photographs and options."""
     plain = options_to_dict(options)
-    inputs = {record.name: _input_key(record) for record in image_set.images}
+    inputs = {record.name: input_key(record) for record in image_set.images}
     features = stage_key(("features", "images"), plain["features"])
     images = [features, list(inputs.items()), options.seed]
     lenses = [[camera.model.name, camera.width, camera.height, camera.params.tolist()] for camera in image_set.cameras]
@@ -46,7 +46,7 @@ def stage_keys(options: Options, image_set: ImageSet) -> StageKeys:
     return StageKeys(inputs, features, pairs, matching, mapping)
 
 
-def _input_key(record: ImageRecord) -> str:
+def input_key(record: ImageRecord) -> str:
     """Digest of an image's file and of whatever masks it."""
     key = record.digest + ("+alpha" if record.has_alpha else "")
     if record.mask_path is None:

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import SfmError, UsageError
 from sfmapp.features.extract import FeatureOptions
 from sfmapp.images.image_set import ImageOptions
@@ -30,6 +31,7 @@ from sfmapp.matching.pairs import PairOptions
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.pipelines import resources
 from sfmapp.pipelines.odometry_scale import ScaleOptions
+from sfmapp.surface.options import SurfaceOptions
 
 LIST_ADVICE = "sfmapp reconstruct --list-options shows every option with its default"
 
@@ -40,6 +42,7 @@ class Options:
 
     Attributes:
         images, features, pairs, matching, mapping, adjust: the options of the stages of a reconstruction.
+        dense, surface: those of patches and of the mesh that is made of them.
         sequence, odometry, scale: those of odometry.
         seed: where every random choice starts; the same seed gives the same bytes.
         threads: worker threads; None: as many as the process has cores. Results do not depend on it.
@@ -52,6 +55,8 @@ class Options:
     matching: MatchingOptions = field(default_factory=MatchingOptions)
     mapping: MappingOptions = field(default_factory=MappingOptions)
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
+    dense: DenseOptions = field(default_factory=DenseOptions)
+    surface: SurfaceOptions = field(default_factory=SurfaceOptions)
     sequence: SequenceOptions = field(default_factory=SequenceOptions)
     odometry: OdometryOptions = field(default_factory=OdometryOptions)
     scale: ScaleOptions = field(default_factory=ScaleOptions)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 FORMAT = "sfmapp workspace 1"
 MANIFEST = "run.json"
 # the commands that write workspaces; manifests of before the second one name none
-RECONSTRUCT, ODOMETRY, REFINE = "reconstruct", "odometry", "refine"
+RECONSTRUCT, ODOMETRY, REFINE, DENSE = "reconstruct", "odometry", "refine", "dense"
 LOCK = ".lock"
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 _PACKAGE = Path(__file__).resolve().parent.parent

@@ -1,0 +1,125 @@
+"""``sfmapp dense``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sfmapp.cli.common import (
+    add_output_flags,
+    limit_library_threads,
+    list_options,
+    listening,
+    load_numba_without_blas,
+    print_json,
+)
+
+if TYPE_CHECKING:
+    from sfmapp.pipelines.options import Options
+
+DENSE_EXAMPLES = """\
+examples:
+  sfmapp dense out/
+  sfmapp dense colmap/sparse/0 --images colmap/images -o out/
+  sfmapp dense out/ --set dense.level=0 --region -1 -1 0 1 1 2 --maps
+
+SOURCE is a workspace of sfmapp reconstruct, or a COLMAP model (binary or text, any of our camera models) with the
+folder of its photographs. Writes OUT/dense/fused.ply (places, normals, colours, number of views, score, sigma) and
+patches.npz; the same command again resumes a run that was cut off, and does nothing where all is done."""
+
+
+def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the commands of this family to the parser."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = commands.add_parser(
+        "dense", help="cameras and photographs to a dense cloud of oriented patches", epilog=DENSE_EXAMPLES,
+        formatter_class=raw, description="Reconstruct oriented patches all over the surfaces that photographs show.",
+    )  # fmt: skip
+    parser.add_argument("source", metavar="SOURCE", type=Path, nargs="?", help="a workspace, or a COLMAP model")
+    parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="workspace of the results; default: SOURCE")
+    parser.add_argument("--images", metavar="DIR", type=Path, help="folder of the photographs of a COLMAP model")
+    parser.add_argument("--maps", action="store_true", help="depth and normal maps of every view in OUT/dense/maps")
+    parser.add_argument("--list-options", action="store_true", help="list every stage.option and its default")
+    _add_dense_flags(parser)
+    add_output_flags(parser, has_log=True)
+    parser.set_defaults(run=_dense, parser=parser)
+
+
+def _add_dense_flags(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("options (later ones win: presets in order, then --set, then the flags)")
+    group.add_argument("--preset", metavar="NAME|FILE", action="append", default=[], help="default, fast, or a file")
+    group.add_argument("--set", metavar="STAGE.OPTION=VALUE", action="append", default=[], help="may be repeated")
+    group.add_argument("--threads", metavar="N", help="workers; default: all cores. Results do not depend on it")
+    group.add_argument("--level", metavar="N", help="halve the photographs N times; default: 1600 px or less a side")
+    group.add_argument("--ground-sampling", metavar="D", help="instead: what a pixel measures, in units of the world")
+    group.add_argument("--masks", metavar="DIR", help="folder of masks named IMAGE.png; black is ignored")
+    group.add_argument(
+        "--region", metavar=("X", "Y", "Z", "X", "Y", "Z"), nargs=6,
+        help="lower and upper corner of the box to reconstruct",
+    )  # fmt: skip
+    group.add_argument("--max-memory", metavar="MB", help="work in clusters of views that stay below this")
+    group.add_argument("--no-recording", action="store_true", help="do not write dense/recording.rrd")
+
+
+def _options(args: argparse.Namespace) -> Options:
+    """The effective options of a command line."""
+    limit_library_threads()
+    from sfmapp.pipelines.options import load_options
+
+    flags = {
+        "threads": args.threads,
+        "dense.level": args.level,
+        "dense.ground_sampling": args.ground_sampling,
+        "images.mask_path": args.masks,
+        "dense.region": None if args.region is None else ",".join(args.region),
+        "dense.max_memory_mb": args.max_memory,
+    }
+    settings = [*args.set, *(f"{name}={value}" for name, value in flags.items() if value is not None)]
+    return load_options(args.preset, settings)
+
+
+def _dense(args: argparse.Namespace) -> int:
+    if args.list_options:
+        return list_options(args)
+    if args.source is None:
+        args.parser.error("SOURCE is needed")
+    options = _options(args)
+    load_numba_without_blas()
+    from sfmapp.pipelines.dense import dense
+    from sfmapp.pipelines.usage import Stopwatch
+
+    watch = Stopwatch(whole_process=True)
+    with listening(args) as events:
+        result = dense(
+            args.source, args.output, options, images=args.images, maps=args.maps, record=not args.no_recording,
+            events=events, watch=watch,
+        )  # fmt: skip
+    output = args.output or args.source
+    if args.json:
+        print_json({"exit_code": 0, **dense_result(output, result.report)})
+    elif not args.quiet:
+        print_dense(output, result.report)
+    return 0
+
+
+def dense_result(output: Path, report: dict[str, Any]) -> dict[str, Any]:
+    """What ``--json`` prints of a cloud; the rest is in report.json."""
+    names = ("num_patches", "mean_views", "median_score", "median_sigma", "median_size", "shares", "run")
+    paths = {"cloud": str(output / "dense" / "fused.ply"), "patches": str(output / "dense" / "patches.npz")}
+    return {"output": str(output), **paths, **{name: report[name] for name in names if name in report}}
+
+
+def print_dense(output: Path, report: dict[str, Any]) -> None:
+    """A cloud in three lines."""
+    print(
+        f"{report['num_patches']} patches from {report['views']['num_views']} views, each in {report['mean_views']:.1f}"
+        f" of them, score {report['median_score']:.3f}, sigma {report['median_sigma']:.3g},"
+        f" a pixel measures {report['median_size']:.3g}"
+    )
+    if report.get("is_up_to_date"):
+        print(f"{output} is up to date: nothing to do")
+    else:
+        run = report["run"]
+        print(f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB")
+    print(f"cloud {output / 'dense' / 'fused.ply'}; a surface of it: sfmapp mesh {output}")

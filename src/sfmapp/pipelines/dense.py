@@ -1,0 +1,151 @@
+"""A model and its photographs to dense patches, on a page.
+
+:func:`dense` opens the workspace and sees to it that every end is a clean one; :func:`_run` is the job.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sfmapp.dense import outcome
+from sfmapp.dense.clusters import Cluster, in_core, make_clusters, merge_clusters
+from sfmapp.dense.densify import densify
+from sfmapp.dense.files import read_patches, write_patches
+from sfmapp.dense.prepare import DensePlan, load_scene
+from sfmapp.dense.scene import Patches
+from sfmapp.errors import InputError, NoReconstructionError
+from sfmapp.events import Events
+from sfmapp.pipelines import dense_results
+from sfmapp.pipelines.dense_results import STAGE
+from sfmapp.pipelines.dense_source import DenseJob, dense_job, find_source, plan_source
+from sfmapp.pipelines.kernels import compile_dense_kernels
+from sfmapp.pipelines.options import Options, with_absolute_paths
+from sfmapp.pipelines.usage import Stopwatch
+
+
+class DenseResult(NamedTuple):
+    """The patches, the names of the images that they count, and the report of it: ``dense`` of ``report.json``."""
+
+    patches: Patches
+    image_names: tuple[str, ...]
+    report: dict[str, Any]
+
+
+def dense(
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str] | None = None,
+    options: Options | None = None,
+    *,
+    images: str | os.PathLike[str] | None = None,
+    maps: bool = False,
+    record: bool = True,
+    events: Events | None = None,
+    watch: Stopwatch | None = None,
+) -> DenseResult:
+    """Reconstruct oriented patches all over the surfaces that the photographs of a model show.
+
+    What an earlier run in the same workspace has done is used where it still holds.
+
+    Args:
+        source: a workspace, or the folder of a COLMAP model.
+        output: workspace of the results; None: ``source`` itself.
+        options: ``dense`` and, for masks, ``images`` count here.
+        images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
+        maps: write depth and normal maps of every view as well.
+        record: write ``dense/recording.rrd``, the patches growing wave by wave.
+        events: listens in, and can ask the run to stop.
+        watch: started earlier, if more is to be counted in the report than this call.
+
+    Raises:
+        UsageError: no place for the results, or the output folder holds something else.
+        InputError: no model, or too few of its photographs are there.
+        NoReconstructionError: hardly a patch was found; the report and what there is are written.
+        InterruptedRunError: ``events`` was asked to stop; the same call resumes.
+    """
+    where = find_source(source, output, images, with_absolute_paths(options or Options()))
+    with dense_job(where, events or Events(), watch) as job:
+        return _run(job, maps=maps, record=record)
+
+
+def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
+    """The job: views, what still holds of an earlier run, patches, and the report of it all."""
+    report: dict[str, Any] = {}
+    key = ""
+    try:
+        with job.stage("views"):
+            plan, report["views"] = plan_source(job)
+        key = dense_results.dense_key(job, plan)
+        if (earlier := dense_results.earlier_report(job, key)) is not None:
+            patches, _ = read_patches(job.workspace.folder / dense_results.PATCHES)
+            dense_results.write_extras(job, plan, patches, maps=maps, record=record, is_new=False)
+            return DenseResult(patches, plan.names, earlier)
+        is_resumed = job.workspace.has_key(STAGE, key)
+        job.note_source()
+        job.workspace.begin(STAGE, key)
+        with job.measured("kernels"):
+            compile_dense_kernels(job.events)
+        patches = _densify(job, plan, report, is_resumed)
+        dense_results.write_cloud(job, plan, patches)
+        if warning := outcome.check(patches, report["shares"]):
+            job.events.warned(STAGE, warning)
+        dense_results.write_extras(job, plan, patches, maps=maps, record=record, is_new=True)
+    except NoReconstructionError as failure:
+        dense_results.finish(job, key, report, failure)
+        raise
+    return DenseResult(patches, plan.names, dense_results.finish(job, key, report))
+
+
+def _densify(job: DenseJob, plan: DensePlan, report: dict[str, Any], is_resumed: bool) -> Patches:
+    """Patches of all clusters, within the region; what came of it goes into the report."""
+    options = job.options.dense
+    clusters = make_clusters(plan, options.cell_px, options.max_memory_mb)
+    if len(clusters) > 1:
+        sizes = [len(cluster.core) for cluster in clusters]
+        job.events.decided(
+            STAGE, f"{len(plan.records)} views in {len(clusters)} clusters to stay below {options.max_memory_mb} MB",
+            sizes=sizes, memory_mb=[round(cluster.memory_mb) for cluster in clusters],
+        )  # fmt: skip
+    parts, texture = [], []
+    report["clusters"] = []
+    with job.stage(STAGE):
+        for number, cluster in enumerate(clusters):
+            path = dense_results.part_path(job, number)
+            part = _read_part(path, plan) if is_resumed else None
+            if part is None:
+                part, row = _densify_cluster(job, plan, cluster)
+                if len(clusters) > 1:
+                    write_patches(path, part, plan.names)
+            else:
+                row = {"is_resumed": True}
+            texture += row.pop("texture", [])
+            report["clusters"].append({"views": [plan.names[m] for m in cluster.core], "num_patches": len(part)} | row)
+            parts.append(part)
+        patches = merge_clusters(plan, options.cell_px, parts) if len(parts) > 1 else parts[0]
+        if plan.region is not None:
+            patches = patches.subset(plan.region.holds(patches.xyz))
+    dense_results.remove_parts(job)
+    report |= dense_results.summary(patches)
+    report["shares"] = outcome.judge(patches, texture, options.cell_px)
+    return patches
+
+
+def _densify_cluster(job: DenseJob, plan: DensePlan, cluster: Cluster) -> tuple[Patches, dict[str, Any]]:
+    is_whole = len(cluster.core) == len(plan.records)
+    scene = load_scene(
+        plan, cluster.views, core=None if is_whole else cluster.core, threads=job.threads, events=job.events
+    )
+    texture = [outcome.textured_pixels(scene.views[at]) for at in np.searchsorted(cluster.views, cluster.core)]
+    patches, row = densify(scene, job.options.dense, threads=job.threads, events=job.events)
+    return in_core(patches, cluster), row | {"texture": texture}
+
+
+def _read_part(path: Any, plan: DensePlan) -> Patches | None:
+    """Patches of a cluster that an earlier run has finished; None if it has not."""
+    try:
+        patches, names = read_patches(path)
+    except InputError:
+        return None
+    return patches if names == plan.names else None

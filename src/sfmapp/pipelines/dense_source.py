@@ -1,0 +1,213 @@
+"""What a dense run works on: a model, its photographs, and the workspace that the results go to."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import sfmapp
+from sfmapp.dense.photographs import find_photographs
+from sfmapp.dense.prepare import DensePlan, plan_views
+from sfmapp.errors import InputError, NoReconstructionError, UsageError
+from sfmapp.events import Events
+from sfmapp.formats.colmap import has_model, read_model
+from sfmapp.images.sources import find_images
+from sfmapp.pipelines.listeners import DecisionLog, EventLog
+from sfmapp.pipelines.options import Options, options_from_dict, options_to_dict
+from sfmapp.pipelines.run import Job
+from sfmapp.pipelines.usage import Stopwatch
+from sfmapp.pipelines.workspace import DENSE, RECONSTRUCT, open_workspace, read_manifest
+
+# where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0
+_USUAL_FOLDERS = ("images", "../images", "../../images")
+
+
+@dataclass(frozen=True)
+class DenseSource:
+    """Where everything is.
+
+    Attributes:
+        model: folder of the COLMAP model.
+        images: folder of the photographs.
+        output: the workspace.
+        command: that wrote it or is to make it.
+        is_upright: the model counts pixels in photographs turned as EXIF says.
+        options: those given, with the masks of the run that made the model unless others are named.
+    """
+
+    model: Path
+    images: Path
+    output: Path
+    command: str
+    is_upright: bool
+    options: Options
+
+
+@dataclass
+class DenseJob(Job):
+    """A dense run, or the making of its mesh, under way.
+
+    Attributes:
+        where: model, photographs and workspace.
+    """
+
+    where: DenseSource | None = None
+
+    @property
+    def known(self) -> DenseSource:
+        """``where``, which every such job has."""
+        assert self.where is not None
+        return self.where
+
+    def note_source(self) -> None:
+        """Write down what this run works on and how; a reconstruction has noted its own photographs."""
+        manifest = self.workspace.manifest
+        if self.known.command == DENSE:
+            self.note_inputs({})
+            manifest["model"], manifest["is_upright"] = os.path.abspath(self.known.model), self.known.is_upright
+        else:
+            plain = options_to_dict(self.options)
+            manifest.setdefault("options", {}).update({name: plain[name] for name in ("dense", "surface")})
+        self.workspace.save()
+
+
+@contextmanager
+def dense_job(where: DenseSource, events: Events, watch: Stopwatch | None = None) -> Iterator[DenseJob]:
+    """Open the workspace of a dense run or of its mesh, and listen in."""
+    from threadpoolctl import threadpool_limits
+
+    options, source = where.options, str(where.images)
+    threads = options.threads or len(os.sched_getaffinity(0))
+    with (
+        open_workspace(where.output, where.command) as workspace,
+        EventLog(workspace.log, source=source, version=sfmapp.__version__) as event_log,
+        # our workers use the cores; sums must not depend on how many the linear algebra beneath them would use
+        threadpool_limits(1, "blas"),
+    ):
+        job = DenseJob(source, workspace, options, events, watch or Stopwatch(), DecisionLog(), threads, where=where)
+        for listener in (event_log, job.log):
+            events.subscribe(listener)
+        yield job
+
+
+def plan_source(job: DenseJob) -> tuple[DensePlan, dict[str, Any]]:
+    """What is planned with the views of the model, and the report of it.
+
+    Raises:
+        InputError: the model or too many of its photographs are gone.
+        NoReconstructionError: no baseline between the views.
+    """
+    where = job.known
+    if not has_model(where.model):
+        raise InputError(f"{where.model}: the model that this workspace was made of is gone", "bring it back")
+    model, _ = read_model(where.model)
+    photographs = find_photographs(
+        model, where.images, job.options.images,
+        is_upright=where.is_upright, threads=job.threads, events=job.events,
+    )  # fmt: skip
+    return plan_views(model, photographs, job.options.dense, job.events)
+
+
+def find_source(
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str] | None,
+    images: str | os.PathLike[str] | None,
+    options: Options,
+) -> DenseSource:
+    """Find model, photographs and workspace.
+
+    Args:
+        source: a workspace, or the folder of a COLMAP model.
+        output: where the results go; None: into ``source``, which has to be a workspace then.
+        images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
+        options: of the run.
+
+    Raises:
+        UsageError: no place for the results, or a workspace of another command.
+        InputError: no model, no photographs.
+        NoReconstructionError: the workspace holds no model.
+    """
+    folder = Path(source)
+    if (folder / "run.json").is_file():
+        return _in_workspace(folder, output, images, options)
+    if not has_model(folder):
+        if not has_model(folder / "sparse" / "0"):
+            what = "no such folder" if not folder.is_dir() else "neither of them"
+            raise InputError(f"{folder}: expected a workspace of sfmapp or a COLMAP model, found {what}")
+        folder = folder / "sparse" / "0"
+    if output is None:
+        raise UsageError(f"{folder} is a COLMAP model: -o OUT is needed", "give a folder for the results")
+    return DenseSource(folder, _image_folder(folder, images), Path(output), DENSE, False, options)
+
+
+def _in_workspace(
+    folder: Path, output: str | os.PathLike[str] | None, images: str | os.PathLike[str] | None, options: Options
+) -> DenseSource:
+    manifest = read_manifest(folder)
+    command = manifest.get("command", RECONSTRUCT)
+    if command not in (RECONSTRUCT, DENSE):
+        raise UsageError(
+            f"{folder} holds the results of sfmapp {command}, not of sfmapp {RECONSTRUCT}",
+            f"its model can be used all the same: sfmapp dense {folder}/sparse/0 --images DIR -o OUT",
+        )
+    is_own = output is None or Path(output).resolve() == folder.resolve()
+    target = folder if output is None else Path(output)
+    if command == DENSE:
+        model = Path(str(manifest.get("model", "")))
+        found = Path(images) if images is not None else Path(str(manifest.get("source", "")))
+        is_upright = bool(manifest.get("is_upright"))
+    else:
+        model = folder / "sparse" / "0"
+        found = Path(images) if images is not None else image_root(str(manifest.get("source") or ""))
+        is_upright = True
+        if not has_model(model):
+            raise NoReconstructionError(f"{folder} holds no model", "run sfmapp reconstruct first")
+    earlier = options_from_dict({"images": manifest.get("options", {}).get("images", {})}).images
+    if options.images.mask_path is None and earlier.mask_path is not None:
+        images_options = dataclasses.replace(options.images, mask_path=earlier.mask_path)
+        options = dataclasses.replace(options, images=images_options)
+    return DenseSource(model, found, target, command if is_own else DENSE, is_upright, options)
+
+
+def image_root(source: str) -> Path:
+    """The folder that the names of a reconstruction are relative to: its source, or what a glob or list spans.
+
+    Raises:
+        InputError: the photographs are gone.
+    """
+    path = Path(source)
+    if path.is_dir() and source:
+        return path
+    if not source:
+        raise InputError("run.json does not name the photographs", "name their folder: --images DIR")
+    try:
+        return find_images(source).root
+    except InputError as error:
+        raise InputError(f"the photographs of this workspace are gone: {error}", "give --images DIR") from error
+
+
+def _image_folder(model: Path, images: str | os.PathLike[str] | None) -> Path:
+    if images is not None:
+        if not Path(images).is_dir():
+            raise InputError(f"{images}: expected the folder of the photographs, found no folder")
+        return Path(images)
+    for name in _USUAL_FOLDERS:
+        if (model / name).is_dir():
+            return model / name
+    looked = ", ".join(os.path.normpath(model / name) for name in _USUAL_FOLDERS)
+    raise UsageError(f"where are the photographs of {model}?", f"give --images DIR; there is no {looked}")
+
+
+def model_digest(model: Path) -> str:
+    """Hash of the files of a model."""
+    digest = hashlib.blake2b(digest_size=16)
+    for path in sorted(model.iterdir()):
+        if path.suffix in (".bin", ".txt") and path.stem in ("cameras", "images", "points3D", "rigs", "frames"):
+            digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
