@@ -40,9 +40,11 @@ def coverage(scene: DenseScene, patches: Patches, *, block_px: int = 4, min_view
     """
     poses = scene.cam_from_world
     trusting = np.repeat(np.arange(len(patches)), patches.num_views)
+    trusting = trusting[np.argsort(patches.view_idx, kind="stable")]
+    limits = np.concatenate([[0], np.cumsum(np.bincount(patches.view_idx, minlength=len(scene.views)))])
     rows = []
     for v, view in enumerate(scene.views):
-        mine = trusting[patches.view_idx == v]
+        mine = trusting[limits[v] : limits[v + 1]]
         wanted, covered, depth = _blocks(view, patches.xyz[mine], block_px)
         is_plain = _deviation(view, block_px) < PLAIN
         seen_by = 1 + _num_seeing(scene, poses, v, depth, block_px)
