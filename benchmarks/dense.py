@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -135,23 +135,20 @@ def run_ours(case: Case, work: Path, threads: int = 1) -> dict[str, Any]:
 
 
 def run_prototype(case: Case, work: Path) -> dict[str, Any]:
-    """The batch PMVS of the research note, its second pass over the same input: compiled. CPU as it tells it itself."""
+    """The batch PMVS of the research note, compiled by a run on small images before. CPU as it tells it itself."""
     copy = work / "prototype"
     shutil.copytree(PROTOTYPE, copy, dirs_exist_ok=True)
-    command = [sys.executable, "pmvs_batch.py", str(case.peer_images or case.images), str(case.model)]
-    command += [
-        str(work / "peer.ply"),
-        "--level",
-        str(case.level),
-        "--csize",
-        str(case.cell_px),
-        "--threads",
-        "1",
-        "--warm",
-    ]
-    done = subprocess.run(command, cwd=copy, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    words = ["pmvs_batch.py", str(case.peer_images or case.images), str(case.model), str(work / "peer.ply")]
+    words += ["--csize", str(case.cell_px), "--threads", "1", "--level"]
+    code = "import sys, pmvs_batch"
+    for level in (case.level + 1 + (case.peer_images is None), case.level):
+        code += f"; sys.argv = {[*words, str(level)]!r}; pmvs_batch.main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=copy, capture_output=True, text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
     if done.returncode:
-        return {"case": case.name, "program": "prototype", "failed": done.stderr[-500:]}
+        return {"case": case.name, "program": "prototype", "threads": 1, "failed": done.stderr[-500:]}
     told = [json.loads(line) for line in done.stdout.splitlines() if re.match(r'\{"times"', line)][-1]
     row = {"case": case.name, "program": "prototype", "threads": 1, "num_points": told["N"], "cpu_s": told["cpu"]}
     return row | {"wall_s": told["wall"]} | scores(case, read_ply_geometry(work / "peer.ply").xyz)
@@ -186,14 +183,22 @@ def truth_labels(path: Path) -> NDArray[np.uint8] | None:
         return np.fromfile(file, [("xyz", "<f4", 3), ("red", "u1"), ("green", "u1")])["green"]
 
 
-def measure(case: Case, work: Path) -> Iterator[dict[str, Any]]:
+def measure(case: Case, work: Path, program: str | None) -> Iterator[dict[str, Any]]:
     """All runs of a case: ours, the prototype where it is at hand, and for the fountain ours on two threads."""
     load = os.getloadavg()[0]
-    yield run_ours(case, work) | {"load_before": load}
-    if case.name == "fountain":
+    if program != "prototype":
+        yield run_ours(case, work) | {"load_before": load}
+    if program != "prototype" and case.name == "fountain":
         yield run_ours(case, work, threads=2) | {"load_before": load}
-    if case.has_peer and PROTOTYPE.is_dir():
-        yield run_prototype(case, work) | {"load_before": os.getloadavg()[0]}
+    if program != "sfmapp" and case.has_peer and PROTOTYPE.is_dir():
+        yield run_prototype(case, work) | {"load_before": load}
+
+
+def merged(runs: list[dict[str, Any]], new: dict[str, Any]) -> list[dict[str, Any]]:
+    """The runs with a new one in the place of the one it repeats."""
+    key = ("case", "program", "threads")
+    kept = [run for run in runs if any(run[k] != new[k] for k in key)]
+    return sorted([*kept, new], key=lambda run: (run["case"], run["program"] != "sfmapp", run["threads"]))
 
 
 # ---------------------------------------------------------------- report
@@ -257,18 +262,20 @@ def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--scenes", type=Path, default=ROOT / "out" / "dense", help="folder of the rendered scenes")
-    parser.add_argument("--only", default="", help="cases whose names begin with this")
+    parser.add_argument("--only", default="", help="cases whose names begin with this; others keep their results")
+    parser.add_argument("--program", choices=["sfmapp", "prototype"], help="run just one of the two")
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "benchmarks" / "results" / "dense.json")
     args = parser.parse_args()
-    report: dict[str, Any] = environment() | {"runs": []}
+    runs = json.loads(args.output.read_text())["runs"] if args.output.is_file() else []
+    report: dict[str, Any] = environment() | {"runs": runs}
     with tempfile.TemporaryDirectory(prefix="dense-") as name:
         work = Path(name)
         for case in find_cases(args.scenes, work, args.only):
             if not case.name.startswith(args.only):
                 continue
-            report.setdefault("cases", {})[case.name] = {k: str(v) for k, v in asdict(case).items()}
-            for run in measure(case, work):
-                report["runs"].append(run)
+            for run in measure(case, work, args.program):
+                run |= {"commit": report["commit"], "date": report["date"]}
+                report["runs"] = merged(report["runs"], run)
                 print(json.dumps(run), file=sys.stderr, flush=True)
                 args.output.write_text(json.dumps(report, indent=1) + "\n")
     args.output.with_suffix(".md").write_text(markdown(report))

@@ -42,6 +42,7 @@ Place = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
 
 WIDTH, HEIGHT, FOCAL_PX = 1600, 1200, 1408.0
 NOISE_GREY = 3.0
+SKYLIGHT, GROUNDLIGHT = [0.42, 0.47, 0.55], [0.24, 0.22, 0.19]  # on surfaces that face up and down
 MIN_VIEWS_SURFACE, MIN_VIEWS_POINT = 2, 3
 NUM_POINTS = 3000
 RAILING_DISTANCE_M = 3.4  # of the cameras from the bars, about
@@ -148,24 +149,40 @@ def pixels() -> tuple[mi.Float, mi.Float]:
     return mi.Float(index % WIDTH), mi.Float(index // WIDTH)
 
 
+def radiance(scene: mi.Scene, ray: mi.Ray3f, xi: list[mi.Float]) -> mi.Color3f:
+    """Light along rays: the sun, with soft shadows, and an even sky over even ground.
+
+    Without the hemisphere that make_sample draws from there is no noise but the sensor's, at a few samples per pixel.
+    """
+    hit = scene.ray_intersect(ray)
+    seen = hit.is_valid()
+    albedo, frame = sample._surface(hit, ray, seen)
+    sun_frame = mi.Frame3f(dr.normalize(mi.Vector3f(sample.SUN.tolist())))
+    disc = mi.warp.square_to_uniform_disk(mi.Point2f(xi[0], xi[1])) * sample.SUN_RADIUS
+    light = sample._sunlight(scene, hit, frame, dr.normalize(sun_frame.to_world(mi.Vector3f(disc.x, disc.y, 1))), seen)
+    up = 0.5 + 0.5 * frame.n.z
+    light += up * mi.Color3f(SKYLIGHT) + (1 - up) * mi.Color3f(GROUNDLIGHT)
+    return dr.select(seen, albedo * light, scene.environment().eval(hit, ~seen))
+
+
 def photograph(scene: mi.Scene, pose: Pose, spp: int, seed: int) -> Array:
     """(H, W, 3) uint8; sampled as make_sample.render does, then the sensor's noise."""
     rng = np.random.default_rng([seed, 99])
     column, row = pixels()
-    shifts = [mi.Float(rng.random(WIDTH * HEIGHT, dtype=np.float32)) for _ in range(6)]
-    orders = [rng.permutation(spp) for _ in range(3)]
+    shifts = [mi.Float(rng.random(WIDTH * HEIGHT, dtype=np.float32)) for _ in range(4)]
+    orders = [rng.permutation(spp) for _ in range(2)]
     r2 = np.array([0.7548776662466927, 0.5698402909980532])
     total = mi.Color3f(0)
     for k in range(spp):
         xi = []
-        for d in range(6):
+        for d in range(4):
             offset = mi.Float(float(orders[d // 2][k] * r2[d % 2] % 1))
             dr.make_opaque(offset)
             xi.append(dr.minimum((shifts[d] + offset) - dr.floor(shifts[d] + offset), 0.9999))
         spread = 0.42 * dr.sqrt(-2 * dr.log(1 - xi[0]))  # Box and Muller
         sin, cos = dr.sincos(2 * np.pi * xi[1])
         ray = rays(pose, column + 0.5 + spread * cos, row + 0.5 + spread * sin)
-        total += sample.radiance(scene, ray, xi[2:])
+        total += radiance(scene, ray, xi[2:])
         dr.eval(total)
     linear = np.array(total).T.reshape(HEIGHT, WIDTH, 3) / spp
     grey = sample.develop(linear, sample.EXPOSURE) + rng.normal(0, NOISE_GREY, linear.shape)
@@ -278,39 +295,47 @@ def name_of(view: int) -> str:
     return f"view_{view + 1:02d}.jpg"
 
 
+def write_geometry(world: World, output: Path) -> None:
+    """Depth maps, models, truth and scene.json."""
+    (output / "depth").mkdir(exist_ok=True)
+    depths, labels = [], []
+    for k, pose in enumerate(world.views):
+        depths.append(distances(world.scene, pose))
+        np.save(output / "depth" / f"{Path(name_of(k)).stem}.npy", depths[-1])
+        labels.append(np.zeros(depths[-1].shape, np.uint8))
+        for width, bars in world.bars.items():
+            labels[-1][(depths[-1] > 0) & (np.abs(distances(bars, pose) - depths[-1]) < 1e-4)] = width
+    gsd = float(np.median([np.median(depth[depth > 0]) for depth in depths]) / FOCAL_PX)
+    xyz, label, seen = surface(world, depths, labels, gsd)
+    write_truth(output / "truth.ply", xyz, label if world.bars else None)
+    chosen = np.flatnonzero(seen.sum(axis=1) >= MIN_VIEWS_POINT)
+    chosen = np.random.default_rng(5).choice(chosen, NUM_POINTS, replace=False)
+    write_model(output / "model", world.views, np.zeros((0, 3)), seen[:0])
+    write_model(output / "model_points", world.views, xyz[chosen], seen[chosen])
+    facts = {"gsd": gsd, "bbox": [world.low.tolist(), world.high.tolist()], "num_truth": len(xyz)}
+    (output / "scene.json").write_text(json.dumps(facts, indent=1) + "\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("world", choices=["courtyard", "railing"])
     parser.add_argument("output", type=Path)
     parser.add_argument("--spp", type=int, default=4, help="samples per pixel")
     parser.add_argument("--quality", type=int, default=92, help="of the JPEGs")
+    parser.add_argument("--photographs-only", action="store_true", help="depth, models and truth are there already")
     args = parser.parse_args()
     start = time.process_time()
     world = {"courtyard": courtyard, "railing": railing}[args.world]()
     print(f"scene built, {time.process_time() - start:.0f} CPU s", flush=True)
     (args.output / "images").mkdir(parents=True, exist_ok=True)
-    (args.output / "depth").mkdir(exist_ok=True)
-    depths, labels = [], []
     for k, pose in enumerate(world.views):
         Image.fromarray(photograph(world.scene, pose, args.spp, k)).save(
             args.output / "images" / name_of(k), quality=args.quality, subsampling=0
         )
-        depths.append(distances(world.scene, pose))
-        np.save(args.output / "depth" / f"{Path(name_of(k)).stem}.npy", depths[-1])
-        labels.append(np.zeros(depths[-1].shape, np.uint8))
-        for width, bars in world.bars.items():
-            labels[-1][(depths[-1] > 0) & (np.abs(distances(bars, pose) - depths[-1]) < 1e-4)] = width
         print(f"{name_of(k)}: {time.process_time() - start:.0f} CPU s", flush=True)
-    gsd = float(np.median([np.median(depth[depth > 0]) for depth in depths]) / FOCAL_PX)
-    xyz, label, seen = surface(world, depths, labels, gsd)
-    write_truth(args.output / "truth.ply", xyz, label if world.bars else None)
-    chosen = np.flatnonzero(seen.sum(axis=1) >= MIN_VIEWS_POINT)
-    chosen = np.random.default_rng(5).choice(chosen, NUM_POINTS, replace=False)
-    write_model(args.output / "model", world.views, np.zeros((0, 3)), seen[:0])
-    write_model(args.output / "model_points", world.views, xyz[chosen], seen[chosen])
-    facts = {"gsd": gsd, "bbox": [world.low.tolist(), world.high.tolist()], "num_truth": len(xyz), "spp": args.spp}
-    (args.output / "scene.json").write_text(json.dumps(facts, indent=1) + "\n")
-    print(f"gsd {1000 * gsd:.2f} mm, {len(xyz)} points of truth, {time.process_time() - start:.0f} CPU s", flush=True)
+    if not args.photographs_only:
+        write_geometry(world, args.output)
+        print(f"all written, {time.process_time() - start:.0f} CPU s", flush=True)
     dr.flush_malloc_cache()
 
 
