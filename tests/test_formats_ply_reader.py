@@ -123,7 +123,7 @@ def test_files_that_are_not_what_they_claim(tmp_path: Path, data: bytes, message
     ("faces", "message"),
     [
         (b"\x03" + struct.pack("<3i", 0, 1, 9), "faces of vertices 0 to 4, found 9"),
-        (b"\x03" + struct.pack("<3i", 0, -1, 2), "faces of vertices 0 to 4"),
+        (b"\x03" + struct.pack("<3i", 0, -1, 2), "faces of vertices 0 to 4, found -1"),
         (b"\x02" + struct.pack("<2i", 0, 1), "three corners and more, found 2"),
         (b"\xff" + struct.pack("<3i", 0, 1, 2), "truncated in row 0 of 'face', a list of 255"),
     ],
@@ -133,6 +133,23 @@ def test_bad_faces(tmp_path: Path, faces: bytes, message: str) -> None:
     (tmp_path / "a.ply").write_bytes(head("binary_little_endian", body) + vertex_bytes("<") + faces)
     with pytest.raises(InputError, match=message):
         read_ply_geometry(tmp_path / "a.ply")
+
+
+def test_a_corner_beyond_64_bits(tmp_path: Path) -> None:
+    body = "element vertex 1\n" + PLAIN + "element face 1\nproperty list uchar int vertex_indices\n"
+    (tmp_path / "a.ply").write_bytes(head("ascii", body) + f"1 2 3\n3 0 0 {2**64}\n".encode())
+    with pytest.raises(InputError, match="beyond 64 bits"):
+        read_ply_geometry(tmp_path / "a.ply")
+
+
+def test_names_of_properties_are_free(tmp_path: Path) -> None:
+    """Counts of lists have names of their own in memory; none that a file gives collides with them."""
+    body = VERTEX + "element face 1\nproperty uchar #vertex_indices\nproperty list uchar int vertex_indices\n"
+    data = vertex_bytes("<") + b"\x07\x03" + struct.pack("<3i", 2, 1, 4)
+    (tmp_path / "a.ply").write_bytes(head("binary_little_endian", body) + data)
+    triangles = read_ply_geometry(tmp_path / "a.ply").triangles
+    assert triangles is not None
+    assert triangles.tolist() == [[2, 1, 4]]
 
 
 def test_a_missing_file(tmp_path: Path) -> None:

@@ -55,14 +55,18 @@ class _Element:
         return any(prop.count_kind is not None for prop in self.properties)
 
     def dtype(self, order: str, lengths: tuple[int, ...] = ()) -> np.dtype:
-        """Of one row; lists get the given lengths, in their order, and a field ``#NAME`` for the count before them."""
+        """Of one row; lists get the given lengths, in their order, and their counts a field ``NAME count``.
+
+        No header can name such a field itself: its names hold no blanks.
+        """
         fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
         left = list(lengths)
         for prop in self.properties:
             if prop.count_kind is None:
                 fields.append((prop.name, order + prop.kind))
             else:
-                fields += [(f"#{prop.name}", order + prop.count_kind), (prop.name, order + prop.kind, (left.pop(0),))]
+                fields.append((f"{prop.name} count", order + prop.count_kind))
+                fields.append((prop.name, order + prop.kind, (left.pop(0),)))
         return np.dtype(fields)
 
 
@@ -95,8 +99,11 @@ def _read(path: Path, file: BinaryIO) -> PlyGeometry:
             triangles = _fans(path, *_lists(path, file, element, order))
         else:
             _skip(path, file, element, order)
-    if triangles is not None and len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(xyz):
-        raise InputError(f"{path}: expected faces of vertices 0 to {len(xyz) - 1}, found {triangles.max()}")
+    if triangles is not None and len(triangles):
+        lowest, highest = int(triangles.min()), int(triangles.max())
+        if lowest < 0 or highest >= len(xyz):
+            found = lowest if lowest < 0 else highest
+            raise InputError(f"{path}: expected faces of vertices 0 to {len(xyz) - 1}, found {found}")
     return PlyGeometry(xyz, triangles)
 
 
@@ -250,7 +257,7 @@ def _lists_alike(file: BinaryIO, element: _Element, order: str) -> NDArray | Non
         rows = np.fromfile(file, dtype, element.count)
         lists = [prop.name for prop in element.properties if prop.count_kind is not None]
         if len(rows) == element.count and all(
-            (rows[f"#{name}"] == length).all() for name, length in zip(lists, lengths, strict=True)
+            (rows[f"{name} count"] == length).all() for name, length in zip(lists, lengths, strict=True)
         ):
             return rows
     file.seek(start)
@@ -277,7 +284,10 @@ def _text_lists(
                 place += length
         except (ValueError, IndexError):
             raise InputError(f"{path}: expected row {row} of '{element.name}', found {line[:60]!r}") from None
-    return np.array(lengths, np.int64), np.array(values, np.int64)
+    try:
+        return np.array(lengths, np.int64), np.array(values, np.int64)
+    except OverflowError:
+        raise InputError(f"{path}: expected rows of vertices in '{element.name}', found one beyond 64 bits") from None
 
 
 def _fans(path: Path, lengths: NDArray[np.int64], values: NDArray[np.int64]) -> NDArray[np.int64]:
