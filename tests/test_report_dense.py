@@ -86,15 +86,12 @@ def quad() -> Mesh:
     return Mesh(xyz, faces, vertex_normals(xyz, faces), np.full((4, 3), 200, np.uint8))
 
 
-def part(document: dict[str, Any] | None) -> dict[str, Any]:
-    """A part of a report: what was found, or why not."""
-    outcome = {"exit_code": 0 if document else 4, "message": "nothing agreed", "advice": None}
-    return {"outcome": outcome, **(document or {}), "usage": {}, "warnings": [], "decisions": []}
-
-
-def page_report(dense: dict[str, Any] | None, mesh: dict[str, Any] | None = None) -> dict[str, Any]:
+def page_report(dense: dict[str, Any] | None) -> dict[str, Any]:
     run = {"source": "a & b", "started": "2026-01-01", "versions": {"sfmapp": "1"}, "wall_s": 1.0, "cpu_s": 2.0}
-    return {"run": run, "dense": part(dense)} | ({"mesh": part(mesh)} if mesh else {})
+    return {
+        "outcome": {"exit_code": 0 if dense else 4, "message": "nothing agreed", "advice": None}, "run": run,
+        "usage": {}, "warnings": [], "decisions": [], "dense": dense,
+    }  # fmt: skip
 
 
 # ------------------------------------------------------------------------------------------------------------ coverage
@@ -154,7 +151,7 @@ def test_masked_places_do_not_count() -> None:
 
 def test_the_counts_of_a_document_add_up() -> None:
     patches = wall()
-    document = dense_document(make_scene(), patches, [report_of(len(patches))])
+    document = dense_document(make_scene(), patches, report_of(len(patches)), mesh_report())
     for entry in document["histograms"].values():
         assert sum(entry["counts"]) == len(patches)
         assert len(entry["edges"]) == len(entry["counts"]) + 1
@@ -164,8 +161,8 @@ def test_the_counts_of_a_document_add_up() -> None:
     score = document["histograms"]["score"]
     expected = np.histogram(patches.score.astype(float), score["edges"])[0]
     np.testing.assert_allclose(score["counts"], expected, atol=1)
-    funnel = [step["count"] for step in document["growth"]["funnel"]]
-    assert funnel[0] - sum(funnel[1:]) == document["num_patches"]
+    funnel = [step["count"] for step in document["funnel"]]
+    assert funnel[0] - sum(funnel[1:-1]) == funnel[-1] == document["num_patches"]
     assert {check["light"] for check in document["checks"]} <= {"green", "amber", "red"}
     assert json.loads(json.dumps(document)) == document
 
@@ -174,27 +171,19 @@ def test_values_out_of_range_and_unknown_ones_are_counted() -> None:
     patches = wall()
     patches.sigma[:3] = np.nan, np.inf, 1e6
     patches.score[:2] = -1.0, 0.1
-    document = dense_document(make_scene(), patches, [report_of(len(patches))])
+    document = dense_document(make_scene(), patches, report_of(len(patches)))
     assert all(sum(entry["counts"]) == len(patches) for entry in document["histograms"].values())
     assert document["histograms"]["score"]["counts"][0] >= 2
     assert document["histograms"]["sigma_px"]["counts"][-1] >= 3
     json.dumps(document, allow_nan=False)
 
 
-def test_clusters_are_summed_and_what_their_merging_took_is_said() -> None:
+def test_what_went_away_after_densification_is_a_step_of_its_own() -> None:
     patches = wall()
-    n = len(patches)
-    both = dense_document(make_scene(), patches, [report_of(n - 100), report_of(300)])["growth"]
-    assert [row["accepted"] for row in both["levels"]] == [n - 100 + 300 + 60]
-    assert both["levels"][0]["cpu_s"] == 5.0
-    assert both["waves"] == [{"wave": 2, "tried": 200, "accepted": 120}, {"wave": 3, "tried": 100, "accepted": 60}]
-    assert both["seeds"] == {"carried": 100, "points": 10, "corners": 14}
-    counts = [step["count"] for step in both["funnel"]]
-    assert counts[-1] == 200
-    assert counts[0] - sum(counts[1:]) == n
-    resumed = dense_document(make_scene(), patches, [report_of(300), {"is_resumed": True}])["growth"]
-    assert (resumed["num_clusters"], resumed["num_untold"]) == (2, 1)
-    assert resumed["levels"][0]["accepted"] == 330
+    document = dense_document(make_scene(), patches, report_of(len(patches) + 200))
+    counts = [step["count"] for step in document["funnel"]]
+    assert counts[-2] == 200
+    assert counts[0] - sum(counts[1:-1]) == counts[-1] == len(patches)
 
 
 # ------------------------------------------------------------------------------------------------------------ pictures
@@ -228,8 +217,8 @@ def test_the_turned_eye_sees_everything_from_above() -> None:
 
 def test_the_page_is_self_contained_and_holds_the_numbers() -> None:
     scene, patches = make_scene(), wall()
-    document = dense_document(scene, patches, [report_of(len(patches))])
-    page = render_dense_html(page_report(document, mesh_report()), dense_pictures(scene, patches, quad()))
+    document = dense_document(scene, patches, report_of(len(patches)), mesh_report())
+    page = render_dense_html(page_report(document), dense_pictures(scene, patches, quad()))
     assert page.count("data:image/jpeg;base64,") == 7
     assert not re.search(r'(src|href)="(?!data:)', page)
     assert "<script" not in page
@@ -241,15 +230,15 @@ def test_the_page_is_self_contained_and_holds_the_numbers() -> None:
 
 def test_the_worst_covered_photograph_comes_first() -> None:
     scene = make_scene(0.8)
-    document = dense_document(scene, wall(), [report_of(10)])
-    section = dense_section(part(document), None, [])
+    document = dense_document(scene, wall(), report_of(10))
+    section = dense_section(document, [])
     names = re.findall(r">(\d)&lt;b&gt;\.jpg", section)
     assert names == ["2", "1", "0"]
 
 
 def test_no_patches_still_make_a_page() -> None:
     scene, none = make_scene(), wall().subset(np.zeros(0, np.int64))
-    document = dense_document(scene, none, [report_of(0)])
+    document = dense_document(scene, none, report_of(0))
     assert all(row["coverage"] == 0.0 for row in document["images"])
     page = render_dense_html(page_report(document), dense_pictures(scene, none, None))
     assert "0 patches" in page

@@ -111,7 +111,7 @@ def dense_result(output: Path, report: dict[str, Any]) -> dict[str, Any]:
 
 
 def print_dense(output: Path, report: dict[str, Any]) -> None:
-    """A cloud in four lines."""
+    """A cloud in three lines."""
     print(
         f"{report['num_patches']} patches from {report['views']['num_views']} views, each in {report['mean_views']:.1f}"
         f" of them, score {report['median_score']:.3f}, sigma {report['median_sigma']:.3g},"
@@ -122,5 +122,4 @@ def print_dense(output: Path, report: dict[str, Any]) -> None:
     else:
         run = report["run"]
         print(f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB")
-    print(f"report {output / 'report.html'}; look at it: sfmapp view {output}")
     print(f"cloud {output / 'dense' / 'fused.ply'}; a surface of it: sfmapp mesh {output}")

@@ -18,7 +18,7 @@ from sfmapp.dense.prepare import DensePlan, load_scene
 from sfmapp.dense.scene import Patches
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
-from sfmapp.pipelines import dense_page, dense_results
+from sfmapp.pipelines import dense_results
 from sfmapp.pipelines.dense_results import STAGE
 from sfmapp.pipelines.dense_source import DenseJob, dense_job, find_source, plan_source
 from sfmapp.pipelines.kernels import compile_dense_kernels
@@ -92,14 +92,10 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
         if warning := outcome.check(patches, report["shares"]):
             job.events.warned(STAGE, warning)
         dense_results.write_extras(job, plan, patches, maps=maps, record=record, is_new=True)
-        shown, pictures = dense_page.look_at(job, plan, patches, report["clusters"])
     except NoReconstructionError as failure:
         dense_results.finish(job, key, report, failure)
-        dense_page.write_page(job, [])
         raise
-    section = dense_results.finish(job, key, report | shown)
-    dense_page.write_page(job, pictures)
-    return DenseResult(patches, plan.names, section)
+    return DenseResult(patches, plan.names, dense_results.finish(job, key, report))
 
 
 def _densify(job: DenseJob, plan: DensePlan, report: dict[str, Any], is_resumed: bool) -> Patches:

@@ -18,21 +18,22 @@ HARDLY_COVERED = 0.2
 
 
 def dense_document(
-    scene: DenseScene, patches: Patches, reports: Sequence[Mapping[str, Any]], *, cell_px: int = 1, min_views: int = 3
-) -> dict[str, Any]:
-    """What the dense part of a report shows.
+    scene: DenseScene, patches: Patches, dense_report: Mapping[str, Any], mesh_report: Mapping[str, Any] | None = None,
+    *, cell_px: int = 1, min_views: int = 3,
+) -> dict[str, Any]:  # fmt: skip
+    """The dense part of a report.
 
     Args:
         scene: the views, in any resolution.
-        patches: of all of them.
-        reports: of :func:`~sfmapp.dense.densify.densify`, one for each cluster of views; those without ``levels`` are
-            of an earlier run and are counted only.
+        patches: what :func:`~sfmapp.dense.densify.densify` made of them.
+        dense_report: its report, or the sums of those of several clusters of views.
+        mesh_report: of :func:`~sfmapp.surface.mesh.make_mesh`; None without a mesh.
         cell_px, min_views: of the options.
 
     Returns:
-        ``num_patches``, ``num_views``, ``checks``, ``growth`` (see :func:`_growth`), ``histograms`` of views, score and
-        deviation (``edges``, ``counts``, ``median``; all patches are in one of the bins, the outermost of which are
-        open) and ``images`` (see :func:`~sfmapp.report.coverage.coverage`).
+        ``num_patches``, ``num_views``, ``checks``, ``seeds``, ``levels``, ``waves`` and ``funnel`` of densification,
+        ``histograms`` of views, score and deviation (``edges``, ``counts``, ``median``; all patches are in one of the
+        bins, the outermost of which are open), ``images`` (see :func:`~sfmapp.report.coverage.coverage`) and ``mesh``.
     """
     images = coverage(scene, patches, block_px=max(4, 2 * cell_px), min_views=min_views)
     histograms = _histograms(patches)
@@ -40,49 +41,20 @@ def dense_document(
         "num_patches": len(patches),
         "num_views": len(scene.views),
         "checks": _checks(histograms, images) if len(patches) else [],
-        "growth": _growth(reports, len(patches)),
+        **{key: dense_report[key] for key in ("seeds", "levels", "waves")},
+        "funnel": _funnel(dense_report["funnel"], len(patches)),
         "histograms": histograms,
         "images": images,
+        "mesh": dict(mesh_report) if mesh_report is not None else None,
     }
 
 
-def _growth(reports: Sequence[Mapping[str, Any]], num_patches: int) -> dict[str, Any]:
-    """``levels``, ``waves``, ``seeds`` and ``funnel`` of densification, each the sum over clusters, and how many
-    clusters there are and of how many an earlier run has the numbers (``num_clusters``, ``num_untold``).
-
-    The funnel begins with what was accepted and goes on with what each step took away. Where clusters overlap, and at
-    the sides of the region, more went away later: the last step, unless there are clusters that are not counted.
-    """
-    told = [report for report in reports if "levels" in report]
-    levels = _sums([row for report in told for row in report["levels"]], "level")
-    steps = _sums([step for report in told for step in report["funnel"] if step["name"] != "patches"], "name")
-    left = sum(report["num_patches"] for report in told)
-    if len(told) == len(reports) and left != num_patches:
-        steps.append({"name": "of overlapping clusters or outside the region", "count": left - num_patches})
-    return {
-        "levels": sorted(levels, key=lambda row: -row["level"]),
-        "waves": sorted(
-            _sums([row for report in told for row in report["waves"]], "wave"), key=lambda row: row["wave"]
-        ),
-        "seeds": {
-            name: sum(report["seeds"].get(name, 0) for report in told)
-            for name in dict.fromkeys(name for report in told for name in report["seeds"])
-        },
-        "funnel": steps,
-        "num_clusters": len(reports),
-        "num_untold": len(reports) - len(told),
-    }
-
-
-def _sums(rows: Sequence[Mapping[str, Any]], key: str) -> list[dict[str, Any]]:
-    """One row for each value of a key, in the order in which they come, with the sums of all else."""
-    found: dict[Any, dict[str, Any]] = {}
-    for row in rows:
-        total = found.setdefault(row[key], {key: row[key]})
-        for name, value in row.items():
-            if name != key:
-                total[name] = round(total.get(name, 0) + value, 3)
-    return list(found.values())
+def _funnel(steps: Sequence[Mapping[str, Any]], num_patches: int) -> list[dict[str, Any]]:
+    """The steps of densification, which end with the patches that it left, and what went away after it."""
+    *removals, left = steps
+    later = left["count"] - num_patches
+    more = [{"name": "of overlapping clusters or outside the region", "count": later}] if later else []
+    return [*map(dict, removals), *more, {"name": left["name"], "count": num_patches}]
 
 
 def _histograms(patches: Patches) -> dict[str, dict[str, Any]]:

@@ -23,43 +23,35 @@ def render_dense_html(report: Mapping[str, Any], pictures: Sequence[PictureRow])
     """The page of a report on densification or meshing alone.
 
     Args:
-        report: ``run`` as in the report of a reconstruction, and the parts ``dense`` and, if there is a mesh, ``mesh``:
-            see :func:`dense_section`. Each has an ``outcome``, ``usage``, ``warnings`` and ``decisions``, too.
+        report: ``outcome``, ``run``, ``usage``, ``warnings`` and ``decisions`` as in the report of a reconstruction,
+            and ``dense`` as :func:`~sfmapp.report.dense_document.dense_document` makes it; None if it came to nothing.
         pictures: of :func:`~sfmapp.report.dense_pictures.dense_pictures`.
     """
     run = report["run"]
     facts = "; ".join([run["source"], f"sfmapp {run['versions']['sfmapp']}", run["started"]])
-    body = [f'<p class="dim">{escape(facts)}</p>', dense_section(report["dense"], report.get("mesh"), pictures)]
-    parts = [report[name] for name in ("dense", "mesh") if report.get(name)]
-    body.append(usage_table({name: entry for part in parts for name, entry in part["usage"].items()}, run))
-    for title in ("Warnings", "Decisions"):
-        body.append(log_table(title, [line for part in parts for line in part[title.lower()]]))
+    body = [f'<p class="dim">{escape(facts)}</p>', failure_box(report["outcome"])]
+    if report["dense"] is not None:
+        body.append(dense_section(report["dense"], pictures))
+    body.append(usage_table(report["usage"], run))
+    body.append(log_table("Warnings", report["warnings"]) + log_table("Decisions", report["decisions"]))
     return render_page(f"sfmapp dense: {run['source']}", body)
 
 
-def dense_section(
-    dense: Mapping[str, Any], mesh: Mapping[str, Any] | None, pictures: Sequence[PictureRow]
-) -> str:  # fmt: skip
+def dense_section(document: Mapping[str, Any], pictures: Sequence[PictureRow]) -> str:
     """The dense part of a page: pictures, checks, how sure the patches are, what is bare, their growth, the mesh.
 
     Args:
-        dense: ``outcome``, and unless that is a failure the entries of
-            :func:`~sfmapp.report.dense_document.dense_document`.
-        mesh: ``outcome``, and unless that is a failure the report of :func:`~sfmapp.surface.mesh.make_mesh`; None
-            without a mesh.
+        document: of :func:`~sfmapp.report.dense_document.dense_document`.
         pictures: of :func:`~sfmapp.report.dense_pictures.dense_pictures`.
     """
-    failures = failure_box(dense["outcome"]) + (failure_box(mesh["outcome"]) if mesh else "")
-    if "histograms" not in dense:
-        return f"<h2>Surface</h2>{failures}"
-    has_mesh = mesh is not None and "num_faces" in mesh
-    facts = [f"{dense['num_patches']} patches of {dense['num_views']} photographs"]
-    facts += [f"a mesh of {mesh['num_faces']} triangles"] if mesh is not None and has_mesh else []
-    parts = [f"<h2>Surface</h2>{failures}<p>{' and '.join(facts)}</p>"]
+    mesh = document["mesh"]
+    facts = [f"{document['num_patches']} patches of {document['num_views']} photographs"]
+    facts += [f"a mesh of {mesh['num_faces']} triangles"] if mesh else []
+    parts = [f"<h2>Surface</h2><p>{' and '.join(facts)}</p>"]
     parts += [_picture_row(row, "row large" if k == 0 else "row") for k, row in enumerate(pictures)]
-    parts += [check_table(dense["checks"]), _histograms(dense["histograms"]) if dense["num_patches"] else ""]
-    parts += [_images(dense["images"]), _growth(dense["growth"], dense["num_patches"])]
-    parts += [_mesh(mesh)] if mesh is not None and has_mesh else []
+    parts += [check_table(document["checks"]), _histograms(document["histograms"]) if document["num_patches"] else ""]
+    parts += [_images(document["images"]), _growth(document)]
+    parts += [_mesh(mesh)] if mesh else []
     return "".join(parts)
 
 
@@ -105,18 +97,11 @@ def _images(images: Sequence[Mapping[str, Any]]) -> str:
     return "<h2>What of each photograph is covered</h2>" + table(head, rows) + note
 
 
-def _growth(growth: Mapping[str, Any], num_patches: int) -> str:
-    if not growth["levels"]:
-        return ""
-    parts = ["<h2>How the patches came about</h2>", _levels(growth["levels"]), _waves(growth["waves"])]
-    seeds = ", ".join(f"{count} from {_SEEDS.get(name, name)}" for name, count in growth["seeds"].items())
+def _growth(document: Mapping[str, Any]) -> str:
+    parts = ["<h2>How the patches came about</h2>", _levels(document["levels"]), _waves(document["waves"])]
+    seeds = ", ".join(f"{count} from {_SEEDS.get(name, name)}" for name, count in document["seeds"].items())
     parts.append(f"<p>Seeds of the finest level: {escape(seeds)}.</p>")
-    if growth["num_clusters"] > 1:
-        untold = growth["num_untold"]
-        note = f"; of {untold} of them an earlier run has the numbers" if untold else ""
-        parts.append(f"<p>The photographs were worked on in {growth['num_clusters']} clusters{note}.</p>")
-    if not growth["num_untold"]:
-        parts.append(_funnel(growth["funnel"], num_patches))
+    parts.append(_funnel("What was taken away again", "patches", document["funnel"][:-1], document["num_patches"]))
     return "".join(parts)
 
 
@@ -165,8 +150,8 @@ def _mesh(mesh: Mapping[str, Any]) -> str:
     )  # fmt: skip
 
 
-def _funnel(steps: Sequence[Mapping[str, Any]], left: int) -> str:
+def _funnel(title: str, what: str, steps: Sequence[Mapping[str, Any]], left: int) -> str:
     """The first step is what there was, the others what each took away."""
     rows = [[("t", step["name"]), ("", step["count"] if k == 0 else -step["count"])] for k, step in enumerate(steps)]
-    rows.append([("t", "left"), ("", left)])
-    return "<h3>What was taken away again</h3>" + table([("t", "step"), ("", "patches")], rows)
+    rows.append([("t", f"{what} left"), ("", left)])
+    return f"<h3>{title}</h3>" + table([("t", "step"), ("", what)], rows)

@@ -32,8 +32,8 @@ def render_html(
     """The page of a report.
 
     Args:
-        report: as the run writes it; where it has an entry ``dense``, and perhaps ``mesh``, the page has a part on it:
-            see :func:`~sfmapp.report.dense_html.dense_section`.
+        report: as the run writes it; where it has an entry ``dense``, of
+            :func:`~sfmapp.report.dense_document.dense_document`, the page has a part on it.
         model: the largest model, for a view from above.
         dense_pictures: of the patches.
     """
@@ -41,8 +41,8 @@ def render_html(
     if model is not None:
         note = "Points and cameras of the largest model; each triangle opens where its camera looks."
         body.append(f'<h2>From above</h2>{top_view_svg(model)}<p class="dim">{note}</p>')
-    if report.get("dense"):
-        body.append(dense_section(report["dense"], report.get("mesh"), dense_pictures))
+    if report.get("dense") is not None:
+        body.append(dense_section(report["dense"], dense_pictures))
     body.append(_failed(report["images"]) + _skipped(report["skipped"]))
     body.append("<h2>Images</h2>" + _images(report["images"]))
     body.append("<h2>Cameras</h2>" + _cameras(report["cameras"]))
