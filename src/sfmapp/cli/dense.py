@@ -1,4 +1,4 @@
-"""``sfmapp dense``."""
+"""``sfmapp dense`` and ``sfmapp mesh``."""
 
 from __future__ import annotations
 
@@ -29,6 +29,15 @@ folder of its photographs. Writes OUT/dense/fused.ply (places, normals, colours,
 patches.npz; the same command again resumes a run that was cut off, and does nothing where all is done."""
 
 
+MESH_EXAMPLES = """\
+examples:
+  sfmapp mesh out/
+  sfmapp mesh out/ --texture
+  sfmapp mesh out/dense/fused.ply -o surface/ --set surface.depth=9
+
+Writes OUT/mesh/mesh.ply and OUT/mesh/mesh.glb, with the colours of its vertices or, with --texture, the photographs."""
+
+
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the commands of this family to the parser."""
     raw = argparse.RawDescriptionHelpFormatter
@@ -45,12 +54,31 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_dense, parser=parser)
 
+    parser = commands.add_parser(
+        "mesh", help="dense patches to a mesh", epilog=MESH_EXAMPLES, formatter_class=raw,
+        description="Make a mesh of dense patches: Poisson, trimmed to what patches and photographs vouch for.",
+    )  # fmt: skip
+    parser.add_argument("source", metavar="SOURCE", type=Path, nargs="?", help="a workspace, or a PLY with normals")
+    parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="folder of the mesh of a PLY")
+    parser.add_argument("--list-options", action="store_true", help="list every stage.option and its default")
+    group = _add_option_flags(parser)
+    group.add_argument("--texture", action="store_true", help="the photographs as a texture of mesh.glb")
+    group.add_argument("--depth", metavar="N", help="of the octree; default: from how dense the patches are")
+    group.add_argument("--no-recording", action="store_true", help="do not show it in dense/recording.rrd")
+    add_output_flags(parser, has_log=True)
+    parser.set_defaults(run=_mesh, parser=parser)
 
-def _add_dense_flags(parser: argparse.ArgumentParser) -> None:
+
+def _add_option_flags(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     group = parser.add_argument_group("options (later ones win: presets in order, then --set, then the flags)")
     group.add_argument("--preset", metavar="NAME|FILE", action="append", default=[], help="default, fast, or a file")
     group.add_argument("--set", metavar="STAGE.OPTION=VALUE", action="append", default=[], help="may be repeated")
     group.add_argument("--threads", metavar="N", help="workers; default: all cores. Results do not depend on it")
+    return group
+
+
+def _add_dense_flags(parser: argparse.ArgumentParser) -> None:
+    group = _add_option_flags(parser)
     group.add_argument("--level", metavar="N", help="halve the photographs N times; default: 1600 px or less a side")
     group.add_argument("--ground-sampling", metavar="D", help="instead: what a pixel measures, in units of the world")
     group.add_argument("--masks", metavar="DIR", help="folder of masks named IMAGE.png; black is ignored")
@@ -62,19 +90,12 @@ def _add_dense_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--no-recording", action="store_true", help="do not write dense/recording.rrd")
 
 
-def _options(args: argparse.Namespace) -> Options:
-    """The effective options of a command line."""
+def _options(args: argparse.Namespace, flags: dict[str, str | None]) -> Options:
+    """The effective options of a command line; ``flags``: by name of the option, None where not given."""
     limit_library_threads()
     from sfmapp.pipelines.options import load_options
 
-    flags = {
-        "threads": args.threads,
-        "dense.level": args.level,
-        "dense.ground_sampling": args.ground_sampling,
-        "images.mask_path": args.masks,
-        "dense.region": None if args.region is None else ",".join(args.region),
-        "dense.max_memory_mb": args.max_memory,
-    }
+    flags = {"threads": args.threads} | flags
     settings = [*args.set, *(f"{name}={value}" for name, value in flags.items() if value is not None)]
     return load_options(args.preset, settings)
 
@@ -84,7 +105,14 @@ def _dense(args: argparse.Namespace) -> int:
         return list_options(args)
     if args.source is None:
         args.parser.error("SOURCE is needed")
-    options = _options(args)
+    flags = {
+        "dense.level": args.level,
+        "dense.ground_sampling": args.ground_sampling,
+        "images.mask_path": args.masks,
+        "dense.region": None if args.region is None else ",".join(args.region),
+        "dense.max_memory_mb": args.max_memory,
+    }
+    options = _options(args, flags)
     load_numba_without_blas()
     from sfmapp.pipelines.dense import dense
     from sfmapp.pipelines.usage import Stopwatch
@@ -100,6 +128,35 @@ def _dense(args: argparse.Namespace) -> int:
         print_json({"exit_code": 0, **dense_result(output, result.report)})
     elif not args.quiet:
         print_dense(output, result.report)
+    return 0
+
+
+def _mesh(args: argparse.Namespace) -> int:
+    if args.list_options:
+        return list_options(args)
+    if args.source is None:
+        args.parser.error("SOURCE is needed")
+    is_cloud = args.source.suffix.lower() == ".ply"
+    if is_cloud != (args.output is not None):
+        args.parser.error("-o OUT is needed for a PLY" if is_cloud else "leave out -o: it goes into the workspace")
+    flags = {"surface.texture": "true" if args.texture else None, "surface.depth": args.depth}
+    options = _options(args, flags)
+    load_numba_without_blas()
+    from sfmapp.pipelines.mesh import mesh_cloud, mesh_workspace
+    from sfmapp.pipelines.usage import Stopwatch
+
+    watch = Stopwatch(whole_process=True)
+    with listening(args) as events:
+        if is_cloud:
+            result = mesh_cloud(args.source, args.output, options, events=events)
+        else:
+            result = mesh_workspace(args.source, options, record=not args.no_recording, events=events, watch=watch)
+    report = result.report if "run" in result.report else result.report | {"run": watch.read()}
+    output = args.output or args.source
+    if args.json:
+        print_json({"exit_code": 0, **mesh_result(output, report)})
+    elif not args.quiet:
+        print_mesh(output, report)
     return 0
 
 
@@ -123,3 +180,25 @@ def print_dense(output: Path, report: dict[str, Any]) -> None:
         run = report["run"]
         print(f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB")
     print(f"cloud {output / 'dense' / 'fused.ply'}; a surface of it: sfmapp mesh {output}")
+
+
+def mesh_result(output: Path, report: dict[str, Any]) -> dict[str, Any]:
+    """What ``--json`` prints of a mesh; the rest is in report.json."""
+    names = ("num_vertices", "num_faces", "num_rim_edges", "depth", "spacing", "texture", "run")
+    paths = {"mesh": str(output / "mesh" / "mesh.ply"), "glb": str(output / "mesh" / "mesh.glb")}
+    return {"output": str(output), **paths, **{name: report[name] for name in names if name in report}}
+
+
+def print_mesh(output: Path, report: dict[str, Any]) -> None:
+    """A mesh in three lines."""
+    rim = report["num_rim_edges"]
+    print(
+        f"{report['num_faces']} triangles, {report['num_vertices']} vertices, octree of depth {report['depth']},"
+        f" {'closed' if rim == 0 else f'{rim} edges at its rim'}"
+    )
+    if report.get("is_up_to_date"):
+        print(f"{output} is up to date: nothing to do")
+    else:
+        run = report["run"]
+        print(f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB")
+    print(f"mesh {output / 'mesh' / 'mesh.ply'} and {output / 'mesh' / 'mesh.glb'}")

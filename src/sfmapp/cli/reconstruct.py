@@ -24,6 +24,7 @@ EXAMPLES = """\
 examples:
   sfmapp reconstruct photos/ -o out/
   sfmapp reconstruct photos/ -o out/ --preset quality --set features.max_num_features=12000
+  sfmapp reconstruct photos/ -o out/ --dense --mesh
   sfmapp reconstruct 'frames/*.png' -o out/ --camera-model OPENCV_FISHEYE --seed 7
 
 The same command again resumes a run that was cut off, does nothing where all is done, and re-runs only what a changed
@@ -39,6 +40,9 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )  # fmt: skip
     parser.add_argument("images", metavar="IMAGES", nargs="?", help="a folder, a glob in quotes, or a .txt list")
     parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="folder of the results, made if need be")
+    parser.add_argument("--dense", action="store_true", help="go on to dense patches: OUT/dense/fused.ply")
+    parser.add_argument("--mesh", action="store_true", help="go on to a mesh as well: OUT/mesh/mesh.ply and mesh.glb")
+    parser.add_argument("--texture", action="store_true", help="with --mesh: the photographs as a texture of mesh.glb")
     parser.add_argument("--list-options", action="store_true", help="list every stage.option and its default")
     _add_option_flags(parser)
     add_output_flags(parser, has_log=True)
@@ -90,12 +94,42 @@ def _reconstruct(args: argparse.Namespace) -> int:
         return list_options(args)
     if args.images is None or args.output is None:
         args.parser.error("IMAGES and -o OUT are needed")
-    report = _run(args, args.images, _options(args))
-    if args.json:
-        print_json({"exit_code": 0, **_result(args.output, report)})
-    elif not args.quiet:
+    if args.texture and not args.mesh:
+        args.parser.error("--texture is of no use without --mesh")
+    if args.texture:
+        args.set.append("surface.texture=true")
+    options = _options(args)
+    report = _run(args, args.images, options)
+    result = _result(args.output, report)
+    if not args.json and not args.quiet:
         _print_summary(args.output, report)
+    if args.dense or args.mesh:
+        result |= _go_on(args, options)
+    if args.json:
+        print_json({"exit_code": 0, **result})
     return 0
+
+
+def _go_on(args: argparse.Namespace, options: Options) -> dict[str, Any]:
+    """Dense patches and maybe a mesh of what was reconstructed; what ``--json`` prints of them."""
+    from sfmapp.cli.dense import dense_result, mesh_result, print_dense, print_mesh
+    from sfmapp.pipelines.dense import dense
+    from sfmapp.pipelines.mesh import mesh_workspace
+
+    is_talking = not args.json and not args.quiet
+    with listening(args) as events:
+        # the recording shows patches and mesh: it is written once, by the last stage
+        record = not args.no_recording
+        cloud = dense(args.output, options=options, record=record and not args.mesh, events=events).report
+        result = {"dense": dense_result(args.output, cloud)}
+        if is_talking:
+            print_dense(args.output, cloud)
+        if args.mesh:
+            mesh = mesh_workspace(args.output, options, record=record, events=events).report
+            result["mesh"] = mesh_result(args.output, mesh)
+            if is_talking:
+                print_mesh(args.output, mesh)
+    return result
 
 
 def _demo(args: argparse.Namespace) -> int:

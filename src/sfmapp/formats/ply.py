@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,16 @@ def read_ply(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     The vertices have to come first; other properties of theirs and other elements (faces) are passed over.
 
     Raises:
+        InputError: as :func:`read_vertices`.
+    """
+    vertices = read_vertices(path)
+    return xyz_of(vertices), rgb_of(vertices)
+
+
+def read_vertices(path: str | Path) -> NDArray[Any]:
+    """Read vertices (N,), a structured array of all their properties, x, y and z among them.
+
+    Raises:
         InputError: the file is missing, not binary little-endian, truncated, or its coordinates are not finite.
     """
     path = Path(path)
@@ -66,13 +77,22 @@ def read_ply(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
             f"{path}: truncated: expected {count} vertices of {dtype.itemsize} bytes, found {len(data) - start} bytes"
         )
     vertices = np.frombuffer(data, dtype, count, start)
-    xyz = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], 1)
-    if not np.isfinite(xyz).all():
+    if not np.isfinite(xyz_of(vertices)).all():
         raise InputError(f"{path}: expected finite coordinates, found NaN or infinity")
+    return vertices
+
+
+def xyz_of(vertices: NDArray[Any]) -> NDArray[np.float64]:
+    """(N, 3) places of vertices (N,)."""
+    return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], 1)
+
+
+def rgb_of(vertices: NDArray[Any]) -> NDArray[np.uint8]:
+    """(N, 3) colours of vertices (N,), black where there are none."""
     colors = ("red", "green", "blue")
-    if all(color in names and dtype[color] == np.uint8 for color in colors):
-        return xyz, np.stack([vertices[color] for color in colors], 1)
-    return xyz, np.zeros((count, 3), np.uint8)
+    if all(color in (vertices.dtype.names or ()) and vertices.dtype[color] == np.uint8 for color in colors):
+        return np.stack([vertices[color] for color in colors], 1)
+    return np.zeros((len(vertices), 3), np.uint8)
 
 
 def _header(path: Path, data: bytes) -> tuple[int, list[tuple[str, str]], int]:

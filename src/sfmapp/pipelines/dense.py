@@ -13,10 +13,10 @@ import numpy as np
 from sfmapp.dense import outcome
 from sfmapp.dense.clusters import Cluster, in_core, make_clusters, merge_clusters
 from sfmapp.dense.densify import densify
-from sfmapp.dense.files import read_patches, write_patches
+from sfmapp.dense.files import read_patches
 from sfmapp.dense.prepare import DensePlan, load_scene
 from sfmapp.dense.scene import Patches
-from sfmapp.errors import InputError, NoReconstructionError
+from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.pipelines import dense_results
 from sfmapp.pipelines.dense_results import STAGE
@@ -78,9 +78,10 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
         with job.stage("views"):
             plan, report["views"] = plan_source(job)
         key = dense_results.dense_key(job, plan)
-        if (earlier := dense_results.earlier_report(job, key)) is not None:
+        files = (dense_results.FUSED, dense_results.PATCHES)
+        if (earlier := dense_results.earlier_report(job, STAGE, key, files)) is not None:
             patches, _ = read_patches(job.workspace.folder / dense_results.PATCHES)
-            dense_results.write_extras(job, plan, patches, maps=maps, record=record, is_new=False)
+            dense_results.write_extras(job, plan, patches, None, maps=maps, record=record)
             return DenseResult(patches, plan.names, earlier)
         is_resumed = job.workspace.has_key(STAGE, key)
         job.note_source()
@@ -91,11 +92,17 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
         dense_results.write_cloud(job, plan, patches)
         if warning := outcome.check(patches, report["shares"]):
             job.events.warned(STAGE, warning)
-        dense_results.write_extras(job, plan, patches, maps=maps, record=record, is_new=True)
-    except NoReconstructionError as failure:
-        dense_results.finish(job, key, report, failure)
+    except dense_results.AsBeforeError:
         raise
-    return DenseResult(patches, plan.names, dense_results.finish(job, key, report))
+    except NoReconstructionError as failure:
+        job.note_source()
+        dense_results.finish(job, STAGE, key, report, failure=failure)
+        raise
+    scene = dense_results.picture_scene(job, plan)
+    dense_results.remove_extras(job)
+    dense_results.write_extras(job, plan, patches, scene, maps=maps, record=record)
+    report = dense_results.finish(job, STAGE, key, report, (scene, patches, None))
+    return DenseResult(patches, plan.names, report)
 
 
 def _densify(job: DenseJob, plan: DensePlan, report: dict[str, Any], is_resumed: bool) -> Patches:
@@ -108,26 +115,25 @@ def _densify(job: DenseJob, plan: DensePlan, report: dict[str, Any], is_resumed:
             STAGE, f"{len(plan.records)} views in {len(clusters)} clusters to stay below {options.max_memory_mb} MB",
             sizes=sizes, memory_mb=[round(cluster.memory_mb) for cluster in clusters],
         )  # fmt: skip
-    parts, texture = [], []
+    parts, texture, rows = [], [], []
     report["clusters"] = []
     with job.stage(STAGE):
         for number, cluster in enumerate(clusters):
-            path = dense_results.part_path(job, number)
-            part = _read_part(path, plan) if is_resumed else None
-            if part is None:
-                part, row = _densify_cluster(job, plan, cluster)
-                if len(clusters) > 1:
-                    write_patches(path, part, plan.names)
-            else:
-                row = {"is_resumed": True}
-            texture += row.pop("texture", [])
-            report["clusters"].append({"views": [plan.names[m] for m in cluster.core], "num_patches": len(part)} | row)
+            known = dense_results.read_part(job, plan, number) if is_resumed else None
+            part, row = known or _densify_cluster(job, plan, cluster)
+            if known is None and len(clusters) > 1:
+                dense_results.write_part(job, plan, number, part, row)
+            texture += row.pop("texture")
+            report["clusters"].append(
+                {"views": [plan.names[m] for m in cluster.core], "num_patches": len(part), "is_resumed": bool(known)}
+            )
             parts.append(part)
+            rows.append(row)
         patches = merge_clusters(plan, options.cell_px, parts) if len(parts) > 1 else parts[0]
         if plan.region is not None:
             patches = patches.subset(plan.region.holds(patches.xyz))
     dense_results.remove_parts(job)
-    report |= dense_results.summary(patches)
+    report |= dense_results.summary(patches) | dense_results.summed(rows)
     report["shares"] = outcome.judge(patches, texture, options.cell_px)
     return patches
 
@@ -140,12 +146,3 @@ def _densify_cluster(job: DenseJob, plan: DensePlan, cluster: Cluster) -> tuple[
     texture = [outcome.textured_pixels(scene.views[at]) for at in np.searchsorted(cluster.views, cluster.core)]
     patches, row = densify(scene, job.options.dense, threads=job.threads, events=job.events)
     return in_core(patches, cluster), row | {"texture": texture}
-
-
-def _read_part(path: Any, plan: DensePlan) -> Patches | None:
-    """Patches of a cluster that an earlier run has finished; None if it has not."""
-    try:
-        patches, names = read_patches(path)
-    except InputError:
-        return None
-    return patches if names == plan.names else None

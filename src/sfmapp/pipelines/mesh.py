@@ -1,0 +1,170 @@
+"""Dense patches to a mesh, on a page: those of a workspace, or a cloud of oriented points in a PLY file."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.dense.files import read_patches
+from sfmapp.dense.prepare import DensePlan, coarser_plan, load_scene
+from sfmapp.errors import InputError, NoReconstructionError, UsageError
+from sfmapp.events import Events
+from sfmapp.formats.glb import write_glb
+from sfmapp.formats.mesh_ply import write_mesh_ply
+from sfmapp.formats.ply import read_vertices, rgb_of, xyz_of
+from sfmapp.geometry.upright import up_direction
+from sfmapp.pipelines import dense_results
+from sfmapp.pipelines.dense_source import DenseJob, dense_job, find_source, plan_source
+from sfmapp.pipelines.options import Options, options_from_dict, options_to_dict, with_absolute_paths
+from sfmapp.pipelines.usage import Stopwatch
+from sfmapp.pipelines.workspace import read_manifest, stage_key
+from sfmapp.scene.mesh import Mesh
+from sfmapp.surface.mesh import make_mesh
+from sfmapp.surface.texture import texture_mesh
+
+STAGE = "mesh"
+MESH_PLY, MESH_GLB = "mesh/mesh.ply", "mesh/mesh.glb"
+# what a pixel measures at the points of a PLY, which does not say: so much of the way to the nearest ones
+_NUM_NEAREST = 4
+
+
+class MeshResult(NamedTuple):
+    """The mesh, None where that of an earlier run holds; and the report of it."""
+
+    mesh: Mesh | None
+    report: dict[str, Any]
+
+
+def mesh_workspace(
+    source: str | os.PathLike[str],
+    options: Options | None = None,
+    *,
+    record: bool = True,
+    events: Events | None = None,
+    watch: Stopwatch | None = None,
+) -> MeshResult:
+    """Make a mesh of the patches of a workspace: ``mesh/mesh.ply`` and ``mesh/mesh.glb`` in it.
+
+    Args:
+        source: workspace in which ``sfmapp dense`` has been at work.
+        options: ``surface`` counts here.
+        record: show the mesh in ``dense/recording.rrd``.
+        events: listens in, and can ask the run to stop.
+        watch: started earlier, if more is to be counted in the report than this call.
+
+    Raises:
+        InputError: no patches, or the photographs are gone.
+        NoReconstructionError: they hold no surface; the report is written.
+        InterruptedRunError: ``events`` was asked to stop.
+    """
+    folder = Path(source)
+    manifest = read_manifest(folder)
+    if not (folder / dense_results.PATCHES).is_file():
+        raise InputError(f"{folder} holds no patches to make a mesh of", f"run first: sfmapp dense {folder}")
+    options = with_absolute_paths(options or Options())
+    # the views are those that the patches were made of, whatever is said of them now
+    earlier = options_from_dict({"dense": manifest.get("options", {}).get("dense", {})})
+    options = dataclasses.replace(options, dense=earlier.dense)
+    with dense_job(find_source(folder, None, None, options), events or Events(), watch) as job:
+        return _run(job, record)
+
+
+def _run(job: DenseJob, record: bool) -> MeshResult:
+    folder = job.workspace.folder
+    digest = dense_results.file_digest(folder / dense_results.PATCHES)
+    key = stage_key(("surface",), options_to_dict(job.options.surface), digest)
+    if (earlier := dense_results.earlier_report(job, STAGE, key, (MESH_PLY, MESH_GLB))) is not None:
+        return MeshResult(None, earlier)
+    patches, names = read_patches(folder / dense_results.PATCHES)
+    with job.stage("views"):
+        plan, _ = plan_source(job)
+    if plan.names != names:
+        raise InputError(
+            f"{folder}: the patches are of {len(names)} photographs, the model now has {len(plan.names)} others",
+            f"run again: sfmapp dense {folder}",
+        )
+    job.note_source()
+    job.workspace.begin(STAGE, key)
+    try:
+        with job.stage(STAGE):
+            scene = dense_results.picture_scene(job, plan)
+            mesh, report = make_mesh(
+                patches.xyz, patches.normal, patches.rgb, patches.size, scene, job.options.surface,
+                threads=job.threads, events=job.events,
+            )  # fmt: skip
+            if job.options.surface.texture:
+                mesh, report["texture"] = _textured(job, plan, mesh)
+    except NoReconstructionError as failure:
+        dense_results.finish(job, STAGE, key, {}, (scene, patches, None), failure)
+        raise
+    is_z_up = bool(up_direction(plan.cam_from_world)[2] > np.sqrt(0.5))
+    with job.measured("output"):
+        write_mesh_ply(folder / MESH_PLY, mesh)
+        write_glb(folder / MESH_GLB, mesh, is_z_up=is_z_up)
+    if record:
+        with job.measured("recording"):
+            dense_results.write_recording(job, scene, patches, mesh)
+    return MeshResult(mesh, dense_results.finish(job, STAGE, key, report, (scene, patches, mesh)))
+
+
+def _textured(job: DenseJob, plan: DensePlan, mesh: Mesh) -> tuple[Mesh, dict[str, Any]]:
+    """With the photographs at working resolution, or as finely as fits into memory."""
+    num_bytes = 3.0 * float(plan.num_pixels.sum())
+    shrink = max(1.0, np.sqrt(num_bytes / (0.5e6 * job.options.dense.max_memory_mb)))
+    longest = max(max(canvas.working_size) for canvas in plan.canvases)
+    scene = load_scene(coarser_plan(plan, int(longest / shrink)), threads=job.threads, events=job.events)
+    return texture_mesh(mesh, scene, job.options.surface, events=job.events)
+
+
+def mesh_cloud(
+    cloud: str | os.PathLike[str], output: str | os.PathLike[str], options: Options | None = None, *,
+    events: Events | None = None,
+) -> MeshResult:  # fmt: skip
+    """Make a mesh of a cloud of oriented points: ``mesh/mesh.ply`` and ``mesh/mesh.glb`` in a folder.
+
+    Args:
+        cloud: binary little-endian PLY with x y z and nx ny nz, such as ``dense/fused.ply``.
+        output: the folder; made if need be.
+        options: ``surface`` and ``threads`` count here.
+        events: listens in, and can ask the run to stop.
+
+    Raises:
+        UsageError: a texture is asked for, which needs photographs.
+        InputError: not such a file.
+        NoReconstructionError: the points hold no surface.
+        InterruptedRunError: ``events`` was asked to stop.
+    """
+    options = options or Options()
+    if options.surface.texture:
+        raise UsageError("a texture needs the photographs, which a PLY does not hold", "give the workspace instead")
+    vertices = read_vertices(Path(cloud))
+    if not {"nx", "ny", "nz"} <= set(vertices.dtype.names or ()):
+        raise InputError(f"{cloud}: expected points with normals nx, ny and nz, found none")
+    xyz = xyz_of(vertices)
+    normal = np.stack([vertices[axis].astype(np.float32) for axis in ("nx", "ny", "nz")], 1)
+    length = np.linalg.norm(normal, axis=1)
+    usable = np.isfinite(length) & (length > 0.0)
+    xyz, normal, rgb = xyz[usable], normal[usable] / length[usable, None], rgb_of(vertices)[usable]
+    threads = options.threads or len(os.sched_getaffinity(0))
+    size = _sizes(xyz, threads)
+    mesh, report = make_mesh(xyz, normal, rgb, size, None, options.surface, threads=threads, events=events)
+    folder = Path(output)
+    write_mesh_ply(folder / MESH_PLY, mesh)
+    write_glb(folder / MESH_GLB, mesh)
+    return MeshResult(mesh, report)
+
+
+def _sizes(xyz: NDArray[np.float64], threads: int) -> NDArray[np.float32]:
+    """(N,) how far apart points are around each, evened out over its neighbours."""
+    from scipy.spatial import cKDTree
+
+    if len(xyz) <= _NUM_NEAREST:
+        raise NoReconstructionError(f"expected points of a surface, found {len(xyz)}")
+    distance, idx = cKDTree(xyz).query(xyz, k=_NUM_NEAREST + 1, workers=threads)
+    own = distance[:, 1:].mean(axis=1)
+    return np.asarray(np.maximum(np.median(own[idx], axis=1), 1e-30), np.float32)
