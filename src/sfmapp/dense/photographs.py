@@ -121,8 +121,6 @@ def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
     params = [v * factor.get(name, 1.0) for name, v in zip(PARAM_NAMES[camera.model], camera.params, strict=True)]
     return replace(camera, width=width, height=height, params=np.array(params))
 
-    return PARAM_NAMES[camera.model]
-
 
 def _without_copies(
     found: list[tuple[int, ImageRecord, Camera]], center: NDArray[np.float64]
