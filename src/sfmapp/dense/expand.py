@@ -35,6 +35,9 @@ NUM_CHOOSING = 3
 CONTRAST, LEAST_CONTRAST = 6.0, 20.0
 # deviation of a window, in those of the noise, below which it shows nothing
 LEAST_DEVIATION = 1.0
+# and the deviation up to which noise keeps windows of the same place from agreeing: the NCC of two such windows is
+# 1 - (noise / deviation)^2 on average, and has to pass the threshold of trust by as much as it varies
+CLEAR_DEVIATION = 2.5
 
 
 @numba.njit(cache=True, nogil=True)
@@ -160,14 +163,15 @@ def try_cells(  # type: ignore[no-untyped-def]
         found.num_views[i] = 0
         u, v = places[i, 0], places[i, 1]
         deviation = read_reference(quads, width, u, v, contrast, work)
+        uf, vf = f32(u), f32(v)
+        candidate = offset(pointer(candidates), CANDIDATES * i)
         if deviation < f32(LEAST_DEVIATION) * images.noise[m]:
             continue
-        uf, vf = f32(u), f32(v)
         there = cells.patch[LAYERS * cell_of(images, m, u, v)] if wave >= 0 else np.int32(-1)
         known = _likeness(images, store, m, uf, vf, there, work) if there >= 0 else f32(-1.0)
         if known > CONTENT:
             continue
-        parent = choose(images, store, m, uf, vf, offset(pointer(candidates), CANDIDATES * i), work)
+        parent = choose(images, store, m, uf, vf, candidate, work)
         if parent < 0:
             continue
         n = slots_of(images, store, m, parent, slots, limits.max_refined)
@@ -175,6 +179,8 @@ def try_cells(  # type: ignore[no-untyped-def]
             continue
         n, sigma = refine(images, m, uf, vf, best, slots, rhos, n, limits, work)
         if n == 0 or not judge(images, m, uf, vf, best, slots, rhos, n, sigma, limits, work, found, i):
+            if wave < 0 and n > 0 and deviation < f32(CLEAR_DEVIATION) * images.noise[m]:
+                inherit(images, store, m, uf, vf, parent, found, i)
             continue
         found.wave[i] = wave if wave >= 0 else store.wave[parent]
         # a second layer has to explain the pixel better than the first, and must not have slid back onto it
@@ -184,6 +190,37 @@ def try_cells(  # type: ignore[no-untyped-def]
         ):
             found.num_views[i] = 0
     slot_array[0] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def inherit(images, store, m, u, v, p, found, i):  # type: ignore[no-untyped-def]
+    """Enter the patch of a coarser level as it is at ``found[i]``, where pixel (u, v) of view m looks at its plane."""
+    row, num = p * store.row, np.int64(store.num_views[p])
+    is_trusted = False
+    for j in range(num):
+        is_trusted = is_trusted or store.views[row + j] == m
+    normal = offset(store.normal, 3 * p)
+    wu, wv, w = plane_in_view(images, m, offset(store.xyz, 3 * p), normal)
+    w0 = wu * u + wv * v + w
+    if not is_trusted or not w0 > 0.0:
+        return
+    k, r, t = offset(images.k, 4 * m), offset(images.rotation, 9 * m), offset(images.translation, 3 * m)
+    rx, ry, z = (u - k[2]) / k[0], (v - k[3]) / k[1], 1.0 / w0
+    x0, x1, x2 = rx * z - t[0], ry * z - t[1], z - t[2]
+    for j in range(3):
+        found.xyz[3 * i + j] = r[j] * x0 + r[3 + j] * x1 + r[6 + j] * x2
+        found.normal[3 * i + j] = normal[j]
+    found.score[i], found.sigma[i] = store.score[p], store.sigma[p]
+    found.size[i], found.wave[i] = z / (0.5 * (k[0] + k[1])), store.wave[p]
+    found.views[i * found.row] = m
+    at = 1
+    for j in range(num):
+        if store.views[row + j] != m:
+            found.views[i * found.row + at] = store.views[row + j]
+            at += 1
+    for j in range(num, found.row):
+        found.views[i * found.row + j] = -1
+    found.num_views[i] = num
 
 
 @numba.njit(cache=True, nogil=True)
