@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +131,18 @@ def test_a_thinned_recording_says_so_and_keeps_the_true_totals(tmp_path: Path) -
     assert values_of(found["/plots/patches"], "Scalars:scalars")[-1] == [3000.0]
     assert "1000 of them are shown" in values_of(found["/about"], "TextDocument:text")[0][0]
     assert "/world/scene/mesh" not in found
+
+
+def test_a_textured_mesh_keeps_its_texture(tmp_path: Path) -> None:
+    texture = np.random.default_rng(3).integers(0, 255, (8, 16, 3)).astype(np.uint8)
+    mesh = replace(make_mesh(), uv=np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32), texture=texture)
+    path = tmp_path / "recording.rrd"
+    assert record_dense(path, make_scene(), make_patches(growing()), mesh=mesh).problem == ""
+    found = chunks_of(path)["/world/scene/mesh"]
+    (buffer,) = values_of(found, "Mesh3D:albedo_texture_buffer")
+    assert bytes(buffer[0]) == texture.tobytes()
+    assert len(values_of(found, "Mesh3D:vertex_texcoords")[0]) == 4
+    assert not values_of(found, "Mesh3D:vertex_colors")
 
 
 def test_a_recording_of_no_patches_is_still_a_recording(tmp_path: Path) -> None:
