@@ -204,8 +204,9 @@ def merged(runs: list[dict[str, Any]], new: dict[str, Any]) -> list[dict[str, An
 # ---------------------------------------------------------------- report
 def markdown(report: dict[str, Any]) -> str:
     """One table of all runs and of the published figures, and one of the surfaces of the railing."""
+    commits = ", ".join(sorted({run["commit"] for run in report["runs"]}))
     lines = [
-        f"sfmapp at {', '.join(sorted({run['commit'] for run in report['runs']}))}, one thread, kernels compiled; {report['cpu']}, {report['date']}.",
+        f"sfmapp at {commits}, one thread, kernels compiled; {report['cpu']}, {report['date']}.",
         "",
         "| case | program | CPU s | points | F % | accuracy % | completeness % | peak MB |",
         "|---|---|---|---|---|---|---|---|",
