@@ -13,18 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from sfmapp.dense.scene import DenseScene, DenseView, Region
 from sfmapp.errors import InterruptedRunError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.scene.mesh import Mesh, face_vectors
+from sfmapp.scene.mesh import face_vectors
 from sfmapp.surface import child, gaps, poisson, trim
 from sfmapp.surface.mesh import make_mesh
 from sfmapp.surface.options import SurfaceOptions
 from sfmapp.surface.patch_cloud import make_patch_cloud
-from sfmapp.surface.shade import shade
 
 SPACING = 0.1
 
@@ -226,26 +224,6 @@ def test_the_result_does_not_depend_on_threads() -> None:
     one, two = (make_mesh(xyz, normal, rgb, size, None, SurfaceOptions(), threads=n)[0] for n in (1, 2))
     for name in ("xyz", "faces", "normal", "rgb"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
-
-
-def test_shading_shows_the_side_in_the_light() -> None:
-    xyz, normal, rgb, _ = sphere(2000)
-    hull_faces = ConvexHull(xyz).simplices.astype(np.int32)
-    inward = np.einsum("fc,fc->f", face_vectors(xyz, hull_faces), xyz[hull_faces].mean(axis=1)) < 0.0
-    hull_faces[inward] = hull_faces[inward][:, ::-1]
-    mesh = Mesh(xyz + 1e5, hull_faces, normal, rgb)
-    view = looking_at(np.array([0.0, -4.0, 0.0]), np.zeros(3))
-    pose = rigid3.compose(view.cam_from_world, rigid3.from_matrix(np.eye(3), [-1e5] * 3))
-    image = shade(mesh, view.k, pose, 64, 64)
-    radius = np.linalg.norm(xyz[0])
-    covered = (image < 255).any(axis=2).sum()
-    # the outline of a sphere is a circle: the cone that touches it, cut at the focal length
-    assert covered == pytest.approx(np.pi * (64.0 * radius / np.sqrt(16.0 - radius**2)) ** 2, rel=0.04)
-    assert (image[0, 0] == 255).all()
-    assert image[24, 24, 0] > image[32, 32, 0] > image[44, 44, 0]
-    colored = shade(mesh, view.k, pose, 64, 64, colored=True)
-    np.testing.assert_array_equal(colored[24, 32], [200, 100, 0])
-    np.testing.assert_array_equal(colored[40, 32], [0, 100, 200])
 
 
 def test_open3d_stays_out_of_this_process() -> None:
