@@ -18,6 +18,9 @@ from sfmapp.scene.reconstruction import Reconstruction
 
 STAGE = "views"
 _NAMES_SHOWN = 3
+# shares of the extent of all cameras within which those of equal files, and those of other copies, are in one place
+SAME_FILE_PLACE, SAME_PLACE = 1e-2, 1e-4
+SAME_TURN_DEG = 1.0
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Photographs:
         records: V of them.
         cameras: V of them, in pixels of the photograph as it is held.
         missing: (name, reason) of registered images that have none.
-        copies: names of images that are left out because another one in the same place holds the same pixels.
+        copies: names of images that are left out because another one holds the same pixels, or has the same pose.
     """
 
     image_idx: NDArray[np.int64]
@@ -78,7 +81,7 @@ def find_photographs(
         raise InputError(
             f"no mask in {options.mask_path} fits any image", f"expected for example {options.mask_path}/{name}.png"
         )
-    kept, copies = _without_copies(found, rigid3.center(model.cam_from_world))
+    kept, copies = _without_copies(found, model.cam_from_world)
     if copies:
         events.warned(STAGE, f"{_some(copies)}: copies of other images in the same place, left out", names=copies)
     return Photographs(
@@ -123,21 +126,25 @@ def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
 
 
 def _without_copies(
-    found: list[tuple[int, ImageRecord, Camera]], center: NDArray[np.float64]
+    found: list[tuple[int, ImageRecord, Camera]], cam_from_world: NDArray[np.float64]
 ) -> tuple[list[tuple[int, ImageRecord, Camera]], list[str]]:
-    """The first of each set of equal files: to trust a patch in a photograph and in its copy is to trust it twice."""
-    places = np.array([center[image] for image, _, _ in found])
-    reach = 1e-2 * float(np.ptp(places, axis=0).max(initial=0.0))
-    kept: list[tuple[int, ImageRecord, Camera]] = []
-    first: dict[str, NDArray[np.float64]] = {}
+    """The first of each set of equal files in about the same place, and of photographs with the same pose, as copies in
+    another encoding have: to trust a patch in a photograph and in its copy is to trust it twice."""
+    poses = cam_from_world[[image for image, _, _ in found]]
+    center, rotation = rigid3.center(poses), rigid3.rotation_matrix(poses)
+    extent = float(np.linalg.norm(np.ptp(center, axis=0))) if len(found) else 0.0
+    kept: list[int] = []
     copies = []
-    for entry, place in zip(found, places, strict=True):
-        other = first.setdefault(entry[1].digest, place)
-        if other is not place and np.linalg.norm(other - place) <= reach:
-            copies.append(entry[1].name)
+    for i, (_, record, _) in enumerate(found):
+        apart = np.linalg.norm(center[kept] - center[i], axis=1)
+        turned = rigid3.rotation_angle_deg(rotation[kept] @ rotation[i].T)
+        same_file = np.array([found[j][1].digest == record.digest for j in kept], bool)
+        same_pose = (apart <= SAME_PLACE * extent) & (turned < SAME_TURN_DEG)
+        if (same_pose | (same_file & (apart <= SAME_FILE_PLACE * extent))).any():
+            copies.append(record.name)
         else:
-            kept.append(entry)
-    return kept, copies
+            kept.append(i)
+    return [found[i] for i in kept], copies
 
 
 def _some(names: list[str]) -> str:

@@ -90,7 +90,7 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
             compile_dense_kernels(job.events)
         patches = _densify(job, plan, report, is_resumed)
         dense_results.write_cloud(job, plan, patches)
-        if warning := outcome.check(patches, report["shares"]):
+        if warning := outcome.check(patches, report["shares"], plan, job.options.dense.min_views):
             job.events.warned(STAGE, warning)
     except dense_results.AsBeforeError:
         raise
