@@ -72,7 +72,10 @@ def _coarse_to_fine(
         waves += growth.waves
     assert growth is not None
     growth.close()
-    patches = _patches(scene, growth, frame)
+    store, count = growth.store, growth.count
+    # the images and their cells take as much room as the patches, which are about to be there twice
+    del growth, coarser, images
+    patches = _patches(scene, store, count, frame)
     return patches, _report(rows, waves, len(patches))
 
 
@@ -174,16 +177,14 @@ def _depth_ranges(scene: DenseScene, frame: Frame) -> NDArray[np.float64]:
     return ranges
 
 
-def _patches(scene: DenseScene, growth: Growth, frame: Frame) -> Patches:
-    """Back to the world, with colours."""
-    n, store = growth.count, growth.store
+def _patches(scene: DenseScene, store: Store, n: int, frame: Frame) -> Patches:
+    """The first n of a store, back in the world and with colours."""
     reference = store.views[:n, 0]
     rgb = np.zeros((n, 3), np.uint8)
     xyz = store.xyz[:n].astype(np.float64) / frame.scale + frame.origin
     for m, view in enumerate(scene.views):
         mine = np.flatnonzero(reference == m)
-        r, t = growth.images.rotation[m], growth.images.translation[m]
-        seen = store.xyz[mine].astype(np.float64) @ r.T + t
+        seen = rigid3.apply(view.cam_from_world, xyz[mine])
         x = (seen[:, 0] / seen[:, 2] * view.k[0] + view.k[2]).astype(np.int64).clip(0, view.width - 1)
         y = (seen[:, 1] / seen[:, 2] * view.k[1] + view.k[3]).astype(np.int64).clip(0, view.height - 1)
         rgb[mine] = view.rgb[y, x]
