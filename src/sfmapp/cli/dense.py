@@ -46,7 +46,13 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         formatter_class=raw, description="Reconstruct oriented patches all over the surfaces that photographs show.",
     )  # fmt: skip
     parser.add_argument("source", metavar="SOURCE", type=Path, nargs="?", help="a workspace, or a COLMAP model")
-    parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="workspace of the results; default: SOURCE")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT",
+        type=Path,
+        help="workspace of the results; default: SOURCE, or SOURCE/sfmapp for a COLMAP model",
+    )
     parser.add_argument("--images", metavar="DIR", type=Path, help="folder of the photographs of a COLMAP model")
     parser.add_argument("--maps", action="store_true", help="depth and normal maps of every view in OUT/dense/maps")
     parser.add_argument("--list-options", action="store_true", help="list every stage.option and its default")
@@ -123,11 +129,10 @@ def _dense(args: argparse.Namespace) -> int:
             args.source, args.output, options, images=args.images, maps=args.maps, record=not args.no_recording,
             events=events, watch=watch,
         )  # fmt: skip
-    output = args.output or args.source
     if args.json:
-        print_json({"exit_code": 0, **dense_result(output, result.report)})
+        print_json({"exit_code": 0, **dense_result(result.output, result.report)})
     elif not args.quiet:
-        print_dense(output, result.report)
+        print_dense(result.output, result.report)
     return 0
 
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,11 +28,15 @@ from sfmapp.pipelines.usage import Stopwatch
 
 
 class DenseResult(NamedTuple):
-    """The patches, the names of the images that they count, and the report of it: ``dense`` of ``report.json``."""
+    """The patches, the names of the images that they count, and the report of it: ``dense`` of ``report.json``.
+
+    ``output``: the workspace.
+    """
 
     patches: Patches
     image_names: tuple[str, ...]
     report: dict[str, Any]
+    output: Path
 
 
 def dense(
@@ -51,7 +56,7 @@ def dense(
 
     Args:
         source: a workspace, or the folder of a COLMAP model.
-        output: workspace of the results; None: ``source`` itself.
+        output: workspace of the results; None: ``source`` itself, or the folder ``sfmapp`` of a COLMAP model.
         options: ``dense`` and, for masks, ``images`` count here.
         images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
         maps: write depth and normal maps of every view as well.
@@ -60,7 +65,7 @@ def dense(
         watch: started earlier, if more is to be counted in the report than this call.
 
     Raises:
-        UsageError: no place for the results, or the output folder holds something else.
+        UsageError: the output folder holds something else.
         InputError: no model, or too few of its photographs are there.
         NoReconstructionError: hardly a patch was found; the report and what there is are written.
         InterruptedRunError: ``events`` was asked to stop; the same call resumes.
@@ -82,7 +87,7 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
         if (earlier := dense_results.earlier_report(job, STAGE, key, files)) is not None:
             patches, _ = read_patches(job.workspace.folder / dense_results.PATCHES)
             dense_results.write_extras(job, plan, patches, None, maps=maps, record=record)
-            return DenseResult(patches, plan.names, earlier)
+            return DenseResult(patches, plan.names, earlier, job.workspace.folder)
         is_resumed = job.workspace.has_key(STAGE, key)
         job.note_source()
         job.workspace.begin(STAGE, key)
@@ -102,7 +107,7 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
     dense_results.remove_extras(job)
     dense_results.write_extras(job, plan, patches, scene, maps=maps, record=record)
     report = dense_results.finish(job, STAGE, key, report, (scene, patches, None))
-    return DenseResult(patches, plan.names, report)
+    return DenseResult(patches, plan.names, report, job.workspace.folder)
 
 
 def _densify(job: DenseJob, plan: DensePlan, report: dict[str, Any], is_resumed: bool) -> Patches:

@@ -24,6 +24,9 @@ from sfmapp.pipelines.run import Job
 from sfmapp.pipelines.usage import Stopwatch
 from sfmapp.pipelines.workspace import DENSE, RECONSTRUCT, open_workspace, read_manifest
 
+# the workspace in the folder of a COLMAP model, if no other place is named
+INSIDE = "sfmapp"
+
 # where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0
 _USUAL_FOLDERS = ("images", "../images", "../../images")
 
@@ -124,12 +127,12 @@ def find_source(
 
     Args:
         source: a workspace, or the folder of a COLMAP model.
-        output: where the results go; None: into ``source``, which has to be a workspace then.
+        output: where the results go; None: into the workspace itself, or the folder ``sfmapp`` of the model.
         images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
         options: of the run.
 
     Raises:
-        UsageError: no place for the results, or a workspace of another command.
+        UsageError: a workspace of another command.
         InputError: no model, no photographs.
         NoReconstructionError: the workspace holds no model.
     """
@@ -141,9 +144,8 @@ def find_source(
             what = "no such folder" if not folder.is_dir() else "neither of them"
             raise InputError(f"{folder}: expected a workspace of sfmapp or a COLMAP model, found {what}")
         folder = folder / "sparse" / "0"
-    if output is None:
-        raise UsageError(f"{folder} is a COLMAP model: -o OUT is needed", "give a folder for the results")
-    return DenseSource(folder, _image_folder(folder, images), Path(output), DENSE, False, options)
+    target = folder / INSIDE if output is None else Path(output)
+    return DenseSource(folder, _image_folder(folder, images), target, DENSE, False, options)
 
 
 def _in_workspace(
