@@ -64,7 +64,7 @@ def test_where_no_other_view_has_them_in_its_picture_nothing_is_said() -> None:
 
 
 def test_patches_of_chance_are_refused_and_few_good_ones_are_not() -> None:
-    shares = {"textured": 0.8, "covered": 0.12}
+    shares = {"textured": 0.8, "covered": 0.12, "points": None}
     with pytest.raises(NoReconstructionError, match="10 % of them agree with more than 3 views: the poses contradict"):
         check(patches_of([3] * 900 + [4] * 100), shares, plan_of(), 3)
     assert check(patches_of([5] * 800), shares, plan_of(), 3) is None
@@ -82,7 +82,7 @@ def test_next_to_nothing_is_refused_with_the_reason() -> None:
 
 def test_of_a_region_no_more_is_asked_than_that_it_holds_something() -> None:
     plan = plan_of(region=Region(np.zeros(3), np.array([1.0, 2.0, 3.5])))
-    shares = {"textured": 0.8, "covered": 0.0001}
+    shares = {"textured": 0.8, "covered": 0.0001, "points": None}
     assert check(patches_of([3] * 10), shares, plan, 3) is None
     with pytest.raises(NoReconstructionError, match=r"region from \(0, 0, 0\) to \(1, 2, 3\.5\)"):
         check(patches_of([]), shares, plan, 3)

@@ -139,7 +139,8 @@ def _densify(job: DenseJob, plan: DensePlan, report: dict[str, Any], is_resumed:
             patches = patches.subset(plan.region.holds(patches.xyz))
     dense_results.remove_parts(job)
     report |= dense_results.summary(patches) | dense_results.summed(rows)
-    report["shares"] = outcome.judge(patches, texture, options.cell_px)
+    points = report["seeds"]["points"], sum(row["num_points"] for row in rows)
+    report["shares"] = outcome.judge(patches, texture, points, options.cell_px)
     return patches
 
 
@@ -150,4 +151,4 @@ def _densify_cluster(job: DenseJob, plan: DensePlan, cluster: Cluster) -> tuple[
     )
     texture = [outcome.textured_pixels(scene.views[at]) for at in np.searchsorted(cluster.views, cluster.core)]
     patches, row = densify(scene, job.options.dense, threads=job.threads, events=job.events)
-    return in_core(patches, cluster), row | {"texture": texture}
+    return in_core(patches, cluster), row | {"texture": texture, "num_points": len(scene.point_xyz)}

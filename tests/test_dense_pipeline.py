@@ -1,0 +1,288 @@
+"""Dense runs in a workspace: from a model to patches and a mesh, resumed, and a reason where there are none."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from dense_models import DEPTH, PINHOLE, row_of_poses, texture, write_wall
+from sfmapp.dense.files import read_patches
+from sfmapp.dense.options import DenseOptions
+from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError, UsageError
+from sfmapp.events import Event, Events
+from sfmapp.formats.colmap import read_model, write_model
+from sfmapp.formats.ply import read_vertices
+from sfmapp.pipelines.dense import dense
+from sfmapp.pipelines.mesh import mesh_cloud, mesh_workspace
+from sfmapp.pipelines.options import Options
+from sfmapp.scene.camera import Camera, CameraModel
+from sfmapp.surface.options import SurfaceOptions
+
+BARREL = Camera(CameraModel.OPENCV, 200, 140, np.array([165.0, 164.0, 98.4, 72.3, -0.18, 0.03, 1e-3, -1e-3]))
+PIXEL = DEPTH / PINHOLE.focal
+FAST = Options(dense=DenseOptions(cell_px=2), threads=1)
+
+
+def report_of(output: Path) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads((output / "report.json").read_text())
+    return report
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model, and what was made of it in ``out``."""
+    folder = tmp_path_factory.mktemp("wall")
+    write_wall(folder, camera=BARREL, text=True)
+    dense(folder / "sparse" / "0", folder / "out", FAST, images=folder / "images", maps=True, record=False)
+    return folder
+
+
+def copy_of(wall: Path, tmp_path: Path) -> Path:
+    shutil.copytree(wall, tmp_path / "wall")
+    return tmp_path / "wall"
+
+
+def test_a_text_model_with_distortion_comes_out_where_the_wall_is(wall: Path) -> None:
+    patches, names = read_patches(wall / "out" / "dense" / "patches.npz")
+    assert names == tuple(f"view_{m}.png" for m in range(5))
+    off = np.abs(patches.xyz[:, 2] - DEPTH) / PIXEL
+    assert np.median(off) < 0.3
+    assert np.quantile(off, 0.99) < 1.5
+    # a patch for each cell of most of the wall that three views show
+    assert len(patches) > 0.7 * 200 * 140 / 4
+    assert np.degrees(np.arccos(np.clip(-patches.normal[:, 2], -1, 1))).mean() < 15.0
+    # how far off they are along the ray is what they say, within a factor
+    assert 0.2 < np.median(off * PIXEL / patches.sigma) < 3.0
+    cloud = read_vertices(wall / "out" / "dense" / "fused.ply")
+    np.testing.assert_array_equal(cloud["z"], patches.xyz[:, 2])
+    # colours are those of the wall
+    wall_image = texture()
+    place = np.rint(patches.xyz[:, :2] * 100 + 800 - 0.5).astype(int)
+    wanted = wall_image[place[:, 1], place[:, 0]].astype(int)
+    assert np.median(np.abs(patches.rgb.astype(int) - wanted)) < 12
+
+
+def test_maps_are_depths_of_the_wall(wall: Path) -> None:
+    folder = wall / "out" / "dense" / "maps"
+    depth = np.load(folder / "view_2.png.depth.npy", allow_pickle=False)
+    normal = np.load(folder / "view_2.png.normal.npy", allow_pickle=False)
+    # the camera in the middle looks straight at the wall
+    assert depth.dtype == np.float32
+    assert np.isfinite(depth).mean() > 0.6
+    assert np.nanquantile(np.abs(depth - DEPTH), 0.95) < 1.5 * PIXEL
+    assert normal.shape == (*depth.shape, 3)
+    assert np.median(normal[np.isfinite(depth)][:, 2]) < -0.95
+    for kind in ("depth", "normal"):
+        assert cv2.imread(str(folder / f"view_0.png.{kind}.png")).shape[:2] == depth.shape
+    views = json.loads((folder / "views.json").read_text())
+    assert [view["name"] for view in views] == [f"view_{m}.png" for m in range(5)]
+    assert (views[2]["height"], views[2]["width"]) == depth.shape
+
+
+def test_the_report_tells_what_was_done(wall: Path) -> None:
+    report = report_of(wall / "out")
+    section = report["stages"]["dense"]
+    patches, _ = read_patches(wall / "out" / "dense" / "patches.npz")
+    assert report["outcome"]["exit_code"] == 0
+    assert section["num_patches"] == len(patches)
+    assert section["views"]["num_views"] == 5
+    assert section["views"]["views"][0]["neighbors"]
+    assert section["funnel"][-1]["count"] == len(patches)
+    assert section["shares"]["covered"] > 0.5
+    assert report["dense"]["num_patches"] == len(patches)
+    assert report["usage"]["dense"]["cpu_s"] > 0
+    assert "view_2.png" in (wall / "out" / "report.html").read_text()
+    manifest = json.loads((wall / "out" / "run.json").read_text())
+    assert manifest["command"] == "dense"
+    assert manifest["stages"]["dense"]["is_done"]
+    assert manifest["options"]["dense"]["cell_px"] == 2
+
+
+def test_the_same_again_does_nothing(wall: Path, tmp_path: Path) -> None:
+    copy = copy_of(wall, tmp_path)
+    out = copy / "out"
+    before = (out / "dense" / "patches.npz").stat().st_mtime_ns
+    again = dense(copy / "sparse" / "0", out, FAST, images=copy / "images", record=False)
+    assert again.report["is_up_to_date"]
+    assert (out / "dense" / "patches.npz").stat().st_mtime_ns == before
+    # threads are no reason to begin anew, another photograph is
+    assert dense(out, options=replace(FAST, threads=2), record=False).report["is_up_to_date"]
+    image = cv2.imread(str(copy / "images" / "view_4.png"))
+    cv2.imwrite(str(copy / "images" / "view_4.png"), np.maximum(image, 2))
+    changed = dense(copy / "sparse" / "0", out, FAST, images=copy / "images", record=False)
+    assert "is_up_to_date" not in changed.report
+    assert not (out / "dense" / "maps").exists()
+    wiped = out / "dense" / "fused.ply"
+    wiped.unlink()
+    dense(copy / "sparse" / "0", out, FAST, images=copy / "images", record=False)
+    assert wiped.is_file()
+
+
+def test_an_interrupted_run_is_resumed_cluster_by_cluster(wall: Path, tmp_path: Path) -> None:
+    options = replace(FAST, dense=DenseOptions(cell_px=2, max_neighbors=2, max_memory_mb=500))
+    source, images, out = wall / "sparse" / "0", wall / "images", tmp_path / "out"
+    from sfmapp.dense import clusters
+
+    expected = clusters.BASE_MB
+    try:
+        clusters.BASE_MB = 498.8  # so that two or three of these small views fit
+        whole = dense(source, tmp_path / "whole", options, images=images, record=False)
+        assert len(whole.report["clusters"]) >= 2
+        events = Events()
+        seen = [0]
+
+        def stop_at_second(event: Event) -> None:
+            if event.kind == "finished" and event.stage == "dense":
+                seen[0] += 1
+            if seen[0] == 1 and event.kind == "started" and event.stage == "dense":
+                events.cancel()
+
+        events.subscribe(stop_at_second)
+        with pytest.raises(InterruptedRunError):
+            dense(source, out, options, images=images, record=False, events=events)
+        assert (out / "dense" / "clusters" / "0.npz").is_file()
+        resumed = dense(source, out, options, images=images, record=False)
+        assert resumed.report["clusters"][0]["is_resumed"]
+        assert not resumed.report["clusters"][-1]["is_resumed"]
+        assert not (out / "dense" / "clusters").exists()
+        np.testing.assert_array_equal(resumed.patches.xyz, whole.patches.xyz)
+        assert resumed.report["funnel"] == whole.report["funnel"]
+    finally:
+        clusters.BASE_MB = expected
+
+
+def test_a_region_holds_all_patches(wall: Path, tmp_path: Path) -> None:
+    region = (-0.4, -0.3, 3.0, 0.5, 0.4, 5.0)
+    options = replace(FAST, dense=DenseOptions(cell_px=2, region=region))
+    found = dense(wall / "sparse" / "0", tmp_path / "out", options, images=wall / "images", record=False).patches
+    assert len(found) > 100
+    assert (found.xyz >= region[:3]).all()
+    assert (found.xyz <= region[3:]).all()
+    assert np.ptp(found.xyz[:, 0]) > 0.8
+
+
+# ---------------------------------------------------------------------------------------------------------------- mesh
+
+
+def test_a_mesh_lies_on_the_wall(wall: Path, tmp_path: Path) -> None:
+    out = copy_of(wall, tmp_path) / "out"
+    result = mesh_workspace(out, FAST, record=False)
+    assert result.mesh is not None
+    assert np.quantile(np.abs(result.mesh.xyz[:, 2] - DEPTH), 0.9) < 1.5 * PIXEL
+    assert (out / "mesh" / "mesh.ply").is_file()
+    assert (out / "mesh" / "mesh.glb").read_bytes()[:4] == b"glTF"
+    report = report_of(out)
+    assert report["stages"]["mesh"]["num_faces"] == len(result.mesh.faces)
+    assert report["dense"]["mesh"]["num_faces"] == len(result.mesh.faces)
+    again = mesh_workspace(out, FAST, record=False)
+    assert again.report["is_up_to_date"]
+    # patches that have changed make a new one
+    dense(out, options=replace(FAST, dense=DenseOptions(cell_px=3)), record=False)
+    assert mesh_workspace(out, FAST, record=False).mesh is not None
+
+
+def test_a_mesh_of_a_cloud(wall: Path, tmp_path: Path) -> None:
+    result = mesh_cloud(wall / "out" / "dense" / "fused.ply", tmp_path / "surface", FAST)
+    assert result.mesh is not None
+    assert np.quantile(np.abs(result.mesh.xyz[:, 2] - DEPTH), 0.9) < 1.5 * PIXEL
+    assert (tmp_path / "surface" / "mesh" / "mesh.ply").is_file()
+    with pytest.raises(UsageError, match="texture"):
+        mesh_cloud(
+            wall / "out" / "dense" / "fused.ply", tmp_path / "t", replace(FAST, surface=SurfaceOptions(texture=True))
+        )
+
+
+def test_a_mesh_needs_patches_or_normals(tmp_path: Path) -> None:
+    from sfmapp.formats.ply import write_ply
+
+    write_ply(tmp_path / "bare.ply", np.zeros((4, 3)), np.zeros((4, 3), np.uint8))
+    with pytest.raises(InputError, match="normals"):
+        mesh_cloud(tmp_path / "bare.ply", tmp_path / "out")
+    with pytest.raises(InputError, match="not a workspace"):
+        mesh_workspace(tmp_path)
+
+
+# ----------------------------------------------------------------------------------------------------------- bad input
+
+
+def assert_failed(output: Path, code: int, words: str) -> None:
+    report = report_of(output)
+    assert report["outcome"]["exit_code"] == code
+    assert words in report["outcome"]["message"]
+    assert report["outcome"]["advice"]
+    assert (output / "report.html").is_file()
+
+
+@pytest.mark.parametrize(("order", "num_points"), [((3, 0, 4, 2, 1), 120), ((2, 4, 0, 1, 3), 0)])
+def test_poses_that_contradict_the_images(tmp_path: Path, order: tuple[int, ...], num_points: int) -> None:
+    model = write_wall(tmp_path, 5, num_points=num_points)
+    write_model(tmp_path / "wrong", replace(model, cam_from_world=row_of_poses(5)[list(order)]))
+    with pytest.raises(NoReconstructionError, match="poses contradict") as caught:
+        dense(tmp_path / "wrong", tmp_path / "out", FAST, images=tmp_path / "images", record=False)
+    assert "photographs belong together" in str(caught.value.advice)
+    assert_failed(tmp_path / "out", 4, "contradict")
+    # what there is is kept
+    assert (tmp_path / "out" / "dense" / "fused.ply").is_file()
+    with pytest.raises(NoReconstructionError, match="as before"):
+        dense(tmp_path / "out", options=FAST, record=False)
+
+
+def test_no_texture(tmp_path: Path) -> None:
+    write_wall(tmp_path, 4, wall=np.full((1600, 1600, 3), 140, np.uint8))
+    with pytest.raises(NoReconstructionError, match="no texture"):
+        dense(tmp_path / "sparse" / "0", tmp_path / "out", FAST, images=tmp_path / "images", record=False)
+    assert_failed(tmp_path / "out", 4, "no texture")
+
+
+def test_one_photograph_many_times(tmp_path: Path) -> None:
+    model = write_wall(tmp_path, 4)
+    first = (tmp_path / "images" / "view_0.png").read_bytes()
+    for name in model.image_names:
+        (tmp_path / "images" / name).write_bytes(first)
+    write_model(tmp_path / "model", replace(model, cam_from_world=np.tile(row_of_poses(4)[:1], (4, 1))))
+    with pytest.raises(NoReconstructionError, match="copies"):
+        dense(tmp_path / "model", tmp_path / "out", FAST, images=tmp_path / "images", record=False)
+    assert_failed(tmp_path / "out", 4, "copies")
+
+
+def test_fewer_than_three_views(tmp_path: Path) -> None:
+    write_wall(tmp_path, 2)
+    with pytest.raises(InputError, match="2 usable images"):
+        dense(tmp_path / "sparse" / "0", tmp_path / "out", FAST, images=tmp_path / "images", record=False)
+
+
+def test_a_photograph_and_its_copies_are_warned_of(tmp_path: Path) -> None:
+    write_wall(tmp_path, 4)
+    shutil.copy(tmp_path / "images" / "view_1.png", tmp_path / "images" / "view_9.png")
+    model, _ = read_model(tmp_path / "sparse" / "0")
+    model.image_names.append("view_9.png")
+    model.image_camera_idx = np.append(model.image_camera_idx, model.image_camera_idx[1])
+    model.cam_from_world = np.concatenate([model.cam_from_world, model.cam_from_world[1:2]])
+    model.tracks = replace(model.tracks, image_ptr=np.append(model.tracks.image_ptr, model.tracks.image_ptr[-1]))
+    write_model(tmp_path / "model", model)
+    result = dense(tmp_path / "model", tmp_path / "out", FAST, images=tmp_path / "images", record=False)
+    assert result.report["views"]["copies"] == ["view_9.png"]
+    assert result.image_names == tuple(f"view_{m}.png" for m in range(4))
+    assert any("view_9.png" in row["message"] for row in report_of(tmp_path / "out")["warnings"])
+
+
+def test_what_is_no_source(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="expected a workspace of sfmapp or a COLMAP model"):
+        dense(tmp_path / "empty")
+    with pytest.raises(InputError, match="no such folder"):
+        dense(tmp_path / "none")
+    write_wall(tmp_path / "wall", 3)
+    model = tmp_path / "wall" / "sparse" / "0"
+    with pytest.raises(InputError, match="found no folder"):
+        dense(model, tmp_path / "out", images=tmp_path / "gone")
+    (tmp_path / "wall" / "images").rename(tmp_path / "wall" / "elsewhere")
+    with pytest.raises(UsageError, match="where are the photographs"):
+        dense(model, tmp_path / "out")
