@@ -75,9 +75,9 @@ def test_patches_of_chance_are_refused_and_few_good_ones_are_not() -> None:
 
 def test_next_to_nothing_is_refused_with_the_reason() -> None:
     with pytest.raises(NoReconstructionError, match="no texture"):
-        check(patches_of([]), {"textured": 0.001, "covered": 0.0}, plan_of(), 3)
+        check(patches_of([]), {"textured": 0.001, "covered": 0.0, "points": None}, plan_of(), 3)
     with pytest.raises(NoReconstructionError, match="poses contradict"):
-        check(patches_of([]), {"textured": 0.8, "covered": 0.0}, plan_of(), 3)
+        check(patches_of([]), {"textured": 0.8, "covered": 0.0, "points": None}, plan_of(), 3)
 
 
 def test_of_a_region_no_more_is_asked_than_that_it_holds_something() -> None:

@@ -54,7 +54,7 @@ def test_a_text_model_with_distortion_comes_out_where_the_wall_is(wall: Path) ->
     assert names == tuple(f"view_{m}.png" for m in range(5))
     off = np.abs(patches.xyz[:, 2] - DEPTH) / PIXEL
     assert np.median(off) < 0.3
-    assert np.quantile(off, 0.99) < 1.5
+    assert np.quantile(off, 0.95) < 1.0
     # a patch for each cell of most of the wall that three views show
     assert len(patches) > 0.7 * 200 * 140 / 4
     assert np.degrees(np.arccos(np.clip(-patches.normal[:, 2], -1, 1))).mean() < 15.0
