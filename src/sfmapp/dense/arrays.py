@@ -82,11 +82,11 @@ class Store(NamedTuple):
 
     @staticmethod
     def of_capacity(count: int, num_neighbors: int) -> Store:
-        """Room for so many patches of which there is none yet."""
+        """Room for so many patches of which there is none yet; memory is taken as they come."""
         return Store(
             np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32),
             np.zeros(count, np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32),
-            np.full((count, num_neighbors + 1), -1, np.int16), np.zeros(count, np.uint8), np.zeros(count, np.int32),
+            np.zeros((count, num_neighbors + 1), np.int16), np.zeros(count, np.uint8), np.zeros(count, np.int32),
         )  # fmt: skip
 
     def grown(self, capacity: int) -> Store:

@@ -97,6 +97,7 @@ def _grow(
     if coarser is not None:
         row["carried"] = growth.refine_coarser(coarser, lambda: events.advanced(STAGE, steps))
         coarser.close()
+        coarser.release()
     row["points"] = growth.seed_points(points)
     row["expanded"] = growth.expand(events, everywhere=True)
     if coarser is not None:
@@ -151,6 +152,7 @@ def _sparse_points(scene: DenseScene, frame: Frame) -> Store:
     count = len(scene.point_xyz)
     num_neighbors = scene.neighbors.shape[1]
     points = Store.of_capacity(count, num_neighbors)
+    points.views[:] = -1
     points.xyz[:] = (scene.point_xyz - frame.origin) * frame.scale
     centers = scene.centers
     for p in range(count):

@@ -47,7 +47,7 @@ class Growth:
         num_cells = len(images.closed)
         self.cells = Cells(np.full((num_cells, LAYERS), -1, np.int32), np.zeros(num_cells, np.uint8))
         self.num_neighbors = images.neighbors.shape[1]
-        self.store = Store.of_capacity(max(num_cells // 8, 1024), self.num_neighbors)
+        self.store = Store.of_capacity(max(num_cells // 2, 1024), self.num_neighbors)
         self.num_views = len(images.width)
         most = int((images.columns.astype(np.int64) * images.rows).max())
         self._places = np.zeros((most, 2), np.int32)
@@ -64,6 +64,11 @@ class Growth:
         self._pool.shutdown()
         self._places = self._candidates = self._fresh = np.zeros((0, 0), np.int32)
         self._found = Store.of_capacity(0, self.num_neighbors)
+
+    def release(self) -> None:
+        """Let go of the patches and their cells as well."""
+        self.store = Store.of_capacity(0, self.num_neighbors)
+        self.cells = Cells(np.zeros((0, LAYERS), np.int32), np.zeros(0, np.uint8))
 
     # ------------------------------------------------------------------------------------------------------------ seeds
 
