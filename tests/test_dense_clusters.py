@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dense_models import DEPTH, PINHOLE, write_wall
-from sfmapp.dense.clusters import BASE_MB, in_core, join, make_clusters, merge_clusters
+from sfmapp.dense.clusters import BASE_MB, Cluster, in_core, join, make_clusters, merge_clusters
 from sfmapp.dense.densify import densify
 from sfmapp.dense.options import DenseOptions
 from sfmapp.dense.photographs import find_photographs
@@ -44,10 +45,16 @@ def test_every_view_is_in_one_core_and_no_cluster_is_too_large(plan: DensePlan) 
     assert len(make_clusters(plan, 2, 1)) == 8
 
 
+def parts_of(plan: DensePlan) -> list[Cluster]:
+    """Two or more clusters."""
+    whole = make_clusters(plan, 2, 10_000)[0]
+    return make_clusters(plan, 2, BASE_MB + 0.75 * (whole.memory_mb - BASE_MB))
+
+
 def test_clusters_make_the_same_surface(plan: DensePlan) -> None:
     whole, _ = densify(load_scene(plan), OPTIONS)
     parts = []
-    for cluster in make_clusters(plan, 2, BASE_MB + 5.0):
+    for cluster in parts_of(plan):
         patches, _ = densify(load_scene(plan, cluster.views, core=cluster.core), OPTIONS)
         mine = in_core(patches, cluster)
         assert np.isin(mine.reference_idx, cluster.core).all()
@@ -64,6 +71,12 @@ def test_clusters_make_the_same_surface(plan: DensePlan) -> None:
     assert (counts[1] > 0.75 * counts[0]).all()
 
 
+def _first_and_others(patches: Patches) -> list[NDArray[np.int32]]:
+    """Of each patch the reference and the second, the reference and the third of its views."""
+    start = patches.view_ptr[:-1]
+    return [np.stack([patches.view_idx[start], patches.view_idx[start + k]], axis=1).ravel() for k in (1, 2)]
+
+
 def shifted(patches: Patches, depth: float) -> Patches:
     return replace(patches, xyz=patches.xyz + np.array([0.0, 0.0, depth]))
 
@@ -71,7 +84,16 @@ def shifted(patches: Patches, depth: float) -> Patches:
 def test_a_double_goes_and_a_second_layer_stays(plan: DensePlan) -> None:
     one, _ = densify(load_scene(plan), OPTIONS)
     one = one.subset(np.arange(0, len(one), 7))
-    assert len(merge_clusters(plan, 2, [one, one])) == len(one)
+    again = merge_clusters(plan, 2, [one, one])
+    np.testing.assert_array_equal(again.xyz, one.xyz)
+    np.testing.assert_array_equal(again.view_ptr, one.view_ptr)
+    np.testing.assert_array_equal(again.view_idx, one.view_idx)
+    # seen by some views in one cluster and by others in the next: trusted by all of them
+    halves = [replace(one, view_ptr=2 * np.arange(len(one) + 1), view_idx=idx) for idx in _first_and_others(one)]
+    joined = merge_clusters(plan, 2, halves)
+    assert len(joined) == len(one)
+    np.testing.assert_array_equal(joined.num_views, 3)
+    np.testing.assert_array_equal(joined.reference_idx, one.reference_idx)
     pixel = float(np.median(one.size))
     close = merge_clusters(plan, 2, [one, shifted(one, 1.0 * pixel)])
     assert len(close) < 1.05 * len(one)
@@ -84,7 +106,7 @@ def test_a_double_goes_and_a_second_layer_stays(plan: DensePlan) -> None:
 
 
 def test_a_cluster_does_not_depend_on_threads(plan: DensePlan, tmp_path: Path) -> None:
-    cluster = make_clusters(plan, 2, BASE_MB + 5.0)[0]
+    cluster = parts_of(plan)[0]
     first, second = (
         densify(load_scene(plan, cluster.views, core=cluster.core, threads=n), OPTIONS, threads=n)[0] for n in (1, 2)
     )

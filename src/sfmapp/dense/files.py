@@ -15,6 +15,7 @@ from sfmapp.errors import InputError
 from sfmapp.formats.atomic import replaced_file
 
 FORMAT = "sfmapp patches 1"
+CHUNK = 1 << 20
 _PLY_FIELDS = (
     *((axis, "<f8", "double") for axis in "xyz"),
     *((axis, "<f4", "float") for axis in ("nx", "ny", "nz")),
@@ -37,17 +38,23 @@ def write_fused_ply(path: str | Path, patches: Patches) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    data = np.empty(len(patches), [(name, kind) for name, kind, _ in _PLY_FIELDS])
-    for column, axis in enumerate("xyz"):
-        data[axis], data[f"n{axis}"] = patches.xyz[:, column], patches.normal[:, column]
-    for column, color in enumerate(("red", "green", "blue")):
-        data[color] = patches.rgb[:, column]
-    data["views"], data["score"], data["sigma"] = patches.num_views.clip(0, 255), patches.score, patches.sigma
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(patches)}"]
     lines += [f"property {ply_kind} {name}" for name, _, ply_kind in _PLY_FIELDS]
     with replaced_file(Path(path)) as beside, beside.open("wb") as file:
         file.write("\n".join([*lines, "end_header", ""]).encode())
-        file.write(data.tobytes())
+        for start in range(0, len(patches), CHUNK):
+            file.write(_vertices(patches, slice(start, start + CHUNK)).tobytes())
+
+
+def _vertices(patches: Patches, part: slice) -> NDArray[Any]:
+    num_views = patches.num_views[part]
+    data = np.empty(len(num_views), [(name, kind) for name, kind, _ in _PLY_FIELDS])
+    for column, axis in enumerate("xyz"):
+        data[axis], data[f"n{axis}"] = patches.xyz[part, column], patches.normal[part, column]
+    for column, color in enumerate(("red", "green", "blue")):
+        data[color] = patches.rgb[part, column]
+    data["views"], data["score"], data["sigma"] = num_views.clip(0, 255), patches.score[part], patches.sigma[part]
+    return data
 
 
 def write_patches(path: str | Path, patches: Patches, names: Sequence[str]) -> None:

@@ -14,7 +14,7 @@ from sfmapp.errors import NoReconstructionError
 from sfmapp.geometry import rigid3
 
 # a window of 7x7 pixels is textured if its grey values vary by so much, and by so much more than noise does
-LEAST_DEVIATION, NOISE_FACTOR, WINDOW_PX = 4.0, 3.0, 7
+LEAST_DEVIATION, NOISE_FACTOR, WINDOW_PX = 4.0, 1.5, 7
 # of the open pixels that have to be textured, and of the textured cells that have to be covered
 LEAST_TEXTURED, LEAST_COVERED, GOOD_COVERED = 0.01, 0.01, 0.1
 # Patches of chance: where photographs are given to the wrong poses they cover 7 to 12 %, and one in five is trusted by

@@ -139,7 +139,8 @@ def _densify(job: DenseJob, plan: DensePlan, report: dict[str, Any], is_resumed:
             patches = patches.subset(plan.region.holds(patches.xyz))
     dense_results.remove_parts(job)
     report |= dense_results.summary(patches) | dense_results.summed(rows)
-    points = report["seeds"]["points"], sum(row["num_points"] for row in rows)
+    # noise drowns points in the finest images; in one of the sizes they hold up if the poses are right
+    points = max(level["points"] for level in report["levels"]), sum(row["num_points"] for row in rows)
     report["shares"] = outcome.judge(patches, texture, points, options.cell_px)
     return patches
 
@@ -151,4 +152,6 @@ def _densify_cluster(job: DenseJob, plan: DensePlan, cluster: Cluster) -> tuple[
     )
     texture = [outcome.textured_pixels(scene.views[at]) for at in np.searchsorted(cluster.views, cluster.core)]
     patches, row = densify(scene, job.options.dense, threads=job.threads, events=job.events)
-    return in_core(patches, cluster), row | {"texture": texture, "num_points": len(scene.point_xyz)}
+    # all of them are of the core: hundreds of megabytes that need no copy
+    mine = patches if is_whole else in_core(patches, cluster)
+    return mine, row | {"texture": texture, "num_points": len(scene.point_xyz)}
