@@ -29,7 +29,7 @@ class DenseOptions:
     min_views: int = 3
     max_neighbors: int = 8
     region: tuple[float, ...] | None = None
-    max_memory_mb: int = 4000
+    max_memory_mb: int = 3000
 
     def __post_init__(self) -> None:
         if self.level is not None and not 0 <= self.level <= 6:
