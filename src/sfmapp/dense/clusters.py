@@ -74,16 +74,6 @@ def in_core(patches: Patches, cluster: Cluster) -> Patches:
     return replace(mine, view_idx=cluster.views[mine.view_idx].astype(np.int32))
 
 
-def join(parts: Sequence[Patches]) -> Patches:
-    """All patches of several sets, in this order."""
-    offsets = np.cumsum([0, *(len(part.view_idx) for part in parts)])
-    ends = [part.view_ptr[1:] + offset for part, offset in zip(parts, offsets[:-1], strict=True)]
-    fields = ("xyz", "normal", "rgb", "score", "sigma", "size", "wave")
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in fields}
-    ptr = np.concatenate([np.zeros(1, np.int64), *ends])
-    return Patches(**joined, view_ptr=ptr, view_idx=np.concatenate([part.view_idx for part in parts]))
-
-
 def merge_clusters(plan: DensePlan, cell_px: int, parts: Sequence[Patches]) -> Patches:
     """Patches of clusters, without those that an earlier cluster has already.
 
@@ -96,56 +86,88 @@ def merge_clusters(plan: DensePlan, cell_px: int, parts: Sequence[Patches]) -> P
         cell_px: side of a cell, pixels.
         parts: patches of each cluster (:func:`in_core`), in the order of the clusters.
     """
-    rotation, center = rigid3.rotation_matrix(plan.cam_from_world), rigid3.center(plan.cam_from_world)
-    cells = _Cells(np.array([canvas.k for canvas in plan.canvases]), rotation, center, cell_px)
-    kept, count = [], 0
-    known: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]] = []
-    same_patch, same_view = [], []
-    for part in parts:
-        tolerance = SAME_DEPTH_PX * part.size.astype(np.float64)
-        patch = np.full(len(part), -1, np.int64)
-        if known:
-            keys, depths, owners = (np.concatenate(column) for column in zip(*known, strict=True))
-            patch = _same_place(keys, depths, owners, *cells.of(part.xyz, part.reference_idx), tolerance)
-        is_fresh = patch < 0
-        patch[is_fresh] = count + np.arange(is_fresh.sum())
-        kept.append(part.subset(is_fresh))
-        count += len(kept[-1])
-        of_view = np.repeat(patch, part.num_views)
-        known.append((*cells.of(np.repeat(part.xyz, part.num_views, axis=0), part.view_idx), of_view))
-        is_double = np.repeat(~is_fresh, part.num_views)
-        same_patch.append(of_view[is_double])
-        same_view.append(part.view_idx[is_double])
-    return _trusted_by(join(kept), np.concatenate(same_patch), np.concatenate(same_view))
+    rotation = rigid3.rotation_matrix(plan.cam_from_world)
+    indices = [_ByView.of(part, len(plan.records)) for part in parts]
+    owners: list[NDArray[np.int64]] = []  # where each patch of a part, or the one that stands for it, is in the result
+    fresh: list[NDArray[np.bool_]] = []
+    count = 0
+    for n, part in enumerate(parts):
+        owner = np.full(len(part), -1, np.int64)
+        for v in np.unique(part.reference_idx) if n else ():
+            camera = _Camera(plan.canvases[v].k, rotation[v], plan.cam_from_world[v, 4:], cell_px)
+            earlier = [indices[j].trusted_in(v) for j in range(n)]
+            xyz = np.concatenate([parts[j].xyz[idx] for j, idx in enumerate(earlier)])
+            owned = np.concatenate([owners[j][idx] for j, idx in enumerate(earlier)])
+            mine = np.flatnonzero(part.reference_idx == v)
+            tolerance = SAME_DEPTH_PX * part.size[mine].astype(np.float64)
+            owner[mine] = _same_place(*camera.cells(xyz), owned, *camera.cells(part.xyz[mine]), tolerance)
+        fresh.append(owner < 0)
+        owner[fresh[-1]] = count + np.arange(fresh[-1].sum())
+        count += int(fresh[-1].sum())
+        owners.append(owner)
+    fields = ("xyz", "normal", "rgb", "score", "sigma", "size", "wave")
+    values = {
+        name: np.concatenate([getattr(part, name)[kept] for part, kept in zip(parts, fresh, strict=True)])
+        for name in fields
+    }
+    ptr, view_idx = _all_views(parts, owners, fresh)
+    return Patches(**values, view_ptr=ptr, view_idx=view_idx)
 
 
-def _trusted_by(patches: Patches, patch: NDArray[np.int64], view: NDArray[np.int32]) -> Patches:
-    """Patches that are trusted by further views: pairs (M,) of a patch and a view, some of them known already."""
-    of_view = np.concatenate([np.repeat(np.arange(len(patches)), patches.num_views), patch])
-    views = np.concatenate([patches.view_idx, view])
-    _, first = np.unique(np.stack([of_view, views], axis=1), axis=0, return_index=True)
-    # the reference first, then the others in the order in which they came
-    first = first[np.lexsort((first, of_view[first]))]
-    counts = np.bincount(of_view[first], minlength=len(patches))
-    ptr = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    return replace(patches, view_ptr=ptr, view_idx=np.ascontiguousarray(views[first], np.int32))
+def _all_views(
+    parts: Sequence[Patches], owners: Sequence[NDArray[np.int64]], fresh: Sequence[NDArray[np.bool_]]
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Lists of the views that trust each patch of the result: its own, then those of patches that it stands for."""
+    own, more, of_patch = [], [], []
+    for part, owner, kept in zip(parts, owners, fresh, strict=True):
+        is_own = np.repeat(kept, part.num_views)
+        own.append(part.view_idx[is_own])
+        more.append(part.view_idx[~is_own])
+        of_patch.append(np.repeat(owner[~kept], part.num_views[~kept]))
+    counts = np.concatenate([part.num_views[kept] for part, kept in zip(parts, fresh, strict=True)]).astype(np.int64)
+    views, extra_view, extra_patch = np.concatenate(own), np.concatenate(more), np.concatenate(of_patch)
+    num_views = int(max(views.max(initial=0), extra_view.max(initial=0))) + 1
+    known = np.repeat(np.isin(np.arange(len(counts)), extra_patch), counts)
+    known_keys = np.repeat(np.arange(len(counts)), counts)[known] * num_views + views[known]
+    extra = np.setdiff1d(extra_patch * num_views + extra_view, known_keys)
+    patch = extra // num_views
+    ends = np.cumsum(counts)
+    ptr = np.concatenate([[0], np.cumsum(counts + np.bincount(patch, minlength=len(counts)))]).astype(np.int64)
+    return ptr, np.insert(views, ends[patch], (extra % num_views).astype(np.int32)).astype(np.int32)
 
 
 @dataclass(frozen=True)
-class _Cells:
-    """Numbers of cells, unique over all views."""
+class _ByView:
+    """The patches that each view trusts, of one cluster: those of view v are ``patch[start[v]:start[v + 1]]``."""
+
+    patch: NDArray[np.int32]
+    start: NDArray[np.int64]
+
+    @staticmethod
+    def of(patches: Patches, num_views: int) -> _ByView:
+        order = np.argsort(patches.view_idx, kind="stable")
+        patch = np.repeat(np.arange(len(patches), dtype=np.int32), patches.num_views)[order]
+        counts = np.bincount(patches.view_idx, minlength=num_views)
+        return _ByView(patch, np.concatenate([[0], np.cumsum(counts)]).astype(np.int64))
+
+    def trusted_in(self, v: int) -> NDArray[np.int32]:
+        return self.patch[self.start[v] : self.start[v + 1]]
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """A view and its cells."""
 
     k: NDArray[np.float64]
     rotation: NDArray[np.float64]
-    center: NDArray[np.float64]
+    translation: NDArray[np.float64]
     cell_px: int
 
-    def of(self, xyz: NDArray[np.float64], view: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """(N,) cell and (N,) depth of places (N, 3), each in a view."""
-        seen = np.einsum("nij,nj->ni", self.rotation[view], xyz - self.center[view])
-        k = self.k[view]
-        cell = np.floor((seen[:, :2] / seen[:, 2:] * k[:, :2] + k[:, 2:]) / self.cell_px).astype(np.int64)
-        return (view.astype(np.int64) << 42) + (cell[:, 1] << 21) + cell[:, 0], seen[:, 2]
+    def cells(self, xyz: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """(N,) number of the cell and (N,) depth of places (N, 3)."""
+        seen = xyz @ self.rotation.T + self.translation
+        cell = np.floor((seen[:, :2] / seen[:, 2:] * self.k[:2] + self.k[2:]) / self.cell_px).astype(np.int64)
+        return (cell[:, 1] << 32) + cell[:, 0], seen[:, 2]
 
 
 def _same_place(

@@ -140,7 +140,9 @@ def _densify(job: DenseJob, plan: DensePlan, report: dict[str, Any], is_resumed:
     dense_results.remove_parts(job)
     report |= dense_results.summary(patches) | dense_results.summed(rows)
     # noise drowns points in the finest images; in one of the sizes they hold up if the poses are right
-    points = max(level["points"] for level in report["levels"]), sum(row["num_points"] for row in rows)
+    points = max(level["points"] for level in report["levels"]), rows[0]["num_points"]
+    if len(rows) > 1:  # there they are not told from those of the views around
+        points = 0, 0
     report["shares"] = outcome.judge(patches, texture, points, options.cell_px)
     return patches
 
