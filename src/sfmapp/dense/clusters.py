@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -118,22 +119,34 @@ def _all_views(
     parts: Sequence[Patches], owners: Sequence[NDArray[np.int64]], fresh: Sequence[NDArray[np.bool_]]
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """Lists of the views that trust each patch of the result: its own, then those of patches that it stands for."""
-    own, more, of_patch = [], [], []
+    pairs = list(zip(parts, fresh, strict=True))
+    counts = np.concatenate([part.num_views[kept] for part, kept in pairs]).astype(np.int64)
+    views = np.concatenate([part.view_idx[np.repeat(kept, part.num_views)] for part, kept in pairs])
+    ptr = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    found = [np.zeros(0, np.int64)]
     for part, owner, kept in zip(parts, owners, fresh, strict=True):
-        is_own = np.repeat(kept, part.num_views)
-        own.append(part.view_idx[is_own])
-        more.append(part.view_idx[~is_own])
-        of_patch.append(np.repeat(owner[~kept], part.num_views[~kept]))
-    counts = np.concatenate([part.num_views[kept] for part, kept in zip(parts, fresh, strict=True)]).astype(np.int64)
-    views, extra_view, extra_patch = np.concatenate(own), np.concatenate(more), np.concatenate(of_patch)
-    num_views = int(max(views.max(initial=0), extra_view.max(initial=0))) + 1
-    known = np.repeat(np.isin(np.arange(len(counts)), extra_patch), counts)
-    known_keys = np.repeat(np.arange(len(counts)), counts)[known] * num_views + views[known]
-    extra = np.setdiff1d(extra_patch * num_views + extra_view, known_keys)
-    patch = extra // num_views
-    ends = np.cumsum(counts)
-    ptr = np.concatenate([[0], np.cumsum(counts + np.bincount(patch, minlength=len(counts)))]).astype(np.int64)
-    return ptr, np.insert(views, ends[patch], (extra % num_views).astype(np.int32)).astype(np.int32)
+        of_patch = np.repeat(owner, part.num_views)
+        is_new = np.zeros(len(of_patch), np.bool_)
+        _find_new_views(ptr, views, np.repeat(~kept, part.num_views), of_patch, part.view_idx, is_new)
+        # sorted by patch, then by view; a view for each number below 2^20
+        found.append(np.unique((of_patch[is_new] << 20) + part.view_idx[is_new]))
+    extra = np.unique(np.concatenate(found))
+    patch = extra >> 20
+    views = np.insert(views, ptr[patch + 1], (extra & (1 << 20) - 1).astype(np.int32))
+    ptr[1:] += np.cumsum(np.bincount(patch, minlength=len(counts)))
+    return ptr, views
+
+
+@numba.njit(cache=True, nogil=True)
+def _find_new_views(ptr, views, asked, patch, view, is_new):  # type: ignore[no-untyped-def]
+    """Where it is asked whether a view is not yet among those of a patch, say so."""
+    for n in range(patch.shape[0]):
+        if asked[n]:
+            is_new[n] = True
+            for at in range(ptr[patch[n]], ptr[patch[n] + 1]):
+                if views[at] == view[n]:
+                    is_new[n] = False
+                    break
 
 
 @dataclass(frozen=True)
