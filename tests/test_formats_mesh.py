@@ -83,6 +83,7 @@ def broken(old: bytes, new: bytes) -> Any:
         (broken(b"element face", b"element edge"), "vertex and face"),
         (broken(b"float z", b"float w"), "x, y and z"),
         (broken(b"list uchar int", b"list float int"), "a list of corners"),
+        (broken(b"list uchar int", b"list uchar half"), "a list of corners"),
         (broken(b"element vertex 4", b"element vertex x"), "elements and their properties"),
         (lambda data: data[:-13] + b"\4" + data[-12:], "4 corners"),
         (lambda data: data[:-4] + struct.pack("<i", 4), "corners from 0 to 3"),

@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from sfmapp.dense.scene import Patches
 from sfmapp.errors import InputError
 from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.ply import COLORS, TYPES
 
 FORMAT = "sfmapp patches 1"
 CHUNK = 1 << 20
 _PLY_FIELDS = (
-    *((axis, "<f8", "double") for axis in "xyz"),
-    *((axis, "<f4", "float") for axis in ("nx", "ny", "nz")),
-    *((color, "u1", "uchar") for color in ("red", "green", "blue")),
-    ("views", "u1", "uchar"), ("score", "<f4", "float"), ("sigma", "<f4", "float"),
+    *((axis, "double") for axis in "xyz"), *((axis, "float") for axis in ("nx", "ny", "nz")),
+    *((color, "uchar") for color in COLORS), ("views", "uchar"), ("score", "float"), ("sigma", "float"),
 )  # fmt: skip
 # name, kind of its dtype, its shape: N patches, N+1, M trusted images or a number
 _ARRAYS = (
@@ -39,7 +38,7 @@ def write_fused_ply(path: str | Path, patches: Patches) -> None:
         InputError: the file cannot be written.
     """
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(patches)}"]
-    lines += [f"property {ply_kind} {name}" for name, _, ply_kind in _PLY_FIELDS]
+    lines += [f"property {ply_kind} {name}" for name, ply_kind in _PLY_FIELDS]
     with replaced_file(Path(path)) as beside, beside.open("wb") as file:
         file.write("\n".join([*lines, "end_header", ""]).encode())
         for start in range(0, len(patches), CHUNK):
@@ -48,10 +47,10 @@ def write_fused_ply(path: str | Path, patches: Patches) -> None:
 
 def _vertices(patches: Patches, part: slice) -> NDArray[Any]:
     num_views = patches.num_views[part]
-    data = np.empty(len(num_views), [(name, kind) for name, kind, _ in _PLY_FIELDS])
+    data = np.empty(len(num_views), [(name, "<" + TYPES[kind]) for name, kind in _PLY_FIELDS])
     for column, axis in enumerate("xyz"):
         data[axis], data[f"n{axis}"] = patches.xyz[part, column], patches.normal[part, column]
-    for column, color in enumerate(("red", "green", "blue")):
+    for column, color in enumerate(COLORS):
         data[color] = patches.rgb[part, column]
     data["views"], data["score"], data["sigma"] = num_views.clip(0, 255), patches.score[part], patches.sigma[part]
     return data

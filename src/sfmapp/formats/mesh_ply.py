@@ -9,15 +9,9 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
 from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.ply import COLORS, TYPES, coordinate_type, read_binary, rgb_of, xyz_of
 from sfmapp.scene.mesh import Mesh, vertex_normals
 
-_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4", "float": "<f4",
-    "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4",
-    "float32": "<f4", "float64": "<f8",
-}  # fmt: skip
-_LARGEST_HEADER_BYTES = 65536
-_COLORS = ("red", "green", "blue")
 _NORMALS = ("nx", "ny", "nz")
 
 Field = tuple[str, ...]
@@ -25,22 +19,17 @@ Element = tuple[str, int, list[Field]]
 
 
 def write_mesh_ply(path: str | Path, mesh: Mesh) -> None:
-    """Write vertices with normals and colours, and triangles. A texture is left out.
-
-    Coordinates are ``float``, which every viewer reads, unless that rounds them by more than a millionth of the extent
-    of the mesh (georeferenced ones): then they are ``double``.
-    """
-    kind = "float"
-    if len(mesh.xyz) and np.abs(mesh.xyz.astype(np.float32) - mesh.xyz).max() > 1e-6 * np.ptp(mesh.xyz, axis=0).max():
-        kind = "double"
-    vertices = np.empty(len(mesh.xyz), [("xyz", _TYPES[kind], 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
+    """Write vertices with normals and colours, and triangles; coordinates are of the
+    :func:`~sfmapp.formats.ply.coordinate_type`. A texture is left out."""
+    kind = coordinate_type(mesh.xyz)
+    vertices = np.empty(len(mesh.xyz), [("xyz", "<" + TYPES[kind], 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
     vertices["xyz"], vertices["normal"], vertices["rgb"] = mesh.xyz, mesh.normal, mesh.rgb
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
     faces["count"], faces["corners"] = 3, mesh.faces
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     lines += [f"property {kind} {axis}" for axis in "xyz"]
     lines += [f"property float {axis}" for axis in _NORMALS]
-    lines += [f"property uchar {color}" for color in _COLORS]
+    lines += [f"property uchar {color}" for color in COLORS]
     lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
     with replaced_file(Path(path)) as beside, beside.open("wb") as file:
         file.write("\n".join(lines).encode())
@@ -58,19 +47,15 @@ def read_mesh_ply(path: str | Path) -> Mesh:
             vertices, or coordinates that are not finite.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    elements, start = _header(path, data)
+    data, lines, start = read_binary(path)
+    elements = _elements(path, lines)
     if [name for name, _, _ in elements[:2]] != ["vertex", "face"]:
         found = ", ".join(name for name, _, _ in elements) or "none"
         raise InputError(f"{path}: expected the elements vertex and face, found {found}")
     vertices = _rows(path, data, start, "vertices", elements[0][1], _vertex_type(path, elements[0][2]))
     face_type = _face_type(path, elements[1][2])
     rows = _rows(path, data, start + vertices.nbytes, "triangles", elements[1][1], face_type)
-    names = vertices.dtype.names or ()
-    xyz = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    xyz = xyz_of(vertices)
     if not np.isfinite(xyz).all():
         raise InputError(f"{path}: expected finite coordinates, found NaN or infinity")
     faces = rows["corners"].astype(np.int64)
@@ -81,53 +66,43 @@ def read_mesh_ply(path: str | Path) -> Mesh:
     if len(rows) and not (faces.min() >= 0 and faces.max() < len(xyz)):
         raise InputError(f"{path}: expected corners from 0 to {len(xyz) - 1}, found {faces.min()} to {faces.max()}")
     corners = faces.astype(np.int32)
-    rgb = np.zeros((len(xyz), 3), np.uint8)
-    if all(color in names and vertices.dtype[color] == np.uint8 for color in _COLORS):
-        rgb = np.stack([vertices[color] for color in _COLORS], axis=1)
-    if all(axis in names for axis in _NORMALS):
+    if set(_NORMALS) <= set(vertices.dtype.names or ()):
         normal = np.stack([vertices[axis].astype(np.float32) for axis in _NORMALS], axis=1)
     else:
         normal = vertex_normals(xyz, corners)
-    return Mesh(xyz, corners, normal, rgb)
+    return Mesh(xyz, corners, normal, rgb_of(vertices))
 
 
-def _header(path: Path, data: bytes) -> tuple[list[Element], int]:
-    """Name, count and properties of each element, and where the first begins."""
-    end = data.find(b"end_header\n", 0, _LARGEST_HEADER_BYTES)
-    if not data.startswith(b"ply\n") or end < 0:
-        raise InputError(f"{path}: expected a PLY header, found {data[:16]!r}")
-    lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()[1:]]
-    lines = [words for words in lines if words and words[0] not in ("comment", "obj_info")]
-    if lines[:1] != [["format", "binary_little_endian", "1.0"]]:
-        raise InputError(f"{path}: expected binary little-endian PLY, found {' '.join((lines or [[]])[0])!r}")
+def _elements(path: Path, lines: list[list[str]]) -> list[Element]:
+    """Name, count and properties of each element of a header."""
     elements: list[Element] = []
-    for words in lines[1:]:
+    for words in lines:
         if words[0] == "element" and len(words) == 3 and words[2].isdecimal() and len(words[2]) <= 18:
             elements.append((words[1], int(words[2]), []))
         elif words[0] == "property" and elements:
             elements[-1][2].append(tuple(words[1:]))
         else:
             raise InputError(f"{path}: expected elements and their properties, found {' '.join(words)[:80]!r}")
-    return elements, end + len(b"end_header\n")
+    return elements
 
 
 def _vertex_type(path: Path, fields: list[Field]) -> np.dtype:
     names = [field[-1] for field in fields]
-    if any(len(field) != 2 or field[0] not in _TYPES for field in fields) or len(set(names)) < len(names):
+    if any(len(field) != 2 or field[0] not in TYPES for field in fields) or len(set(names)) < len(names):
         raise InputError(f"{path}: expected plain properties of the vertices, found {', '.join(names)}")
     if not {"x", "y", "z"} <= set(names):
         raise InputError(f"{path}: expected vertices with x, y and z, found {', '.join(names) or 'none'}")
-    return np.dtype([(name, _TYPES[kind]) for kind, name in fields])
+    return np.dtype([(name, "<" + TYPES[kind]) for kind, name in fields])
 
 
 def _face_type(path: Path, fields: list[Field]) -> np.dtype:
     """Of faces that are all triangles."""
     words = fields[0] if len(fields) == 1 else ()
     kinds = words[1:3] if len(words) == 4 and words[0] == "list" else ()
-    if len(kinds) != 2 or any(_TYPES.get(kind, "f")[-2] not in "iu" for kind in kinds):
+    if len(kinds) != 2 or any(TYPES.get(kind, "f4")[0] not in "iu" for kind in kinds):
         found = "; ".join(" ".join(field) for field in fields) or "none"
         raise InputError(f"{path}: expected one property of faces, a list of corners, found {found}")
-    return np.dtype([("count", _TYPES[kinds[0]]), ("corners", _TYPES[kinds[1]], 3)])
+    return np.dtype([("count", "<" + TYPES[kinds[0]]), ("corners", "<" + TYPES[kinds[1]], 3)])
 
 
 def _rows(path: Path, data: bytes, start: int, what: str, count: int, dtype: np.dtype) -> NDArray:

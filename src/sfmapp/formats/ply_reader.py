@@ -13,14 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
+from sfmapp.formats.ply import LARGEST_HEADER_BYTES, TYPES
 
-_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
-    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "float32": "f4", "float64": "f8",
-}  # fmt: skip
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_LARGEST_HEADER_BYTES = 65536
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 
 
@@ -112,7 +107,7 @@ def _read(path: Path, file: BinaryIO) -> PlyGeometry:
 
 def _header(path: Path, file: BinaryIO) -> tuple[str, list[_Element]]:
     """Byte order ("" for text) and elements; the file stands at the first byte behind the header."""
-    head = file.read(_LARGEST_HEADER_BYTES)
+    head = file.read(LARGEST_HEADER_BYTES)
     end = head.find(b"end_header")
     if head[:4] not in (b"ply\n", b"ply\r") or end < 0:
         raise InputError(f"{path}: expected a PLY header, found {head[:16]!r}")
@@ -141,10 +136,10 @@ def _header(path: Path, file: BinaryIO) -> tuple[str, list[_Element]]:
 
 
 def _property(words: list[str]) -> _Property | None:
-    if len(words) == 3 and words[1] in _TYPES:
-        return _Property(words[2], _TYPES[words[1]], None)
-    if len(words) == 5 and words[1] == "list" and words[3] in _TYPES and _TYPES.get(words[2], "f")[0] != "f":
-        return _Property(words[4], _TYPES[words[3]], _TYPES[words[2]])
+    if len(words) == 3 and words[1] in TYPES:
+        return _Property(words[2], TYPES[words[1]], None)
+    if len(words) == 5 and words[1] == "list" and words[3] in TYPES and TYPES.get(words[2], "f")[0] != "f":
+        return _Property(words[4], TYPES[words[3]], TYPES[words[2]])
     return None
 
 
