@@ -38,6 +38,17 @@ def face_vectors(xyz: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[
     return np.asarray(0.5 * np.cross(b - a, c - a))
 
 
+def face_areas(xyz: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+    """(F,) areas of triangles."""
+    return np.asarray(np.linalg.norm(face_vectors(xyz, faces), axis=1))
+
+
+def flat_areas(xy: NDArray[np.float64], faces: NDArray[np.integer]) -> NDArray[np.float64]:
+    """(F,) areas of triangles whose corners are places (N, 2) in a picture."""
+    a, b, c = (xy[faces[:, corner]] for corner in range(3))
+    return np.asarray(0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]))
+
+
 def vertex_normals(xyz: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float32]:
     """(N, 3) unit normals of vertices: those of their faces, weighted by area; z where a vertex has no face."""
     vectors = face_vectors(xyz, faces)

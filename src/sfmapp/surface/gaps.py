@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.dense.scene import DenseScene
-from sfmapp.scene.mesh import face_vectors
+from sfmapp.scene.mesh import face_areas
 from sfmapp.surface.trim import in_view, pieces
 
 # as large as a dome on a flat gap, a half sphere
@@ -46,21 +46,21 @@ def close_gaps(
     if not len(idx) or largest_share == 0.0:
         return xyz, kept
     piece = pieces(faces[idx], len(xyz))
-    kept_area = float(_areas(xyz, faces[kept]).sum())
+    kept_area = float(face_areas(xyz, faces[kept]).sum())
     is_fixed = np.zeros(len(xyz), np.bool_)
     is_fixed[faces[kept]] = True
-    area = np.bincount(piece, _areas(xyz, faces[idx]))
+    area = np.bincount(piece, face_areas(xyz, faces[idx]))
     # the membranes of the largest balloons would take long and come to nothing
     candidate = (np.bincount(piece, is_fixed[faces[idx]].any(axis=1)) > 0) & (area <= LARGEST_BALLOON * kept_area)
     idx, piece = idx[candidate[piece]], piece[candidate[piece]]
     if not len(idx):
         return xyz, kept
     flat = _membranes(xyz, faces[idx], is_fixed)
-    flat_area = np.bincount(piece, _areas(flat, faces[idx]), len(area))
+    flat_area = np.bincount(piece, face_areas(flat, faces[idx]), len(area))
     is_balloon = area > LARGEST_DOME * flat_area
     largest = np.full(len(area), largest_share * kept_area)
     if scene is not None:
-        shown = np.bincount(piece, _areas(flat, faces[idx]) * in_view(flat, faces[idx], scene), len(area))
+        shown = np.bincount(piece, face_areas(flat, faces[idx]) * in_view(flat, faces[idx], scene), len(area))
         largest[shown > 0.5 * flat_area] *= SHOWN
         largest[(shown > 0.5 * flat_area) & is_balloon] *= SHOWN
     is_gap = flat_area <= largest
@@ -69,10 +69,6 @@ def close_gaps(
     flattened = np.unique(faces[idx[(is_gap & is_balloon)[piece]]])
     moved[flattened] = flat[flattened]
     return moved, out
-
-
-def _areas(xyz: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.norm(face_vectors(xyz, faces), axis=1))
 
 
 def _membranes(xyz: NDArray[np.float64], faces: NDArray[np.int32], is_fixed: NDArray[np.bool_]) -> NDArray[np.float64]:

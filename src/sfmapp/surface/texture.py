@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sfmapp.dense.scene import DenseScene
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
-from sfmapp.scene.mesh import Mesh, face_vectors
+from sfmapp.scene.mesh import Mesh, face_areas, flat_areas
 from sfmapp.surface.child import run_child
 from sfmapp.surface.options import SurfaceOptions
 from sfmapp.surface.painting import fill_gaps, paint
@@ -85,7 +85,7 @@ def texture_mesh(
     events.advanced(STAGE, message="painting")
     texture = _paint(mesh, scene, charts, places, has_texels, offset, size)
     events.advanced(STAGE)
-    area = np.linalg.norm(face_vectors(mesh.xyz, mesh.faces), axis=1)
+    area = face_areas(mesh.xyz, mesh.faces)
     idx = charts.vertex_idx
     report = packed | {
         "width": int(size[0]),
@@ -135,10 +135,9 @@ def _project_unseen(
     pixels: NDArray[np.float64],
 ) -> None:
     """Places (in place) of the vertices that no view shows: along the axis that their faces look along most."""
-    p, q, r = (pixels[faces[:, corner]] for corner in range(3))
-    covered = 0.5 * np.abs((q - p)[:, 0] * (r - p)[:, 1] - (q - p)[:, 1] * (r - p)[:, 0])
+    covered = flat_areas(pixels, faces)
     seen = side[faces[:, 0]] < 0
-    area = np.linalg.norm(face_vectors(mesh.xyz, mesh.faces), axis=1)
+    area = face_areas(mesh.xyz, mesh.faces)
     per_unit = np.sqrt(covered[seen].sum() / max(area[seen].sum(), 1e-300)) if seen.any() else 0.0
     if per_unit == 0.0:
         per_unit = 1.0 / np.sqrt(np.median(area))
@@ -156,8 +155,7 @@ def _pack(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int64], dict[str, Any]]:
     """Places of the vertices in texels (N, 2), whether faces have any (F,), the texture's width and height (2,), and
     what packing has to say."""
-    p, q, r = (charts.pixels[charts.faces[:, corner]] for corner in range(3))
-    covered = 0.5 * np.abs((q - p)[:, 0] * (r - p)[:, 1] - (q - p)[:, 1] * (r - p)[:, 0]).sum()
+    covered = flat_areas(charts.pixels, charts.faces).sum()
     arrays: dict[str, NDArray] = {
         "uv": charts.pixels.astype(np.float32),
         "faces": charts.faces.astype(np.uint32),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sfmapp.dense.scene import DenseScene
 from sfmapp.geometry import rigid3
-from sfmapp.scene.mesh import face_vectors
+from sfmapp.scene.mesh import face_areas, face_vectors
 from sfmapp.surface.patch_cloud import CHUNK, PatchCloud
 
 
@@ -89,7 +89,7 @@ def without_islands(
     if not len(idx):
         return kept
     piece = pieces(faces[idx], len(xyz))
-    area = np.linalg.norm(face_vectors(xyz, faces[idx]), axis=1)
+    area = face_areas(xyz, faces[idx])
     piece_area = np.bincount(piece, area)
     out = np.zeros_like(kept)
     out[idx] = piece_area[piece] >= smallest_share * area.sum()

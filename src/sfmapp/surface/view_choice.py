@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sfmapp.dense.scene import DenseScene, DenseView
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.scene.mesh import Mesh, face_vectors
+from sfmapp.scene.mesh import Mesh, face_vectors, flat_areas
 from sfmapp.surface.child import run_child
 
 # what lies so near the border of an image is not looked up in it
@@ -104,8 +104,7 @@ def _worth(
         ray = camera - centers
         facing = np.einsum("fc,fc->f", ray, vectors) > SMALLEST_COSINE * np.linalg.norm(ray, axis=1) * area
         face_idx = np.flatnonzero(facing & inside[mesh.faces].all(axis=1))
-        p, q, r = (pixel[mesh.faces[face_idx, corner]] for corner in range(3))
-        pixels = 0.5 * np.abs((q - p)[:, 0] * (r - p)[:, 1] - (q - p)[:, 1] * (r - p)[:, 0])
+        pixels = flat_areas(pixel, mesh.faces[face_idx])
         worth.append((face_idx, pixels / area[face_idx] * _likeness(view, centers[face_idx], color[face_idx])))
     view_ptr = np.cumsum([0, *(len(face_idx) for face_idx, _ in worth)])
     middle, extent = mesh.xyz.mean(axis=0), float(np.ptp(mesh.xyz, axis=0).max())
