@@ -9,7 +9,6 @@ Entities::
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
+
+from sfmapp.viewer.rrd_file import recording_file
 
 # Points of one entity in a recording; more are thinned evenly. 16 bytes each.
 _MAX_POINTS = 1_500_000
@@ -48,16 +49,11 @@ def write_error_rrd(path: Path, clouds: Mapping[str, ErrorCloud], limits: NDArra
         limits: (3,) ascending distances at which the colour changes.
         title: of the recording.
     """
-    beside = path.with_name(f".{path.name}.part")
-    recording = rr.RecordingStream("sfmapp")
-    try:
-        recording.save(beside)
-        recording.send_recording_name(title)
-        views = [
-            rrb.Spatial3DView(origin="world", contents=f"world/{name}/**", name=name.replace("/", ", "))
-            for name in clouds
-        ]
-        layout = rrb.Vertical(rrb.Tabs(*views), rrb.TextDocumentView(origin="legend"), row_shares=[6, 1])
+    views = [
+        rrb.Spatial3DView(origin="world", contents=f"world/{name}/**", name=name.replace("/", ", ")) for name in clouds
+    ]
+    layout = rrb.Vertical(rrb.Tabs(*views), rrb.TextDocumentView(origin="legend"), row_shares=[6, 1])
+    with recording_file(path, "sfmapp", title) as recording:
         recording.send_blueprint(rrb.Blueprint(layout, collapse_panels=True), make_active=True, make_default=True)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for name, cloud in clouds.items():
@@ -69,11 +65,6 @@ def write_error_rrd(path: Path, clouds: Mapping[str, ErrorCloud], limits: NDArra
             recording.log(f"world/{name}", points, static=True)
         text = ", ".join(f"{word} up to {limit:.4g}" for word, limit in zip(_WORDS, limits, strict=False))
         recording.log("legend", rr.TextDocument(f"{title}. Distance: {text}, {_WORDS[-1]} beyond"), static=True)
-        recording.flush()
-        recording.disconnect()
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def error_colors(distance: NDArray[np.float64], limits: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ from sfmapp.dense.scene import DenseScene, Patches
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.upright import up_direction
 from sfmapp.scene.mesh import Mesh
+from sfmapp.viewer.handover import load_fields, save_fields
 from sfmapp.viewer.photos import shrunk_jpeg
 
 Ints = NDArray[np.int64]
@@ -80,19 +79,12 @@ class DenseReplay:
 
     def save(self, folder: Path) -> None:
         """Write ``dense.npz`` and ``dense.json``."""
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-        np.savez(folder / "dense.npz", allow_pickle=False, **arrays)
-        text = {name: value for name, value in values.items() if name not in arrays}
-        (folder / "dense.json").write_text(json.dumps(text), encoding="utf-8")
+        save_fields(folder, "dense", self)
 
     @staticmethod
     def load(folder: Path) -> DenseReplay:
         """Read what :meth:`save` wrote."""
-        values: dict[str, Any] = json.loads((folder / "dense.json").read_text(encoding="utf-8"))
-        with np.load(folder / "dense.npz", allow_pickle=False) as arrays:
-            values.update({name: arrays[name] for name in arrays.files})
-        return DenseReplay(**values)
+        return DenseReplay(**load_fields(folder, "dense"))
 
 
 def make_dense_replay(

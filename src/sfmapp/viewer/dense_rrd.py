@@ -14,7 +14,6 @@ Entities (on the timeline ``wave``, but for what is there from the beginning)::
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
 from sfmapp.viewer.dense_replay import DenseReplay
+from sfmapp.viewer.rrd_file import recording_file
 from sfmapp.viewer.stage import body_of, eye_direction, frame_view, frustum_length, turn_to_z
 
 APPLICATION = "sfmapp dense"
@@ -63,14 +63,9 @@ class _Scale:
 
 def write_dense_rrd(replay: DenseReplay, path: Path) -> None:
     """Write a recording with its blueprint. The file appears whole or not at all."""
-    beside = path.with_name(f".{path.name}.part")
-    recording = rr.RecordingStream(APPLICATION)
     scales = _scales(replay)
-    try:
-        recording.save(beside)
+    with recording_file(path, APPLICATION, replay.title) as recording:
         recording.send_blueprint(_blueprint(replay, scales), make_active=True, make_default=True)
-        if replay.title:
-            recording.send_recording_name(replay.title)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         recording.log(_SCENE, rr.Transform3D(mat3x3=turn_to_z(replay.up)), static=True)
         # axes of no length are an error to the viewer
@@ -82,11 +77,6 @@ def write_dense_rrd(replay: DenseReplay, path: Path) -> None:
         _draw_cameras(recording, replay)
         _draw_mesh(recording, replay)
         _draw_words(recording, replay, scales)
-        recording.flush()
-        recording.disconnect()
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 # ---------------------------------------------------------------- three dimensions

@@ -6,8 +6,6 @@ over by a similarity fitted to the cameras, so that nothing jumps when it is pla
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +16,7 @@ from numpy.typing import NDArray
 
 from sfmapp.geometry import similarity
 from sfmapp.geometry.upright import up_direction
+from sfmapp.viewer.handover import load_fields, save_fields
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet
@@ -94,18 +93,12 @@ class Replay:
 
     def save(self, folder: Path) -> None:
         """Write ``replay.npz`` and ``replay.json``."""
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-        np.savez(folder / "replay.npz", **arrays)  # type: ignore[arg-type]
-        text = {name: value for name, value in values.items() if name not in arrays}
-        (folder / "replay.json").write_text(json.dumps(text), encoding="utf-8")
+        save_fields(folder, "replay", self)
 
     @staticmethod
     def load(folder: Path) -> Replay:
         """Read what :meth:`save` wrote."""
-        values: dict[str, Any] = json.loads((folder / "replay.json").read_text(encoding="utf-8"))
-        with np.load(folder / "replay.npz", allow_pickle=False) as arrays:
-            values.update({name: arrays[name] for name in arrays.files})
+        values = load_fields(folder, "replay")
         values["messages"] = [(int(step), level, text) for step, level, text in values["messages"]]
         return Replay(**values)
 

@@ -1,4 +1,4 @@
-"""Draws a replay with rerun: the only module that imports it.
+"""Draws a replay with rerun.
 
 Entities (everything on the timeline ``step``, the photographs on ``photo`` as well)::
 
@@ -12,7 +12,6 @@ Entities (everything on the timeline ``step``, the photographs on ``photo`` as w
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 from sfmapp.geometry import rigid3
 from sfmapp.viewer.photos import ScreenPhoto, load_screen_photo
 from sfmapp.viewer.replay import Replay
+from sfmapp.viewer.rrd_file import recording_file
 from sfmapp.viewer.stage import Stage, set_stage
 
 APPLICATION = "sfmapp"
@@ -48,24 +48,14 @@ _MODEL_COLORS = (_BLUE, (90, 200, 120), (200, 120, 220), (220, 200, 80))
 
 def write_rrd(replay: Replay, path: Path, threads: int = 1) -> None:
     """Write a recording with its blueprint. The file appears whole or not at all."""
-    beside = path.with_name(f".{path.name}.part")
-    recording = rr.RecordingStream(APPLICATION)
-    try:
-        stage = set_stage(replay)
-        recording.save(beside)
+    stage = set_stage(replay)
+    with recording_file(path, APPLICATION, replay.title) as recording:
         # active, so that a layout that somebody kept for another scene does not look past this one
         recording.send_blueprint(_blueprint(replay, stage), make_active=True, make_default=True)
-        if replay.title:
-            recording.send_recording_name(replay.title)
         photos = _load_photos(replay, threads)
         _draw_world(recording, replay, stage, photos)
         _draw_photos(recording, replay, photos)
         _draw_numbers(recording, replay)
-        recording.flush()
-        recording.disconnect()
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 # ---------------------------------------------------------------- three dimensions
