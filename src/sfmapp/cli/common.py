@@ -59,6 +59,11 @@ def print_json(value: Any) -> None:
     print(json.dumps(value, default=plain_number), flush=True)
 
 
+def took(run: dict[str, Any]) -> str:
+    """What a run took: ``run`` of its report in words."""
+    return f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB"
+
+
 def limit_library_threads() -> None:
     """Before numpy is imported: our own workers use the cores; a thread pool in the linear algebra beneath each of them
     would only compete with them for the cores, and would make sums depend on their number."""

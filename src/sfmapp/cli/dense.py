@@ -13,6 +13,7 @@ from sfmapp.cli.common import (
     listening,
     load_numba_without_blas,
     print_json,
+    took,
 )
 
 if TYPE_CHECKING:
@@ -179,11 +180,7 @@ def print_dense(output: Path, report: dict[str, Any]) -> None:
         f" of them, score {report['median_score']:.3f}, sigma {report['median_sigma']:.3g},"
         f" a pixel measures {report['median_size']:.3g}"
     )
-    if report.get("is_up_to_date"):
-        print(f"{output} is up to date: nothing to do")
-    else:
-        run = report["run"]
-        print(f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB")
+    _print_end(output, report)
     print(f"cloud {output / 'dense' / 'fused.ply'}; a surface of it: sfmapp mesh {output}")
 
 
@@ -201,9 +198,9 @@ def print_mesh(output: Path, report: dict[str, Any]) -> None:
         f"{report['num_faces']} triangles, {report['num_vertices']} vertices, octree of depth {report['depth']},"
         f" {'closed' if rim == 0 else f'{rim} edges at its rim'}"
     )
-    if report.get("is_up_to_date"):
-        print(f"{output} is up to date: nothing to do")
-    else:
-        run = report["run"]
-        print(f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB")
+    _print_end(output, report)
     print(f"mesh {output / 'mesh' / 'mesh.ply'} and {output / 'mesh' / 'mesh.glb'}")
+
+
+def _print_end(output: Path, report: dict[str, Any]) -> None:
+    print(f"{output} is up to date: nothing to do" if report.get("is_up_to_date") else took(report["run"]))

@@ -13,6 +13,7 @@ from sfmapp.cli.common import (
     listening,
     load_numba_without_blas,
     print_json,
+    took,
 )
 
 if TYPE_CHECKING:
@@ -174,7 +175,7 @@ def _print_refined(output: Path, report: dict[str, Any]) -> None:
         for row in photos:
             if not row["is_registered"]:
                 print(f"  not registered: {row['name']}: {row['reason']}")
-    print(f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB")
+    print(took(run))
     print(f"model {output / 'sparse' / '0'}, trajectory {output / 'trajectory.tum'}, report {output / 'report.html'}")
 
 
@@ -221,8 +222,8 @@ def _print_summary(args: argparse.Namespace, report: dict[str, Any]) -> None:
                 f" {ate['max']:.3f} m at worst, over {row['true_path_m']:.1f} m ({row['alignment'].upper()})"
             )
     print(
-        f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB;"
-        f" {timing['cpu_ms_per_frame']:.1f} CPU ms a frame, {timing['frames_per_second']:.1f} frames a second"
+        f"{took(run)}; {timing['cpu_ms_per_frame']:.1f} CPU ms a frame,"
+        f" {timing['frames_per_second']:.1f} frames a second"
     )
     looks = "" if args.no_record else f"; look at it: sfmapp view {output}"
     print(f"trajectory {output / 'trajectory.tum'}, report {output / 'report.html'}{looks}")

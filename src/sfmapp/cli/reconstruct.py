@@ -13,6 +13,7 @@ from sfmapp.cli.common import (
     listening,
     load_numba_without_blas,
     print_json,
+    took,
 )
 
 if TYPE_CHECKING:
@@ -188,5 +189,5 @@ def _print_summary(output: Path, report: dict[str, Any]) -> None:
     if run["is_up_to_date"]:
         print(f"{output} is up to date: nothing to do")
     else:
-        print(f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB")
+        print(took(run))
     print(f"model {output / 'sparse' / '0'}, report {output / 'report.html'}; look at it: sfmapp view {output}")

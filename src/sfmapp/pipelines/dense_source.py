@@ -86,7 +86,7 @@ def dense_job(where: DenseSource, events: Events, watch: Stopwatch | None = None
     from threadpoolctl import threadpool_limits
 
     options, source = where.options, str(where.images)
-    threads = options.threads or len(os.sched_getaffinity(0))
+    threads = options.num_workers
     with (
         open_workspace(where.output, where.command) as workspace,
         EventLog(workspace.log, source=source, version=sfmapp.__version__) as event_log,

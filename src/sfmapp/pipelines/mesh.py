@@ -150,7 +150,7 @@ def mesh_cloud(
     length = np.linalg.norm(normal, axis=1)
     usable = np.isfinite(length) & (length > 0.0)
     xyz, normal, rgb = xyz[usable], normal[usable] / length[usable, None], rgb_of(vertices)[usable]
-    threads = options.threads or len(os.sched_getaffinity(0))
+    threads = options.num_workers
     size = _sizes(xyz, threads)
     mesh, report = make_mesh(xyz, normal, rgb, size, None, options.surface, threads=threads, events=events)
     folder = Path(output)

@@ -100,7 +100,7 @@ def track_sequence(
 
     source, options, events = os.fspath(source), with_absolute_paths(options or Options()), events or Events()
     wish = parse_scale(options.scale.source) if options.scale.source is not None else None
-    threads = options.threads or len(os.sched_getaffinity(0))
+    threads = options.num_workers
     with ExitStack() as stack:
         workspace = stack.enter_context(open_workspace(Path(output), ODOMETRY))
         event_log = stack.enter_context(EventLog(workspace.log, source=source, version=sfmapp.__version__))

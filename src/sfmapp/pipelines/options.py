@@ -72,6 +72,11 @@ class Options:
         if self.min_registered is not None and self.min_registered < 2:
             raise UsageError(f"min_registered: expected 2 or more, got {self.min_registered}")
 
+    @property
+    def num_workers(self) -> int:
+        """``threads``, or the cores that this process may use."""
+        return self.threads or len(os.sched_getaffinity(0))
+
 
 def load_options(presets: Iterable[str] = (), settings: Iterable[str] = ()) -> Options:
     """Defaults, then presets or TOML files in order, then ``stage.option=value`` settings; the last word counts.

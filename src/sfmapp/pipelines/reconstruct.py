@@ -74,7 +74,7 @@ def reconstruct(
     from threadpoolctl import threadpool_limits
 
     source, options, events = os.fspath(images), with_absolute_paths(options or Options()), events or Events()
-    threads = options.threads or len(os.sched_getaffinity(0))
+    threads = options.num_workers
     with (
         open_workspace(Path(output)) as workspace,
         EventLog(workspace.log, source=source, version=sfmapp.__version__) as event_log,

@@ -92,7 +92,7 @@ def refine(
     before = read_odometry(source)
     if not before.maps:
         raise NoReconstructionError(f"{source} holds no map to refine", "run sfmapp odometry first")
-    threads = options.threads or len(os.sched_getaffinity(0))
+    threads = options.num_workers
     with ExitStack() as stack:
         workspace = stack.enter_context(open_workspace(Path(refined or source / FOLDER), REFINE))
         event_log = stack.enter_context(EventLog(workspace.log, source=str(source), version=sfmapp.__version__))
