@@ -71,9 +71,9 @@ def _coarse_to_fine(
         rows.append({"level": level} | _grow(growth, coarser, points, found, depth_range, steps, events))
         waves += growth.waves
     assert growth is not None
-    growth.close()
     store, count = growth.store, growth.count
     # the images and their cells take as much room as the patches, which are about to be there twice
+    growth.close()
     del growth, coarser, images
     patches = _patches(scene, store, count, frame)
     return patches, _report(rows, waves, len(patches))
@@ -97,7 +97,6 @@ def _grow(
     if coarser is not None:
         row["carried"] = growth.refine_coarser(coarser, lambda: events.advanced(STAGE, steps))
         coarser.close()
-        coarser.release()
     row["points"] = growth.seed_points(points)
     row["expanded"] = growth.expand(events, everywhere=True)
     if coarser is not None:

@@ -13,7 +13,7 @@ from numba import float32 as f32
 
 from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
-from sfmapp.dense.patch_kernels import cell_of, judge, measure, plane_in_view, project, refine
+from sfmapp.dense.patch_kernels import cell_of, judge, measure, plane_in_view, project, refine, unproject
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
 
 CANDIDATES = 3
@@ -204,11 +204,9 @@ def inherit(images, store, m, u, v, p, found, i):  # type: ignore[no-untyped-def
     w0 = wu * u + wv * v + w
     if not is_trusted or not w0 > 0.0:
         return
-    k, r, t = offset(images.k, 4 * m), offset(images.rotation, 9 * m), offset(images.translation, 3 * m)
-    rx, ry, z = (u - k[2]) / k[0], (v - k[3]) / k[1], 1.0 / w0
-    x0, x1, x2 = rx * z - t[0], ry * z - t[1], z - t[2]
+    k, z = offset(images.k, 4 * m), 1.0 / w0
+    unproject(images, m, u, v, z, offset(found.xyz, 3 * i))
     for j in range(3):
-        found.xyz[3 * i + j] = r[j] * x0 + r[3 + j] * x1 + r[6 + j] * x2
         found.normal[3 * i + j] = normal[j]
     found.score[i], found.sigma[i] = store.score[p], store.sigma[p]
     found.size[i], found.wave[i] = z / (0.5 * (k[0] + k[1])), store.wave[p]

@@ -60,14 +60,10 @@ class Growth:
         self._work = [make_scratch() for _ in range(threads * CHUNKS_PER_THREAD)]
 
     def close(self) -> None:
-        """Let the threads go and keep only the patches and their cells."""
+        """Let go of the threads, the patches, their cells and all that was needed to find them."""
         self._pool.shutdown()
         self._places = self._candidates = self._fresh = np.zeros((0, 0), np.int32)
-        self._found = Store.of_capacity(0, self.num_neighbors)
-
-    def release(self) -> None:
-        """Let go of the patches and their cells as well."""
-        self.store = Store.of_capacity(0, self.num_neighbors)
+        self.store = self._found = Store.of_capacity(0, self.num_neighbors)
         self.cells = Cells(np.zeros((0, LAYERS), np.int32), np.zeros(0, np.uint8))
 
     # ------------------------------------------------------------------------------------------------------------ seeds

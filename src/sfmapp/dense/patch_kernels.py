@@ -67,6 +67,31 @@ def project(images, m, xyz):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
+def unproject(images, m, u, v, z, xyz):  # type: ignore[no-untyped-def]
+    """The place at depth z that view m sees at pixel (u, v), to ``xyz``; the length of the ray to depth one."""
+    k, r, t = offset(images.k, 4 * m), offset(images.rotation, 9 * m), offset(images.translation, 3 * m)
+    rx, ry = (u - k[2]) / k[0], (v - k[3]) / k[1]
+    x0, x1, x2 = rx * z - t[0], ry * z - t[1], z - t[2]
+    for j in range(3):
+        xyz[j] = r[j] * x0 + r[3 + j] * x1 + r[6 + j] * x2
+    return math.sqrt(rx * rx + ry * ry + 1.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def normal_of_plane(images, m, u, v, w, wu, wv, normal):  # type: ignore[no-untyped-def]
+    """Unit normal of a plane of view m, inverse depth w at pixel (u, v) with slopes wu, wv, to ``normal``; returns one
+    over the distance of the plane from the camera."""
+    k, r = offset(images.k, 4 * m), offset(images.rotation, 9 * m)
+    # the inverse depth along a ray is the normal over the distance of the plane, times the ray: away from the camera
+    n0, n1 = wu * k[0], wv * k[1]
+    n2 = w - n0 * ((u - k[2]) / k[0]) - n1 * ((v - k[3]) / k[1])
+    steep = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+    for j in range(3):
+        normal[j] = -(r[j] * n0 + r[3 + j] * n1 + r[6 + j] * n2) / steep
+    return steep
+
+
+@numba.njit(cache=True, nogil=True)
 def cell_of(images, m, u, v):  # type: ignore[no-untyped-def]
     """Cell of a pixel in view m; -1 outside of the grid."""
     side = images.cell_px
@@ -228,23 +253,14 @@ def judge(images, m, u, v, plane, slots, rhos, n, sigma, limits, work, found, i)
 @numba.njit(cache=True, nogil=True)
 def _enter(images, m, u, v, plane, slots, rhos, num_asked, sigma, limits, found, i):  # type: ignore[no-untyped-def]
     """Check the geometry of a patch that enough images trust, and write it down."""
-    k, r, t = offset(images.k, 4 * m), offset(images.rotation, 9 * m), offset(images.translation, 3 * m)
-    center = offset(images.center, 3 * m)
+    k, center = offset(images.k, 4 * m), offset(images.center, 3 * m)
     w0 = np.float64(plane[0])
-    rx, ry = (u - k[2]) / k[0], (v - k[3]) / k[1]
-    n0, n1 = plane[1] * k[0], plane[2] * k[1]
-    n2 = w0 - n0 * rx - n1 * ry
-    # the inverse depth along a ray is the normal over the distance of the plane, times the ray: away from the camera
-    steep = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-    ray = math.sqrt(rx * rx + ry * ry + 1.0)
+    z = 1.0 / w0
+    xyz, normal = offset(found.xyz, 3 * i), offset(found.normal, 3 * i)
+    ray = unproject(images, m, u, v, z, xyz)
+    steep = normal_of_plane(images, m, u, v, w0, plane[1], plane[2], normal)
     if w0 / (steep * ray) < LEAST_COSINE:
         return False
-    z = 1.0 / w0
-    x0, x1, x2 = rx * z - t[0], ry * z - t[1], z - t[2]
-    xyz, normal = offset(found.xyz, 3 * i), offset(found.normal, 3 * i)
-    for j in range(3):
-        xyz[j] = r[j] * x0 + r[3 + j] * x1 + r[6 + j] * x2
-        normal[j] = -(r[j] * n0 + r[3 + j] * n1 + r[6 + j] * n2) / steep
     d0, d1, d2 = center[0] - xyz[0], center[1] - xyz[1], center[2] - xyz[2]
     distance = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
     views = offset(found.views, i * found.row)

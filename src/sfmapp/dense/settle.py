@@ -13,10 +13,10 @@ import numba
 import numpy as np
 from numba import float32 as f32
 
-from sfmapp.adjust.lanes import offset
+from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
 from sfmapp.dense.expand import NEAR, cell_size, off_planes
-from sfmapp.dense.patch_kernels import cell_of, plane_in_view, project
+from sfmapp.dense.patch_kernels import cell_of, normal_of_plane, plane_in_view, project, unproject
 
 # cells to each side that take part, and the pixels over which their weight falls off
 RADIUS_CELLS, FALL_OFF_PX = 4, 3.0
@@ -45,7 +45,8 @@ def settle(image_arrays, store_arrays, cell_arrays, first, last, xyz, normal, si
         wu, wv, _ = plane_in_view(images, r, x, offset(store.normal, 3 * p))
         a, b, c, spread, is_regular = _fit(images, store, cells, p, r, g, u, v, z, wu, wv)
         if is_regular and a > 0.0:
-            _move(images, r, u, v, a, b, c, xyz, normal, p)
+            unproject(images, r, u, v, 1.0 / a, offset(pointer(xyz), 3 * p))
+            normal_of_plane(images, r, u, v, a, b, c, offset(pointer(normal), 3 * p))
             sigma[p] = spread * _length_per_inverse_depth(images, r, u, v, a)
 
 
@@ -119,18 +120,3 @@ def _fit(images, store, cells, p, r, g, u, v, z, wu, wv):  # type: ignore[no-unt
 def _deviation(images, store, q, r, u, v, w):  # type: ignore[no-untyped-def]
     """Standard deviation of a patch in inverse depth of view r, taken along its line of sight."""
     return np.float64(store.sigma[q]) / _length_per_inverse_depth(images, r, u, v, w)
-
-
-@numba.njit(cache=True, nogil=True)
-def _move(images, r, u, v, w, wu, wv, xyz, normal, p):  # type: ignore[no-untyped-def]
-    """Place and normal of a plane of view r at pixel (u, v)."""
-    k, rot, t = offset(images.k, 4 * r), offset(images.rotation, 9 * r), offset(images.translation, 3 * r)
-    rx, ry = (u - k[2]) / k[0], (v - k[3]) / k[1]
-    n0, n1 = wu * k[0], wv * k[1]
-    n2 = w - n0 * rx - n1 * ry
-    length = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-    z = 1.0 / w
-    x0, x1, x2 = rx * z - t[0], ry * z - t[1], z - t[2]
-    for j in range(3):
-        xyz[p, j] = rot[j] * x0 + rot[3 + j] * x1 + rot[6 + j] * x2
-        normal[p, j] = -(rot[j] * n0 + rot[3 + j] * n1 + rot[6 + j] * n2) / length
