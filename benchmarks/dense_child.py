@@ -11,21 +11,18 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfmapp.dense.densify import compile_kernels, densify
 from sfmapp.dense.options import DenseOptions
 from sfmapp.dense.scene import DenseScene, DenseView
+from sfmapp.dense.selection import select_neighbors
 from sfmapp.formats.colmap import read_model
-from sfmapp.geometry import rigid3
 
-# Views at this angle of the rays to the middle of the scene match best; narrower ones are worth less than wider ones.
-BEST_ANGLE_DEG, ANGLES_DEG = 10.0, (1.5, 60.0)
 MAX_NEIGHBORS = 8
 
 
 def load_scene(order: dict[str, Any]) -> DenseScene:
-    """Views at the working level with neighbours by angle; no sparse points: ours has to do without."""
+    """Views at the working level with neighbours by their cameras; no sparse points: ours has to do without."""
     model = read_model(Path(order["model"]))[0]
     views = []
     for name, camera_idx, pose in zip(model.image_names, model.image_camera_idx, model.cam_from_world, strict=True):
@@ -47,20 +44,10 @@ def load_scene(order: dict[str, Any]) -> DenseScene:
         views.append(DenseView(name, np.ascontiguousarray(pixels[..., ::-1]), mask, k, pose))
     views += views[: order["repeat_views"]]
     poses = np.array([view.cam_from_world for view in views])
-    empty = np.zeros((0, 3)), np.zeros(1, np.int64), np.zeros(0, np.int32)
-    return DenseScene(tuple(views), neighbors(rigid3.center(poses), rigid3.rotation_matrix(poses)[:, 2]), *empty)
-
-
-def neighbors(centers: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.int32]:
-    """(V, K) views to match with, best first, -1 behind the last: by the angle at the point nearest to all axes."""
-    across = np.eye(3) - axes[:, :, None] * axes[:, None]
-    middle = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, centers))
-    rays = (middle - centers) / np.linalg.norm(middle - centers, axis=1, keepdims=True)
-    angle = np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)))
-    cost = np.where(angle < BEST_ANGLE_DEG, 1.5 * (BEST_ANGLE_DEG - angle), angle - BEST_ANGLE_DEG)
-    cost[(angle < ANGLES_DEG[0]) | (angle > ANGLES_DEG[1]) | (axes @ axes.T < 0.3)] = np.inf
-    best = np.argsort(cost, axis=1, kind="stable")[:, :MAX_NEIGHBORS]
-    return np.where(np.isfinite(np.take_along_axis(cost, best, 1)), best, -1).astype(np.int32)
+    focal = np.array([view.k[:2].mean() for view in views])
+    no_points = np.zeros((0, 3)), np.zeros(1, np.int64), np.zeros(0, np.int32)
+    neighbors, _ = select_neighbors(focal, poses, *no_points, MAX_NEIGHBORS)
+    return DenseScene(tuple(views), neighbors, *no_points)
 
 
 def cpu_s() -> float:
