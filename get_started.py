@@ -20,7 +20,7 @@ PYTHON = ENVIRONMENT / "bin" / "python"
 PIP_INDEX = "https://pypi.org/pypi/pip/json"
 JOBS = {
     "demo": (".", ["-m", "sfmapp", "demo", "-o", "demo"]),
-    "test": (".[test]", ["-m", "pytest"]),
+    "test": (".[test]", ["-m", "pytest", "--numprocesses=auto", "--dist=worksteal"]),
 }
 
 

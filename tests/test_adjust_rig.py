@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -235,26 +234,6 @@ def test_factors_are_over_the_rigs_pose():
     wrong.add(gtsam.PriorFactorPose3(X(3), away, noise))
     with pytest.raises(ValueError, match=r"sensor 0, found X\(3\)"):
         adjust_bundle(found, KNOWN, extra_factors=wrong)
-
-
-# --- how long it takes ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("rig", [None, synthetic_rig()])
-def test_a_window_is_adjusted_while_frames_wait(rig):
-    """Ten keyframes, about 10,000 observations, set-up included: 8 ms (stereo) and 14 ms (mono) on an idle core."""
-    num_images = 10 if rig is None else 20
-    scene = make_scene(0, num_images, 1400 if rig is None else 700, rig=rig, layout="forward", detection=0.95)
-    images = np.arange(num_images) >= 2
-    options = replace(KNOWN, loss="huber", relative_cost_tolerance=1e-6, max_iterations=10)
-    start, spent = start_of(scene), []
-    for _ in range(8):
-        found = start.copy()
-        begin = time.process_time()
-        report = adjust_bundle(found, options, variable_images=images)
-        spent.append(time.process_time() - begin)
-    assert 9000 < report.num_observations < 11000
-    assert min(spent) < 0.04
 
 
 # --- covariances ------------------------------------------------------------------------------------------------------

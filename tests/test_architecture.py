@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
-import time
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -117,17 +116,12 @@ def test_the_version_is_the_same_everywhere() -> None:
         assert "<" in requirement, requirement
 
 
-def test_help_is_fast_and_light() -> None:
+def test_help_is_light() -> None:
     code = (
         "import sys; from sfmapp.cli.main import make_parser; make_parser().format_help();"
         f"print([name for name in {HEAVY!r} if name in sys.modules])"
     )
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert loaded.strip() == "[]"
-    times = []
-    for _ in range(3):
-        start = time.perf_counter()
-        shown = subprocess.run([sys.executable, "-m", "sfmapp", "--help"], capture_output=True, text=True, check=True)
-        times.append(time.perf_counter() - start)
+    shown = subprocess.run([sys.executable, "-m", "sfmapp", "--help"], capture_output=True, text=True, check=True)
     assert "reconstruct" in shown.stdout
-    assert min(times) < 0.5

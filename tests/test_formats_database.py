@@ -9,7 +9,6 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -261,29 +260,6 @@ def test_failed_transaction_changes_nothing(tmp_path: Path) -> None:
             database.set_images(scene.truth.cameras, ["a", "a"], [0, 0])
         assert database.read_images()[1] == scene.truth.image_names
         assert len(database.feature_keys()) == 5
-
-
-def test_twelve_images_of_8192_features_are_written_quickly(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    features = [
-        Features(
-            rng.random((8192, 4), np.float32),
-            rng.integers(0, 256, (8192, 128), np.uint8),
-            rng.integers(0, 256, (8192, 3), np.uint8),
-        )
-        for _ in range(12)
-    ]
-    start = time.process_time()
-    with Database(tmp_path / "d.db") as database:
-        database.set_images([synthetic_camera()], [f"{i}.jpg" for i in range(12)], [0] * 12)
-        for i in range(12):
-            database.write_features(i, features[i], "key")
-    assert time.process_time() - start < 0.6  # 0.1 s on an idle core
-    start = time.process_time()
-    with Database(tmp_path / "d.db") as database:
-        for i in range(12):
-            database.read_features(i)
-    assert time.process_time() - start < 0.3
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
@@ -147,9 +146,8 @@ def test_the_page_is_whole_small_and_fetches_nothing(finished: Path) -> None:
 
 def test_the_same_command_again_does_nothing(photos: Path, copy: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in copy.rglob("*") if path.name != "log.jsonl"}
-    counter, start = Counter(), time.process_time()
+    counter = Counter()
     result = run(photos, copy, None, counter)
-    assert time.process_time() - start < 1.0
     assert result.report["run"]["is_up_to_date"]
     assert set(counter.reports) == {"images"}
     assert {path: path.stat().st_mtime_ns for path in before} == before
