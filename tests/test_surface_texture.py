@@ -15,7 +15,7 @@ from sfmapp.surface.options import SurfaceOptions
 from sfmapp.surface.painting import fill_gaps, paint
 from sfmapp.surface.seams import level_seams
 from sfmapp.surface.texture import texture_mesh
-from sfmapp.surface.view_choice import choose_views, neighbor_pairs, project
+from sfmapp.surface.view_choice import choose_views, neighbor_pairs
 
 GRAY = 120
 
@@ -110,7 +110,7 @@ def test_what_stands_before_the_surface_is_not_painted_onto_it() -> None:
     views = []
     for view in (view_of(LEFT, (0.0, 0.0)), view_of(RIGHT, (0.0, 0.0))):
         # the lid, white, in the photographs
-        pixel = project(view, lid.xyz[[0, 10, -1, -11]])
+        pixel, _ = view.project(lid.xyz[[0, 10, -1, -11]])
         rgb = view.rgb.copy()
         y, x = np.mgrid[:160, :160] + 0.5
         inside = np.ones((160, 160), bool)

@@ -185,9 +185,7 @@ def _patches(scene: DenseScene, store: Store, n: int, frame: Frame) -> Patches:
     xyz = store.xyz[:n].astype(np.float64) / frame.scale + frame.origin
     for m, view in enumerate(scene.views):
         mine = np.flatnonzero(reference == m)
-        seen = rigid3.apply(view.cam_from_world, xyz[mine])
-        x = (seen[:, 0] / seen[:, 2] * view.k[0] + view.k[2]).astype(np.int64).clip(0, view.width - 1)
-        y = (seen[:, 1] / seen[:, 2] * view.k[1] + view.k[3]).astype(np.int64).clip(0, view.height - 1)
+        x, y = view.project(xyz[mine])[0].astype(np.int64).clip(0, [view.width - 1, view.height - 1]).T
         rgb[mine] = view.rgb[y, x]
     counts = store.num_views[:n].astype(np.int64)
     is_view = np.arange(store.views.shape[1]) < counts[:, None]

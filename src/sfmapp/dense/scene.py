@@ -36,6 +36,16 @@ class DenseView:
     def height(self) -> int:
         return self.rgb.shape[0]
 
+    def project(self, xyz: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(N, 2) pixels and (N,) depth at which the view sees places (N, 3) of the world; pixels are NaN behind it."""
+        seen = rigid3.apply(self.cam_from_world, xyz)
+        depth = seen[:, 2]
+        return seen[:, :2] / np.where(depth > 0.0, depth, np.nan)[:, None] * self.k[:2] + self.k[2:], depth
+
+    def shows(self, pixel: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(N,) bool, True for pixels (N, 2) within the picture; NaN is not."""
+        return np.asarray(((pixel >= 0.0) & (pixel < [self.width, self.height])).all(axis=1))
+
 
 @dataclass(frozen=True)
 class Region:

@@ -38,7 +38,6 @@ def coverage(scene: DenseScene, patches: Patches, *, block_px: int = 4, min_view
         (patches that trust it), ``coverage``, the shares ``out_of_sight``, ``plain`` and ``unmatched``, which add up
         to one with it, and ``reason``, the largest of these three in words, empty where the photograph is well covered.
     """
-    poses = scene.cam_from_world
     trusting = np.repeat(np.arange(len(patches)), patches.num_views)
     trusting = trusting[np.argsort(patches.view_idx, kind="stable")]
     limits = np.concatenate([[0], np.cumsum(np.bincount(patches.view_idx, minlength=len(scene.views)))])
@@ -47,7 +46,7 @@ def coverage(scene: DenseScene, patches: Patches, *, block_px: int = 4, min_view
         mine = trusting[limits[v] : limits[v + 1]]
         wanted, covered, depth = _blocks(view, patches.xyz[mine], block_px)
         is_plain = _deviation(view, block_px) < PLAIN
-        seen_by = 1 + _num_seeing(scene, poses, v, depth, block_px)
+        seen_by = 1 + _num_seeing(scene, v, depth, block_px)
         out_of_sight = wanted & ~covered & (seen_by < min_views)
         plain = wanted & ~covered & ~out_of_sight & is_plain
         count = max(1, int(wanted.sum()))
@@ -82,14 +81,11 @@ def _blocks(view: DenseView, xyz: Array, block_px: int) -> tuple[Bools, Bools, A
 
     shape = (-(-view.height // block_px), -(-view.width // block_px))
     wanted = np.ones(shape, np.bool_) if view.mask is None else _block_means(view.mask, block_px) > 0.5
-    rotation = rigid3.rotation_matrix(view.cam_from_world)
-    place = xyz @ rotation.T + view.cam_from_world[4:]
-    place = place[place[:, 2] > 0.0]
-    column = np.floor((place[:, 0] / place[:, 2] * view.k[0] + view.k[2]) / block_px).astype(np.int64)
-    row = np.floor((place[:, 1] / place[:, 2] * view.k[1] + view.k[3]) / block_px).astype(np.int64)
-    inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
+    pixel, z = view.project(xyz)
+    inside = view.shows(pixel)
+    column, row = (pixel[inside] / block_px).astype(np.int64).T
     depth = np.full(shape, np.nan)
-    depth[row[inside], column[inside]] = place[inside, 2]
+    depth[row, column] = z[inside]
     covered = np.isfinite(depth)
     if not covered.any():
         return wanted, covered, depth
@@ -101,7 +97,7 @@ def _blocks(view: DenseView, xyz: Array, block_px: int) -> tuple[Bools, Bools, A
     return wanted, covered, of_label[label]
 
 
-def _num_seeing(scene: DenseScene, poses: Array, v: int, depth: Array, block_px: int) -> NDArray[np.int64]:
+def _num_seeing(scene: DenseScene, v: int, depth: Array, block_px: int) -> NDArray[np.int64]:
     """(R, C) neighbours of view v whose pictures the middle of each block falls into, at the depth (R, C) it has."""
     count = np.zeros(depth.shape, np.int64)
     if np.isnan(depth).any():
@@ -109,15 +105,10 @@ def _num_seeing(scene: DenseScene, poses: Array, v: int, depth: Array, block_px:
     fx, fy, cx, cy = scene.views[v].k
     y, x = (np.indices(depth.shape) + 0.5) * block_px
     place = np.stack([(x - cx) / fx * depth, (y - cy) / fy * depth, depth], axis=-1)
-    world = rigid3.apply(rigid3.inverse(poses[v]), place.reshape(-1, 3))
+    world = rigid3.apply(rigid3.inverse(scene.views[v].cam_from_world), place.reshape(-1, 3))
     for m in scene.neighbors[v][scene.neighbors[v] >= 0]:
         other = scene.views[m]
-        seen = rigid3.apply(poses[m], world)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = seen[:, 0] / seen[:, 2] * other.k[0] + other.k[2]
-            w = seen[:, 1] / seen[:, 2] * other.k[1] + other.k[3]
-        inside = (seen[:, 2] > 0.0) & (u >= 0.0) & (u < other.width) & (w >= 0.0) & (w < other.height)
-        count += inside.reshape(depth.shape)
+        count += other.shows(other.project(world)[0]).reshape(depth.shape)
     return count
 
 

@@ -17,7 +17,7 @@ from sfmapp.surface.child import run_child
 from sfmapp.surface.options import SurfaceOptions
 from sfmapp.surface.painting import fill_gaps, paint
 from sfmapp.surface.seams import level_seams
-from sfmapp.surface.view_choice import choose_views, neighbor_pairs, project
+from sfmapp.surface.view_choice import choose_views, neighbor_pairs
 
 STAGE = "texture"
 PADDING_TEXELS = 4
@@ -122,7 +122,7 @@ def _cut_charts(mesh: Mesh, scene: DenseScene, view_idx: NDArray[np.int32]) -> _
     pixels = np.zeros((len(key), 2))
     for m, view in enumerate(scene.views):
         mine = vertex_source == m
-        pixels[mine] = project(view, mesh.xyz[vertex_idx[mine]])
+        pixels[mine], _ = view.project(mesh.xyz[vertex_idx[mine]])
     _project_unseen(mesh, faces, vertex_idx, vertex_source - num_views, pixels)
     return _Charts(vertex_idx, faces, source, vertex_source, chart.astype(np.int32), pixels)
 

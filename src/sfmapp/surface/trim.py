@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.dense.scene import DenseScene
-from sfmapp.geometry import rigid3
 from sfmapp.scene.mesh import face_areas, face_vectors
 from sfmapp.surface.patch_cloud import CHUNK, PatchCloud
 
@@ -56,16 +55,11 @@ def in_view(xyz: NDArray[np.float64], faces: NDArray[np.int32], scene: DenseScen
     vectors = face_vectors(xyz, faces)
     centers = xyz[faces].mean(axis=1)
     seen = np.zeros(len(faces), np.bool_)
-    rotation, camera = rigid3.rotation_matrix(scene.cam_from_world), scene.centers
-    for m, view in enumerate(scene.views):
+    for view, camera in zip(scene.views, scene.centers, strict=True):
         open_idx = np.flatnonzero(~seen)
-        ray = centers[open_idx] - camera[m]
-        in_cam = ray @ rotation[m].T
-        depth = np.where(in_cam[:, 2] > 0.0, in_cam[:, 2], np.inf)
-        x = view.k[0] * in_cam[:, 0] / depth + view.k[2]
-        y = view.k[1] * in_cam[:, 1] / depth + view.k[3]
-        inside = np.isfinite(depth) & (x >= 0.0) & (x < view.width) & (y >= 0.0) & (y < view.height)
-        seen[open_idx[inside & (np.einsum("fc,fc->f", ray, vectors[open_idx]) < 0.0)]] = True
+        pixel, _ = view.project(centers[open_idx])
+        faces_camera = np.einsum("fc,fc->f", centers[open_idx] - camera, vectors[open_idx]) < 0.0
+        seen[open_idx[view.shows(pixel) & faces_camera]] = True
     return seen
 
 

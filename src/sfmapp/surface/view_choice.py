@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from sfmapp.dense.scene import DenseScene, DenseView
 from sfmapp.events import Events
-from sfmapp.geometry import rigid3
 from sfmapp.scene.mesh import Mesh, face_vectors, flat_areas
 from sfmapp.surface.child import run_child
 
@@ -34,13 +33,6 @@ class ViewChoice:
 
     view_idx: NDArray[np.int32]
     num_candidates: int
-
-
-def project(view: DenseView, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 2) pixels where a view shows points (N, 3) of the world; NaN behind it."""
-    in_cam = rigid3.apply(view.cam_from_world, xyz)
-    depth = np.where(in_cam[:, 2:] > 0.0, in_cam[:, 2:], np.nan)
-    return np.asarray(in_cam[:, :2] / depth * view.k[:2] + view.k[2:])
 
 
 def neighbor_pairs(faces: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -98,7 +90,7 @@ def _worth(
     color = mesh.rgb[mesh.faces].mean(axis=1)
     worth = []
     for view, camera in zip(scene.views, scene.centers, strict=True):
-        pixel = project(view, mesh.xyz)
+        pixel, _ = view.project(mesh.xyz)
         limit = np.array([view.width, view.height]) - MARGIN_PX
         inside = np.asarray(((pixel >= MARGIN_PX) & (pixel <= limit)).all(axis=1))
         ray = camera - centers
@@ -124,7 +116,7 @@ def _worth(
 def _likeness(view: DenseView, xyz: NDArray[np.float64], color: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N,) near 1 where a view shows points (N, 3) in about their colour (N, 3), near 0 where it shows something else:
     what stands before them without being in the mesh, or the background beside an edge."""
-    x, y = project(view, xyz).astype(np.int64).T
+    x, y = view.project(xyz)[0].astype(np.int64).T
     shown = view.rgb[y.clip(0, view.height - 1), x.clip(0, view.width - 1)]
     return np.asarray(1.0 / (1.0 + (np.abs(shown - color).mean(axis=1) / ANOTHER_COLOR) ** 4))
 
