@@ -122,12 +122,15 @@ class Limits(NamedTuple):
 
     Attributes:
         min_views: images that have to trust it, the reference among them.
+        enough: images from which on nobody asks why the others do not trust it; of a patch with fewer, the others must
+            have a reason for not seeing it.
         trusted: NCC from which an image trusts a patch.
         promising: NCC below which an image does not take part in the refinement.
         max_refined: images that take part in it, best first.
     """
 
     min_views: int
+    enough: int
     trusted: float
     promising: float
     max_refined: int

@@ -58,7 +58,7 @@ def _coarse_to_fine(
 ) -> tuple[Patches, dict[str, Any]]:
     frame = frame_of(scene)
     grays = gray_pyramids(scene.views, num_levels, threads)
-    limits = Limits(options.min_views, TRUSTED, PROMISING, MAX_REFINED)
+    limits = Limits(options.min_views, options.min_views, TRUSTED, PROMISING, MAX_REFINED)
     points, depth_range = _sparse_points(scene, frame), _depth_ranges(scene, frame)
     rows: list[dict[str, Any]] = []
     waves: list[dict[str, int]] = []
@@ -96,7 +96,6 @@ def _grow(
     row: dict[str, Any] = {}
     if coarser is not None:
         row["carried"] = growth.refine_coarser(coarser, lambda: events.advanced(STAGE, steps))
-        coarser.close()
     row["points"] = growth.seed_points(points)
     row["expanded"] = growth.expand(events, everywhere=True)
     if coarser is not None:
@@ -104,6 +103,9 @@ def _grow(
     row["corners"] = growth.seed_corners(found, depth_range, everywhere=coarser is None)
     row["expanded"] += growth.expand(events, everywhere=False)
     events.advanced(STAGE, steps * growth.num_views * (2 if coarser is None else 1))
+    row["excused"] = growth.excuse(coarser, events)
+    if coarser is not None:
+        coarser.close()
     row["accepted"] = growth.count
     row |= growth.filter()
     growth.settle()

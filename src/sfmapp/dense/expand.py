@@ -7,19 +7,22 @@ the cells: threads share the work, and the result does not depend on how many th
 
 from __future__ import annotations
 
+import math
+
 import numba
 import numpy as np
 from numba import float32 as f32
 
 from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
-from sfmapp.dense.patch_kernels import cell_of, judge, measure, plane_in_view, project, refine, unproject
+from sfmapp.dense.patch_kernels import LEAST_COSINE, cell_of, judge, measure, plane_in_view, project, refine, unproject
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
 
 CANDIDATES = 3
 # a cell that has failed so often is left alone until the next round
 MOST_TRIES = 3
-WAITING = np.uint8(128)
+WAITING, SHORT = np.uint8(128), np.uint8(64)
+TRIES = np.uint8(63)
 # how far two patches may lie off each other's planes to be of one surface, in cells
 NEAR = 1.5
 # and how far they have to lie off them to be two surfaces, one behind the other
@@ -95,7 +98,7 @@ def frontier(image_arrays, store_arrays, cell_arrays, m, fresh, num_fresh, place
 def _may_be_tried(images, cells, m, x, y):  # type: ignore[no-untyped-def]
     """The cell has room for a patch, its window lies in the image, and it has not failed too often."""
     g = images.cell_start[m] + y * images.columns[m] + x
-    if images.closed[g] != 0 or cells.patch[LAYERS * g + LAYERS - 1] >= 0 or (cells.tried[g] & ~WAITING) >= MOST_TRIES:
+    if images.closed[g] != 0 or cells.patch[LAYERS * g + LAYERS - 1] >= 0 or (cells.tried[g] & TRIES) >= MOST_TRIES:
         return False
     u, v = x * images.cell_px + images.cell_px // 2, y * images.cell_px + images.cell_px // 2
     return u >= HALF and v >= HALF and u < images.width[m] - HALF - 1 and v < images.height[m] - HALF - 1
@@ -147,14 +150,26 @@ def _insert(store, row, count, p):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def try_cells(  # type: ignore[no-untyped-def]
-    image_arrays, store_arrays, cell_arrays, m, places, candidates, first, last, limits, wave, scratch, found_arrays
+    image_arrays,
+    store_arrays,
+    own_arrays,
+    cell_arrays,
+    m,
+    places,
+    candidates,
+    first,
+    last,
+    limits,
+    wave,
+    scratch,
+    found_arrays,
 ):
     """Grow patches into cells ``first`` to ``last`` of view m; results at the same positions of what is found.
 
     With a negative wave the patches are those of a coarser level, and their own waves are passed on.
     """
     images, store, found = image_pointers(image_arrays), store_pointers(store_arrays), store_pointers(found_arrays)
-    cells = cell_pointers(cell_arrays)
+    cells, own = cell_pointers(cell_arrays), store_pointers(own_arrays)
     slot_array, work = np.empty(MOST_SLOTS, np.int64), pointer(scratch)
     slots, rhos, best = pointer(slot_array), offset(work, RHOS), offset(work, BEST)
     quads, width = offset(images.quads, images.start[m]), images.width[m]
@@ -178,9 +193,15 @@ def try_cells(  # type: ignore[no-untyped-def]
         if n < limits.min_views - 1:
             continue
         n, sigma = refine(images, m, uf, vf, best, slots, rhos, n, limits, work)
-        if n == 0 or not judge(images, m, uf, vf, best, slots, rhos, n, sigma, limits, work, found, i):
+        if n <= 0 or not judge(images, m, uf, vf, best, slots, rhos, n, sigma, limits, work, found, i):
+            one_less = limits.min_views - 2
+            if one_less > 0 and (n == -one_less or (n > 0 and rhos[one_less - 1] >= f32(limits.trusted))):
+                cells.tried[cell_of(images, m, u, v)] |= SHORT
             if wave < 0 and n > 0 and deviation < f32(CLEAR_DEVIATION) * images.noise[m]:
                 inherit(images, store, m, uf, vf, parent, found, i)
+            continue
+        if found.num_views[i] < limits.enough and not are_excused(images, own, cells, found, i):
+            found.num_views[i] = 0
             continue
         found.wave[i] = wave if wave >= 0 else store.wave[parent]
         # a second layer has to explain the pixel better than the first, and must not have slid back onto it
@@ -190,6 +211,54 @@ def try_cells(  # type: ignore[no-untyped-def]
         ):
             found.num_views[i] = 0
     slot_array[0] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def retry(cell_arrays):  # type: ignore[no-untyped-def]
+    """Let cells be tried again in which a patch was one image short, and no others that were tried."""
+    cells = cell_pointers(cell_arrays)
+    for g in range(cell_arrays.tried.shape[0]):
+        if cells.tried[g] & SHORT:
+            cells.tried[g] = SHORT
+        elif cells.tried[g] & TRIES:
+            cells.tried[g] = MOST_TRIES
+
+
+@numba.njit(cache=True, nogil=True)
+def are_excused(images, store, cells, found, i):  # type: ignore[no-untyped-def]
+    """Whether all neighbours of the reference image that do not trust a patch cannot see it: it lies outside of their
+    images or masks, turns away from them, or is hidden by patches before it."""
+    m, xyz, normal = np.int64(found.views[i * found.row]), offset(found.xyz, 3 * i), offset(found.normal, 3 * i)
+    for slot in range(images.num_slots):
+        s = np.int64(images.neighbors[m * images.num_slots + slot])
+        if s < 0:
+            break
+        is_excused = False
+        for j in range(1, found.num_views[i]):
+            is_excused = is_excused or found.views[i * found.row + j] == s
+        u, v, z = project(images, s, xyz)
+        border = np.float64(HALF + 1)
+        is_excused = (
+            is_excused or z <= 0.0 or u < border or v < border
+            or u > images.width[s] - 1 - border or v > images.height[s] - 1 - border
+        )  # fmt: skip
+        if is_excused:
+            continue
+        g, eye = cell_of(images, s, u, v), offset(images.center, 3 * s)
+        e0, e1, e2 = eye[0] - xyz[0], eye[1] - xyz[1], eye[2] - xyz[2]
+        facing = e0 * normal[0] + e1 * normal[1] + e2 * normal[2]
+        if g < 0 or images.closed[g] != 0 or facing < LEAST_COSINE * math.sqrt(e0 * e0 + e1 * e1 + e2 * e2):
+            continue
+        for layer in range(LAYERS):
+            q = cells.patch[LAYERS * g + layer]
+            if q < 0:
+                break
+            _, _, depth = project(images, s, offset(store.xyz, 3 * q))
+            if depth < z and off_planes(found, i, store, q) > f32(APART) * cell_size(images, found, i):
+                is_excused = True
+        if not is_excused:
+            return False
+    return True
 
 
 @numba.njit(cache=True, nogil=True)

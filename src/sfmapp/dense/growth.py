@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sfmapp.dense import filters, seeds
 from sfmapp.dense.arrays import LAYERS, Cells, Images, Limits, Store
-from sfmapp.dense.expand import CANDIDATES, enter, frontier, try_cells
+from sfmapp.dense.expand import CANDIDATES, enter, frontier, retry, try_cells
 from sfmapp.dense.settle import settle
 from sfmapp.dense.window import make_scratch
 from sfmapp.events import Events
@@ -115,15 +115,28 @@ class Growth:
             ranges[m] = inverse_depth_range(depth, otherwise[m])
         return ranges
 
-    def refine_coarser(self, coarser: Growth, advanced: Callable[[], None]) -> int:
+    def refine_coarser(self, coarser: Growth, advanced: Callable[[], None], *, only_short: bool = False) -> int:
         """Carry the patches of the coarser level over, a cell at a time; how many. ``advanced``: after each view."""
         before = self.count
         for m in range(self.num_views):
             n = seeds.finer_cells(
-                self.images, self.cells, m, coarser.images, coarser.cells, self._places, self._candidates
+                self.images, self.cells, m, coarser.images, coarser.cells, only_short, self._places, self._candidates
             )
             self._grow(m, n, coarser.store, -1)
             advanced()
+        return self.count - before
+
+    def excuse(self, coarser: Growth | None, events: Events) -> int:
+        """Grow patches that one image fewer trusts, where none of the others has the place in sight; how many."""
+        strict, before = self.limits, self.count
+        if strict.min_views <= 2:
+            return 0
+        self.limits = strict._replace(min_views=strict.min_views - 1)
+        retry(self.cells)
+        if coarser is not None:
+            self.refine_coarser(coarser, lambda: None, only_short=True)
+        self.expand(events, everywhere=True)
+        self.limits = strict
         return self.count - before
 
     # ------------------------------------------------------------------------------------------------------------ waves
@@ -162,7 +175,7 @@ class Growth:
 
         def work(first: int, last: int, number: int) -> None:
             try_cells(
-                self.images, parents, self.cells, m, places, candidates, first, last, self.limits, wave,
+                self.images, parents, self.store, self.cells, m, places, candidates, first, last, self.limits, wave,
                 self._work[number], self._found,
             )  # fmt: skip
 

@@ -145,7 +145,8 @@ def refine(images, m, u, v, plane, slots, rhos, n, limits, work):  # type: ignor
     """Gauss-Newton on the mean NCC over neighbours ``slots[:n]``, which are sifted by what they see at the start.
 
     ``plane``: (3,) float32 w0, wx, wy, in place. Returns the number of slots left, with their NCC in ``rhos``, and the
-    standard deviation of w0; 0 slots if fewer than ``limits.min_views - 1`` are promising.
+    standard deviation of w0; 0 if that came to nothing, and their number below zero if fewer than
+    ``limits.min_views - 1`` are promising.
     """
     s0, s1, s2 = plane[0], plane[1], plane[2]
     step0, step1, step2 = f32(0.0), f32(0.0), f32(0.0)
@@ -170,7 +171,7 @@ def refine(images, m, u, v, plane, slots, rhos, n, limits, work):  # type: ignor
         if it == 0:
             n = left
             if n < limits.min_views - 1:
-                return 0, sigma
+                return -n, sigma
         mean = total / f32(n)
         if mean > best:
             gain, best = mean - best, mean

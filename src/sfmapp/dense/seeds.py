@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.dense.arrays import LAYERS, image_pointers, store_pointers
-from sfmapp.dense.expand import CANDIDATES, CONTRAST, LEAST_CONTRAST, slots_of
+from sfmapp.dense.expand import CANDIDATES, CONTRAST, LEAST_CONTRAST, SHORT, slots_of
 from sfmapp.dense.patch_kernels import judge, measure, project, refine
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
 
@@ -199,8 +199,11 @@ def try_points(image_arrays, m, places, point_arrays, first, last, limits, scrat
 
 
 @numba.njit(cache=True, nogil=True)
-def finer_cells(images, cells, m, coarse_images, coarse_cells, places, candidates):  # type: ignore[no-untyped-def]
-    """Empty cells of view m where the coarser level has patches: pixels to ``places``, patches to ``candidates``."""
+def finer_cells(images, cells, m, coarse_images, coarse_cells, only_short, places, candidates):  # type: ignore[no-untyped-def]
+    """Empty cells of view m where the coarser level has patches: pixels to ``places``, patches to ``candidates``.
+
+    ``only_short``: just those where a patch was one image short.
+    """
     start, columns, rows, side = images.cell_start[m], images.columns[m], images.rows[m], images.cell_px[0]
     coarse_start, coarse_columns, coarse_rows = (
         coarse_images.cell_start[m], coarse_images.columns[m], coarse_images.rows[m],
@@ -217,6 +220,8 @@ def finer_cells(images, cells, m, coarse_images, coarse_cells, places, candidate
             u = x * side + side // 2
             g = start + np.int64(y) * columns + x
             if u < HALF or u >= images.width[m] - HALF - 1 or images.closed[g] != 0 or cells.patch[g, 0] >= 0:
+                continue
+            if only_short and not cells.tried[g] & SHORT:
                 continue
             cx = min(int((u + 0.5) * per_x), coarse_columns - 1)
             count = 0
