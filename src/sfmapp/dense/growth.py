@@ -226,10 +226,12 @@ class Growth:
         """Take away what other images contradict, what stands alone and what hangs together in too small groups."""
         contradicted = alone = 0
         self._refill()
+        self._resolve_layers()
+        least = max(self.limits.min_views - 1, 2)
         keep = np.zeros(self.count, np.uint8)
 
         def work(first: int, last: int, _: int) -> None:
-            filters.judge_patches(self.images, self.store, self.cells, first, last, keep)
+            filters.judge_patches(self.images, self.store, self.cells, least, first, last, keep)
 
         self._in_chunks(self.count, work)
         contradicted, alone = int((keep == 1).sum()), int((keep == 2).sum())
@@ -238,6 +240,22 @@ class Growth:
         in_small_groups = int((sizes < filters.SMALLEST_GROUP).sum())
         self._compact(sizes >= filters.SMALLEST_GROUP)
         return {"contradicted": contradicted, "without neighbours": alone, "in small groups": in_small_groups}
+
+    def _resolve_layers(self) -> None:
+        """Where an image trusts two patches in one cell, let it decide between them."""
+        ends = np.append(self.images.cell_start[1:], len(self.images.closed))
+        for m in range(self.num_views):
+            start = self.images.cell_start[m]
+            cell_idx = start + np.flatnonzero(self.cells.patch[start : ends[m], LAYERS - 1] >= 0)
+            loser = np.full(len(cell_idx), -1, np.int32)
+
+            def work(first: int, last: int, number: int, m: int = m, idx=cell_idx, loser=loser) -> None:
+                filters.weigh_layers(
+                    self.images, self.store, self.cells, m, idx, first, last, self._work[number], loser
+                )  # fmt: skip
+
+            self._in_chunks(len(cell_idx), work)
+            filters.take_trust(self.store, self.cells, m, cell_idx, loser)
 
     def settle(self) -> None:
         """Let each patch settle on the plane of its neighbours."""
