@@ -204,13 +204,17 @@ def try_cells(  # type: ignore[no-untyped-def]
             found.num_views[i] = 0
             continue
         found.wave[i] = wave if wave >= 0 else store.wave[parent]
-        # a second layer has to explain the pixel better than the first, and must not have slid back onto it
-        if there >= 0 and (
-            found.score[i] < known + BETTER
-            or off_planes(found, i, store, there) < f32(APART) * cell_size(images, found, i)
-        ):
+        if there >= 0 and not is_second_layer(images, store, there, known, found, i):
             found.num_views[i] = 0
     slot_array[0] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def is_second_layer(images, store, there, known, found, i):  # type: ignore[no-untyped-def]
+    """Whether what was found explains the pixel better than patch ``there`` does, whose NCC is ``known``, and has not
+    slid back onto it."""
+    reach = f32(APART) * cell_size(images, found, i)
+    return found.score[i] >= known + BETTER and not off_planes(found, i, store, there) < reach
 
 
 @numba.njit(cache=True, nogil=True)

@@ -87,7 +87,10 @@ class Growth:
     def seed_corners(
         self, corners: list[NDArray[np.int32]], depth_range: NDArray[np.float64], *, everywhere: bool
     ) -> int:
-        """Match corners of each view (N, 2) whose cells are empty; ``everywhere``: not just with other corners."""
+        """Match corners of each view (N, 2) whose cells are empty, or hold what does not explain them.
+
+        ``everywhere``: not just with other corners.
+        """
         images, before = self.images, self.count
         num_searched = SEARCHED_EVERYWHERE if everywhere else SEARCHED_IN_GAPS
         has_corner = np.full(len(images.closed), everywhere)
@@ -98,8 +101,10 @@ class Growth:
             cell_of.append(images.cell_start[m] + cell[:, 1] * images.columns[m] + cell[:, 0])
             has_corner[cell_of[m]] = True
         for m, xy in enumerate(corners):
-            is_open = (self.cells.patch[cell_of[m], 0] < 0) & (images.closed[cell_of[m]] == 0)
-            self._batch(m, xy[is_open], seeds.match_corners, num_searched, has_corner, depth_range)
+            is_open = (self.cells.patch[cell_of[m], LAYERS - 1] < 0) & (images.closed[cell_of[m]] == 0)
+            self._batch(
+                m, xy[is_open], seeds.match_corners, self.store, self.cells, num_searched, has_corner, depth_range
+            )
         return self.count - before
 
     def depth_ranges(self, otherwise: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -14,9 +14,18 @@ from numba import float32 as f32
 from numpy.typing import NDArray
 
 from sfmapp.adjust.lanes import offset, pointer
-from sfmapp.dense.arrays import LAYERS, image_pointers, store_pointers
-from sfmapp.dense.expand import CANDIDATES, CONTRAST, LEAST_CONTRAST, SHORT, slots_of
-from sfmapp.dense.patch_kernels import judge, measure, project, refine
+from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
+from sfmapp.dense.expand import (
+    CANDIDATES,
+    CONTENT,
+    CONTRAST,
+    LEAST_CONTRAST,
+    SHORT,
+    is_second_layer,
+    likeness,
+    slots_of,
+)
+from sfmapp.dense.patch_kernels import cell_of, judge, measure, project, refine
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
 
 # NCC of a fronto-parallel window with one image, and on average with two, from which a place is worth refining
@@ -47,7 +56,20 @@ def corners(gray: NDArray[np.uint8], block_px: int, noise: float) -> NDArray[np.
 
 @numba.njit(cache=True, nogil=True)
 def match_corners(  # type: ignore[no-untyped-def]
-    image_arrays, m, places, num_searched, has_corner, depth_range, first, last, limits, scratch, found_arrays, spare
+    image_arrays,
+    m,
+    places,
+    store_arrays,
+    cell_arrays,
+    num_searched,
+    has_corner,
+    depth_range,
+    first,
+    last,
+    limits,
+    scratch,
+    found_arrays,
+    spare,
 ):
     """Look for corners ``first`` to ``last`` of view m in its neighbours; patches at the same positions of ``found``.
 
@@ -56,6 +78,7 @@ def match_corners(  # type: ignore[no-untyped-def]
     else uses.
     """
     images, found = image_pointers(image_arrays), store_pointers(found_arrays)
+    store, cells = store_pointers(store_arrays), cell_pointers(cell_arrays)
     slot_array, work = np.empty(MOST_SLOTS, np.int64), pointer(scratch)
     slots, rhos, plane = pointer(slot_array), offset(work, RHOS), offset(work, BEST)
     quads, width = offset(images.quads, images.start[m]), images.width[m]
@@ -68,6 +91,10 @@ def match_corners(  # type: ignore[no-untyped-def]
             continue
         deviation = read_reference(quads, width, u, v, contrast, work)
         if deviation < f32(2.0) * images.noise[m]:
+            continue
+        there = cells.patch[LAYERS * cell_of(images, m, u, v)]
+        known = likeness(images, store, m, f32(u), f32(v), there, work) if there >= 0 else f32(-1.0)
+        if known > CONTENT:
             continue
         likes[:] = LEAST_SUPPORT
         depths[:] = f32(-1.0)
@@ -91,6 +118,8 @@ def match_corners(  # type: ignore[no-untyped-def]
                 if quality > best:
                     best = quality
                     _copy(found_arrays, spare, i)
+        if there >= 0 and not is_second_layer(images, store, there, known, found, i):
+            found.num_views[i] = 0
     slot_array[0] = 0
 
 
