@@ -30,18 +30,21 @@ from sfmapp.dense.sampling import pixels, sample, sample_with_slopes
 from sfmapp.geometry.lanes import add, divide, fma, load, multiply, splat, store, subtract, total
 
 HALF = 3
-SIZE = 48
+SIZE = 32
 # where in the scratch the parts begin
 DX, DY, WEIGHT, REFERENCE, SUMS = 0, SIZE, 2 * SIZE, 3 * SIZE, 4 * SIZE
 NUM_SUMS = 9
 KEPT, TRIAL, RHOS, BEST = SUMS + 16, SUMS + 32, SUMS + 48, SUMS + 64
 # pixels of even weight that say as much as those of the window
 NUM_EFFECTIVE = SUMS + 67
-SCRATCH = SUMS + 72
+FALL_OFF = SUMS + 72
+SCRATCH = FALL_OFF + SIZE
+# pixels from the centre over which their weights fall off
+SPREAD_PX = 1.3
 # neighbours that a view can have
 MOST_SLOTS = 16
 
-_OFFSETS = [(x, y) for y in range(-HALF, HALF + 1) for x in range(-HALF, HALF + 1) if abs(x) + abs(y) < 2 * HALF]
+_OFFSETS = [(x, y) for y in range(-HALF, HALF + 1) for x in range(-HALF, HALF + 1) if x * x + y * y <= HALF * HALF]
 NUM_PIXELS = len(_OFFSETS)
 
 # a source window may be this much smaller or larger in area than the reference window
@@ -55,6 +58,9 @@ def make_scratch() -> NDArray[np.float32]:
     work = np.zeros(SCRATCH, np.float32)
     work[DX : DX + NUM_PIXELS] = [x for x, _ in _OFFSETS]
     work[DY : DY + NUM_PIXELS] = [y for _, y in _OFFSETS]
+    work[FALL_OFF : FALL_OFF + NUM_PIXELS] = [
+        math.exp(-(x * x + y * y) / (2.0 * SPREAD_PX * SPREAD_PX)) for x, y in _OFFSETS
+    ]
     return work
 
 
@@ -72,11 +78,9 @@ def read_reference(quads, width, u, v, contrast, work):  # type: ignore[no-untyp
         value = pixels(base, width, load(work, DX + k), load(work, DY + k))
         difference = multiply(subtract(value, center), scale)
         weight = divide(one, fma(difference, difference, one))
-        weight = multiply(weight, weight)
+        weight = multiply(multiply(weight, weight), load(work, FALL_OFF + k))
         store(work, WEIGHT + k, weight)
         store(work, REFERENCE + k, value)
-    for k in range(NUM_PIXELS, SIZE):
-        work[WEIGHT + k] = f32(0.0)
     for k in range(0, SIZE, 16):
         weight, value = load(work, WEIGHT + k), load(work, REFERENCE + k)
         weights, mean = add(weights, weight), fma(weight, value, mean)
