@@ -28,7 +28,7 @@ LONGEST_STEP_PX, SHORTEST_STEP_PX = f32(1.5), f32(0.02)
 DAMPING = f32(0.01)
 # how far from the centre of the window what tells its depth may lie on average: beyond, depth is guessed, as it is
 # beside the edge of an object before a blank background
-LARGEST_LEAN_PX = 2.0
+LARGEST_LEAN_PX = 1.4
 # pull of the slopes towards where they began, in units of the information on the depth
 SLOPE_PRIOR = f32(0.3)
 # cosine between normal and line of sight below which a patch is too oblique to be judged in a window of this size

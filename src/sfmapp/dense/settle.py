@@ -19,7 +19,7 @@ from sfmapp.dense.expand import NEAR, cell_size, off_planes
 from sfmapp.dense.patch_kernels import cell_of, normal_of_plane, plane_in_view, project, unproject
 
 # cells to each side that take part, and the pixels over which their weight falls off
-RADIUS_CELLS, FALL_OFF_PX = 4, 3.0
+RADIUS_CELLS, FALL_OFF_PX = 3, 2.2
 # how far a surface bends away from its tangent over one pixel, in pixels: a ball of 50 pixels' radius
 BEND_PX = 0.01
 # no neighbour is trusted further than this share of a pixel of depth, whatever its own deviation says
