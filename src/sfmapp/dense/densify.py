@@ -103,7 +103,7 @@ def _grow(
     row["corners"] = growth.seed_corners(found, depth_range, everywhere=coarser is None)
     row["expanded"] += growth.expand(events, everywhere=False)
     events.advanced(STAGE, steps * growth.num_views * (2 if coarser is None else 1))
-    row["excused"] = growth.excuse(coarser, events)
+    row["seen_by_few"] = growth.expand_where_few_see(coarser, events)
     if coarser is not None:
         coarser.close()
     row["accepted"] = growth.count

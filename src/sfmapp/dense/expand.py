@@ -7,26 +7,33 @@ the cells: threads share the work, and the result does not depend on how many th
 
 from __future__ import annotations
 
-import math
-
 import numba
 import numpy as np
 from numba import float32 as f32
 
 from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
-from sfmapp.dense.patch_kernels import LEAST_COSINE, cell_of, judge, measure, plane_in_view, project, refine, unproject
+from sfmapp.dense.patch_kernels import (
+    APART,
+    cell_of,
+    cell_size,
+    judge,
+    measure,
+    off_planes,
+    plane_in_view,
+    project,
+    refine,
+    unproject,
+)
+from sfmapp.dense.visibility import are_excused
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
 
 CANDIDATES = 3
 # a cell that has failed so often is left alone until the next round
 MOST_TRIES = 3
+# what is known of a cell beside the number of tries: it waits for the next wave; a patch was one image short
 WAITING, SHORT = np.uint8(128), np.uint8(64)
 TRIES = np.uint8(63)
-# how far two patches may lie off each other's planes to be of one surface, in cells
-NEAR = 1.5
-# and how far they have to lie off them to be two surfaces, one behind the other
-APART = 8.0
 # NCC of what is in a cell from which no second layer is looked for, and by how much that has to be better
 CONTENT, BETTER = f32(0.85), f32(0.05)
 # planes that differ by less than this across the window are one candidate
@@ -41,21 +48,6 @@ LEAST_DEVIATION = 1.0
 # and the deviation up to which noise keeps windows of the same place from agreeing: the NCC of two such windows is
 # 1 - (noise / deviation)^2 on average, and has to pass the threshold of trust by as much as it varies
 CLEAR_DEVIATION = 2.5
-
-
-@numba.njit(cache=True, nogil=True)
-def off_planes(store, p, other, q):  # type: ignore[no-untyped-def]
-    """How far patch p of one store and q of another lie off each other's planes, in all (Furukawa and Ponce, eq. 6)."""
-    x, n = offset(store.xyz, 3 * p), offset(store.normal, 3 * p)
-    y, o = offset(other.xyz, 3 * q), offset(other.normal, 3 * q)
-    d0, d1, d2 = y[0] - x[0], y[1] - x[1], y[2] - x[2]
-    return abs(d0 * n[0] + d1 * n[1] + d2 * n[2]) + abs(d0 * o[0] + d1 * o[1] + d2 * o[2])
-
-
-@numba.njit(cache=True, nogil=True)
-def cell_size(images, store, p):  # type: ignore[no-untyped-def]
-    """What a cell measures at a patch."""
-    return store.size[p] * f32(images.cell_px)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -194,8 +186,7 @@ def try_cells(  # type: ignore[no-untyped-def]
             continue
         n, sigma = refine(images, m, uf, vf, best, slots, rhos, n, limits, work)
         if n <= 0 or not judge(images, m, uf, vf, best, slots, rhos, n, sigma, limits, work, found, i):
-            one_less = limits.min_views - 2
-            if one_less > 0 and (n == -one_less or (n > 0 and rhos[one_less - 1] >= f32(limits.trusted))):
+            if is_one_short(n, rhos, limits):
                 cells.tried[cell_of(images, m, u, v)] |= SHORT
             if wave < 0 and n > 0 and deviation < f32(CLEAR_DEVIATION) * images.noise[m]:
                 inherit(images, store, m, uf, vf, parent, found, i)
@@ -218,6 +209,13 @@ def is_second_layer(images, store, there, known, found, i):  # type: ignore[no-u
 
 
 @numba.njit(cache=True, nogil=True)
+def is_one_short(n, rhos, limits):  # type: ignore[no-untyped-def]
+    """Whether a patch was refused, by refinement (n < 0) or the verdict (n > 0), that one image fewer would trust."""
+    left = limits.min_views - 2
+    return left > 0 and (n == -left or (n > 0 and rhos[left - 1] >= f32(limits.trusted)))
+
+
+@numba.njit(cache=True, nogil=True)
 def retry(cell_arrays):  # type: ignore[no-untyped-def]
     """Let cells be tried again in which a patch was one image short, and no others that were tried."""
     cells = cell_pointers(cell_arrays)
@@ -226,43 +224,6 @@ def retry(cell_arrays):  # type: ignore[no-untyped-def]
             cells.tried[g] = SHORT
         elif cells.tried[g] & TRIES:
             cells.tried[g] = MOST_TRIES
-
-
-@numba.njit(cache=True, nogil=True)
-def are_excused(images, store, cells, found, i):  # type: ignore[no-untyped-def]
-    """Whether all neighbours of the reference image that do not trust a patch cannot see it: it lies outside of their
-    images or masks, turns away from them, or is hidden by patches before it."""
-    m, xyz, normal = np.int64(found.views[i * found.row]), offset(found.xyz, 3 * i), offset(found.normal, 3 * i)
-    for slot in range(images.num_slots):
-        s = np.int64(images.neighbors[m * images.num_slots + slot])
-        if s < 0:
-            break
-        is_excused = False
-        for j in range(1, found.num_views[i]):
-            is_excused = is_excused or found.views[i * found.row + j] == s
-        u, v, z = project(images, s, xyz)
-        border = np.float64(HALF + 1)
-        is_excused = (
-            is_excused or z <= 0.0 or u < border or v < border
-            or u > images.width[s] - 1 - border or v > images.height[s] - 1 - border
-        )  # fmt: skip
-        if is_excused:
-            continue
-        g, eye = cell_of(images, s, u, v), offset(images.center, 3 * s)
-        e0, e1, e2 = eye[0] - xyz[0], eye[1] - xyz[1], eye[2] - xyz[2]
-        facing = e0 * normal[0] + e1 * normal[1] + e2 * normal[2]
-        if g < 0 or images.closed[g] != 0 or facing < LEAST_COSINE * math.sqrt(e0 * e0 + e1 * e1 + e2 * e2):
-            continue
-        for layer in range(LAYERS):
-            q = cells.patch[LAYERS * g + layer]
-            if q < 0:
-                break
-            _, _, depth = project(images, s, offset(store.xyz, 3 * q))
-            if depth < z and off_planes(found, i, store, q) > f32(APART) * cell_size(images, found, i):
-                is_excused = True
-        if not is_excused:
-            return False
-    return True
 
 
 @numba.njit(cache=True, nogil=True)

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.dense import filters, seeds
+from sfmapp.dense import filters, layers, seeds
 from sfmapp.dense.arrays import LAYERS, Cells, Images, Limits, Store
 from sfmapp.dense.expand import CANDIDATES, enter, frontier, retry, try_cells
 from sfmapp.dense.settle import settle
@@ -32,6 +32,8 @@ def inverse_depth_range(depth: NDArray[np.float64], otherwise: NDArray[np.float6
     return np.array([1.0 / (MARGIN * far), MARGIN / near])
 
 
+# that tell a depth
+FEWEST_VIEWS = 2
 # neighbours in which a corner is looked for, on the coarsest level and where that left gaps
 SEARCHED_EVERYWHERE, SEARCHED_IN_GAPS = 4, 2
 
@@ -131,10 +133,13 @@ class Growth:
             advanced()
         return self.count - before
 
-    def excuse(self, coarser: Growth | None, events: Events) -> int:
-        """Grow patches that one image fewer trusts, where none of the others has the place in sight; how many."""
+    def expand_where_few_see(self, coarser: Growth | None, events: Events) -> int:
+        """Grow patches that one image fewer trusts, where none of the others can see the place; how many.
+
+        Last on a level: what hides a place from an image has to be known by then.
+        """
         strict, before = self.limits, self.count
-        if strict.min_views <= 2:
+        if strict.min_views == FEWEST_VIEWS:
             return 0
         self.limits = strict._replace(min_views=strict.min_views - 1)
         retry(self.cells)
@@ -232,7 +237,7 @@ class Growth:
         contradicted = alone = 0
         self._refill()
         self._resolve_layers()
-        least = max(self.limits.min_views - 1, 2)
+        least = max(self.limits.min_views - 1, FEWEST_VIEWS)
         keep = np.zeros(self.count, np.uint8)
 
         def work(first: int, last: int, _: int) -> None:
@@ -241,7 +246,7 @@ class Growth:
         self._in_chunks(self.count, work)
         contradicted, alone = int((keep == 1).sum()), int((keep == 2).sum())
         self._compact(keep == 0)
-        sizes = filters.group_sizes(self.images, self.store, self.cells, self.count)
+        sizes = filters.group_sizes(self.images, self.store, self.cells, self.count, self.limits.min_views)
         in_small_groups = int((sizes < filters.SMALLEST_GROUP).sum())
         self._compact(sizes >= filters.SMALLEST_GROUP)
         return {"contradicted": contradicted, "without neighbours": alone, "in small groups": in_small_groups}
@@ -253,14 +258,18 @@ class Growth:
             start = self.images.cell_start[m]
             cell_idx = start + np.flatnonzero(self.cells.patch[start : ends[m], LAYERS - 1] >= 0)
             loser = np.full(len(cell_idx), -1, np.int32)
+            self._in_chunks(len(cell_idx), self._weigher(m, cell_idx, loser))
+            layers.take_trust(self.store, self.cells, m, cell_idx, loser)
 
-            def work(first: int, last: int, number: int, m: int = m, idx=cell_idx, loser=loser) -> None:
-                filters.weigh_layers(
-                    self.images, self.store, self.cells, m, idx, first, last, self._work[number], loser
-                )  # fmt: skip
+    def _weigher(
+        self, m: int, cell_idx: NDArray[np.int64], loser: NDArray[np.int32]
+    ) -> Callable[[int, int, int], None]:
+        def work(first: int, last: int, number: int) -> None:
+            layers.weigh_layers(
+                self.images, self.store, self.cells, m, cell_idx, first, last, self._work[number], loser
+            )  # fmt: skip
 
-            self._in_chunks(len(cell_idx), work)
-            filters.take_trust(self.store, self.cells, m, cell_idx, loser)
+        return work
 
     def settle(self) -> None:
         """Let each patch settle on the plane of its neighbours."""

@@ -17,7 +17,8 @@ class DenseOptions:
         ground_sampling: resolution by target: what a pixel should measure on the surface, in units of the world;
             each image is shrunk to it. None: ``level`` decides.
         cell_px: a patch for each cell of so many pixels a side; 1 is densest.
-        min_views: images that have to trust a patch, its reference image among them.
+        min_views: images that have to trust a patch, its reference image among them. One fewer will do, down to two,
+            where none of the others can see it: outside of their pictures, turned away, or hidden by other patches.
         max_neighbors: images that each image is matched with.
         region: x y z of the lower and x y z of the upper corner of the box to reconstruct, world; None: no bounds.
         max_memory_mb: views are worked on in clusters that are expected to stay below this.

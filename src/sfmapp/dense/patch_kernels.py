@@ -21,13 +21,17 @@ from sfmapp.dense.window import (
     warp,
 )
 
+# how far two patches may lie off each other's planes to be of one surface, in cells
+NEAR = 1.5
+# and how far they have to lie off them to be two surfaces, one behind the other
+APART = 8.0
 MAX_STEPS = 4
 # of the mean NCC; less is not worth another step
 LEAST_GAIN = f32(0.001)
 LONGEST_STEP_PX, SHORTEST_STEP_PX = f32(1.5), f32(0.02)
 DAMPING = f32(0.01)
-# how far from the centre of the window what tells its depth may lie on average: beyond, depth is guessed, as it is
-# beside the edge of an object before a blank background
+# how far from the centre of the window what tells its depth may lie on average, about the radius that the weights give
+# it: beyond, depth is guessed, as it is beside the edge of an object before a blank background
 LARGEST_LEAN_PX = 1.4
 # pull of the slopes towards where they began, in units of the information on the depth
 SLOPE_PRIOR = f32(0.3)
@@ -99,6 +103,21 @@ def cell_of(images, m, u, v):  # type: ignore[no-untyped-def]
     if x < 0 or y < 0 or x >= images.columns[m] or y >= images.rows[m]:
         return -1
     return images.cell_start[m] + np.int64(y) * images.columns[m] + np.int64(x)
+
+
+@numba.njit(cache=True, nogil=True)
+def off_planes(store, p, other, q):  # type: ignore[no-untyped-def]
+    """How far patch p of one store and q of another lie off each other's planes, in all (Furukawa and Ponce, eq. 6)."""
+    x, n = offset(store.xyz, 3 * p), offset(store.normal, 3 * p)
+    y, o = offset(other.xyz, 3 * q), offset(other.normal, 3 * q)
+    d0, d1, d2 = y[0] - x[0], y[1] - x[1], y[2] - x[2]
+    return abs(d0 * n[0] + d1 * n[1] + d2 * n[2]) + abs(d0 * o[0] + d1 * o[1] + d2 * o[2])
+
+
+@numba.njit(cache=True, nogil=True)
+def cell_size(images, store, p):  # type: ignore[no-untyped-def]
+    """What a cell measures at a patch."""
+    return store.size[p] * f32(images.cell_px)
 
 
 @numba.njit(cache=True, nogil=True)

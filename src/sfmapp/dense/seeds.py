@@ -74,7 +74,8 @@ def match_corners(  # type: ignore[no-untyped-def]
     """Look for corners ``first`` to ``last`` of view m in its neighbours; patches at the same positions of ``found``.
 
     ``num_searched``: in so many of them. ``has_corner``: (G,) bool, the cells of all views where a match may lie.
-    ``depth_range``: (V, 2) float64 smallest and largest inverse depth. ``spare``: a position of ``found`` that nobody
+    What is in a cell already stays; a second layer has to explain the corner better. ``depth_range``: (V, 2) float64
+    smallest and largest inverse depth. ``spare``: a position of ``found`` that nobody
     else uses.
     """
     images, found = image_pointers(image_arrays), store_pointers(found_arrays)
@@ -92,7 +93,8 @@ def match_corners(  # type: ignore[no-untyped-def]
         deviation = read_reference(quads, width, u, v, contrast, work)
         if deviation < f32(2.0) * images.noise[m]:
             continue
-        there = cells.patch[LAYERS * cell_of(images, m, u, v)]
+        cell = cell_of(images, m, u, v)
+        there = cells.patch[LAYERS * cell] if cell >= 0 else np.int32(-1)
         known = likeness(images, store, m, f32(u), f32(v), there, work) if there >= 0 else f32(-1.0)
         if known > CONTENT:
             continue

@@ -15,8 +15,16 @@ from numba import float32 as f32
 
 from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
-from sfmapp.dense.expand import NEAR, cell_size, off_planes
-from sfmapp.dense.patch_kernels import cell_of, normal_of_plane, plane_in_view, project, unproject
+from sfmapp.dense.patch_kernels import (
+    NEAR,
+    cell_of,
+    cell_size,
+    normal_of_plane,
+    off_planes,
+    plane_in_view,
+    project,
+    unproject,
+)
 
 # cells to each side that take part, and the pixels over which their weight falls off
 RADIUS_CELLS, FALL_OFF_PX = 3, 2.2
