@@ -251,13 +251,13 @@ def tube(height: float, step: float = 0.1) -> tuple[NDArray, NDArray]:
 def test_a_tall_balloon_becomes_a_flat_lid() -> None:
     xyz, faces = tube(5.0)
     kept = (xyz[faces][:, :, 2] < 3.0 + 1e-9).all(axis=1)  # 6 pi of wall, and 5 pi of balloon over an opening of pi
-    moved, closed = gaps.close_gaps(xyz, faces, kept, None, 0.2)
+    moved, closed = gaps.close_gaps(xyz, faces, kept, None, 0.2, 0.1)
     assert closed.all()
     np.testing.assert_array_equal(moved[np.unique(faces[kept])], xyz[np.unique(faces[kept])])
     np.testing.assert_allclose(moved[:, 2].max(), 3.0, atol=1e-6)
     assert np.linalg.norm(face_vectors(moved, faces[~kept]), axis=1).sum() == pytest.approx(np.pi, rel=0.01)
     # too large a share; nothing is closed
-    moved, closed = gaps.close_gaps(xyz, faces, kept, None, 0.15)
+    moved, closed = gaps.close_gaps(xyz, faces, kept, None, 0.15, 0.1)
     np.testing.assert_array_equal(moved, xyz)
     np.testing.assert_array_equal(closed, kept)
 
@@ -265,7 +265,7 @@ def test_a_tall_balloon_becomes_a_flat_lid() -> None:
 def test_a_dome_stays_a_dome() -> None:
     xyz, faces = tube(3.3)
     kept = (xyz[faces][:, :, 2] < 3.0 + 1e-9).all(axis=1)
-    moved, closed = gaps.close_gaps(xyz, faces, kept, None, 0.2)
+    moved, closed = gaps.close_gaps(xyz, faces, kept, None, 0.2, 0.1)
     assert closed.all()
     np.testing.assert_array_equal(moved, xyz)  # 1.6 pi over pi
 

@@ -96,6 +96,7 @@ def _grow(
     row: dict[str, Any] = {}
     if coarser is not None:
         row["carried"] = growth.refine_coarser(coarser, lambda: events.advanced(STAGE, steps))
+        coarser.close()
     row["points"] = growth.seed_points(points)
     row["expanded"] = growth.expand(events, everywhere=True)
     if coarser is not None:
@@ -103,9 +104,7 @@ def _grow(
     row["corners"] = growth.seed_corners(found, depth_range, everywhere=coarser is None)
     row["expanded"] += growth.expand(events, everywhere=False)
     events.advanced(STAGE, steps * growth.num_views * (2 if coarser is None else 1))
-    row["seen_by_few"] = growth.expand_where_few_see(coarser, events)
-    if coarser is not None:
-        coarser.close()
+    row["seen_by_few"] = growth.expand_where_few_see(events)
     row["accepted"] = growth.count
     row |= growth.filter()
     growth.settle()

@@ -122,18 +122,18 @@ class Growth:
             ranges[m] = inverse_depth_range(depth, otherwise[m])
         return ranges
 
-    def refine_coarser(self, coarser: Growth, advanced: Callable[[], None], *, only_short: bool = False) -> int:
+    def refine_coarser(self, coarser: Growth, advanced: Callable[[], None]) -> int:
         """Carry the patches of the coarser level over, a cell at a time; how many. ``advanced``: after each view."""
         before = self.count
         for m in range(self.num_views):
             n = seeds.finer_cells(
-                self.images, self.cells, m, coarser.images, coarser.cells, only_short, self._places, self._candidates
+                self.images, self.cells, m, coarser.images, coarser.cells, self._places, self._candidates
             )
             self._grow(m, n, coarser.store, -1)
             advanced()
         return self.count - before
 
-    def expand_where_few_see(self, coarser: Growth | None, events: Events) -> int:
+    def expand_where_few_see(self, events: Events) -> int:
         """Grow patches that one image fewer trusts, where none of the others can see the place; how many.
 
         Last on a level: what hides a place from an image has to be known by then.
@@ -143,8 +143,6 @@ class Growth:
             return 0
         self.limits = strict._replace(min_views=strict.min_views - 1)
         retry(self.cells)
-        if coarser is not None:
-            self.refine_coarser(coarser, lambda: None, only_short=True)
         self.expand(events, everywhere=True)
         self.limits = strict
         return self.count - before

@@ -20,7 +20,6 @@ from sfmapp.dense.expand import (
     CONTENT,
     CONTRAST,
     LEAST_CONTRAST,
-    SHORT,
     is_second_layer,
     likeness,
     slots_of,
@@ -230,11 +229,8 @@ def try_points(image_arrays, m, places, point_arrays, first, last, limits, scrat
 
 
 @numba.njit(cache=True, nogil=True)
-def finer_cells(images, cells, m, coarse_images, coarse_cells, only_short, places, candidates):  # type: ignore[no-untyped-def]
-    """Empty cells of view m where the coarser level has patches: pixels to ``places``, patches to ``candidates``.
-
-    ``only_short``: just those where a patch was one image short.
-    """
+def finer_cells(images, cells, m, coarse_images, coarse_cells, places, candidates):  # type: ignore[no-untyped-def]
+    """Empty cells of view m where the coarser level has patches: pixels to ``places``, patches to ``candidates``."""
     start, columns, rows, side = images.cell_start[m], images.columns[m], images.rows[m], images.cell_px[0]
     coarse_start, coarse_columns, coarse_rows = (
         coarse_images.cell_start[m], coarse_images.columns[m], coarse_images.rows[m],
@@ -251,8 +247,6 @@ def finer_cells(images, cells, m, coarse_images, coarse_cells, only_short, place
             u = x * side + side // 2
             g = start + np.int64(y) * columns + x
             if u < HALF or u >= images.width[m] - HALF - 1 or images.closed[g] != 0 or cells.patch[g, 0] >= 0:
-                continue
-            if only_short and not cells.tried[g] & SHORT:
                 continue
             cx = min(int((u + 0.5) * per_x), coarse_columns - 1)
             count = 0

@@ -13,6 +13,8 @@ from sfmapp.surface.trim import in_view, pieces
 LARGEST_DOME = 2.0
 # of the largest gap is the largest one that views show, and of that one the largest with a balloon
 SHOWN = 0.25
+# side of the largest square gap that is closed in a surface that stays open elsewhere, in spacings of the patches
+LARGEST_PATCHED = 20.0
 # in areas of what is kept
 LARGEST_BALLOON = 2.0
 
@@ -23,6 +25,7 @@ def close_gaps(
     kept: NDArray[np.bool_],
     scene: DenseScene | None,
     largest_share: float,
+    spacing: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Take back pieces of the closed surface that were cut off, where they close a gap and not an open surface.
 
@@ -51,7 +54,8 @@ def close_gaps(
     is_fixed[faces[kept]] = True
     area = np.bincount(piece, face_areas(xyz, faces[idx]))
     # the membranes of the largest balloons would take long and come to nothing
-    candidate = (np.bincount(piece, is_fixed[faces[idx]].any(axis=1)) > 0) & (area <= LARGEST_BALLOON * kept_area)
+    is_beside = np.bincount(piece, is_fixed[faces[idx]].any(axis=1)) > 0
+    candidate = is_beside & (area <= LARGEST_BALLOON * kept_area)
     idx, piece = idx[candidate[piece]], piece[candidate[piece]]
     if not len(idx):
         return xyz, kept
@@ -63,7 +67,9 @@ def close_gaps(
         shown = np.bincount(piece, face_areas(flat, faces[idx]) * in_view(flat, faces[idx], scene), len(area))
         largest[shown > 0.5 * flat_area] *= SHOWN
         largest[(shown > 0.5 * flat_area) & is_balloon] *= SHOWN
-    is_gap = flat_area <= largest
+    is_gap = candidate & (flat_area <= largest)
+    if (is_beside & ~is_gap).any():
+        is_gap &= flat_area <= (LARGEST_PATCHED * spacing) ** 2
     out, moved = kept.copy(), xyz.copy()
     out[idx] = is_gap[piece]
     flattened = np.unique(faces[idx[(is_gap & is_balloon)[piece]]])

@@ -63,7 +63,7 @@ def make_mesh(
     events.advanced(STAGE, message="trimming")
     around = look_around(surface.xyz, vertex_normals(surface.xyz, surface.faces), patches, threads)
     events.advanced(STAGE)
-    moved, kept, funnel = _trim(surface, around, scene, options)
+    moved, kept, funnel = _trim(surface, around, patches.median_spacing, scene, options)
     if scene is not None and scene.region is not None:
         # what bulges out of the region is pressed flat onto its sides: a closed surface stays closed
         moved = moved.clip(scene.region.low, scene.region.high)
@@ -89,7 +89,7 @@ def make_mesh(
 
 
 def _trim(
-    surface: ClosedSurface, around: Surroundings, scene: DenseScene | None, options: SurfaceOptions
+    surface: ClosedSurface, around: Surroundings, spacing: float, scene: DenseScene | None, options: SurfaceOptions
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[dict[str, Any]]]:
     """Where the vertices go (N, 3), the faces to keep (F,), and how many were left after each step."""
     faces = surface.faces
@@ -114,7 +114,7 @@ def _trim(
     if scene is not None:
         kept = keep("in view", kept & in_view(surface.xyz, faces, scene))
     kept = keep("not in islands", without_islands(surface.xyz, faces, kept, options.min_island))
-    xyz, kept = close_gaps(surface.xyz, faces, kept, scene, options.max_hole)
+    xyz, kept = close_gaps(surface.xyz, faces, kept, scene, options.max_hole, spacing)
     return xyz, keep("gaps closed", kept), funnel
 
 
