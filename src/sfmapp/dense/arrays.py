@@ -210,3 +210,12 @@ class CellPointers(NamedTuple):
 def cell_pointers(cells):  # type: ignore[no-untyped-def]
     """Pointers to the arrays of cells, which the caller keeps alive."""
     return CellPointers(pointer(cells.patch), pointer(cells.tried))
+
+
+@numba.njit(cache=True, nogil=True)
+def copy_patch(store, source, target):  # type: ignore[no-untyped-def]
+    """Enter a patch of a store at another position of it as well."""
+    store.xyz[target], store.normal[target] = store.xyz[source], store.normal[source]
+    store.score[target], store.sigma[target] = store.score[source], store.sigma[source]
+    store.size[target], store.views[target] = store.size[source], store.views[source]
+    store.num_views[target], store.wave[target] = store.num_views[source], store.wave[source]

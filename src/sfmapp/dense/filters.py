@@ -7,7 +7,7 @@ import numpy as np
 from numba import float32 as f32
 
 from sfmapp.adjust.lanes import offset
-from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
+from sfmapp.dense.arrays import LAYERS, cell_pointers, copy_patch, image_pointers, store_pointers
 from sfmapp.dense.expand import place
 from sfmapp.dense.patch_kernels import NEAR, cell_of, cell_size, off_planes, project
 
@@ -25,6 +25,20 @@ def refill(image_arrays, store_arrays, cell_arrays, order, fresh, num_fresh):  #
     images, store, cells = image_pointers(image_arrays), store_pointers(store_arrays), cell_pointers(cell_arrays)
     for i in range(order.shape[0]):
         place(images, store, cells, order[i], fresh, num_fresh)
+
+
+@numba.njit(cache=True, nogil=True)
+def compact(store, kept):  # type: ignore[no-untyped-def]
+    """Move the patches that are ``kept`` (N,) bool to the front; (N,) int32 their new positions, -1 for the others."""
+    new_idx = np.full(kept.shape[0], -1, np.int32)
+    count = 0
+    for p in range(kept.shape[0]):
+        if kept[p]:
+            if p != count:
+                copy_patch(store, p, count)
+            new_idx[p] = count
+            count += 1
+    return new_idx
 
 
 @numba.njit(cache=True, nogil=True)
@@ -114,10 +128,10 @@ def _support(images, store, cells, p, r, reach):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def group_sizes(image_arrays, store_arrays, cell_arrays, count, min_views):  # type: ignore[no-untyped-def]
-    """(N,) int64 size of the group of each patch: patches in adjacent cells of one surface hang together, and those
+    """(N,) int32 size of the group of each patch: patches in adjacent cells of one surface hang together, and those
     that ``min_views`` images trust count."""
     images, store, cells = image_pointers(image_arrays), store_pointers(store_arrays), cell_pointers(cell_arrays)
-    parent = np.arange(count)
+    parent = np.arange(count, dtype=np.int32)
     for m in range(images.num_views):
         start, columns, rows = images.cell_start[m], np.int64(images.columns[m]), np.int64(images.rows[m])
         for y in range(rows):
@@ -137,14 +151,13 @@ def group_sizes(image_arrays, store_arrays, cell_arrays, count, min_views):  # t
         g = cell_of(images, r, u, v)
         if g >= 0:
             _join(images, store, cells, parent, p, g)
-    sizes = np.zeros(count, np.int64)
+    sizes = np.zeros(count, np.int32)
     for p in range(count):
         if store.num_views[p] >= min_views:
             sizes[_root(parent, p)] += 1
-    out = np.empty(count, np.int64)
     for p in range(count):
-        out[p] = sizes[_root(parent, p)]
-    return out
+        sizes[p] = sizes[_root(parent, p)]
+    return sizes
 
 
 @numba.njit(cache=True, nogil=True)

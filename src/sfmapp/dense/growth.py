@@ -245,8 +245,10 @@ class Growth:
         contradicted, alone = int((keep == 1).sum()), int((keep == 2).sum())
         self._compact(keep == 0)
         sizes = filters.group_sizes(self.images, self.store, self.cells, self.count, self.limits.min_views)
-        in_small_groups = int((sizes < filters.SMALLEST_GROUP).sum())
-        self._compact(sizes >= filters.SMALLEST_GROUP)
+        is_surface = sizes >= filters.SMALLEST_GROUP
+        del sizes
+        self._compact(is_surface)
+        in_small_groups = int((~is_surface).sum())
         return {"contradicted": contradicted, "without neighbours": alone, "in small groups": in_small_groups}
 
     def _resolve_layers(self) -> None:
@@ -288,8 +290,5 @@ class Growth:
         filters.refill(self.images, self.store, self.cells, order, self._fresh, self._num_fresh)
 
     def _compact(self, kept: NDArray[np.bool_]) -> None:
-        idx = np.flatnonzero(kept)
-        for array in self.store:
-            array[: len(idx)] = array[idx]
-        self.count = len(idx)
-        filters.renumber(self.cells, np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32))
+        filters.renumber(self.cells, filters.compact(self.store, kept))
+        self.count = int(kept.sum())

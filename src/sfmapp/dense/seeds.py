@@ -14,7 +14,7 @@ from numba import float32 as f32
 from numpy.typing import NDArray
 
 from sfmapp.adjust.lanes import offset, pointer
-from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
+from sfmapp.dense.arrays import LAYERS, cell_pointers, copy_patch, image_pointers, store_pointers
 from sfmapp.dense.expand import (
     CANDIDATES,
     CONTENT,
@@ -118,18 +118,11 @@ def match_corners(  # type: ignore[no-untyped-def]
                 quality = found.score[spare] * f32(found.num_views[spare])
                 if quality > best:
                     best = quality
-                    _copy(found_arrays, spare, i)
+                    copy_patch(found_arrays, spare, i)
+                    found.wave[i] = 0
         if there >= 0 and not is_second_layer(images, store, there, known, found, i):
             found.num_views[i] = 0
     slot_array[0] = 0
-
-
-@numba.njit(cache=True, nogil=True)
-def _copy(found, source, target):  # type: ignore[no-untyped-def]
-    found.xyz[target], found.normal[target] = found.xyz[source], found.normal[source]
-    found.score[target], found.sigma[target] = found.score[source], found.sigma[source]
-    found.size[target], found.views[target] = found.size[source], found.views[source]
-    found.num_views[target], found.wave[target] = found.num_views[source], 0
 
 
 @numba.njit(cache=True, nogil=True)
