@@ -33,7 +33,8 @@ def close_gaps(
     balloon behind a wall has one about as large as the wall. Where Poisson's surface is little more than the membrane
     it is taken as it is. Where it is a balloon (under a statue's base, through a doorway) the membrane is taken in its
     place. What the views show most of they would have found patches on, if it were there and had texture: such gaps
-    have to be smaller.
+    have to be smaller. All this is for objects that were captured all round. Of a surface that stays open anyway most
+    gaps are where nobody has looked, and just the small ones are closed.
 
     Args:
         xyz: (N, 3) vertices of the closed surface.
@@ -41,6 +42,7 @@ def close_gaps(
         kept: (F,) what trimming has left.
         scene: the views; None: nobody knows what they show.
         largest_share: of the area of what is kept, that a gap may have; 0: none is closed.
+        spacing: of the patches, world units.
 
     Returns:
         The vertices (N, 3), those of membranes in their new places, and the faces to keep (F,).
