@@ -66,7 +66,8 @@ def judge(
 def confirmed_share(patches: Patches, plan: DensePlan, min_views: int) -> float | None:
     """Of the patches that could be trusted by more views than they need, the share that is; None if they are too few.
 
-    A view could if it is a neighbour of the reference image and has the patch in its picture.
+    A view could if it is a neighbour of the reference image and has the patch in its picture. Those that fewer views
+    trust because the others cannot see them are not asked.
     """
     some = np.unique(np.linspace(0, len(patches) - 1, SAMPLE).astype(np.int64)) if len(patches) else np.zeros(0, int)
     xyz, reference = patches.xyz[some], patches.reference_idx[some]
@@ -79,10 +80,11 @@ def confirmed_share(patches: Patches, plan: DensePlan, min_views: int) -> float 
         size = np.array([canvas.working_size for canvas in plan.canvases])[other]
         pixel = seen[:, :2] / np.where(seen[:, 2:] > 0.0, seen[:, 2:], np.nan) * k[:, :2] + k[:, 2:]
         num_seeing += (other >= 0) & ((pixel >= 0.0) & (pixel < size)).all(axis=1)
-    asked = num_seeing > min_views
+    num_views = patches.num_views[some]
+    asked = (num_seeing > min_views) & (num_views >= min_views)
     if asked.sum() < LEAST_ASKED:
         return None
-    return float((patches.num_views[some][asked] > min_views).mean())
+    return float((num_views[asked] > min_views).mean())
 
 
 def check(patches: Patches, shares: dict[str, Any], plan: DensePlan, min_views: int) -> str | None:
