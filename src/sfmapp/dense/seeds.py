@@ -103,26 +103,33 @@ def match_corners(  # type: ignore[no-untyped-def]
             if images.neighbors[m * images.num_slots + slot] < 0:
                 break
             _search(images, m, slot, f32(u), f32(v), has_corner, depth_range[m], likes, depths, work)
-        best = f32(-1.0)
-        for j in range(NUM_KEPT):
-            if depths[j] <= f32(0.0):
-                break
-            plane[0], plane[1], plane[2] = depths[j], f32(0.0), f32(0.0)
-            n = 0
-            for slot in range(images.num_slots):
-                if images.neighbors[m * images.num_slots + slot] >= 0 and n < limits.max_refined:
-                    slots[n] = slot
-                    n += 1
-            n, sigma = refine(images, m, f32(u), f32(v), plane, slots, rhos, n, limits, work)
-            if n > 0 and judge(images, m, f32(u), f32(v), plane, slots, rhos, n, sigma, limits, work, found, spare):
-                quality = found.score[spare] * f32(found.num_views[spare])
-                if quality > best:
-                    best = quality
-                    copy_patch(found_arrays, spare, i)
-                    found.wave[i] = 0
+        _refine_best(images, m, f32(u), f32(v), depths, limits, slots, rhos, plane, work, found_arrays, spare, i)
         if there >= 0 and not is_second_layer(images, store, there, known, found, i):
             found.num_views[i] = 0
     slot_array[0] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _refine_best(images, m, u, v, depths, limits, slots, rhos, plane, work, found_arrays, spare, i):  # type: ignore[no-untyped-def]
+    """Refine what the search has left of pixel (u, v), and enter the best at position i of ``found``."""
+    found = store_pointers(found_arrays)
+    best = f32(-1.0)
+    for j in range(NUM_KEPT):
+        if depths[j] <= f32(0.0):
+            break
+        plane[0], plane[1], plane[2] = depths[j], f32(0.0), f32(0.0)
+        n = 0
+        for slot in range(images.num_slots):
+            if images.neighbors[m * images.num_slots + slot] >= 0 and n < limits.max_refined:
+                slots[n] = slot
+                n += 1
+        n, sigma = refine(images, m, u, v, plane, slots, rhos, n, limits, work)
+        if n > 0 and judge(images, m, u, v, plane, slots, rhos, n, sigma, limits, work, found, spare):
+            quality = found.score[spare] * f32(found.num_views[spare])
+            if quality > best:
+                best = quality
+                copy_patch(found_arrays, spare, i)
+                found.wave[i] = 0
 
 
 @numba.njit(cache=True, nogil=True)
