@@ -71,7 +71,7 @@ def _coarse_to_fine(
         rows.append({"level": level} | _grow(growth, coarser, points, found, depth_range, steps, events))
         waves += growth.waves
     assert growth is not None
-    store, count = growth.store, growth.count
+    store, count = growth.store._asdict(), growth.count
     # the images and their cells take as much room as the patches, which are about to be there twice
     growth.close()
     del growth, coarser, images
@@ -179,19 +179,24 @@ def _depth_ranges(scene: DenseScene, frame: Frame) -> NDArray[np.float64]:
     return ranges
 
 
-def _patches(scene: DenseScene, store: Store, n: int, frame: Frame) -> Patches:
-    """The first n of a store, back in the world and with colours."""
-    reference = store.views[:n, 0]
+def _patches(scene: DenseScene, store: dict[str, Any], n: int, frame: Frame) -> Patches:
+    """The first n of a store, back in the world and with colours. Its arrays, which are large, are let go of in turn."""
+    views, num_views = store.pop("views"), store.pop("num_views")
+    reference = views[:n, 0].copy()
+    view_ptr = np.zeros(n + 1, np.int64)
+    np.cumsum(num_views[:n], out=view_ptr[1:])
+    view_idx = views[:n][np.arange(views.shape[1]) < num_views[:n, None]].astype(np.int32)
+    del views, num_views
+    xyz = store.pop("xyz")[:n].astype(np.float64)
+    xyz /= frame.scale
+    xyz += frame.origin
     rgb = np.zeros((n, 3), np.uint8)
-    xyz = store.xyz[:n].astype(np.float64) / frame.scale + frame.origin
     for m, view in enumerate(scene.views):
         mine = np.flatnonzero(reference == m)
         x, y = view.project(xyz[mine])[0].astype(np.int64).clip(0, [view.width - 1, view.height - 1]).T
         rgb[mine] = view.rgb[y, x]
-    counts = store.num_views[:n].astype(np.int64)
-    is_view = np.arange(store.views.shape[1]) < counts[:, None]
+    unit = np.float32(frame.scale)
     return Patches(
-        xyz, store.normal[:n].copy(), rgb, store.score[:n].copy(),
-        store.sigma[:n] / np.float32(frame.scale), store.size[:n] / np.float32(frame.scale), store.wave[:n].copy(),
-        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), store.views[:n][is_view].astype(np.int32),
+        xyz, store.pop("normal")[:n].copy(), rgb, store.pop("score")[:n].copy(), store.pop("sigma")[:n] / unit,
+        store.pop("size")[:n] / unit, store.pop("wave")[:n].copy(), view_ptr, view_idx,
     )  # fmt: skip
