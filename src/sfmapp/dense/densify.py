@@ -180,7 +180,7 @@ def _depth_ranges(scene: DenseScene, frame: Frame) -> NDArray[np.float64]:
 
 
 def _patches(scene: DenseScene, store: dict[str, Any], n: int, frame: Frame) -> Patches:
-    """The first n of a store, back in the world and with colours. Its arrays, which are large, are let go of in turn."""
+    """The first n of a store, back in the world and with colours. Its large arrays are let go of in turn."""
     views, num_views = store.pop("views"), store.pop("num_views")
     reference = views[:n, 0].copy()
     view_ptr = np.zeros(n + 1, np.int64)
