@@ -32,7 +32,7 @@ def inverse_depth_range(depth: NDArray[np.float64], otherwise: NDArray[np.float6
     return np.array([1.0 / (MARGIN * far), MARGIN / near])
 
 
-# that tell a depth
+# images that tell a depth
 FEWEST_VIEWS = 2
 # neighbours in which a corner is looked for, on the coarsest level and where that left gaps
 SEARCHED_EVERYWHERE, SEARCHED_IN_GAPS = 4, 2
@@ -232,7 +232,6 @@ class Growth:
 
     def filter(self) -> dict[str, int]:
         """Take away what other images contradict, what stands alone and what hangs together in too small groups."""
-        contradicted = alone = 0
         self._refill()
         self._resolve_layers()
         least = max(self.limits.min_views - 1, FEWEST_VIEWS)

@@ -73,9 +73,8 @@ def match_corners(  # type: ignore[no-untyped-def]
     """Look for corners ``first`` to ``last`` of view m in its neighbours; patches at the same positions of ``found``.
 
     ``num_searched``: in so many of them. ``has_corner``: (G,) bool, the cells of all views where a match may lie.
-    What is in a cell already stays; a second layer has to explain the corner better. ``depth_range``: (V, 2) float64
-    smallest and largest inverse depth. ``spare``: a position of ``found`` that nobody
-    else uses.
+    ``depth_range``: (V, 2) float64 smallest and largest inverse depth. ``spare``: a position of ``found`` that nobody
+    else uses. What is in a cell already stays; a second layer has to explain the corner better.
     """
     images, found = image_pointers(image_arrays), store_pointers(found_arrays)
     store, cells = store_pointers(store_arrays), cell_pointers(cell_arrays)
