@@ -17,6 +17,7 @@ from sfmapp.dense.patch_kernels import (
     APART,
     cell_of,
     cell_size,
+    holds_window,
     judge,
     measure,
     off_planes,
@@ -93,7 +94,7 @@ def _may_be_tried(images, cells, m, x, y):  # type: ignore[no-untyped-def]
     if images.closed[g] != 0 or cells.patch[LAYERS * g + LAYERS - 1] >= 0 or (cells.tried[g] & TRIES) >= MOST_TRIES:
         return False
     u, v = x * images.cell_px + images.cell_px // 2, y * images.cell_px + images.cell_px // 2
-    return u >= HALF and v >= HALF and u < images.width[m] - HALF - 1 and v < images.height[m] - HALF - 1
+    return holds_window(images, m, u, v)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -15,8 +15,8 @@ from numba import float32 as f32
 from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
 from sfmapp.dense.expand import BETTER, CONTRAST, LEAST_CONTRAST, LEAST_DEVIATION, likeness
-from sfmapp.dense.patch_kernels import project
-from sfmapp.dense.window import HALF, read_reference
+from sfmapp.dense.patch_kernels import holds_window, project
+from sfmapp.dense.window import read_reference
 
 
 @numba.njit(cache=True, nogil=True)
@@ -27,7 +27,7 @@ def weigh_layers(image_arrays, store_arrays, cell_arrays, m, cell_idx, first, la
     """
     images, store, cells = image_pointers(image_arrays), store_pointers(store_arrays), cell_pointers(cell_arrays)
     work = pointer(scratch)
-    quads, width, height = offset(images.quads, images.start[m]), images.width[m], images.height[m]
+    quads, width = offset(images.quads, images.start[m]), images.width[m]
     contrast = f32(CONTRAST) * images.noise[m] + f32(LEAST_CONTRAST)
     for i in range(first, last):
         loser[i] = -1
@@ -37,7 +37,7 @@ def weigh_layers(image_arrays, store_arrays, cell_arrays, m, cell_idx, first, la
             q = cells.patch[LAYERS * cell_idx[i] + LAYERS - 1 - layer]
             uf, vf, _ = project(images, m, offset(store.xyz, 3 * p))
             u, v = np.int32(math.floor(uf + 0.5)), np.int32(math.floor(vf + 0.5))
-            if u < HALF or v < HALF or u >= width - HALF - 1 or v >= height - HALF - 1:
+            if not holds_window(images, m, u, v):
                 continue
             if read_reference(quads, width, u, v, contrast, work) < f32(LEAST_DEVIATION) * images.noise[m]:
                 continue

@@ -10,6 +10,7 @@ from numba import float32 as f32
 
 from sfmapp.adjust.lanes import offset
 from sfmapp.dense.window import (
+    HALF,
     KEPT,
     NUM_EFFECTIVE,
     NUM_SUMS,
@@ -118,6 +119,12 @@ def off_planes(store, p, other, q):  # type: ignore[no-untyped-def]
 def cell_size(images, store, p):  # type: ignore[no-untyped-def]
     """What a cell measures at a patch."""
     return store.size[p] * f32(images.cell_px)
+
+
+@numba.njit(cache=True, nogil=True)
+def holds_window(images, m, u, v):  # type: ignore[no-untyped-def]
+    """Whether the window about pixel (u, v) lies in view m, with the pixel beyond that bilinear samples need."""
+    return u >= HALF and v >= HALF and u < images.width[m] - HALF - 1 and v < images.height[m] - HALF - 1
 
 
 @numba.njit(cache=True, nogil=True)

@@ -24,7 +24,7 @@ from sfmapp.dense.expand import (
     likeness,
     slots_of,
 )
-from sfmapp.dense.patch_kernels import cell_of, judge, measure, project, refine
+from sfmapp.dense.patch_kernels import cell_of, holds_window, judge, measure, project, refine
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
 
 # NCC of a fronto-parallel window with one image, and on average with two, from which a place is worth refining
@@ -86,7 +86,7 @@ def match_corners(  # type: ignore[no-untyped-def]
     for i in range(first, last):
         found.num_views[i] = 0
         u, v = places[i, 0], places[i, 1]
-        if u < HALF or v < HALF or u >= width - HALF - 1 or v >= images.height[m] - HALF - 1:
+        if not holds_window(images, m, u, v):
             continue
         deviation = read_reference(quads, width, u, v, contrast, work)
         if deviation < f32(2.0) * images.noise[m]:
@@ -211,7 +211,7 @@ def try_points(image_arrays, m, places, point_arrays, first, last, limits, scrat
     for i in range(first, last):
         found.num_views[i] = 0
         u, v = places[i, 0], places[i, 1]
-        if u < HALF or v < HALF or u >= width - HALF - 1 or v >= images.height[m] - HALF - 1:
+        if not holds_window(images, m, u, v):
             continue
         deviation = read_reference(quads, width, u, v, contrast, work)
         if deviation < f32(2.0) * images.noise[m]:
