@@ -32,6 +32,7 @@ FLOORS = (
     ("images",),
     ("scene",),
     ("geometry",),
+    ("contradictions",),
     ("events",),
     ("errors",),
 )
@@ -96,7 +97,7 @@ def test_library_does_not_print_exit_or_configure_logging(path: Path) -> None:
 
 
 def test_every_room_has_a_floor() -> None:
-    rooms = {path.parent.name for path in SOURCE.glob("*/__init__.py")} | {"events", "errors"}
+    rooms = {path.parent.name for path in SOURCE.glob("*/__init__.py")} | {"contradictions", "events", "errors"}
     assert rooms == set(LEVEL)
 
 

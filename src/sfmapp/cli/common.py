@@ -8,7 +8,7 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
@@ -62,6 +62,14 @@ def print_json(value: Any) -> None:
 def took(run: dict[str, Any]) -> str:
     """What a run took: ``run`` of its report in words."""
     return f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB"
+
+
+def print_contradictions(found: Iterable[Mapping[str, Any]]) -> None:
+    """Contradictions as ``Contradiction.describe`` gives them: a line for each, and what to do about it."""
+    for row in found:
+        print(f"  CONTRADICTED: {row['message']}")
+        if row["advice"]:
+            print(f"    {row['advice']}")
 
 
 def limit_library_threads() -> None:

@@ -12,6 +12,7 @@ from sfmapp.cli.common import (
     list_options,
     listening,
     load_numba_without_blas,
+    print_contradictions,
     print_json,
     took,
 )
@@ -221,6 +222,7 @@ def _print_summary(args: argparse.Namespace, report: dict[str, Any]) -> None:
                 f"  against the truth{which}: off by {ate['rmse']:.3f} m rmse,"
                 f" {ate['max']:.3f} m at worst, over {row['true_path_m']:.1f} m ({row['alignment'].upper()})"
             )
+    print_contradictions(row for found in report["maps"] for row in found["contradictions"])
     print(
         f"{took(run)}; {timing['cpu_ms_per_frame']:.1f} CPU ms a frame,"
         f" {timing['frames_per_second']:.1f} frames a second"

@@ -80,7 +80,9 @@ def map_images(
         models = _merge_models(_without_parts(models), mapper_of, options, events)
         for model in models:
             model.point_rgb = track_colors(tracks, features)
-        model_reports = [model.summary() | {"uncertainty": mapper_of(model).uncertainty()} for model in models]
+        model_reports: list[dict[str, Any]] = [
+            model.summary() | {"uncertainty": mapper_of(model).uncertainty(), "contradictions": []} for model in models
+        ]
     report = {
         "tracks": track_report,
         "focal": focal_report,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import estimate_covariances
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.mapping.structure import residual_scale_px
@@ -54,11 +55,13 @@ class Conclusion:
         covariance: (K, 6, 6) of the keyframes; None if not asked for or too many.
         gauge: what it holds fixed.
         report: numbers for the report.
+        contradictions: evidence against the map that stands unresolved.
     """
 
     covariance: Array | None
     gauge: str
     report: dict[str, Any]
+    contradictions: list[Contradiction] = field(default_factory=list)
 
 
 def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -> Conclusion:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.contradictions import widened, widened_scale_sigma
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.finish import Conclusion
 from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
@@ -116,8 +117,13 @@ def gather(
 def _map_result(keyframes: KeyframeMap, conclusion: Conclusion) -> MapResult:
     num, num_sensors = len(keyframes.keyframes), len(keyframes.rig.cameras)
     model, _ = keyframes.reconstruction(np.arange(num))
+    covariance, found = conclusion.covariance, conclusion.contradictions
+    if covariance is not None:
+        centers = rigid3.center(np.array([k.rig_from_world for k in keyframes.keyframes]))
+        spread = float(np.sqrt(((centers - centers.mean(0)) ** 2).sum(1).mean()))
+        covariance = widened(covariance, spread, found)
     return MapResult(
         model, np.array([k.frame_idx for k in keyframes.keyframes], np.int64),
-        np.arange(num, dtype=np.int64) * num_sensors, conclusion.covariance, conclusion.gauge,
-        "stereo" if num_sensors > 1 else "none", 0.0 if num_sensors > 1 else None,
+        np.arange(num, dtype=np.int64) * num_sensors, covariance, conclusion.gauge,
+        "stereo" if num_sensors > 1 else "none", widened_scale_sigma(0.0 if num_sensors > 1 else None, found), found,
     )  # fmt: skip

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.contradictions import Contradiction
 from sfmapp.odometry.smoothing import SmoothedTrajectory
 from sfmapp.scene.reconstruction import Reconstruction
 
@@ -37,6 +38,7 @@ class MapResult:
         gauge: what the covariance holds fixed, in words.
         scale_source: ``stereo``, ``none`` (arbitrary unit), ``marker``, ``distance``, ``camera_height`` or ``imu``.
         scale_sigma: relative standard deviation of the unit of length; None for an arbitrary unit.
+        contradictions: evidence against the map that was not resolved; covariance and scale_sigma hold what it adds.
     """
 
     reconstruction: Reconstruction
@@ -46,6 +48,7 @@ class MapResult:
     gauge: str = ""
     scale_source: str = "none"
     scale_sigma: float | None = None
+    contradictions: list[Contradiction] = field(default_factory=list)
 
 
 @dataclass

@@ -92,8 +92,11 @@ def _record(run: Run, models: Sequence[Reconstruction]) -> str:
 
 def _make_report(run: Run, models: Sequence[Reconstruction], failure: NoReconstructionError | None) -> dict[str, Any]:
     assert run.image_set is not None
-    summaries = [model.summary() for model in models]
-    uncertainty = mapped[0]["uncertainty"] if (mapped := run.stages.get("mapping", {}).get("models")) else {}
+    mapped = run.stages.get("mapping", {}).get("models") or []
+    summaries = [
+        model.summary() | {"contradictions": row["contradictions"]} for model, row in zip(models, mapped, strict=True)
+    ]
+    uncertainty = mapped[0]["uncertainty"] if mapped else {}
     images = _image_rows(run, failure)
     cameras = camera_rows(run.image_set, models[0] if models else None, uncertainty)
     return {
@@ -105,7 +108,7 @@ def _make_report(run: Run, models: Sequence[Reconstruction], failure: NoReconstr
         },
         "run": run.facts(),
         "models": summaries,
-        "checks": make_checks(summaries[0], len(models), images, cameras) if models else [],
+        "checks": make_checks(summaries, images, cameras) if models else [],
         "images": images,
         "skipped": [{"name": name, "reason": reason} for name, reason in run.image_set.skipped],
         "cameras": cameras,

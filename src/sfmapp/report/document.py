@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -150,12 +150,12 @@ def camera_rows(
 
 
 def make_checks(
-    summary: Mapping[str, Any],
-    num_models: int,
+    models: Sequence[Mapping[str, Any]],
     images: Sequence[Mapping[str, Any]],
     cameras: Sequence[Mapping[str, Any]],
 ) -> list[dict[str, str]]:
-    """Traffic lights over the largest model, each with its thresholds in words."""
+    """Traffic lights over the largest model and the contradictions of all, each with its thresholds in words."""
+    summary, num_models = models[0], len(models)
     share = 100 * summary["num_registered"] / max(1, summary["num_images"])
     features = float(np.median([image["funnel"]["features"] for image in images])) if images else 0.0
     checks = [
@@ -177,7 +177,7 @@ def make_checks(
             change = abs(_focal(camera["refined"]) - _focal(camera["initial"])) / camera["focal_sigma_px"]
             name = f"focal length of camera {camera['idx']} against its prior"
             checks.append(check(name, -change, f"{change:.1f} sigma", -2, -4, "sigma"))
-    return checks
+    return checks + check_contradictions(found for model in models for found in model["contradictions"])
 
 
 def check(name: str, value: float, text: str, green: float, amber: float, unit: str = "") -> dict[str, str]:
@@ -186,6 +186,17 @@ def check(name: str, value: float, text: str, green: float, amber: float, unit: 
     word = "at most" if green < 0 else "at least"
     thresholds = f"green: {word} {abs(green):g}, amber: {word} {abs(amber):g} {unit}".strip()
     return {"name": name, "value": text, "light": light, "thresholds": thresholds}
+
+
+def check_contradictions(found: Iterable[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """A red light for each contradiction as ``Contradiction.describe`` gives it, or one green light for none."""
+    rows = [
+        {"name": f"agrees with the {row['subject']}", "value": row["message"], "light": "red",
+         "thresholds": row["advice"]}
+        for row in found
+    ]  # fmt: skip
+    thresholds = "green: no evidence in hand contradicts the result"
+    return rows or [{"name": "contradictions", "value": "none found", "light": "green", "thresholds": thresholds}]
 
 
 def _named_params(camera: Camera) -> dict[str, float]:

@@ -22,7 +22,7 @@ from sfmapp.evaluation.trajectory import (
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Truth
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
-from sfmapp.report.document import check
+from sfmapp.report.document import check, check_contradictions
 
 FORMAT = "sfmapp odometry report 1"
 Array = NDArray[np.float64]
@@ -124,6 +124,7 @@ def map_row(result: OdometryResult, map_idx: int) -> dict[str, Any]:
         "scale_sigma": entry.scale_sigma,
         "gauge": entry.gauge,
         **_uncertainty(entry),
+        "contradictions": [found.describe() for found in entry.contradictions],
     }
 
 
@@ -222,4 +223,4 @@ def make_checks(
     if timing.get("times_real_time"):
         speed = timing["times_real_time"]
         rows.append(check("speed against the camera's", speed, f"{speed:.2f} x", 1, 0.5, "x"))
-    return rows
+    return rows + check_contradictions(row for found in maps for row in found["contradictions"])
