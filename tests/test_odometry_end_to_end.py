@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sfmapp.contradictions import Contradiction
 from sfmapp.errors import InputError, InterruptedRunError, UsageError
 from sfmapp.events import Event, Events
 from sfmapp.formats.colmap import read_model
@@ -93,6 +95,17 @@ def test_what_is_written_can_be_read_again(tracked: tuple[Path, TrackResult]) ->
         assert np.array_equal(ours.keyframe_frame_idx, theirs.keyframe_frame_idx)
         poses = [entry.reconstruction.cam_from_world[entry.keyframe_image_idx] for entry in (ours, theirs)]
         assert np.allclose(poses[0], poses[1], atol=1e-12)
+
+
+def test_what_contradicts_a_map_is_read_again_with_it(tracked: tuple[Path, TrackResult], tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    found = Contradiction("given calibration", "f is too long", "calibrate", {"sigmas": 9.0}, 0.3)
+    shutil.copytree(tracked[0], output)
+    report = json.loads((output / "report.json").read_text())
+    report["maps"][0]["contradictions"] = [found.describe()]
+    (output / "report.json").write_text(json.dumps(report))
+    assert read_odometry(output).maps[0].contradictions == [found]
+    assert read_odometry(tracked[0]).maps[0].contradictions == tracked[1].odometry.maps[0].contradictions == []
 
 
 def test_threads_do_not_change_a_byte(room: Path, tracked: tuple[Path, TrackResult], tmp_path: Path) -> None:

@@ -176,6 +176,7 @@ def _print_refined(output: Path, report: dict[str, Any]) -> None:
         for row in photos:
             if not row["is_registered"]:
                 print(f"  not registered: {row['name']}: {row['reason']}")
+    print_contradictions(row for found in report["maps"]["after"] for row in found["contradictions"])
     print(took(run))
     print(f"model {output / 'sparse' / '0'}, trajectory {output / 'trajectory.tum'}, report {output / 'report.html'}")
 

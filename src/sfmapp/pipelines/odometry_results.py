@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sfmapp.contradictions import Contradiction
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.formats.colmap import read_model
 from sfmapp.formats.trajectory import read_tum, write_tum
@@ -138,7 +139,12 @@ def read_odometry(folder: Path) -> OdometryResult:
         frames = np.array([indices[position[model.image_names[k]]] for k in images], np.int64)
         order = np.argsort(frames, kind="stable")
         source, sigma = row["scale_source"], row["scale_sigma"]
-        maps.append(MapResult(model, frames[order], images[order], scale_source=source, scale_sigma=sigma))
+        against = [Contradiction(**entry) for entry in row.get("contradictions", ())]
+        maps.append(
+            MapResult(
+                model, frames[order], images[order], scale_source=source, scale_sigma=sigma, contradictions=against
+            )
+        )
     return OdometryResult(indices, names, times, poses, np.full_like(poses, np.nan), frame_map, states, maps)
 
 

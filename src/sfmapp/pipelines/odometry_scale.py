@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.contradictions import widened_scale_sigma
 from sfmapp.errors import UsageError
 from sfmapp.events import Events
 from sfmapp.images.sequence import Imu, Sequence
@@ -131,7 +132,7 @@ def rescale(result: OdometryResult, map_idx: int, found: ScaleEstimate) -> None:
     covariance = None if entry.covariance is None else scale_covariance(entry.covariance, found.scale)
     result.maps[map_idx] = replace(
         entry, reconstruction=apply_scale(entry.reconstruction, found.scale), covariance=covariance,
-        scale_source=found.source, scale_sigma=found.sigma_relative,
+        scale_source=found.source, scale_sigma=widened_scale_sigma(found.sigma_relative, entry.contradictions),
     )  # fmt: skip
     result.cam_from_world[mine, 4:] *= found.scale
     if result.covariance is not None:

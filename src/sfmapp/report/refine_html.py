@@ -8,9 +8,10 @@ from typing import Any
 
 from sfmapp.images.sequence import Truth
 from sfmapp.odometry.result import OdometryResult
+from sfmapp.report.document import check_contradictions
 from sfmapp.report.odometry_document import Against
 from sfmapp.report.odometry_html import trajectory_views
-from sfmapp.report.page import failure_box, log_table, render_page, table, usage_table
+from sfmapp.report.page import check_table, failure_box, log_table, render_page, table, usage_table
 
 REFINE_FORMAT = "sfmapp refine report 1"
 _ROWS = (
@@ -27,7 +28,8 @@ def render_refine_html(
     run = report["run"]
     facts = "; ".join([run["source"], f"sfmapp {run['versions']['sfmapp']}", run["started"]])
     body = [f'<p class="dim">{escape(facts)}</p>']
-    body += [failure_box(report["outcome"]), "<h2>Before and after</h2>" + _comparison(report)]
+    found = check_contradictions(row for entry in report["maps"]["after"] for row in entry["contradictions"])
+    body += [failure_box(report["outcome"]), check_table(found), "<h2>Before and after</h2>" + _comparison(report)]
     body.append(trajectory_views(result, truth, against))
     body.append(_photographs(report["photographs"], report["skipped"]))
     body.append(usage_table(report["usage"], run))
