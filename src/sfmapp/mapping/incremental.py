@@ -20,6 +20,7 @@ from sfmapp.events import Events
 from sfmapp.images.folder import ImageSet
 from sfmapp.mapping import structure, verified_pairs
 from sfmapp.mapping.focal import estimate_focal_ratio
+from sfmapp.mapping.join import find_joint, holds_together, unite
 from sfmapp.mapping.mapper import STAGE, Mapper
 from sfmapp.mapping.merge import find_merge, merge, num_linking_points
 from sfmapp.mapping.options import MappingOptions
@@ -77,7 +78,7 @@ def map_images(
 
         empty = Reconstruction.empty(cameras, names, image_camera_idx, tracks)
         models, initial_reports = _grow_models(empty, mapper_of, options, events)
-        models = _merge_models(_without_parts(models), mapper_of, options, events)
+        models = _merge_models(_without_parts(models), mapper_of, correspondences, options, events)
         for model in models:
             model.point_rgb = track_colors(tracks, features)
         contradictions = verified_pairs.contradictions_of(models, correspondences)
@@ -148,33 +149,63 @@ def _without_parts(models: list[Reconstruction]) -> list[Reconstruction]:
 def _merge_models(
     models: list[Reconstruction],
     mapper_of: Callable[..., Mapper],
+    correspondences: Correspondences,
     options: MappingOptions,
     events: Events,
 ) -> list[Reconstruction]:
-    """Join smaller models to larger ones where shared images and points tell how they lie to each other."""
+    """Join smaller models to larger ones where shared images, points or pairs tell how they lie to each other.
+
+    What is joined may reach a third one, so that it goes on until nothing can be joined any more.
+    """
     merged: list[Reconstruction] = []
     for source in models:
-        for n, target in enumerate(merged):
-            found = find_merge(target, source)
-            if found is None:
-                continue
-            target_from_source, votes = found
-            union = merge(target, source, target_from_source)
-            mapper = mapper_of(union)
-            mapper.adjust_globally()
-            mapper.grow()
-            mapper.finish()
-            new = union.is_registered & ~target.is_registered
-            # images that both models had do not count: they hold the new ones at any scale
-            link = num_linking_points(union, new, target.is_registered & ~source.is_registered)
-            if link >= options.min_pose_inliers:
-                num_new = int(new.sum())
-                events.decided(STAGE, f"merged two models by {votes} common points: {num_new} images more")
-                merged[n] = union
+        while True:
+            found = ((n, _union(target, source, mapper_of, correspondences, options, events))
+                     for n, target in enumerate(merged))  # fmt: skip
+            n, union = next(((n, union) for n, union in found if union is not None), (-1, None))
+            if union is None:
                 break
-        else:
-            merged.append(source)
-    return merged
+            del merged[n]
+            source = union
+        merged.append(source)
+    return sorted(merged, key=lambda model: -int(model.is_registered.sum()))
+
+
+def _union(
+    target: Reconstruction,
+    source: Reconstruction,
+    mapper_of: Callable[..., Mapper],
+    correspondences: Correspondences,
+    options: MappingOptions,
+    events: Events,
+) -> Reconstruction | None:
+    """Two models in one, or None if they cannot be joined."""
+    through_image = find_merge(target, source)
+    if through_image is not None:
+        target_from_source, votes = through_image
+        union = merge(target, source, target_from_source)
+        mapper = mapper_of(union)
+        mapper.adjust_globally()
+        mapper.grow()
+        mapper.finish()
+        new = union.is_registered & ~target.is_registered
+        # images that both models had do not count: they hold the new ones at any scale
+        link = num_linking_points(union, new, target.is_registered & ~source.is_registered)
+        if link >= options.min_pose_inliers:
+            events.decided(STAGE, f"merged two models by {votes} common points: {int(new.sum())} images more")
+            return union
+    joint = find_joint(target, source, correspondences, options)
+    if joint is None:
+        return None
+    union = unite(target, source, joint, mapper_of, options)
+    if not holds_together(union, target, source, correspondences, options):
+        return None
+    num_new = int((union.is_registered & ~target.is_registered).sum())
+    events.decided(
+        STAGE,
+        f"joined two models: {joint.num_agreeing} of {joint.num_links} points that both see agree; {num_new} images more",
+    )
+    return union
 
 
 def no_reconstruction(report: dict[str, Any]) -> NoReconstructionError:

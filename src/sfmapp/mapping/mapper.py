@@ -17,6 +17,7 @@ from sfmapp.mapping import structure
 from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_initial_pairs
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
+from sfmapp.mapping.tracks import USELESS_CONFIGS
 from sfmapp.scene.camera import PARAM_NAMES, Camera
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
@@ -25,6 +26,12 @@ STAGE = "mapping"
 # Share of the observations of an image that must hold once all is adjusted, where they are few. Those of a right pose
 # are verified matches and nearly all hold; those of a mirrored or repeated part are torn between two poses.
 MIN_AGREEMENT = 2 / 3
+# A position this uncertain, in distances of the points that tell it and in shares of the least angle of triangulation
+# (in radians), is weak: a tenth of the shortest baseline that makes points.
+WEAK_SHARE_OF_ANGLE = 0.1
+# A weak image waits for another model if a pair with an image outside of this one has so many times the matches of its
+# strongest pair inside: no matter of chance, and what comes with one image comes with its neighbours too.
+ELSEWHERE = 2.0
 # Uncertainties cost an inverse of eight unknowns per image: half a second and 50 MB for this many.
 MAX_UNCERTAINTY_IMAGES = 200
 
@@ -33,7 +40,8 @@ MAX_UNCERTAINTY_IMAGES = 200
 class Mapper:
     """Grows one model. Every method is a step of the method and changes ``reconstruction`` in place.
 
-    ``locked`` (I,) bool are images that this model must not register.
+    ``locked`` (I,) bool are images that this model must not register. ``waits``: weak images whose strongest pairs are
+    with images outside of the model are left to another one, which may grow from there.
     """
 
     reconstruction: Reconstruction
@@ -48,6 +56,7 @@ class Mapper:
     failed_with: dict[int, int] = field(default_factory=dict)
     times_dropped: dict[int, int] = field(default_factory=dict)
     size_at_global: tuple[int, int] = (0, 0)
+    waits: bool = True
     max_error_px: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -112,7 +121,8 @@ class Mapper:
     def register_next_images(self) -> list[int]:
         """Register the best next image, and with it others that see as much of the map; returns them.
 
-        Images that failed are tried again once they see half as many points more.
+        Images that failed are tried again once they see half as many points more. Images whose position is weak come
+        when no other does, one at a time, the surest first.
         """
         order, scores, counts = rank_next_images(self.reconstruction, self._candidates())
         worth = [
@@ -121,14 +131,65 @@ class Mapper:
             if n >= max(self.options.min_pose_inliers, 1.5 * self.failed_with.get(int(i), 0))
         ]
         registered: list[int] = []
+        weak: list[Registration] = []
         while worth and not registered:
             # "as much": the map around them is as settled as around the best, and no image hangs on another
             batch = [i for i, score in worth if score >= 0.75 * worth[0][1]]
             worth = worth[len(batch) :]
             known = self._known_cameras()
-            results = self.pool.map(lambda i, known=known: self._attempt(i, known), batch)
-            registered = [result.image_idx for result in results if self._accept(result)]
+            # all of them before the first is accepted, which changes what the others would start from
+            results = list(self.pool.map(lambda i, known=known: self._attempt(i, known), batch))
+            weak += [result for result in results if self._is_weak(result)]
+            sure = [result for result in results if not self._is_weak(result)]
+            registered = [result.image_idx for result in self._one_for_each_camera(sure) if self._accept(result)]
+        for result in sorted(weak, key=lambda result: result.position_sigma):
+            if registered:
+                break
+            if not self._is_left_to_another(result) and self._accept(result):
+                registered = [result.image_idx]
         return registered
+
+    def _is_weak(self, result: Registration) -> bool:
+        limit = WEAK_SHARE_OF_ANGLE * np.radians(self.options.min_triangulation_angle_deg)
+        return result.cam_from_world is not None and not result.position_sigma <= limit
+
+    def _one_for_each_camera(self, results: list[Registration]) -> list[Registration]:
+        """Results without those that searched the focal length of a camera which a surer one has found as well."""
+        found: dict[int, Registration] = {}
+        for result in results:
+            if result.focal_px is not None:
+                camera_idx = int(self.reconstruction.image_camera_idx[result.image_idx])
+                best = found.setdefault(camera_idx, result)
+                if result.position_sigma < best.position_sigma:
+                    found[camera_idx] = result
+        return [
+            result
+            for result in results
+            if result.focal_px is None or result is found[int(self.reconstruction.image_camera_idx[result.image_idx])]
+        ]
+
+    def _is_left_to_another(self, result: Registration) -> bool:
+        """Whether a weak image waits, as its strongest pair is with an image outside of this model."""
+        others, matches = self._pairs_of(result.image_idx)
+        registered = self.reconstruction.is_registered[others]
+        inside, outside = matches[registered].max(initial=0), np.where(registered, 0, matches)
+        strongest = int(outside.max(initial=0))
+        if not self.waits or strongest < max(ELSEWHERE * inside, self.options.min_initial_inliers):
+            return False
+        reason = (
+            f"its position is uncertain by {100 * result.position_sigma:.1f} % of the distance of the points it sees, "
+            f"and its strongest pair, {strongest} matches, is with "
+            f"{self.reconstruction.image_names[others[np.argmax(outside)]]}, outside of this model"
+        )
+        self._accept(replace(result, cam_from_world=None, reason=reason))
+        return True
+
+    def _pairs_of(self, image_idx: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Images (K,) that an image has verified matches with, and how many (K,)."""
+        pairs, matches = self.correspondences.pair_image_idx, self.correspondences.num_inliers
+        useful = (matches > 0) & ~np.isin(self.correspondences.config, USELESS_CONFIGS)
+        own = np.flatnonzero(useful & (pairs == image_idx).any(axis=1))
+        return pairs[own].sum(axis=1, dtype=np.int64) - image_idx, matches[own]
 
     def _attempt(self, image_idx: int, known_cameras: NDArray[np.bool_]) -> Registration:
         camera_idx = self.reconstruction.image_camera_idx[image_idx]
