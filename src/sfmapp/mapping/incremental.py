@@ -20,7 +20,7 @@ from sfmapp.events import Events
 from sfmapp.images.folder import ImageSet
 from sfmapp.mapping import structure, verified_pairs
 from sfmapp.mapping.focal import estimate_focal_ratio
-from sfmapp.mapping.join import find_joint, holds_together, unite
+from sfmapp.mapping.join import find_joint, holds_together, in_common_cameras, unite
 from sfmapp.mapping.mapper import STAGE, Mapper
 from sfmapp.mapping.merge import find_merge, merge, num_linking_points
 from sfmapp.mapping.options import MappingOptions
@@ -194,17 +194,16 @@ def _union(
         if link >= options.min_pose_inliers:
             events.decided(STAGE, f"merged two models by {votes} common points: {int(new.sum())} images more")
             return union
-    joint = find_joint(target, source, correspondences, options)
+    matched = in_common_cameras(target, source, mapper_of)
+    joint = find_joint(*matched, correspondences, options)
     if joint is None:
         return None
-    union = unite(target, source, joint, mapper_of, options)
+    union = unite(*matched, joint, mapper_of, options)
     if not holds_together(union, target, source, correspondences, options):
         return None
     num_new = int((union.is_registered & ~target.is_registered).sum())
-    events.decided(
-        STAGE,
-        f"joined two models: {joint.num_agreeing} of {joint.num_links} points that both see agree; {num_new} images more",
-    )
+    link = f"{joint.num_agreeing} of {joint.num_links} points that both see agree"
+    events.decided(STAGE, f"joined two models: {link}, {num_new} images more")
     return union
 
 

@@ -129,6 +129,26 @@ def find_joint(
     return Joint(refined[chosen], checks.num_links, int(agreeing[chosen]))
 
 
+def in_common_cameras(
+    target: Reconstruction, source: Reconstruction, mapper_of: Callable[[Reconstruction], Mapper]
+) -> tuple[Reconstruction, Reconstruction]:
+    """Both models with the same intrinsics where they share a camera: those of the model with more images of it.
+
+    Each has refined them for itself, and few images tell little of a lens. The models are left as they are; one that
+    must change is a copy.
+    """
+    models = [target, source]
+    counts = [
+        np.bincount(model.image_camera_idx[model.is_registered], minlength=len(model.cameras)) for model in models
+    ]
+    better = [target.cameras[c] if counts[0][c] >= counts[1][c] else source.cameras[c] for c in range(len(counts[0]))]
+    for n, model in enumerate(models):
+        if any(counts[n][c] and model.cameras[c] is not camera for c, camera in enumerate(better)):
+            models[n] = model.copy()
+            mapper_of(models[n]).adjust_to_cameras(better)
+    return models[0], models[1]
+
+
 def unite(
     target: Reconstruction,
     source: Reconstruction,
@@ -298,7 +318,7 @@ def _from_image(
 ) -> Array:
     """(N, 8) with N at most 1: the similarity through an image that sees points of the other model."""
     is_own = target.is_registered[image_idx]  # an image of the target, which sees points of the source
-    own, other = (target, source) if is_own else (source, target)
+    own = target if is_own else source
     mine = (checks.image_idx == image_idx) & (checks.is_forward == is_own)
     camera = own.cameras[own.image_camera_idx[image_idx]]
     normalized = pixels_to_normalized(camera, checks.xy[mine])

@@ -259,6 +259,14 @@ class Mapper:
         )  # fmt: skip
         structure.filter_observations(reconstruction, self.options, self.pool, seen, self.max_error_px)
 
+    def adjust_to_cameras(self, cameras: list[Camera]) -> None:
+        """Take over intrinsics that another model has found, and adjust poses and points to them."""
+        reconstruction = self.reconstruction
+        reconstruction.cameras[:] = cameras
+        options = replace(self.adjust_options, max_iterations=25, relative_cost_tolerance=1e-4)
+        fixed = np.zeros(len(cameras), bool)
+        adjust_bundle(reconstruction, options, variable_cameras=fixed, prior_cameras=self.prior_cameras)
+
     def adjust_globally(self) -> None:
         """Adjust everything, filter, and triangulate again what was lost or has become possible."""
         reconstruction = self.reconstruction
