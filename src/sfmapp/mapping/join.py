@@ -34,7 +34,7 @@ Bools = NDArray[np.bool_]
 # Each model is off by its own drift, which the adjustment of the union takes out: hypotheses are searched with this
 # multiple of the tolerance for poses, and refined down to that tolerance.
 SEARCH_FACTOR = 3.0
-# With a third of the links right, 500 triples miss an all-right one with a probability of 1e-8.
+# With two fifths of the links right, 500 triples miss an all-right one with a probability of 1e-14; they are noisy.
 NUM_TRIPLES = 500
 # Images of each side that are tried as a bridge, those with most links first, and links that vote on the scale.
 MAX_BRIDGES = 6
@@ -43,7 +43,7 @@ SCALE_TOLERANCE = 0.05
 # Hypotheses that are refined: the minimal ones are noisy and their order with them.
 NUM_REFINED = 3
 # Links that must agree, as a share of all: the rest are mismatches, of which weak pairs have many.
-MIN_LINK_SHARE = 1 / 3
+MIN_LINK_SHARE = 0.4
 # Share of the observations of each model that must still hold in the union: what contradicts is torn between the two.
 MIN_KEPT = 0.9
 
@@ -104,7 +104,7 @@ def find_joint(
     Args:
         target, source: models over the same tracks; images that both hold count as the target's.
         correspondences: verified matches that the tracks were made of.
-        options: thresholds. At least ``min_pose_inliers`` links must agree, and a third of all.
+        options: thresholds. At least ``min_pose_inliers`` links must agree, and two fifths of all.
     """
     checks = _checks(target, source, correspondences)
     if checks.num_links < options.min_pose_inliers:

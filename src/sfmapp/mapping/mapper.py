@@ -18,6 +18,7 @@ from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_in
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
 from sfmapp.mapping.tracks import USELESS_CONFIGS
+from sfmapp.mapping.verified_pairs import pair_agreement
 from sfmapp.scene.camera import PARAM_NAMES, Camera
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
@@ -69,17 +70,26 @@ class Mapper:
         options = self.options
         tried: list[dict[str, Any]] = []
         ranked = rank_initial_pairs(self.reconstruction, self.correspondences, seeds, options)
-        inliers, angle = options.min_initial_inliers, options.min_initial_angle_deg
+        inliers = options.min_initial_inliers
         while True:
-            for pair in ranked:
-                reason = pair.reason or pair.shortfall(inliers, angle)
-                tried.append({**pair.describe(self.reconstruction.image_names), "reason": reason})
-                if not reason and self._start_from(pair):
-                    return tried
-            if inliers <= options.min_pose_inliers and angle < 2 * options.min_triangulation_angle_deg:
+            # many matches under a small angle before few under a wide one, which may be of things that look alike
+            for angle in self._initial_angles():
+                for pair in ranked:
+                    reason = pair.reason or pair.shortfall(inliers, angle)
+                    tried.append({**pair.describe(self.reconstruction.image_names), "reason": reason})
+                    if not reason and self._start_from(pair):
+                        return tried
+            if inliers <= options.min_pose_inliers:
                 return tried
-            inliers, angle = max(inliers // 2, options.min_pose_inliers), angle / 2
-            self.events.decided(STAGE, f"no initial pair; relaxing to {inliers} matches and {angle:.1f} degrees")
+            inliers = max(inliers // 2, options.min_pose_inliers)
+            self.events.decided(STAGE, f"no initial pair; relaxing to {inliers} matches")
+
+    def _initial_angles(self) -> list[float]:
+        """The median angle that an initial pair should have, and its halves; what is too narrow makes no point anyway."""
+        angles = [self.options.min_initial_angle_deg]
+        while angles[-1] >= self.options.min_triangulation_angle_deg:
+            angles.append(angles[-1] / 2)
+        return angles
 
     def _start_from(self, pair: InitialPair) -> bool:
         initialize_from_pair(self.reconstruction, pair)
@@ -294,6 +304,11 @@ class Mapper:
             self.events.decided(STAGE, f"final adjustment: {changed} observations changed sides", **summary)
             if changed <= 1e-3 * before.sum():
                 return
+
+    def agreement(self) -> tuple[int, int]:
+        """How many verified matches between registered images agree with their poses, and how many there are."""
+        found = pair_agreement(self.reconstruction, self.correspondences)
+        return int(found.num_agreeing.sum()), int(found.num_matches.sum())
 
     def _refine_principal_points(self, options: AdjustOptions) -> None:
         """Adjust everything with free principal points, for the cameras that MappingOptions names."""
