@@ -18,7 +18,7 @@ from sfmapp.adjust.solver import AdjustOptions
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.images.folder import ImageSet
-from sfmapp.mapping import structure
+from sfmapp.mapping import structure, verified_pairs
 from sfmapp.mapping.focal import estimate_focal_ratio
 from sfmapp.mapping.mapper import STAGE, Mapper
 from sfmapp.mapping.merge import find_merge, merge, num_linking_points
@@ -80,8 +80,14 @@ def map_images(
         models = _merge_models(_without_parts(models), mapper_of, options, events)
         for model in models:
             model.point_rgb = track_colors(tracks, features)
+        contradictions = verified_pairs.contradictions_of(models, correspondences)
+        for found in contradictions:
+            for contradiction in found:
+                events.warned(STAGE, contradiction.message, **contradiction.evidence)
         model_reports: list[dict[str, Any]] = [
-            model.summary() | {"uncertainty": mapper_of(model).uncertainty(), "contradictions": []} for model in models
+            model.summary()
+            | {"uncertainty": mapper_of(model).uncertainty(), "contradictions": [c.describe() for c in found]}
+            for model, found in zip(models, contradictions, strict=True)
         ]
     report = {
         "tracks": track_report,
@@ -243,4 +249,5 @@ def compile_kernels() -> None:
     build_tracks(true_correspondences(scene, min_matches=1), features)
     structure.compile_kernels()
     rank_next_images(model, np.arange(3))
+    verified_pairs.compile_kernels()
     solver.compile_kernels()
