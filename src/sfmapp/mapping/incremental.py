@@ -20,6 +20,7 @@ from sfmapp.events import Events
 from sfmapp.images.folder import ImageSet
 from sfmapp.mapping import structure
 from sfmapp.mapping.focal import estimate_focal_ratio
+from sfmapp.mapping.intrinsics_check import Mapped, check_intrinsics, settle_focal_lengths
 from sfmapp.mapping.mapper import STAGE, Mapper
 from sfmapp.mapping.merge import find_merge, merge, num_linking_points
 from sfmapp.mapping.options import MappingOptions
@@ -62,32 +63,37 @@ def map_images(
     image_camera_idx = np.array([record.camera_idx for record in image_set.images], np.int32)
     tracks, track_report = build_tracks(correspondences, features)
     events.decided(STAGE, f"{track_report['num_tracks']} tracks", **track_report)
-    cameras, focal_report = _first_cameras(
-        image_set.cameras, image_camera_idx, correspondences, tracks, options, events
-    )
-    attempts: dict[int, Registration] = {}
     events.started(STAGE, "mapping", total=len(names))
     with ThreadPoolExecutor(threads) as pool:
 
-        def mapper_of(model: Reconstruction, locked: NDArray[np.bool_] | None = None) -> Mapper:
-            locked = np.zeros(len(names), bool) if locked is None else locked
-            return Mapper(
-                model, correspondences, options, adjust_options, events, pool, list(cameras), locked, attempts
-            )
+        def map_from(given: list[Camera]) -> Mapped:
+            """Models that begin with the given cameras."""
+            cameras, focal_report = _first_cameras(given, image_camera_idx, correspondences, tracks, options, events)
+            attempts: dict[int, Registration] = {}
 
-        empty = Reconstruction.empty(cameras, names, image_camera_idx, tracks)
-        models, initial_reports = _grow_models(empty, mapper_of, options, events)
-        models = _merge_models(_without_parts(models), mapper_of, options, events)
+            def mapper_of(model: Reconstruction, locked: NDArray[np.bool_] | None = None) -> Mapper:
+                locked = np.zeros(len(names), bool) if locked is None else locked
+                return Mapper(
+                    model, correspondences, options, adjust_options, events, pool, list(cameras), locked, attempts
+                )
+
+            empty = Reconstruction.empty(cameras, names, image_camera_idx, tracks)
+            models, initial_reports = _grow_models(empty, mapper_of, options, events)
+            models = _merge_models(_without_parts(models), mapper_of, options, events)
+            return Mapped(cameras, models, initial_reports, focal_report, attempts, mapper_of)
+
+        mapped, doubts = settle_focal_lengths(map_from(list(image_set.cameras)), map_from, events)
+        models = mapped.models
         for model in models:
             model.point_rgb = track_colors(tracks, features)
         model_reports: list[dict[str, Any]] = [
-            model.summary() | {"uncertainty": mapper_of(model).uncertainty(), "contradictions": []} for model in models
+            model.summary() | check_intrinsics(mapped, model, map_from, events) for model in models
         ]
     report = {
         "tracks": track_report,
-        "focal": focal_report,
-        "initial_pairs": initial_reports,
-        "images": _image_reports(names, models, attempts),
+        "focal": mapped.focal_report | doubts,
+        "initial_pairs": mapped.initial_reports,
+        "images": _image_reports(names, models, mapped.attempts),
         "models": model_reports,
     }
     events.finished(STAGE, f"{len(models)} model(s)", num_models=len(models))
