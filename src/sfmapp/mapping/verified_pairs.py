@@ -253,8 +253,25 @@ def _inside(model: Reconstruction, correspondences: Correspondences) -> list[Con
                 "num_pairs": len(pairs), "num_matches": int(matches.sum()), "num_matches_of_all": total,
                 "num_pairs_overruled": int((agreement.contradicts & ~standing.stands).sum()), "pairs": named,
             },
+            rotation_sigma_deg=_turn_deg(model, correspondences, agreement, pairs),
+            # an image that is in a wrong place may be anywhere in the model
+            position_sigma_share=1.0,
         )
     ]  # fmt: skip
+
+
+def _turn_deg(
+    model: Reconstruction, correspondences: Correspondences, agreement: PairAgreement, pairs: NDArray[np.int64]
+) -> float:
+    """Root mean square angle between the relative rotations of some pairs and those of the model, by their matches."""
+    own = correspondences.cam2_from_cam1[agreement.pair_idx[pairs]]
+    poses = model.cam_from_world[agreement.image_idx[pairs]]
+    in_model = rigid3.compose(poses[:, 1], rigid3.inverse(poses[:, 0]))
+    angle = rigid3.rotation_angle_deg(rigid3.rotation_matrix(rigid3.compose(own, rigid3.inverse(in_model))))
+    is_known = np.isfinite(angle)
+    if not is_known.any():
+        return 180.0
+    return float(np.sqrt(np.average(angle[is_known] ** 2, weights=agreement.num_matches[pairs][is_known])))
 
 
 def _between(
