@@ -16,17 +16,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.contradictions import Contradiction
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.images.folder import ImageSet
 from sfmapp.mapping import structure, verified_pairs
 from sfmapp.mapping.focal import estimate_focal_ratio
+from sfmapp.mapping.intrinsics_check import (
+    MapFrom,
+    Mapped,
+    check_intrinsics,
+    settle_focal_lengths,
+    widened_uncertainty,
+)
 from sfmapp.mapping.join import find_joint, holds_together, in_common_cameras, unite
+from sfmapp.mapping.look_alikes import tell_apart
 from sfmapp.mapping.mapper import STAGE, Mapper
 from sfmapp.mapping.merge import find_merge, merge, num_linking_points
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images
 from sfmapp.mapping.tracks import build_tracks, track_colors
+from sfmapp.mapping.verified_pairs import contradictions_of
 from sfmapp.scene.camera import Camera
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.features import Features
@@ -72,44 +82,66 @@ def map_images(
     image_camera_idx = np.array([record.camera_idx for record in image_set.images], np.int32)
     tracks, track_report = build_tracks(correspondences, features)
     events.decided(STAGE, f"{track_report['num_tracks']} tracks", **track_report)
-    cameras, focal_report = _first_cameras(
-        image_set.cameras, image_camera_idx, correspondences, tracks, options, events
-    )
-    attempts: dict[int, Registration] = {}
-    events.started(STAGE, "mapping", total=len(names))
     with ThreadPoolExecutor(threads) as pool:
 
-        def mapper_of(model: Reconstruction, locked: NDArray[np.bool_] | None = None) -> Mapper:
-            locked = np.zeros(len(names), bool) if locked is None else locked
-            return Mapper(
-                model, correspondences, options, adjust_options, events, pool, list(cameras), locked, attempts
-            )
+        def map_from(given: list[Camera], found: Correspondences, tracks: Tracks) -> Mapped:
+            """Models that begin with the given cameras, from the matches found and their tracks."""
+            events.started(STAGE, "mapping", total=len(names))
+            cameras, focal_report = _first_cameras(given, image_camera_idx, found, tracks, options, events)
+            attempts: dict[int, Registration] = {}
 
-        empty = Reconstruction.empty(cameras, names, image_camera_idx, tracks)
-        models, initial_reports = _grow_models(empty, mapper_of, options, events)
-        models = _merge_models(_without_parts(models), mapper_of, correspondences, options, events)
+            def mapper_of(model: Reconstruction, locked: NDArray[np.bool_] | None = None) -> Mapper:
+                locked = np.zeros(len(names), bool) if locked is None else locked
+                return Mapper(model, found, options, adjust_options, events, pool, list(cameras), locked, attempts)
+
+            empty = Reconstruction.empty(cameras, names, image_camera_idx, tracks)
+            models, initial_reports = _grow_models(empty, mapper_of, options, events)
+            models = _merge_models(_without_parts(models), mapper_of, found, options, events)
+            return Mapped(cameras, models, initial_reports, focal_report, attempts, mapper_of)
+
+        def map_all(given: list[Camera]) -> Mapped:
+            return map_from(given, correspondences, tracks)
+
+        mapped, doubts = settle_focal_lengths(map_all(list(image_set.cameras)), map_all, events)
+
+        def map_again(found: Correspondences) -> Mapped:
+            return map_from(list(mapped.cameras), found, build_tracks(found, features)[0])
+
+        mapped, look_alikes = tell_apart(mapped, correspondences, map_again, events)
+        models = mapped.models
         for model in models:
-            model.point_rgb = track_colors(tracks, features)
-        contradictions = verified_pairs.contradictions_of(models, correspondences)
-        for found in contradictions:
-            for contradiction in found:
-                events.warned(STAGE, contradiction.message, **contradiction.evidence)
+            model.point_rgb = track_colors(model.tracks, features)
+        contradictions = contradictions_of(models, correspondences)
         model_reports: list[dict[str, Any]] = [
-            model.summary()
-            | {"uncertainty": mapper_of(model).uncertainty(), "contradictions": [c.describe() for c in found]}
+            model.summary() | _check(mapped, model, found, map_all, events)
             for model, found in zip(models, contradictions, strict=True)
         ]
     report = {
         "tracks": track_report,
-        "focal": focal_report,
-        "initial_pairs": initial_reports,
-        "images": _image_reports(names, models, attempts),
+        "focal": mapped.focal_report | doubts,
+        "look_alikes": look_alikes,
+        "initial_pairs": mapped.initial_reports,
+        "images": _image_reports(names, models, mapped.attempts),
         "models": model_reports,
     }
     events.finished(STAGE, f"{len(models)} model(s)", num_models=len(models))
     if not models:
         raise no_reconstruction(report)
     return models, report
+
+
+def _check(
+    mapped: Mapped, model: Reconstruction, found: Sequence[Contradiction], map_all: MapFrom, events: Events
+) -> dict[str, Any]:
+    """``uncertainty`` and ``contradictions`` of a model, those that were found among the verified pairs included."""
+    checked = check_intrinsics(mapped, model, map_all, events)
+    for contradiction in found:
+        events.warned(STAGE, contradiction.message, **contradiction.evidence)
+        checked["contradictions"].append(contradiction.describe())
+        checked["uncertainty"] = widened_uncertainty(
+            checked["uncertainty"], model, contradiction.position_sigma_share, contradiction.rotation_sigma_deg
+        )
+    return checked
 
 
 def _grow_models(

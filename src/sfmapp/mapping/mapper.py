@@ -314,7 +314,7 @@ class Mapper:
         """Adjust everything with free principal points, for the cameras that MappingOptions names."""
         chosen = self._free_principal_points()
         if chosen.any():
-            options = self._with_principal_points(options, chosen)
+            options = self.with_free_centers(options, chosen)
             adjust_bundle(self.reconstruction, options, variable_cameras=chosen, prior_cameras=self.prior_cameras)
 
     def _free_principal_points(self) -> NDArray[np.bool_]:
@@ -326,7 +326,10 @@ class Mapper:
         unknown = np.array([mode == "always" or c.focal_source == "default" for c in reconstruction.cameras], bool)
         return shared & unknown & (mode != "never" and self.adjust_options.backend == "schur")
 
-    def _with_principal_points(self, options: AdjustOptions, chosen: NDArray[np.bool_]) -> AdjustOptions:
+    def with_free_centers(self, options: AdjustOptions, chosen: NDArray[np.bool_]) -> AdjustOptions:
+        """The options with free principal points under the prior of MappingOptions, for cameras chosen (C,) bool."""
+        if self.adjust_options.backend != "schur":
+            return options
         cameras = self.reconstruction.cameras
         size = max(max(c.width, c.height) for c, is_chosen in zip(cameras, chosen, strict=True) if is_chosen)
         # the adjustment counts residuals in pixels; the prior is weighed against them at their true noise
@@ -346,7 +349,7 @@ class Mapper:
             return {}
         chosen = self._free_principal_points()
         if chosen.any():
-            options = self._with_principal_points(options, chosen)
+            options = self.with_free_centers(options, chosen)
         found = estimate_covariances(reconstruction, options, prior_cameras=self.prior_cameras)
         if not found.is_determined:
             return {}

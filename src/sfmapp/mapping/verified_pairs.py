@@ -143,7 +143,7 @@ class Standing:
 
     Attributes:
         agreement: of all verified pairs with the model.
-        strength: (K,) of these pairs.
+        strength: (K,) of these pairs; zeros if none contradicts the model.
         overruled_by: (K,) how strong the weakest link is of the strongest chain of agreeing pairs between the two
             images; 0 where there is none.
         stands: (K,) bool: contradicts the model, and is not clearly weaker than that chain.
@@ -158,37 +158,50 @@ class Standing:
 def standing_pairs(reconstruction: Reconstruction, correspondences: Correspondences) -> Standing:
     """Which verified pairs contradict a model, and which of them with evidence as strong as what it rests on."""
     agreement = pair_agreement(reconstruction, correspondences)
-    strength = pair_strengths(reconstruction, correspondences)[agreement.pair_idx]
-    contradicts = agreement.contradicts
-    overruled_by = np.zeros(len(strength))
+    agrees, contradicts = agreement.agrees, agreement.contradicts
+    strength, overruled_by = np.zeros(len(agrees)), np.zeros(len(agrees))
     if contradicts.any():
-        agrees = agreement.agrees
-        widest = widest_paths(len(reconstruction.image_names), agreement.image_idx[agrees], strength[agrees])
-        overruled_by = widest[agreement.image_idx[:, 0], agreement.image_idx[:, 1]]
+        strength = pair_strengths(reconstruction, correspondences)[agreement.pair_idx]
+        chains = Chains.of(len(reconstruction.image_names), agreement.image_idx[agrees], strength[agrees])
+        for k in np.flatnonzero(contradicts):
+            link = chains.weakest_link(*agreement.image_idx[k])
+            overruled_by[k] = chains.strength[link] if link >= 0 else 0.0
     return Standing(agreement, strength, overruled_by, contradicts & (overruled_by < CLEARLY * strength))
 
 
-def widest_paths(num_images: int, image_idx: Ints, strength: Array) -> Array:
-    """(I, I) strength of the weakest link of the strongest chain between two images, 0 where there is none.
+@dataclass(frozen=True)
+class Chains:
+    """The strongest chains of pairs between images: what joins them when pairs are taken from the strongest down.
 
-    Such chains run along a maximum spanning tree: edges are taken from the strongest down, and what one joins first
-    is as strong as it.
+    A tree over the images in which each hangs on another by the pair that joined the group of the one to that of the
+    other. As the smaller group is hung on the larger one, it is as deep as the logarithm of their number.
 
-    Args:
-        num_images: I.
-        image_idx: (E, 2) images that a pair links.
-        strength: (E,) of the links.
+    Attributes:
+        parent: (I,) int64 the image that this one hangs on; itself at a root.
+        joined_as: (I,) int64 when: 0 for the strongest pair; I at a root.
+        strength: (I,) of the pair that joined them; 0 at a root.
     """
-    widest = np.zeros((num_images, num_images))
-    label = np.arange(num_images)
-    for e in np.argsort(-strength, kind="stable"):
-        a, b = label[image_idx[e]]
-        if a == b:
-            continue
-        one, other = label == a, label == b
-        widest[np.ix_(one, other)] = widest[np.ix_(other, one)] = strength[e]
-        label[other] = a
-    return widest
+
+    parent: Ints
+    joined_as: Ints
+    strength: Array
+
+    @staticmethod
+    def of(num_images: int, image_idx: Ints, strength: Array) -> Chains:
+        """Chains between I images over pairs of them (E, 2) with strengths (E,)."""
+        chains = Chains(np.arange(num_images), np.full(num_images, num_images), np.zeros(num_images))
+        order = np.argsort(-strength, kind="stable")
+        _hang(image_idx[order], strength[order], chains.parent, chains.joined_as, chains.strength)
+        return chains
+
+    def weakest_link(self, first: int, second: int) -> int:
+        """The image that hangs on its parent by the weakest link between two images, -1 where no chain joins them."""
+        return int(_weakest_link(first, second, self.parent, self.joined_as))
+
+    def group_before(self, image_idx: int, when: int) -> Bools:
+        """(I,) bool: what pairs stronger than the one that joined as number ``when`` join with an image."""
+        roots = _roots_before(when, self.parent, self.joined_as)
+        return np.asarray(roots == roots[image_idx])
 
 
 def contradictions_of(models: Sequence[Reconstruction], correspondences: Correspondences) -> list[list[Contradiction]]:
@@ -240,8 +253,25 @@ def _inside(model: Reconstruction, correspondences: Correspondences) -> list[Con
                 "num_pairs": len(pairs), "num_matches": int(matches.sum()), "num_matches_of_all": total,
                 "num_pairs_overruled": int((agreement.contradicts & ~standing.stands).sum()), "pairs": named,
             },
+            rotation_sigma_deg=_turn_deg(model, correspondences, agreement, pairs),
+            # an image that is in a wrong place may be anywhere in the model
+            position_sigma_share=1.0,
         )
     ]  # fmt: skip
+
+
+def _turn_deg(
+    model: Reconstruction, correspondences: Correspondences, agreement: PairAgreement, pairs: NDArray[np.int64]
+) -> float:
+    """Root mean square angle between the relative rotations of some pairs and those of the model, by their matches."""
+    own = correspondences.cam2_from_cam1[agreement.pair_idx[pairs]]
+    poses = model.cam_from_world[agreement.image_idx[pairs]]
+    in_model = rigid3.compose(poses[:, 1], rigid3.inverse(poses[:, 0]))
+    angle = rigid3.rotation_angle_deg(rigid3.rotation_matrix(rigid3.compose(own, rigid3.inverse(in_model))))
+    is_known = np.isfinite(angle)
+    if not is_known.any():
+        return 180.0
+    return float(np.sqrt(np.average(angle[is_known] ** 2, weights=agreement.num_matches[pairs][is_known])))
 
 
 def _between(
@@ -287,13 +317,64 @@ def _is_useful(correspondences: Correspondences) -> Bools:
 def _obs_of_features(tracks: Tracks, correspondences: Correspondences) -> tuple[Ints, Ints]:
     """(I + 1,) where the keypoints of each image begin, and for every keypoint its observation or -1."""
     sizes = np.zeros(tracks.num_images, np.int64)
-    np.maximum.at(sizes, tracks.obs_image_idx, tracks.obs_feature_idx + 1)
-    per_match = np.repeat(correspondences.pair_image_idx, correspondences.num_inliers, axis=0)
-    np.maximum.at(sizes, per_match.ravel(), correspondences.matches.ravel() + 1)
+    _num_features(tracks.obs_image_idx, tracks.obs_feature_idx, sizes)
+    for side in range(2):
+        per_match = np.repeat(correspondences.pair_image_idx[:, side], correspondences.num_inliers)
+        _num_features(per_match, np.ascontiguousarray(correspondences.matches[:, side]), sizes)
     first = np.concatenate([[0], np.cumsum(sizes)])
     obs_of_feature = np.full(first[-1], -1, np.int64)
     obs_of_feature[first[tracks.obs_image_idx] + tracks.obs_feature_idx] = np.arange(tracks.num_observations)
     return first, obs_of_feature
+
+
+@numba.njit(cache=True, nogil=True)
+def _num_features(image_idx: NDArray[np.int32], feature_idx: NDArray[np.int32], sizes: Ints) -> None:
+    """Raise sizes (I,) to one more than the largest position of a keypoint in each image."""
+    for k in range(len(image_idx)):
+        sizes[image_idx[k]] = max(sizes[image_idx[k]], feature_idx[k] + 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _hang(image_idx: Ints, strength: Array, parent: Ints, joined_as: Ints, link: Array) -> None:
+    size = np.ones(len(parent), np.int64)
+    count = 0
+    for e in range(len(image_idx)):
+        a, b = image_idx[e, 0], image_idx[e, 1]
+        while parent[a] != a:
+            a = parent[a]
+        while parent[b] != b:
+            b = parent[b]
+        if a == b:
+            continue
+        if size[a] > size[b]:
+            a, b = b, a
+        parent[a], joined_as[a], link[a] = b, count, strength[e]
+        size[b] += size[a]
+        count += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _weakest_link(a: int, b: int, parent: Ints, joined_as: Ints) -> int:
+    last = -1
+    while a != b:
+        if joined_as[a] > joined_as[b]:
+            a, b = b, a  # links get weaker on the way up: the one that was joined earlier goes first
+        if parent[a] == a:
+            return -1
+        last, a = a, parent[a]
+    return last
+
+
+@numba.njit(cache=True, nogil=True)
+def _roots_before(when: int, parent: Ints, joined_as: Ints) -> Ints:
+    """(I,) the image at which each ends on its way up the links that came before number ``when``."""
+    roots = np.empty(len(parent), np.int64)
+    for i in range(len(parent)):
+        root = i
+        while joined_as[root] < when:
+            root = parent[root]
+        roots[i] = root
+    return roots
 
 
 @numba.njit(cache=True, nogil=True)
@@ -352,7 +433,7 @@ def _rays_meet(r: Array, t: Array, x: float, y: float, u: float, v: float, toler
     ab = a0 * u + a1 * v + a2
     c0, c1, c2 = a1 - a2 * v, a2 * u - a0, a0 * v - a1 * u
     cross = c0 * c0 + c1 * c1 + c2 * c2
-    if math.atan2(math.sqrt(cross), ab) <= tolerance:
+    if ab > 0.0 and cross <= tolerance * tolerance * aa * bb:
         return True
     # the angles of both rays to the plane of the other one and the baseline
     e0, e1, e2 = t[1] * a2 - t[2] * a1, t[2] * a0 - t[0] * a2, t[0] * a1 - t[1] * a0
