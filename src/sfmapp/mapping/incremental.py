@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -97,6 +98,7 @@ def map_images(
             empty = Reconstruction.empty(cameras, names, image_camera_idx, tracks)
             models, initial_reports = _grow_models(empty, mapper_of, options, events)
             models = _merge_models(_without_parts(models), mapper_of, found, options, events)
+            models = _with_left_over(models, mapper_of, found, events)
             return Mapped(cameras, models, initial_reports, focal_report, attempts, mapper_of)
 
         def map_all(given: list[Camera]) -> Mapped:
@@ -157,7 +159,7 @@ def _grow_models(
     seeds = np.ones(len(empty.image_names), bool)
     locked = np.zeros(len(seeds), bool)
     while seeds.sum() >= 2 and (options.multiple_models or not models):
-        model, tried = _grow_model(empty, seeds, lambda model, locked=locked: mapper_of(model, locked), events)
+        model, tried = _grow_model(empty, seeds, partial(mapper_of, locked=locked), events)
         initial_reports.append({"pairs": tried})
         if model is None:
             break
@@ -269,15 +271,52 @@ def _union(
             return union
     matched = in_common_cameras(target, source, mapper_of)
     joint = find_joint(*matched, correspondences, options)
-    if joint is None:
+    reason, union = joint.reason, target
+    if not reason:
+        union = unite(*matched, joint, mapper_of, options)
+        reason = holds_together(union, target, source, correspondences, options)
+    sizes = f"of {int(target.is_registered.sum())} and {int(source.is_registered.sum())} images"
+    if reason:
+        events.decided(STAGE, f"two models {sizes} are kept apart: {reason}")
         return None
-    union = unite(*matched, joint, mapper_of, options)
-    if not holds_together(union, target, source, correspondences, options):
-        return None
-    num_new = int((union.is_registered & ~target.is_registered).sum())
-    link = f"{joint.num_agreeing} of {joint.num_links} points that both see agree"
-    events.decided(STAGE, f"joined two models: {link}, {num_new} images more")
+    share = f"{joint.num_agreeing} of {joint.num_links} points that both see agree"
+    events.decided(STAGE, f"joined two models {sizes}: {share}")
     return union
+
+
+def _with_left_over(
+    models: list[Reconstruction], mapper_of: Callable[..., Mapper], correspondences: Correspondences, events: Events
+) -> list[Reconstruction]:
+    """Models with the images that none of them holds, where these waited for another model and none came of it.
+
+    They come with what evidence there is, and go again if their verified pairs contradict it.
+    """
+    out: list[Reconstruction] = []
+    for model in models:
+        taken = np.any([other.is_registered for other in [*models, *out]], axis=0)
+        if taken.all():
+            out.append(model)
+            continue
+        grown = model.copy()
+        mapper = mapper_of(grown, taken & ~model.is_registered)
+        mapper.waits = False
+        mapper.grow()
+        new = grown.is_registered & ~model.is_registered
+        if not new.any():
+            out.append(model)
+            continue
+        mapper.finish()
+        agreement = verified_pairs.pair_agreement(grown, correspondences)
+        with_new = new[agreement.image_idx].any(axis=1)
+        agreeing, matches = int(agreement.num_agreeing[with_new].sum()), int(agreement.num_matches[with_new].sum())
+        is_kept = agreeing > verified_pairs.AGREES * matches and grown.is_registered[model.is_registered].all()
+        events.decided(
+            STAGE,
+            f"{int(new.sum())} images that had waited {'came last' if is_kept else 'do not fit'}: {agreeing} of their "
+            f"{matches} verified matches agree",
+        )
+        out.append(grown if is_kept else model)
+    return out
 
 
 def no_reconstruction(report: dict[str, Any]) -> NoReconstructionError:

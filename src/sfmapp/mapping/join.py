@@ -22,7 +22,7 @@ from sfmapp.geometry.lens import distort
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.mapping.merge import merge, num_linking_points
 from sfmapp.mapping.options import MappingOptions
-from sfmapp.mapping.verified_pairs import AGREES, CONTRADICTS, MIN_MATCHES, pair_agreement
+from sfmapp.mapping.verified_pairs import AGREES, CONTRADICTS, pair_agreement
 from sfmapp.scene.camera import pixels_to_normalized
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
@@ -44,8 +44,8 @@ SCALE_TOLERANCE = 0.05
 NUM_REFINED = 3
 # Links that must agree, as a share of all: the rest are mismatches, of which weak pairs have many.
 MIN_LINK_SHARE = 0.4
-# Share of the observations of each model that must still hold in the union: what contradicts is torn between the two.
-MIN_KEPT = 0.9
+# Share of the matches which agree with each model that must still do so in the union: a wrong one is torn.
+MIN_KEPT = 0.95
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,13 @@ class Joint:
         target_from_source: (8,) as in :mod:`sfmapp.geometry.similarity`.
         num_links: points of the scene that both see and at least one has triangulated.
         num_agreeing: links that the similarity brings within the tolerance for poses.
+        reason: why it is not to be trusted, with the numbers; empty if it is.
     """
 
     target_from_source: Array
     num_links: int
     num_agreeing: int
+    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,8 @@ class _Checks:
 
 def find_joint(
     target: Reconstruction, source: Reconstruction, correspondences: Correspondences, options: MappingOptions
-) -> Joint | None:
-    """The similarity between two models that most of their links agree with, or None.
+) -> Joint:
+    """The similarity between two models that most of their links agree with.
 
     Args:
         target, source: models over the same tracks; images that both hold count as the target's.
@@ -107,8 +109,11 @@ def find_joint(
         options: thresholds. At least ``min_pose_inliers`` links must agree, and two fifths of all.
     """
     checks = _checks(target, source, correspondences)
-    if checks.num_links < options.min_pose_inliers:
-        return None
+    needed = max(options.min_pose_inliers, math.ceil(MIN_LINK_SHARE * checks.num_links))
+    nothing = np.full(8, np.nan)
+    if checks.num_links < needed:
+        reason = f"they see {checks.num_links} points in common, at least {needed} are needed"
+        return Joint(nothing, checks.num_links, 0, reason)
     tolerance_px = options.max_pose_error_px
     hypotheses = np.concatenate(
         [
@@ -118,15 +123,16 @@ def find_joint(
     )
     hypotheses = hypotheses[np.isfinite(hypotheses).all(axis=1) & (hypotheses[:, 7] > 0)]
     if len(hypotheses) == 0:
-        return None
+        return Joint(nothing, checks.num_links, 0, "no three points and no image tell how they lie to each other")
     cost, _ = _scores(hypotheses, checks, SEARCH_FACTOR * tolerance_px)
     best = hypotheses[np.argsort(cost, kind="stable")[:NUM_REFINED]]
     refined = np.array([_refined(sim, checks, tolerance_px) for sim in best])
     cost, agreeing = _scores(refined, checks, tolerance_px)
     chosen = int(np.argmin(cost))
-    if agreeing[chosen] < max(options.min_pose_inliers, MIN_LINK_SHARE * checks.num_links):
-        return None
-    return Joint(refined[chosen], checks.num_links, int(agreeing[chosen]))
+    num_agreeing, reason = int(agreeing[chosen]), ""
+    if num_agreeing < needed:
+        reason = f"{num_agreeing} of {checks.num_links} common points agree on one place, at least {needed} are needed"
+    return Joint(refined[chosen], checks.num_links, num_agreeing, reason)
 
 
 def in_common_cameras(
@@ -180,8 +186,10 @@ def holds_together(
     source: Reconstruction,
     correspondences: Correspondences,
     options: MappingOptions,
-) -> bool:
-    """Whether the pairs between two models agree with their union, and each model is none the worse for it.
+) -> str:
+    """What speaks against the union of two models, with the numbers: empty if it holds together.
+
+    The pairs between the two must agree with it, and each model may be none the worse for it.
 
     Args:
         union: of the target and the source, adjusted.
@@ -189,20 +197,26 @@ def holds_together(
     """
     lost = (target.is_registered | source.is_registered) & ~union.is_registered
     sides = (target.is_registered, source.is_registered & ~target.is_registered)
-    if lost.any() or num_linking_points(union, sides[1], sides[0]) < options.min_pose_inliers:
-        return False
-    for model, side in zip((target, source), sides, strict=True):
-        own = side[model.tracks.obs_image_idx]
-        if (union.obs_is_inlier & own).sum() < MIN_KEPT * (model.obs_is_inlier & own).sum():
-            return False
+    if lost.any():
+        return f"adjusted as one, {int(lost.sum())} images lose their support"
+    if (linking := num_linking_points(union, sides[1], sides[0])) < options.min_pose_inliers:
+        return f"adjusted as one, {linking} common points are left"
     agreement = pair_agreement(union, correspondences)
+    for model, side in zip((target, source), sides, strict=True):
+        alone = pair_agreement(model, correspondences)
+        kept, before = (
+            int(found.num_agreeing[side[found.image_idx].all(axis=1)].sum()) for found in (agreement, alone)
+        )
+        if kept < MIN_KEPT * before:
+            return f"adjusted as one, {kept} of the {before} matches that agree with one of them do so still"
     first, second = agreement.image_idx.T
     between = (sides[0][first] & sides[1][second]) | (sides[1][first] & sides[0][second])
-    between &= agreement.num_matches >= MIN_MATCHES
     matches, agreeing, shared = (
         int(count[between].sum()) for count in (agreement.num_matches, agreement.num_agreeing, agreement.num_shared)
     )
-    return agreeing > AGREES * matches and shared > CONTRADICTS * agreeing
+    if not (agreeing > AGREES * matches and shared > CONTRADICTS * agreeing):
+        return f"adjusted as one, {agreeing} of {matches} verified matches between them agree, {shared} support a point"
+    return ""
 
 
 # ---------------------------------------------------------------------- links

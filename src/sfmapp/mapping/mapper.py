@@ -85,7 +85,7 @@ class Mapper:
             self.events.decided(STAGE, f"no initial pair; relaxing to {inliers} matches")
 
     def _initial_angles(self) -> list[float]:
-        """The median angle that an initial pair should have, and its halves; what is too narrow makes no point anyway."""
+        """The median angle that an initial pair should have, and its halves: narrow ones make few points anyway."""
         angles = [self.options.min_initial_angle_deg]
         while angles[-1] >= self.options.min_triangulation_angle_deg:
             angles.append(angles[-1] / 2)
