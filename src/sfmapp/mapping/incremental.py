@@ -21,7 +21,7 @@ from sfmapp.contradictions import Contradiction
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.images.folder import ImageSet
-from sfmapp.mapping import structure, verified_pairs
+from sfmapp.mapping import join, mend, structure, verified_pairs
 from sfmapp.mapping.focal import estimate_focal_ratio
 from sfmapp.mapping.intrinsics_check import (
     MapFrom,
@@ -33,6 +33,7 @@ from sfmapp.mapping.intrinsics_check import (
 from sfmapp.mapping.join import find_joint, holds_together, in_common_cameras, unite
 from sfmapp.mapping.look_alikes import tell_apart
 from sfmapp.mapping.mapper import STAGE, Mapper
+from sfmapp.mapping.mend import mended
 from sfmapp.mapping.merge import find_merge, merge, num_linking_points
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images
@@ -99,6 +100,7 @@ def map_images(
             models, initial_reports = _grow_models(empty, mapper_of, options, events)
             models = _merge_models(_without_parts(models), mapper_of, found, options, events)
             models = _with_left_over(models, mapper_of, found, events)
+            models = [mended(model, found, mapper_of, options, events) for model in models]
             return Mapped(cameras, models, initial_reports, focal_report, attempts, mapper_of)
 
         def map_all(given: list[Camera]) -> Mapped:
@@ -392,4 +394,6 @@ def compile_kernels() -> None:
     structure.compile_kernels()
     rank_next_images(model, np.arange(3))
     verified_pairs.compile_kernels()
+    join.compile_kernels()
+    mend.compile_kernels()
     solver.compile_kernels()

@@ -18,7 +18,7 @@ from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_in
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
 from sfmapp.mapping.tracks import USELESS_CONFIGS
-from sfmapp.mapping.verified_pairs import pair_agreement
+from sfmapp.mapping.verified_pairs import MIN_MATCHES, pair_agreement
 from sfmapp.scene.camera import PARAM_NAMES, Camera
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
@@ -122,7 +122,8 @@ class Mapper:
                     self.adjust_around(registered)
                 self._decided(f"registered {self._names(registered)}", registered)
                 self.events.advanced(STAGE, len(registered))
-            if not self._candidates().size or self._size() == self.size_at_global:
+            taken_back = self._drop_contradicted_images()
+            if not taken_back and (not self._candidates().size or self._size() == self.size_at_global):
                 return
             # a second chance: the adjusted map may hold more points and better poses
             self.adjust_globally()
@@ -409,10 +410,45 @@ class Mapper:
         structure.filter_observations(reconstruction, self.options, self.pool, None, self.max_error_px)
         for i in dropped.tolist():
             reason = f"{counts[i]} of {visible[i]} observations hold after the adjustment: too few to trust the pose"
-            self.attempts[i] = Registration(i, int(visible[i]), int(counts[i]), None, reason=reason)
-            self.failed_with[i] = int(visible[i])
-            self.times_dropped[i] = self.times_dropped.get(i, 0) + 1
-            self.events.decided(STAGE, f"took back {reconstruction.image_names[i]}: {reason}")
+            self._take_back(i, int(visible[i]), int(counts[i]), reason)
+
+    def _drop_contradicted_images(self) -> bool:
+        """Take back images that most of their own verified matches contradict, the worst first; True if there are any.
+
+        What contradicts one image of a pair contradicts the other: once the wrong one is gone, nothing speaks against
+        its neighbours any more.
+        """
+        reconstruction = self.reconstruction
+        found = pair_agreement(reconstruction, self.correspondences)
+        weight = np.where(found.num_matches >= MIN_MATCHES, found.num_matches, 0)
+        against = weight * found.contradicts
+        num_images = len(reconstruction.image_names)
+        dropped: list[int] = []
+        while reconstruction.is_registered.sum() - len(dropped) > 3:
+            total, bad = (
+                np.bincount(found.image_idx.ravel(), weights=w.repeat(2), minlength=num_images)
+                for w in (weight, against)
+            )
+            share = bad / np.maximum(total, 1)
+            worst = int(np.argmax(share))
+            if share[worst] <= 0.5:
+                break
+            dropped.append(worst)
+            touching = (found.image_idx == worst).any(axis=1)
+            weight, against = np.where(touching, 0, weight), np.where(touching, 0, against)
+            reason = f"{int(bad[worst])} of its {int(total[worst])} verified matches contradict its pose"
+            self._take_back(worst, int(total[worst]), int(total[worst] - bad[worst]), reason)
+        if dropped:
+            reconstruction.cam_from_world[dropped] = np.nan
+            structure.filter_observations(reconstruction, self.options, self.pool, None, self.max_error_px)
+        return bool(dropped)
+
+    def _take_back(self, image_idx: int, num_correspondences: int, num_inliers: int, reason: str) -> None:
+        """Note that an image is unregistered again, and why."""
+        self.attempts[image_idx] = Registration(image_idx, num_correspondences, num_inliers, None, reason=reason)
+        self.failed_with[image_idx] = num_correspondences
+        self.times_dropped[image_idx] = self.times_dropped.get(image_idx, 0) + 1
+        self.events.decided(STAGE, f"took back {self.reconstruction.image_names[image_idx]}: {reason}")
 
     # ---------------------------------------------------------------- helpers
 
