@@ -22,6 +22,9 @@ _SIGMA_USER_FOCAL, _SIGMA_USER_PARAMS = 0.03, 0.01
 _SERIES_SHARE = 0.9
 # That many names that differ in their numbers alone make a series of their own.
 _SERIES_LENGTH = 5
+# Editors and converters write a focal length as another fraction, which changes its fifth digit or a later one; the
+# nearest settings of a zoom are about a per cent apart, and focusing alone changes the picture by more than this.
+_SAME_FOCAL = 1e-3
 _SOURCE_RANK = ("exif_35mm", "exif_sensor", "default")
 
 
@@ -137,10 +140,12 @@ def _automatic_keys(shots: Sequence[Shot]) -> tuple[list[Hashable], list[str]]:
     rules = ["on its own: EXIF does not tell the camera, and the series has other sizes"] * len(shots)
     series: defaultdict[Hashable, list[int]] = defaultdict(list)
     templates = Counter(_template(shot) for shot in shots if not _tells_camera(shot.facts))
+    focal_mm = _without_rounding([shot.facts.focal_mm for shot in shots])
+    focal_35mm = _without_rounding([shot.facts.focal_35mm for shot in shots])
     for i, shot in enumerate(shots):
         if _tells_camera(shot.facts):
             facts = shot.facts
-            lens = (facts.make, facts.model, facts.lens, facts.serial, facts.focal_mm, facts.focal_35mm)
+            lens = (facts.make, facts.model, facts.lens, facts.serial, focal_mm[i], focal_35mm[i])
             keys[i] = ("exif", *lens, shot.width, shot.height)
             rules[i] = "EXIF: same make, model, lens, focal length and size"
             continue
@@ -157,6 +162,16 @@ def _automatic_keys(shots: Sequence[Shot]) -> tuple[list[Hashable], list[str]]:
                 keys[i] = ("series", key, shots[i].width, shots[i].height)
                 rules[i] = "no EXIF: same folder, file type, manner of naming and size"
     return keys, rules
+
+
+def _without_rounding(focals: Sequence[float | None]) -> list[float | None]:
+    """The focal lengths with all that are the same but for their rounding replaced by the shortest of them."""
+    shortest: dict[float, float] = {}
+    first = 0.0
+    for focal in sorted({focal for focal in focals if focal is not None}):
+        first = first if focal <= (1.0 + _SAME_FOCAL) * first else focal
+        shortest[focal] = first
+    return [None if focal is None else shortest[focal] for focal in focals]
 
 
 def _tells_camera(facts: ExifFacts) -> bool:

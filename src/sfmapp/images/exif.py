@@ -27,8 +27,8 @@ _FOCAL_MM = (0.1, 10_000.0)
 #   Sensor: the nominal focal length of a zoom and the sensor are each good to 2 %.
 #   Unknown crop: 16:9 from 4:3 or 3:2 changes the answer by up to 8 %, an editor's crop by anything.
 #   Default: fields of view of common lenses lie between 25 and 90 degrees, a factor of two around 1.2.
-_SIGMA_35MM, _SIGMA_SENSOR, _SIGMA_FRAME, _SIGMA_CROP, _SIGMA_DEFAULT = 0.05, 0.03, 0.10, 0.20, 0.50
-_DEFAULT_FOCAL = 1.2
+_SIGMA_35MM, _SIGMA_SENSOR, _SIGMA_FRAME, _SIGMA_CROP = 0.05, 0.03, 0.10, 0.20
+DEFAULT_FOCAL, DEFAULT_FOCAL_SIGMA = 1.2, 0.50
 
 # Long side of the sensor in mm, for cameras that leave out the 35 mm equivalent. First match of "make model" counts.
 _SENSOR_WIDTH_MM: tuple[tuple[str, float], ...] = (
@@ -222,8 +222,8 @@ def focal_prior(facts: ExifFacts, width: int, height: int) -> FocalPrior:
         if _is_believable(focal / long_side, reason, problems):
             sigma = _SIGMA_CROP if is_cropped else _SIGMA_SENSOR
             return FocalPrior(focal, sigma * focal, "exif_sensor", reason, tuple(problems))
-    focal = _DEFAULT_FOCAL * long_side
-    return FocalPrior(focal, _SIGMA_DEFAULT * focal, "default", "1.2 times the long side", tuple(problems))
+    focal = DEFAULT_FOCAL * long_side
+    return FocalPrior(focal, DEFAULT_FOCAL_SIGMA * focal, "default", "1.2 times the long side", tuple(problems))
 
 
 def _is_cropped(facts: ExifFacts, long_side: float, short_side: float) -> bool:

@@ -13,7 +13,7 @@ from sfmapp.scene.features import Features
 from sfmapp.scene.tracks import Tracks, make_tracks
 
 # Pairs whose matches say nothing about depth or are not of the scene at all.
-_USELESS = (TwoViewConfig.UNDEFINED, TwoViewConfig.DEGENERATE, TwoViewConfig.WATERMARK)
+USELESS_CONFIGS = (TwoViewConfig.UNDEFINED, TwoViewConfig.DEGENERATE, TwoViewConfig.WATERMARK)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -82,7 +82,7 @@ def build_tracks(correspondences: Correspondences, features: Sequence[Features])
     counts = np.array([len(f) for f in features], np.int64)
     offset = np.concatenate([[0], np.cumsum(counts)])
     image_of_node = np.repeat(np.arange(len(features), dtype=np.int32), counts)
-    useful = ~np.isin(correspondences.config, _USELESS)
+    useful = ~np.isin(correspondences.config, USELESS_CONFIGS)
     pairs = np.flatnonzero(useful)
     pairs = pairs[np.argsort(-correspondences.num_inliers[pairs], kind="stable")]
     empty = np.zeros((0, 2), np.int64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -66,3 +66,15 @@ class Correspondences:
     def matches_of_pair(self, pair_idx: int) -> NDArray[np.int32]:
         """(K, 2) keypoint positions of a pair."""
         return self.matches[self.pair_ptr[pair_idx] : self.pair_ptr[pair_idx + 1]]
+
+    def without(self, pair_idx: NDArray[np.integer]) -> Correspondences:
+        """The same without the matches of some pairs, which stay in as UNDEFINED."""
+        kept = np.ones(self.num_pairs, bool)
+        kept[pair_idx] = False
+        counts = self.num_inliers
+        return replace(
+            self,
+            pair_ptr=np.concatenate([[0], np.cumsum(np.where(kept, counts, 0))]),
+            matches=self.matches[np.repeat(kept, counts)],
+            config=np.where(kept, self.config, TwoViewConfig.UNDEFINED).astype(np.int8),
+        )
