@@ -20,7 +20,8 @@ from sfmapp.events import Events
 from sfmapp.images.folder import ImageSet
 from sfmapp.mapping import structure
 from sfmapp.mapping.focal import estimate_focal_ratio
-from sfmapp.mapping.intrinsics_check import Mapped, check_intrinsics, settle_focal_lengths
+from sfmapp.mapping.focal_priors import Mapped, settle_focal_lengths
+from sfmapp.mapping.intrinsics_check import check_intrinsics
 from sfmapp.mapping.mapper import STAGE, Mapper
 from sfmapp.mapping.merge import find_merge, merge, num_linking_points
 from sfmapp.mapping.options import MappingOptions
