@@ -7,9 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from nadir_block import nadir_block
-from test_mapping import center_errors, inputs
 
+from nadir_block import nadir_block
 from sfmapp.adjust.solver import AdjustOptions
 from sfmapp.events import Events
 from sfmapp.mapping.incremental import map_images
@@ -17,6 +16,7 @@ from sfmapp.mapping.options import MappingOptions
 from sfmapp.report.document import camera_rows, make_checks
 from sfmapp.scene.camera import Camera, CameraModel, simple_camera
 from sfmapp.scene.synthetic import SyntheticScene, make_scene
+from test_mapping import center_errors, inputs
 
 TRUE = simple_camera(CameraModel.SIMPLE_RADIAL, 1000, 750, 900.0)
 
