@@ -215,7 +215,7 @@ def _reduce(  # type: ignore[no-untyped-def]
     track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, fisheye, penalty, directions,
     fields, loss, scale2, weight, longest, system, cross,
 ):  # fmt: skip
-    """Add the tracks, points eliminated, to the upper half of the system over poses (F * 6), and to cross (F * 6, Q)."""
+    """Add the tracks, points eliminated, to the upper half of a system over poses (F * 6), and to cross (F * 6, Q)."""
     num = directions.shape[2]
     J, frames = np.zeros(SCRATCH), np.zeros(longest, np.int64)
     pose_part, lens_part = np.zeros((2 * longest, 6)), np.zeros((2 * longest, num))

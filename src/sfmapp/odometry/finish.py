@@ -25,8 +25,8 @@ from sfmapp.scene.rig import Rig
 Array = NDArray[np.float64]
 
 STAGE = "adjustment"
-# A rolling shutter has to explain this much, in units of the noise. Independent noise alone explains 1; errors of patches
-# are not independent, and exact cameras of rendered sequences show up to 30.
+# A rolling shutter has to explain this much, in units of the noise. Independent noise alone explains 1; errors of
+# patches are not independent, and exact cameras of rendered sequences show up to 30.
 MIN_EVIDENCE = 90.0
 # Covariances take two dense matrices over all poses.
 _MAX_COVARIANCE_KEYFRAMES = 400
@@ -115,8 +115,8 @@ def _question(model: Reconstruction, cost: float, sigma: float, options: Odometr
     if answer.scale_sigma is not None and answer.scale_sigma > _SCALE_OPEN:
         events.warned(
             STAGE,
-            f"the unit of length is known to {answer.scale_sigma:.1%} only: on so straight a path, or with points so far, "
-            "the images do not tell how long the lenses are and how the cameras are turned against each other",
+            f"the unit of length is known to {answer.scale_sigma:.1%} only: on so straight a path, or with points so "
+            "far, the images do not tell how long the lenses are and how the cameras are turned against each other",
         )
     return answer
 
