@@ -278,3 +278,10 @@ def _by_track(  # type: ignore[no-untyped-def]
                 gradient[t, q] += value * residual[r]  # the rows hold nothing of the point any more
                 for p in range(num):
                     information[t, q, p] += value * lens_part[r, p]
+
+
+def compile_kernels() -> None:
+    """Compile the kernels of this module, or load them from numba's cache."""
+    from sfmapp.scene.synthetic import make_scene
+
+    reduce_to_calibration(make_scene(0, 3, 24).observed, np.zeros((1, RAW, 1)), 1.0)

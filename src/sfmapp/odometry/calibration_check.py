@@ -181,21 +181,19 @@ def question_calibration(model: Reconstruction, cost: float, sigma: float, *, ma
     if first is None:
         is_rig = len(model.cameras) > 1
         return Answer(model, False, {"is_refined": False}, [], BASELINE_SIGMA if is_rig else None)
-    if not may_refine:
-        return _kept(first, first, unknowns, {"is_refined": False}, [])
+    limit = _SHARED_ERRORS * float(chi2.isf(_MAX_CHANCE, len(first.x)))
+    surprise = float(first.step @ first.data_information @ first.step)
+    if not may_refine or surprise < limit:
+        return _kept(first, first, unknowns, _report(first, surprise, limit, unknowns), [])
     last = _settle(first, sigma, unknowns)
     surprise = float(last.x @ last.data_information @ last.x)
-    limit = _SHARED_ERRORS * float(chi2.isf(_MAX_CHANCE, len(last.x)))
     basis, held_out = _held_out(last)
     far = last.priors > unknowns.sigmas
     known = (np.sqrt(np.diag(last.covariance)) < _MAX_UNSURE * np.abs(last.x))[far].all()
     settled = last.step_sigmas < _SETTLED_SIGMAS * _ROUNDS
     agree = held_out[:-1] > _MIN_DIRECTION_SIGMAS
-    report = {
-        "surprise": surprise, "max_surprise": limit, "held_out_sigmas": float(held_out[-1]),
-        "direction_sigmas": held_out[:-1].tolist(),
-        "noise_inflation": last.noise, "is_settled": settled, "change": unknowns.named(last.x),
-        "sigma": unknowns.named(np.sqrt(np.diag(last.covariance))),
+    report = _report(last, surprise, limit, unknowns) | {
+        "held_out_sigmas": float(held_out[-1]), "direction_sigmas": held_out[:-1].tolist(), "is_settled": settled,
         "given": [c.params.tolist() for c in model.cameras],
     }  # fmt: skip
     is_better = last.cost < first.cost and held_out[-1] > _MIN_HELD_OUT_SIGMAS
@@ -213,7 +211,16 @@ def question_calibration(model: Reconstruction, cost: float, sigma: float, *, ma
             }  # fmt: skip
             return _refined(refined, unknowns, report)
     found = [_contradiction(first, last, report, unknowns)] if surprise > limit and far.any() else []
-    return _kept(first, last, unknowns, report | {"is_refined": False}, found)
+    return _kept(first, last, unknowns, report, found)
+
+
+def _report(look: _Look, surprise: float, limit: float, unknowns: Unknowns) -> dict[str, Any]:
+    """What the images would change, how sure they are of it, and how much is needed to be believed."""
+    change = look.x if look.x.any() else look.step
+    return {
+        "is_refined": False, "surprise": surprise, "max_surprise": limit, "noise_inflation": look.noise,
+        "change": unknowns.named(change), "sigma": unknowns.named(np.sqrt(np.diag(look.covariance))),
+    }  # fmt: skip
 
 
 # ------------------------------------------------------------------ what the images say
