@@ -76,7 +76,7 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -
     job.model = model = answer.model
     report["sigma_px"] = classify(model, job.num_elsewhere)
     take_over(job, keyframes)
-    keyframes.rig = _rig_of(model)
+    keyframes.rig = rig_of(model)
     covariance, gauge = None, ""
     if options.covariance and 1 < len(everything) <= _MAX_COVARIANCE_KEYFRAMES:
         covariance, gauge = _covariance(model, len(keyframes.rig.cameras))
@@ -96,7 +96,7 @@ def _conclude_large(keyframes: KeyframeMap, options: OdometryOptions, events: Ev
     answer = _question(job.model, cost, sigma, options, events)
     report["camera"] = answer.report
     if answer.is_refined:
-        keyframes.rig = _rig_of(answer.model)
+        keyframes.rig = rig_of(answer.model)
         if answer.model.rig is not None:
             _rescale(keyframes, spread(answer.model) / spread(job.model))
     sweep(keyframes, options, events)
@@ -121,7 +121,8 @@ def _question(model: Reconstruction, cost: float, sigma: float, options: Odometr
     return answer
 
 
-def _rig_of(model: Reconstruction) -> Rig:
+def rig_of(model: Reconstruction) -> Rig:
+    """The cameras of a map's model, and where they sit."""
     return Rig(tuple(model.cameras), rigid3.IDENTITY[None] if model.rig is None else model.rig.cam_from_rig)
 
 
