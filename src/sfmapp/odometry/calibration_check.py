@@ -41,8 +41,9 @@ _RADIAL_SIGMA, _TANGENTIAL_SIGMA = 0.02, 0.002
 _TURN_SIGMA_DEG = 0.05
 # A board measures the baseline of a rig to some thousandths.
 BASELINE_SIGMA = 0.002
-# Smooth fields that no lens model has: rectification leaves a tenth of a pixel, as a calibration's own residuals do.
-_FIELD_SIGMA_PX, _FIELD_DEGREES = 0.1, (2, 3)
+# Smooth fields that no lens model has: rectification leaves a tenth of a pixel, as a calibration's own residuals do;
+# where the images show more of them, up to twice that, rounds of finding out.
+_FIELD_SIGMA_PX, _MAX_FIELD_SIGMA_PX, _FIELD_STEPS, _FIELD_DEGREES = 0.1, 0.2, 3, (2, 3)
 # Tracks that began within so many frames of the map, in the same cell (columns, rows) of the image, share errors of
 # their patches. Small maps have too few such clusters to tell how errors are spread, and get by with smaller ones, in
 # the end with single tracks: there have to be that many for each unknown.
@@ -143,7 +144,7 @@ class _Look:
         x: (Q,) change from the given calibration so far. cost: of the adjustment, in units of the noise.
         system: its last N unknowns are amplitudes of smooth fields.
         noise: how much more the data vary than independent errors would. clusters: (T,) whose errors are shared.
-        priors: (Q,) standard deviations around the given calibration.
+        priors: (Q,) standard deviations around the given calibration. field_prior: information of an amplitude.
         step: (Q,) to where the cost and the priors are least. covariance: (Q, Q) of that.
     """
 
@@ -154,6 +155,7 @@ class _Look:
     noise: float
     clusters: NDArray[np.int64]
     priors: Array
+    field_prior: float
     step: Array
     covariance: Array
 
@@ -183,7 +185,7 @@ def question_calibration(model: Reconstruction, cost: float, sigma: float, *, ma
         return Answer(model, False, {"is_refined": False}, [], BASELINE_SIGMA if is_rig else None)
     limit = _SHARED_ERRORS * float(chi2.isf(_MAX_CHANCE, len(first.x)))
     surprise = float(first.step @ first.data_information @ first.step)
-    if not may_refine or surprise < limit:
+    if not may_refine or surprise < limit / _SHARED_ERRORS:
         return _kept(first, first, unknowns, _report(first, surprise, limit, unknowns), [])
     last = _settle(first, sigma, unknowns)
     surprise = float(last.x @ last.data_information @ last.x)
@@ -258,12 +260,13 @@ def _look(model: Reconstruction, x: Array, cost: float, sigma: float, unknowns: 
     np.add.at(scores, clusters, system.gradient + system.information @ away)
     scatter = scores.T @ scores * num_clusters / (num_clusters - 1)
     noise = max(1.0, float(np.trace(np.linalg.solve(weak, scatter))) / len(gradient))
-    priors = unknowns.priors(x)
-    prior = np.concatenate([priors, np.full(len(gradient) - num, _FIELD_SIGMA_PX)]) ** -2.0
-    off = np.concatenate([x, np.zeros(len(gradient) - num)])
-    covariance = np.linalg.inv(information / noise + np.diag(prior))
-    step = -(covariance @ (gradient / noise + prior * off))
-    found = _Look(model, x, cost, system, noise, clusters, priors, step[:num], covariance[:num, :num])
+    priors, off, field_sigma = unknowns.priors(x), np.concatenate([x, np.zeros(len(gradient) - num)]), _FIELD_SIGMA_PX
+    for _ in range(_FIELD_STEPS):
+        prior = np.concatenate([priors, np.full(len(gradient) - num, field_sigma)]) ** -2.0
+        covariance = np.linalg.inv(information / noise + np.diag(prior))
+        step = -(covariance @ (gradient / noise + prior * off))
+        field_sigma = float(np.clip(np.sqrt((step[num:] ** 2).mean()), _FIELD_SIGMA_PX, _MAX_FIELD_SIGMA_PX))
+    found = _Look(model, x, cost, system, noise, clusters, priors, prior[-1], step[:num], covariance[:num, :num])
     return found if np.isfinite(covariance).all() and np.isfinite(step).all() else None
 
 
@@ -302,7 +305,7 @@ def _held_out(look: _Look) -> tuple[Array, Array]:
         deviations, which are those of its sum over the clusters.
     """
     system, num = look.system, len(look.x)
-    prior = np.concatenate([look.priors, np.full(system.gradient.shape[1] - num, _FIELD_SIGMA_PX)]) ** -2.0
+    prior = np.concatenate([look.priors**-2.0, np.full(system.gradient.shape[1] - num, look.field_prior)])
     off = np.concatenate([look.x, np.zeros(len(prior) - num)])
     _, basis = eigh(look.data_information, np.diag(prior[:num]))
     coordinates = np.linalg.inv(basis)
