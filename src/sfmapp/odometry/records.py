@@ -125,5 +125,5 @@ def _map_result(keyframes: KeyframeMap, conclusion: Conclusion) -> MapResult:
     return MapResult(
         model, np.array([k.frame_idx for k in keyframes.keyframes], np.int64),
         np.arange(num, dtype=np.int64) * num_sensors, covariance, conclusion.gauge,
-        "stereo" if num_sensors > 1 else "none", widened_scale_sigma(0.0 if num_sensors > 1 else None, found), found,
+        "stereo" if num_sensors > 1 else "none", widened_scale_sigma(conclusion.scale_sigma, found), found,
     )  # fmt: skip

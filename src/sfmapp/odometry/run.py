@@ -13,6 +13,7 @@ from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Frame, Sequence
 from sfmapp.odometry.active_tracks import ActiveTracks
+from sfmapp.odometry.early_calibration import is_time_to_ask, refine_early
 from sfmapp.odometry.finish import conclude
 from sfmapp.odometry.inertial import imu_rotation
 from sfmapp.odometry.initialize import Beginning, TwoViews, pose_between
@@ -45,6 +46,7 @@ class Odometry:
         self, sequence: Sequence, options: OdometryOptions, *, seed: int, threads: int, events: Events
     ) -> None:
         self.rig, self.options, self.seed, self.events = sequence.rig, options, seed, events
+        self.given_rig, self.is_refined, self.asked = sequence.rig, False, set[tuple[int, int]]()
         self.executor = ThreadPoolExecutor(1, "adjust") if threads > 1 else None
         self.records: list[FrameRecord] = []
         self.maps: dict[int, LocalMap] = {}
@@ -199,6 +201,28 @@ class Odometry:
         self._settle(record, state, self.pose, is_keyframe=True)
         self._remember(view)
         self._tell(reason, num_tracks=len(self.tracks), num_mapped=self.num_mapped_at_keyframe)
+        self._question_calibration(record)
+
+    def _question_calibration(self, record: FrameRecord) -> None:
+        """Go on with a refined calibration as soon as the map, whose newest keyframe is the frame, tells one."""
+        local = self.local
+        assert local is not None
+        asked = (local.map_idx, local.newest)
+        if not self.options.refine_camera or self.is_refined or asked in self.asked or not is_time_to_ask(local):
+            return
+        self.asked.add(asked)
+        self._take_over(local, None)
+        before, is_refined = local.pose(local.newest), refine_early(local)
+        self.pose = local.pose(local.newest)
+        if not is_refined:
+            return
+        self.is_refined, self.rig = True, local.rig
+        record.live = self.pose.copy()
+        scale = np.linalg.norm(self.pose[4:]) / max(float(np.linalg.norm(before[4:])), 1e-300)
+        self.step = self.step * np.repeat([1.0, scale], [4, 3])
+        self.tracks = local.tracks_of_newest()
+        self._count_mapped()
+        self._tell("the images contradict the given calibration: going on with a refined one", everything=True)
 
     def _cull(self, local: LocalMap) -> None:
         """Drop a keyframe that adds nothing, once it has left the window."""
@@ -322,6 +346,8 @@ class Odometry:
             maps[number] = local.keyframes
             self.events.started("adjustment", f"adjusting {local.newest + 1} keyframes together")
             straightened = self._straighten(local)
+            if not is_too_large(local.keyframes):
+                local.keyframes.rig = self.given_rig  # what is given is questioned once more, by all there is
             conclusions[number] = conclude(local.keyframes, self.options, self.events)
             conclusions[number].report["shutter"] = straightened
             measure_again(self.records, local.keyframes, number)

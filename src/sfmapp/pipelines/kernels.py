@@ -28,6 +28,7 @@ ODOMETRY_MODULES = (
     "sfmapp.geometry.epipolar",
     "sfmapp.mapping.structure",
     "sfmapp.adjust.solver",
+    "sfmapp.adjust.calibration",
     "sfmapp.odometry.relocalize",
     "sfmapp.odometry.pose_graph",
 )
