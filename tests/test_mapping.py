@@ -13,6 +13,7 @@ from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.mapping.incremental import map_images
 from sfmapp.mapping.options import MappingOptions
+from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.scene.camera import CameraModel, simple_camera
 from sfmapp.scene.correspondences import TwoViewConfig
 from sfmapp.scene.features import Features
@@ -200,3 +201,18 @@ def test_an_image_that_cannot_be_registered_is_explained():
     assert "verified matches" in report["images"][7]["reason"] or "points of the map" in report["images"][7]["reason"]
     angle = rigid3.rotation_angle_deg(rigid3.rotation_matrix(models[0].cam_from_world[:7]))
     assert np.isfinite(angle).all()
+
+
+def test_residual_scale_leaves_out_points_behind_their_camera() -> None:
+    model = make_scene(0, 6, 80).observed.copy()
+    model.obs_is_inlier[:] = True
+    before = residual_scale_px(model)
+    assert 0.0 < before < np.inf
+    center = rigid3.center(model.cam_from_world[model.tracks.obs_image_idx[0]])
+    point = model.tracks.obs_track_idx[0]
+    model.point_xyz[point] = center - 0.1 * (model.point_xyz[point] - center)
+    assert residual_scale_px(model) == pytest.approx(before, rel=0.1)
+    assert residual_scale_px(model, 2 * before) == 2 * before
+    model.obs_is_inlier[:] = False
+    assert np.isnan(residual_scale_px(model))
+    assert residual_scale_px(model, 0.5) == 0.5

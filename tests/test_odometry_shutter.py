@@ -86,6 +86,16 @@ def test_global_shutter_is_left_alone() -> None:
         np.testing.assert_array_equal(keyframe.rig_from_world, pose)
 
 
+def test_a_point_behind_its_camera_does_not_decide() -> None:
+    keyframes, records = make_map(0.0)
+    center = rigid3.center(keyframes.keyframes[0].rig_from_world)
+    behind = keyframes.keyframes[0].point_id[3]
+    keyframes.point_xyz[behind] = center - 0.1 * (keyframes.point_xyz[behind] - center)
+    found = straighten(records, keyframes, 0)
+    assert found["readout"] == 0.0
+    assert 0.0 <= found["evidence"] < found["min_evidence"]
+
+
 def test_frames_without_neighbours_say_nothing() -> None:
     keyframes, records = make_map(0.6)
     for record in records:

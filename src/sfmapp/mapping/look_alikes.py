@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Events
-from sfmapp.mapping.intrinsics_check import Mapped
+from sfmapp.mapping.focal_priors import Mapped
 from sfmapp.mapping.mapper import STAGE
 from sfmapp.mapping.verified_pairs import NUM_NAMED, Chains, Standing, standing_pairs
 from sfmapp.scene.correspondences import Correspondences

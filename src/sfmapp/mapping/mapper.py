@@ -334,7 +334,7 @@ class Mapper:
         cameras = self.reconstruction.cameras
         size = max(max(c.width, c.height) for c, is_chosen in zip(cameras, chosen, strict=True) if is_chosen)
         # the adjustment counts residuals in pixels; the prior is weighed against them at their true noise
-        noise_px = max(structure.residual_scale_px(self.reconstruction), 0.1)
+        noise_px = structure.residual_scale_px(self.reconstruction, 0.1)
         sigma_px = self.options.principal_point_sigma * size / noise_px
         return replace(options, refine_principal_point=True, principal_point_sigma_px=sigma_px)
 

@@ -51,15 +51,22 @@ def filter_observations(
     return _over_chunks(triangulation.classify_observations, reconstruction, tracks, options, pool, max_error_px)
 
 
-def residual_scale_px(reconstruction: Reconstruction) -> float:
-    """Robust standard deviation of one residual coordinate of the inliers in pixels; NaN without observations.
+def residual_scale_px(reconstruction: Reconstruction, at_least: float = math.nan) -> float:
+    """Robust standard deviation of one residual coordinate of the inliers in pixels.
 
-    The length of a residual of two normal coordinates is Rayleigh distributed with median 1.1774 sigma.
+    The length of a residual of two normal coordinates is Rayleigh distributed with median 1.1774 sigma. Inliers that
+    have come to lie behind their camera have no residual and are left out.
+
+    Args:
+        reconstruction: what is measured.
+        at_least: returned where the residuals are shorter, or where there is none.
     """
-    used = reconstruction.obs_is_inlier
-    if not used.any():
-        return math.nan
-    return float(np.median(np.linalg.norm(reconstruction.residuals_px()[used], axis=1)) / 1.1774)
+    lengths = np.linalg.norm(reconstruction.residuals_px()[reconstruction.obs_is_inlier], axis=1)
+    lengths = lengths[np.isfinite(lengths)]
+    if not len(lengths):
+        return at_least
+    scale = float(np.median(lengths) / 1.1774)
+    return at_least if scale < at_least else scale
 
 
 def _over_chunks(

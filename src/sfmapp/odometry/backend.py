@@ -90,7 +90,7 @@ def run_job(job: Job) -> Job:
     model = job.model
     num_sensors = len(model.image_names) // max(1, len(job.keyframe_idx))
     options = AdjustOptions(
-        loss="cauchy", loss_scale_px=max(_MIN_LOSS_PX, _LOSS_SIGMAS * residual_scale_px(model)),
+        loss="cauchy", loss_scale_px=_LOSS_SIGMAS * residual_scale_px(model, _MIN_LOSS_PX / _LOSS_SIGMAS),
         max_iterations=_WINDOW_STEPS, relative_cost_tolerance=1e-4, refine_focal=False, refine_distortion=False,
     )  # fmt: skip
     adjust_bundle(model, options, variable_images=np.repeat(job.is_variable, num_sensors))

@@ -66,7 +66,7 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -
     job = make_job(keyframes, everything, everything > 0)
     model, report = job.model, dict[str, Any]()
     for steps in (_FIRST_STEPS, _MAX_STEPS):  # which observations agree is clear long before all have settled
-        sigma = max(residual_scale_px(model), MIN_SIGMA_PX)
+        sigma = residual_scale_px(model, MIN_SIGMA_PX)
         cost = adjust_poses(model, sigma, steps, _TOLERANCE)
         if steps == _FIRST_STEPS:
             classify(model, job.num_elsewhere)
@@ -91,7 +91,7 @@ def _conclude_large(keyframes: KeyframeMap, options: OdometryOptions, events: Ev
     num = len(keyframes.keyframes)
     part = np.arange(num - _NUM_QUESTIONED, num)
     job = make_job(keyframes, part, part > part[0])
-    sigma = max(residual_scale_px(job.model), MIN_SIGMA_PX)
+    sigma = residual_scale_px(job.model, MIN_SIGMA_PX)
     cost = adjust_poses(job.model, sigma, _MAX_STEPS, _TOLERANCE)
     answer = _question(job.model, cost, sigma, options, events)
     report["camera"] = answer.report

@@ -187,7 +187,8 @@ class Beginning:
             start = pose_between(rigid3.IDENTITY, last_from_first, n / last)
             pose = refine_pose(camera.canonical, camera.is_fisheye, start, xyz[known], xy[known]).cam_from_world
             error = np.linalg.norm(project(camera, rigid3.apply(pose, xyz[known])) - xy[known], axis=1)
-            left += max(0.0, float(np.nanmedian(error)) ** 2 - _NOISE_PX**2)
+            error = np.nan_to_num(error, nan=camera.width)  # a point behind its camera explains nothing
+            left += max(0.0, float(np.median(error)) ** 2 - _NOISE_PX**2)
             turned += _left_by_turn(camera, first_xy[known], xy[known]) ** 2
         return left < _MAX_LEFT_SHARE**2 * turned
 

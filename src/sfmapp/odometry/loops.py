@@ -186,7 +186,7 @@ class LoopFinder:
                 self._suspicion = trial
                 if len(trial.views) < self.options.min_views:
                     return None
-                if np.mean([v.located.agreement for v in trial.views]) < self.options.min_agreement:
+                if not np.mean([v.located.agreement for v in trial.views]) >= self.options.min_agreement:
                     self._suspicion = None
                     return None
                 self._suspicion = None
@@ -275,7 +275,7 @@ def _initial_similarity(keyframes: KeyframeMap, view: LoopView, options: LoopOpt
     pose = keyframes.keyframes[view.new_idx].rig_from_world
     new_depth = rigid3.apply(pose, keyframes.point_xyz[np.maximum(view.new_id, 0)])[:, 2]
     old_depth = rigid3.apply(view.located.cam_from_world, view.old.xyz)[:, 2]
-    known = (view.new_id >= 0) & (new_depth > 0)  # False for NaN
+    known = (view.new_id >= 0) & (new_depth > 0) & (old_depth > 0)  # False for NaN
     if known.sum() < 6:
         return None
     scale = float(np.median(old_depth[known] / new_depth[known]))

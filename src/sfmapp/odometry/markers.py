@@ -144,7 +144,7 @@ def scale_from_markers(
         return ScaleRefusal("marker", f"no marker was measured from two keyframes that agree ({what})", evidence)
     log_side, sigma = _average(np.array([f[0] for f in found.values()]), np.array([f[1] for f in found.values()]))
     sigma = float(np.hypot(sigma, side.sigma_m / side.metres))
-    if sigma > options.max_sigma_relative:
+    if not sigma <= options.max_sigma_relative:
         reason = (
             f"the markers give the scale to {sigma:.0%} only, at most {options.max_sigma_relative:.0%} are allowed: "
             "they are too small in the images or seen from too nearly one place"

@@ -27,6 +27,7 @@ from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.shutter import straighten
 from sfmapp.odometry.smoothing import smooth_trajectory
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
+from sfmapp.odometry.stereo_clock import StereoClock
 from sfmapp.odometry.sweep import is_too_large
 from sfmapp.odometry.tracker import MIN_INLIERS, keyframe_reason, measure_pose, track
 
@@ -57,6 +58,7 @@ class Odometry:
         self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
         self.pose, self.step = rigid3.IDENTITY, rigid3.IDENTITY
         self.imu = sequence.imu
+        self.clock = StereoClock(self.rig)
         self.previous: Pyramid | None = None
         self.num_mapped_at_keyframe = 0
         self.lost_since: float | None = None
@@ -97,7 +99,7 @@ class Odometry:
         if is_open:
             self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
         if self.rig.is_stereo:
-            if is_open:
+            if is_open and self.clock.is_usable:
                 self._begin_stereo(record, view)
             return
         views = self.beginning.add(view.pyramids[0])
@@ -194,9 +196,11 @@ class Odometry:
     def _make_keyframe(self, record: FrameRecord, view: View, state: FrameState, reason: str) -> None:
         local = self.local
         assert local is not None
+        assert self.previous is not None
+        seen = self.clock.look(self.previous, view, self.records[-2].timestamp_s)
         self._take_over(local, None)
         self._cull(local)
-        self.tracks = local.add_keyframe(view, self.pose, self.tracks, len(self.records))
+        self.tracks = local.add_keyframe(seen, self.pose, self.tracks, len(self.records))
         self._count_mapped()
         self._settle(record, state, self.pose, is_keyframe=True)
         self._remember(view)
@@ -350,6 +354,7 @@ class Odometry:
                 local.keyframes.rig = self.given_rig  # what is given is questioned once more, by all there is
             conclusions[number] = conclude(local.keyframes, self.options, self.events)
             conclusions[number].report["shutter"] = straightened
+            conclusions[number].contradictions.extend(self.clock.contradictions(local.keyframes))
             measure_again(self.records, local.keyframes, number)
             self.events.finished("adjustment", **conclusions[number].report)
         if self.executor is not None:
@@ -379,6 +384,7 @@ class Odometry:
             "num_frames": len(self.records), "num_tracked": int(tracked.sum()), "num_maps": len(result.maps),
             "num_keyframes": [len(m.keyframe_frame_idx) for m in result.maps],
             "tracking_cpu_s": sum(record.time_s for record in self.records), "backend_cpu_s": backend, **self.counts,
+            "right_late_frames": self.clock.shift, "pairs": [c.describe() for c in self.clock.contradictions()],
         }  # fmt: skip
 
 
@@ -400,7 +406,7 @@ def run_odometry(
     events = events or Events()
     odometry = Odometry(sequence, options, seed=seed, threads=threads, events=events)
     events.started(STAGE, total=sequence.num_frames)
-    for frame in sequence.frames():
+    for frame in odometry.clock.pair(sequence.frames(), events):
         odometry.process(frame)
     events.finished(STAGE)
     return odometry.finish()

@@ -346,7 +346,7 @@ def _height_verdict(
         "height_map_units": float(np.exp(middle)), "relative_spread": spread, "last_over_first_third": drift,
         "median_points": int(np.median(counts[good])), "median_keyframe_sigma": float(np.median(sigmas[good])),
     }  # fmt: skip
-    if spread > options.max_spread:
+    if not spread <= options.max_spread:
         return ScaleRefusal(
             "camera_height",
             f"the heights over what looks like ground differ by {spread:.0%} between keyframes, "

@@ -53,9 +53,9 @@ def straighten(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int)
         readout, evidence, job = _search(records, keyframes, map_idx, stride)
         if stride == _STRIDES[0]:
             report = {"evidence": evidence, "min_evidence": MIN_EVIDENCE, "first_readout": readout}
-            if evidence < MIN_EVIDENCE or abs(readout) < _MIN_READOUT:
-                break
-        if job is None:
+        # what is next gained is little, but never a loss
+        least = MIN_EVIDENCE if stride == _STRIDES[0] else 0.0
+        if job is None or not evidence >= least or not _MIN_READOUT <= abs(total + readout) <= _MAX_READOUT:
             break
         total += readout
         _move(records, keyframes, map_idx, readout)
@@ -67,7 +67,8 @@ def straighten(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int)
 def _search(
     records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, stride: float
 ) -> tuple[float, float, Job | None]:
-    """The readout of least cost in steps of a stride, what it gains, and the map adjusted with it."""
+    """The readout of least cost in steps of a stride, what it gains, and the map adjusted with it; None for the map
+    where there is no least cost within reach, or costs that are no numbers."""
     everything = np.arange(len(keyframes.keyframes))
     job = make_job(keyframes, everything, everything > 0)
     model, tracks = job.model, job.model.tracks
@@ -78,24 +79,22 @@ def _search(
         shifts[obs] = shift_of(keyframe.frame_idx, model.point_xyz[tracks.obs_track_idx[obs]], tracks.obs_xy[obs])
     if not shifts.any():
         return 0.0, 0.0, None
-    sigma = max(residual_scale_px(model), MIN_SIGMA_PX)
+    sigma = residual_scale_px(model, MIN_SIGMA_PX)
     glance = [_adjusted(job, shifts, n * stride, sigma, _GLANCE_STEPS)[0] for n in (-1, 0, 1)]
-    if abs(_vertex(*glance)) * stride < 0.5 * _MIN_READOUT:
+    if not np.isfinite(glance).all() or abs(_vertex(*glance)) * stride < 0.5 * _MIN_READOUT:
         return 0.0, 0.0, None
     costs = {n: _adjusted(job, shifts, n * stride, sigma)[0] for n in (-1, 0, 1)}
     best = min(costs, key=lambda n: (costs[n], abs(n)))
-    while {best - 1, best + 1} - set(costs) and (abs(best) + 1) * stride <= _MAX_READOUT:
+    while {best - 1, best + 1} - set(costs) and abs(best) * stride <= _MAX_READOUT:
         beyond = best + (1 if best > 0 else -1)
         costs[beyond] = _adjusted(job, shifts, beyond * stride, sigma)[0]
         if costs[beyond] >= costs[best]:
             break
         best = beyond
-    if best - 1 in costs and best + 1 in costs:
-        readout = stride * (best + _vertex(costs[best - 1], costs[best], costs[best + 1]))
-    else:
-        readout = stride * best
-    cost, model = _adjusted(job, shifts, readout, sigma)
-    job.model = model
+    if {best - 1, best + 1} - set(costs) or not np.isfinite(list(costs.values())).all():
+        return 0.0, 0.0, None
+    readout = stride * (best + _vertex(costs[best - 1], costs[best], costs[best + 1]))
+    cost, job.model = _adjusted(job, shifts, readout, sigma)
     return readout, costs[0] - cost, job
 
 

@@ -184,7 +184,7 @@ def _refine(first: Floats, second: Floats, gain: float, rotation: Doubles, focal
     normal, right = np.empty((3, 3)), np.empty(3)
     for _ in range(_ITERATIONS):
         correlation, overlap = _accumulate(first, second, gain, rotation, focal, normal, right)
-        if overlap < _MIN_OVERLAP or correlation < 0.0 or np.linalg.cond(normal) > 1e6:
+        if not (overlap >= _MIN_OVERLAP and correlation >= 0.0 and np.linalg.cond(normal) <= 1e6):
             return None
         turn = np.linalg.solve(normal, right)
         if focal * np.abs(turn).max() < _SMALL_STEP_PX:

@@ -50,7 +50,7 @@ def match_stereo(rig: Rig, pyramids: tuple[Pyramid, ...], xy: Array, depth: Arra
     there, zncc, is_found = search_along_epipolar(pyramids[0], xy[lost], pyramids[1], segments, counts)
     good = is_found & (zncc > _MIN_LIKENESS)
     out[lost[good]] = there[good]
-    out[_off_line_px(rig, rays, out) > _MAX_OFF_LINE_PX] = np.nan
+    out[~(_off_line_px(rig, rays, out) <= _MAX_OFF_LINE_PX)] = np.nan
     return out
 
 

@@ -162,7 +162,10 @@ def no_map(run: Tracking, result: OdometryResult) -> NoReconstructionError:
     if seen < 2:
         found = "no frame could be read" if seen == 0 else "only one frame could be read"
         return NoReconstructionError(f"{run.source}: {found}", "-v names the files and what is wrong with them")
-    return NoReconstructionError(f"{run.source}: {seen} frames were read, but no map could be begun", NO_MAP_ADVICE)
+    text = f"{run.source}: {seen} frames were read, but no map could be begun"
+    for against in result.report.get("pairs", []):
+        return NoReconstructionError(f"{text}: {against['message']}", against["advice"])
+    return NoReconstructionError(text, NO_MAP_ADVICE)
 
 
 class Watched:

@@ -164,9 +164,9 @@ def adjusted(
     priors = [replace(camera, focal_sigma=_FOCAL_SIGMA * camera.focal) for camera in model.cameras]
     for _ in range(_MAX_ROUNDS):
         used = model.obs_is_inlier.copy()
-        sigma_px = max(structure.residual_scale_px(model), _MIN_SIGMA_PX)
+        sigma_px = structure.residual_scale_px(model, _MIN_SIGMA_PX)
         adjust_bundle(model, robust(adjust, sigma_px), prior_cameras=priors)
-        sigma_px = max(structure.residual_scale_px(model), _MIN_SIGMA_PX)
+        sigma_px = structure.residual_scale_px(model, _MIN_SIGMA_PX)
         limit_px = mapping.max_reprojection_error_sigmas * sigma_px
         limit_px = float(np.clip(limit_px, _MIN_LIMIT_PX, mapping.max_reprojection_error_px))
         structure.filter_observations(model, mapping, pool, None, limit_px)
