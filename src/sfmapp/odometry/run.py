@@ -49,6 +49,7 @@ class Odometry:
         self.records: list[FrameRecord] = []
         self.maps: dict[int, LocalMap] = {}
         self.local: LocalMap | None = None
+        self.num_begun = 0  # numbers of maps that were taken into others are not given again: live poses are in worlds
         self.recognition = Recognition(seed)
         self.beginning = Beginning(self.rig.cameras[0], options, seed)
         self.waiting: list[tuple[FrameRecord, View]] = []
@@ -147,7 +148,7 @@ class Odometry:
         self.beginning = Beginning(self.rig.cameras[0], self.options, self.seed)
 
     def _new_map(self) -> LocalMap:
-        number = max(self.maps, default=-1) + 1
+        number = self.num_begun
         self.maps[number] = LocalMap(self.rig, self.options, self.executor, number)
         return self.maps[number]
 
@@ -155,6 +156,7 @@ class Odometry:
         """Go on from the newest keyframe of a map."""
         self.local, self.tracks, self.pose, self.step = local, tracks, pose, rigid3.IDENTITY
         self.lost_since = None
+        self.num_begun = local.map_idx + 1
         self._count_mapped()
 
     # ------------------------------------------------------------------ tracking
@@ -290,6 +292,8 @@ class Odometry:
             self.maps[number].backend.finish(self.maps[number].keyframes)
         self.local, scale = self.recognition.close(self.maps, self.records, closure)
         self.pose, self.step = self.local.pose(self.local.newest), self.step * np.repeat([1.0, scale], [4, 3])
+        # the newest frame is given out after this: in the world, and with the unit, that those after it have as well
+        self.records[-1].live = self.pose.copy()
         self.tracks = self.local.tracks_of_newest()
         self._count_mapped()
         self.counts["loops"] += 1
