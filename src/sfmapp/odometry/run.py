@@ -14,7 +14,7 @@ from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Frame, Sequence
 from sfmapp.odometry.active_tracks import ActiveTracks
 from sfmapp.odometry.finish import conclude
-from sfmapp.odometry.inertial import imu_rotation
+from sfmapp.odometry.gyroscope import GyroTrust, imu_rotation
 from sfmapp.odometry.initialize import Beginning, TwoViews, pose_between
 from sfmapp.odometry.keyframe_map import KeyframeMap
 from sfmapp.odometry.local_map import LocalMap, View
@@ -55,7 +55,8 @@ class Odometry:
         self.waiting: list[tuple[FrameRecord, View]] = []
         self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
         self.pose, self.step = rigid3.IDENTITY, rigid3.IDENTITY
-        self.imu = sequence.imu
+        self.imu, self.gyro_trust = sequence.imu, GyroTrust()
+        self.foretold: tuple[Array, Array] | None = None  # turns since the last frame, by the gyroscope and if steady
         self.previous: Pyramid | None = None
         self.num_mapped_at_keyframe = 0
         self.lost_since: float | None = None
@@ -172,6 +173,8 @@ class Odometry:
             self._lose(record)
             return False
         self.step = rigid3.compose(tracked.pose, rigid3.inverse(self.pose))
+        if self.foretold is not None:
+            self.gyro_trust.learn(*self.foretold, rigid3.rotation_matrix(self.step))
         self.pose, self.tracks, self.is_mapped = tracked.pose, tracked.tracks, tracked.is_mapped
         reason = keyframe_reason(local, tracked, self.num_mapped_at_keyframe, self.options)
         if reason is None:
@@ -182,6 +185,7 @@ class Odometry:
 
     def _predicted_step(self) -> Array:
         """The motion since the last frame: steady, over the time that has passed; turned as a gyroscope says."""
+        self.foretold = None
         if len(self.records) < 3:
             return self.step
         before, last, now = (record.timestamp_s for record in self.records[-3:])
@@ -189,7 +193,8 @@ class Odometry:
         share = min((now - last) / (last - before), _MAX_STEADY_SHARE)
         step = pose_between(rigid3.IDENTITY, self.step, share) if abs(share - 1) > _STEADY_SHARE else self.step
         turn = None if self.imu is None else imu_rotation(self.imu, last, now)
-        return step if turn is None else rigid3.from_matrix(turn, step[4:])
+        self.foretold = None if turn is None else (turn, rigid3.rotation_matrix(step))
+        return rigid3.from_matrix(turn, step[4:]) if turn is not None and self.gyro_trust.is_better else step
 
     def _make_keyframe(self, record: FrameRecord, view: View, state: FrameState, reason: str) -> None:
         local = self.local
