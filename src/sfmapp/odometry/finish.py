@@ -39,7 +39,7 @@ MIN_EVIDENCE = 90.0
 # A map whose poses leave the calibration open must not decide on it: the largest change in sigmas of what was given.
 _MAX_CHANGE_SIGMAS = 4.0
 # Covariances take two dense matrices over all poses.
-_MAX_COVARIANCE_KEYFRAMES = 400
+MAX_COVARIANCE_KEYFRAMES = 400
 _FIRST_STEPS, _MAX_STEPS = 8, 30
 # Keyframes of a large map that its cameras are questioned on.
 _NUM_QUESTIONED = 100
@@ -86,7 +86,7 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -
     take_over(job, keyframes)
     keyframes.rig = _rig_of(model)
     covariance, gauge = None, ""
-    if options.covariance and 1 < len(everything) <= _MAX_COVARIANCE_KEYFRAMES:
+    if options.covariance and 1 < len(everything) <= MAX_COVARIANCE_KEYFRAMES:
         covariance, gauge = _covariance(model, len(keyframes.rig.cameras))
     return Conclusion(covariance, gauge, report)
 

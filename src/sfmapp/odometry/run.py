@@ -338,6 +338,9 @@ class Odometry:
         if self.executor is not None:
             self.executor.shutdown()
         result = gather(self.records, maps, conclusions)
+        for m, entry in enumerate(result.maps):
+            if entry.covariance_gap:
+                self.events.warned("adjustment", f"map {m}, covariances are missing: {entry.covariance_gap}")
         if self.options.smooth and result.covariance is not None:
             for m in range(len(result.maps)):
                 poses = np.where((result.frame_map == m)[:, None], result.cam_from_world, np.nan)
