@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import Imu
+from sfmapp.odometry.gyroscope import GyroTrust, imu_rotation, imu_steps
 from sfmapp.odometry.inertial import (
     GRAVITY,
     InertialAlignment,
@@ -14,10 +17,9 @@ from sfmapp.odometry.inertial import (
     _MapPose,
     _midway,
     _preintegration,
-    _steps,
     align_imu,
-    imu_rotation,
 )
+from sfmapp.odometry.inertial_faults import align_or_explain
 from sfmapp.odometry.scale import ScaleRefusal
 
 IMU_FROM_CAM = rigid3.from_matrix(rigid3.exp_so3([1.2, -1.1, 1.3]), [0.05, -0.03, 0.08])
@@ -102,7 +104,7 @@ def test_gtsam_and_our_integration_follow_the_true_motion() -> None:
 
     flight = Flight(1)
     imu = flight.imu(1, 3.0, noise=0.0, rate_hz=1000.0)
-    steps = _steps(imu, 0.3137, 0.9)
+    steps = imu_steps(imu, 0.3137, 0.9)
     assert steps is not None
     assert steps[:, 0].sum() == pytest.approx(0.9 - 0.3137)
     ends = np.array([0.3137, 0.9])
@@ -149,7 +151,7 @@ def test_gtsam_s_covariance_is_that_of_drawn_noise() -> None:
     flight = Flight(2)
     clean = flight.imu(2, 1.0, noise=0.0)
     noise = Imu(clean.timestamps_s, clean.gyro, clean.accel, IMU_FROM_CAM, 0.01, 0.1, 1e-8, 1e-8)
-    steps = _steps(clean, 0.0, 0.5)
+    steps = imu_steps(clean, 0.0, 0.5)
     assert steps is not None
     sums = gtsam.PreintegratedCombinedMeasurements(_preintegration(noise), gtsam.imuBias.ConstantBias())
     for step in _midway(steps, np.zeros(3)):
@@ -174,22 +176,31 @@ def test_slopes_of_the_link_between_map_and_sensor() -> None:
     turn = rigid3.exp_so3(rng.normal(size=3))
     imu = Flight(0).imu(0, 0.1)
     pose = rigid3.from_matrix(rigid3.exp_so3(rng.normal(size=3)), rng.normal(size=3))
-    link, alignment = _MapPose(pose, imu, turn), np.array([0.7, 0.0, 0.0])
+    rate, velocity = rng.normal(size=3), rng.normal(size=3)
+    link, alignment = _MapPose(pose, imu, turn, rate), np.array([0.7, 0.0, 0.0, 0.0])
     map_from_cam = rigid3.inverse(pose)
     world_from_cam = rigid3.from_matrix(
         turn @ rigid3.rotation_matrix(map_from_cam), np.exp(0.7) * turn @ map_from_cam[4:]
     )
     exact = rigid3.compose(world_from_cam, rigid3.inverse(IMU_FROM_CAM))
     sensor = gtsam.Pose3(gtsam.Rot3(rigid3.rotation_matrix(exact)), exact[4:])
-    assert np.allclose(link.residual(sensor, alignment), 0, atol=1e-12)
-    sensor, alignment = sensor.retract(1e-2 * rng.normal(size=6)), np.array([0.72, 0.01, -0.02])
-    by_pose, by_alignment = link.slopes(sensor, alignment)
+    assert np.allclose(link.residual(sensor, alignment, velocity), 0, atol=1e-12)
+    # the picture was taken later: the sensor was not there yet
+    back = rigid3.from_matrix(rigid3.rotation_matrix(exact) @ rigid3.exp_so3(-0.01 * rate), exact[4:] - 0.01 * velocity)
+    early = gtsam.Pose3(gtsam.Rot3(rigid3.rotation_matrix(back)), back[4:])
+    assert np.allclose(link.residual(early, np.r_[alignment[:3], 0.01], velocity), 0, atol=1e-12)
+    sensor, alignment = sensor.retract(1e-2 * rng.normal(size=6)), np.array([0.72, 0.01, -0.02, 0.01])
+    by_pose, by_alignment, by_velocity = link.slopes(sensor, alignment, velocity)
     for d, column in zip(1e-6 * np.eye(6), by_pose.T, strict=True):
-        change = link.residual(sensor.retract(d), alignment) - link.residual(sensor.retract(-d), alignment)
+        change = link.residual(sensor.retract(d), alignment, velocity)
+        change -= link.residual(sensor.retract(-d), alignment, velocity)
         assert np.allclose(change / 2e-6, column, atol=2e-4)
-    for d, column in zip(1e-6 * np.eye(3), by_alignment.T, strict=True):
-        change = link.residual(sensor, alignment + d) - link.residual(sensor, alignment - d)
+    for d, column in zip(1e-6 * np.eye(4), by_alignment.T, strict=True):
+        change = link.residual(sensor, alignment + d, velocity) - link.residual(sensor, alignment - d, velocity)
         assert np.allclose(change / 2e-6, column, atol=2e-3)
+    for d, column in zip(1e-6 * np.eye(3), by_velocity.T, strict=True):
+        change = link.residual(sensor, alignment, velocity + d) - link.residual(sensor, alignment, velocity - d)
+        assert np.allclose(change / 2e-6, column, atol=1e-6)
 
 
 # ---- the whole
@@ -286,18 +297,94 @@ def test_motion_that_says_nothing_is_refused() -> None:
     refusal = align_imu(times, a_map(slow, times, 6, 0.1, 0.02), slow.imu(6, 15.0), is_metric=False)
     assert isinstance(refusal, ScaleRefusal), refusal
     assert "scale" in refusal.reason
+    assert refusal.contradiction is None
     flight = Flight(7)
     poses, imu = a_map(flight, times, 7, 0.1, 0.02), flight.imu(7, 15.0)
     few = align_imu(times[:5], poses[:5], imu, is_metric=False)
     assert isinstance(few, ScaleRefusal)
     assert "intervals" in few.reason
-    # a clock that is three quarters of a second off, a sensor mounted otherwise than believed
-    late = Imu(imu.timestamps_s + 0.75, imu.gyro, imu.accel, IMU_FROM_CAM, 1.7e-4, 2e-3, 1.9e-5, 3e-3)
-    turned = Imu(imu.timestamps_s, imu.gyro, imu.accel, rigid3.IDENTITY, 1.7e-4, 2e-3, 1.9e-5, 3e-3)
-    for wrong in (late, turned):
-        refusal = align_imu(times, poses, wrong, is_metric=False)
-        assert isinstance(refusal, ScaleRefusal), refusal
-        assert "contradicts" in refusal.reason
+    # clocks that have nothing to do with each other
+    other = replace(imu, timestamps_s=imu.timestamps_s + 1e6)
+    refusal = align_imu(times, poses, other, is_metric=False)
+    assert isinstance(refusal, ScaleRefusal)
+    assert "clocks" in refusal.reason
+
+
+# ---- measurements that are not what they are taken for
+
+
+@pytest.mark.parametrize("has_covariance", [False, True])
+def test_clocks_apart_are_found_and_taken_into_account(has_covariance: bool) -> None:
+    """The scale is what it would be without, and both errors are inside three of their sigmas."""
+    times = np.arange(0, 15, 0.25)
+    covariance = noise(times) if has_covariance else None
+    for seed, late_s in ((11, 0.02), (12, -0.05), (13, 0.2), (14, -0.75)):
+        flight = Flight(seed)
+        poses, imu = a_map(flight, times, seed, 0.1, 0.01), flight.imu(seed, 15.0)
+        late = replace(imu, timestamps_s=imu.timestamps_s + late_s)
+        found = align_or_explain(times, poses, late, is_metric=False, covariance=covariance)
+        assert isinstance(found, InertialAlignment), found
+        assert abs(np.log(found.scale / 2.7)) < 3 * found.sigma_relative < 0.06
+        assert abs(found.clock_offset_s - late_s) < 3.5 * found.clock_sigma_s < 0.01
+        assert found.evidence["clock_offset_s"] == found.clock_offset_s
+
+
+def noise(times: np.ndarray) -> np.ndarray:
+    """Covariances of poses of 0.1 degrees and 1 cm."""
+    return np.tile(np.diag(np.r_[np.full(3, np.radians(0.1)), np.full(3, 0.01 / 2.7)] ** 2), (len(times), 1, 1))
+
+
+def faulty(imu: Imu, flight: Flight, fault: str) -> Imu:
+    """What wrong drivers, phones and users make of measurements."""
+    up = np.einsum("nji,j->ni", flight.rotation(imu.timestamps_s), [0.0, 0.0, GRAVITY])
+    order = [1, 2, 0]
+    changes: dict[str, dict[str, np.ndarray]] = {
+        "no gravity, late": {"accel": imu.accel - up, "timestamps_s": imu.timestamps_s + 0.05},
+        "accel order": {"accel": imu.accel[:, order]},
+        "accel sign": {"accel": -imu.accel},
+        "gyro sign, both orders": {"accel": imu.accel[:, order], "gyro": -imu.gyro[:, order]},
+        "both units": {"accel": imu.accel / 9.81, "gyro": np.degrees(imu.gyro)},
+        "mounting inverted": {"imu_from_cam": rigid3.inverse(IMU_FROM_CAM)},
+        "mounting unknown": {"imu_from_cam": rigid3.IDENTITY},
+    }
+    return replace(imu, **changes[fault])
+
+
+@pytest.mark.parametrize(
+    ("fault", "cause", "remedy"),
+    [
+        ("no gravity, late", "gravity is already subtracted", "with gravity"),
+        ("accel order", "the accelerometer has other axes", "(z, x, y) of accelerometer"),
+        ("accel sign", "the accelerometer is negated", "sign of accelerometer"),
+        ("gyro sign, both orders", "the gyroscope has other axes", "(-z, -x, -y) of gyroscope"),
+        ("both units", "degrees per second and the accelerometer is in g", "9.81"),
+        ("mounting inverted", "the wrong way round", "invert"),
+        ("mounting unknown", "against the mounting", "calibrate the rotation"),
+    ],
+)
+def test_what_contradicts_the_map_is_named_with_its_remedy(fault: str, cause: str, remedy: str) -> None:
+    flight, times = Flight(16), np.arange(0, 12, 0.25)
+    poses, imu = a_map(flight, times, 16, 0.1, 0.01), flight.imu(16, 12.0)
+    found = align_or_explain(times, poses, faulty(imu, flight, fault), is_metric=False, covariance=noise(times))
+    assert isinstance(found, ScaleRefusal), found
+    assert found.contradiction is not None
+    rows = found.contradiction.evidence["explained_by"]
+    assert [cause in row["fault"] for row in rows] == [True]
+    assert cause in found.contradiction.message
+    assert remedy in found.contradiction.advice
+    assert rows[0]["residual"] < 5
+
+
+def test_a_fault_that_nothing_explains_is_no_less_refused() -> None:
+    flight, times = Flight(17), np.arange(0, 12, 0.25)
+    poses, imu = a_map(flight, times, 17, 0.1, 0.01), flight.imu(17, 12.0)
+    other = Flight(18).imu(18, 12.0)
+    wrong = replace(imu, accel=other.accel)
+    found = align_or_explain(times, poses, wrong, is_metric=False, covariance=noise(times))
+    assert isinstance(found, ScaleRefusal), found
+    assert found.contradiction is not None
+    assert "explained_by" not in found.contradiction.evidence
+    assert "check the sensor" in found.contradiction.advice
 
 
 def test_same_input_same_bytes() -> None:
@@ -326,3 +413,28 @@ def test_the_gyroscope_predicts_the_camera_s_rotation() -> None:
     assert imu_rotation(imu, 4.0, 5.5) is None
     assert imu_rotation(imu, -1.0, 0.5) is None
     assert imu_rotation(imu, 2.0, 2.0) is None
+
+
+def test_a_gyroscope_is_believed_while_it_foretells_better_than_a_steady_motion() -> None:
+    flight, times = Flight(10, turning=3.0), np.arange(0.1, 4.0, 0.05)
+    imu = flight.imu(10, 5.0)
+    turns = rigid3.rotation_matrix(flight.cam_from_world(times))
+    steps = turns[1:] @ turns[:-1].swapaxes(1, 2)
+    wrong = {
+        "right": imu,
+        "negated": replace(imu, gyro=-imu.gyro),
+        "permuted": replace(imu, gyro=imu.gyro[:, [1, 2, 0]]),
+        "degrees": replace(imu, gyro=np.degrees(imu.gyro)),
+        "late": replace(imu, timestamps_s=imu.timestamps_s + 0.15),
+    }
+    for name, sensor in wrong.items():
+        trust, believed = GyroTrust(), []
+        for k in range(1, len(steps)):
+            foretold = imu_rotation(sensor, times[k], times[k + 1])
+            if foretold is None:
+                continue
+            believed.append(trust.is_better)
+            trust.learn(foretold, steps[k - 1], steps[k])
+        assert len(believed) > 60
+        assert not any(believed[:5])  # nothing is known yet
+        assert np.mean(believed[10:]) == (1.0 if name == "right" else 0.0), name

@@ -17,7 +17,11 @@ from sfmapp.events import Event, Events
 from sfmapp.formats.colmap import read_model
 from sfmapp.formats.trajectory import read_tum
 from sfmapp.geometry import rigid3
-from sfmapp.images.sequence import SequenceOptions
+from sfmapp.images.sequence import Imu, SequenceOptions
+from sfmapp.odometry import inertial_faults
+from sfmapp.odometry.finish import MAX_COVARIANCE_KEYFRAMES, Conclusion
+from sfmapp.odometry.inertial import contradicted
+from sfmapp.odometry.records import _covariance_gap
 from sfmapp.odometry.result import FrameState
 from sfmapp.pipelines import odometry as pipeline
 from sfmapp.pipelines.odometry import TrackResult, track_sequence
@@ -26,6 +30,7 @@ from sfmapp.pipelines.odometry_timing import ThreadTimes
 from sfmapp.pipelines.options import Options, load_options, options_from_dict
 from sfmapp.pipelines.reconstruct import reconstruct
 from sfmapp.pipelines.validate import validate
+from sfmapp.report.odometry_document import FrameFacts, make_checks
 from sfmapp.report.plots import Curve, plot_svg, ticks
 from sfmapp.scene.camera import CameraModel, simple_camera
 from sfmapp.scene.rig import Rig
@@ -108,6 +113,33 @@ def test_keyframes_have_covariances(finished: tuple[Path, TrackResult]) -> None:
     assert float(of_frames[0]["ty_ty"]) == 1e-4
     sigma = finished[1].report["maps"][0]["position_sigma"]
     assert sigma["median"] == pytest.approx(np.sqrt(3e-4))
+
+
+def test_missing_covariances_are_said_and_not_green(finished: tuple[Path, TrackResult]) -> None:
+    """None at all is red, some amber; all, or none asked for, is no row."""
+    report = finished[1].report
+    facts = FrameFacts(np.full(1, np.nan), np.full(1, np.nan), np.full(1, np.nan), np.full(1, -1))
+    for gap, sigma, light in (("", {"median": 1.0}, None), ("2 of 9", {"median": 1.0}, "amber"), ("open", None, "red")):
+        maps = [report["maps"][0] | {"covariance_gap": gap, "position_sigma": sigma}]
+        rows = [row for row in make_checks(report["frames"], maps, {}, facts) if "uncertainty" in row["name"]]
+        assert [row["light"] for row in rows] == ([] if light is None else [light])
+        assert [row["value"] for row in rows] == ([] if light is None else [gap])
+
+
+@pytest.mark.parametrize(
+    ("covariance", "num", "said"),
+    [
+        (None, 7, ""),  # not asked for
+        (None, MAX_COVARIANCE_KEYFRAMES + 1, "too many"),
+        (np.full((7, 6, 6), np.nan), 7, "do not determine"),
+        (np.where(np.arange(7)[:, None, None] < 2, np.nan, np.eye(6)), 7, "2 of 7"),
+        (np.tile(np.eye(6), (7, 1, 1)), 7, ""),
+    ],
+)
+def test_why_there_is_no_covariance(covariance: np.ndarray | None, num: int, said: str) -> None:
+    gap = _covariance_gap(Conclusion(covariance, "", {}), num)
+    assert said in gap
+    assert bool(gap) == bool(said)
 
 
 def test_the_map_is_a_model_with_grey_points(finished: tuple[Path, TrackResult]) -> None:
@@ -295,6 +327,20 @@ def test_a_known_distance_makes_metres(wish: str, tmp_path: Path, monkeypatch: P
     assert row["position_sigma"]["median"] == pytest.approx(2 * np.sqrt(3e-4), rel=0.01)
     model, _ = read_model(tmp_path / "out" / "sparse" / "0")
     assert model.summary()["mean_reprojection_error_px"] < 0.1
+
+
+def test_a_sensor_that_contradicts_the_map_is_red_and_gives_no_metres(tmp_path: Path, monkeypatch: Patch) -> None:
+    sequence = FakeSequence()
+    sequence.imu = Imu(np.zeros(2), np.zeros((2, 3)), np.zeros((2, 3)), rigid3.IDENTITY, 1e-4, 1e-3, 1e-5, 1e-3)
+    use(monkeypatch, sequence, FakeRunner())
+    refusal = contradicted("the accelerometer is upside down", "turn it", {"residual": 99.0})
+    monkeypatch.setattr(inertial_faults, "align_or_explain", lambda *_, **__: refusal)
+    report = run(tmp_path / "out").report
+    assert report["maps"][0]["unit"] == ""
+    assert report["maps"][0]["scale_sigma"] is None
+    assert any("upside down" in warning["message"] for warning in report["warnings"])
+    red = [row for row in report["checks"] if row["light"] == "red"]
+    assert [(row["name"], row["thresholds"]) for row in red] == [("agrees with the inertial measurements", "turn it")]
 
 
 def test_a_scale_that_cannot_be_had_is_a_warning(tmp_path: Path, monkeypatch: Patch) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +15,13 @@ import odometry_sequences as played
 from odometry_sequences import Played, Told, absolute_error, path_length, run
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.odometry.active_tracks import ActiveTracks
+from sfmapp.odometry.local_map import LocalMap, View
 from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.recognition import Recognition
+from sfmapp.odometry.records import FrameRecord
 from sfmapp.odometry.result import FrameState, OdometryResult
-from sfmapp.odometry.run import run_odometry
+from sfmapp.odometry.run import Odometry, run_odometry
 from sfmapp.scene import rendered
 
 Array = np.ndarray
@@ -134,6 +140,52 @@ def test_live_poses_know_nothing_of_the_future() -> None:
     whole, part = run(sequence), run(sequence.taken(np.arange(50)))
     np.testing.assert_array_equal(whole.live_cam_from_world[:50], part.live_cam_from_world)
     np.testing.assert_array_equal(whole.frame_state[:50], part.frame_state)
+
+
+def test_the_frame_at_which_worlds_change_has_its_live_pose_in_the_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A closure that moves the whole map into another world and unit, as two maps that are joined: exact to the last
+    bit of what was moved, so live poses are steady in the old world before it and in the new one from it on."""
+    sequence, after_frame = played.room(50), 25
+    shift = similarity.from_parts(rigid3.exp_so3([0.3, -0.8, 1.1]), [20.0, -7.0, 3.0], 1.7)
+    seen: list[int] = []
+
+    def remember(self: Recognition, maps: object, local: LocalMap, view: View, *_: object) -> object:
+        if seen or view.frame_idx < after_frame:
+            return None
+        seen.append(view.frame_idx)
+        empty = SimpleNamespace(old_map=local.map_idx, new_map=local.map_idx, shift=0.0, rotation_deg=0.0, scale=1.7)
+        return SimpleNamespace(**vars(empty), num_inliers=(1,), rms_px=0.1)
+
+    def close(self: Recognition, maps: dict[int, LocalMap], records: list[FrameRecord], closure: Any) -> Any:
+        local = maps[closure.new_map]
+        for keyframe in local.keyframes.keyframes:
+            keyframe.rig_from_world = similarity.transform_poses(shift, keyframe.rig_from_world)
+        local.keyframes.point_xyz[:] = similarity.apply(shift, local.keyframes.point_xyz)
+        for record in records:
+            record.frame_from_keyframe[4:] *= 1.7
+        return local, 1.7
+
+    monkeypatch.setattr(Recognition, "remember", remember)
+    monkeypatch.setattr(Recognition, "close", close)
+    result = run(sequence)
+    live, final = rigid3.center(result.live_cam_from_world), rigid3.center(result.cam_from_world)
+    known, is_new = np.isfinite(live[:, 0]), np.arange(50) >= seen[0]
+    live[~is_new] = similarity.apply(shift, live[~is_new])
+    assert (known & ~is_new).sum() >= 5
+    # 1.7 map units are a few metres of a walk: what an adjustment moves is percents of it, the jump was 20 units
+    assert np.linalg.norm(live - final, axis=1)[known].max() < 0.1 * np.linalg.norm(np.ptp(final, axis=0))
+
+
+def test_a_map_that_was_taken_into_another_leaves_its_number_unused() -> None:
+    """Live poses are told apart by the numbers of the worlds they were given out in."""
+    odometry = Odometry(played.room(2), OdometryOptions(), seed=0, threads=1, events=Events())  # type: ignore[arg-type]
+    first = odometry._new_map()
+    assert odometry._new_map().map_idx == first.map_idx  # one that did not begin is forgotten
+    for _ in range(2):
+        local = odometry._new_map()
+        odometry._enter(local, ActiveTracks.none(), rigid3.IDENTITY)
+    del odometry.maps[local.map_idx]
+    assert odometry._new_map().map_idx == local.map_idx + 1
 
 
 @pytest.mark.parametrize("is_stereo", [False, True], ids=["mono", "stereo"])

@@ -252,7 +252,7 @@ def lean_on_priors(mapped: Mapped, model: Reconstruction, sigmas: dict[int, Foca
     if not open_:
         return open_
     mapper = mapped.mapper_of(model)
-    noise = max(structure.residual_scale_px(model), 0.1)  # the adjustment counts it as one pixel
+    noise = structure.residual_scale_px(model, 0.1)  # the adjustment counts it as one pixel
     priors = list(mapped.cameras)
     for c, s in open_.items():
         # where the data's information is as good as none, any weight that counts is enough

@@ -23,7 +23,7 @@ from sfmapp.events import Events
 from sfmapp.images.folder import ImageSet
 from sfmapp.mapping import join, mend, structure, verified_pairs
 from sfmapp.mapping.focal import estimate_focal_ratio
-from sfmapp.mapping.focal_priors import Mapped, MapFrom, settle_focal_lengths
+from sfmapp.mapping.focal_priors import MapFrom, Mapped, settle_focal_lengths
 from sfmapp.mapping.intrinsics_check import check_intrinsics, widened_uncertainty
 from sfmapp.mapping.join import find_joint, holds_together, in_common_cameras, unite
 from sfmapp.mapping.look_alikes import tell_apart

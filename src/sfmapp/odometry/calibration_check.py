@@ -401,7 +401,7 @@ def _start_afresh(look: _Look, sigma: float, unknowns: Unknowns) -> _Look | None
         math.radians(_TRIANGULATION_DEG), model.point_xyz, model.obs_is_inlier,
     )  # fmt: skip
     classify(model, np.zeros(tracks.num_tracks, np.int64))
-    sigma = max(residual_scale_px(model), _MIN_SIGMA_PX)
+    sigma = residual_scale_px(model, _MIN_SIGMA_PX)
     again = _look(model, look.x, adjust_poses(model, sigma, _FOLLOWING_STEPS, 1e-5), sigma, unknowns)
     return look if again is None else replace(_settle(again, sigma, unknowns), cost=look.cost)
 

@@ -27,7 +27,7 @@ def refine_early(local: LocalMap) -> bool:
     keyframes = local.keyframes
     everything = np.arange(len(keyframes.keyframes))
     job = make_job(keyframes, everything, everything > 0)
-    sigma = max(residual_scale_px(job.model), MIN_SIGMA_PX)
+    sigma = residual_scale_px(job.model, MIN_SIGMA_PX)
     cost = adjust_poses(job.model, sigma, _STEPS, _TOLERANCE)
     answer = question_calibration(job.model, cost, sigma, may_refine=True)
     if not answer.is_refined:

@@ -29,7 +29,7 @@ STAGE = "adjustment"
 # patches are not independent, and exact cameras of rendered sequences show up to 30.
 MIN_EVIDENCE = 90.0
 # Covariances take two dense matrices over all poses.
-_MAX_COVARIANCE_KEYFRAMES = 400
+MAX_COVARIANCE_KEYFRAMES = 400
 _FIRST_STEPS, _MAX_STEPS, _TOLERANCE = 8, 30, 1e-4
 # A unit of length that is less sure than that is worth a word.
 _SCALE_OPEN = 0.02
@@ -78,7 +78,7 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -
     take_over(job, keyframes)
     keyframes.rig = rig_of(model)
     covariance, gauge = None, ""
-    if options.covariance and 1 < len(everything) <= _MAX_COVARIANCE_KEYFRAMES:
+    if options.covariance and 1 < len(everything) <= MAX_COVARIANCE_KEYFRAMES:
         covariance, gauge = _covariance(model, len(keyframes.rig.cameras))
         if answer.pose_covariance is not None:
             covariance = covariance + answer.pose_covariance

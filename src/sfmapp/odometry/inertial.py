@@ -1,24 +1,27 @@
-"""A map and an inertial sensor: scale, the vertical, velocities and biases; rotations predicted from the gyroscope.
+"""A map and an inertial sensor: scale, the vertical, velocities, biases, and the offset between the clocks.
 
 Between two keyframes the measurements are integrated once (Forster, Carlone, Dellaert and Scaramuzza, "On-manifold
 preintegration for real-time visual-inertial odometry", T-RO 2017). The gyroscope's bias comes from the rotations;
 scale, gravity and the accelerometer's bias from a linear system without velocities (Mur-Artal and Tardos,
 "Visual-inertial monocular SLAM with map reuse", RA-L 2017; Martinelli, "Closed-form solution of visual-inertial
 structure from motion", IJCV 2014); all of it is then refined in a gtsam factor graph in which the map's poses are
-measurements with noise.
+measurements with noise, taken at their time and an offset that all share (Qin and Shen, "Online temporal calibration
+for monocular visual-inertial systems", IROS 2018).
 """
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.odometry.gyroscope import Turns, imu_steps, multiply, read_as_given, turn_by
 from sfmapp.odometry.scale import ScaleEstimate, ScaleRefusal
 
 if TYPE_CHECKING:
@@ -28,12 +31,14 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 GRAVITY = 9.81
-# No inertial sensor is slower than 10 Hz: a longer silence is a gap.
-_MAX_SILENCE_S = 0.1
 # Mean velocities over about a second are compared to start with: accelerations have shown in the positions by then.
 _SPAN_S = 1.0
 # What biases of small sensors may reasonably be, as standard deviations of their priors.
-_GYRO_BIAS_SIGMA, _ACCEL_BIAS_SIGMA = 0.1, 0.3
+_GYRO_BIAS_SIGMA, ACCEL_BIAS_SIGMA = 0.1, 0.3
+MAX_BIAS = 5 * ACCEL_BIAS_SIGMA
+# What the gyroscope leaves of the offset between the clocks is a millisecond where the rotations tell it; where they do
+# not, cameras and sensors that are meant to be synchronous are within half a hundred.
+_CLOCK_SIGMA_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,9 @@ class InertialOptions:
     max_poses: int = 400  # of more poses fewer are taken, evenly in time as long as the intervals allow
     min_intervals: int = 10  # fewer say nothing reliable
     max_sigma_relative: float = 0.1  # a less certain scale is refused
+    # chi2 a degree of freedom: noise of the map and the sensor that is twice what is stated leaves 4; a gravity that is
+    # missing, an axis or a sign left 37 to 660 on rendered flights
+    max_residual: float = 5.0
     max_rotation_residual: float = 0.25  # share of the rotations that the gyroscope may contradict (at least 1 degree)
 
 
@@ -58,6 +66,7 @@ class InertialAlignment:
         gravity_in_map: (3,) m/s^2 along the map's axes, downwards. gravity_sigma_rad: of its direction, both angles.
         pose_idx: (J,) positions of the poses that took part, ascending.
         velocity: (J, 3) m/s of the sensor in the z-up world.
+        clock_offset_s: to be added to a time of the frames for the time that the measurements carry; clock_sigma_s.
         gyro_bias, accel_bias: (3,) means over the poses; gyro_bias_sigma, accel_bias_sigma: (3,) at the middle one.
         residual: chi2 over degrees of freedom of the refined graph, 1 where all noises are as modelled.
         evidence: numbers for the report, JSON-able.
@@ -70,6 +79,8 @@ class InertialAlignment:
     gravity_sigma_rad: float
     pose_idx: Ints
     velocity: Array
+    clock_offset_s: float
+    clock_sigma_s: float
     gyro_bias: Array
     accel_bias: Array
     gyro_bias_sigma: Array
@@ -109,24 +120,6 @@ class _Interval:
         return self.delta[15 + 9 * n : 24 + 9 * n].reshape(3, 3)
 
 
-def imu_rotation(imu: Imu, start_s: float, stop_s: float, gyro_bias: ArrayLike = (0.0, 0.0, 0.0)) -> Array | None:
-    """Rotation (3, 3) of the rig's first camera from one moment to a later one: ``x_cam(stop) = R x_cam(start)``.
-
-    Args:
-        gyro_bias: (3,) rad/s, taken off the measurements.
-
-    Returns:
-        None where the measurements do not cover the time.
-    """
-    steps = _steps(imu, start_s, stop_s)
-    if steps is None:
-        return None
-    turn = np.empty((3, 3))
-    _integrate_rotation(steps, np.asarray(gyro_bias, np.float64), turn)
-    imu_from_cam = rigid3.rotation_matrix(imu.imu_from_cam)
-    return np.asarray(imu_from_cam.T @ turn.T @ imu_from_cam)
-
-
 def align_imu(
     timestamps_s: ArrayLike,
     cam_from_world: ArrayLike,
@@ -139,7 +132,7 @@ def align_imu(
     """Scale and vertical of a map from inertial measurements.
 
     Args:
-        timestamps_s: (K,) ascending, on the clock of the measurements.
+        timestamps_s: (K,) ascending, on the clock of the measurements or up to a second off, which is found.
         cam_from_world: (K, 7) poses of the rig's first camera in one map; NaN where there is none.
         is_metric: the map is in metres (stereo): the scale is 1 and only the rest is found.
         covariance: (K, 6, 6) over rotation and translation of ``x_cam <- exp(w) x_cam + v``, of errors that are
@@ -147,57 +140,108 @@ def align_imu(
             poses fit: better than covariances in a map's gauge, which count the drift that neighbours have in common.
 
     Returns:
-        The alignment, or why the measurements do not give one: too few, contradicting the map's rotations (wrong clock
-        or mounting), or a motion too even to tell the scale.
+        The alignment, or why the measurements do not give one: too few, contradicting the map (then the refusal holds a
+        contradiction), or a motion too even to tell the scale.
     """
     times, poses = np.asarray(timestamps_s, np.float64), np.array(cam_from_world, np.float64)
     if covariance is not None:
         covariance = np.asarray(covariance, np.float64)
         poses[~np.isfinite(covariance).all((1, 2))] = np.nan
-    chosen = _choose_poses(times, poses, options)
+    chosen = choose_poses(times, poses, options)
     intervals = _intervals(times, chosen, imu, options.max_interval_s)
     evidence: dict[str, Any] = {"num_poses": len(chosen), "num_intervals": len(intervals)}
     if len(intervals) < options.min_intervals:
-        reason = (
-            f"{len(intervals)} intervals between poses have inertial measurements, "
-            f"at least {options.min_intervals} are asked for"
+        return ScaleRefusal("imu", _too_few(intervals, times[chosen], imu, options), evidence)
+    clock = read_as_given(turns_of(times, poses, chosen, options.max_interval_s), imu)
+    if np.isfinite(clock.offset_sigma_s):
+        imu = replace(imu, timestamps_s=imu.timestamps_s - clock.offset_s)
+        intervals = _intervals(times, chosen, imu, options.max_interval_s)
+    found = _fit(times, poses, imu, intervals, is_metric, covariance, options, evidence)
+    if isinstance(found, ScaleRefusal):
+        return found
+    offset = found.clock_offset_s + (clock.offset_s if np.isfinite(clock.offset_sigma_s) else 0.0)
+    evidence = found.evidence | {"clock_offset_s": offset, "clock_sigma_s": found.clock_sigma_s}
+    return _accept(replace(found, clock_offset_s=offset, evidence=evidence), options)
+
+
+def _too_few(intervals: list[_Interval], times: Array, imu: Imu, options: InertialOptions) -> str:
+    """Why there is nothing to align with."""
+    reason = (
+        f"{len(intervals)} intervals between poses have inertial measurements, "
+        f"at least {options.min_intervals} are asked for"
+    )
+    first, last = (imu.timestamps_s[0], imu.timestamps_s[-1]) if len(imu.timestamps_s) else (np.nan, np.nan)
+    if len(times) and not (first < times[-1] and last > times[0]):
+        reason += (
+            f"; they run from {first:.3f} to {last:.3f} s, the map from {times[0]:.3f} to {times[-1]:.3f} s: "
+            "the clocks have other beginnings"
         )
-        return ScaleRefusal("imu", reason, evidence)
+    return reason
+
+
+def _fit(
+    times: Array, poses: Array, imu: Imu, intervals: list[_Interval], is_metric: bool, covariance: Array | None,
+    options: InertialOptions, evidence: dict[str, Any],
+) -> InertialAlignment | ScaleRefusal:  # fmt: skip
+    """The alignment with measurements as they are, accepted or not."""
     map_from_imu = _map_from_imu_rotation(poses, imu)
     gyro_bias, rotation_residual, rotation = _gyro_bias(intervals, map_from_imu)
     evidence |= {
         "rotation_residual_deg": float(np.degrees(rotation_residual)),
         "rotation_deg": float(np.degrees(rotation)),
     }
-    if rotation_residual > max(np.radians(1.0), options.max_rotation_residual * rotation):
+    if not rotation_residual <= max(np.radians(1.0), options.max_rotation_residual * rotation):
         reason = (
             f"the gyroscope contradicts the map's rotations by {np.degrees(rotation_residual):.1f} of "
-            f"{np.degrees(rotation):.1f} degrees an interval: are the clocks and the mounting of the sensor right?"
+            f"{np.degrees(rotation):.1f} degrees an interval"
         )
-        return ScaleRefusal("imu", reason, evidence)
+        return contradicted(reason, "", evidence)
     intervals = [_reintegrate(interval, gyro_bias) for interval in intervals]
     start = _solve_linear(intervals, gyro_bias, rigid3.center(poses), map_from_imu, poses, imu, is_metric)
     evidence |= {"condition": start.condition, "position_sigma_map_units": start.position_sigma}
-    if start.inverse_scale <= 0:
+    if not start.inverse_scale > 0:
         return ScaleRefusal("imu", "the motion does not tell the scale: accelerations and positions disagree", evidence)
     graph = _Graph(
         times, poses, imu, intervals, start, gyro_bias, rotation_residual / np.sqrt(2.0), is_metric, covariance
     )
-    return _accept(graph.solve(evidence), options)
+    return graph.solve(evidence)
 
 
-def _accept(found: InertialAlignment | ScaleRefusal, options: InertialOptions) -> InertialAlignment | ScaleRefusal:
-    """Refuse a scale that is too uncertain."""
-    if isinstance(found, ScaleRefusal) or found.sigma_relative <= options.max_sigma_relative:
+def _accept(found: InertialAlignment, options: InertialOptions) -> InertialAlignment | ScaleRefusal:
+    """Refuse a fit that leaves far more than noise, and a scale that is too uncertain."""
+    bias = float(np.linalg.norm(found.accel_bias))
+    is_fitted = found.residual <= options.max_residual
+    if is_fitted and not found.sigma_relative <= options.max_sigma_relative:
+        reason = (
+            f"the motion gives the scale to {found.sigma_relative:.0%} only, at most "
+            f"{options.max_sigma_relative:.0%} are allowed: move and turn the camera more briskly"
+        )
+        return ScaleRefusal("imu", reason, found.evidence)
+    if is_fitted and bias <= MAX_BIAS:
         return found
     reason = (
-        f"the motion gives the scale to {found.sigma_relative:.0%} only, at most "
-        f"{options.max_sigma_relative:.0%} are allowed: move and turn the camera more briskly"
+        f"the inertial measurements contradict the map: the fit leaves {found.residual:.3g} a degree of freedom "
+        f"(noise alone 1, allowed {options.max_residual:g}), with a bias of the accelerometer of {bias:.2g} m/s^2"
     )
-    return ScaleRefusal("imu", reason, found.evidence)
+    return contradicted(reason, "", found.evidence)
 
 
-def _choose_poses(times: Array, poses: Array, options: InertialOptions) -> Ints:
+def contradicted(reason: str, advice: str, evidence: dict[str, Any]) -> ScaleRefusal:
+    """A refusal because map and measurements say different things. The map in its own unit is not touched by it."""
+    numbers = {key: value for key, value in evidence.items() if not isinstance(value, float) or np.isfinite(value)}
+    return ScaleRefusal("imu", reason, evidence, Contradiction("inertial measurements", reason, advice, numbers))
+
+
+def turns_of(times: Array, poses: Array, chosen: Ints, max_interval_s: float) -> Turns:
+    """The rotations between neighbours of the chosen poses."""
+    first, second = chosen[:-1], chosen[1:]
+    near = times[second] - times[first] <= max_interval_s
+    first, second = first[near], second[near]
+    rotation = rigid3.rotation_matrix(poses)
+    return Turns(times[first], times[second], rotation[first] @ rotation[second].swapaxes(1, 2))
+
+
+def choose_poses(times: Array, poses: Array, options: InertialOptions) -> Ints:
     """Positions of poses that exist and are far enough apart in time."""
     known = np.flatnonzero(np.isfinite(poses).all(1))
     duration = float(np.ptp(times[known])) if len(known) else 0.0
@@ -219,67 +263,6 @@ def _map_from_imu_rotation(poses: Array, imu: Imu) -> Array:
 # ---- integration
 
 
-def _steps(imu: Imu, start_s: float, stop_s: float) -> Array | None:
-    """(n, 7) duration, mean gyro and mean accel between neighbouring samples from start to stop; None in gaps."""
-    times = imu.timestamps_s
-    low, high = int(np.searchsorted(times, start_s, "right")), int(np.searchsorted(times, stop_s, "left"))
-    if not stop_s > start_s or len(times) < 2:
-        return None
-    index = np.clip(np.arange(low - 1, high + 1), 0, len(times) - 1)
-    nodes = np.concatenate([[start_s], times[low:high], [stop_s]])
-    silence = np.diff(times[index]).max(initial=0.0)
-    if silence > _MAX_SILENCE_S or times[0] - start_s > _MAX_SILENCE_S or stop_s - times[-1] > _MAX_SILENCE_S:
-        return None
-    local = times[index[0] : index[-1] + 1]
-    values = np.concatenate([imu.gyro[index[0] : index[-1] + 1], imu.accel[index[0] : index[-1] + 1]], 1)
-    at_nodes = np.stack([np.interp(nodes, local, column) for column in values.T], 1)
-    steps = np.column_stack([np.diff(nodes), 0.5 * (at_nodes[1:] + at_nodes[:-1])])
-    return np.ascontiguousarray(steps[steps[:, 0] > 0])
-
-
-@numba.njit(cache=True, nogil=True)
-def _turn_by(wx: float, wy: float, wz: float, out: Array, slope: Array) -> None:
-    """exp(w) and its right Jacobian, (3, 3), by series: a step of an inertial sensor is a small angle."""
-    n2 = wx * wx + wy * wy + wz * wz
-    a = 1.0 - n2 / 6.0 * (1.0 - n2 / 20.0 * (1.0 - n2 / 42.0))
-    b = 0.5 - n2 / 24.0 * (1.0 - n2 / 30.0 * (1.0 - n2 / 56.0))
-    c = (1.0 - n2 / 20.0 * (1.0 - n2 / 42.0)) / 6.0
-    w = (wx, wy, wz)
-    for i in range(3):
-        for j in range(3):
-            square = w[i] * w[j] - (n2 if i == j else 0.0)
-            out[i, j] = (1.0 if i == j else 0.0) + b * square
-            slope[i, j] = (1.0 if i == j else 0.0) + c * square
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        out[k, j] += a * w[i]
-        out[j, k] -= a * w[i]
-        slope[k, j] -= b * w[i]
-        slope[j, k] += b * w[i]
-
-
-@numba.njit(cache=True, nogil=True)
-def _integrate_rotation(steps: Array, gyro_bias: Array, turn: Array) -> None:
-    """Rotation imu(start) from imu(stop) into turn (3, 3)."""
-    step, slope, new = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    turn[:] = np.eye(3)
-    for n in range(steps.shape[0]):
-        h = steps[n, 0]
-        _turn_by(
-            (steps[n, 1] - gyro_bias[0]) * h, (steps[n, 2] - gyro_bias[1]) * h, (steps[n, 3] - gyro_bias[2]) * h, step,
-            slope,
-        )  # fmt: skip
-        _multiply(turn, step, new)
-        turn[:] = new
-
-
-@numba.njit(cache=True, nogil=True)
-def _multiply(a: Array, b: Array, out: Array) -> None:
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
-
-
 @numba.njit(cache=True, nogil=True)
 def _integrate(steps: Array, gyro_bias: Array, out: Array) -> None:
     """Fill out (60,), see _Interval (Forster et al. 2017, equations 33 and 44, and the appendix for the slopes)."""
@@ -291,14 +274,14 @@ def _integrate(steps: Array, gyro_bias: Array, out: Array) -> None:
         h = steps[n, 0]
         wx, wy, wz = steps[n, 1] - gyro_bias[0], steps[n, 2] - gyro_bias[1], steps[n, 3] - gyro_bias[2]
         # the mean force of a step acts in the orientation of its middle
-        _turn_by(0.5 * wx * h, 0.5 * wy * h, 0.5 * wz * h, step, slope)
-        _multiply(turn, step, half)
+        turn_by(0.5 * wx * h, 0.5 * wy * h, 0.5 * wz * h, step, slope)
+        multiply(turn, step, half)
         for i in range(3):
             a[i] = half[i, 0] * steps[n, 4] + half[i, 1] * steps[n, 5] + half[i, 2] * steps[n, 6]
         cross[0, 1], cross[0, 2], cross[1, 2] = -steps[n, 6], steps[n, 5], -steps[n, 4]
         cross[1, 0], cross[2, 0], cross[2, 1] = steps[n, 6], -steps[n, 5], steps[n, 4]
-        _multiply(half, cross, new)
-        _multiply(new, r_g, lean)
+        multiply(half, cross, new)
+        multiply(new, r_g, lean)
         for i in range(3):
             position[i] += velocity[i] * h + 0.5 * a[i] * h * h
             velocity[i] += a[i] * h
@@ -307,8 +290,8 @@ def _integrate(steps: Array, gyro_bias: Array, out: Array) -> None:
                 p_a[i, j] += v_a[i, j] * h - 0.5 * half[i, j] * h * h
                 v_g[i, j] -= lean[i, j] * h
                 v_a[i, j] -= half[i, j] * h
-        _turn_by(wx * h, wy * h, wz * h, step, slope)
-        _multiply(turn, step, new)
+        turn_by(wx * h, wy * h, wz * h, step, slope)
+        multiply(turn, step, new)
         turn[:] = new
         for i in range(3):
             for j in range(3):
@@ -329,7 +312,7 @@ def _intervals(times: Array, chosen: Ints, imu: Imu, max_interval_s: float) -> l
     """Between neighbouring poses, where the measurements cover the time."""
     out = []
     for first, second in itertools.pairwise(chosen):
-        steps = _steps(imu, times[first], times[second]) if times[second] - times[first] <= max_interval_s else None
+        steps = imu_steps(imu, times[first], times[second]) if times[second] - times[first] <= max_interval_s else None
         if steps is not None:
             out.append(_reintegrate(_Interval(int(first), int(second), steps, np.empty(60)), np.zeros(3)))
     return out
@@ -357,7 +340,7 @@ def _gyro_bias(intervals: list[_Interval], map_from_imu: Array) -> tuple[Array, 
 
 
 @dataclass(frozen=True)
-class _Start:
+class LinearStart:
     """Map units per metre, gravity (3,) m/s^2 in the map's axes, accel bias, noise of a map position in map units."""
 
     inverse_scale: float
@@ -368,15 +351,20 @@ class _Start:
 
 
 def _solve_linear(
-    intervals: list[_Interval],
-    gyro_bias: Array,
-    centers: Array,
-    map_from_imu: Array,
-    poses: Array,
-    imu: Imu,
+    intervals: list[_Interval], gyro_bias: Array, centers: Array, map_from_imu: Array, poses: Array, imu: Imu,
     is_metric: bool,
-) -> _Start:
-    """Scale, gravity and accelerometer bias from mean velocities over neighbouring intervals.
+) -> LinearStart:  # fmt: skip
+    """Scale, gravity and accelerometer bias from mean velocities over neighbouring intervals."""
+    system = _linear_system(intervals, gyro_bias, centers, map_from_imu, poses, imu)
+    return (
+        LinearStart(0.0, np.zeros(3), np.zeros(3), np.nan, np.inf) if system is None else constrain(*system, is_metric)
+    )
+
+
+def _linear_system(
+    intervals: list[_Interval], gyro_bias: Array, centers: Array, map_from_imu: Array, poses: Array, imu: Imu
+) -> tuple[Array, Array] | None:
+    """Design (N, 3, 7) and target (N, 3) of :func:`constrain`; None of too few.
 
     With rho = 1 / scale the change of the camera's mean velocity in map units is
     rho (what was integrated, less what the lever arm moved) + rho g (dt1 + dt2) / 2 + rho (slopes) bias:
@@ -396,10 +384,18 @@ def _solve_linear(
         left.append(_velocity_change(centers[index], dt1, dt2))
         blur.append(np.sqrt(1 / dt1**2 + 1 / dt2**2 + (1 / dt1 + 1 / dt2) ** 2))
     if len(pairs) < 4:
-        return _Start(0.0, np.zeros(3), np.zeros(3), np.nan, np.inf)
+        return None
     weight = 1.0 / np.array(blur)
-    design, target = np.array(rows) * weight[:, None, None], np.array(left) * weight[:, None]
-    return _constrain(design, target, is_metric)
+    return np.array(rows) * weight[:, None, None], np.array(left) * weight[:, None]
+
+
+def linear_system(
+    times: Array, poses: Array, imu: Imu, gyro_bias: Array, options: InertialOptions
+) -> tuple[Array, Array] | None:
+    """The same from poses as :func:`align_imu` takes them."""
+    chosen = choose_poses(times, poses, options)
+    intervals = [_reintegrate(i, gyro_bias) for i in _intervals(times, chosen, imu, options.max_interval_s)]
+    return _linear_system(intervals, gyro_bias, rigid3.center(poses), _map_from_imu_rotation(poses, imu), poses, imu)
 
 
 def _long_pairs(intervals: list[_Interval], gyro_bias: Array) -> list[tuple[_Interval, _Interval]]:
@@ -425,7 +421,7 @@ def _velocity_change(positions: Array, dt1: float, dt2: float) -> Array:
     return changed
 
 
-def _constrain(design: Array, target: Array, is_metric: bool) -> _Start:
+def constrain(design: Array, target: Array, is_metric: bool, rounds: int = 15) -> LinearStart:
     """Reweighted least squares of design (N, 3, 7) x = target (N, 3) with |gravity| known; x = rho (1, g, bias).
 
     Started from the solution without that knowledge, and from gravity as it is felt on the average; the better end.
@@ -439,13 +435,13 @@ def _constrain(design: Array, target: Array, is_metric: bool) -> _Start:
         rho = float((along * target).sum() / max(float((along**2).sum()), 1e-300))
         # not a sign, but a size to start from: what the positions do over what the sensor feels
         rho = 1.0 if is_metric else max(rho, 0.1 * float(np.sqrt((target**2).sum() / (along**2).sum())))
-        ends.append(_descend(design, target, is_metric, rho, down))
+        ends.append(_descend(design, target, is_metric, rho, down, rounds))
     return min(ends, key=lambda end: end.position_sigma)
 
 
-def _descend(design: Array, target: Array, is_metric: bool, rho: float, down: Array) -> _Start:
-    bias, condition, sigma = np.zeros(3), np.inf, np.nan
-    for _ in range(15):
+def _descend(design: Array, target: Array, is_metric: bool, rho: float, down: Array, rounds: int) -> LinearStart:
+    bias, sigma = np.zeros(3), np.nan
+    for _ in range(rounds):
         basis = np.linalg.svd(down[None])[2][1:].T
         x = np.concatenate([[1.0], GRAVITY * down, bias])
         left = target - rho * design @ x
@@ -458,17 +454,17 @@ def _descend(design: Array, target: Array, is_metric: bool, rho: float, down: Ar
         slopes = slopes[..., 1:] if is_metric else slopes
         size = slopes.shape[2]
         prior = np.zeros((3, size))
-        prior[:, -3:] = sigma / _ACCEL_BIAS_SIGMA * np.eye(3)
+        prior[:, -3:] = sigma / ACCEL_BIAS_SIGMA * np.eye(3)
         a = np.concatenate([(slopes * weight[:, None, None]).reshape(-1, size), prior])
-        b = np.concatenate([(left * weight[:, None]).ravel(), -sigma / _ACCEL_BIAS_SIGMA * bias])
+        b = np.concatenate([(left * weight[:, None]).ravel(), -sigma / ACCEL_BIAS_SIGMA * bias])
         step = np.linalg.lstsq(a, b, rcond=None)[0]
-        condition = float(np.linalg.cond(a / np.linalg.norm(a, axis=0)))
         if not is_metric:
             rho = float(np.clip(rho + step[0], 0.3 * rho, 3.0 * rho))  # a scale does not change its sign
         down = down + basis @ np.clip(step[-5:-3], -0.5, 0.5)
         down /= np.linalg.norm(down)
         bias = bias + step[-3:]
-    return _Start(rho, GRAVITY * down, bias, sigma, condition)
+    condition = float(np.linalg.cond(a / np.maximum(np.linalg.norm(a, axis=0), 1e-300)))
+    return LinearStart(rho, GRAVITY * down, bias, sigma, condition)
 
 
 # ---- the refinement
@@ -484,16 +480,19 @@ def _upright(gravity: Array) -> Array:
 
 
 class _Graph:
-    """Poses X, velocities V and biases B of the sensor in the z-up world, and A: log scale and two angles of tilt."""
+    """Poses X, velocities V and biases B of the sensor in the z-up world, and A: log scale, two angles of tilt, and the
+    seconds after its time at which a pose of the map was taken."""
 
     def __init__(
-        self, times: Array, poses: Array, imu: Imu, intervals: list[_Interval], start: _Start, gyro_bias: Array,
+        self, times: Array, poses: Array, imu: Imu, intervals: list[_Interval], start: LinearStart, gyro_bias: Array,
         rotation_sigma: float, is_metric: bool, covariance: Array | None,
     ) -> None:  # fmt: skip
         self._poses, self._imu, self._intervals, self._is_metric = poses, imu, intervals, is_metric
         self._covariance = covariance
         self._start, self._gyro_bias = start, gyro_bias
         self._index = sorted({k for interval in intervals for k in (interval.first, interval.second)})
+        rates = np.stack([np.interp(times, imu.timestamps_s, column) for column in imu.gyro.T], 1)
+        self._rates = rates - gyro_bias
         # rounding alone leaves less than this; zero noise would make the graph singular
         self._sigmas = np.r_[np.full(3, max(rotation_sigma, 1e-7)), np.full(3, max(start.position_sigma, self._tiny()))]
         self._world_from_map = _upright(start.gravity)
@@ -526,7 +525,7 @@ class _Graph:
         from gtsam.symbol_shorthand import A, B, V, X
 
         values, scale = gtsam.Values(), 1.0 / self._start.inverse_scale
-        values.insert(A(0), np.array([np.log(scale), 0.0, 0.0]))
+        values.insert(A(0), np.array([np.log(scale), 0.0, 0.0, 0.0]))
         sensor = {}
         for k in self._index:
             map_from_cam = rigid3.inverse(self._poses[k])
@@ -565,7 +564,7 @@ class _Graph:
             a, b = i.first, i.second
             graph.push_back(gtsam.CombinedImuFactor(X(a), V(a), X(b), V(b), B(a), B(b), sums))
             if a not in linked:  # the first of a chain of intervals
-                sigmas = np.repeat([_ACCEL_BIAS_SIGMA, _GYRO_BIAS_SIGMA], 3)
+                sigmas = np.repeat([ACCEL_BIAS_SIGMA, _GYRO_BIAS_SIGMA], 3)
                 prior = gtsam.imuBias.ConstantBias(np.zeros(3), self._gyro_bias)
                 graph.push_back(gtsam.PriorFactorConstantBias(B(a), prior, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
             linked.update((a, b))
@@ -575,23 +574,24 @@ class _Graph:
                 if self._covariance is None
                 else gtsam.noiseModel.Gaussian.Covariance(self._covariance[k] + floor)
             )
-            link = _MapPose(self._poses[k], self._imu, self._world_from_map)
-            graph.push_back(gtsam.CustomFactor(gtsam.noiseModel.Robust.Create(loss, noise), [X(k), A(0)], link.error))
+            link = _MapPose(self._poses[k], self._imu, self._world_from_map, self._rates[k])
+            robust = gtsam.noiseModel.Robust.Create(loss, noise)
+            graph.push_back(gtsam.CustomFactor(robust, [X(k), A(0), V(k)], link.error))
         # the tilt is only kept from running away; a metric map's scale is known (1e-9 would be a constraint to gtsam)
-        sigmas = np.array([1e-6 if self._is_metric else 10.0, 10.0, 10.0])
+        sigmas = np.array([1e-6 if self._is_metric else 10.0, 10.0, 10.0, _CLOCK_SIGMA_S])
         scale = 1.0 if self._is_metric else 1.0 / self._start.inverse_scale
-        center = np.array([np.log(scale), 0.0, 0.0])
+        center = np.array([np.log(scale), 0.0, 0.0, 0.0])
         graph.push_back(gtsam.PriorFactorVector(A(0), center, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
         return graph
 
     def _links(self, values: Any) -> Array:
         """(J, 6) residuals of the map's poses: radians and map units."""
-        from gtsam.symbol_shorthand import A, X
+        from gtsam.symbol_shorthand import A, V, X
 
         out = np.empty((len(self._index), 6))
         for n, k in enumerate(self._index):
-            link = _MapPose(self._poses[k], self._imu, self._world_from_map)
-            out[n] = link.residual(values.atPose3(X(k)), values.atVector(A(0)))
+            link = _MapPose(self._poses[k], self._imu, self._world_from_map, self._rates[k])
+            out[n] = link.residual(values.atPose3(X(k)), values.atVector(A(0)), values.atVector(V(k)))
         return out
 
     def _weigh(self, values: Any) -> None:
@@ -604,15 +604,15 @@ class _Graph:
     def _read(self, graph: Any, values: Any, evidence: dict[str, Any]) -> InertialAlignment:
         from gtsam.symbol_shorthand import A, B, V
 
-        log_scale, *tilt = values.atVector(A(0))
+        log_scale, *tilt, offset = values.atVector(A(0))
         rotation = rigid3.exp_so3(np.r_[tilt, 0.0]) @ self._world_from_map
         gravity = rotation.T @ [0.0, 0.0, -GRAVITY]
         upright = _upright(gravity)
         keep_heading = upright @ rotation.T
         covariance, bias_covariance = _covariances(graph, values, A(0), B(self._index[len(self._index) // 2]))
-        # rows: 15 an interval, 6 a pose, 6 a chain; unknowns: 15 a pose and 3
+        # rows: 15 an interval, 6 a pose, 6 a chain; unknowns: 15 a pose and 4
         chains = len(self._index) - len(self._intervals)
-        num_free = 15 * len(self._intervals) + 6 * len(self._index) + 6 * chains + 3 - 15 * len(self._index) - 3
+        num_free = 15 * len(self._intervals) + 6 * len(self._index) + 6 * chains + 4 - 15 * len(self._index) - 4
         residual = 2.0 * graph.error(values) / num_free
         widen = np.sqrt(max(residual, 1.0))
         biases = np.array([values.atConstantBias(B(k)).vector() for k in self._index]).mean(0)
@@ -628,8 +628,9 @@ class _Graph:
         scale = 1.0 if self._is_metric else float(np.exp(log_scale))
         return InertialAlignment(
             scale, sigma, similarity.from_parts(upright, np.zeros(3), scale), gravity, gravity_sigma,
-            np.array(self._index), np.array([values.atVector(V(k)) for k in self._index]) @ keep_heading.T, biases[3:],
-            biases[:3], bias_sigma[3:], bias_sigma[:3], float(residual), evidence,
+            np.array(self._index), np.array([values.atVector(V(k)) for k in self._index]) @ keep_heading.T,
+            float(offset), float(widen * np.sqrt(covariance[3, 3])), biases[3:], biases[:3], bias_sigma[3:],
+            bias_sigma[:3], float(residual), evidence,
         )  # fmt: skip
 
 
@@ -680,59 +681,64 @@ def _midway(steps: Array, gyro_bias: Array) -> Array:
 
 
 class _MapPose:
-    """A pose of the map as a measurement of the sensor's pose, given the map's scale and tilt.
+    """A pose of the map as a measurement of the sensor's pose, given the map's scale, its tilt and the clocks' offset.
 
     The residual (6,) is the (w, v) of ``x_cam <- exp(w) x_cam + v`` that carries what is measured to what is predicted,
-    up to the sign: radians and map units, so that covariances of the map apply as they are.
+    up to the sign: radians and map units, so that covariances of the map apply as they are. Over the offset, some
+    milliseconds by now, the sensor turns at its rate (3,) in rad/s and moves at its velocity.
     """
 
-    def __init__(self, cam_from_map: Array, imu: Imu, world_from_map: Array) -> None:
+    def __init__(self, cam_from_map: Array, imu: Imu, world_from_map: Array, rate: Array) -> None:
         self._cam_from_map = rigid3.rotation_matrix(cam_from_map)
         self._center = rigid3.center(cam_from_map)
         self._imu_from_cam = rigid3.rotation_matrix(imu.imu_from_cam)
-        self._arm, self._arm_cross = imu.imu_from_cam[4:], rigid3.skew(imu.imu_from_cam[4:])
+        self._arm, self._rate = imu.imu_from_cam[4:], rate
         self._world_from_map = world_from_map
 
-    def residual(self, pose: Any, alignment: Array) -> Array:
-        """(6,) at a gtsam.Pose3 of the sensor and (3,) log scale and tilt."""
-        cam_from_world = self._upright_cam(alignment)
-        rotation = pose.rotation().matrix()
+    def residual(self, pose: Any, alignment: Array, velocity: Array) -> Array:
+        """(6,) at a gtsam.Pose3 of the sensor, (4,) log scale, tilt and offset, and its velocity (3,)."""
+        cam_from_world, rotation, center = self._later(pose, alignment, velocity)
         angle = rigid3.log_so3(cam_from_world @ rotation @ self._imu_from_cam)
-        center = pose.translation() + rotation @ self._arm
         return np.r_[angle, cam_from_world @ center / np.exp(alignment[0]) - self._cam_from_map @ self._center]
 
-    def _upright_cam(self, alignment: Array) -> Array:
+    def _later(self, pose: Any, alignment: Array, velocity: Array) -> tuple[Array, Array, Array]:
+        """Of the camera, as the map has it, from the z-up world; and the sensor's rotation and the camera's centre
+        there, when the picture was taken."""
         tilt = rigid3.exp_so3([-alignment[1], -alignment[2], 0.0])
-        return np.asarray(self._cam_from_map @ self._world_from_map.T @ tilt)
+        rotation = pose.rotation().matrix() @ rigid3.exp_so3(alignment[3] * self._rate)
+        center = pose.translation() + alignment[3] * velocity + rotation @ self._arm
+        return np.asarray(self._cam_from_map @ self._world_from_map.T @ tilt), rotation, center
 
-    def slopes(self, pose: Any, alignment: Array) -> tuple[Array, Array]:
-        """Of the residual, (6, 6) by the pose's tangent and (6, 3) by log scale and tilt."""
-        cam_from_world, scale = self._upright_cam(alignment), np.exp(alignment[0])
-        rotation = pose.rotation().matrix()
-        turned, center = rotation @ self._imu_from_cam, pose.translation() + rotation @ self._arm
+    def slopes(self, pose: Any, alignment: Array, velocity: Array) -> tuple[Array, Array, Array]:
+        """Of the residual, (6, 6) by the pose's tangent, (6, 4) by the alignment and (6, 3) by the velocity."""
+        cam_from_world, rotation, center = self._later(pose, alignment, velocity)
+        scale, at_time = np.exp(alignment[0]), pose.rotation().matrix()
+        turned = rotation @ self._imu_from_cam
         of_tilt = (np.eye(3) + 0.5 * rigid3.skew([alignment[1], alignment[2], 0.0]))[:, :2]
         # inverse right Jacobian, to first order
         of_angle = np.eye(3) + 0.5 * rigid3.skew(rigid3.log_so3(cam_from_world @ turned))
-        by_pose, by_alignment = np.zeros((6, 6)), np.zeros((6, 3))
-        by_pose[:3, :3] = of_angle @ self._imu_from_cam.T
-        by_pose[3:, :3] = -cam_from_world @ rotation @ self._arm_cross / scale
-        by_pose[3:, 3:] = cam_from_world @ rotation / scale
-        by_alignment[:3, 1:] = -of_angle @ turned.T @ of_tilt
+        by_pose, by_alignment, by_velocity = np.zeros((6, 6)), np.zeros((6, 4)), np.zeros((6, 3))
+        by_pose[:3, :3] = of_angle @ turned.T @ at_time
+        by_pose[3:, :3] = -cam_from_world @ at_time @ rigid3.skew(at_time.T @ rotation @ self._arm) / scale
+        by_pose[3:, 3:] = cam_from_world @ at_time / scale
+        by_alignment[:3, 1:3] = -of_angle @ turned.T @ of_tilt
+        by_alignment[:3, 3] = of_angle @ self._imu_from_cam.T @ self._rate
         by_alignment[3:, 0] = -cam_from_world @ center / scale
-        by_alignment[3:, 1:] = cam_from_world @ rigid3.skew(center) @ of_tilt / scale
-        return by_pose, by_alignment
+        by_alignment[3:, 1:3] = cam_from_world @ rigid3.skew(center) @ of_tilt / scale
+        by_alignment[3:, 3] = cam_from_world @ (velocity + rotation @ np.cross(self._rate, self._arm)) / scale
+        by_velocity[3:] = alignment[3] * cam_from_world / scale
+        return by_pose, by_alignment, by_velocity
 
     def error(self, factor: Any, values: Any, slopes: Any) -> Array:
         """For gtsam.CustomFactor."""
-        pose_key, alignment_key = factor.keys()
-        pose, alignment = values.atPose3(pose_key), values.atVector(alignment_key)
+        pose_key, alignment_key, velocity_key = factor.keys()
+        at = values.atPose3(pose_key), values.atVector(alignment_key), values.atVector(velocity_key)
         if slopes is not None:
-            slopes[0], slopes[1] = self.slopes(pose, alignment)
-        return self.residual(pose, alignment)
+            slopes[0], slopes[1], slopes[2] = self.slopes(*at)
+        return self.residual(*at)
 
 
 def compile_kernels() -> None:
     """Compile the kernels of this module, or load them from numba's cache."""
     steps = np.zeros((1, 7))
-    _integrate_rotation(steps, np.zeros(3), np.empty((3, 3)))
     _integrate(steps, np.zeros(3), np.empty(60))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sfmapp.contradictions import widened, widened_scale_sigma
 from sfmapp.geometry import rigid3
-from sfmapp.odometry.finish import Conclusion
+from sfmapp.odometry.finish import MAX_COVARIANCE_KEYFRAMES, Conclusion
 from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.odometry.tracker import measure_pose
@@ -126,4 +126,21 @@ def _map_result(keyframes: KeyframeMap, conclusion: Conclusion) -> MapResult:
         model, np.array([k.frame_idx for k in keyframes.keyframes], np.int64),
         np.arange(num, dtype=np.int64) * num_sensors, covariance, conclusion.gauge,
         "stereo" if num_sensors > 1 else "none", widened_scale_sigma(conclusion.scale_sigma, found), found,
+        _covariance_gap(conclusion, num),
     )  # fmt: skip
+
+
+def _covariance_gap(conclusion: Conclusion, num_keyframes: int) -> str:
+    """Why keyframes have no covariance; empty where all have one, or none was asked for."""
+    covariance = conclusion.covariance
+    if covariance is None:
+        if num_keyframes < 2:
+            return "a single keyframe has nothing that it could be uncertain against"
+        if num_keyframes > MAX_COVARIANCE_KEYFRAMES or conclusion.report.get("is_piecewise"):
+            return f"{num_keyframes} keyframes are too many for covariances, {MAX_COVARIANCE_KEYFRAMES} the most"
+        return ""
+    num_known = int(np.isfinite(covariance).all((1, 2)).sum())
+    if num_known == 0:
+        return "the observations do not determine the poses: more than place and size of the map is open"
+    unheld = f"{num_keyframes - num_known} of {num_keyframes} keyframes are held by no points"
+    return unheld if num_known < num_keyframes else ""

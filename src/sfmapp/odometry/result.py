@@ -39,6 +39,7 @@ class MapResult:
         scale_source: ``stereo``, ``none`` (arbitrary unit), ``marker``, ``distance``, ``camera_height`` or ``imu``.
         scale_sigma: relative standard deviation of the unit of length; None for an arbitrary unit.
         contradictions: evidence against the map that was not resolved; covariance and scale_sigma hold what it adds.
+        covariance_gap: why keyframes lack a covariance; empty where none does, or none was asked for.
     """
 
     reconstruction: Reconstruction
@@ -49,6 +50,7 @@ class MapResult:
     scale_source: str = "none"
     scale_sigma: float | None = None
     contradictions: list[Contradiction] = field(default_factory=list)
+    covariance_gap: str = ""
 
 
 @dataclass

@@ -15,7 +15,7 @@ from sfmapp.images.sequence import Frame, Sequence
 from sfmapp.odometry.active_tracks import ActiveTracks
 from sfmapp.odometry.early_calibration import is_time_to_ask, refine_early
 from sfmapp.odometry.finish import conclude
-from sfmapp.odometry.inertial import imu_rotation
+from sfmapp.odometry.gyroscope import GyroTrust, imu_rotation
 from sfmapp.odometry.initialize import Beginning, TwoViews, pose_between
 from sfmapp.odometry.keyframe_map import KeyframeMap
 from sfmapp.odometry.local_map import LocalMap, View
@@ -52,12 +52,14 @@ class Odometry:
         self.records: list[FrameRecord] = []
         self.maps: dict[int, LocalMap] = {}
         self.local: LocalMap | None = None
+        self.num_begun = 0  # numbers of maps that were taken into others are not given again: live poses are in worlds
         self.recognition = Recognition(seed)
         self.beginning = Beginning(self.rig.cameras[0], options, seed)
         self.waiting: list[tuple[FrameRecord, View]] = []
         self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
         self.pose, self.step = rigid3.IDENTITY, rigid3.IDENTITY
-        self.imu = sequence.imu
+        self.imu, self.gyro_trust = sequence.imu, GyroTrust()
+        self.foretold: tuple[Array, Array] | None = None  # turns since the last frame, by the gyroscope and if steady
         self.clock = StereoClock(self.rig)
         self.previous: Pyramid | None = None
         self.num_mapped_at_keyframe = 0
@@ -151,7 +153,7 @@ class Odometry:
         self.beginning = Beginning(self.rig.cameras[0], self.options, self.seed)
 
     def _new_map(self) -> LocalMap:
-        number = max(self.maps, default=-1) + 1
+        number = self.num_begun
         self.maps[number] = LocalMap(self.rig, self.options, self.executor, number)
         return self.maps[number]
 
@@ -159,6 +161,7 @@ class Odometry:
         """Go on from the newest keyframe of a map."""
         self.local, self.tracks, self.pose, self.step = local, tracks, pose, rigid3.IDENTITY
         self.lost_since = None
+        self.num_begun = local.map_idx + 1
         self._count_mapped()
 
     # ------------------------------------------------------------------ tracking
@@ -174,6 +177,8 @@ class Odometry:
             self._lose(record)
             return False
         self.step = rigid3.compose(tracked.pose, rigid3.inverse(self.pose))
+        if self.foretold is not None:
+            self.gyro_trust.learn(*self.foretold, rigid3.rotation_matrix(self.step))
         self.pose, self.tracks, self.is_mapped = tracked.pose, tracked.tracks, tracked.is_mapped
         reason = keyframe_reason(local, tracked, self.num_mapped_at_keyframe, self.options)
         if reason is None:
@@ -184,6 +189,7 @@ class Odometry:
 
     def _predicted_step(self) -> Array:
         """The motion since the last frame: steady, over the time that has passed; turned as a gyroscope says."""
+        self.foretold = None
         if len(self.records) < 3:
             return self.step
         before, last, now = (record.timestamp_s for record in self.records[-3:])
@@ -191,7 +197,8 @@ class Odometry:
         share = min((now - last) / (last - before), _MAX_STEADY_SHARE)
         step = pose_between(rigid3.IDENTITY, self.step, share) if abs(share - 1) > _STEADY_SHARE else self.step
         turn = None if self.imu is None else imu_rotation(self.imu, last, now)
-        return step if turn is None else rigid3.from_matrix(turn, step[4:])
+        self.foretold = None if turn is None else (turn, rigid3.rotation_matrix(step))
+        return rigid3.from_matrix(turn, step[4:]) if turn is not None and self.gyro_trust.is_better else step
 
     def _make_keyframe(self, record: FrameRecord, view: View, state: FrameState, reason: str) -> None:
         local = self.local
@@ -318,6 +325,8 @@ class Odometry:
             self.maps[number].backend.finish(self.maps[number].keyframes)
         self.local, scale = self.recognition.close(self.maps, self.records, closure)
         self.pose, self.step = self.local.pose(self.local.newest), self.step * np.repeat([1.0, scale], [4, 3])
+        # the newest frame is given out after this: in the world, and with the unit, that those after it have as well
+        self.records[-1].live = self.pose.copy()
         self.tracks = self.local.tracks_of_newest()
         self._count_mapped()
         self.counts["loops"] += 1
@@ -360,6 +369,9 @@ class Odometry:
         if self.executor is not None:
             self.executor.shutdown()
         result = gather(self.records, maps, conclusions)
+        for m, entry in enumerate(result.maps):
+            if entry.covariance_gap:
+                self.events.warned("adjustment", f"map {m}, covariances are missing: {entry.covariance_gap}")
         if self.options.smooth and result.covariance is not None:
             for m in range(len(result.maps)):
                 poses = np.where((result.frame_map == m)[:, None], result.cam_from_world, np.nan)

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sfmapp.contradictions import Contradiction
 from sfmapp.errors import UsageError
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
@@ -49,11 +50,13 @@ class ScaleRefusal:
         source: which.
         reason: a sentence for the report, with the numbers that failed.
         evidence: more numbers, JSON-able.
+        contradiction: set where the source does not fall silent but says something else than the map.
     """
 
     source: Source
     reason: str
     evidence: dict[str, Any]
+    contradiction: Contradiction | None = None
 
 
 @dataclass(frozen=True)

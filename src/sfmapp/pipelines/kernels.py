@@ -33,7 +33,7 @@ ODOMETRY_MODULES = (
     "sfmapp.odometry.pose_graph",
 )
 DENSE_MODULES = ("sfmapp.dense.densify",)
-INERTIAL_MODULES = ("sfmapp.odometry.inertial",)
+INERTIAL_MODULES = ("sfmapp.odometry.gyroscope", "sfmapp.odometry.inertial")
 
 
 @contextmanager

@@ -30,6 +30,8 @@ from sfmapp.odometry.scale import (
 from sfmapp.pipelines.odometry_keyframes import KeyframeWatch
 
 STAGE = "scale"
+# Clocks that differ by less are as good as one: a drone that flies 3 m/s moves 3 mm.
+_WORTH_SAYING_S = 1e-3
 Array = NDArray[np.float64]
 
 
@@ -118,12 +120,25 @@ def scale_maps(
             rescale(result, m, found)
             row |= {"metres_per_unit": found.scale, "sigma_relative": found.sigma_relative}
             text = f"map {m} is in metres, from {found.source.replace('_', ' ')}, to {100 * found.sigma_relative:.2g} %"
+            text += _clocks_apart(found.evidence)
             events.decided(STAGE, text, **row)
         else:
             row["reason"] = found.reason
+            if found.contradiction is not None:
+                entry = result.maps[m]
+                result.maps[m] = replace(entry, contradictions=[*entry.contradictions, found.contradiction])
             events.warned(STAGE, f"map {m} keeps an arbitrary unit of length: {found.reason}", **row)
         rows.append(row)
     return rows
+
+
+def _clocks_apart(evidence: dict[str, Any]) -> str:
+    """What the offset between the clocks is, where it is one; empty elsewhere."""
+    offset, sigma = evidence.get("clock_offset_s", 0.0), evidence.get("clock_sigma_s", np.inf)
+    if not abs(offset) > max(_WORTH_SAYING_S, 3 * sigma):
+        return ""
+    side = "late" if offset > 0 else "early"
+    return f"; the inertial measurements are stamped {1e3 * abs(offset):.1f} ms {side}, which is taken into account"
 
 
 def rescale(result: OdometryResult, map_idx: int, found: ScaleEstimate) -> None:
@@ -197,12 +212,15 @@ def _covariance_near(result: OdometryResult, entry: MapResult, position: int) ->
 
 
 def _from_imu(result: OdometryResult, m: int, imu: Imu) -> ScaleEstimate | ScaleRefusal:
-    from sfmapp.odometry.inertial import align_imu
+    from sfmapp.odometry.inertial_faults import align_or_explain
 
     entry = result.maps[m]
     times = result.timestamps_s[np.searchsorted(result.frame_idx, entry.keyframe_frame_idx)]
     poses = entry.reconstruction.cam_from_world[entry.keyframe_image_idx]
-    found = align_imu(times, poses, imu, is_metric=False, covariance=entry.covariance)
+    covariance = entry.covariance
+    if covariance is not None and not np.isfinite(covariance).any():
+        covariance = None  # none could be had: the noise is judged by how the poses fit
+    found = align_or_explain(times, poses, imu, is_metric=False, covariance=covariance)
     if isinstance(found, ScaleRefusal):
         return found
     return ScaleEstimate(found.scale, found.sigma_relative, "imu", found.evidence)

@@ -124,6 +124,7 @@ def map_row(result: OdometryResult, map_idx: int) -> dict[str, Any]:
         "scale_sigma": entry.scale_sigma,
         "gauge": entry.gauge,
         **_uncertainty(entry),
+        "covariance_gap": entry.covariance_gap,
         "contradictions": [found.describe() for found in entry.contradictions],
     }
 
@@ -223,4 +224,11 @@ def make_checks(
     if timing.get("times_real_time"):
         speed = timing["times_real_time"]
         rows.append(check("speed against the camera's", speed, f"{speed:.2f} x", 1, 0.5, "x"))
+    for found in maps:
+        if found["covariance_gap"]:
+            # a map without any is one whose sigmas nobody knows; one that lacks some states the others
+            light = "amber" if found["position_sigma"] is not None or found["num_keyframes"] < 2 else "red"
+            thresholds = "green: every keyframe has a covariance, amber: some have"
+            name = f"uncertainty of the keyframes of map {found['idx']}"
+            rows.append({"name": name, "value": found["covariance_gap"], "light": light, "thresholds": thresholds})
     return rows + check_contradictions(row for found in maps for row in found["contradictions"])
