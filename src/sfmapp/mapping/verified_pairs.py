@@ -76,10 +76,15 @@ class PairAgreement:
         return self.num_agreeing > AGREES * self.num_matches
 
     @property
-    def contradicts(self) -> Bools:
-        """(K,) bool: enough matches to say so, and next to none agree or share a point."""
+    def disagrees(self) -> Bools:
+        """(K,) bool: next to none of the matches agree or share a point."""
         limit = CONTRADICTS * self.num_matches
-        return (self.num_matches >= MIN_MATCHES) & (self.num_agreeing <= limit) & (self.num_shared <= limit)
+        return (self.num_agreeing <= limit) & (self.num_shared <= limit)
+
+    @property
+    def contradicts(self) -> Bools:
+        """(K,) bool: the pair disagrees, and has matches enough to say so."""
+        return (self.num_matches >= MIN_MATCHES) & self.disagrees
 
 
 def pair_agreement(reconstruction: Reconstruction, correspondences: Correspondences) -> PairAgreement:
@@ -150,12 +155,15 @@ class Standing:
         overruled_by: (K,) how strong the weakest link is of the strongest chain of agreeing pairs between the two
             images; 0 where there is none.
         stands: (K,) bool: contradicts the model, and is not clearly weaker than that chain.
+        doubt: how strong what contradicts the model is, at most, against what it rests on there: 0 if nothing does,
+            1 if it is as strong, infinite if the two images hang together by nothing else.
     """
 
     agreement: PairAgreement
     strength: Array
     overruled_by: Array
     stands: Bools
+    doubt: float
 
 
 def standing_pairs(reconstruction: Reconstruction, correspondences: Correspondences) -> Standing:
@@ -169,7 +177,9 @@ def standing_pairs(reconstruction: Reconstruction, correspondences: Corresponden
         for k in np.flatnonzero(contradicts):
             link = chains.weakest_link(*agreement.image_idx[k])
             overruled_by[k] = chains.strength[link] if link >= 0 else 0.0
-    return Standing(agreement, strength, overruled_by, contradicts & (overruled_by < CLEARLY * strength))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(contradicts & (strength > 0), strength / overruled_by, 0.0)
+    return Standing(agreement, strength, overruled_by, ratio > 1 / CLEARLY, float(ratio.max(initial=0.0)))
 
 
 @dataclass(frozen=True)
