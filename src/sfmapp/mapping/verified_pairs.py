@@ -40,6 +40,9 @@ AGREES, CONTRADICTS = 0.5, 1 / 3
 MIN_MATCHES = 30
 # A cell is covered by a pair that matches half as much of what is in it as it does where it has its matches.
 HALF_AS_WELL = 0.5
+# Few matches that are scattered over a picture do not cover it: a pair should match a fifth of what is where it has
+# its matches, which pairs of 40 degrees apart still do.
+GOOD_SHARE = 0.2
 # Side of the grid on which strength is measured: fine enough to tell a thing from what is around it.
 CELLS = 8
 # Evidence must be stronger by so much to overrule what contradicts it. Near neighbours cover 0.75 to 0.95 of a picture,
@@ -499,7 +502,7 @@ def _covered_share(matched: Ints, matchable: Ints) -> float:
             weighted += matched[c] * matched[c] / matchable[c]
     if total == 0.0:
         return 0.0
-    full = HALF_AS_WELL * weighted / total
+    full = HALF_AS_WELL * max(weighted / total, GOOD_SHARE)
     covered, everything = 0.0, 0.0
     for c in range(len(matched)):
         if matchable[c] > 0:
