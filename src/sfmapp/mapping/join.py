@@ -175,7 +175,6 @@ def unite(
     union.obs_is_inlier[np.isin(seen, linking)] = False
     mapper.triangulate_images(np.flatnonzero(is_new).tolist())
     mapper.adjust_globally()
-    mapper.grow()
     mapper.finish()
     return union
 
@@ -336,7 +335,10 @@ def _from_image(
     mine = (checks.image_idx == image_idx) & (checks.is_forward == is_own)
     camera = own.cameras[own.image_camera_idx[image_idx]]
     normalized = pixels_to_normalized(camera, checks.xy[mine])
-    found = resection.estimate_pose(checks.xyz[mine], normalized, tolerance_px / camera.focal)
+    # a bridge that has to be searched for longer is none
+    found = resection.estimate_pose(
+        checks.xyz[mine], normalized, tolerance_px / camera.focal, confidence=0.99, max_iterations=500
+    )
     if found is None:
         return np.zeros((0, 8))
     # through the frame of the image: what it sees of its own world, scaled, stands in the other one
