@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from photo_groups import Place, make_place, thinned
 
+from photo_groups import Place, make_place, thinned
 from sfmapp.adjust.solver import AdjustOptions
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3, similarity
