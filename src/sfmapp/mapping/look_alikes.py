@@ -16,19 +16,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Events
+from sfmapp.geometry import rigid3
 from sfmapp.mapping.intrinsics_check import Mapped
 from sfmapp.mapping.mapper import STAGE
-from sfmapp.mapping.verified_pairs import NUM_NAMED, Chains, Standing, standing_pairs
+from sfmapp.mapping.verified_pairs import (
+    CLEARLY,
+    MIN_MATCHES,
+    NUM_NAMED,
+    Chains,
+    Standing,
+    pair_strengths,
+    standing_pairs,
+)
 from sfmapp.scene.correspondences import Correspondences
+from sfmapp.scene.reconstruction import Reconstruction
 
-# Each round removes what holds images in a wrong place; what was hidden behind it comes to light in the next.
+# Each round maps without what the last one refuted; the poses of a better map refute more.
 MAX_ROUNDS = 3
+# A pair whose rotation is so far from that of a chain of stronger pairs leads elsewhere. Rotations of pairs are good to
+# a few degrees even where the focal length is a guess; sides that look alike are turned by a twelfth of a turn or more.
+MAX_TURN_DEG = 20.0
 
 
 def tell_apart(
     mapped: Mapped, correspondences: Correspondences, map_again: Callable[[Correspondences], Mapped], events: Events
 ) -> tuple[Mapped, dict[str, Any]]:
-    """Map again without the pairs that stronger ones contradict, for as long as the evidence against the map falls.
+    """Map again without the pairs that stronger ones refute, if verified pairs stand against a map.
 
     Args:
         mapped: the map from all pairs.
@@ -39,56 +52,91 @@ def tell_apart(
     Returns:
         The map with the least verified matches against it, and the report: empty if none stands against the first.
     """
-    standing = [standing_pairs(model, correspondences) for model in mapped.models]
-    first = weight = _weight(standing)
-    if weight == 0:
+    standing = _standing(mapped, correspondences)
+    before = _weight(standing)
+    if before == 0:
         return mapped, {}
-    best, dropped, kept_dropped = mapped, np.zeros(0, np.int64), np.zeros(0, np.int64)
+    best, against, last = (mapped, np.zeros(0, np.int64)), before, mapped
+    dropped = np.zeros(0, np.int64)
     for _ in range(MAX_ROUNDS):
-        suspects = np.concatenate([suspected_pairs(s, len(mapped.models[0].image_names)) for s in standing])
-        if np.isin(suspects, dropped).all():
+        if against > 0:
+            refuted = refuted_pairs(last.models, standing, correspondences)
+        else:  # all that the map does agree with makes it better, all that it does not only disturbs
+            refuted = np.concatenate([s.agreement.pair_idx[s.agreement.contradicts] for s in standing])
+        if np.array_equal(refuted, dropped):
             break
-        dropped = np.union1d(dropped, suspects)
+        dropped = refuted
         events.decided(
             STAGE,
-            f"{weight} verified matches contradict the model: mapping again without {len(dropped)} weaker pairs, which "
-            "may have taken parts that look alike for one",
+            f"{_weight(standing)} verified matches contradict the model: mapping again without {len(dropped)} pairs "
+            "that stronger ones refute",
         )
-        again = map_again(correspondences.without(dropped))
-        standing = [standing_pairs(model, correspondences) for model in again.models]
-        if _weight(standing) < weight and _size(again) >= _size(best):
-            best, weight, kept_dropped = again, _weight(standing), dropped
-        if _weight(standing) == 0:
+        was_settled = against == 0
+        last = map_again(correspondences.without(dropped))
+        standing = _standing(last, correspondences)
+        if _size(last) >= _size(best[0]) and (_weight(standing) < against or (was_settled and _weight(standing) == 0)):
+            best, against = (last, dropped), _weight(standing)
+        if was_settled:
             break
-    events.decided(STAGE, f"{weight} verified matches contradict the model, {first} before")
-    return best, _report(correspondences, best, kept_dropped, first, weight)
+    events.decided(STAGE, f"{against} verified matches contradict the model, {before} before")
+    return best[0], _report(correspondences, *best, before, against)
 
 
-def suspected_pairs(standing: Standing, num_images: int) -> NDArray[np.int64]:
-    """Pairs, as positions in the correspondences, that a model rests on and that stronger ones contradict.
+def refuted_pairs(
+    models: Sequence[Reconstruction], standing: Sequence[Standing], correspondences: Correspondences
+) -> NDArray[np.int64]:
+    """Verified pairs, as positions in the correspondences, that chains of clearly stronger pairs refute.
 
-    A pair that stands against a model and the chain of pairs that holds its two images where they are cannot both be
-    right. Where the weakest link of that chain is weaker than the pair, it goes, and with it all pairs between what
-    stronger ones join on either side, as they say the same; then the next chain, until none is left that is weaker.
+    Images are joined from the strongest pair down, and turned as it has them: as the model does where it agrees with
+    the pair, else as the pair itself. A pair between images that are joined already, but are turned otherwise, is
+    refuted if it is clearly weaker than the weakest link between them.
 
     Args:
-        standing: of the pairs with one model.
-        num_images: of the model, registered or not.
+        models: whose tracks are those of the correspondences.
+        standing: of the pairs with each model.
+        correspondences: all verified matches.
     """
-    agreement, strength = standing.agreement, standing.strength
-    images = agreement.image_idx
-    is_left = agreement.agrees
-    against = np.flatnonzero(standing.stands)
-    for k in against[np.argsort(-strength[against], kind="stable")]:
-        first, second = images[k]
-        while True:
-            chains = Chains.of(num_images, images[is_left], strength[is_left])
-            link = chains.weakest_link(first, second)
-            if link < 0 or chains.strength[link] >= strength[k]:
-                break
-            here, there = (chains.group_before(i, int(chains.joined_as[link])) for i in (first, second))
-            is_left &= ~((here[images] & there[images][:, ::-1]).any(axis=1))
-    return agreement.pair_idx[agreement.agrees & ~is_left]
+    strength = pair_strengths(models[0], correspondences)
+    rotation = rigid3.rotation_matrix(correspondences.cam2_from_cam1)
+    for model, of_model in zip(models, standing, strict=True):
+        pairs = of_model.agreement.pair_idx[of_model.agreement.agrees]
+        first, second = (
+            rigid3.rotation_matrix(model.cam_from_world[i]) for i in correspondences.pair_image_idx[pairs].T
+        )
+        rotation[pairs] = second @ np.swapaxes(first, 1, 2)
+    known = (strength > 0) & (correspondences.num_inliers >= MIN_MATCHES) & np.isfinite(rotation).all(axis=(1, 2))
+    pairs = np.flatnonzero(known)
+    pairs = pairs[np.argsort(-strength[pairs], kind="stable")]
+    images = correspondences.pair_image_idx.astype(np.int64)
+    chains = Chains.of(len(models[0].image_names), images[pairs], strength[pairs])
+    turned = _turn_together(chains, images[pairs], rotation[pairs])
+    i, j = images[pairs].T
+    between = turned[j] @ np.swapaxes(turned[i], 1, 2) @ np.swapaxes(rotation[pairs], 1, 2)
+    is_off = rigid3.rotation_angle_deg(between) > MAX_TURN_DEG
+    refuted = [p for p in pairs[is_off] if chains.strength[chains.weakest_link(*images[p])] > CLEARLY * strength[p]]
+    return np.sort(np.array(refuted, np.int64))
+
+
+def _turn_together(chains: Chains, images: NDArray[np.int64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(I, 3, 3) rotations of images along the pairs that join them, which come from the strongest down.
+
+    Args:
+        chains: of the pairs.
+        images: (K, 2) of the pairs.
+        rotation: (K, 3, 3) second from first.
+    """
+    turned = np.tile(np.eye(3), (len(chains.parent), 1, 1))
+    group = np.arange(len(turned))
+    for (i, j), second_from_first in zip(images, rotation, strict=True):
+        if group[i] != group[j]:
+            moved = group == group[j]
+            turned[moved] = turned[moved] @ (turned[j].T @ second_from_first @ turned[i])
+            group[moved] = group[i]
+    return turned
+
+
+def _standing(mapped: Mapped, correspondences: Correspondences) -> list[Standing]:
+    return [standing_pairs(model, correspondences) for model in mapped.models]
 
 
 def _weight(standing: Sequence[Standing]) -> int:
@@ -102,7 +150,7 @@ def _size(mapped: Mapped) -> int:
 
 
 def _report(
-    correspondences: Correspondences, mapped: Mapped, dropped: NDArray[np.int64], before: int, after: int
+    correspondences: Correspondences, mapped: Mapped, dropped: NDArray[np.int64], before: int, against: int
 ) -> dict[str, Any]:
     matches = correspondences.num_inliers[dropped]
     names = mapped.models[0].image_names
@@ -111,7 +159,7 @@ def _report(
         "num_pairs_dropped": len(dropped),
         "num_matches_dropped": int(matches.sum()),
         "num_matches_against_before": before,
-        "num_matches_against": after,
+        "num_matches_against": against,
         "pairs": [
             {
                 "images": [names[i] for i in correspondences.pair_image_idx[p]],

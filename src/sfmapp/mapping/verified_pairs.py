@@ -3,8 +3,8 @@
 Every pair with verified matches says how its two images lie to each other. A model that was grown from some of them
 may put the images elsewhere: then it contradicts evidence in hand, as a model does that takes two sides of a thing
 that look alike for one. Not every such pair is right, however: repeated structure gives pairs that are verified and
-false. What tells is the strength of the evidence, here the share of what could be matched that a pair does match: a
-pair stands against the model if whatever holds its two images in their places is not clearly stronger.
+false. What tells is the strength of the evidence, here the share of the picture in which a pair matches what can be
+matched: a pair stands against the model if what holds its two images in their places is not clearly stronger.
 """
 
 from __future__ import annotations
@@ -38,11 +38,13 @@ TOLERANCE_SHARE, TOLERANCE_PX = 0.004, (4.0, 16.0)
 AGREES, CONTRADICTS = 0.5, 1 / 3
 # Fewer verified matches prove no geometry on their own: twice what verification asks for.
 MIN_MATCHES = 30
+# A cell is covered by a pair that matches half as much of what is in it as it does where it has its matches.
+HALF_AS_WELL = 0.5
 # Side of the grid on which strength is measured: fine enough to tell a thing from what is around it.
 CELLS = 8
-# Evidence must be stronger by so much to overrule what contradicts it: look-alike parts fill half of a picture or
-# more, near neighbours match in nearly all of it.
-CLEARLY = 1.25
+# Evidence must be stronger by so much to overrule what contradicts it. Near neighbours cover 0.75 to 0.95 of a picture,
+# look-alike things what they fill of it. Where they fill the picture, or nothing else is in it, neither is stronger.
+CLEARLY = 4 / 3
 # Verified matches between two models that need an explanation.
 MIN_MATCHES_BETWEEN = 100
 # Pairs that are named; the numbers count all.
@@ -115,12 +117,13 @@ def pair_agreement(reconstruction: Reconstruction, correspondences: Corresponden
 
 
 def pair_strengths(reconstruction: Reconstruction, correspondences: Correspondences) -> Array:
-    """(P,) share of what could be matched that a pair does match, between 0 and 1: the strength of its evidence.
+    """(P,) share of the picture that a pair matches, between 0 and 1: the strength of its evidence.
 
-    Each image is divided into cells. Of the keypoints in a cell that are matched with any image, a pair matches some
-    share; the mean over the cells that have any, in the image where it is less, is the strength. Near neighbours match
-    in all of the picture, pictures of two things that look alike on the thing only, whatever the number of matches on
-    it. Only the tracks and cameras of ``reconstruction`` are used, no pose.
+    Each image is divided into cells. Of the keypoints in a cell that any pair matches, a pair matches some share; the
+    cell is covered if that is at least half of the share where this pair has its matches, and in part if it is less.
+    The share of covered cells, in the image where it is less, is the strength. Near neighbours match in all of the
+    picture, if less the farther they are apart; pictures of two things that look alike match on the thing only,
+    however well. Only the tracks and cameras of ``reconstruction`` are used, no pose.
     """
     tracks = reconstruction.tracks
     first, obs_of_feature = _obs_of_features(tracks, correspondences)
@@ -471,13 +474,29 @@ def _measure_strengths(
                     matched[side, obs_cell[o]] += 1
         weakest = 1.0
         for side in range(2):
-            total, occupied = 0.0, 0
-            for c in range(num_cells):
-                if matchable[image_idx[p, side], c] > 0:
-                    total += matched[side, c] / matchable[image_idx[p, side], c]
-                    occupied += 1
-            weakest = min(weakest, total / occupied) if occupied else 0.0
+            weakest = min(weakest, _covered_share(matched[side], matchable[image_idx[p, side]]))
         out[p] = weakest
+
+
+@numba.njit(cache=True, nogil=True)
+def _covered_share(matched: Ints, matchable: Ints) -> float:
+    """How much of an image a pair covers, 0 to 1, from the keypoints in each cell: those that it matches, and all that
+    any pair does."""
+    total, weighted = 0.0, 0.0
+    for c in range(len(matched)):
+        if matched[c] > 0:
+            total += matched[c]
+            weighted += matched[c] * matched[c] / matchable[c]
+    if total == 0.0:
+        return 0.0
+    full = HALF_AS_WELL * weighted / total
+    covered, everything = 0.0, 0.0
+    for c in range(len(matched)):
+        if matchable[c] > 0:
+            weight = math.sqrt(matchable[c])
+            everything += weight
+            covered += weight * min(1.0, matched[c] / matchable[c] / full)
+    return covered / everything
 
 
 def compile_kernels() -> None:
