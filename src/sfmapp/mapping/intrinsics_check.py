@@ -130,9 +130,9 @@ def _with_open_focals(mapped: Mapped, model: Reconstruction) -> dict[str, Any]:
         # the change of the focal length that moved the cameras so far, against its sigma
         moved = max(abs(model.cameras[c].focal - before.cameras[c].focal) / s.posterior_px for c, s in open_.items())
         share = min(1.0 / max(moved, 1e-3), 10.0)
-        uncertainty = _widened(uncertainty, model, share * spread, share * turn)
+        uncertainty = widened_uncertainty(uncertainty, model, share * spread, share * turn)
     if open_:  # a scene that does not tell the focal length does not tell a lens from a bend of the whole either
-        uncertainty = _widened(uncertainty, model, *bend)
+        uncertainty = widened_uncertainty(uncertainty, model, *bend)
     for entry in uncertainty.get("cameras", ()):
         c = entry["camera"]
         if c in open_:
