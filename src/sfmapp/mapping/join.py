@@ -36,7 +36,7 @@ Bools = NDArray[np.bool_]
 SEARCH_FACTOR = 3.0
 # With two fifths of the links right, 500 triples miss an all-right one with a probability of 1e-14; they are noisy.
 NUM_TRIPLES = 500
-# Images of each side that are tried as a bridge, those with most links first, and links that vote on the scale.
+# Images of each side that are tried as a bridge, those with most links first.
 MAX_BRIDGES = 6
 # Scales that agree within 5 %: depths near the edge of a model are good to a few per cent.
 SCALE_TOLERANCE = 0.05
@@ -75,7 +75,7 @@ class _Checks:
         xyz: (C, 3) points in the world of their model. xy: (C, 2) pixels.
         image_idx: (C,) the images; rotation: (C, 3, 3), translation: (C, 3), canonical: (C, 8), fisheye: (C,) theirs.
         num_links: L.
-        point_link: (B,), point_target: (B, 3), point_source: (B, 3): links that are triangulated on both sides.
+        point_target, point_source: (B, 3) points of the links that are triangulated on both sides, in either world.
     """
 
     group_ptr: Ints
