@@ -195,6 +195,12 @@ def test_exif_cameras_are_told_apart_by_all_that_matters(tmp_path: Path) -> None
     assert "sensor 22.3 mm" in entry["focal_reason"]
 
 
+def test_exif_focal_lengths_that_differ_by_rounding_are_one_camera(tmp_path: Path) -> None:
+    for i, focal_mm in enumerate((20.0, 20.0001, 19.99995, 20.1, 20.2)):
+        save(tmp_path / f"{i}.jpg", seed=i, exif=exif_of(focal_mm=focal_mm))
+    assert sharing(load(tmp_path)[0]) == [0, 0, 0, 1, 2]
+
+
 def test_frames_without_exif_share_a_camera(tmp_path: Path) -> None:
     for i in range(12):
         save(tmp_path / f"frame_{i:04}.jpg", seed=i)

@@ -1,15 +1,12 @@
-"""Whether the photographs agree with what was said of their cameras, and what becomes of the models if they do not.
+"""Whether the photographs agree with parameters of their cameras that were held.
 
-Bundle adjustment finds the nearest minimum, and mapping registers what fits the cameras as they were given. A focal
-length that is wrong by a factor, or held where it is wrong, therefore ends in a model that is bent and does not know:
-its observations are those that survived. Two questions tell, both asked of the verified matches, not of the model: does
-mapping that begins without the doubtful value explain more of them, and do parameters that were held, once freed and
-fitted to half of the tracks, explain the other half far better?
+A lens that is held where it is wrong bends the model, and its observations are those that survived. One question tells:
+do the held parameters, once freed and fitted to half of the tracks, explain the other half far better?
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,24 +17,14 @@ from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.images.exif import DEFAULT_FOCAL, DEFAULT_FOCAL_SIGMA
-from sfmapp.mapping import structure
-from sfmapp.mapping.mapper import STAGE, Mapper
-from sfmapp.mapping.register import Registration
+from sfmapp.mapping.focal_priors import MapFrom, Mapped, as_unknown, focal_sigmas, lean_on_priors
+from sfmapp.mapping.mapper import STAGE
 from sfmapp.scene.camera import PARAM_NAMES, Camera
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# A prior is doubted where the refined focal length has left it by so many of its standard deviations: at five it was
-# wrong or its sigma was. At two it is doubted where photographs were left out besides, which a wrong one causes.
-DOUBT_SIGMAS, DOUBT_SIGMAS_IF_INCOMPLETE = 5.0, 2.0
-# A second map takes the place of the first if it explains as much, to the share of observations that come and go at the
-# threshold between two equally good models (under 1 % over the shared sets).
-SAME_SUPPORT = 0.98
-# Residuals below so many robust standard deviations agree with a model.
-AGREE_SIGMAS = 3.0
 # Parameters that were held contradict the photographs if freeing them lowers the median residual of tracks that they
 # were not fitted to by a fifth: more than a third of the variance had nothing to do with noise. On the shared sets this
 # is a focal length that is off by 1 to 2.5 %; right ones give 0.94 to 1. It must hold in nearly every photograph, since
@@ -45,21 +32,6 @@ AGREE_SIGMAS = 3.0
 CLEAR_RATIO, CLEAR_IMAGES = 0.8, 0.9
 # Fewer tracks on either side do not tell.
 MIN_TRACKS = 50
-
-
-@dataclass(frozen=True)
-class Mapped:
-    """What mapping made of the cameras that it began with: its models, the largest first, and how they came about."""
-
-    cameras: list[Camera]
-    models: list[Reconstruction]
-    initial_reports: list[dict[str, Any]]
-    focal_report: dict[str, Any]
-    attempts: dict[int, Registration]
-    mapper_of: Callable[..., Mapper]
-
-
-MapFrom = Callable[[list[Camera]], Mapped]
 
 
 @dataclass(frozen=True)
@@ -80,96 +52,6 @@ class HeldOut:
     def is_clear(self) -> bool:
         """The photographs contradict what was held; False for a ratio that is not a number."""
         return self.ratio <= CLEAR_RATIO and self.improved_share >= CLEAR_IMAGES
-
-
-def as_unknown(camera: Camera) -> Camera:
-    """The camera as if nothing were known of its focal length: free, with the prior of photographs without EXIF."""
-    focal = DEFAULT_FOCAL * max(camera.width, camera.height)
-    sigma = DEFAULT_FOCAL_SIGMA * focal
-    return replace(camera.with_focal(focal), focal_sigma=sigma, focal_source="default", is_fixed=False)
-
-
-# ------------------------------------------------------------------------------------------------- doubtful priors
-
-
-def settle_focal_lengths(mapped: Mapped, map_from: MapFrom, events: Events) -> tuple[Mapped, dict[str, Any]]:
-    """Map again without the focal lengths that a map has left far behind, and keep what explains more matches.
-
-    Args:
-        mapped: made of the given cameras.
-        map_from: maps from other first cameras; those that are unknown get theirs from the pairs.
-        events: warned of every prior that is not believed any more.
-
-    Returns:
-        The better of both, and the decision for the report.
-    """
-    doubted = _doubted_cameras(mapped)
-    if not doubted.any():
-        return mapped, {}
-    events.decided(STAGE, f"the focal lengths of {int(doubted.sum())} camera(s) are doubtful: mapping without them")
-    again = map_from([as_unknown(c) if d else c for c, d in zip(mapped.cameras, doubted, strict=True)])
-    support = _support((mapped.models, again.models))
-    better = again if support[1] >= SAME_SUPPORT * support[0] and support[1] > 0 else mapped
-    report = {
-        "doubted_cameras": np.flatnonzero(doubted).tolist(),
-        "agreeing_observations": {"as_given": support[0], "as_unknown": support[1]},
-        "kept": "as_unknown" if better is again else "as_given",
-    }
-    for line in _refuted(mapped.cameras, better.models, doubted):
-        events.warned(STAGE, line)
-    return better, report
-
-
-def _deviations(cameras: Sequence[Camera], models: Sequence[Reconstruction]) -> Array:
-    """(C,) how far the focal lengths of the models have left those of the cameras, in sigmas of these; 0 if unused."""
-    out = np.zeros(len(cameras))
-    for model in models:
-        for c in np.unique(model.image_camera_idx[model.is_registered]):
-            sigma = cameras[c].focal_sigma
-            if sigma:
-                out[c] = max(out[c], abs(model.cameras[c].focal - cameras[c].focal) / sigma)
-    return out
-
-
-def _doubted_cameras(mapped: Mapped) -> Mask:
-    """(C,) bool: cameras whose focal length was known and has to be asked for anew."""
-    known = np.array([c.focal_source != "default" and not c.is_fixed for c in mapped.cameras], bool)
-    if not mapped.models:
-        return known
-    is_complete = len(mapped.models) == 1 and bool(mapped.models[0].is_registered.all())
-    limit = DOUBT_SIGMAS if is_complete else DOUBT_SIGMAS_IF_INCOMPLETE
-    return known & (_deviations(mapped.cameras, mapped.models) > limit)
-
-
-def _support(results: Sequence[list[Reconstruction]]) -> list[int]:
-    """Observations that agree with each of several results, by the tolerance of the most precise one."""
-    scales = [structure.residual_scale_px(models[0]) for models in results if models]
-    finite = [scale for scale in scales if np.isfinite(scale)]
-    limit = AGREE_SIGMAS * min(finite, default=0.0)
-    counts = []
-    for models in results:
-        agrees = np.zeros(models[0].tracks.num_observations if models else 0, bool)
-        for model in models:
-            agrees |= model.obs_is_inlier & (np.linalg.norm(model.residuals_px(), axis=1) <= limit)
-        counts.append(int(agrees.sum()))
-    return counts
-
-
-def _refuted(cameras: Sequence[Camera], models: Sequence[Reconstruction], doubted: Mask) -> list[str]:
-    """A line for each doubted camera that the photographs still contradict."""
-    off = _deviations(cameras, models)
-    lines = []
-    for c in np.flatnonzero(doubted & (off > DOUBT_SIGMAS)):
-        found = next(m.cameras[c].focal for m in models if (m.image_camera_idx[m.is_registered] == c).any())
-        source = {"user": "given", "file": "given"}.get(cameras[c].focal_source, "from EXIF")
-        lines.append(
-            f"camera {c}: the focal length {source}, {cameras[c].focal:.0f} px, is wrong by the photographs, which say "
-            f"{found:.0f} px; it was left out of account"
-        )
-    return lines
-
-
-# ------------------------------------------------------------------------------------------------- held parameters
 
 
 def hold_out(model: Reconstruction, held: AdjustOptions, free: AdjustOptions, cameras: Sequence[Camera]) -> HeldOut:
@@ -222,25 +104,57 @@ def check_intrinsics(mapped: Mapped, model: Reconstruction, map_from: MapFrom, e
         ``uncertainty`` as of :meth:`Mapper.uncertainty`, with what the held parameters add to it, and the
         ``contradictions`` that stand.
     """
-    mapper = mapped.mapper_of(model)
-    uncertainty = mapper.uncertainty()
+    uncertainty = _with_open_focals(mapped, model)
     used = np.unique(model.image_camera_idx[model.is_registered])
     fixed = np.array([c in used and camera.is_fixed for c, camera in enumerate(model.cameras)], bool)
     contradictions: list[Contradiction] = []
     if fixed.any():
-        options = replace(mapper.adjust_options, initial_damping=1e-7, relative_cost_tolerance=1e-7)
-        freed = [replace(c, is_fixed=False, focal_sigma=None) for c in model.cameras]
-        found = hold_out(model, options, mapper.with_free_centers(options, fixed), freed)
-        other = found.freed
+        found, spread, turn = _held_against_free(mapped, model, fixed, map_from)
         if found.is_clear:
-            cameras = [as_unknown(c) if f else c for c, f in zip(mapped.cameras, fixed, strict=True)]
-            other = _largest_overlap(model, [found.freed, *map_from(cameras).models])
-        spread, turn = difference(model, other)
-        if found.is_clear:
-            contradictions.append(_given_intrinsics(model, other, np.flatnonzero(fixed), found, spread, turn))
+            contradictions.append(_given_intrinsics(model, np.flatnonzero(fixed), found, spread, turn))
             events.warned(STAGE, contradictions[-1].message)
         uncertainty = widened_uncertainty(uncertainty, model, spread, turn)
     return {"uncertainty": uncertainty, "contradictions": [c.describe() for c in contradictions]}
+
+
+def _with_open_focals(mapped: Mapped, model: Reconstruction) -> dict[str, Any]:
+    """The uncertainty of a model whose focal lengths come to lie nearer their priors where nothing else tells them."""
+    uncertainty = mapped.mapper_of(model).uncertainty()
+    sigmas, richer = focal_sigmas(mapped, model, uncertainty)
+    bend = difference(model, richer) if richer is not None else (0.0, 0.0)
+    before = model.copy()
+    open_ = lean_on_priors(mapped, model, sigmas)
+    if open_:
+        uncertainty = mapped.mapper_of(model).uncertainty()
+        spread, turn = difference(model, before)
+        # the change of the focal length that moved the cameras so far, against its sigma
+        moved = max(abs(model.cameras[c].focal - before.cameras[c].focal) / s.posterior_px for c, s in open_.items())
+        share = min(1.0 / max(moved, 1e-3), 10.0)
+        uncertainty = widened_uncertainty(uncertainty, model, share * spread, share * turn)
+    if open_:  # a scene that does not tell the focal length does not tell a lens from a bend of the whole either
+        uncertainty = widened_uncertainty(uncertainty, model, *bend)
+    for entry in uncertainty.get("cameras", ()):
+        c = entry["camera"]
+        if c in open_:
+            entry["sigma"] |= {name: open_[c].posterior_px for name in entry["sigma"] if name[0] == "f"}
+        entry["focal"] = sigmas[c].describe() if c in sigmas else {}
+        entry["focal"]["is_prior_left_out"] = c in mapped.without_prior
+    return uncertainty
+
+
+def _held_against_free(
+    mapped: Mapped, model: Reconstruction, fixed: Mask, map_from: MapFrom
+) -> tuple[HeldOut, float, float]:
+    """What freeing the cameras that are fixed does to held-out tracks, and how far it moves the poses: a share of their
+    spread and degrees. Where the photographs clearly want it, the free model is mapped from the start."""
+    mapper = mapped.mapper_of(model)
+    options = replace(mapper.adjust_options, initial_damping=1e-7, relative_cost_tolerance=1e-7)
+    freed = [replace(c, is_fixed=False, focal_sigma=None) for c in model.cameras]
+    found = hold_out(model, options, mapper.with_free_centers(options, fixed), freed)
+    if found.is_clear:
+        cameras = [as_unknown(c) if f else c for c, f in zip(mapped.cameras, fixed, strict=True)]
+        found = replace(found, freed=_largest_overlap(model, [found.freed, *map_from(cameras).models]))
+    return found, *difference(model, found.freed)
 
 
 def difference(model: Reconstruction, other: Reconstruction) -> tuple[float, float]:
@@ -265,14 +179,9 @@ def _largest_overlap(model: Reconstruction, others: Sequence[Reconstruction]) ->
 
 
 def _given_intrinsics(
-    model: Reconstruction,
-    other: Reconstruction,
-    camera_idx: NDArray[np.int64],
-    found: HeldOut,
-    spread: float,
-    turn: float,
+    model: Reconstruction, camera_idx: NDArray[np.int64], found: HeldOut, spread: float, turn: float
 ) -> Contradiction:
-    held, freed = (_values(m.cameras[camera_idx[0]]) for m in (model, other))
+    held, freed = (_values(m.cameras[camera_idx[0]]) for m in (model, found.freed))
     more = f" (and {len(camera_idx) - 1} more cameras)" if len(camera_idx) > 1 else ""
     return Contradiction(
         "given intrinsics",

@@ -17,6 +17,8 @@ from sfmapp.mapping import structure
 from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_initial_pairs
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
+from sfmapp.mapping.tracks import USELESS_CONFIGS
+from sfmapp.mapping.verified_pairs import MIN_MATCHES, pair_agreement
 from sfmapp.scene.camera import PARAM_NAMES, Camera
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
@@ -25,6 +27,12 @@ STAGE = "mapping"
 # Share of the observations of an image that must hold once all is adjusted, where they are few. Those of a right pose
 # are verified matches and nearly all hold; those of a mirrored or repeated part are torn between two poses.
 MIN_AGREEMENT = 2 / 3
+# A position this uncertain, in distances of the points that tell it and in shares of the least angle of triangulation
+# (in radians), is weak: a tenth of the shortest baseline that makes points.
+WEAK_SHARE_OF_ANGLE = 0.1
+# A weak image waits for another model if a pair with an image outside of this one has so many times the matches of its
+# strongest pair inside: no matter of chance, and what comes with one image comes with its neighbours too.
+ELSEWHERE = 2.0
 # Uncertainties cost an inverse of eight unknowns per image: half a second and 50 MB for this many.
 MAX_UNCERTAINTY_IMAGES = 200
 
@@ -33,7 +41,8 @@ MAX_UNCERTAINTY_IMAGES = 200
 class Mapper:
     """Grows one model. Every method is a step of the method and changes ``reconstruction`` in place.
 
-    ``locked`` (I,) bool are images that this model must not register.
+    ``locked`` (I,) bool are images that this model must not register. ``waits``: weak images whose strongest pairs are
+    with images outside of the model are left to another one, which may grow from there.
     """
 
     reconstruction: Reconstruction
@@ -48,6 +57,7 @@ class Mapper:
     failed_with: dict[int, int] = field(default_factory=dict)
     times_dropped: dict[int, int] = field(default_factory=dict)
     size_at_global: tuple[int, int] = (0, 0)
+    waits: bool = True
     max_error_px: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -60,17 +70,26 @@ class Mapper:
         options = self.options
         tried: list[dict[str, Any]] = []
         ranked = rank_initial_pairs(self.reconstruction, self.correspondences, seeds, options)
-        inliers, angle = options.min_initial_inliers, options.min_initial_angle_deg
+        inliers = options.min_initial_inliers
         while True:
-            for pair in ranked:
-                reason = pair.reason or pair.shortfall(inliers, angle)
-                tried.append({**pair.describe(self.reconstruction.image_names), "reason": reason})
-                if not reason and self._start_from(pair):
-                    return tried
-            if inliers <= options.min_pose_inliers and angle < 2 * options.min_triangulation_angle_deg:
+            # many matches under a small angle before few under a wide one, which may be of things that look alike
+            for angle in self._initial_angles():
+                for pair in ranked:
+                    reason = pair.reason or pair.shortfall(inliers, angle)
+                    tried.append({**pair.describe(self.reconstruction.image_names), "reason": reason})
+                    if not reason and self._start_from(pair):
+                        return tried
+            if inliers <= options.min_pose_inliers:
                 return tried
-            inliers, angle = max(inliers // 2, options.min_pose_inliers), angle / 2
-            self.events.decided(STAGE, f"no initial pair; relaxing to {inliers} matches and {angle:.1f} degrees")
+            inliers = max(inliers // 2, options.min_pose_inliers)
+            self.events.decided(STAGE, f"no initial pair; relaxing to {inliers} matches")
+
+    def _initial_angles(self) -> list[float]:
+        """The median angle that an initial pair should have, and its halves: narrow ones make few points anyway."""
+        angles = [self.options.min_initial_angle_deg]
+        while angles[-1] >= self.options.min_triangulation_angle_deg:
+            angles.append(angles[-1] / 2)
+        return angles
 
     def _start_from(self, pair: InitialPair) -> bool:
         initialize_from_pair(self.reconstruction, pair)
@@ -103,7 +122,8 @@ class Mapper:
                     self.adjust_around(registered)
                 self._decided(f"registered {self._names(registered)}", registered)
                 self.events.advanced(STAGE, len(registered))
-            if not self._candidates().size or self._size() == self.size_at_global:
+            taken_back = self._drop_contradicted_images()
+            if not taken_back and (not self._candidates().size or self._size() == self.size_at_global):
                 return
             # a second chance: the adjusted map may hold more points and better poses
             self.adjust_globally()
@@ -112,7 +132,8 @@ class Mapper:
     def register_next_images(self) -> list[int]:
         """Register the best next image, and with it others that see as much of the map; returns them.
 
-        Images that failed are tried again once they see half as many points more.
+        Images that failed are tried again once they see half as many points more. Images whose position is weak come
+        when no other does, one at a time, the surest first.
         """
         order, scores, counts = rank_next_images(self.reconstruction, self._candidates())
         worth = [
@@ -121,14 +142,65 @@ class Mapper:
             if n >= max(self.options.min_pose_inliers, 1.5 * self.failed_with.get(int(i), 0))
         ]
         registered: list[int] = []
+        weak: list[Registration] = []
         while worth and not registered:
             # "as much": the map around them is as settled as around the best, and no image hangs on another
             batch = [i for i, score in worth if score >= 0.75 * worth[0][1]]
             worth = worth[len(batch) :]
             known = self._known_cameras()
-            results = self.pool.map(lambda i, known=known: self._attempt(i, known), batch)
-            registered = [result.image_idx for result in results if self._accept(result)]
+            # all of them before the first is accepted, which changes what the others would start from
+            results = list(self.pool.map(lambda i, known=known: self._attempt(i, known), batch))
+            weak += [result for result in results if self._is_weak(result)]
+            sure = [result for result in results if not self._is_weak(result)]
+            registered = [result.image_idx for result in self._one_for_each_camera(sure) if self._accept(result)]
+        for result in sorted(weak, key=lambda result: result.position_sigma):
+            if registered:
+                break
+            if not self._is_left_to_another(result) and self._accept(result):
+                registered = [result.image_idx]
         return registered
+
+    def _is_weak(self, result: Registration) -> bool:
+        limit = WEAK_SHARE_OF_ANGLE * np.radians(self.options.min_triangulation_angle_deg)
+        return result.cam_from_world is not None and not result.position_sigma <= limit
+
+    def _one_for_each_camera(self, results: list[Registration]) -> list[Registration]:
+        """Results without those that searched the focal length of a camera which a surer one has found as well."""
+        found: dict[int, Registration] = {}
+        for result in results:
+            if result.focal_px is not None:
+                camera_idx = int(self.reconstruction.image_camera_idx[result.image_idx])
+                best = found.setdefault(camera_idx, result)
+                if result.position_sigma < best.position_sigma:
+                    found[camera_idx] = result
+        return [
+            result
+            for result in results
+            if result.focal_px is None or result is found[int(self.reconstruction.image_camera_idx[result.image_idx])]
+        ]
+
+    def _is_left_to_another(self, result: Registration) -> bool:
+        """Whether a weak image waits, as its strongest pair is with an image outside of this model."""
+        others, matches = self._pairs_of(result.image_idx)
+        registered = self.reconstruction.is_registered[others]
+        inside, outside = matches[registered].max(initial=0), np.where(registered, 0, matches)
+        strongest = int(outside.max(initial=0))
+        if not self.waits or strongest < max(ELSEWHERE * inside, self.options.min_initial_inliers):
+            return False
+        reason = (
+            f"its position is uncertain by {100 * result.position_sigma:.1f} % of the distance of the points it sees, "
+            f"and its strongest pair, {strongest} matches, is with "
+            f"{self.reconstruction.image_names[others[np.argmax(outside)]]}, outside of this model"
+        )
+        self._accept(replace(result, cam_from_world=None, reason=reason))
+        return True
+
+    def _pairs_of(self, image_idx: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Images (K,) that an image has verified matches with, and how many (K,)."""
+        pairs, matches = self.correspondences.pair_image_idx, self.correspondences.num_inliers
+        useful = (matches > 0) & ~np.isin(self.correspondences.config, USELESS_CONFIGS)
+        own = np.flatnonzero(useful & (pairs == image_idx).any(axis=1))
+        return pairs[own].sum(axis=1, dtype=np.int64) - image_idx, matches[own]
 
     def _attempt(self, image_idx: int, known_cameras: NDArray[np.bool_]) -> Registration:
         camera_idx = self.reconstruction.image_camera_idx[image_idx]
@@ -198,6 +270,14 @@ class Mapper:
         )  # fmt: skip
         structure.filter_observations(reconstruction, self.options, self.pool, seen, self.max_error_px)
 
+    def adjust_to_cameras(self, cameras: list[Camera]) -> None:
+        """Take over intrinsics that another model has found, and adjust poses and points to them."""
+        reconstruction = self.reconstruction
+        reconstruction.cameras[:] = cameras
+        options = replace(self.adjust_options, max_iterations=25, relative_cost_tolerance=1e-4)
+        fixed = np.zeros(len(cameras), bool)
+        adjust_bundle(reconstruction, options, variable_cameras=fixed, prior_cameras=self.prior_cameras)
+
     def adjust_globally(self) -> None:
         """Adjust everything, filter, and triangulate again what was lost or has become possible."""
         reconstruction = self.reconstruction
@@ -225,6 +305,11 @@ class Mapper:
             self.events.decided(STAGE, f"final adjustment: {changed} observations changed sides", **summary)
             if changed <= 1e-3 * before.sum():
                 return
+
+    def agreement(self) -> tuple[int, int]:
+        """How many verified matches between registered images agree with their poses, and how many there are."""
+        found = pair_agreement(self.reconstruction, self.correspondences)
+        return int(found.num_agreeing.sum()), int(found.num_matches.sum())
 
     def _refine_principal_points(self, options: AdjustOptions) -> None:
         """Adjust everything with free principal points, for the cameras that MappingOptions names."""
@@ -325,10 +410,45 @@ class Mapper:
         structure.filter_observations(reconstruction, self.options, self.pool, None, self.max_error_px)
         for i in dropped.tolist():
             reason = f"{counts[i]} of {visible[i]} observations hold after the adjustment: too few to trust the pose"
-            self.attempts[i] = Registration(i, int(visible[i]), int(counts[i]), None, reason=reason)
-            self.failed_with[i] = int(visible[i])
-            self.times_dropped[i] = self.times_dropped.get(i, 0) + 1
-            self.events.decided(STAGE, f"took back {reconstruction.image_names[i]}: {reason}")
+            self._take_back(i, int(visible[i]), int(counts[i]), reason)
+
+    def _drop_contradicted_images(self) -> bool:
+        """Take back images that most of their own verified matches contradict, the worst first; True if there are any.
+
+        What contradicts one image of a pair contradicts the other: once the wrong one is gone, nothing speaks against
+        its neighbours any more.
+        """
+        reconstruction = self.reconstruction
+        found = pair_agreement(reconstruction, self.correspondences)
+        weight = np.where(found.num_matches >= MIN_MATCHES, found.num_matches, 0)
+        against = weight * found.contradicts
+        num_images = len(reconstruction.image_names)
+        dropped: list[int] = []
+        while reconstruction.is_registered.sum() - len(dropped) > 3:
+            total, bad = (
+                np.bincount(found.image_idx.ravel(), weights=w.repeat(2), minlength=num_images)
+                for w in (weight, against)
+            )
+            share = bad / np.maximum(total, 1)
+            worst = int(np.argmax(share))
+            if share[worst] <= 0.5:
+                break
+            dropped.append(worst)
+            touching = (found.image_idx == worst).any(axis=1)
+            weight, against = np.where(touching, 0, weight), np.where(touching, 0, against)
+            reason = f"{int(bad[worst])} of its {int(total[worst])} verified matches contradict its pose"
+            self._take_back(worst, int(total[worst]), int(total[worst] - bad[worst]), reason)
+        if dropped:
+            reconstruction.cam_from_world[dropped] = np.nan
+            structure.filter_observations(reconstruction, self.options, self.pool, None, self.max_error_px)
+        return bool(dropped)
+
+    def _take_back(self, image_idx: int, num_correspondences: int, num_inliers: int, reason: str) -> None:
+        """Note that an image is unregistered again, and why."""
+        self.attempts[image_idx] = Registration(image_idx, num_correspondences, num_inliers, None, reason=reason)
+        self.failed_with[image_idx] = num_correspondences
+        self.times_dropped[image_idx] = self.times_dropped.get(image_idx, 0) + 1
+        self.events.decided(STAGE, f"took back {self.reconstruction.image_names[image_idx]}: {reason}")
 
     # ---------------------------------------------------------------- helpers
 

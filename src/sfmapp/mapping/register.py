@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.pose import refine_pose
-from sfmapp.geometry import resection
+from sfmapp.adjust.pose import RefinedPose, refine_pose
+from sfmapp.geometry import resection, rigid3
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.scene.camera import pixels_to_normalized
 from sfmapp.scene.reconstruction import Reconstruction
@@ -32,6 +33,8 @@ class Registration:
         num_inliers: how many of them agree with the pose.
         cam_from_world: (7,) float64, or None if the attempt failed.
         focal_px: focal length found for the image's camera, None if it was not searched.
+        position_sigma: standard deviation of the position along its least certain axis, with the focal length free if
+            it was searched, as a share of the median distance of the points that agree; infinite if nothing holds it.
         reason: why it failed, with the numbers; empty if it succeeded.
     """
 
@@ -40,6 +43,7 @@ class Registration:
     num_inliers: int
     cam_from_world: NDArray[np.float64] | None
     focal_px: float | None = None
+    position_sigma: float = math.inf
     reason: str = ""
 
 
@@ -139,7 +143,23 @@ def register_image(
         tracks.obs_xy[obs], scale_px=0.5 * max_error_px, inlier_px=max_error_px, refine_focal=search_focal,
     )  # fmt: skip
     focal_px = float(refined.canonical[:2].mean()) if search_focal else None
-    return Registration(image_idx, len(obs), int(refined.is_inlier.sum()), refined.cam_from_world, focal_px)
+    return Registration(
+        image_idx, len(obs), int(refined.is_inlier.sum()), refined.cam_from_world, focal_px,
+        _position_sigma(refined, xyz[refined.is_inlier]),
+    )  # fmt: skip
+
+
+def _position_sigma(refined: RefinedPose, xyz: NDArray[np.float64]) -> float:
+    """Standard deviation of a refined position along its least certain axis, in median distances of its points.
+
+    The centre -R^T t moves by -R^T v with the translation, which the turn of the axes does not lengthen.
+    """
+    if len(xyz) == 0 or not np.isfinite(refined.covariance).all():
+        return math.inf
+    variance = float(np.linalg.eigvalsh(refined.covariance[3:6, 3:6])[-1])
+    distance = float(np.median(np.linalg.norm(rigid3.apply(refined.cam_from_world, xyz), axis=1)))
+    sigma = math.sqrt(max(variance, 0.0)) / distance if distance > 0 else math.inf
+    return sigma if math.isfinite(sigma) else math.inf
 
 
 def _needed_inliers(num_correspondences: int, options: MappingOptions) -> int:

@@ -126,7 +126,7 @@ def camera_rows(
     image_set: ImageSet, model: Reconstruction | None, uncertainty: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
     """Each camera with the parameters that it began with and, if a model holds it, those it ended with, and sigmas."""
-    sigmas = {entry["camera"]: entry["sigma"] for entry in uncertainty.get("cameras", ())}
+    entries = {entry["camera"]: entry for entry in uncertainty.get("cameras", ())}
     num_images = np.bincount([record.camera_idx for record in image_set.images], minlength=len(image_set.cameras))
     rows = []
     for idx, camera in enumerate(image_set.cameras):
@@ -141,7 +141,8 @@ def camera_rows(
             "is_fixed": camera.is_fixed,
             "initial": _named_params(camera),
             "refined": None,
-            "sigma": sigmas.get(idx, {}),
+            "sigma": entries.get(idx, {}).get("sigma", {}),
+            "focal_evidence": entries.get(idx, {}).get("focal", {}),
         }
         if model is not None and model.is_registered[model.image_camera_idx == idx].any():
             row["refined"] = _named_params(model.cameras[idx])
@@ -174,10 +175,29 @@ def make_checks(
     ]  # fmt: skip
     for camera in cameras:
         if camera["refined"] and camera["focal_sigma_px"]:
-            change = abs(_focal(camera["refined"]) - _focal(camera["initial"])) / camera["focal_sigma_px"]
-            name = f"focal length of camera {camera['idx']} against its prior"
-            checks.append(check(name, -change, f"{change:.1f} sigma", -2, -4, "sigma"))
+            checks.append(_check_focal(camera))
     return checks + check_contradictions(found for model in models for found in model["contradictions"])
+
+
+def _check_focal(camera: Mapping[str, Any]) -> dict[str, str]:
+    """The refined focal length of a camera against its prior. Amber where the photographs do not tell it, as agreement
+    means nothing then, and where they refute a prior that was left out: the result is right, the input is not."""
+    change = abs(_focal(camera["refined"]) - _focal(camera["initial"])) / camera["focal_sigma_px"]
+    found = check(
+        f"focal length of camera {camera['idx']} against its prior", -change, f"{change:.1f} sigma", -2, -4, "sigma"
+    )
+    evidence = camera["focal_evidence"]
+    if evidence.get("is_prior_left_out") and found["light"] != "green":
+        found |= {"light": "amber", "value": f"{found['value']}; the photographs refute it, it was left out"}
+    elif evidence.get("is_determined") is False and camera["focal_source"] != "default":
+        own = evidence["data_sigma_px"]
+        told = f"within {own:.0f} px by themselves" if own is not None else "not at all"
+        value = (
+            f"{found['value']}; not determined by these photographs, which tell it {told}, the prior within "
+            f"{evidence['prior_sigma_px']:.0f} px"
+        )
+        found |= {"light": "amber" if found["light"] == "green" else found["light"], "value": value}
+    return found
 
 
 def check(name: str, value: float, text: str, green: float, amber: float, unit: str = "") -> dict[str, str]:
