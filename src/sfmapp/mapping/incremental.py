@@ -30,6 +30,7 @@ from sfmapp.mapping.look_alikes import tell_apart
 from sfmapp.mapping.mapper import STAGE, Mapper
 from sfmapp.mapping.mend import mended
 from sfmapp.mapping.merge import find_merge, merge, num_linking_points
+from sfmapp.mapping.moving_planes import without_moving_planes
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images
 from sfmapp.mapping.tracks import build_tracks, track_colors
@@ -78,6 +79,14 @@ def map_images(
     names = [record.name for record in image_set.images]
     image_camera_idx = np.array([record.camera_idx for record in image_set.images], np.int32)
     tracks, track_report = build_tracks(correspondences, features)
+    correspondences, num_flat = without_moving_planes(correspondences, tracks, image_set.cameras, image_camera_idx)
+    if num_flat:
+        tracks, track_report = build_tracks(correspondences, features)
+        events.warned(
+            STAGE,
+            f"something flat that is no part of the scene moves through the photographs ({num_flat} pairs match on it "
+            "alone); its matches were left out. Masks over it (images.mask_path) would save the rest",
+        )
     events.decided(STAGE, f"{track_report['num_tracks']} tracks", **track_report)
     with ThreadPoolExecutor(threads) as pool:
 

@@ -36,7 +36,7 @@ Bools = NDArray[np.bool_]
 SEARCH_FACTOR = 3.0
 # With two fifths of the links right, 500 triples miss an all-right one with a probability of 1e-14; they are noisy.
 NUM_TRIPLES = 500
-# Images of each side that are tried as a bridge, those with most links first, and links that vote on the scale.
+# Images of each side that are tried as a bridge, those with most links first.
 MAX_BRIDGES = 6
 # Scales that agree within 5 %: depths near the edge of a model are good to a few per cent.
 SCALE_TOLERANCE = 0.05
@@ -75,7 +75,7 @@ class _Checks:
         xyz: (C, 3) points in the world of their model. xy: (C, 2) pixels.
         image_idx: (C,) the images; rotation: (C, 3, 3), translation: (C, 3), canonical: (C, 8), fisheye: (C,) theirs.
         num_links: L.
-        point_link: (B,), point_target: (B, 3), point_source: (B, 3): links that are triangulated on both sides.
+        point_target, point_source: (B, 3) points of the links that are triangulated on both sides, in either world.
     """
 
     group_ptr: Ints
@@ -175,7 +175,6 @@ def unite(
     union.obs_is_inlier[np.isin(seen, linking)] = False
     mapper.triangulate_images(np.flatnonzero(is_new).tolist())
     mapper.adjust_globally()
-    mapper.grow()
     mapper.finish()
     return union
 
@@ -336,7 +335,10 @@ def _from_image(
     mine = (checks.image_idx == image_idx) & (checks.is_forward == is_own)
     camera = own.cameras[own.image_camera_idx[image_idx]]
     normalized = pixels_to_normalized(camera, checks.xy[mine])
-    found = resection.estimate_pose(checks.xyz[mine], normalized, tolerance_px / camera.focal)
+    # a bridge that has to be searched for longer is none
+    found = resection.estimate_pose(
+        checks.xyz[mine], normalized, tolerance_px / camera.focal, confidence=0.99, max_iterations=500
+    )
     if found is None:
         return np.zeros((0, 8))
     # through the frame of the image: what it sees of its own world, scaled, stands in the other one

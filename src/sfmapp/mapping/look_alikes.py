@@ -10,6 +10,7 @@ Reconstruction", ECCV 2014) and Yan et al. ("Distinguishing the Indistinguishabl
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,6 @@ from sfmapp.mapping.focal_priors import Mapped
 from sfmapp.mapping.mapper import STAGE
 from sfmapp.mapping.verified_pairs import (
     CLEARLY,
-    MIN_MATCHES,
     NUM_NAMED,
     Chains,
     Standing,
@@ -32,10 +32,20 @@ from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
 
 # Each round maps without what the last one refuted; the poses of a better map refute more.
-MAX_ROUNDS = 3
+MAX_ROUNDS = 4
 # A pair whose rotation is so far from that of a chain of stronger pairs leads elsewhere. Rotations of pairs are good to
 # a few degrees even where the focal length is a guess; sides that look alike are turned by a twelfth of a turn or more.
 MAX_TURN_DEG = 20.0
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """A map, the pairs that it was made without, and what stands against it: verified matches, and how strongly."""
+
+    mapped: Mapped
+    dropped: NDArray[np.int64]
+    against: int
+    doubt: float
 
 
 def tell_apart(
@@ -50,51 +60,56 @@ def tell_apart(
         events: told of what was tried and what came of it.
 
     Returns:
-        The map with the least verified matches against it, and the report: empty if none stands against the first.
+        The map that is contradicted least, and the report: empty if nothing stands against the first.
     """
     standing = _standing(mapped, correspondences)
-    before = _weight(standing)
-    if before == 0:
+    before = best = _Attempt(mapped, np.zeros(0, np.int64), _weight(standing), _doubt(standing))
+    if before.against == 0:
         return mapped, {}
-    best, against, last = (mapped, np.zeros(0, np.int64)), before, mapped
-    dropped = np.zeros(0, np.int64)
+    clearly, last = CLEARLY, before
     for _ in range(MAX_ROUNDS):
-        if against > 0:
-            refuted = refuted_pairs(last.models, standing, correspondences)
-        else:  # all that the map does agree with makes it better, all that it does not only disturbs
-            refuted = np.concatenate([s.agreement.pair_idx[s.agreement.contradicts] for s in standing])
-        if np.array_equal(refuted, dropped):
+        is_settled = last.against == 0
+        if is_settled:  # all that the map does agree with makes it better, all that it does not only disturbs
+            refuted = np.concatenate([s.agreement.pair_idx[s.agreement.disagrees] for s in standing])
+        else:
+            refuted = refuted_pairs(last.mapped.models, standing, correspondences, clearly)
+            if np.array_equal(refuted, last.dropped) and clearly > 1.0:
+                clearly = 1.0
+                refuted = refuted_pairs(last.mapped.models, standing, correspondences, clearly)
+        if np.array_equal(refuted, last.dropped):
             break
-        dropped = refuted
         events.decided(
             STAGE,
-            f"{_weight(standing)} verified matches contradict the model: mapping again without {len(dropped)} pairs "
-            "that stronger ones refute",
+            f"{last.against} verified matches contradict the model: mapping again without {len(refuted)} pairs that "
+            "stronger ones refute",
         )
-        was_settled = against == 0
-        last = map_again(correspondences.without(dropped))
-        standing = _standing(last, correspondences)
-        if _size(last) >= _size(best[0]) and (_weight(standing) < against or (was_settled and _weight(standing) == 0)):
-            best, against = (last, dropped), _weight(standing)
-        if was_settled:
+        again = map_again(correspondences.without(refuted))
+        standing = _standing(again, correspondences)
+        last = _Attempt(again, refuted, _weight(standing), _doubt(standing))
+        # of several maps that are as doubtful, the least doubtful says nothing: that would be choosing by chance
+        is_better = CLEARLY * last.doubt < best.doubt or (is_settled and last.against == 0)
+        if is_better and _size(last.mapped) >= _size(best.mapped):
+            best = last
+        if is_settled:
             break
-    events.decided(STAGE, f"{against} verified matches contradict the model, {before} before")
-    return best[0], _report(correspondences, *best, before, against)
+    events.decided(STAGE, f"{best.against} verified matches contradict the model, {before.against} before")
+    return best.mapped, _report(correspondences, best, before)
 
 
 def refuted_pairs(
-    models: Sequence[Reconstruction], standing: Sequence[Standing], correspondences: Correspondences
+    models: Sequence[Reconstruction], standing: Sequence[Standing], correspondences: Correspondences, clearly: float
 ) -> NDArray[np.int64]:
-    """Verified pairs, as positions in the correspondences, that chains of clearly stronger pairs refute.
+    """Verified pairs, as positions in the correspondences, that chains of stronger pairs refute.
 
     Images are joined from the strongest pair down, and turned as it has them: as the model does where it agrees with
     the pair, else as the pair itself. A pair between images that are joined already, but are turned otherwise, is
-    refuted if it is clearly weaker than the weakest link between them.
+    refuted if it is weaker than the weakest link between them.
 
     Args:
         models: whose tracks are those of the correspondences.
         standing: of the pairs with each model.
         correspondences: all verified matches.
+        clearly: factor by which it must be weaker.
     """
     strength = pair_strengths(models[0], correspondences)
     rotation = rigid3.rotation_matrix(correspondences.cam2_from_cam1)
@@ -104,8 +119,8 @@ def refuted_pairs(
             rigid3.rotation_matrix(model.cam_from_world[i]) for i in correspondences.pair_image_idx[pairs].T
         )
         rotation[pairs] = second @ np.swapaxes(first, 1, 2)
-    known = (strength > 0) & (correspondences.num_inliers >= MIN_MATCHES) & np.isfinite(rotation).all(axis=(1, 2))
-    pairs = np.flatnonzero(known)
+    # pairs of few matches too: they prove little, but a map that finds no others rests on them
+    pairs = np.flatnonzero((strength > 0) & np.isfinite(rotation).all(axis=(1, 2)))
     pairs = pairs[np.argsort(-strength[pairs], kind="stable")]
     images = correspondences.pair_image_idx.astype(np.int64)
     chains = Chains.of(len(models[0].image_names), images[pairs], strength[pairs])
@@ -113,7 +128,7 @@ def refuted_pairs(
     i, j = images[pairs].T
     between = turned[j] @ np.swapaxes(turned[i], 1, 2) @ np.swapaxes(rotation[pairs], 1, 2)
     is_off = rigid3.rotation_angle_deg(between) > MAX_TURN_DEG
-    refuted = [p for p in pairs[is_off] if chains.strength[chains.weakest_link(*images[p])] > CLEARLY * strength[p]]
+    refuted = [p for p in pairs[is_off] if chains.strength[chains.weakest_link(*images[p])] > clearly * strength[p]]
     return np.sort(np.array(refuted, np.int64))
 
 
@@ -144,22 +159,25 @@ def _weight(standing: Sequence[Standing]) -> int:
     return sum(int(s.agreement.num_matches[s.stands].sum()) for s in standing)
 
 
+def _doubt(standing: Sequence[Standing]) -> float:
+    """How strong what contradicts the models is, at most, against what they rest on."""
+    return max((s.doubt for s in standing), default=0.0)
+
+
 def _size(mapped: Mapped) -> int:
     """Images in the largest model."""
     return max((int(model.is_registered.sum()) for model in mapped.models), default=0)
 
 
-def _report(
-    correspondences: Correspondences, mapped: Mapped, dropped: NDArray[np.int64], before: int, against: int
-) -> dict[str, Any]:
-    matches = correspondences.num_inliers[dropped]
-    names = mapped.models[0].image_names
-    strongest = dropped[np.argsort(-matches, kind="stable")[:NUM_NAMED]]
+def _report(correspondences: Correspondences, best: _Attempt, before: _Attempt) -> dict[str, Any]:
+    matches = correspondences.num_inliers[best.dropped]
+    names = best.mapped.models[0].image_names
+    strongest = best.dropped[np.argsort(-matches, kind="stable")[:NUM_NAMED]]
     return {
-        "num_pairs_dropped": len(dropped),
+        "num_pairs_dropped": len(best.dropped),
         "num_matches_dropped": int(matches.sum()),
-        "num_matches_against_before": before,
-        "num_matches_against": against,
+        "num_matches_against_before": before.against,
+        "num_matches_against": best.against,
         "pairs": [
             {
                 "images": [names[i] for i in correspondences.pair_image_idx[p]],

@@ -40,6 +40,9 @@ AGREES, CONTRADICTS = 0.5, 1 / 3
 MIN_MATCHES = 30
 # A cell is covered by a pair that matches half as much of what is in it as it does where it has its matches.
 HALF_AS_WELL = 0.5
+# Few matches that are scattered over a picture do not cover it: a pair should match a fifth of what is where it has
+# its matches, which pairs of 40 degrees apart still do.
+GOOD_SHARE = 0.2
 # Side of the grid on which strength is measured: fine enough to tell a thing from what is around it.
 CELLS = 8
 # Evidence must be stronger by so much to overrule what contradicts it. Near neighbours cover 0.75 to 0.95 of a picture,
@@ -76,10 +79,15 @@ class PairAgreement:
         return self.num_agreeing > AGREES * self.num_matches
 
     @property
-    def contradicts(self) -> Bools:
-        """(K,) bool: enough matches to say so, and next to none agree or share a point."""
+    def disagrees(self) -> Bools:
+        """(K,) bool: next to none of the matches agree or share a point."""
         limit = CONTRADICTS * self.num_matches
-        return (self.num_matches >= MIN_MATCHES) & (self.num_agreeing <= limit) & (self.num_shared <= limit)
+        return (self.num_agreeing <= limit) & (self.num_shared <= limit)
+
+    @property
+    def contradicts(self) -> Bools:
+        """(K,) bool: the pair disagrees, and has matches enough to say so."""
+        return (self.num_matches >= MIN_MATCHES) & self.disagrees
 
 
 def pair_agreement(reconstruction: Reconstruction, correspondences: Correspondences) -> PairAgreement:
@@ -150,12 +158,15 @@ class Standing:
         overruled_by: (K,) how strong the weakest link is of the strongest chain of agreeing pairs between the two
             images; 0 where there is none.
         stands: (K,) bool: contradicts the model, and is not clearly weaker than that chain.
+        doubt: how strong what contradicts the model is, at most, against what it rests on there: 0 if nothing does,
+            1 if it is as strong, infinite if the two images hang together by nothing else.
     """
 
     agreement: PairAgreement
     strength: Array
     overruled_by: Array
     stands: Bools
+    doubt: float
 
 
 def standing_pairs(reconstruction: Reconstruction, correspondences: Correspondences) -> Standing:
@@ -169,7 +180,9 @@ def standing_pairs(reconstruction: Reconstruction, correspondences: Corresponden
         for k in np.flatnonzero(contradicts):
             link = chains.weakest_link(*agreement.image_idx[k])
             overruled_by[k] = chains.strength[link] if link >= 0 else 0.0
-    return Standing(agreement, strength, overruled_by, contradicts & (overruled_by < CLEARLY * strength))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(contradicts & (strength > 0), strength / overruled_by, 0.0)
+    return Standing(agreement, strength, overruled_by, ratio > 1 / CLEARLY, float(ratio.max(initial=0.0)))
 
 
 @dataclass(frozen=True)
@@ -489,7 +502,7 @@ def _covered_share(matched: Ints, matchable: Ints) -> float:
             weighted += matched[c] * matched[c] / matchable[c]
     if total == 0.0:
         return 0.0
-    full = HALF_AS_WELL * weighted / total
+    full = HALF_AS_WELL * max(weighted / total, GOOD_SHARE)
     covered, everything = 0.0, 0.0
     for c in range(len(matched)):
         if matchable[c] > 0:

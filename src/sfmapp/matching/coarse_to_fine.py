@@ -12,7 +12,8 @@ from sfmapp.matching.descriptors import match_sift
 from sfmapp.matching.guided import GuidedImage, change_of_shape, match_guided
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.products import DIMS, Ints
-from sfmapp.matching.two_view import Ransac, find_fundamental, is_significant, polish_fundamental
+from sfmapp.matching.search import Ransac, find_fundamental, is_significant, polish_fundamental
+from sfmapp.matching.second_motion import has_second_motion
 from sfmapp.scene.features import Features
 
 # The coarse epipolar lines are off by more than the noise of the matches that they rest on.
@@ -89,6 +90,8 @@ def _match_coarse_to_fine(
     if inlier.sum() < max(options.min_inliers, _MIN_COARSE_SHARE * len(coarse)):
         return doubtful
     if not is_significant(inlier, threshold_px, extent):
+        return doubtful
+    if has_second_motion(xy1, xy2, inlier, threshold_px, extent, options, ransac):
         return doubtful
     change = change_of_shape(image1, image2, coarse[inlier])
     guided = match_guided(image1, image2, fundamental, _BAND_PER_THRESHOLD * threshold_px, change, *limits)

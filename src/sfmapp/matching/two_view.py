@@ -8,13 +8,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import epipolar, homography, rigid3
 from sfmapp.matching.options import MatchingOptions
+from sfmapp.matching.search import (
+    Ransac,
+    find_fundamental,
+    find_homography,
+    first_matrix,
+    is_significant,
+    polish_fundamental,
+)
+from sfmapp.matching.second_motion import geometry_off_plane
 from sfmapp.scene.camera import Camera, pixels_to_normalized
 from sfmapp.scene.correspondences import TwoViewConfig
 
@@ -44,6 +52,7 @@ class TwoViewGeometry:
         cam2_from_cam1: (7,) pose with unit translation, NaN where there is none. Its translation is zero if PANORAMIC.
         median_angle_deg: median angle between the rays of the inliers, NaN without a pose.
         num_inliers_f, num_inliers_e, num_inliers_h: how many matches each model explains.
+        num_moving_alone: matches that were set aside, as they lie on a plane that moves otherwise than all else.
     """
 
     config: TwoViewConfig
@@ -56,30 +65,7 @@ class TwoViewGeometry:
     num_inliers_f: int = 0
     num_inliers_e: int = 0
     num_inliers_h: int = 0
-
-
-@dataclass(frozen=True)
-class Ransac:
-    """How to draw: most hypotheses of a search, and the state of the random generator (31 bits)."""
-
-    max_trials: int
-    seed: int
-
-    def params(self, threshold: float) -> Any:
-        """MAGSAC++ scores (Barath et al., CVPR 2020) with local optimisation, in OpenCV's USAC framework."""
-        import cv2
-
-        params = cv2.UsacParams()
-        params.confidence = 0.999
-        params.maxIterations = self.max_trials
-        params.threshold = threshold
-        params.score = cv2.SCORE_METHOD_MAGSAC
-        params.loMethod = cv2.LOCAL_OPTIM_SIGMA
-        params.final_polisher = cv2.MAGSAC
-        params.sampler = cv2.SAMPLING_UNIFORM
-        params.isParallel = False
-        params.randomGeneratorState = self.seed
-        return params
+    num_moving_alone: int = 0
 
 
 def error_threshold_px(camera1: Camera, camera2: Camera, options: MatchingOptions) -> float:
@@ -112,9 +98,43 @@ def verify_pair(
         ransac: the same gives the same answer on any thread.
         fundamental: (3, 3) that is known to be nearly right, in place of a search.
     """
-    result = TwoViewGeometry(TwoViewConfig.UNDEFINED, np.zeros(len(xy1), bool))
     if len(xy1) < max(options.min_inliers, 8):
+        return TwoViewGeometry(TwoViewConfig.UNDEFINED, np.zeros(len(xy1), bool))
+    result, inliers = _verify(xy1, xy2, camera1, camera2, options, ransac, fundamental)
+    threshold, extent = error_threshold_px(camera1, camera2, options), (camera2.width, camera2.height)
+    off_plane = geometry_off_plane(xy1, xy2, inliers.f, inliers.h, threshold, extent, options, ransac)
+    if off_plane is None:
         return result
+    kept = np.flatnonzero(~inliers.h)
+    second, others = _verify(xy1[kept], xy2[kept], camera1, camera2, options, ransac, off_plane)
+    # the plane may be a wall of the scene and the rest a thing that moves: what lies on neither tells
+    off_both = ~others.h
+    has_depth = (others.f & off_both).sum() > (inliers.f[kept] & off_both).sum()
+    if second.config == TwoViewConfig.PLANAR:  # a facade has more than a plane that only turned
+        on_plane = inliers.h
+        plane, _ = _verify(xy1[on_plane], xy2[on_plane], camera1, camera2, options, ransac, None)
+        has_depth &= plane.config in (TwoViewConfig.PANORAMIC, TwoViewConfig.WATERMARK)
+    elif second.config not in (TwoViewConfig.CALIBRATED, TwoViewConfig.UNCALIBRATED):
+        has_depth = False
+    if not has_depth:
+        return result
+    is_inlier = np.zeros(len(xy1), bool)
+    is_inlier[kept] = second.is_inlier
+    second.is_inlier, second.num_moving_alone = is_inlier, int(inliers.h.sum())
+    return second
+
+
+def _verify(
+    xy1: Array,
+    xy2: Array,
+    camera1: Camera,
+    camera2: Camera,
+    options: MatchingOptions,
+    ransac: Ransac,
+    fundamental: Array | None,
+) -> tuple[TwoViewGeometry, _Inliers]:
+    """The geometry that explains most matches, at least eight, and the inliers of each model."""
+    result = TwoViewGeometry(TwoViewConfig.UNDEFINED, np.zeros(len(xy1), bool))
     threshold = error_threshold_px(camera1, camera2, options)
     inliers = _Inliers(*(np.zeros(len(xy1), bool) for _ in range(3)))
     if fundamental is None:
@@ -137,7 +157,7 @@ def verify_pair(
     _classify(result, inliers, is_calibrated, options)
     if result.config == TwoViewConfig.DEGENERATE:
         result.essential, result.cam2_from_cam1 = _no_matrix(), np.full(7, np.nan)
-        return result
+        return result, inliers
     _tell_planar_apart(result, inliers.h, poses, is_calibrated)
     if _is_watermark(xy1, xy2, result.is_inlier, camera1, camera2, threshold):
         result.config = TwoViewConfig.WATERMARK
@@ -145,7 +165,7 @@ def verify_pair(
         depths, angles = epipolar.ray_depths(result.cam2_from_cam1, *poses.subset(result.is_inlier))
         in_front = (depths > 0).all(1)
         result.median_angle_deg = float(np.degrees(np.median(angles[in_front]))) if in_front.any() else 0.0
-    return result
+    return result, inliers
 
 
 @dataclass
@@ -171,63 +191,6 @@ def _classify(result: TwoViewGeometry, inliers: _Inliers, is_calibrated: bool, o
             result.is_inlier = inliers.h
 
 
-def is_significant(inlier: Mask, threshold: float, extent: tuple[float, float]) -> bool:
-    """Whether so many inliers of an F cannot be chance: fewer than one such F is expected among unrelated matches.
-
-    The number of false alarms of Moisan and Stival, "A probabilistic criterion to detect rigid point matches", IJCV
-    2004, at a fixed threshold.
-
-    Args:
-        inlier: (N,) bool.
-        threshold: distance from the epipolar line in pixels.
-        extent: width and height in pixels of where the matches could lie.
-    """
-    n, k = len(inlier), int(inlier.sum())
-    if k < 8:
-        return False
-    band_share = min(2.0 * threshold * math.hypot(*extent) / max(extent[0] * extent[1], 1.0), 1.0)
-
-    def log_choose(a: int, b: int) -> float:
-        return math.lgamma(a + 1) - math.lgamma(b + 1) - math.lgamma(a - b + 1)
-
-    log_expected = math.log(max(n - 7, 1)) + log_choose(n, k) + log_choose(k, 7) + (k - 7) * math.log(band_share)
-    return log_expected < 0.0
-
-
-def _first_matrix(found: Any) -> Array | None:
-    """OpenCV returns None, an empty array, or several 3 x 3 solutions stacked."""
-    if found is None or found.shape[0] < 3 or not np.isfinite(found[:3]).all():
-        return None
-    matrix = np.ascontiguousarray(found[:3], np.float64)
-    norm = np.linalg.norm(matrix)
-    return matrix / norm if norm > 0 else None
-
-
-def find_fundamental(xy1: Array, xy2: Array, threshold: float, ransac: Ransac) -> Array | None:
-    """F (3, 3) by RANSAC from matched pixels (N, 2), N >= 8, or None."""
-    import cv2
-
-    try:
-        return _first_matrix(cv2.findFundamentalMat(xy1, xy2, ransac.params(threshold))[0])
-    except cv2.error:  # coincident points can leave it without a single valid sample
-        return None
-
-
-def polish_fundamental(f: Array, xy1: Array, xy2: Array, threshold: float, rounds: int = 3) -> tuple[Array, Mask]:
-    """F fitted to all of its inliers, as long as that does not lose any, and the inliers (N,) of the last."""
-    inlier = epipolar.sampson_errors(f, xy1, xy2) < threshold**2
-    for _ in range(rounds):
-        if inlier.sum() < 8:
-            break
-        a, b = xy1[inlier], xy2[inlier]
-        refined = epipolar.fundamental_from_points(a, b, epipolar.sampson_weights(f, a, b))
-        refined_inlier = epipolar.sampson_errors(refined, xy1, xy2) < threshold**2
-        if refined_inlier.sum() < inlier.sum():
-            break
-        f, inlier = refined, refined_inlier
-    return f, inlier
-
-
 def _find_essential(xn1: Array, xn2: Array, threshold: float, ransac: Ransac) -> Array | None:
     import cv2
 
@@ -236,17 +199,12 @@ def _find_essential(xn1: Array, xn2: Array, threshold: float, ransac: Ransac) ->
         found = cv2.findEssentialMat(xn1, xn2, eye, eye, no_distortion, no_distortion, ransac.params(threshold))[0]
     except cv2.error:
         return None
-    e = _first_matrix(found)
+    e = first_matrix(found)
     return None if e is None else epipolar.nearest_essential(e)
 
 
 def _estimate_homography(xy1: Array, xy2: Array, pool: Mask, threshold: float, ransac: Ransac) -> tuple[Array, Mask]:
-    import cv2
-
-    try:
-        h = _first_matrix(cv2.findHomography(xy1[pool], xy2[pool], ransac.params(threshold))[0])
-    except cv2.error:
-        h = None
+    h = find_homography(xy1[pool], xy2[pool], threshold, ransac)
     if h is None:
         return _no_matrix(), np.zeros(len(xy1), bool)
     return h, homography.transfer_errors(h, xy1, xy2) < threshold**2

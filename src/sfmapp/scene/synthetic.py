@@ -7,7 +7,7 @@ seen from the front side only, inside the image, and detected with some probabil
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -110,6 +110,17 @@ def make_scene(
         frames = _poses(layout, int(mounted.frame_idx[-1]) + 1, rng)
         poses = mounted.cam_from_world(np.arange(num_images), frames[mounted.frame_idx])
     xyz, visible = _points_and_visibility(layout, num_points, poses, camera_list, image_camera_idx, detection, rng)
+    scene = _observe(seed, camera_list, image_camera_idx, poses, xyz, visible, sigma_px, outlier_ratio, rng)
+    scene.truth.rig = scene.observed.rig = mounted
+    return scene
+
+
+def _observe(
+    seed: int, camera_list: list[Camera], image_camera_idx: NDArray[np.int32], poses: Array, xyz: Array,
+    visible: NDArray[np.bool_], sigma_px: float, outlier_ratio: float, rng: np.random.Generator,
+) -> SyntheticScene:  # fmt: skip
+    """The scene of points (N, 3) that images see as ``visible`` (N, I) tells, with pixel noise and outliers."""
+    num_images, num_points = len(poses), len(xyz)
     point_idx, image_idx = np.nonzero(visible)
     exact = np.empty((len(point_idx), 2))
     for i in range(num_images):
@@ -125,7 +136,6 @@ def make_scene(
         tracks = make_tracks(num_images, num_points, point_idx, image_idx, feature_idx, xy)
         names = [f"image{i:04d}.jpg" for i in range(num_images)]
         model = Reconstruction.empty(camera_list, names, image_camera_idx, tracks)
-        model.rig = mounted
         model.cam_from_world[:] = poses
         model.point_xyz[:] = xyz
         model.obs_is_inlier[:] = True
@@ -215,6 +225,87 @@ def true_correspondences(scene: SyntheticScene, min_matches: int = 15) -> Corres
         **matrices, cam2_from_cam1=relative, median_angle_deg=angle, num_putative=putative,
         num_inliers_f=found, num_inliers_e=found.copy(), num_inliers_h=np.zeros(num, np.int32),
     )  # fmt: skip
+
+
+def make_look_alike(
+    seed: int = 0, num_images: int = 24, num_points: int = 2400, *, sides: int = 2, background: float = 0.5
+) -> tuple[SyntheticScene, Correspondences]:
+    """A ring of cameras round a thing whose sides look alike, and what a good matcher finds, which takes sides for
+    one another.
+
+    A keypoint is matched where one point in the other image looks like it, rarer the more the view has changed; of the
+    matches of a pair, those are verified that most others agree with, be they of the same side or of another one.
+
+    Args:
+        sides: how often the thing looks the same as it turns once.
+        background: share of the points that lie behind it all round and look like no other.
+    """
+    rng = np.random.default_rng([seed, 0xA11CE])
+    camera = synthetic_camera()
+    poses = _poses("ring", num_images, rng)
+    turns = rigid3.exp_so3(np.outer(np.arange(sides), [0.0, 0.0, 2 * np.pi / sides]))
+    num_alike = round((1.0 - background) * num_points / sides)
+    one_side, normals = _surface("ring", num_alike, poses, rng)
+    num_behind = num_points - sides * num_alike
+    angle = rng.uniform(0.0, 2 * np.pi, num_behind)
+    inward = -np.stack([np.cos(angle), np.sin(angle), np.zeros(num_behind)], 1)
+    behind = -rng.uniform(5.0, 7.0, (num_behind, 1)) * inward
+    behind[:, 2] = rng.uniform(-3.0, 3.0, num_behind)
+    xyz = np.concatenate([*(one_side @ turn.T for turn in turns), behind])
+    normals = np.concatenate([*(normals @ turn.T for turn in turns), inward])
+    looks_like = np.concatenate([np.tile(np.arange(num_alike), sides), np.arange(num_behind) + num_alike])
+    visible = rng.random((len(xyz), num_images)) < 0.9
+    for i, pose in enumerate(poses):
+        view = _unit(xyz - rigid3.center(pose))
+        passes_by = np.linalg.norm(np.cross(np.broadcast_to(rigid3.center(pose), view.shape), view), axis=1) > 1.0
+        visible[:, i] &= _sees(camera, pose, xyz, normals) & (passes_by | (np.arange(len(xyz)) < sides * num_alike))
+    kept = visible.sum(1) >= 2
+    xyz, visible, looks_like = xyz[kept], visible[kept], looks_like[kept]
+    side = np.where(kept, np.minimum(np.arange(len(kept)) // max(num_alike, 1), sides), 0)[kept]
+    scene = _observe(seed, [camera], np.zeros(num_images, np.int32), poses, xyz, visible, 0.5, 0.0, rng)
+    return scene, _alike_correspondences(scene, looks_like, side, turns, rng)
+
+
+def _alike_correspondences(
+    scene: SyntheticScene, looks_like: NDArray[np.int64], side: NDArray[np.int64], turns: Array,
+    rng: np.random.Generator,
+) -> Correspondences:  # fmt: skip
+    """Verified matches between points that look alike: of each pair those of the turn that most agree with."""
+    tracks, poses, sides = scene.observed.tracks, scene.truth.cam_from_world, len(turns)
+    # what each image sees of what looks the same: the observation if it is one, else none
+    obs_of = np.full((tracks.num_images, looks_like.max() + 1), -1)
+    count = np.zeros(obs_of.shape, np.int64)
+    kind = looks_like[tracks.obs_track_idx]
+    obs_of[tracks.obs_image_idx, kind] = np.arange(tracks.num_observations)
+    np.add.at(count, (tracks.obs_image_idx, kind), 1)
+    obs_of[count != 1] = -1
+    found = true_correspondences(scene, min_matches=1)
+    matches: list[NDArray[np.int32]] = []
+    for p, (i, j) in enumerate(found.pair_image_idx):
+        both = np.flatnonzero((obs_of[i] >= 0) & (obs_of[j] >= 0))
+        one, other = (side[tracks.obs_track_idx[obs_of[a, both]]] for a in (i, j))
+        turn = (other - one) % sides
+        is_behind = one == sides  # what looks like nothing else is matched with itself
+        turn[is_behind] = 0
+        centers = [rigid3.center(poses[a]) for a in (i, j)]
+        kept = np.zeros(0, np.int64)
+        for t in range(sides):
+            # the other camera as it would stand if both saw the same side
+            cosine = float(_unit(centers[0]) @ _unit(turns[t].T @ centers[1]))
+            share = 0.5 ** (np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))) / 15.0)
+            agree = both[(turn == t) & (rng.random(len(both)) < share)]
+            if len(agree) > len(kept):
+                kept = agree
+                turned = rigid3.from_matrix(turns[t], np.zeros(3))
+                pose = rigid3.compose(rigid3.compose(poses[j], turned), rigid3.inverse(poses[i]))
+                baseline = float(np.linalg.norm(pose[4:]))
+                found.cam2_from_cam1[p] = np.append(pose[:4], pose[4:] / max(baseline, 1e-9))
+        kept = kept if len(kept) >= 15 else kept[:0]
+        found.config[p] = TwoViewConfig.CALIBRATED if len(kept) else TwoViewConfig.UNDEFINED
+        pair = np.stack([tracks.obs_feature_idx[obs_of[a, kept]] for a in (i, j)], 1)
+        matches.append(pair.astype(np.int32))
+    counts = np.array([len(m) for m in matches])
+    return replace(found, pair_ptr=np.concatenate([[0], np.cumsum(counts)]), matches=np.concatenate(matches))
 
 
 def _rig_images(rig: Rig, num_images: int) -> RigImages:

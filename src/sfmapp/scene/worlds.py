@@ -530,3 +530,30 @@ class _Street:
             yaw = float(np.degrees(np.arctan2(direction[1], direction[0])))
             velocity = [*direction * speed, 0.0]
             self.car([*start, 0.0], yaw, velocity, (self.rng.uniform(0, length), length))
+
+
+@lru_cache(maxsize=2)
+def look_alike_world(seed: int = 0, *, has_background: bool = True) -> World:
+    """A thing about a metre in size that looks the same from opposite sides, in a room of 9 x 8 m with clutter along
+    its walls that does not, or before nothing at all."""
+    rng = np.random.default_rng([seed, 0xA11CE])
+    build = WorldBuilder(rng)
+    kinds = (textures.machine, textures.books, textures.carton, textures.poster, textures.picture)
+    ends, sides, *small = (Skin(build.texture(kind(rng))) for kind in kinds)
+    plain = Skin(build.texture(textures.plaster(rng)), 3.0)
+    build.box((0, 0, 0), (0.9, 0.55, 1.1), (ends, sides, plain))
+    for k, (x, y, width, height) in enumerate(
+        ((0.55, 0.42, 0.25, 0.5), (0.15, -0.5, 0.3, 0.35), (0.6, -0.3, 0.22, 0.7))
+    ):
+        for sign in (1, -1):
+            skins = (small[k], small[(k + 1) % 3], small[(k + 2) % 3])
+            build.box((sign * x, sign * y, 0), (width, width, height), skins)
+    if has_background:
+        build.inside((4.5, 4.0), 3.2, plain, Skin(build.texture(textures.carpet(rng)), 2.5), plain)
+        for n in range(14):
+            angle = 2 * np.pi * (n + rng.uniform(-0.3, 0.3)) / 14
+            foot = rng.uniform(3.0, 3.7) * np.array([np.cos(angle), np.sin(angle), 0.0])
+            skin = Skin(build.texture(kinds[int(rng.integers(len(kinds)))](rng)))
+            size = [float(v) for v in (*rng.uniform(0.4, 0.9, 2), rng.uniform(0.6, 2.0))]
+            build.box(foot, size, (skin, skin, plain), yaw_deg=float(rng.uniform(0, 90)))
+    return build.build()
