@@ -69,8 +69,8 @@ def map_images(
         tracks, track_report = build_tracks(correspondences, features)
         events.warned(
             STAGE,
-            f"{num_flat} pairs match on something flat alone that is no part of the scene; they were left out. Masks over "
-            "it (images.mask_path) would save what else they share",
+            f"{num_flat} pairs match on something flat alone that is no part of the scene; they were left out. Masks "
+            "over it (images.mask_path) would save what else they share",
         )
     events.decided(STAGE, f"{track_report['num_tracks']} tracks", **track_report)
     events.started(STAGE, "mapping", total=len(names))

@@ -124,8 +124,8 @@ def match_images(
     if (num_moving := report["num_pairs_with_moving_plane"]) >= _MANY_MOVING:
         events.warned(
             _STAGE,
-            f"in {num_moving} pairs something flat moves otherwise than the scene (held into the picture, on the camera, "
-            "or a background that stays while the object turns); its matches were left out. A mask over it "
+            f"in {num_moving} pairs something flat moves otherwise than the scene (held into the picture, on the "
+            "camera, or a background that stays while the object turns); its matches were left out. A mask over it "
             "(images.mask_path) is better",
         )
     events.finished(_STAGE, f"{report['num_verified_pairs']} of {len(pairs)} pairs verified", **report)
