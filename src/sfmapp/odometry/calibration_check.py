@@ -80,7 +80,7 @@ class Answer:
         model: with the calibration that is believed, poses and points adjusted to it.
         is_refined: it is not the given one.
         report: the numbers behind that.
-        contradictions: the given calibration is wrong, and what is right could not be told.
+        contradictions: the given calibration is wrong, and what is right could not be told or may not be taken.
         scale_sigma: relative standard deviation of the unit of length of a rig; None for a single camera.
         pose_covariance: (F, 6, 6) what the refined calibration leaves open, in the gauge of the map's covariance; None
             if the given one is believed.
@@ -180,7 +180,7 @@ def question_calibration(model: Reconstruction, cost: float, sigma: float, *, ma
     Args:
         model: adjusted with the cameras as they were given; image S k + s is that of sensor s at the k-th keyframe.
         cost: of that adjustment in units of the noise. sigma: the noise in pixels.
-        may_refine: the given calibration may be replaced; otherwise it is only said how well the scale is known.
+        may_refine: the given calibration may be replaced; otherwise it is only said what contradicts it.
     """
     unknowns = Unknowns.of(model)
     first = _look(model, np.zeros(len(unknowns.names)), cost, sigma, unknowns)
@@ -189,7 +189,7 @@ def question_calibration(model: Reconstruction, cost: float, sigma: float, *, ma
         return Answer(model, False, {"is_refined": False}, [], _UNKNOWN_SCALE if is_rig else None)
     limit = _SHARED_ERRORS * float(chi2.isf(_MAX_CHANCE, len(first.x)))
     surprise = float(first.step @ first.data_information @ first.step)
-    if not may_refine or surprise < limit / _SHARED_ERRORS:
+    if surprise < limit / _SHARED_ERRORS:
         return _kept(first, first, unknowns, _report(first, surprise, limit, unknowns), [])
     last = _settle(first, sigma, unknowns)
     surprise = float(last.x @ last.data_information @ last.x)
@@ -203,7 +203,7 @@ def question_calibration(model: Reconstruction, cost: float, sigma: float, *, ma
         "given": [c.params.tolist() for c in model.cameras],
     }  # fmt: skip
     is_better = last.cost < first.cost and held_out[-1] > _MIN_HELD_OUT_SIGMAS
-    if settled and known and surprise > limit and is_better and agree.any():
+    if may_refine and settled and known and surprise > limit and is_better and agree.any():
         # x = basis a, and what other tracks do not confirm stays as it was given
         dropped = basis[:, ~agree] @ (np.linalg.inv(basis)[~agree] @ last.x)
         refined = _go(last, -dropped, sigma, unknowns)
@@ -456,7 +456,7 @@ def _scale_sigma(look: _Look, shift: float, unknowns: Unknowns) -> tuple[float |
     }
     calibration = float(np.sqrt(by @ look.covariance @ by))
     noise = math.sqrt(look.noise * look.system.scale_variance)
-    total = math.sqrt(BASELINE_SIGMA**2 + calibration**2 + noise**2 + shift**2)
+    total = math.sqrt(_BASELINE_SIGMA**2 + calibration**2 + noise**2 + shift**2)
     return total, {
         "baseline": _BASELINE_SIGMA, "calibration": calibration, **parts, "disparity": noise, "shift": abs(shift),
         "sigma": total,
@@ -469,7 +469,7 @@ def spread(model: Reconstruction) -> float:
 
 
 def _contradiction(first: _Look, last: _Look, report: dict[str, Any], unknowns: Unknowns) -> Contradiction:
-    """The images say clearly that the given calibration is wrong, and not clearly enough what is right."""
+    """The images say clearly that the given calibration is wrong; what is right they do not, or it may not be taken."""
     num_sensors = len(first.model.cameras)
     given, found = first.model.cam_from_world[::num_sensors], last.model.cam_from_world[::num_sensors]
     moved = similarity.transform_poses(similarity.align_poses(found, given).b_from_a, found)
@@ -481,8 +481,8 @@ def _contradiction(first: _Look, last: _Look, report: dict[str, Any], unknowns: 
     return Contradiction(
         "given calibration",
         f"the images contradict the given calibration by {report['surprise']:.0f} where shared errors make up to "
-        f"{report['max_surprise']:.0f} (focal length {focal[0]:.1f} px given, they lead to {focal[1]:.1f} at least), "
-        "and do not settle on another one",
+        f"{report['max_surprise']:.0f}: a focal length of {focal[0]:.1f} px is given, they lead to {focal[1]:.1f}"
+        + ("" if report["is_settled"] else " and have not settled there"),
         "calibrate the camera, or give a focal length that is nearer the right one",
         {k: report[k] for k in ("surprise", "max_surprise", "is_settled", "change")},
         rotation_sigma_deg=share * float(np.degrees(np.sqrt((turn**2).mean()))),
