@@ -40,7 +40,9 @@ _RADIAL_SIGMA, _TANGENTIAL_SIGMA = 0.02, 0.002
 # scale of a drive by half a percent.
 _TURN_SIGMA_DEG = 0.05
 # A board measures the baseline of a rig to some thousandths.
-BASELINE_SIGMA = 0.002
+_BASELINE_SIGMA = 0.002
+# What a turn of the rig by its prior makes of the scale of a drive: where tracks are too few to say more.
+_UNKNOWN_SCALE = 0.05
 # Smooth fields that no lens model has: rectification leaves a tenth of a pixel, as a calibration's own residuals do;
 # where the images show more of them, up to twice that, rounds of finding out.
 _FIELD_SIGMA_PX, _MAX_FIELD_SIGMA_PX, _FIELD_STEPS, _FIELD_DEGREES = 0.1, 0.2, 3, (2, 3)
@@ -52,6 +54,8 @@ _CLUSTERS, _MIN_CLUSTERS = ((3, 4, 2), (1, 4, 2), (1, 8, 4)), 1.5
 # common make of it (exact cameras of rendered sequences: up to half of chance; real rectified ones: 20 to 150 times);
 # what other tracks must gain by it, in standard deviations, and by each direction of it.
 _MAX_CHANCE, _SHARED_ERRORS, _MIN_HELD_OUT_SIGMAS, _MIN_DIRECTION_SIGMAS, _FOLDS = 1e-3, 3.0, 3.0, 1.0, 5
+# A cluster counts for no more than so many usual ones.
+_MAX_GAIN = 5.0
 # Rounds until the next would move by less than a share of a sigma; how far one may go, in the focal length's logarithm.
 _ROUNDS, _ROUNDS_FAR, _SETTLED_SIGMAS, _MAX_STEP = 6, 14, 0.5, 0.05
 # A step that makes the cost rise by more than this share has gone too far; steps of the adjustment that follows one.
@@ -76,7 +80,7 @@ class Answer:
         model: with the calibration that is believed, poses and points adjusted to it.
         is_refined: it is not the given one.
         report: the numbers behind that.
-        contradictions: the given calibration is wrong, and what is right could not be told.
+        contradictions: the given calibration is wrong, and what is right could not be told or may not be taken.
         scale_sigma: relative standard deviation of the unit of length of a rig; None for a single camera.
         pose_covariance: (F, 6, 6) what the refined calibration leaves open, in the gauge of the map's covariance; None
             if the given one is believed.
@@ -176,16 +180,16 @@ def question_calibration(model: Reconstruction, cost: float, sigma: float, *, ma
     Args:
         model: adjusted with the cameras as they were given; image S k + s is that of sensor s at the k-th keyframe.
         cost: of that adjustment in units of the noise. sigma: the noise in pixels.
-        may_refine: the given calibration may be replaced; otherwise it is only said how well the scale is known.
+        may_refine: the given calibration may be replaced; otherwise it is only said what contradicts it.
     """
     unknowns = Unknowns.of(model)
     first = _look(model, np.zeros(len(unknowns.names)), cost, sigma, unknowns)
     if first is None:
         is_rig = len(model.cameras) > 1
-        return Answer(model, False, {"is_refined": False}, [], BASELINE_SIGMA if is_rig else None)
+        return Answer(model, False, {"is_refined": False}, [], _UNKNOWN_SCALE if is_rig else None)
     limit = _SHARED_ERRORS * float(chi2.isf(_MAX_CHANCE, len(first.x)))
     surprise = float(first.step @ first.data_information @ first.step)
-    if not may_refine or surprise < limit / _SHARED_ERRORS:
+    if surprise < limit / _SHARED_ERRORS:
         return _kept(first, first, unknowns, _report(first, surprise, limit, unknowns), [])
     last = _settle(first, sigma, unknowns)
     surprise = float(last.x @ last.data_information @ last.x)
@@ -199,19 +203,18 @@ def question_calibration(model: Reconstruction, cost: float, sigma: float, *, ma
         "given": [c.params.tolist() for c in model.cameras],
     }  # fmt: skip
     is_better = last.cost < first.cost and held_out[-1] > _MIN_HELD_OUT_SIGMAS
-    if settled and known and surprise > limit and is_better and agree.any():
+    if may_refine and settled and known and surprise > limit and is_better and agree.any():
         # x = basis a, and what other tracks do not confirm stays as it was given
-        confirmed = basis[:, agree] @ (np.linalg.inv(basis)[agree] @ last.x)
-        refined = _go(last, confirmed - last.x, sigma, unknowns)
-        if refined is not None and far.any():
-            refined = _start_afresh(refined, sigma, unknowns)
+        dropped = basis[:, ~agree] @ (np.linalg.inv(basis)[~agree] @ last.x)
+        refined = _go(last, -dropped, sigma, unknowns)
         if refined is not None and refined.cost < first.cost:
+            refined = _start_afresh(refined, sigma, unknowns)
             pairs = zip(refined.model.cameras, model.cameras, strict=True)
             report |= {
                 "is_refined": True, "focal_change": [c.focal / g.focal - 1 for c, g in pairs],
                 "refined": [c.params.tolist() for c in refined.model.cameras],
             }  # fmt: skip
-            return _refined(refined, unknowns, report)
+            return _refined(refined, dropped, unknowns, report)
     found = [_contradiction(first, last, report, unknowns)] if surprise > limit and far.any() else []
     return _kept(first, last, unknowns, report, found)
 
@@ -323,6 +326,9 @@ def _held_out(look: _Look) -> tuple[Array, Array]:
         costs = system.gradient[held] @ states
         costs += 0.5 * np.einsum("tqn,qn->tn", system.information[held] @ states, states)
         np.add.at(gains, look.clusters[held], costs[:, 1:] - costs[:, :1])
+    # one cluster that gains very much must not make the rest look unsure, nor decide alone
+    limit = _MAX_GAIN * np.median(np.abs(gains), axis=0)
+    gains = np.clip(gains, -limit, limit)
     total = gains.sum(0)
     sigma = np.sqrt(((gains - gains.mean(0)) ** 2).sum(0))
     return basis, np.where(sigma > 0, total / np.where(sigma > 0, sigma, 1.0), 0.0)
@@ -389,8 +395,9 @@ def _move_frames(model: Reconstruction, motion: Array) -> None:
     model.cam_from_world = model.rig.cam_from_world(np.arange(len(model.image_names)), frames[model.rig.frame_idx])
 
 
-def _start_afresh(look: _Look, sigma: float, unknowns: Unknowns) -> _Look | None:
-    """The tracks were sorted out under a calibration that was far off: take them all again, and settle once more."""
+def _start_afresh(look: _Look, sigma: float, unknowns: Unknowns) -> _Look:
+    """The tracks were sorted out by a calibration that was off, which keeps what agrees with it: take them all again,
+    and settle once more."""
     model = look.model.copy()
     tracks = model.tracks
     canonical, fisheye = model.canonical_cameras()
@@ -409,9 +416,9 @@ def _start_afresh(look: _Look, sigma: float, unknowns: Unknowns) -> _Look | None
 # ------------------------------------------------------------------ what follows from it
 
 
-def _refined(look: _Look, unknowns: Unknowns, report: dict[str, Any]) -> Answer:
-    """The calibration that was found is believed, as far as it is known."""
-    num = len(look.x)
+def _refined(look: _Look, dropped: Array, unknowns: Unknowns, report: dict[str, Any]) -> Answer:
+    """The calibration that was found is believed, as far as it is known; what (Q,) was dropped of it may be right."""
+    num, look = len(look.x), replace(look, covariance=look.covariance + np.outer(dropped, dropped))
     scale_sigma, report["scale"] = _scale_sigma(look, 0.0, unknowns)
     num_sensors = len(look.model.cameras)
     poses, freedoms = look.model.cam_from_world[::num_sensors], 6 if num_sensors > 1 else 7
@@ -449,9 +456,9 @@ def _scale_sigma(look: _Look, shift: float, unknowns: Unknowns) -> tuple[float |
     }
     calibration = float(np.sqrt(by @ look.covariance @ by))
     noise = math.sqrt(look.noise * look.system.scale_variance)
-    total = math.sqrt(BASELINE_SIGMA**2 + calibration**2 + noise**2 + shift**2)
+    total = math.sqrt(_BASELINE_SIGMA**2 + calibration**2 + noise**2 + shift**2)
     return total, {
-        "baseline": BASELINE_SIGMA, "calibration": calibration, **parts, "disparity": noise, "shift": abs(shift),
+        "baseline": _BASELINE_SIGMA, "calibration": calibration, **parts, "disparity": noise, "shift": abs(shift),
         "sigma": total,
     }  # fmt: skip
 
@@ -462,7 +469,7 @@ def spread(model: Reconstruction) -> float:
 
 
 def _contradiction(first: _Look, last: _Look, report: dict[str, Any], unknowns: Unknowns) -> Contradiction:
-    """The images say clearly that the given calibration is wrong, and not clearly enough what is right."""
+    """The images say clearly that the given calibration is wrong; what is right they do not, or it may not be taken."""
     num_sensors = len(first.model.cameras)
     given, found = first.model.cam_from_world[::num_sensors], last.model.cam_from_world[::num_sensors]
     moved = similarity.transform_poses(similarity.align_poses(found, given).b_from_a, found)
@@ -474,8 +481,8 @@ def _contradiction(first: _Look, last: _Look, report: dict[str, Any], unknowns: 
     return Contradiction(
         "given calibration",
         f"the images contradict the given calibration by {report['surprise']:.0f} where shared errors make up to "
-        f"{report['max_surprise']:.0f} (focal length {focal[0]:.1f} px given, they lead to {focal[1]:.1f} at least), "
-        "and do not settle on another one",
+        f"{report['max_surprise']:.0f}: a focal length of {focal[0]:.1f} px is given, they lead to {focal[1]:.1f}"
+        + ("" if report["is_settled"] else " and have not settled there"),
         "calibrate the camera, or give a focal length that is nearer the right one",
         {k: report[k] for k in ("surprise", "max_surprise", "is_settled", "change")},
         rotation_sigma_deg=share * float(np.degrees(np.sqrt((turn**2).mean()))),

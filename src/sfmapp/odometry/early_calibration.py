@@ -22,8 +22,10 @@ def is_time_to_ask(local: LocalMap) -> bool:
 
 
 def refine_early(local: LocalMap) -> bool:
-    """Hold the calibration of a growing map against what it has seen; returns whether it was refined. The map is then
-    adjusted to it, in place, and goes on with it. No adjustment may be under way."""
+    """Hold the calibration of a growing map against what it has seen; returns whether it was refined.
+
+    The map is then adjusted to it, in place, and goes on with it; what else is under way is over. Otherwise nothing has
+    changed."""
     keyframes = local.keyframes
     everything = np.arange(len(keyframes.keyframes))
     job = make_job(keyframes, everything, everything > 0)
@@ -32,6 +34,7 @@ def refine_early(local: LocalMap) -> bool:
     answer = question_calibration(job.model, cost, sigma, may_refine=True)
     if not answer.is_refined:
         return False
+    local.backend.finish(keyframes)
     job.model = answer.model
     classify(job.model, job.num_elsewhere)
     take_over(job, keyframes)

@@ -222,11 +222,10 @@ class Odometry:
         if not self.options.refine_camera or self.is_refined or asked in self.asked or not is_time_to_ask(local):
             return
         self.asked.add(asked)
-        self._take_over(local, None)
-        before, is_refined = local.pose(local.newest), refine_early(local)
-        self.pose = local.pose(local.newest)
-        if not is_refined:
+        before = local.pose(local.newest)
+        if not refine_early(local):
             return
+        self.pose = local.pose(local.newest)
         self.is_refined, self.rig = True, local.rig
         record.live = self.pose.copy()
         scale = np.linalg.norm(self.pose[4:]) / max(float(np.linalg.norm(before[4:])), 1e-300)

@@ -21,9 +21,6 @@ _STEP_PX = 2.0
 # A match agrees with the epipolar line to that many pixels, and with a forward-backward check.
 _MAX_OFF_LINE_PX = 1.5
 _MIN_LIKENESS = 0.8
-# How much longer one lens may be than the other, beyond what is known; where the loss begins to bend (Cauchy's 95 %
-# efficiency), and the rounds of weighting.
-_LENGTH_SIGMA, _LOSS_SIGMAS, _ROBUST_STEPS = 0.01, 2.385, 8
 
 
 def match_stereo(rig: Rig, pyramids: tuple[Pyramid, ...], xy: Array, depth: Array) -> Array:
@@ -86,29 +83,3 @@ def _lines(rig: Rig, rays: Array, xy: Array) -> tuple[Array, Array]:
     line = (rays @ rigid3.rotation_matrix(right_from_left).T) @ rigid3.skew(right_from_left[4:]).T
     here = np.column_stack([pixels_to_normalized(rig.cameras[1], xy), np.ones(len(xy))])
     return line / np.linalg.norm(line[:, :2], axis=1)[:, None], here
-
-
-def turn_of_rig(rig: Rig, xy1: Array, xy2: Array, sigma_deg: float) -> Array:
-    """How the second camera is turned against what is known, from matches (N, 2) that miss their epipolar lines.
-
-    With the second camera turned by exp(w), its lines l turn along: a match h is off by ``l.h + w.(l x h)``. Lenses
-    that are not equally long are told apart from a turn by a fourth unknown.
-
-    Args:
-        sigma_deg: what the rig may be turned by.
-
-    Returns:
-        (3,) rotation vector w, in the frame of the second camera.
-    """
-    rays = np.column_stack([pixels_to_normalized(rig.cameras[0], xy1), np.ones(len(xy1))])
-    line, here = _lines(rig, rays, xy2)
-    off = (line * here).sum(1)
-    columns = np.column_stack([np.cross(line, here), (line[:, :2] * here[:, :2]).sum(1)])
-    prior = np.array([np.radians(sigma_deg)] * 3 + [_LENGTH_SIGMA]) ** -2.0
-    found = np.zeros(4)
-    for _ in range(_ROBUST_STEPS):
-        left = off + columns @ found
-        sigma = max(1.4826 * float(np.median(np.abs(left))), 1e-12)
-        weight = 1 / (sigma**2 + (left / _LOSS_SIGMAS) ** 2)
-        found = -np.linalg.solve((columns.T * weight) @ columns + np.diag(prior), columns.T @ (weight * off))
-    return found[:3]
