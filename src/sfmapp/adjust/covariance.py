@@ -95,10 +95,10 @@ def estimate_covariances(
     if extras is not None:
         extras.weight = variance
     engine.linearize(0.0, map)
-    information = _reduced_matrix(engine)[np.ix_(used, used)]
+    information = reduced_matrix(engine)[np.ix_(used, used)]
     scale = engine.diagonal[used]
-    basis, constraint = _gauge(problem, used, information, scale)
-    covariance = _constrained_inverse(information, scale, basis, constraint)
+    basis, constraint = gauge_of(problem, used, information, scale)
+    covariance = constrained_inverse(information, scale, basis, constraint)
     determined = covariance is not None
     full = np.zeros((len(used), len(used)))
     full[np.ix_(used, used)] = covariance if covariance is not None else np.inf
@@ -118,7 +118,7 @@ def _variance(engine: Engine, num_unknowns: int) -> float:
     return total / dof if dof > 0 else np.inf
 
 
-def _reduced_matrix(engine: Engine) -> Array:
+def reduced_matrix(engine: Engine) -> Array:
     """The undamped reduced system as a full (B * 8, B * 8) matrix."""
     blocks, tiles = engine.problem.num_blocks, engine.tiles[0]
     if engine.extras is not None:
@@ -157,7 +157,7 @@ def similarity_basis(poses: Array) -> tuple[Array, Array]:
     return basis.reshape(7, -1), (basis * weight).reshape(7, -1)
 
 
-def _gauge(problem: Problem, used: Mask, information: Array, scale: Array) -> tuple[Array, Array]:
+def gauge_of(problem: Problem, used: Mask, information: Array, scale: Array) -> tuple[Array, Array]:
     """Directions (k, N) that the information leaves open among the similarities, and their constraints (k, N)."""
     poses = np.flatnonzero(problem.pose_block >= 0)
     if len(poses) == 0:
@@ -176,7 +176,7 @@ def _gauge(problem: Problem, used: Mask, information: Array, scale: Array) -> tu
     return open_ @ basis, open_ @ constraint
 
 
-def _constrained_inverse(information: Array, scale: Array, basis: Array, constraint: Array) -> Array | None:
+def constrained_inverse(information: Array, scale: Array, basis: Array, constraint: Array) -> Array | None:
     """Inverse of the information where ``constraint x = 0``, given that ``information basis^T = 0``."""
     root = 1.0 / np.sqrt(scale)
     matrix = information * np.outer(root, root)
@@ -203,7 +203,7 @@ def _collect(
     determined: bool,
 ) -> Covariances:
     p = engine.problem
-    image_idx, poses = _pose_covariances(reconstruction, p, covariance)
+    image_idx, poses = pose_covariances(reconstruction, p, covariance)
     cameras = np.flatnonzero(p.camera_block >= 0)
     intrinsics = []
     for c in cameras:
@@ -232,7 +232,7 @@ def _collect(
     )
 
 
-def _pose_covariances(
+def pose_covariances(
     reconstruction: Reconstruction, problem: Problem, covariance: Array
 ) -> tuple[NDArray[np.int64], Array]:
     """Images (n,) that vary, all of their frames included, and (n, 6, 6): through the adjoint of its place on the rig

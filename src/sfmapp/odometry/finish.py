@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.covariance import estimate_covariances
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
@@ -17,6 +16,7 @@ from sfmapp.geometry import rigid3
 from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.backend import classify, make_job, take_over
 from sfmapp.odometry.keyframe_map import KeyframeMap
+from sfmapp.odometry.map_covariance import estimate_map_covariance
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.stereo import turn_of_rig
 from sfmapp.odometry.sweep import is_too_large, sweep
@@ -43,6 +43,8 @@ _MAX_COVARIANCE_KEYFRAMES = 400
 _FIRST_STEPS, _MAX_STEPS = 8, 30
 # Keyframes of a large map that its cameras are questioned on.
 _NUM_QUESTIONED = 100
+# Where Cauchy's loss begins to bend, in sigmas.
+_LOSS_SIGMAS = 2.0
 # Residuals are not believed to be better than that, however well a synthetic sequence fits.
 MIN_SIGMA_PX = 0.02
 
@@ -87,7 +89,9 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -
     keyframes.rig = _rig_of(model)
     covariance, gauge = None, ""
     if options.covariance and 1 < len(everything) <= _MAX_COVARIANCE_KEYFRAMES:
-        covariance, gauge = _covariance(model, len(keyframes.rig.cameras))
+        covariance, gauge, report["covariance"] = estimate_map_covariance(
+            model, len(keyframes.rig.cameras), _LOSS_SIGMAS * sigma
+        )
     return Conclusion(covariance, gauge, report)
 
 
@@ -122,7 +126,7 @@ def _adjust(
     result = adjust_bundle(
         model,
         AdjustOptions(
-            loss="cauchy", loss_scale_px=2 * sigma, max_iterations=max_steps,
+            loss="cauchy", loss_scale_px=_LOSS_SIGMAS * sigma, max_iterations=max_steps,
             # how long lenses are and what the scale is show last: with 1e-4 a drive of 144 m ends 0.1 m off, not 0.02
             relative_cost_tolerance=1e-4 if given is None else 1e-5,
             refine_focal=given is not None, refine_distortion=given is not None,
@@ -202,17 +206,3 @@ def _with_distortion(camera: Camera) -> Camera:
     if camera.is_fisheye:
         return replace(camera, is_fixed=False)
     return replace(camera, model=CameraModel.OPENCV, params=camera.canonical, is_fixed=False)
-
-
-def _covariance(model: Reconstruction, num_sensors: int) -> tuple[Array, str]:
-    """(K, 6, 6) of the keyframes, NaN for those that no point holds, and what they are relative to.
-
-    The noise of the observations is taken to be independent and of the size that the residuals have, in which the few
-    large ones weigh as much as they are: see ``sfmapp.adjust.covariance``.
-    """
-    found = estimate_covariances(model, AdjustOptions(loss="trivial", refine_focal=False, refine_distortion=False))
-    covariance = np.full((len(model.image_names) // num_sensors, 6, 6), np.nan)
-    of_first = found.image_idx % num_sensors == 0
-    covariance[found.image_idx[of_first] // num_sensors] = found.poses[of_first]
-    covariance[~np.isfinite(covariance).all((1, 2))] = np.nan
-    return covariance, "centroid, mean rotation" + ("" if num_sensors > 1 else " and spread")
