@@ -271,9 +271,29 @@ def errors_in_gauge(
     Returns:
         poses (n, 6), intrinsics m times (Q,), and points (p, 3).
     """
-    wanted = truth.copy()
     images = covariances.image_idx
-    freedoms = covariances.num_gauge
+    wanted = _moved_to_gauge(estimate, truth, images, covariances.num_gauge)
+    intrinsics = [
+        (estimate.cameras[c].params - truth.cameras[c].params)[free]
+        for c, free in zip(covariances.camera_idx, covariances.free_params, strict=True)
+    ]
+    points = estimate.point_xyz[covariances.track_idx] - wanted.point_xyz[covariances.track_idx]
+    return _pose_errors(estimate.cam_from_world[images], wanted.cam_from_world[images]), intrinsics, points
+
+
+def pose_errors_in_gauge(
+    estimate: Reconstruction, truth: Reconstruction, image_idx: NDArray[np.int64], num_gauge: int
+) -> Array:
+    """(n, 6) errors of the poses of images (n,) alone, as of :func:`errors_in_gauge`."""
+    wanted = _moved_to_gauge(estimate, truth, image_idx, num_gauge)
+    return _pose_errors(estimate.cam_from_world[image_idx], wanted.cam_from_world[image_idx])
+
+
+def _moved_to_gauge(
+    estimate: Reconstruction, truth: Reconstruction, images: NDArray[np.int64], freedoms: int
+) -> Reconstruction:
+    """The truth, moved to where this module's gauge compares it with the estimate."""
+    wanted = truth.copy()
     reached = estimate.distinct_poses(images)[0]
     for _ in range(20 if freedoms >= 6 else 0):
         poses = wanted.distinct_poses(images)[0]
@@ -283,12 +303,7 @@ def errors_in_gauge(
         _apply_similarity(wanted, poses, move)
         if np.abs(move).max() < 1e-14:
             break
-    intrinsics = [
-        (estimate.cameras[c].params - truth.cameras[c].params)[free]
-        for c, free in zip(covariances.camera_idx, covariances.free_params, strict=True)
-    ]
-    points = estimate.point_xyz[covariances.track_idx] - wanted.point_xyz[covariances.track_idx]
-    return _pose_errors(estimate.cam_from_world[images], wanted.cam_from_world[images]), intrinsics, points
+    return wanted
 
 
 def _pose_errors(estimate: Array, truth: Array) -> Array:

@@ -16,7 +16,7 @@ from sfmapp.geometry import rigid3
 from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.backend import classify, make_job, take_over
 from sfmapp.odometry.keyframe_map import KeyframeMap
-from sfmapp.odometry.map_covariance import estimate_map_covariance
+from sfmapp.odometry.map_covariance import covariance_of_refinement, estimate_map_covariance
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.stereo import turn_of_rig
 from sfmapp.odometry.sweep import is_too_large, sweep
@@ -79,19 +79,20 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -
         if steps == _FIRST_STEPS:
             classify(model, job.num_elsewhere)
         events.raise_if_cancelled()
+    num_sensors, of_refinement = len(keyframes.rig.cameras), np.zeros((6, 6))
     if options.refine_camera:
         refined, report["camera"] = _question_cameras(job.model, cost, sigma)
         if refined is not None:
             events.decided(STAGE, "the images contradict the given calibration, which is refined", **report["camera"])
+            of_refinement = covariance_of_refinement(model, refined, num_sensors)
             job.model = model = refined
     report["sigma_px"] = classify(model, job.num_elsewhere)
     take_over(job, keyframes)
     keyframes.rig = _rig_of(model)
     covariance, gauge = None, ""
     if options.covariance and 1 < len(everything) <= _MAX_COVARIANCE_KEYFRAMES:
-        covariance, gauge, report["covariance"] = estimate_map_covariance(
-            model, len(keyframes.rig.cameras), _LOSS_SIGMAS * sigma
-        )
+        covariance, gauge, report["covariance"] = estimate_map_covariance(model, num_sensors, _LOSS_SIGMAS * sigma)
+        covariance += of_refinement
     return Conclusion(covariance, gauge, report)
 
 
