@@ -141,3 +141,15 @@ def test_a_stopped_run_is_interrupted() -> None:
     events.cancel()
     with pytest.raises(InterruptedRunError):
         conclude(keyframes, OPTIONS, events)
+
+
+def test_a_refined_calibration_widens_what_it_moved() -> None:
+    """Sigmas of a map whose calibration had to be refined hold half of the way that this has moved it."""
+    rig = Rig.single(CAMERA)
+    right, _ = small_map(3, rig, num_keyframes=14, num_points=600, sigma_px=0.1)
+    wrong, _ = small_map(3, rig, num_keyframes=14, num_points=600, sigma_px=0.1)
+    wrong.rig = Rig((replace(CAMERA, params=CAMERA.params * [1.02, 1.02, 1, 1]),), rig.cam_from_rig)
+    found = [conclude(keyframes, OPTIONS, Events()) for keyframes in (right, wrong)]
+    assert [c.report["camera"]["is_refined"] for c in found] == [False, True]
+    sigmas = [np.sqrt(np.einsum("kii->ki", c.covariance)).mean() for c in found if c.covariance is not None]
+    assert 2.0 < sigmas[1] / sigmas[0] < 200.0

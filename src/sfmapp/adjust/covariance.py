@@ -95,10 +95,10 @@ def estimate_covariances(
     if extras is not None:
         extras.weight = variance
     engine.linearize(0.0, map)
-    information = _reduced_matrix(engine)[np.ix_(used, used)]
+    information = reduced_matrix(engine)[np.ix_(used, used)]
     scale = engine.diagonal[used]
-    basis, constraint = _gauge(problem, used, information, scale)
-    covariance = _constrained_inverse(information, scale, basis, constraint)
+    basis, constraint = gauge_of(problem, used, information, scale)
+    covariance = constrained_inverse(information, scale, basis, constraint)
     determined = covariance is not None
     full = np.zeros((len(used), len(used)))
     full[np.ix_(used, used)] = covariance if covariance is not None else np.inf
@@ -118,7 +118,7 @@ def _variance(engine: Engine, num_unknowns: int) -> float:
     return total / dof if dof > 0 else np.inf
 
 
-def _reduced_matrix(engine: Engine) -> Array:
+def reduced_matrix(engine: Engine) -> Array:
     """The undamped reduced system as a full (B * 8, B * 8) matrix."""
     blocks, tiles = engine.problem.num_blocks, engine.tiles[0]
     if engine.extras is not None:
@@ -157,7 +157,7 @@ def similarity_basis(poses: Array) -> tuple[Array, Array]:
     return basis.reshape(7, -1), (basis * weight).reshape(7, -1)
 
 
-def _gauge(problem: Problem, used: Mask, information: Array, scale: Array) -> tuple[Array, Array]:
+def gauge_of(problem: Problem, used: Mask, information: Array, scale: Array) -> tuple[Array, Array]:
     """Directions (k, N) that the information leaves open among the similarities, and their constraints (k, N)."""
     poses = np.flatnonzero(problem.pose_block >= 0)
     if len(poses) == 0:
@@ -176,7 +176,7 @@ def _gauge(problem: Problem, used: Mask, information: Array, scale: Array) -> tu
     return open_ @ basis, open_ @ constraint
 
 
-def _constrained_inverse(information: Array, scale: Array, basis: Array, constraint: Array) -> Array | None:
+def constrained_inverse(information: Array, scale: Array, basis: Array, constraint: Array) -> Array | None:
     """Inverse of the information where ``constraint x = 0``, given that ``information basis^T = 0``."""
     root = 1.0 / np.sqrt(scale)
     matrix = information * np.outer(root, root)
@@ -203,7 +203,7 @@ def _collect(
     determined: bool,
 ) -> Covariances:
     p = engine.problem
-    image_idx, poses = _pose_covariances(reconstruction, p, covariance)
+    image_idx, poses = pose_covariances(reconstruction, p, covariance)
     cameras = np.flatnonzero(p.camera_block >= 0)
     intrinsics = []
     for c in cameras:
@@ -232,7 +232,7 @@ def _collect(
     )
 
 
-def _pose_covariances(
+def pose_covariances(
     reconstruction: Reconstruction, problem: Problem, covariance: Array
 ) -> tuple[NDArray[np.int64], Array]:
     """Images (n,) that vary, all of their frames included, and (n, 6, 6): through the adjoint of its place on the rig
@@ -271,9 +271,29 @@ def errors_in_gauge(
     Returns:
         poses (n, 6), intrinsics m times (Q,), and points (p, 3).
     """
-    wanted = truth.copy()
     images = covariances.image_idx
-    freedoms = covariances.num_gauge
+    wanted = _moved_to_gauge(estimate, truth, images, covariances.num_gauge)
+    intrinsics = [
+        (estimate.cameras[c].params - truth.cameras[c].params)[free]
+        for c, free in zip(covariances.camera_idx, covariances.free_params, strict=True)
+    ]
+    points = estimate.point_xyz[covariances.track_idx] - wanted.point_xyz[covariances.track_idx]
+    return _pose_errors(estimate.cam_from_world[images], wanted.cam_from_world[images]), intrinsics, points
+
+
+def pose_errors_in_gauge(
+    estimate: Reconstruction, truth: Reconstruction, image_idx: NDArray[np.int64], num_gauge: int
+) -> Array:
+    """(n, 6) errors of the poses of images (n,) alone, as of :func:`errors_in_gauge`."""
+    wanted = _moved_to_gauge(estimate, truth, image_idx, num_gauge)
+    return _pose_errors(estimate.cam_from_world[image_idx], wanted.cam_from_world[image_idx])
+
+
+def _moved_to_gauge(
+    estimate: Reconstruction, truth: Reconstruction, images: NDArray[np.int64], freedoms: int
+) -> Reconstruction:
+    """The truth, moved to where this module's gauge compares it with the estimate."""
+    wanted = truth.copy()
     reached = estimate.distinct_poses(images)[0]
     for _ in range(20 if freedoms >= 6 else 0):
         poses = wanted.distinct_poses(images)[0]
@@ -283,12 +303,7 @@ def errors_in_gauge(
         _apply_similarity(wanted, poses, move)
         if np.abs(move).max() < 1e-14:
             break
-    intrinsics = [
-        (estimate.cameras[c].params - truth.cameras[c].params)[free]
-        for c, free in zip(covariances.camera_idx, covariances.free_params, strict=True)
-    ]
-    points = estimate.point_xyz[covariances.track_idx] - wanted.point_xyz[covariances.track_idx]
-    return _pose_errors(estimate.cam_from_world[images], wanted.cam_from_world[images]), intrinsics, points
+    return wanted
 
 
 def _pose_errors(estimate: Array, truth: Array) -> Array:

@@ -69,6 +69,8 @@ _MAX_UNSURE = 0.2
 # Where the rounds end before it has settled, at least as much is still to come.
 _PART_OF_THE_WAY = 2.0
 _MIN_SIGMA_PX = 0.02
+# Where Cauchy's loss begins to bend, in sigmas.
+LOSS_SIGMAS = 2.0
 _TRIANGULATION_PX, _TRIANGULATION_DEG = 2.0, 0.2
 
 
@@ -84,6 +86,7 @@ class Answer:
         scale_sigma: relative standard deviation of the unit of length of a rig; None for a single camera.
         pose_covariance: (F, 6, 6) what the refined calibration leaves open, in the gauge of the map's covariance; None
             if the given one is believed.
+        excess: how many times farther off the given calibration was than calibrations ordinarily are, at least 1.
     """
 
     model: Reconstruction
@@ -92,6 +95,7 @@ class Answer:
     contradictions: list[Contradiction]
     scale_sigma: float | None
     pose_covariance: Array | None = None
+    excess: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -237,7 +241,7 @@ def adjust_poses(model: Reconstruction, sigma: float, max_steps: int, tolerance:
     variable = np.ones(len(model.image_names), bool)
     variable[:num_sensors] = False
     options = AdjustOptions(
-        loss="cauchy", loss_scale_px=2 * sigma, max_iterations=max_steps, relative_cost_tolerance=tolerance,
+        loss="cauchy", loss_scale_px=LOSS_SIGMAS * sigma, max_iterations=max_steps, relative_cost_tolerance=tolerance,
         refine_focal=False, refine_distortion=False,
     )  # fmt: skip
     return 2 * adjust_bundle(model, options, variable_images=variable).final_cost / sigma**2
@@ -426,7 +430,9 @@ def _refined(look: _Look, dropped: Array, unknowns: Unknowns, report: dict[str, 
     moved = look.system.response[:, :, :num].reshape(-1, num)
     moved = moved - basis.T @ np.linalg.solve(constraint @ basis.T, constraint @ moved)
     by_frame = moved.reshape(-1, 6, num)
-    return Answer(look.model, True, report, [], scale_sigma, by_frame @ look.covariance @ by_frame.transpose(0, 2, 1))
+    open_ = by_frame @ look.covariance @ by_frame.transpose(0, 2, 1)
+    excess = max(1.0, float(np.abs(look.x / unknowns.sigmas).max()) / _PRIOR_SIGMAS)
+    return Answer(look.model, True, report, [], scale_sigma, open_, excess)
 
 
 def _kept(first: _Look, last: _Look, unknowns: Unknowns, report: dict[str, Any], found: list[Contradiction]) -> Answer:

@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.covariance import estimate_covariances
-from sfmapp.adjust.solver import AdjustOptions
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.backend import classify, make_job, take_over
-from sfmapp.odometry.calibration_check import Answer, adjust_poses, question_calibration, spread
+from sfmapp.odometry.calibration_check import LOSS_SIGMAS, Answer, adjust_poses, question_calibration, spread
 from sfmapp.odometry.keyframe_map import KeyframeMap
+from sfmapp.odometry.map_covariance import covariance_of_refinement, estimate_map_covariance
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.sweep import is_too_large, sweep
 from sfmapp.scene.reconstruction import Reconstruction
@@ -73,15 +72,19 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -
         events.raise_if_cancelled()
     answer = _question(model, cost, sigma, options, events)
     report["camera"] = answer.report
+    num_sensors, of_refinement = len(keyframes.rig.cameras), np.zeros((6, 6))
+    if answer.is_refined:
+        of_refinement = covariance_of_refinement(model, answer.model, num_sensors) / answer.excess**2
     job.model = model = answer.model
     report["sigma_px"] = classify(model, job.num_elsewhere)
     take_over(job, keyframes)
     keyframes.rig = rig_of(model)
     covariance, gauge = None, ""
     if options.covariance and 1 < len(everything) <= MAX_COVARIANCE_KEYFRAMES:
-        covariance, gauge = _covariance(model, len(keyframes.rig.cameras))
+        covariance, gauge, report["covariance"] = estimate_map_covariance(model, num_sensors, LOSS_SIGMAS * sigma)
+        covariance += of_refinement
         if answer.pose_covariance is not None:
-            covariance = covariance + answer.pose_covariance
+            covariance += answer.pose_covariance
     return Conclusion(covariance, gauge, report, answer.contradictions, answer.scale_sigma)
 
 
@@ -131,17 +134,3 @@ def _rescale(keyframes: KeyframeMap, scale: float) -> None:
     keyframes.point_xyz *= scale
     for keyframe in keyframes.keyframes:
         keyframe.rig_from_world[4:] *= scale
-
-
-def _covariance(model: Reconstruction, num_sensors: int) -> tuple[Array, str]:
-    """(K, 6, 6) of the keyframes, NaN for those that no point holds, and what they are relative to.
-
-    The noise of the observations is taken to be independent and of the size that the residuals have, in which the few
-    large ones weigh as much as they are: see ``sfmapp.adjust.covariance``.
-    """
-    found = estimate_covariances(model, AdjustOptions(loss="trivial", refine_focal=False, refine_distortion=False))
-    covariance = np.full((len(model.image_names) // num_sensors, 6, 6), np.nan)
-    of_first = found.image_idx % num_sensors == 0
-    covariance[found.image_idx[of_first] // num_sensors] = found.poses[of_first]
-    covariance[~np.isfinite(covariance).all((1, 2))] = np.nan
-    return covariance, "centroid, mean rotation" + ("" if num_sensors > 1 else " and spread")

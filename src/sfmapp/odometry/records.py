@@ -106,12 +106,30 @@ def gather(
             frame_map[n] = record.map_idx
     order = sorted(maps, key=lambda m: (-int((frame_map == m).sum()), m))
     place = np.array([-1 if m < 0 else order.index(int(m)) for m in frame_map], np.int32)
+    results = [_map_result(maps[m], conclusions[m]) for m in order]
+    covariance = [_covariance(record, results[m] if m >= 0 else None) for record, m in zip(records, place, strict=True)]
     return OdometryResult(
         np.array([r.frame_idx for r in records], np.int64), [r.name for r in records],
         np.array([r.timestamp_s for r in records]), poses, np.array([r.live for r in records]).reshape(-1, 7), place,
-        np.array([r.state for r in records], np.uint8), [_map_result(maps[m], conclusions[m]) for m in order],
-        np.array([r.covariance for r in records]).reshape(-1, 6, 6),
+        np.array([r.state for r in records], np.uint8), results, np.array(covariance).reshape(-1, 6, 6),
     )  # fmt: skip
+
+
+def _covariance(record: FrameRecord, found: MapResult | None) -> Array:
+    """(6, 6) of a frame's pose in the gauge of its map; NaN where it is not known.
+
+    Points near a frame err together with the keyframe that it hangs on, whose covariance goes through the adjoint of
+    the frame's pose relative to it; what the frame was measured with, given the points, is independent of that.
+    """
+    if found is None or found.covariance is None:
+        return _NO_COVARIANCE
+    of_keyframe: Array = found.covariance[record.keyframe]
+    if record.is_keyframe:
+        return of_keyframe
+    rotation, adjoint = rigid3.rotation_matrix(record.frame_from_keyframe), np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = rotation
+    adjoint[3:, :3] = rigid3.skew(record.frame_from_keyframe[4:]) @ rotation
+    return adjoint @ of_keyframe @ adjoint.T + record.covariance
 
 
 def _map_result(keyframes: KeyframeMap, conclusion: Conclusion) -> MapResult:

@@ -65,8 +65,9 @@ class OdometryResult:
         frame_map: (F,) int32 position in ``maps``, -1 in gaps.
         frame_state: (F,) uint8 of :class:`FrameState`.
         maps: the largest (most frames) first; each has a world and, without a scale, a unit of its own.
-        covariance: (F, 6, 6) of the final poses given their map, over rotation (radians) and translation of
-            ``x_cam <- exp(w) x_cam + v``; NaN where not measured. None for a result read from files.
+        covariance: (F, 6, 6) of the final poses in the gauge of their map, over rotation (radians) and translation of
+            ``x_cam <- exp(w) x_cam + v``; NaN where not measured, or where the map's keyframes have none. None for a
+            result read from files.
         smoothed: for each map its frames as the error-state filter has them; empty if not asked for.
         report: counts, times and decisions, JSON-able.
     """

@@ -175,7 +175,7 @@ def _covariance_csv(result: OdometryResult) -> str:
 
 
 def _frame_covariance_csv(result: OdometryResult) -> str:
-    """The same of every frame's pose given its map: how well the frame was measured, not how well the map is known."""
+    """The same of every frame's pose, in the gauge of its map."""
     rows = []
     if (covariances := result.covariance) is not None:
         known = np.flatnonzero(np.isfinite(covariances).all((1, 2)) & (result.frame_map >= 0))
