@@ -15,6 +15,7 @@ from sfmapp.odometry.active_tracks import ActiveTracks, References, align_to_ref
 from sfmapp.odometry.backend import Backend, Job, choose_window, make_job
 from sfmapp.odometry.corners import find_corners
 from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.moving import Witnesses
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.pyramid import Pyramid
 from sfmapp.odometry.stereo import match_stereo
@@ -23,6 +24,7 @@ from sfmapp.scene.rig import Rig
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Ids = NDArray[np.int64]
 
 # Keyframes whose images are kept: references of patches and places to find lost points again.
 _KEPT_IMAGES = 20
@@ -32,6 +34,8 @@ _MIN_LIKENESS = 0.9
 _FOUND_LIKENESS, _FOUND_PX, _FOUND_SCALE = 0.85, 3.0, 1.5
 # Points are looked for so far from the border, and where no track is in the same cell.
 _MARGIN_PX, _CELL_PX = 8.0, 4
+# Keyframes that must have seen a point before it counts as missing.
+_OFTEN = 3
 # A triangulated point agrees with its observations to that many pixels.
 _TRIANGULATION_PX = 2.0
 
@@ -55,6 +59,7 @@ class LocalMap:
         self.keyframes = KeyframeMap(rig)
         self.backend = Backend(executor)
         self.images: dict[int, Pyramid] = {}
+        self.witnesses = Witnesses()
 
     @property
     def camera(self) -> Camera:
@@ -135,7 +140,9 @@ class LocalMap:
         """
         pyramid = view.pyramids[0]
         if self.images:
-            tracks = tracks.joined(self._find_again(tracks, pyramid, pose))
+            found, lost_id = self._find_again(tracks, pyramid, pose)
+            self._count_visible(view.frame_idx, tracks.point_id, found.point_id, lost_id)
+            tracks = tracks.joined(found)
         number = self.newest + 1
         self.images[number] = pyramid
         tracks = self._renew_references(tracks, number, pose)
@@ -176,8 +183,18 @@ class LocalMap:
         )  # fmt: skip
         self.keyframes.point_xyz[job.point_id[new]] = model.point_xyz[new]
 
-    def _find_again(self, tracks: ActiveTracks, pyramid: Pyramid, pose: Array) -> ActiveTracks:
-        """Look for points of recent keyframes that are not tracked any more."""
+    def _count_visible(self, frame_idx: int, tracked: Ids, found: Ids, lost: Ids) -> None:
+        """Note how many of the points that should be in sight, and that have been seen often, are."""
+        tracked = tracked[self.keyframes.is_triangulated(tracked)]
+        num = [
+            int((self.keyframes.num_observations(ids) >= _OFTEN * len(self.rig.cameras)).sum())
+            for ids in (tracked, found, lost)
+        ]
+        self.witnesses.visible(frame_idx, num[0] + num[2], num[0] + num[1])
+
+    def _find_again(self, tracks: ActiveTracks, pyramid: Pyramid, pose: Array) -> tuple[ActiveTracks, Ids]:
+        """Look for points of recent keyframes that are not tracked any more; also returns the ids of all of them that
+        should be in sight."""
         lost = self._lost_points(tracks)
         xyz = self.keyframes.point_xyz[lost.point_id]
         references = self.references(lost)
@@ -188,6 +205,7 @@ class LocalMap:
         height, width = pyramid.shape
         margin = np.minimum(guess, np.array([width, height]) - guess).min(1)
         near = (margin > _MARGIN_PX) & (ratio < _FOUND_SCALE) & (ratio > 1 / _FOUND_SCALE)  # False for NaN
+        expected = lost.point_id[near]
         near[near] = self._is_free(guess[near], tracks.xy, width)
         guess, ratio, k, depth = guess[near], ratio[near], k[near], in_reference[near, 2]
         lost = replace(
@@ -196,7 +214,7 @@ class LocalMap:
         warp = patch_warp(references.camera_from(pose)[0][k], lost.reference_ray, ratio)
         xy, zncc, found = align_to_references(lost, self.images, pyramid, guess, warp, coarsest_level=1)
         found &= (np.linalg.norm(xy - guess, axis=1) < _FOUND_PX) & (zncc > _FOUND_LIKENESS)
-        return replace(lost, xy=xy, zncc=zncc).subset(found)
+        return replace(lost, xy=xy, zncc=zncc).subset(found), expected
 
     def _lost_points(self, tracks: ActiveTracks) -> ActiveTracks:
         """Points of keyframes whose images are kept that are not tracked, each as the newest of these saw it."""

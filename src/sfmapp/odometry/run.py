@@ -180,6 +180,7 @@ class Odometry:
         if self.foretold is not None:
             self.gyro_trust.learn(*self.foretold, rigid3.rotation_matrix(self.step))
         self.pose, self.tracks, self.is_mapped = tracked.pose, tracked.tracks, tracked.is_mapped
+        local.witnesses.followed(view.frame_idx, tracked.num_followed, len(tracked.tracks))
         reason = keyframe_reason(local, tracked, self.num_mapped_at_keyframe, self.options)
         if reason is None:
             self._settle(record, FrameState.TRACKED, self.pose, tracks=self.tracks.subset(self.is_mapped))
@@ -363,6 +364,7 @@ class Odometry:
             conclusions[number] = conclude(local.keyframes, self.options, self.events)
             conclusions[number].report["shutter"] = straightened
             conclusions[number].contradictions.extend(self.clock.contradictions(local.keyframes))
+            conclusions[number].contradictions.extend(local.witnesses.contradictions(local.keyframes))
             measure_again(self.records, local.keyframes, number)
             self.events.finished("adjustment", **conclusions[number].report)
         if self.executor is not None:

@@ -42,7 +42,7 @@ class Tracked:
     Attributes:
         pose: (7,) cam_from_world. covariance: (6, 6) as of ``refine_pose``.
         tracks: what is followed from here; outliers are gone. is_mapped: (N,) which of them measured the pose.
-        num_found, num_inliers: of the mapped tracks.
+        num_found, num_inliers: of the mapped tracks. num_followed: tracks found, mapped or not.
         residual_px: robust standard deviation of the residuals of the inliers.
     """
 
@@ -52,6 +52,7 @@ class Tracked:
     is_mapped: Mask
     num_found: int
     num_inliers: int
+    num_followed: int
     residual_px: float
 
 
@@ -91,7 +92,16 @@ def track(
     keep = np.ones(len(tracks), bool)
     keep[mapped] = inlier
     keep[~mapped] = _near_epipolar_lines(local, tracks.subset(~mapped), new_pose)
-    return Tracked(new_pose, covariance, tracks.subset(keep), mapped[keep], int(mapped.sum()), int(inlier.sum()), sigma)
+    return Tracked(
+        new_pose,
+        covariance,
+        tracks.subset(keep),
+        mapped[keep],
+        int(mapped.sum()),
+        int(inlier.sum()),
+        len(tracks),
+        sigma,
+    )
 
 
 def _chained(

@@ -1,0 +1,50 @@
+"""Something that moves before the camera: told, and in every sigma."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from odometry_sequences import Images, room
+from sfmapp.events import Events
+from sfmapp.geometry import rigid3, similarity
+from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.run import run_odometry
+
+FIRST, LAST = 30, 60
+
+
+def covered(images: Images, frame: int, texture: np.ndarray) -> Images:
+    """A board that sways before the camera and fills 60 % of the view for some frames."""
+    if not FIRST <= frame < LAST:
+        return images
+    image = images[0].copy()
+    height, width = image.shape
+    y, x = int(0.2 * height), int(width * (0.12 + 0.1 * np.sin(frame / 9)))
+    h, w = int(0.79 * height), int(0.76 * width)
+    image[y : y + h, x : x + w] = texture[:h, :w]
+    return (image,)
+
+
+def test_a_board_that_sways_before_the_camera_is_told() -> None:
+    walk = room(80)
+    board = np.kron(np.random.default_rng(0).integers(20, 235, (60, 80)), np.ones((4, 4))).astype(np.uint8)
+    images = [covered(seen, k, board) for k, seen in enumerate(walk.images)]
+    result = run_odometry(replace(walk, images=images), OdometryOptions(), events=Events())
+    entry = result.maps[0]
+    (found,) = entry.contradictions
+    assert found.subject == "what moves"
+    assert FIRST - 1 <= found.evidence["first_frame"] <= FIRST + 8
+    assert found.evidence["last_frame"] <= LAST + 4
+    centers = rigid3.center(result.cam_from_world[entry.keyframe_frame_idx])
+    truth = rigid3.center(walk.truth.cam_from_world[result.frame_idx[entry.keyframe_frame_idx]])
+    unit = similarity.umeyama(centers, truth)
+    error = np.linalg.norm(similarity.apply(unit, centers) - truth, axis=1)
+    assert entry.covariance is not None
+    sigma = float(unit[7]) * np.sqrt(np.trace(entry.covariance[:, 3:, 3:], axis1=1, axis2=2))
+    assert np.median(error) < 3 * np.median(sigma)
+
+
+def test_a_walk_through_a_still_room_is_not_doubted() -> None:
+    assert run_odometry(room(80), OdometryOptions(covariance=False), events=Events()).maps[0].contradictions == []
