@@ -73,7 +73,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _add_sequence_flags(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("sequence")
     group.add_argument("--camera", metavar="MODEL,...|FILE", help="intrinsics, such as PINHOLE,fx,fy,cx,cy, or a file")
-    group.add_argument("--self-calibrate", action="store_true", help="find them from the first seconds")
+    group.add_argument("--self-calibrate", action="store_true", help="find them from the first minute")
     group.add_argument("--mono", action="store_true", help="use the first camera alone")
     group.add_argument("--truth", metavar="FILE", help="true trajectory of TUM, KITTI or EuRoC, to compare with")
     group.add_argument("--imu", metavar="FILE", help="inertial measurements in EuRoC's form")

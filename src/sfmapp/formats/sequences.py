@@ -62,7 +62,7 @@ _LAYOUTS = (
 HOW_TO_CALIBRATE = (
     "give --camera PINHOLE,fx,fy,cx,cy or --camera FILE (calib.json, cameras.txt, sensor.yaml, camera_info.yaml, "
     "OpenCV's yml or xml), to be had by photographing a chessboard (OpenCV's calibrate_camera, Kalibr); or let "
-    "--self-calibrate find the focal length from the first seconds"
+    "--self-calibrate find the focal length from the first minute"
 )
 
 

@@ -87,7 +87,7 @@ def track_sequence(
         events: listens in, and can ask the run to stop: what was tracked until then is written.
         record: write ``recording.rrd``, which replays the run.
         screen: shows the run while it is under way; None: nobody looks.
-        self_calibrate: find the intrinsics by a reconstruction from the first seconds.
+        self_calibrate: find the intrinsics by a reconstruction from the first minute.
         watch: started earlier, if more is to be counted in the report than this call.
 
     Raises:
@@ -141,6 +141,10 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         )
         run.threads_cpu.sample()
     run.stages["odometry"] = result.report
+    if self_calibrate:
+        from sfmapp.pipelines.self_calibrate import doubt
+
+        doubt(result, run.stages["self_calibration"])
     with run.measured("scale"):
         run.keyframes.colour(result)
         if run.wish is not None:

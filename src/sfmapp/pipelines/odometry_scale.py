@@ -30,8 +30,8 @@ from sfmapp.odometry.scale import (
 from sfmapp.pipelines.odometry_keyframes import KeyframeWatch
 
 STAGE = "scale"
-# Clocks that differ by less are as good as one: a drone that flies 3 m/s moves 3 mm.
-_WORTH_SAYING_S = 1e-3
+# Clocks that differ by less are as good as one: exposures alone shift them by so much.
+_WORTH_SAYING_S = 5e-3
 Array = NDArray[np.float64]
 
 
@@ -120,8 +120,9 @@ def scale_maps(
             rescale(result, m, found)
             row |= {"metres_per_unit": found.scale, "sigma_relative": found.sigma_relative}
             text = f"map {m} is in metres, from {found.source.replace('_', ' ')}, to {100 * found.sigma_relative:.2g} %"
-            text += _clocks_apart(found.evidence)
             events.decided(STAGE, text, **row)
+            if apart := _clocks_apart(found.evidence):
+                events.warned(STAGE, f"map {m}: {apart}")
         else:
             row["reason"] = found.reason
             if found.contradiction is not None:
@@ -138,7 +139,7 @@ def _clocks_apart(evidence: dict[str, Any]) -> str:
     if not abs(offset) > max(_WORTH_SAYING_S, 3 * sigma):
         return ""
     side = "late" if offset > 0 else "early"
-    return f"; the inertial measurements are stamped {1e3 * abs(offset):.1f} ms {side}, which is taken into account"
+    return f"the inertial measurements are stamped {1e3 * abs(offset):.1f} ms {side}; this is taken into account"
 
 
 def rescale(result: OdometryResult, map_idx: int, found: ScaleEstimate) -> None:

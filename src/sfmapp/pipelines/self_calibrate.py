@@ -1,4 +1,4 @@
-"""The intrinsics of a camera from the first seconds of its sequence, by a reconstruction of a few frames."""
+"""The intrinsics of a camera from the first minute of its sequence, by a reconstruction of a few frames."""
 
 from __future__ import annotations
 
@@ -10,28 +10,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.contradictions import Contradiction, widened
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.formats.sequences import HOW_TO_CALIBRATE, open_sequence
+from sfmapp.geometry import rigid3
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.images.sequence import Frame, Sequence
+from sfmapp.odometry.result import OdometryResult
+from sfmapp.pipelines.lens_fit import LensFit, fit_lens
 from sfmapp.pipelines.options import Options
-from sfmapp.pipelines.reconstruct import reconstruct
-from sfmapp.scene.camera import CameraModel
+from sfmapp.pipelines.reconstruct import RunResult, reconstruct
+from sfmapp.scene.camera import PARAM_NAMES, CameraModel
 
 STAGE = "calibration"
 Pixels = NDArray[np.uint8]
 
-# Frames that are reconstructed: enough baselines for a focal length, few enough for a minute.
-MAX_FRAMES, MIN_FRAMES = 16, 6
+# Frames that are reconstructed: enough baselines and turns for a focal length, few enough for two minutes.
+MAX_FRAMES, MIN_FRAMES = 20, 6
 # They are looked for in so many seconds, or frames where the rate is high.
-MAX_SECONDS, MAX_READ = 30.0, 900
+MAX_SECONDS, MAX_READ = 60.0, 1800
 # The next frame is taken when the picture has moved by this share of its width, or most of what was seen is gone.
-_MOTION, _LEFT = 0.04, 0.4
+_MOTION, _LEFT = 0.07, 0.5
 # Motion is measured on images of this width.
 _SMALL_PX = 320
-# What a calibration must reach to be used. A focal length that is off by 3 % bends a straight path noticeably.
-MAX_FOCAL_SIGMA, MIN_SHARE = 0.03, 0.6
+# What a calibration must reach to be used: a focal length that is off by 3 % bends a straight path noticeably. What it
+# must reach to be called settled: 2 %, the best that odometry puts right by itself, is three of these sigmas away.
+MAX_FOCAL_SIGMA, SETTLED_SIGMA, MIN_SHARE = 0.03, 0.0067, 0.6
 # A second term of distortion has to make the reprojection error smaller by this share: noise alone, of a few thousand
 # observations, would give it some thousandths; a wide lens whose first term is not enough, more than half.
 _MIN_GAIN = 0.05
@@ -50,7 +55,7 @@ def self_calibrated(source: str, options: Options, events: Events) -> tuple[Opti
     """
     wish = replace(options.sequence, camera=None, mono=True)
     sequence = open_sequence(source, wish, events, require_camera=False)
-    events.started(STAGE, "calibrating with the first seconds")
+    events.started(STAGE, "calibrating with the first minute")
     frames = choose_frames(sequence)
     if len(frames) < MIN_FRAMES:
         raise InputError(
@@ -58,28 +63,42 @@ def self_calibrated(source: str, options: Options, events: Events) -> tuple[Opti
             f"at least {MIN_FRAMES} are needed",
             f"begin where the camera moves (--start), or {ADVICE}",
         )
-    report = _reconstruct(source, frames, options, events)
-    found = _verdict(source, report, [frame.name for frame in frames])
+    run = _reconstruct(source, frames, options, events)
+    found = _verdict(source, run.report, fit_lens(run.reconstruction), [frame.name for frame in frames])
     text = ",".join([found["model"], *(f"{value!r}" for value in found["params"].values())])
     events.finished(STAGE, found["text"])
+    if not found["is_settled"]:
+        events.warned(STAGE, f"the calibration is not settled: {found['text']}")
     return replace(options, sequence=replace(wish, camera=text)), found
 
 
 def choose_frames(sequence: Sequence) -> list[Frame]:
-    """Up to MAX_FRAMES frames of the first seconds, the picture moved by some percent from each to the next."""
-    chosen: list[Frame] = []
+    """Up to MAX_FRAMES frames in a row, the picture moved by some percent from each to the next.
+
+    Of all such rows in the first minute the one in which the camera turns, or moves sideways, most past things at
+    different distances: driving straight on, and turning on the spot, tell next to nothing of a lens.
+    """
+    found: list[Frame] = []
+    worth: list[float] = []
     follower: _Follower | None = None
     frames = sequence.frames()
     first_s = 0.0
     for count, frame in enumerate(frames):
         first_s = frame.timestamp_s if count == 0 else first_s
         if follower is None or follower.has_moved(frame.images[0]):
-            chosen.append(frame)
+            worth.append(0.0 if follower is None else follower.worth)
+            found.append(frame)
             follower = _Follower(frame.images[0])
-        if len(chosen) == MAX_FRAMES or count >= MAX_READ or frame.timestamp_s - first_s > MAX_SECONDS:
+        if count >= MAX_READ or frame.timestamp_s - first_s > MAX_SECONDS:
             break
     frames.close()  # type: ignore[attr-defined]  # a generator: ends its thread
-    return chosen
+    if len(found) <= MAX_FRAMES:
+        return found
+    # the first step leads to the first frame of a row and is no part of it
+    total = np.concatenate([[0.0], np.cumsum(worth)])
+    rows = total[MAX_FRAMES:] - total[1 : len(total) - MAX_FRAMES + 1]
+    start = int(np.argmax(rows))
+    return found[start : start + MAX_FRAMES]
 
 
 class _Follower:
@@ -108,6 +127,17 @@ class _Follower:
         shift = np.linalg.norm(self._now - self._start, axis=2)
         return float(np.median(shift)) > _MOTION * small.shape[1]
 
+    @property
+    def worth(self) -> float:
+        """What the motion since the first frame tells of a lens: the geometric mean of how far the picture as a whole
+        has moved, in its widths, and how far its points have moved apart."""
+        motion = (self._now - self._start)[:, 0]
+        if len(motion) < 8:
+            return 0.0
+        whole = np.median(motion, axis=0)
+        apart = np.median(np.linalg.norm(motion - whole, axis=1))
+        return float(np.sqrt(np.linalg.norm(whole) * apart)) / _SMALL_PX
+
     @staticmethod
     def _shrunk(image: Pixels) -> Pixels:
         import cv2
@@ -117,8 +147,8 @@ class _Follower:
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
-def _reconstruct(source: str, frames: list[Frame], options: Options, events: Events) -> dict[str, Any]:
-    """Report of a reconstruction of the frames, in a folder that is gone afterwards.
+def _reconstruct(source: str, frames: list[Frame], options: Options, events: Events) -> RunResult:
+    """A reconstruction of the frames, in a folder that is gone afterwards.
 
     Unless the user has named a camera model, two are tried: the default, and one with another term of distortion.
     """
@@ -126,7 +156,7 @@ def _reconstruct(source: str, frames: list[Frame], options: Options, events: Eve
 
     model = options.images.camera_model
     models = (model, CameraModel.RADIAL) if model == ImageOptions().camera_model else (model,)
-    reports: list[dict[str, Any]] = []
+    runs: list[RunResult] = []
     with tempfile.TemporaryDirectory(prefix="sfmapp-calibration-") as name:
         folder = Path(name) / "frames"
         folder.mkdir()
@@ -136,22 +166,20 @@ def _reconstruct(source: str, frames: list[Frame], options: Options, events: Eve
             images = replace(options.images, camera_model=model, camera_sharing="all", mask_path=None)
             wish = replace(options, images=images, min_registered=None)
             try:
-                reports.append(reconstruct(folder, Path(name) / "out", wish, events=events, record=False).report)
+                runs.append(reconstruct(folder, Path(name) / "out", wish, events=events, record=False))
             except NoReconstructionError as failure:
                 raise InputError(
-                    f"{source}: no calibration from its first seconds: {failure}",
+                    f"{source}: no calibration from its first minute: {failure}",
                     f"begin where the camera moves sideways past something near (--start), or {ADVICE}",
                 ) from failure
-    errors = [report["models"][0]["mean_reprojection_error_px"] for report in reports]
-    return reports[1] if len(errors) > 1 and errors[1] < (1 - _MIN_GAIN) * errors[0] else reports[0]
+    errors = [run.report["models"][0]["mean_reprojection_error_px"] for run in runs]
+    return runs[1] if len(errors) > 1 and errors[1] < (1 - _MIN_GAIN) * errors[0] else runs[0]
 
 
-def _verdict(source: str, report: dict[str, Any], names: list[str]) -> dict[str, Any]:
+def _verdict(source: str, report: dict[str, Any], lens: LensFit, names: list[str]) -> dict[str, Any]:
     """The camera of a good reconstruction and how good it is."""
-    model, camera = report["models"][0], report["cameras"][0]
-    params, sigma = camera["refined"] or camera["initial"], camera["sigma"]
-    focals = [name for name in params if name in ("f", "fx", "fy")]
-    relative = max((sigma[name] / params[name] for name in focals if sigma.get(name)), default=np.inf)
+    model, camera = report["models"][0], lens.camera
+    relative = lens.focal_sigma_relative
     problem = ""
     if model["num_registered"] < max(MIN_FRAMES, MIN_SHARE * len(names)):
         problem = f"only {model['num_registered']} of {len(names)} frames could be joined"
@@ -160,16 +188,39 @@ def _verdict(source: str, report: dict[str, Any], names: list[str]) -> dict[str,
         problem = f"they tell the focal length {known}, {100 * MAX_FOCAL_SIGMA:g} % are needed"
     if problem:
         raise InputError(
-            f"{source}: no calibration from its first seconds: {problem}",
+            f"{source}: no calibration from its first minute: {problem}",
             f"begin where the camera moves sideways and turns (--start), or {ADVICE}",
         )
-    focal = float(np.mean([params[name] for name in focals]))
     text = (
-        f"{camera['model']}, f {focal:.1f} px \N{PLUS-MINUS SIGN}{relative * focal:.1f}, from "
+        f"{camera.model.name}, f {camera.focal:.1f} px \N{PLUS-MINUS SIGN}{relative * camera.focal:.1f}, from "
         f"{model['num_registered']} frames, reprojection error {model['mean_reprojection_error_px']:.2f} px"
     )
+    params = dict(zip(PARAM_NAMES[camera.model], map(float, camera.params), strict=True))
     return {
-        "model": camera["model"], "params": params, "sigma": sigma, "focal_sigma_relative": float(relative),
-        "frames": names, "num_registered": model["num_registered"], "num_points": model["num_points"],
+        "model": camera.model.name, "params": params, "sigma": lens.sigma, "focal_sigma_relative": float(relative),
+        "is_settled": relative <= SETTLED_SIGMA, "fit": lens.evidence, "frames": names,
+        "num_registered": model["num_registered"], "num_points": model["num_points"],
         "mean_reprojection_error_px": model["mean_reprojection_error_px"], "text": text,
     }  # fmt: skip
+
+
+def doubt(result: OdometryResult, calibration: dict[str, Any]) -> None:
+    """Note on every map, in place, that it rests on a focal length which is not settled, and how far that reaches."""
+    if calibration["is_settled"]:
+        return
+    relative = calibration["focal_sigma_relative"]
+    found = Contradiction(
+        "self-calibration",
+        f"the focal length is known to {100 * relative:.1f} % only: parts of the first minute contradict each other",
+        f"begin where the camera moves sideways and turns (--start), or {ADVICE}",
+        {"focal_sigma_relative": relative, "settled": SETTLED_SIGMA, "parts": calibration["fit"]["parts"]},
+        # a turn of 90 degrees is seen wrong by the same share, and so is what follows it
+        rotation_sigma_deg=90.0 * relative, position_sigma_share=np.pi / 2 * relative, scale_sigma=relative,
+    )  # fmt: skip
+    for m, entry in enumerate(result.maps):
+        covariance = entry.covariance
+        if covariance is not None:
+            centers = rigid3.center(entry.reconstruction.cam_from_world[entry.keyframe_image_idx])
+            spread = float(np.sqrt(((centers - centers.mean(0)) ** 2).sum(1).mean()))
+            covariance = widened(covariance, spread, [found])
+        result.maps[m] = replace(entry, covariance=covariance, contradictions=[*entry.contradictions, found])

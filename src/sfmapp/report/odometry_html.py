@@ -215,7 +215,7 @@ def _sequence(sequence: Mapping[str, Any], stages: Mapping[str, Any]) -> str:
         return ""
     rows = [[("t", key.replace("_", " ")), ("w", _short(value))] for key, value in sequence.items() if key != "cameras"]
     if calibration := stages.get("self_calibration"):
-        rows.append([("t", "calibrated with the first seconds"), ("w", calibration["text"])])
+        rows.append([("t", "calibrated with the first minute"), ("w", calibration["text"])])
     head = [("", "camera"), ("t", "model"), ("", "size"), ("t", "parameters"), ("t", "refined in the end")]
     cameras = [
         [

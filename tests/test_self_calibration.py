@@ -1,0 +1,63 @@
+"""A lens fitted to a reconstruction of frames: right within its sigmas, and not surer than the motion allows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from odometry_fakes import FakeRunner, FakeSequence
+from sfmapp.events import Events
+from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.result import OdometryResult
+from sfmapp.pipelines.lens_fit import fit_lens
+from sfmapp.pipelines.self_calibrate import MAX_FOCAL_SIGMA, SETTLED_SIGMA, doubt
+from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.synthetic import Layout, make_scene, perturb, synthetic_camera
+
+FOCAL = 900.0
+
+
+def bent(seed: int, layout: Layout, distortion: float = 0.0, wrong: float = 1.15) -> Reconstruction:
+    """A scene of 14 images with a tenth of outliers, told of a focal length that is off, and a little disturbed."""
+    camera = synthetic_camera()
+    params = np.array([FOCAL, 0.5 * camera.width, 0.5 * camera.height, distortion])
+    scene = make_scene(seed, 14, 400, replace(camera, params=params), sigma_px=0.3, outlier_ratio=0.1, layout=layout)
+    model = perturb(scene.observed, rotation_deg=0.2, translation_fraction=0.01, point_fraction=0.01, seed=seed)
+    model.cameras = [replace(model.cameras[0], params=params * [wrong, 1, 1, 0], focal_sigma=None)]
+    return model
+
+
+@pytest.mark.parametrize(("layout", "distortion"), [("ring", 0.0), ("ring", -0.1), ("grid", 0.0), ("forward", 0.0)])
+def test_a_lens_is_found_within_its_sigmas_and_not_called_settled_where_it_is_not(
+    layout: Layout, distortion: float
+) -> None:
+    """Whatever the motion tells: a begin 15 % off is left behind, or the standard deviation says so."""
+    for seed in range(2):
+        found = fit_lens(bent(seed, layout, distortion))
+        error, sigma = abs(found.camera.focal / FOCAL - 1), found.focal_sigma_relative
+        assert error < 3 * sigma
+        assert error < 0.02 or sigma > SETTLED_SIGMA
+        assert error < 0.05
+        if distortion == 0:  # zero, unless the images clearly show some
+            assert found.camera.params[3] == 0.0
+
+
+def test_an_unsettled_lens_is_red_on_every_map_and_in_its_sigmas() -> None:
+    def result() -> OdometryResult:
+        return FakeRunner()(FakeSequence(), OdometryOptions(), seed=0, threads=1, events=Events())  # type: ignore[arg-type]
+
+    settled, doubtful = result(), result()
+    before = doubtful.maps[0].covariance
+    doubt(settled, {"is_settled": True})
+    assert settled.maps[0].contradictions == []
+    share = 0.5 * (SETTLED_SIGMA + MAX_FOCAL_SIGMA)
+    doubt(doubtful, {"is_settled": False, "focal_sigma_relative": share, "fit": {"parts": [1.0]}})
+    entry = doubtful.maps[0]
+    assert [found.subject for found in entry.contradictions] == ["self-calibration"]
+    assert before is not None
+    assert entry.covariance is not None
+    turned = np.degrees(np.sqrt(entry.covariance[0, 0, 0] - before[0, 0, 0]))
+    assert turned == pytest.approx(90 * share)
+    assert (entry.covariance[:, 3, 3] > before[:, 3, 3]).all()
