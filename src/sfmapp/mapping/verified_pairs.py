@@ -38,6 +38,9 @@ TOLERANCE_SHARE, TOLERANCE_PX = 0.004, (4.0, 16.0)
 AGREES, CONTRADICTS = 0.5, 1 / 3
 # Fewer verified matches prove no geometry on their own: twice what verification asks for.
 MIN_MATCHES = 30
+# One such pair makes a model red: three times what verification asks for. Of 50 views of a small model with much
+# repetition one false pair was verified with twice as many.
+MIN_MATCHES_AGAINST = 45
 # A cell is covered by a pair that matches half as much of what is in it as it does where it has its matches.
 HALF_AS_WELL = 0.5
 # Few matches that are scattered over a picture do not cover it: a pair should match a fifth of what is where it has
@@ -50,6 +53,8 @@ CELLS = 8
 CLEARLY = 4 / 3
 # Verified matches between two models that need an explanation.
 MIN_MATCHES_BETWEEN = 100
+# Strength from which on a pair matches in most of the picture.
+MOST = 0.5
 # Pairs that are named; the numbers count all.
 NUM_NAMED = 5
 
@@ -157,7 +162,7 @@ class Standing:
         strength: (K,) of these pairs; zeros if none contradicts the model.
         overruled_by: (K,) how strong the weakest link is of the strongest chain of agreeing pairs between the two
             images; 0 where there is none.
-        stands: (K,) bool: contradicts the model, and is not clearly weaker than that chain.
+        stands: (K,) bool: contradicts the model, with matches enough, and is not clearly weaker than that chain.
         doubt: how strong what contradicts the model is, at most, against what it rests on there: 0 if nothing does,
             1 if it is as strong, infinite if the two images hang together by nothing else.
     """
@@ -172,7 +177,7 @@ class Standing:
 def standing_pairs(reconstruction: Reconstruction, correspondences: Correspondences) -> Standing:
     """Which verified pairs contradict a model, and which of them with evidence as strong as what it rests on."""
     agreement = pair_agreement(reconstruction, correspondences)
-    agrees, contradicts = agreement.agrees, agreement.contradicts
+    agrees, contradicts = agreement.agrees, agreement.contradicts & (agreement.num_matches >= MIN_MATCHES_AGAINST)
     strength, overruled_by = np.zeros(len(agrees)), np.zeros(len(agrees))
     if contradicts.any():
         strength = pair_strengths(reconstruction, correspondences)[agreement.pair_idx]
@@ -221,7 +226,7 @@ class Chains:
 
 
 def contradictions_of(models: Sequence[Reconstruction], correspondences: Correspondences) -> list[list[Contradiction]]:
-    """For each model the verified evidence that stands against it: pairs inside it, and pairs that lead to another.
+    """For each model the verified evidence that stands against it: pairs inside it, and pairs that lead out of it.
 
     Args:
         models: over the same tracks, the largest first.
@@ -233,7 +238,7 @@ def contradictions_of(models: Sequence[Reconstruction], correspondences: Corresp
         for m, other in enumerate(models):
             if m > n:
                 of_model += _between(model, other, correspondences, m)
-        found.append(of_model)
+        found.append(of_model + _left_out(model, models, correspondences))
     return found
 
 
@@ -319,6 +324,42 @@ def _between(
             {"other_model": other_idx, "num_pairs": len(pairs), "num_matches": int(matches.sum()), "pairs": named},
         )
     ]
+
+
+def _left_out(
+    model: Reconstruction, models: Sequence[Reconstruction], correspondences: Correspondences
+) -> list[Contradiction]:
+    """Images that no model holds although they match an image of this one in most of the picture.
+
+    The seam of a fold looks like this when the images that it tears apart have been taken back.
+    """
+    images = correspondences.pair_image_idx
+    nowhere = ~np.any([m.is_registered for m in models], axis=0)
+    linked = (model.is_registered[images] & nowhere[images][:, ::-1]).any(axis=1) & _is_useful(correspondences)
+    pairs = np.flatnonzero(linked & (correspondences.num_inliers >= MIN_MATCHES_BETWEEN))
+    if len(pairs):
+        pairs = pairs[pair_strengths(model, correspondences)[pairs] >= MOST]
+    if len(pairs) == 0:
+        return []
+    matches = correspondences.num_inliers[pairs]
+    left_out = np.unique(images[pairs][nowhere[images[pairs]]])
+    named: list[dict[str, Any]] = [
+        {"images": [model.image_names[i] for i in images[pairs[k]]], "num_matches": int(matches[k])}
+        for k in np.argsort(-matches, kind="stable")[:NUM_NAMED]
+    ]
+    message = (
+        f"{_count(len(left_out), 'photograph')} that no model holds match photographs of the model in most of the "
+        f"picture: {named[0]['images'][0]} and {named[0]['images'][1]} have {named[0]['num_matches']} verified matches"
+    )
+    return [
+        Contradiction(
+            "photographs left out", message,
+            "parts that look alike may have been taken for one: add photographs with more of what is around",
+            {"num_images": len(left_out), "num_pairs": len(pairs), "num_matches": int(matches.sum()), "pairs": named},
+            # what was taken back may have been right, and the model wrong
+            rotation_sigma_deg=180.0, position_sigma_share=1.0,
+        )
+    ]  # fmt: skip
 
 
 def _count(number: int, noun: str) -> str:
