@@ -73,11 +73,11 @@ def map_images(
             "over it (images.mask_path) would save what else they share",
         )
     events.decided(STAGE, f"{track_report['num_tracks']} tracks", **track_report)
-    events.started(STAGE, "mapping", total=len(names))
     with ThreadPoolExecutor(threads) as pool:
 
         def map_from(given: list[Camera]) -> Mapped:
             """Models that begin with the given cameras."""
+            events.started(STAGE, "mapping", total=len(names))
             cameras, focal_report = _first_cameras(given, image_camera_idx, correspondences, tracks, options, events)
             attempts: dict[int, Registration] = {}
 
