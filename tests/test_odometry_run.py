@@ -87,6 +87,11 @@ def test_keyframes_are_frames_of_the_trajectory() -> None:
         )
         assert m.covariance is not None
         assert m.covariance.shape == (len(m.keyframe_frame_idx), 6, 6)
+        # frames between are known no better than the keyframes that they hang on
+        assert result.covariance is not None
+        np.testing.assert_array_equal(result.covariance[m.keyframe_frame_idx], m.covariance)
+        about = np.einsum("kii->k", result.covariance[:, :3, :3])
+        assert (about[np.isfinite(about)] >= about[m.keyframe_frame_idx].min()).all()
         assert [model.image_names[i] for i in m.keyframe_image_idx] == [
             result.frame_names[f] for f in m.keyframe_frame_idx
         ]

@@ -178,6 +178,7 @@ def make_engine(
 
 def compile_kernels() -> None:
     """Compile, or load from the cache, every kernel of this package, by running each on next to nothing."""
+    from sfmapp.adjust.clustered import clustered_covariances
     from sfmapp.adjust.covariance import estimate_covariances
     from sfmapp.adjust.pose import refine_pose
     from sfmapp.scene.synthetic import make_scene
@@ -185,7 +186,9 @@ def compile_kernels() -> None:
     scene = make_scene(0, 3, 8)
     model = scene.observed.copy()
     adjust_bundle(model, AdjustOptions(max_iterations=2), variable_images=np.array([True, True, False]))
-    estimate_covariances(model, AdjustOptions(refine_focal=False, refine_distortion=False))
+    fixed = AdjustOptions(refine_focal=False, refine_distortion=False)
+    estimate_covariances(model, fixed)
+    clustered_covariances(make_scene(0, 3, 40).observed, fixed)
     camera, tracks = model.cameras[0], model.tracks
     refine_pose(camera.canonical, camera.is_fisheye, model.cam_from_world[0], model.point_xyz, tracks.obs_xy[:8])
     no_images = np.zeros(0, np.int32)
