@@ -49,24 +49,31 @@ class GyroTrust:
     """Whether the gyroscope has lately told the turn between frames better than a steady motion would have.
 
     A wrong axis, sign, unit or clock makes its predictions worse than none. Errors fade with a factor a frame, so that
-    two seconds of film decide; a tie, and what nobody has seen yet, speak against it.
+    two seconds of film decide; a tie, and what nobody has seen yet, speak against it. What all errors have in common is
+    its bias, which is taken off.
     """
 
-    _FADE, _MIN_FRAMES = 0.97, 5
+    _FADE, _MIN_FRAMES, _MEMORY = 0.97, 5, 30
 
     def __init__(self) -> None:
         self._gyro, self._steady, self._seen = 0.0, 0.0, 0
+        self._bias = np.zeros(3)  # radians a frame
 
     @property
     def is_better(self) -> bool:
         """The gyroscope's prediction is the one to use."""
         return self._seen >= self._MIN_FRAMES and self._gyro < self._steady
 
+    def corrected(self, predicted: Array) -> Array:
+        """A foretold turn (3, 3) without the bias."""
+        return np.asarray(predicted @ rigid3.exp_so3(self._bias))
+
     def learn(self, predicted: Array, steady: Array, measured: Array) -> None:
         """Note the turns (3, 3) that both foretold for a frame, and the one that its image has shown."""
         errors = rigid3.log_so3(np.stack([predicted, steady]).swapaxes(1, 2) @ measured)
-        gyro, still = (errors**2).sum(1)
+        gyro, still = ((errors - [self._bias, np.zeros(3)]) ** 2).sum(1)
         if np.isfinite(gyro) and np.isfinite(still):
+            self._bias = self._bias + (errors[0] - self._bias) / min(self._seen + 1, self._MEMORY)
             self._gyro = self._FADE * self._gyro + float(gyro)
             self._steady = self._FADE * self._steady + float(still)
             self._seen += 1

@@ -199,7 +199,9 @@ class Odometry:
         step = pose_between(rigid3.IDENTITY, self.step, share) if abs(share - 1) > _STEADY_SHARE else self.step
         turn = None if self.imu is None else imu_rotation(self.imu, last, now)
         self.foretold = None if turn is None else (turn, rigid3.rotation_matrix(step))
-        return rigid3.from_matrix(turn, step[4:]) if turn is not None and self.gyro_trust.is_better else step
+        if turn is None or not self.gyro_trust.is_better:
+            return step
+        return rigid3.from_matrix(self.gyro_trust.corrected(turn), step[4:])
 
     def _make_keyframe(self, record: FrameRecord, view: View, state: FrameState, reason: str) -> None:
         local = self.local
