@@ -128,3 +128,19 @@ def test_fixed_intrinsics_that_are_right_are_not_contradicted():
     assert result.row["contradictions"] == []
     assert result.warnings == []
     assert worst_error_in_sigmas(result, scene) < 4
+
+
+# --------------------------------------------------------------------------------------------------- cut photographs
+
+
+@pytest.mark.parametrize("offset", [0.0, 90.0])
+def test_photographs_that_were_cut_each_otherwise_are_red(offset):
+    rng = np.random.default_rng(7)
+    centers = TRUE.params[1:3] + rng.uniform(-offset, offset, (12, 2))
+    scene = make_scene(7, 12, 1500, [TRUE.with_params([900.0, *center, 0.0]) for center in centers], layout="grid")
+    for model in (scene.truth, scene.observed):  # all that is known is that the files have one size
+        model.cameras, model.image_camera_idx = [TRUE], np.zeros(12, np.int32)
+    result = map_with(scene, simple_camera(CameraModel.SIMPLE_RADIAL, 1000, 750, 1200.0, 600.0))
+    found = [row["subject"] for row in result.row["contradictions"]]
+    assert found == (["middle of the photographs"] if offset else [])
+    assert worst_error_in_sigmas(result, scene) < (3 if offset else 4)

@@ -125,6 +125,40 @@ def test_a_caption_is_a_watermark() -> None:
     assert g.config == TwoViewConfig.PANORAMIC
 
 
+def poster(rng: np.random.Generator, num: int, shift: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Matches on something flat that lies over both pictures, at another place in each."""
+    xy = rng.uniform([100, 100], [500, 500], (num, 2))
+    return xy + rng.normal(0, 0.3, xy.shape), xy + shift + rng.normal(0, 0.3, xy.shape)
+
+
+@pytest.mark.parametrize("camera", [KNOWN, UNKNOWN], ids=["known focal", "unknown focal"])
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (60.0, 170.0)], ids=["at its place", "moved"])
+def test_the_scene_is_found_behind_a_poster_that_most_matches_lie_on(
+    camera: Camera, shift: tuple[float, float]
+) -> None:
+    rng = np.random.default_rng(11)
+    xy1, xy2, truth = views(SIDEWAYS, rng, num_wrong=60)
+    flat1, flat2 = poster(rng, 2 * int(truth.sum()), shift)
+    g = verify_pair(np.concatenate([xy1, flat1]), np.concatenate([xy2, flat2]), camera, camera, OPTIONS, RANSAC)
+    assert g.config in (TwoViewConfig.CALIBRATED, TwoViewConfig.UNCALIBRATED)
+    assert g.is_inlier[: len(xy1)][truth].mean() > 0.95
+    assert g.is_inlier[len(xy1) :].mean() < 0.05
+    assert g.num_moving_alone > 0.9 * len(flat1)
+    assert rotation_error_deg(g) < (0.3 if camera is KNOWN else 8.0)
+
+
+def test_a_wall_with_a_passer_by_stays_the_scene() -> None:
+    rng = np.random.default_rng(12)
+    wall1, wall2, _ = views(SIDEWAYS, rng, num=400, num_wrong=0, plane=True)
+    depth1, depth2, in_depth = views(SIDEWAYS, rng, num=150, num_wrong=40)
+    walker1, walker2 = poster(rng, 120, (40.0, 3.0))
+    xy1, xy2 = (np.concatenate(parts) for parts in ((wall1, depth1, walker1), (wall2, depth2, walker2)))
+    g = verify_pair(xy1, xy2, KNOWN, KNOWN, OPTIONS, RANSAC)
+    assert g.num_moving_alone == 0
+    assert g.is_inlier[: len(wall1) + int(in_depth.sum())].mean() > 0.95
+    assert rotation_error_deg(g) < 0.3
+
+
 @pytest.mark.parametrize("num", [20, 60, 200, 1000])
 def test_random_matches_are_degenerate(num: int) -> None:
     for seed in range(5):

@@ -84,8 +84,8 @@ def map_images(
         tracks, track_report = build_tracks(correspondences, features)
         events.warned(
             STAGE,
-            f"something flat that is no part of the scene moves through the photographs ({num_flat} pairs match on it "
-            "alone); its matches were left out. Masks over it (images.mask_path) would save the rest",
+            f"{num_flat} pairs match on something flat alone that is no part of the scene; they were left out. Masks "
+            "over it (images.mask_path) would save what else they share",
         )
     events.decided(STAGE, f"{track_report['num_tracks']} tracks", **track_report)
     with ThreadPoolExecutor(threads) as pool:

@@ -36,6 +36,8 @@ __all__ = [
 ]
 
 _STAGE = "matching"
+# In one or two pairs it may be anything that went by.
+_MANY_MOVING = 3
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,13 @@ def match_images(
             raise
     results = [done[p] for p in pairs]
     report = _report(pairs, results, num_known, time.monotonic() - start)
+    if (num_moving := report["num_pairs_with_moving_plane"]) >= _MANY_MOVING:
+        events.warned(
+            _STAGE,
+            f"in {num_moving} pairs something flat moves otherwise than the scene (held into the picture, on the "
+            "camera, or a background that stays while the object turns); its matches were left out. A mask over it "
+            "(images.mask_path) is better",
+        )
     events.finished(_STAGE, f"{report['num_verified_pairs']} of {len(pairs)} pairs verified", **report)
     return join_pairs(pair_image_idx, results), report
 
@@ -203,6 +212,7 @@ def _report(
         "num_resumed_pairs": num_known,
         "num_verified_pairs": sum(len(r.matches) > 0 for r in results),
         "num_matches": sum(len(r.matches) for r in results),
+        "num_pairs_with_moving_plane": sum(r.geometry.num_moving_alone > 0 for r in results),
         "configs": {name: configs.count(name) for name in sorted(set(configs))},
         "cpu_s": sum(r.cpu_s for r in results),
         "wall_s": wall_s,
