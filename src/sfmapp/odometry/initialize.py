@@ -15,6 +15,7 @@ from sfmapp.matching.two_view import Ransac, TwoViewGeometry, verify_pair
 from sfmapp.odometry.alignment import align_patches
 from sfmapp.odometry.corners import find_corners
 from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.pose_choice import only_pose
 from sfmapp.odometry.pyramid import Pyramid
 from sfmapp.odometry.small_image import align_small_images
 from sfmapp.scene.camera import Camera, pixels_to_normalized, project
@@ -146,19 +147,24 @@ class Beginning:
         if found.median_angle_deg < _MIN_MEDIAN_ANGLE_DEG or num < max(_MIN_POINTS, 0.5 * len(track)):
             self.reason = f"{num} of {len(track)} corners agree, {found.median_angle_deg:.2f} deg of parallax"
             return None
+        pose: Array | None = found.cam2_from_cam1
+        if self.options.motion == "free":
+            pose = only_pose(self.camera, xy1[found.is_inlier], xy2[found.is_inlier], found.cam2_from_cam1, limit)
+        if pose is None:
+            self.reason = "several motions explain the two views alike"
+            return None
         xn1, xn2 = (pixels_to_normalized(self.camera, xy[found.is_inlier]) for xy in (xy1, xy2))
-        depths, angles = epipolar.ray_depths(found.cam2_from_cam1, xn1, xn2)
+        depths, angles = epipolar.ray_depths(pose, xn1, xn2)
         good = (depths > 0).all(1) & (np.degrees(angles) > 0.25 * _MIN_MEDIAN_ANGLE_DEG)
         if good.sum() < _MIN_POINTS:
             self.reason = f"{int(good.sum())} points with depth"
             return None
         shown = np.column_stack([xn1, np.ones(len(xn1))]) * depths[:, :1]
-        if not self._is_confirmed(found.cam2_from_cam1, track[found.is_inlier][good], shown[good]):
+        if not self._is_confirmed(pose, track[found.is_inlier][good], shown[good]):
             self.reason = "the frames in between do not show the same depths"
             return None
         unit = 1.0 / float(np.median(depths[good, 0]))
-        pose = found.cam2_from_cam1.copy()
-        pose[4:] *= unit
+        pose = np.concatenate([pose[:4], unit * pose[4:]])
         return TwoViews(
             pose,
             track[found.is_inlier][good],
