@@ -32,7 +32,7 @@ def test_an_arbitrary_unit_has_no_sigma_and_one_in_metres_is_widened() -> None:
 def test_each_is_a_red_light_that_says_what_it_contradicts() -> None:
     rows = check_contradictions(found.describe() for found in (LENS, RIG))
     assert [row["light"] for row in rows] == ["red", "red"]
-    assert rows[0]["name"] == "agrees with the given calibration"
+    assert rows[0]["name"] == "contradiction: given calibration"
     assert rows[0]["value"] == LENS.message
     assert [row["light"] for row in check_contradictions([])] == ["green"]
     assert json.loads(json.dumps(LENS.describe()))["evidence"] == {"evidence": 2800.0}

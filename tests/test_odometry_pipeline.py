@@ -340,7 +340,7 @@ def test_a_sensor_that_contradicts_the_map_is_red_and_gives_no_metres(tmp_path: 
     assert report["maps"][0]["scale_sigma"] is None
     assert any("upside down" in warning["message"] for warning in report["warnings"])
     red = [row for row in report["checks"] if row["light"] == "red"]
-    assert [(row["name"], row["thresholds"]) for row in red] == [("agrees with the inertial measurements", "turn it")]
+    assert [(row["name"], row["thresholds"]) for row in red] == [("contradiction: inertial measurements", "turn it")]
 
 
 def test_a_scale_that_cannot_be_had_is_a_warning(tmp_path: Path, monkeypatch: Patch) -> None:

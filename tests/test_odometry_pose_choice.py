@@ -15,8 +15,8 @@ NOISE_PX, LIMIT_PX, NUM = 0.2, 1.0, 150
 
 
 def views(seed: int, way: float, relief: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels in two views of points up to ``relief`` off a slanted plane 2 away, and the true cam2_from_cam1 after a way
-    of that length and a small turn."""
+    """Pixels in two views of points up to ``relief`` off a slanted plane 2 away, and the true cam2_from_cam1 after a
+    way of that length and a small turn."""
     rng = np.random.default_rng([seed, 0x9056])
     rays = np.column_stack([rng.uniform(-0.5, 0.5, NUM), rng.uniform(-0.4, 0.4, NUM), np.ones(NUM)])
     slope = rng.uniform(-0.8, 0.8, 2)

@@ -92,7 +92,7 @@ def add_photos(
     joined = join(model, images, features, matches, idx_of_image)
     attempts: dict[int, Registration] = {}
     mapper = Mapper(
-        joined, matches, mapping, options.adjust, events, pool, list(joined.cameras),
+        joined, _as_joined(matches, model.tracks, idx_of_image), mapping, options.adjust, events, pool, list(joined.cameras),
         np.zeros(len(joined.image_names), bool), attempts,
     )  # fmt: skip
     events.started(STAGE, f"adding {len(found.images)} photographs", total=None)
@@ -173,7 +173,7 @@ def join(
 
 def _tracks_beside(old: Tracks, new: Tracks, idx_of_image: NDArray[np.int64], num_images: int) -> Tracks:
     """Both sets of tracks; keypoints of the new ones are numbered after those of the old."""
-    offset = int(old.obs_feature_idx.max(initial=-1)) + 1
+    offset = _num_features(old)
     return make_tracks(
         num_images,
         old.num_tracks + new.num_tracks,
@@ -182,6 +182,17 @@ def _tracks_beside(old: Tracks, new: Tracks, idx_of_image: NDArray[np.int64], nu
         np.concatenate([old.obs_feature_idx, new.obs_feature_idx + offset]),
         np.concatenate([old.obs_xy, new.obs_xy]),
     )
+
+
+def _as_joined(matches: Correspondences, old: Tracks, idx_of_image: NDArray[np.int64]) -> Correspondences:
+    """Matches with the images and keypoints numbered as :func:`join` has them."""
+    pairs = idx_of_image[matches.pair_image_idx].astype(np.int32)
+    return replace(matches, pair_image_idx=pairs, matches=matches.matches + np.int32(_num_features(old)))
+
+
+def _num_features(tracks: Tracks) -> int:
+    """Keypoints of other tracks are numbered from here on."""
+    return int(tracks.obs_feature_idx.max(initial=-1)) + 1
 
 
 def _row(model: Reconstruction, image_idx: int, attempts: dict[int, Registration]) -> dict[str, Any]:

@@ -211,7 +211,7 @@ def check(name: str, value: float, text: str, green: float, amber: float, unit: 
 def check_contradictions(found: Iterable[Mapping[str, Any]]) -> list[dict[str, str]]:
     """A red light for each contradiction as ``Contradiction.describe`` gives it, or one green light for none."""
     rows = [
-        {"name": f"agrees with the {row['subject']}", "value": row["message"], "light": "red",
+        {"name": f"contradiction: {row['subject']}", "value": row["message"], "light": "red",
          "thresholds": row["advice"]}
         for row in found
     ]  # fmt: skip
