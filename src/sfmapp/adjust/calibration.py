@@ -10,7 +10,7 @@ models", 1982); and what some tracks say can be judged by others.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -36,7 +36,7 @@ class CalibrationSystem:
     """Cost over calibration unknowns (Q,) by track, in units of the noise, halves included: ``g.x + x.H.x / 2``.
 
     Attributes:
-        track_idx: (T,) the tracks that have something to say.
+        track_idx: (T,) the tracks that have something to say; once summed, the first of each cluster.
         gradient: (T, Q); information: (T, Q, Q).
         response: (F, 6, Q) how rotation and translation of each frame's pose, ``x <- exp(w) x + v``, follow a unit of
             each unknown; the first frame stays.
@@ -50,6 +50,19 @@ class CalibrationSystem:
     response: Array
     log_scale: Array
     scale_variance: float
+
+    def summed(self, clusters: NDArray[np.int64]) -> CalibrationSystem:
+        """The same by cluster in place of track, which takes no memory to speak of.
+
+        Args:
+            clusters: (T,) number of the cluster of each track, from 0 on without gaps.
+        """
+        count, num = int(clusters.max(initial=-1)) + 1, self.gradient.shape[1]
+        gradient, information = np.zeros((count, num)), np.zeros((count, num, num))
+        np.add.at(gradient, clusters, self.gradient)
+        np.add.at(information, clusters, self.information)
+        first = self.track_idx[np.unique(clusters, return_index=True)[1]]
+        return replace(self, track_idx=first, gradient=gradient, information=information)
 
 
 def reduce_to_calibration(

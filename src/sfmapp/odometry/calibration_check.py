@@ -151,8 +151,8 @@ class _Look:
 
     Attributes:
         x: (Q,) change from the given calibration so far. cost: of the adjustment, in units of the noise.
-        system: its last N unknowns are amplitudes of smooth fields.
-        noise: how much more the data vary than independent errors would. clusters: (T,) whose errors are shared.
+        system: by cluster of tracks whose errors are shared; its last N unknowns are amplitudes of smooth fields.
+        noise: how much more the data vary than independent errors would.
         priors: (Q,) standard deviations around the given calibration. field_prior: information of an amplitude.
         step: (Q,) to where the cost and the priors are least. covariance: (Q, Q) of that.
     """
@@ -162,7 +162,6 @@ class _Look:
     cost: float
     system: CalibrationSystem
     noise: float
-    clusters: NDArray[np.int64]
     priors: Array
     field_prior: float
     step: Array
@@ -257,15 +256,14 @@ def _look(model: Reconstruction, x: Array, cost: float, sigma: float, unknowns: 
         return None
     gradient, information = system.gradient.sum(0), system.information.sum(0)
     num_wanted = _MIN_CLUSTERS * len(gradient)
-    clusters = _clusters(model, system.track_idx, num_wanted)
-    num_clusters = int(clusters.max(initial=-1)) + 1
+    system = system.summed(_clusters(model, system.track_idx, num_wanted))
+    num_clusters = len(system.gradient)
     if num_clusters < num_wanted or not (np.isfinite(information).all() and np.isfinite(cost)):
         return None
     # scores where the data have their minimum: a weak prior keeps what they leave open
     weak = information + np.diag(1e-6 * np.diag(information))
     away: Array = -np.linalg.solve(weak, gradient)
-    scores = np.zeros((num_clusters, len(gradient)))
-    np.add.at(scores, clusters, system.gradient + system.information @ away)
+    scores = system.gradient + system.information @ away
     scatter = scores.T @ scores * num_clusters / (num_clusters - 1)
     noise = max(1.0, float(np.trace(np.linalg.solve(weak, scatter))) / len(gradient))
     priors, off, field_sigma = unknowns.priors(x), np.concatenate([x, np.zeros(len(gradient) - num)]), _FIELD_SIGMA_PX
@@ -274,7 +272,7 @@ def _look(model: Reconstruction, x: Array, cost: float, sigma: float, unknowns: 
         covariance = np.linalg.inv(information / noise + np.diag(prior))
         step = -(covariance @ (gradient / noise + prior * off))
         field_sigma = float(np.clip(np.sqrt((step[num:] ** 2).mean()), _FIELD_SIGMA_PX, _MAX_FIELD_SIGMA_PX))
-    found = _Look(model, x, cost, system, noise, clusters, priors, prior[-1], step[:num], covariance[:num, :num])
+    found = _Look(model, x, cost, system, noise, priors, prior[-1], step[:num], covariance[:num, :num])
     return found if np.isfinite(covariance).all() and np.isfinite(step).all() else None
 
 
@@ -317,9 +315,9 @@ def _held_out(look: _Look) -> tuple[Array, Array]:
     off = np.concatenate([look.x, np.zeros(len(prior) - num)])
     _, basis = eigh(look.data_information, np.diag(prior[:num]))
     coordinates = np.linalg.inv(basis)
-    gains = np.zeros((int(look.clusters.max()) + 1, num + 1))
+    gains = np.zeros((len(system.gradient), num + 1))
     for fold in range(_FOLDS):
-        held = look.clusters % _FOLDS == fold
+        held = np.arange(len(gains)) % _FOLDS == fold
         gradient = system.gradient[~held].sum(0) / look.noise + prior * off
         information = system.information[~held].sum(0) / look.noise + np.diag(prior)
         best = -np.linalg.solve(information, gradient)
@@ -330,7 +328,7 @@ def _held_out(look: _Look) -> tuple[Array, Array]:
         states[num:, 1:] = -np.linalg.solve(information[num:, num:], right)
         costs = system.gradient[held] @ states
         costs += 0.5 * np.einsum("tqn,qn->tn", system.information[held] @ states, states)
-        np.add.at(gains, look.clusters[held], costs[:, 1:] - costs[:, :1])
+        gains[held] = costs[:, 1:] - costs[:, :1]
     # one cluster that gains very much must not make the rest look unsure, nor decide alone
     limit = _MAX_GAIN * np.median(np.abs(gains), axis=0)
     gains = np.clip(gains, -limit, limit)

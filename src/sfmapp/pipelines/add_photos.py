@@ -92,8 +92,8 @@ def add_photos(
     joined = join(model, images, features, matches, idx_of_image)
     attempts: dict[int, Registration] = {}
     mapper = Mapper(
-        joined, _as_joined(matches, model.tracks, idx_of_image), mapping, options.adjust, events, pool, list(joined.cameras),
-        np.zeros(len(joined.image_names), bool), attempts,
+        joined, _as_joined(matches, model.tracks, idx_of_image), mapping, options.adjust, events, pool,
+        list(joined.cameras), np.zeros(len(joined.image_names), bool), attempts,
     )  # fmt: skip
     events.started(STAGE, f"adding {len(found.images)} photographs", total=None)
     mapper.triangulate_images([idx for idx, _ in keyframes])
