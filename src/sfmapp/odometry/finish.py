@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.backend import classify, make_job, take_over
 from sfmapp.odometry.calibration_check import LOSS_SIGMAS, Answer, adjust_poses, question_calibration, spread
 from sfmapp.odometry.keyframe_map import KeyframeMap
-from sfmapp.odometry.map_covariance import covariance_of_refinement, estimate_map_covariance
+from sfmapp.odometry.map_covariance import covariance_of_refinement, estimate_map_covariance, scale_sigma_of_refinement
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.sweep import is_too_large, sweep
 from sfmapp.scene.reconstruction import Reconstruction
@@ -109,6 +110,10 @@ def _conclude_large(keyframes: KeyframeMap, options: OdometryOptions, events: Ev
 def _question(model: Reconstruction, cost: float, sigma: float, options: OdometryOptions, events: Events) -> Answer:
     """Question the calibration of an adjusted map, and tell of what comes of it."""
     answer = question_calibration(model, cost, sigma, may_refine=options.refine_camera)
+    if answer.is_refined and answer.scale_sigma is not None:
+        of_refinement = scale_sigma_of_refinement(model, answer.model) / answer.excess
+        answer = replace(answer, scale_sigma=math.hypot(answer.scale_sigma, of_refinement))
+        answer.report["scale"]["beyond_the_lens_model"] = of_refinement
     events.raise_if_cancelled()
     if answer.is_refined:
         message = "the images contradict the given calibration, which is refined"

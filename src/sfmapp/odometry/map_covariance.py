@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from sfmapp.adjust.clustered import clustered_covariances
 from sfmapp.adjust.covariance import pose_errors_in_gauge
 from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.odometry.calibration_check import spread
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -24,6 +26,8 @@ _INDEPENDENT, _CORRELATED = 0.95, 1.0
 # A calibration that the images contradicted is a model that did not fit; what the lens does beyond the parameters that
 # were refined is known as well as this share of what refining them has moved. On KITTI 00 and 01 a quarter to a third.
 _UNKNOWN_SHARE = 0.5
+# The same of the unit of length, which one number of the calibration moves: a fifth on KITTI 01, the one real rig here.
+_UNKNOWN_SHARE_OF_SCALE = 0.25
 
 
 def estimate_map_covariance(
@@ -64,3 +68,8 @@ def covariance_of_refinement(given: Reconstruction, refined: Reconstruction, num
     moved = pose_errors_in_gauge(refined, given, first, 7 if num_sensors == 1 else 6)
     mean_squares = [float((moved[:, part] ** 2).mean()) for part in (slice(0, 3), slice(3, 6))]
     return _UNKNOWN_SHARE**2 * np.diag(np.repeat(mean_squares, 3))
+
+
+def scale_sigma_of_refinement(given: Reconstruction, refined: Reconstruction) -> float:
+    """Relative standard deviation that a refined calibration adds to the unit of length of a rig; as above."""
+    return _UNKNOWN_SHARE_OF_SCALE * abs(math.log(spread(refined) / spread(given)))
