@@ -8,6 +8,9 @@ from typing import Any
 
 MAX_DECISIONS = 400
 
+# Longer values are sentences, which are wrapped.
+_MAX_SHORT = 40
+
 STYLE = """
 :root{color-scheme:light dark}
 body{font:15px/1.45 system-ui,sans-serif;max-width:72rem;margin:2rem auto;padding:0 1rem}
@@ -49,7 +52,11 @@ def failure_box(outcome: Mapping[str, Any]) -> str:
 def check_table(checks: Iterable[Mapping[str, str]]) -> str:
     """Traffic lights as :func:`~sfmapp.report.document.check` makes them; nothing without any."""
     rows = [
-        [("t " + check["light"], check["name"]), ("", check["value"]), ("t dim", check["thresholds"])]
+        [
+            ("t " + check["light"], check["name"]),
+            ("w" if len(check["value"]) > _MAX_SHORT else "", check["value"]),
+            ("w dim", check["thresholds"]),
+        ]
         for check in checks
     ]
     return "<h2>Checks</h2>" + table([("t", "check"), ("", "value"), ("t", "thresholds")], rows) if rows else ""
