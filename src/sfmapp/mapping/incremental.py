@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -89,31 +90,15 @@ def map_images(
         )
     events.decided(STAGE, f"{track_report['num_tracks']} tracks", **track_report)
     with ThreadPoolExecutor(threads) as pool:
-
-        def map_from(given: list[Camera], found: Correspondences, tracks: Tracks) -> Mapped:
-            """Models that begin with the given cameras, from the matches found and their tracks."""
-            events.started(STAGE, "mapping", total=len(names))
-            cameras, focal_report = _first_cameras(given, image_camera_idx, found, tracks, options, events)
-            attempts: dict[int, Registration] = {}
-
-            def mapper_of(model: Reconstruction, locked: NDArray[np.bool_] | None = None) -> Mapper:
-                locked = np.zeros(len(names), bool) if locked is None else locked
-                return Mapper(model, found, options, adjust_options, events, pool, list(cameras), locked, attempts)
-
-            empty = Reconstruction.empty(cameras, names, image_camera_idx, tracks)
-            models, initial_reports = _grow_models(empty, mapper_of, options, events)
-            models = _merge_models(_without_parts(models), mapper_of, found, options, events)
-            models = _with_left_over(models, mapper_of, found, events)
-            models = [mended(model, found, mapper_of, options, events) for model in models]
-            return Mapped(cameras, models, initial_reports, focal_report, attempts, mapper_of)
+        task = _Task(names, image_camera_idx, options, adjust_options, events, pool)
 
         def map_all(given: list[Camera]) -> Mapped:
-            return map_from(given, correspondences, tracks)
+            return task.map_from(given, correspondences, tracks)
 
         mapped, doubts = settle_focal_lengths(map_all(list(image_set.cameras)), map_all, events)
 
         def map_again(found: Correspondences) -> Mapped:
-            return map_from(list(mapped.cameras), found, build_tracks(found, features)[0])
+            return task.map_from(list(mapped.cameras), found, build_tracks(found, features)[0])
 
         mapped, look_alikes = tell_apart(mapped, correspondences, map_again, events)
         models = mapped.models
@@ -136,6 +121,38 @@ def map_images(
     if not models:
         raise no_reconstruction(report)
     return models, report
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What all mappings of a run have in common: which cameras they begin with and what they believe may differ."""
+
+    names: list[str]
+    image_camera_idx: NDArray[np.int32]
+    options: MappingOptions
+    adjust_options: AdjustOptions
+    events: Events
+    pool: Executor
+
+    def map_from(self, given: list[Camera], correspondences: Correspondences, tracks: Tracks) -> Mapped:
+        """Models that begin with the given cameras, from verified matches and their tracks."""
+        names, options, events = self.names, self.options, self.events
+        events.started(STAGE, "mapping", total=len(names))
+        cameras, focal_report = _first_cameras(given, self.image_camera_idx, correspondences, tracks, options, events)
+        attempts: dict[int, Registration] = {}
+
+        def mapper_of(model: Reconstruction, locked: NDArray[np.bool_] | None = None) -> Mapper:
+            locked = np.zeros(len(names), bool) if locked is None else locked
+            return Mapper(
+                model, correspondences, options, self.adjust_options, events, self.pool, list(cameras), locked, attempts
+            )
+
+        empty = Reconstruction.empty(cameras, names, self.image_camera_idx, tracks)
+        models, initial_reports = _grow_models(empty, mapper_of, options, events)
+        models = _merge_models(_without_parts(models), mapper_of, correspondences, options, events)
+        models = _with_left_over(models, mapper_of, correspondences, events)
+        models = [mended(model, correspondences, mapper_of, options, events) for model in models]
+        return Mapped(cameras, models, initial_reports, focal_report, attempts, mapper_of)
 
 
 def _check(
