@@ -15,7 +15,7 @@ from sfmapp.matching.two_view import Ransac, TwoViewGeometry, verify_pair
 from sfmapp.odometry.alignment import align_patches
 from sfmapp.odometry.corners import find_corners
 from sfmapp.odometry.options import OdometryOptions
-from sfmapp.odometry.pose_choice import only_pose
+from sfmapp.odometry.pose_choice import RIVAL_SHARE, explaining_poses, is_way_known, tells_apart
 from sfmapp.odometry.pyramid import Pyramid
 from sfmapp.odometry.small_image import align_small_images
 from sfmapp.scene.camera import Camera, pixels_to_normalized, project
@@ -26,6 +26,9 @@ Mask = NDArray[np.bool_]
 
 # The first view is given up for a newer one when fewer of its corners are left.
 _MIN_LEFT = 0.4
+# Before that, where fewer are left than this, parallax is as large as it gets: the best of several motions will do if
+# the next is worse by this factor.
+_LATE, _LATE_RIVAL_SHARE = 0.5, 1.15
 # Displacement, as a share of the image width, below which two views are not even looked at.
 _MIN_FLOW = 0.01
 # Fewest points of a first map; half of what pose refinement and the keyframe rules are comfortable with.
@@ -149,7 +152,7 @@ class Beginning:
             return None
         pose: Array | None = found.cam2_from_cam1
         if self.options.motion == "free":
-            pose = only_pose(self.camera, xy1[found.is_inlier], xy2[found.is_inlier], found.cam2_from_cam1, limit)
+            pose = self._only_pose(found.cam2_from_cam1, track[found.is_inlier], limit)
         if pose is None:
             self.reason = "several motions explain the two views alike"
             return None
@@ -175,6 +178,42 @@ class Beginning:
             len(track),
         )
 
+    def _only_pose(self, given: Array, track: NDArray[np.int64], limit_px: float) -> Array | None:
+        """The relative pose of the first and the last view, None if others explain them and those between as well."""
+        xy1, xy2 = self.corners[track], self.seen[-1][track]
+        poses, costs = explaining_poses(self.camera, xy1, xy2, given, limit_px)
+        own = costs.copy()
+        if len(poses) > 1:
+            for n in self._witnesses(track):
+                costs += [self._left_between(pose, track, n, limit_px) for pose in poses]
+        order = np.argsort(costs, kind="stable")
+        best = int(order[0])
+        is_late = len(track) < _LATE * len(self.corners)
+        share = _LATE_RIVAL_SHARE if is_late else RIVAL_SHARE
+        if len(poses) > 1 and not tells_apart(costs[best], costs[order[1]], len(track), share):
+            return None
+        return poses[best] if is_way_known(self.camera, poses[best], xy1, xy2, own[best]) else None
+
+    def _left_between(self, last_from_first: Array, track: NDArray[np.int64], n: int, limit_px: float) -> float:
+        """Squared residuals, pixels, of the n-th view where points are made of the first and the last."""
+        camera, first_xy, last_xy, xy = self.camera, self.corners[track], self.seen[-1][track], self.seen[n][track]
+        xn1, xn2 = (pixels_to_normalized(camera, pixels) for pixels in (first_xy, last_xy))
+        depths, _ = epipolar.ray_depths(last_from_first, xn1, xn2)
+        xyz = np.column_stack([xn1, np.ones(len(xn1))]) * depths[:, :1]
+        known = np.isfinite(xy[:, 0]) & (depths > 0).all(1)
+        start = pose_between(rigid3.IDENTITY, last_from_first, n / (len(self.seen) - 1))
+        pose = refine_pose(camera.canonical, camera.is_fisheye, start, xyz[known], xy[known]).cam_from_world
+        squared = ((project(camera, rigid3.apply(pose, xyz[known])) - xy[known]) ** 2).sum(1)
+        squared = np.minimum(np.nan_to_num(squared, nan=limit_px**2), limit_px**2)
+        return float(squared.sum()) + limit_px**2 * int((np.isfinite(xy[:, 0]) & ~known).sum())
+
+    def _witnesses(self, track: NDArray[np.int64]) -> list[int]:
+        """Views between the first and the last at which the corners had moved by certain shares of their way."""
+        last, first_xy = len(self.seen) - 1, self.corners[track]
+        flow = float(np.median(np.linalg.norm(self.seen[-1][track] - first_xy, axis=1)))
+        moved = np.array([np.nanmedian(np.linalg.norm(xy[track] - first_xy, axis=1)) for xy in self.seen[1:last]])
+        return sorted({1 + int(np.argmin(np.abs(moved - share * flow))) for share in _WITNESSES_AT if len(moved)})
+
     def _is_confirmed(self, last_from_first: Array, track: NDArray[np.int64], xyz: Array) -> bool:
         """Whether points (N, 3) made of the first and the last view explain the views between them."""
         last, camera = len(self.seen) - 1, self.camera
@@ -182,10 +221,8 @@ class Beginning:
         flow = float(np.median(np.linalg.norm(last_xy - first_xy, axis=1)))
         if last == 1:
             return _left_by_turn(camera, first_xy, last_xy) > _MIN_NOT_TURNED * flow
-        moved = np.array([np.nanmedian(np.linalg.norm(xy[track] - first_xy, axis=1)) for xy in self.seen[1:last]])
-        witnesses = {1 + int(np.argmin(np.abs(moved - share * flow))) for share in _WITNESSES_AT}
         left, turned = 0.0, 0.0
-        for n in sorted(witnesses):
+        for n in self._witnesses(track):
             xy = self.seen[n][track]
             known = np.isfinite(xy[:, 0])
             if known.sum() < _MIN_POINTS:

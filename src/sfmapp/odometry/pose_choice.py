@@ -1,8 +1,8 @@
-"""The relative pose that two views show, where no other one shows them as well.
+"""The relative poses that two views show, and whether they tell them apart.
 
 Over a short way, and before a plane, several motions explain the same two images within their noise (Malis and Vargas
 2007; Longuet-Higgins 1984: a plane leaves two). A map that begins with the wrong one is bent for good, and says that it
-is sure. So all of them are looked for, and what cannot be told yet waits for more parallax.
+is sure. So all of them are looked for; views in between may tell them apart, else it waits for parallax.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ Array = NDArray[np.float64]
 
 # Directions of the way from which a search begins, over half a sphere: some 30 degrees apart, as valleys are wide.
 _NUM_STARTS = 20
-# Poses whose ways differ by less are one; a rival explains the views if its cost is no more than so many times the
-# least. Residuals of patches hang together, so that likelihoods of independent ones would see differences in chance.
-_SAME_DEG, _RIVAL_SHARE = 5.0, 1.5
+# Poses whose ways differ by less are one: an adjustment brings a map that began so far off to its right shape. A rival
+# explains the views if its cost is no more than so many times the least: errors of patches hang together, so that
+# chance makes much of that.
+_SAME_DEG, RIVAL_SHARE = 12.0, 1.5
 # Patches are located to that at best, pixels: what is left below it tells nothing apart.
 _FINEST_PX = 0.05
 # How well the way must be known (one standard deviation), and what correlated errors do to a formal one.
@@ -27,36 +28,51 @@ _MAX_SIGMA_DEG, _INFLATION = 5.0, 2.0
 _STEP = 1e-6
 
 
-def only_pose(camera: Camera, xy1: Array, xy2: Array, given: Array, limit_px: float) -> Array | None:
-    """The pose cam2_from_cam1 (7,) with unit translation that explains the matches best, None if another does as well.
+def explaining_poses(
+    camera: Camera, xy1: Array, xy2: Array, given: Array, limit_px: float
+) -> tuple[list[Array], Array]:
+    """Poses cam2_from_cam1 (7,) with unit translation that explain matches nearly as well as the best, which is first.
 
     Args:
         camera: of both views.
         xy1, xy2: (N, 2) matched pixels.
         given: (7,) a pose to try among others.
         limit_px: residuals beyond it count like that.
+
+    Returns:
+        The poses (K), whose ways differ, and (K,) the sums of their squared residuals, pixels squared.
     """
     xn1, xn2 = pixels_to_normalized(camera, xy1), pixels_to_normalized(camera, xy2)
     turned = homography.rotation_from_rays(xn1, xn2, np.ones(len(xn1)))
     starts = [given, *(rigid3.from_matrix(turned, way) for way in _half_sphere(_NUM_STARTS))]
-    scale, limit = 0.5 * limit_px / camera.focal, (limit_px / camera.focal) ** 2
-    poses, costs = [], []
+    found, costs = [], []
     for start in starts:
-        pose = epipolar.refine_relative_pose(start, xn1, xn2, scale)
+        pose = epipolar.refine_relative_pose(start, xn1, xn2, 0.5 * limit_px / camera.focal)
         other = np.concatenate([pose[:4], -pose[4:]])
         pose, in_front, _ = epipolar.choose_in_front(np.stack([pose, other]), xn1, xn2)
-        error = epipolar.sampson_errors(epipolar.essential_from_pose(pose), xn1, xn2)
-        poses.append(pose)
-        costs.append(float(np.where(in_front, np.minimum(error, limit), limit).sum()))
-    best = int(np.argmin(costs))
-    floor = len(xn1) * (_FINEST_PX / camera.focal) ** 2
-    is_rival = np.array(costs) < _RIVAL_SHARE * (costs[best] + floor)
-    ways = rigid3.center(np.array(poses))
-    cosine = ways @ ways[best] / (np.linalg.norm(ways, axis=1) * np.linalg.norm(ways[best]))
-    if (is_rival & (cosine < np.cos(np.radians(_SAME_DEG)))).any():
-        return None
-    sigma_deg = _sigma_of_way_deg(poses[best], xn1, xn2, max(costs[best], floor))
-    return poses[best] if sigma_deg < _MAX_SIGMA_DEG else None
+        squared = camera.focal**2 * epipolar.sampson_errors(epipolar.essential_from_pose(pose), xn1, xn2)
+        found.append(pose)
+        costs.append(float(np.where(in_front, np.minimum(squared, limit_px**2), limit_px**2).sum()))
+    kept: list[int] = []
+    ways = rigid3.center(np.array(found))
+    ways /= np.linalg.norm(ways, axis=1)[:, None]
+    for k in np.argsort(costs, kind="stable"):
+        is_new = all(ways[k] @ ways[other] < np.cos(np.radians(_SAME_DEG)) for other in kept)
+        if is_new and not (kept and tells_apart(costs[kept[0]], costs[k], len(xn1))):
+            kept.append(int(k))
+    return [found[k] for k in kept], np.array(costs)[kept]
+
+
+def tells_apart(least: float, other: float, num: int, share: float = RIVAL_SHARE) -> bool:
+    """Whether a sum of squared residuals (pixels squared, of num matches) is more than so many times the least."""
+    return other > share * (least + num * _FINEST_PX**2)
+
+
+def is_way_known(camera: Camera, pose: Array, xy1: Array, xy2: Array, cost: float) -> bool:
+    """Whether the matches (N, 2) determine the direction of the way; ``cost``: their squared residuals, pixels."""
+    xn1, xn2 = pixels_to_normalized(camera, xy1), pixels_to_normalized(camera, xy2)
+    squared = max(cost, len(xn1) * _FINEST_PX**2) / camera.focal**2
+    return _sigma_of_way_deg(pose, xn1, xn2, squared) < _MAX_SIGMA_DEG
 
 
 def _half_sphere(count: int) -> Array:
