@@ -250,9 +250,12 @@ def judged(result: OdometryResult, report: dict[str, Any], sequence: Recorded) -
     unit = 1.0 if is_metric else free.scale
     error, sigma = float(np.sqrt((alignment.translation_m**2).mean())), float(np.sqrt(variance)) * unit
     sigmas = error / sigma
-    verdict = "right" if sigmas <= MAX_SIGMAS else "SURE AND WRONG" if not red else "said, but too sure"
-    if red and sigmas <= MAX_SIGMAS:
-        verdict = "said"
+    if is_metric and entry.scale_sigma:  # positions may be stated as unsure while the unit of length is not
+        sigmas = max(sigmas, abs(np.log(free.scale)) / entry.scale_sigma)
+    if red:  # no sigma at all claims nothing
+        verdict = "said, but too sure" if sigmas > MAX_SIGMAS else "said"
+    else:
+        verdict = "right" if sigmas <= MAX_SIGMAS else "SURE AND WRONG"
     return {
         "verdict": verdict, "error_m": error, "sigma_m": sigma, "error_sigmas": sigmas, "scale": 1 / free.scale,
         "scale_sigma": entry.scale_sigma, "red": red, "num_frames": int((result.frame_map == 0).sum()),

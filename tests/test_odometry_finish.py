@@ -11,7 +11,7 @@ import odometry_sequences as played
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.errors import InterruptedRunError
 from sfmapp.events import Events
-from sfmapp.odometry.finish import conclude
+from sfmapp.odometry.finish import _left_open, conclude
 from sfmapp.odometry.keyframe_map import KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.scene.camera import CameraModel, simple_camera
@@ -153,3 +153,14 @@ def test_a_refined_calibration_widens_what_it_moved() -> None:
     assert [c.report["camera"]["is_refined"] for c in found] == [False, True]
     sigmas = [np.sqrt(np.einsum("kii->ki", c.covariance)).mean() for c in found if c.covariance is not None]
     assert 2.0 < sigmas[1] / sigmas[0] < 200.0
+
+
+def test_a_refined_calibration_that_leaves_the_positions_open_is_a_contradiction() -> None:
+    told = Events()
+    covariance = np.eye(6)[None].repeat(5, 0) * 0.3**2
+    covariance[4] = np.nan
+    (found,) = _left_open(covariance, 2.0, told)
+    assert found.evidence["position_sigma_share"] == pytest.approx(3**0.5 * 0.3 / 2.0)
+    assert "26%" in found.message
+    assert _left_open(covariance, 20.0, told) == []
+    assert len(_left_open(np.full((2, 6, 6), np.nan), 2.0, told)) == 1

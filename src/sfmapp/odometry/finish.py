@@ -33,6 +33,8 @@ MAX_COVARIANCE_KEYFRAMES = 400
 _FIRST_STEPS, _MAX_STEPS, _TOLERANCE = 8, 30, 1e-4
 # A unit of length that is less sure than that is worth a word.
 _SCALE_OPEN = 0.02
+# A map whose positions are not known to a tenth of its size has no shape to speak of.
+_MAX_OPEN_SHARE = 0.1
 # Keyframes of a large map that its cameras are questioned on.
 _NUM_QUESTIONED = 100
 # Residuals are not believed to be better than that, however well a synthetic sequence fits.
@@ -49,6 +51,7 @@ class Conclusion:
         report: numbers for the report.
         contradictions: evidence against the map that stands unresolved.
         scale_sigma: relative standard deviation of the unit of length of a rig; None without one.
+        noise_covariance: (K, 6, 6) what the noise of the observations alone makes of ``covariance``.
     """
 
     covariance: Array | None
@@ -56,6 +59,7 @@ class Conclusion:
     report: dict[str, Any]
     contradictions: list[Contradiction] = field(default_factory=list)
     scale_sigma: float | None = None
+    noise_covariance: Array | None = None
 
 
 def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -> Conclusion:
@@ -80,13 +84,30 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -
     report["sigma_px"] = classify(model, job.num_elsewhere)
     take_over(job, keyframes)
     keyframes.rig = rig_of(model)
-    covariance, gauge = None, ""
+    covariance, noise, gauge, contradictions = None, None, "", list(answer.contradictions)
     if options.covariance and 1 < len(everything) <= MAX_COVARIANCE_KEYFRAMES:
-        covariance, gauge, report["covariance"] = estimate_map_covariance(model, num_sensors, LOSS_SIGMAS * sigma)
-        covariance += of_refinement
+        noise, gauge, report["covariance"] = estimate_map_covariance(model, num_sensors, LOSS_SIGMAS * sigma)
+        covariance = noise + of_refinement
         if answer.pose_covariance is not None:
             covariance += answer.pose_covariance
-    return Conclusion(covariance, gauge, report, answer.contradictions, answer.scale_sigma)
+        if answer.is_refined:
+            contradictions += _left_open(covariance, spread(model), events)
+    return Conclusion(covariance, gauge, report, contradictions, answer.scale_sigma, noise)
+
+
+def _left_open(covariance: Array, size: float, events: Events) -> list[Contradiction]:
+    """A contradiction where a refined calibration leaves the positions (K, 6, 6) open against the size of the map."""
+    known = covariance[np.isfinite(covariance).all((1, 2)), 3:, 3:]
+    share = math.sqrt(max(float(np.median(np.trace(known, axis1=1, axis2=2))), 0.0)) / size if len(known) else math.inf
+    if share < _MAX_OPEN_SHARE:
+        return []
+    message = (
+        "the images contradict the given calibration, and what they say instead is so unsure that positions are open "
+        f"by {share:.0%} of the size of the map"
+    )
+    events.warned(STAGE, message)
+    evidence = {"position_sigma_share": min(share, 1e6), "max_position_sigma_share": _MAX_OPEN_SHARE}
+    return [Contradiction("given calibration", message, "calibrate the camera, or move more and turn", evidence)]
 
 
 def _conclude_large(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -> Conclusion:

@@ -144,7 +144,7 @@ def _map_result(keyframes: KeyframeMap, conclusion: Conclusion) -> MapResult:
         model, np.array([k.frame_idx for k in keyframes.keyframes], np.int64),
         np.arange(num, dtype=np.int64) * num_sensors, covariance, conclusion.gauge,
         "stereo" if num_sensors > 1 else "none", widened_scale_sigma(conclusion.scale_sigma, found), found,
-        _covariance_gap(conclusion, num),
+        _covariance_gap(conclusion, num), conclusion.noise_covariance,
     )  # fmt: skip
 
 

@@ -40,6 +40,8 @@ class MapResult:
         scale_sigma: relative standard deviation of the unit of length; None for an arbitrary unit.
         contradictions: evidence against the map that was not resolved; covariance and scale_sigma hold what it adds.
         covariance_gap: why keyframes lack a covariance; empty where none does, or none was asked for.
+        noise_covariance: (K, 6, 6) the part of ``covariance`` that the noise of the observations makes; the rest
+            (calibration, contradictions) is common to neighbouring keyframes. In the map's first unit of length.
     """
 
     reconstruction: Reconstruction
@@ -51,6 +53,7 @@ class MapResult:
     scale_sigma: float | None = None
     contradictions: list[Contradiction] = field(default_factory=list)
     covariance_gap: str = ""
+    noise_covariance: Array | None = None
 
 
 @dataclass

@@ -218,7 +218,7 @@ def _from_imu(result: OdometryResult, m: int, imu: Imu) -> ScaleEstimate | Scale
     entry = result.maps[m]
     times = result.timestamps_s[np.searchsorted(result.frame_idx, entry.keyframe_frame_idx)]
     poses = entry.reconstruction.cam_from_world[entry.keyframe_image_idx]
-    covariance = entry.covariance
+    covariance = entry.noise_covariance  # what calibration adds moves neighbours alike, and would excuse any residual
     if covariance is not None and not np.isfinite(covariance).any():
         covariance = None  # none could be had: the noise is judged by how the poses fit
     found = align_or_explain(times, poses, imu, is_metric=False, covariance=covariance)
