@@ -87,6 +87,12 @@ def center(cam_from_world: ArrayLike) -> Array:
     return inverse(cam_from_world)[..., 4:]
 
 
+def spread(cam_from_world: ArrayLike) -> float:
+    """Root mean square distance of the camera centres of poses (N, 7) from their middle."""
+    centers = center(cam_from_world)
+    return float(np.sqrt(((centers - centers.mean(0)) ** 2).sum(1).mean()))
+
+
 def exp_so3(w: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians (Rodrigues)."""
     w = np.asarray(w, np.float64)

@@ -439,7 +439,7 @@ def _kept(first: _Look, last: _Look, unknowns: Unknowns, report: dict[str, Any],
     if last is first:
         shift = float(first.system.log_scale[: len(first.x)] @ first.step)
     else:
-        shift = math.log(spread(last.model) / spread(first.model))
+        shift = math.log(rigid3.spread(last.model.cam_from_world) / rigid3.spread(first.model.cam_from_world))
     scale_sigma, report["scale"] = _scale_sigma(first, shift, unknowns)
     return Answer(first.model, False, report, found, scale_sigma)
 
@@ -468,11 +468,6 @@ def _scale_sigma(look: _Look, shift: float, unknowns: Unknowns) -> tuple[float |
     }  # fmt: skip
 
 
-def spread(model: Reconstruction) -> float:
-    """Root mean square distance of the cameras from their middle."""
-    return float(np.sqrt(((model.centers - model.centers.mean(0)) ** 2).sum(1).mean()))
-
-
 def _contradiction(first: _Look, last: _Look, report: dict[str, Any], unknowns: Unknowns) -> Contradiction:
     """The images say clearly that the given calibration is wrong; what is right they do not, or it may not be taken."""
     num_sensors = len(first.model.cameras)
@@ -480,7 +475,7 @@ def _contradiction(first: _Look, last: _Look, report: dict[str, Any], unknowns: 
     moved = similarity.transform_poses(similarity.align_poses(found, given).b_from_a, found)
     turn = rigid3.log_so3(rigid3.rotation_matrix(rigid3.compose(moved, rigid3.inverse(given))))
     shift = rigid3.center(moved) - rigid3.center(given)
-    size = max(spread(first.model), 1e-12)
+    size = max(rigid3.spread(first.model.cam_from_world), 1e-12)
     share = 1.0 if report["is_settled"] else _PART_OF_THE_WAY
     focal = [look.model.cameras[0].focal for look in (first, last)]
     return Contradiction(
@@ -492,5 +487,5 @@ def _contradiction(first: _Look, last: _Look, report: dict[str, Any], unknowns: 
         {k: report[k] for k in ("surprise", "max_surprise", "is_settled", "change")},
         rotation_sigma_deg=share * float(np.degrees(np.sqrt((turn**2).mean()))),
         position_sigma_share=share * float(np.sqrt((shift**2).mean())) / size,
-        scale_sigma=share * abs(math.log(spread(last.model) / size)) if num_sensors > 1 else 0.0,
+        scale_sigma=share * abs(math.log(rigid3.spread(last.model.cam_from_world) / size)) if num_sensors > 1 else 0.0,
     )

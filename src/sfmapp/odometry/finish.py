@@ -14,7 +14,7 @@ from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.backend import classify, make_job, take_over
-from sfmapp.odometry.calibration_check import LOSS_SIGMAS, Answer, adjust_poses, question_calibration, spread
+from sfmapp.odometry.calibration_check import LOSS_SIGMAS, Answer, adjust_poses, question_calibration
 from sfmapp.odometry.keyframe_map import KeyframeMap
 from sfmapp.odometry.map_covariance import covariance_of_refinement, estimate_map_covariance, scale_sigma_of_refinement
 from sfmapp.odometry.options import OdometryOptions
@@ -91,7 +91,7 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -
         if answer.pose_covariance is not None:
             covariance += answer.pose_covariance
         if answer.is_refined:
-            contradictions += _left_open(covariance, spread(model), events)
+            contradictions += _left_open(covariance, rigid3.spread(model.cam_from_world), events)
     return Conclusion(covariance, gauge, report, contradictions, answer.scale_sigma, noise)
 
 
@@ -123,7 +123,7 @@ def _conclude_large(keyframes: KeyframeMap, options: OdometryOptions, events: Ev
     if answer.is_refined:
         keyframes.rig = rig_of(answer.model)
         if answer.model.rig is not None:
-            _rescale(keyframes, spread(answer.model) / spread(job.model))
+            _rescale(keyframes, rigid3.spread(answer.model.cam_from_world) / rigid3.spread(job.model.cam_from_world))
     sweep(keyframes, options, events)
     return Conclusion(None, "", report, answer.contradictions, answer.scale_sigma)
 

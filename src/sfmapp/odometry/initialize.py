@@ -196,16 +196,21 @@ class Beginning:
 
     def _left_between(self, last_from_first: Array, track: NDArray[np.int64], n: int, limit_px: float) -> float:
         """Squared residuals, pixels, of the n-th view where points are made of the first and the last."""
-        camera, first_xy, last_xy, xy = self.camera, self.corners[track], self.seen[-1][track], self.seen[n][track]
-        xn1, xn2 = (pixels_to_normalized(camera, pixels) for pixels in (first_xy, last_xy))
+        first_xy, last_xy, xy = self.corners[track], self.seen[-1][track], self.seen[n][track]
+        xn1, xn2 = (pixels_to_normalized(self.camera, pixels) for pixels in (first_xy, last_xy))
         depths, _ = epipolar.ray_depths(last_from_first, xn1, xn2)
         xyz = np.column_stack([xn1, np.ones(len(xn1))]) * depths[:, :1]
         known = np.isfinite(xy[:, 0]) & (depths > 0).all(1)
-        start = pose_between(rigid3.IDENTITY, last_from_first, n / (len(self.seen) - 1))
-        pose = refine_pose(camera.canonical, camera.is_fisheye, start, xyz[known], xy[known]).cam_from_world
-        squared = ((project(camera, rigid3.apply(pose, xyz[known])) - xy[known]) ** 2).sum(1)
-        squared = np.minimum(np.nan_to_num(squared, nan=limit_px**2), limit_px**2)
+        error = self._errors_between(last_from_first, n, xyz[known], xy[known])
+        squared = np.minimum(np.nan_to_num(error**2, nan=limit_px**2), limit_px**2)
         return float(squared.sum()) + limit_px**2 * int((np.isfinite(xy[:, 0]) & ~known).sum())
+
+    def _errors_between(self, last_from_first: Array, n: int, xyz: Array, xy: Array) -> Array:
+        """(N,) pixels by which points are off in the n-th view, its pose fitted to them; NaN behind the camera."""
+        camera = self.camera
+        start = pose_between(rigid3.IDENTITY, last_from_first, n / (len(self.seen) - 1))
+        pose = refine_pose(camera.canonical, camera.is_fisheye, start, xyz, xy).cam_from_world
+        return np.asarray(np.linalg.norm(project(camera, rigid3.apply(pose, xyz)) - xy, axis=1), np.float64)
 
     def _witnesses(self, track: NDArray[np.int64]) -> list[int]:
         """Views between the first and the last at which the corners had moved by certain shares of their way."""
@@ -227,9 +232,7 @@ class Beginning:
             known = np.isfinite(xy[:, 0])
             if known.sum() < _MIN_POINTS:
                 continue
-            start = pose_between(rigid3.IDENTITY, last_from_first, n / last)
-            pose = refine_pose(camera.canonical, camera.is_fisheye, start, xyz[known], xy[known]).cam_from_world
-            error = np.linalg.norm(project(camera, rigid3.apply(pose, xyz[known])) - xy[known], axis=1)
+            error = self._errors_between(last_from_first, n, xyz[known], xy[known])
             error = np.nan_to_num(error, nan=camera.width)  # a point behind its camera explains nothing
             left += max(0.0, float(np.median(error)) ** 2 - _NOISE_PX**2)
             turned += _left_by_turn(camera, first_xy[known], xy[known]) ** 2

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sfmapp.adjust.clustered import clustered_covariances
 from sfmapp.adjust.covariance import pose_errors_in_gauge
 from sfmapp.adjust.solver import AdjustOptions
-from sfmapp.odometry.calibration_check import spread
+from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -72,4 +72,6 @@ def covariance_of_refinement(given: Reconstruction, refined: Reconstruction, num
 
 def scale_sigma_of_refinement(given: Reconstruction, refined: Reconstruction) -> float:
     """Relative standard deviation that a refined calibration adds to the unit of length of a rig; as above."""
-    return _UNKNOWN_SHARE_OF_SCALE * abs(math.log(spread(refined) / spread(given)))
+    return _UNKNOWN_SHARE_OF_SCALE * abs(
+        math.log(rigid3.spread(refined.cam_from_world) / rigid3.spread(given.cam_from_world))
+    )

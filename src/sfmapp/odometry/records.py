@@ -137,9 +137,8 @@ def _map_result(keyframes: KeyframeMap, conclusion: Conclusion) -> MapResult:
     model, _ = keyframes.reconstruction(np.arange(num))
     covariance, found = conclusion.covariance, conclusion.contradictions
     if covariance is not None:
-        centers = rigid3.center(np.array([k.rig_from_world for k in keyframes.keyframes]))
-        spread = float(np.sqrt(((centers - centers.mean(0)) ** 2).sum(1).mean()))
-        covariance = widened(covariance, spread, found)
+        poses = np.array([k.rig_from_world for k in keyframes.keyframes])
+        covariance = widened(covariance, rigid3.spread(poses), found)
     return MapResult(
         model, np.array([k.frame_idx for k in keyframes.keyframes], np.int64),
         np.arange(num, dtype=np.int64) * num_sensors, covariance, conclusion.gauge,

@@ -220,7 +220,6 @@ def doubt(result: OdometryResult, calibration: dict[str, Any]) -> None:
     for m, entry in enumerate(result.maps):
         covariance = entry.covariance
         if covariance is not None:
-            centers = rigid3.center(entry.reconstruction.cam_from_world[entry.keyframe_image_idx])
-            spread = float(np.sqrt(((centers - centers.mean(0)) ** 2).sum(1).mean()))
-            covariance = widened(covariance, spread, [found])
+            poses = entry.reconstruction.cam_from_world[entry.keyframe_image_idx]
+            covariance = widened(covariance, rigid3.spread(poses), [found])
         result.maps[m] = replace(entry, covariance=covariance, contradictions=[*entry.contradictions, found])
