@@ -33,7 +33,8 @@ class SequenceOptions:
         step: play every step-th frame.
         reverse: play backwards. Time still ascends: a frame of time t comes at first + last - t, so that the intervals
             stay what they are; the truth is mirrored with it, and the IMU, whose rates of rotation change sign.
-        fps: frames a second where the sequence holds no times; None: 10 for KITTI, 30 else, with a note.
+        fps: frames a second, in place of the times that the sequence holds; None: its times, and where it holds none
+            10 for KITTI, 30 else, with a note.
         imu: path of IMU measurements in EuRoC's form, ``sensor.yaml`` beside it. None: what the sequence holds.
         truth: path of a trajectory of TUM, KITTI or EuRoC. None: what the sequence holds.
     """
