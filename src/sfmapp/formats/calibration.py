@@ -162,7 +162,7 @@ def calibration_from_fields(place: str, fields: dict[str, Any], image_sizes: Seq
     """As :func:`read_calibration`, of a JSON-able object; ``place`` begins the messages."""
     fields = vins_fields(place, orb_slam_fields(place, fields))
     rate = fields.get("fps", fields.get("rate_hz"))
-    is_rate = isinstance(rate, int | float) and not isinstance(rate, bool) and 0 < rate < 1e6
+    fps = float(rate) if isinstance(rate, int | float) and not isinstance(rate, bool) and 0 < rate < 1e6 else None
     if "P0" in fields:
         calibration = _from_projections(place, fields, image_sizes, 0)
     elif "M1" in fields or "K1" in fields:
@@ -172,7 +172,7 @@ def calibration_from_fields(place: str, fields: dict[str, Any], image_sizes: Seq
         calibration = (
             _from_sections(place, fields, pair, image_sizes) if pair else _from_one(place, fields, image_sizes)
         )
-    return replace(calibration, frames_per_second=float(rate) if is_rate else None)
+    return replace(calibration, frames_per_second=fps)
 
 
 def _from_one(place: str, fields: dict[str, Any], image_sizes: Sequence[Size]) -> Calibration:
