@@ -100,6 +100,9 @@ def test_repeated_frames_are_skipped(tmp_path: Path) -> None:
     frames[3] = frames[2]
     sequence = open_sequence(write_video(tmp_path / "v.avi", frames), PINHOLE, Events(told.append))
     assert [frame.idx for frame in sequence.frames()] == [0, 1, 2, 4, 5]
+    (repeated,) = sequence.repeated  # type: ignore[attr-defined]  # of files
+    assert (repeated.idx, repeated.name, repeated.twin_idx) == (3, "000003", 2)
+    assert repeated.timestamp_s == pytest.approx(3 / 25)
     assert any("1 of 6 frames repeat" in event.message for event in told if event.kind == "warned")
 
 

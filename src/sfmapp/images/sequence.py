@@ -76,6 +76,21 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class RepeatedFrame:
+    """A frame that shows what the one before it shows, to the byte: a camera that was read twice.
+
+    Attributes:
+        idx, name, timestamp_s: as of :class:`Frame`.
+        twin_idx: ``idx`` of the frame that it repeats.
+    """
+
+    idx: int
+    name: str
+    timestamp_s: float
+    twin_idx: int
+
+
+@dataclass(frozen=True)
 class Imu:
     """Inertial measurements, in the IMU's own frame.
 

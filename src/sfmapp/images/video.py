@@ -24,8 +24,15 @@ from sfmapp.images.containers import (
     open_container,
     read_container_facts,
 )
-from sfmapp.images.frame_reader import LARGEST_FRAME_PX, REPEATED, ProblemTeller, Skipped, read_ahead, resampled
-from sfmapp.images.sequence import Frame, Imu, SequenceKind, SequenceOptions, Truth
+from sfmapp.images.frame_reader import (
+    LARGEST_FRAME_PX,
+    ProblemTeller,
+    Skipped,
+    read_ahead,
+    resampled,
+    skipped_twin,
+)
+from sfmapp.images.sequence import Frame, Imu, RepeatedFrame, SequenceKind, SequenceOptions, Truth
 from sfmapp.scene.rig import Rig
 
 Pixels = NDArray[np.uint8]
@@ -150,6 +157,11 @@ class VideoSequence:
         self.frames_per_second = fps / self.options.step if fps else None
         self._teller = ProblemTeller(self.events)
 
+    @property
+    def repeated(self) -> list[RepeatedFrame]:
+        """Frames that the present walk has left out so far, because they repeat the one before them."""
+        return self._teller.repeated
+
     def frames(self) -> Iterator[Frame]:
         """See :class:`~sfmapp.images.sequence.Sequence`."""
         return self._teller.frames_without_problems(self._items())
@@ -176,6 +188,7 @@ class _VideoReader:
         self._position = 0  # of the next frame in the file
         self._idx = 0
         self._last: Pixels | None = None
+        self._last_idx = -1
         self._last_s = -math.inf
         self._seen_s: list[float] = []  # the first and the last time of the file
         self._start = 0.0
@@ -211,9 +224,10 @@ class _VideoReader:
         camera = self._video.rig.cameras[0]
         if gray.shape != (camera.height, camera.width):
             return Skipped(name, f"{gray.shape[1]}x{gray.shape[0]} pixels, where the video began with other ones")
+        self._last_s = stamp
         if self._last is not None and np.array_equal(gray, self._last):
-            return Skipped(name, REPEATED)
-        self._last, self._last_s = gray, stamp
+            return skipped_twin(idx, name, stamp, self._last_idx)
+        self._last, self._last_idx = gray, idx
         return Frame(idx, name, stamp, (resampled(gray, self._video.sampling[0]),))
 
     def _timestamp(self, position: int, time_s: float | None) -> float:

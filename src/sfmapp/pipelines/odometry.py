@@ -16,7 +16,9 @@ import sfmapp
 from sfmapp.errors import InterruptedRunError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.formats.sequences import open_sequence
+from sfmapp.images.frame_reader import FileSequence
 from sfmapp.images.sequence import Frame, Imu, Sequence, SequenceKind, Truth
+from sfmapp.images.video import VideoSequence
 from sfmapp.odometry.run import run_odometry
 from sfmapp.pipelines.kernels import compile_odometry_kernels
 from sfmapp.pipelines.listeners import DecisionLog, EventLog
@@ -140,6 +142,8 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
             Watched(run.sequence, run), options.odometry, seed=options.seed, threads=run.threads, events=events.deaf()
         )
         run.threads_cpu.sample()
+    if isinstance(run.sequence, FileSequence | VideoSequence):  # frames in memory are all there
+        result = result.with_repeated(run.sequence.repeated)
     run.stages["odometry"] = result.report
     if self_calibrate:
         from sfmapp.pipelines.self_calibrate import doubt

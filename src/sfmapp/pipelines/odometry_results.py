@@ -52,7 +52,7 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
     """Write everything, the report last; returns it."""
     assert run.sequence is not None
     workspace, truth = run.workspace, run.sequence.truth
-    facts = run.frames.facts(result.frame_idx)
+    facts = run.frames.facts(result)
     with run.measured("output"):
         write_trajectories(workspace, result, facts)
         workspace.write_text("frames.csv", _frames_csv(result, facts))
