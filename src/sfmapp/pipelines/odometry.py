@@ -19,6 +19,7 @@ from sfmapp.formats.sequences import open_sequence
 from sfmapp.images.frame_reader import FileSequence
 from sfmapp.images.sequence import Frame, Imu, Sequence, SequenceKind, Truth
 from sfmapp.images.video import VideoSequence
+from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
 from sfmapp.pipelines.kernels import compile_odometry_kernels
 from sfmapp.pipelines.listeners import DecisionLog, EventLog
@@ -33,12 +34,13 @@ from sfmapp.pipelines.workspace import ODOMETRY, open_workspace
 from sfmapp.viewer.live import LiveView, Screen
 
 if TYPE_CHECKING:
-    from sfmapp.odometry.result import OdometryResult
     from sfmapp.scene.rig import Rig
 
 NO_MAP_ADVICE = (
     "the camera has to move sideways past something still and textured; OUT/report.html and -v tell what was seen"
 )
+# What held for this share of the frames is why there is no map.
+_MOST_FRAMES = 0.5
 
 
 class TrackResult(NamedTuple):
@@ -170,9 +172,17 @@ def no_map(run: Tracking, result: OdometryResult) -> NoReconstructionError:
     if seen < 2:
         found = "no frame could be read" if seen == 0 else "only one frame could be read"
         return NoReconstructionError(f"{run.source}: {found}", "-v names the files and what is wrong with them")
+    num_repeated = int((result.frame_state == FrameState.REPEATED).sum())
+    if num_repeated == seen - 1:
+        return NoReconstructionError(f"{run.source}: all {seen} frames show the same picture", NO_MAP_ADVICE)
     text = f"{run.source}: {seen} frames were read, but no map could be begun"
     for against in result.report.get("pairs", []):
         return NoReconstructionError(f"{text}: {against['message']}", against["advice"])
+    looked = {name: result.report.get(f"looked_{name}", 0) for name in ("still", "turned")}
+    if looked["still"] >= _MOST_FRAMES * (seen - num_repeated):
+        text += ": the camera stands still, the picture hardly moves"
+    elif looked["turned"] >= _MOST_FRAMES * (seen - num_repeated):
+        text += ": the camera turns on the spot, or everything is too far away for how far it moves"
     return NoReconstructionError(text, NO_MAP_ADVICE)
 
 
