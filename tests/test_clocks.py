@@ -180,6 +180,16 @@ def test_dates_and_counters_are_no_times(tmp_path: Path, kind: str) -> None:
         assert [frame.timestamp_s for frame in frames] == [i / (fps or 30) for i in range(40)]
 
 
+@pytest.mark.parametrize(("unit", "rate"), [("s", 20), ("ms", 20), ("us", 30), ("ns", 10)])
+def test_text_around_times_since_1970(tmp_path: Path, unit: str, rate: int) -> None:
+    texts = [written(ns, unit) for ns in stamps_ns("1970", rate)]
+    for form in ("left_{}_rect", "cam0_{}", "{}-cam1"):
+        write_frames(tmp_path / form, [f"{form.format(text)}.png" for text in texts])
+        assert [frame.timestamp_s for frame in opened(tmp_path / form).frames()] == seconds(texts, unit)
+    write_frames(tmp_path / "b", [f"left_{50 * i}.png" for i in range(COUNT)])
+    assert [frame.timestamp_s for frame in opened(tmp_path / "b").frames()] == [50 * i / 30 for i in range(COUNT)]
+
+
 def test_every_third_of_a_counter_is_time_that_went_by(tmp_path: Path) -> None:
     write_frames(tmp_path, [f"{i:06d}.png" for i in range(0, 60, 3)])
     assert [frame.timestamp_s for frame in opened(tmp_path, fps=30).frames()] == [i / 30 for i in range(0, 60, 3)]

@@ -179,18 +179,23 @@ def times_of_names(stems: Sequence[str]) -> Array | None:
     """(N,) seconds, where the names of files (without ending) are times; None where they are dates, counters or text.
 
     Times are numbers in order, with a decimal point in seconds, without one in the unit in which the frames come at a
-    plausible rate; evenly, and since 1970 or since a machine was switched on.
+    plausible rate; evenly, and since 1970 or since a machine was switched on. With text around the numbers, the same in
+    all names, only times since 1970 are told from counters.
     """
-    if not stems or not all(re.fullmatch(r"\d{1,20}(\.\d+)?", stem) for stem in stems) or are_dates(stems):
+    before, after = _text_around(stems)
+    numbers = [stem[len(before) : len(stem) - len(after)] for stem in stems]
+    if not numbers or not all(re.fullmatch(r"\d{1,20}(\.\d+)?", number) for number in numbers) or are_dates(stems):
         return None
-    values = [parse_time(stem) for stem in stems]
+    values = [parse_time(number) for number in numbers]
     if any(b <= a for a, b in pairwise(values)):
         return None
-    is_whole = all("." not in stem for stem in stems)
-    if not is_whole and not all("." in stem for stem in stems):
+    is_whole, is_bare = "." not in "".join(numbers), not before + after
+    if not is_whole and not all("." in number for number in numbers):
         return None
     found = read_column("", values, "s")
     seconds, is_epoch = found.seconds, _EPOCH_OF_NAMES_S[0] <= found.seconds[0] < _EPOCH_OF_NAMES_S[1]
+    if not is_bare and not is_epoch:
+        return None
     if len(seconds) == 1:
         return seconds if is_epoch or not is_whole else None
     step = _step(seconds)
@@ -198,11 +203,25 @@ def times_of_names(stems: Sequence[str]) -> Array | None:
         return None
     if is_whole:  # nobody follows a camera from one whole second to the next
         raw = np.array([float(value) for value in values])
-        if found.unit == "s" or not (is_epoch or _count_time(raw, stems)):
+        if found.unit == "s" or not (is_epoch or _count_time(raw, numbers)):
             return None
     steps = np.diff(seconds)
     is_even = np.mean(np.abs(steps / step - 1) <= 0.5) >= _LEAST_EVEN_SHARE
     return seconds if is_epoch or not is_whole or is_even else None
+
+
+def _text_around(stems: Sequence[str]) -> tuple[str, str]:
+    """What all names have before and behind their numbers: ``cam0_`` and ``_rect``."""
+    if len(stems) < 2:
+        return "", ""
+    before = re.sub(r"[\d.]*$", "", _common_beginning(stems))
+    return before, re.sub(r"[\d.]*$", "", _common_beginning([stem[len(before) :][::-1] for stem in stems]))[::-1]
+
+
+def _common_beginning(texts: Sequence[str]) -> str:
+    first, last = min(texts), max(texts)  # what these two share, all between them do
+    length = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), min(len(first), len(last)))
+    return first[:length]
 
 
 def _count_time(values: Array, stems: Sequence[str]) -> bool:
