@@ -30,6 +30,7 @@ STARTS = {
     "just on": 10**9,
     "boot": 612_345_000_000,
     "a week": 7 * 86_400 * 10**9,
+    "a month": 30 * 86_400 * 10**9,
     "1970": 1_714_564_797 * 10**9,
 }
 COUNT = 12
@@ -272,6 +273,20 @@ def test_a_column_is_one_clock(values: list[int], unit: str) -> None:
     found = read_column("test", [Decimal(value) for value in values], unit)  # type: ignore[arg-type]
     assert found.seconds.tolist() == [float(Decimal(value).scaleb(-UNITS[found.unit])) for value in values]
     assert bool(found.note) == (found.unit != unit)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("1305031102.1 1305031162.2 1305031222.3", "s"),  # poses a minute apart
+        ("0 5 10 15", "s"), ("0.5 12.5 24", "s"), ("0 33.3 66.7", "ms"), ("0 33 67 100", "ms"), ("0 8 17 25", "ms"),
+        ("2592000000 2592000033 2592000067", "ms"), ("2592000000000 2592000005000", "us"),
+        ("0.000000e+00 1.036e-01 2.07e-01", "s"), ("1.403636579763555584e+18 1.403636579813555456e+18", "ns"),
+        ("1305031102175", "ms"), ("17", "s"),
+    ],
+)  # fmt: skip
+def test_units_of_columns_in_seconds(text: str, unit: str) -> None:
+    assert read_column("test", [parse_time(field) for field in text.split()], "s").unit == unit
 
 
 def test_a_single_name_and_none() -> None:

@@ -25,16 +25,16 @@ _DIGITS: dict[Unit, int] = {"s": 0, "ms": 3, "us": 6, "ns": 9}
 _NAMES: dict[Unit, str] = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 # A larger number is no time in any unit.
 _LARGEST = Decimal(10) ** 20
-# Frames and poses come less than 8 s and 0.5 s to 2000 s apart in the units in question: a file in seconds is believed
-# up to the first, whole numbers beyond it are finer units, each begins where the next coarser one would mean 2 s.
+# A file in seconds is believed while its whole numbers are less than 8 apart. Beyond that a unit is as fine as it takes
+# for frames and poses to come at least once in two seconds.
 _LARGEST_STEP = {"s": 8.0, "ms": 2e3, "us": 2e6}
 # With digits behind the point, seconds are believed for longer: key frames that were written sparsely.
 _LARGEST_STEP_WITH_FRACTION = 20.0
 # EuRoC's nanoseconds are believed up to 5000 measurements a second.
 _LEAST_STEP_NS = 2e5
-# Clocks since 1970 in a file: 2000 to 2100; such seconds may be an hour apart.
+# Clocks since 1970 in a file: 2000 to 2100. With a fraction these are seconds, also where they are minutes apart.
 _EPOCH_S = (946684800.0, 4102444800.0)
-_LARGEST_EPOCH_STEP = {"s": 3600.0, "ms": 2e4}
+_LARGEST_STEP_SINCE_1970 = 3600.0
 # Two clocks of one recording overlap by more than this share; in another unit they do so by a thousandth.
 _LEAST_OVERLAP = 0.005
 
@@ -105,11 +105,8 @@ def _unit(values: Array, expected: Unit, is_whole: bool) -> Unit:
         return expected if expected == "ns" else _unit_of_size(middle)
     if expected == "ns" and step >= _LEAST_STEP_NS:
         return "ns"
-    for unit in ("s", "ms"):
-        since_1970 = middle / 10.0 ** _DIGITS[unit]
-        if _EPOCH_S[0] <= since_1970 < _EPOCH_S[1] and step < _LARGEST_EPOCH_STEP[unit]:
-            return unit
-    if not is_whole and step < _LARGEST_STEP_WITH_FRACTION:
+    is_epoch = _EPOCH_S[0] <= middle < _EPOCH_S[1]
+    if not is_whole and step < (_LARGEST_STEP_SINCE_1970 if is_epoch else _LARGEST_STEP_WITH_FRACTION):
         return "s"
     return next((unit for unit in ("s", "ms", "us") if step < _LARGEST_STEP[unit]), "ns")
 

@@ -22,7 +22,9 @@ _TYPE_KEYS = (
     "projection_type", "projection_model", "model", "type",
 )  # fmt: skip
 # What such keys hold that says nothing of the lens.
-_OF_OTHER_THINGS = frozenset({"", "camera", "mono", "monocular", "stereo", "rgb", "gray", "grey", "color", "image"})
+_OF_OTHER_THINGS = frozenset({
+    "", "camera", "sensor", "calibration", "intrinsics", "mono", "monocular", "stereo", "rgb", "gray", "grey", "color",
+})  # fmt: skip
 _FISHEYE_KEYS = ("fisheye_model", "is_fisheye", "fisheye", "fish_eye")
 # ORB-SLAM3 calls it KannalaBrandt8; Kalibr equidistant; OpenCV fisheye; RealSense kannala_brandt4; VINS-Fusion
 # KANNALA_BRANDT; COLMAP OPENCV_FISHEYE.

@@ -6,6 +6,7 @@ after another (interlaced video) are made whole frames by FFmpeg's ``bwdif``, at
 
 from __future__ import annotations
 
+import os
 import re
 from collections import deque
 from collections.abc import Iterator
@@ -34,6 +35,8 @@ _PROTOCOLS_OF_FILES = "file,crypto,data"
 _PROTOCOLS_OF_STREAMS = "http,https,httpproxy,tcp,tls,udp,rtp,rtsp,rtmp,rtmps,rtmpt,srt,crypto,data"
 # Packets that are decoded to find a first frame: streams are tuned in to between two key frames.
 _PACKETS_TO_FIRST_FRAME = 1000
+# Beyond that, reading a file to count its frames takes longer than the number is worth.
+_LARGEST_COUNTED_BYTES = 1 << 32
 _ADVICE = "try to play it, or convert it: ffmpeg -i VIDEO -c:v libx264 video.mp4"
 _FULL_RANGE = 2
 # Formats whose first plane is the luma, in 8 bits or in 16 with the low byte first.
@@ -168,19 +171,26 @@ def _end_of(container: InputContainer, stream: VideoStream) -> float | None:
 
 
 def _count_packets(source: str) -> tuple[int | None, float | None]:
-    """Number of frames and their mean rate, from the packets: the file is read once, and nothing is decoded."""
+    """Number of frames and their mean rate, from the packets: the file is read once, and nothing is decoded; None of a
+    file too large for that."""
     import av
 
-    times: list[Fraction] = []
+    if os.path.getsize(source) > _LARGEST_COUNTED_BYTES:
+        return None, None
+    count, first, last = 0, None, None
     with closing(open_container(source, is_stream=False)) as container:
+        stream = best_stream(container)
         try:
-            for packet in container.demux(best_stream(container)):
-                if packet.size and packet.pts is not None and packet.time_base is not None:
-                    times.append(packet.pts * packet.time_base)
+            for packet in container.demux(stream):
+                count += packet.size > 0
+                if packet.size and packet.pts is not None:
+                    first = packet.pts if first is None else min(first, packet.pts)
+                    last = packet.pts if last is None else max(last, packet.pts)
         except (av.FFmpegError, OSError):  # it was cut off: what is there counts
             pass
-    span = max(times) - min(times) if times else Fraction(0)
-    return len(times) or None, _rate((len(times) - 1) / span) if span else None
+        if first is None or last is None or last == first or stream.time_base is None:
+            return count or None, None
+        return count or None, _rate((count - 1) / ((last - first) * stream.time_base))
 
 
 def decoded_frames(container: InputContainer) -> Iterator[DecodedFrame | Damaged]:
