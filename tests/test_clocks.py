@@ -138,6 +138,21 @@ def test_whole_numbers_of_euroc_are_nanoseconds(tmp_path: Path, rate: int, unit:
         assert [frame.timestamp_s for frame in opened(tmp_path / start).frames()] == expected
 
 
+@pytest.mark.parametrize("options", [{}, {"reverse": True}, {"start": 3, "step": 2}])
+def test_where_a_clock_begins_has_no_part_in_what_has_elapsed(tmp_path: Path, options: dict[str, object]) -> None:
+    """A time since 1970 is known to a quarter of a microsecond, which would make another trajectory in the last digits."""
+    found = []
+    for start in STARTS:
+        as_euroc(tmp_path / start, [written(ns, "ns") for ns in stamps_ns(start, 30)])
+        sequence = opened(tmp_path / start, **options)
+        assert sequence.imu is not None
+        assert sequence.imu.elapsed_s is not None
+        times = np.array([[frame.timestamp_s, frame.elapsed_s] for frame in sequence.frames()])
+        np.testing.assert_allclose(np.diff(times[:, 0]), np.diff(times[:, 1]), atol=1e-6)
+        found.append((times[:, 1].tolist(), sequence.imu.elapsed_s.tolist()))
+    assert all(other == found[0] for other in found)
+
+
 def test_an_imu_is_read_in_the_unit_in_which_it_fits_the_frames(tmp_path: Path) -> None:
     as_euroc(tmp_path, [written(ns, "us") for ns in stamps_ns("boot", 20)])
     ticks = [612_345_000 + 1000 * i for i in range(560)]  # 1 kHz: as milliseconds, frames of 1 a second
@@ -292,5 +307,5 @@ def test_units_of_columns_in_seconds(text: str, unit: str) -> None:
 def test_a_single_name_and_none() -> None:
     assert times_of_names([]) is None
     assert times_of_names(["17"]) is None
-    assert times_of_names(["1714564797123456789"]).tolist() == [1714564797.123456789]  # type: ignore[union-attr]
+    assert times_of_names(["1714564797123456789"]).seconds.tolist() == [1714564797.123456789]  # type: ignore[union-attr]
     assert not are_dates([])

@@ -244,7 +244,9 @@ def test_times_are_as_the_container_has_them(tmp_path: Path, ending: str, start_
     path = encode(tmp_path / f"v.{ending}", moving(30), pts=pts)
     told: list[Event] = []
     sequence = open_sequence(path, SequenceOptions(camera="PINHOLE,50,50,48,32"), Events(told.append))
-    times = np.array([frame.timestamp_s for frame in sequence.frames()])
+    times, elapsed = np.array([[frame.timestamp_s, frame.elapsed_s] for frame in sequence.frames()]).T
+    if ending == "mkv":  # in whole milliseconds
+        assert elapsed.tolist() == [float(Fraction(int(t - pts[0]), 1000)) for t in pts]
     if ending == "ts":  # the muxer leaves time for the buffer of a player before the first frame
         times -= times[0] - pts[0] / 1000
     np.testing.assert_allclose(times, pts / 1000, rtol=0, atol=2e-4)

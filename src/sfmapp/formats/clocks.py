@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from decimal import Decimal
 from itertools import pairwise
@@ -47,11 +47,20 @@ class Times:
         seconds: (N,) in the order of the column.
         unit: what it is written in.
         note: where that is not the unit of the format, a sentence that says so; empty otherwise.
+        origin: seconds of the first time, exactly. elapsed_s: (N,) since then, or since another origin: without the
+            quarter of a microsecond that a clock since 1970 is rounded by. Both None where they are not known.
     """
 
     seconds: Array
     unit: Unit
     note: str = ""
+    origin: Decimal | None = None
+    elapsed_s: Array | None = None
+
+    def at(self, rows: NDArray[np.int64]) -> Times:
+        """Those at some positions."""
+        elapsed = None if self.elapsed_s is None else self.elapsed_s[rows]
+        return replace(self, seconds=self.seconds[rows], elapsed_s=elapsed)
 
 
 def parse_time(text: str) -> Decimal:
@@ -66,7 +75,13 @@ def parse_time(text: str) -> Decimal:
     return value
 
 
-def read_column(place: str, values: Sequence[Decimal], unit: Unit, like: Array | None = None) -> Times:
+def read_column(
+    place: str,
+    values: Sequence[Decimal],
+    unit: Unit,
+    like: Array | None = None,
+    origin: Decimal | None = None,
+) -> Times:
     """Seconds of a column of times.
 
     Args:
@@ -75,6 +90,7 @@ def read_column(place: str, values: Sequence[Decimal], unit: Unit, like: Array |
             seconds in any format.
         like: (M,) seconds of another clock of the same recording; of two units that are possible, the one in which both
             are of the same time is right.
+        origin: of the elapsed time; None: the first of the values.
     """
     floats = np.array([float(value) for value in values], np.float64)
     is_whole = all(value == value.to_integral_value() for value in values)
@@ -84,13 +100,15 @@ def read_column(place: str, values: Sequence[Decimal], unit: Unit, like: Array |
         others: list[Unit] = [other for other in _DIGITS if other != found]
         fitting = [u for u in (found, *others) if _overlap(floats / 10.0 ** _DIGITS[u], like) > _LEAST_OVERLAP]
         found = fitting[0] if fitting else found
-    seconds = np.array([float(value.scaleb(-_DIGITS[found])) for value in values], np.float64)
+    exact = [value.scaleb(-_DIGITS[found]) for value in values]
+    origin = exact[0] if origin is None and exact else origin
     note = ""
     if found != expected:
         note = (
             f"{place}: times are {_step(floats):.10g} apart: they are read as {_NAMES[found]}, not {_NAMES[expected]}"
         )
-    return Times(seconds, found, note)
+    elapsed = None if origin is None else np.array([float(value - origin) for value in exact], np.float64)
+    return Times(np.array([float(value) for value in exact], np.float64), found, note, origin, elapsed)
 
 
 def _step(values: Array) -> float:
@@ -172,8 +190,8 @@ def _moment(pattern: re.Pattern[str], stem: str) -> tuple[datetime, str] | None:
     return moment, fraction[0] if fraction else ""
 
 
-def times_of_names(stems: Sequence[str]) -> Array | None:
-    """(N,) seconds, where the names of files (without ending) are times; None where they are dates, counters or text.
+def times_of_names(stems: Sequence[str]) -> Times | None:
+    """N times, where the names of files (without ending) are times; None where they are dates, counters or text.
 
     Times are numbers in order, with a decimal point in seconds, without one in the unit in which the frames come at a
     plausible rate; evenly, and since 1970 or since a machine was switched on. With text around the numbers, the same in
@@ -194,7 +212,7 @@ def times_of_names(stems: Sequence[str]) -> Array | None:
     if not is_bare and not is_epoch:
         return None
     if len(seconds) == 1:
-        return seconds if is_epoch or not is_whole else None
+        return found if is_epoch or not is_whole else None
     step = _step(seconds)
     if not (is_epoch or abs(seconds).max() < _LONGEST_UPTIME_S) or step > _LARGEST_STEP_S:
         return None
@@ -204,7 +222,7 @@ def times_of_names(stems: Sequence[str]) -> Array | None:
             return None
     steps = np.diff(seconds)
     is_even = np.mean(np.abs(steps / step - 1) <= 0.5) >= _LEAST_EVEN_SHARE
-    return seconds if is_epoch or not is_whole or is_even else None
+    return found if is_epoch or not is_whole or is_even else None
 
 
 def _text_around(stems: Sequence[str]) -> tuple[str, str]:

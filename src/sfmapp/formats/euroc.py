@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.calibration import Calibration, read_calibration, read_pose
-from sfmapp.formats.clocks import parse_time, read_column
+from sfmapp.formats.clocks import Times, parse_time, read_column
 from sfmapp.formats.flat_yaml import read_flat_yaml
 from sfmapp.formats.sequence_files import (
     Recording,
@@ -90,7 +90,7 @@ def read_euroc_sequence(mav: Path, events: Events, only: str | None = None) -> R
         if body_from_cam is None:
             events.warned(STAGE, f"{mav / 'imu0'} is not used: no calibration says where it sits (T_BS)")
         else:
-            imu, note = read_imu(mav / "imu0" / "data.csv", body_from_cam, times.seconds)
+            imu, note = read_imu(mav / "imu0" / "data.csv", body_from_cam, times)
             notes.append(note)
     for name in _TRUTH_FOLDERS:
         if (mav / name / "data.csv").is_file():
@@ -148,19 +148,20 @@ def _read_rig(mav: Path, cameras: list[str], sizes: tuple[Size, ...]) -> Calibra
     return replace(parts[0], rig=rig, lenses=(parts[0].lenses[0], parts[1].lenses[0]), notes=notes)
 
 
-def read_imu(path: Path, body_from_cam: Array, frames_s: Array | None = None) -> tuple[Imu, str]:
+def read_imu(path: Path, body_from_cam: Array, frames: Times | None = None) -> tuple[Imu, str]:
     """Measurements of ``data.csv`` (time in ns, gyro in rad/s, accelerometer in m/s^2), noise of ``sensor.yaml`` by it;
     and a note if its times are in another unit.
 
     Args:
         body_from_cam: (7,) pose of the first camera in the frame of the body, which ``T_BS`` of the IMU relates to.
-        frames_s: (N,) seconds of the frames on the same clock; None if they are not known.
+        frames: times of the frames on the same clock; None if they are not known.
 
     Raises:
         InputError: a file cannot be read or is not what it should be.
     """
     stamps, table = read_number_table(path, 7)
-    times = read_column(str(path), stamps, "ns", frames_s)
+    like, origin = (None, None) if frames is None else (frames.seconds, frames.origin)
+    times = read_column(str(path), stamps, "ns", like, origin)
     table[:, 0] = times.seconds
     fields: dict[str, Any] = {}
     if (path.parent / "sensor.yaml").is_file():
@@ -188,6 +189,7 @@ def read_imu(path: Path, body_from_cam: Array, frames_s: Array | None = None) ->
         noise["accelerometer_noise_density"],
         noise["gyroscope_random_walk"],
         noise["accelerometer_random_walk"],
+        None if origin is None or times.elapsed_s is None else times.elapsed_s[kept],
     )
     return imu, times.note
 

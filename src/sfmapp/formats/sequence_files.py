@@ -8,7 +8,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path, PurePosixPath
@@ -206,8 +206,7 @@ def frame_numbers(paths: Sequence[Path]) -> NDArray[np.int64] | None:
 
 def times_in_names(paths: Sequence[Path]) -> Times | None:
     """Seconds of the frames where their names are times (see :func:`~sfmapp.formats.clocks.times_of_names`)."""
-    seconds = times_of_names([path.stem for path in paths])
-    return None if seconds is None else Times(seconds, "s")
+    return times_of_names([path.stem for path in paths])
 
 
 def rows_of_frames(num_rows: int, paths: Sequence[Path]) -> NDArray[np.int64] | None:
@@ -258,7 +257,7 @@ def times_of_rows(path: Path, paths: Sequence[Path]) -> Times:
             f"{path}: expected a line for each of {len(paths)} frames, found {len(times.seconds)}",
             "take the file away and give the rate with --fps, or complete it",
         )
-    return replace(times, seconds=times.seconds[rows])
+    return times.at(rows)
 
 
 def in_order(truth: Truth) -> Truth:

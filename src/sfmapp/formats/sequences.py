@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.calibration import Calibration, camera_from_text, read_calibration
-from sfmapp.formats.clocks import are_dates
+from sfmapp.formats.clocks import Times, are_dates
 from sfmapp.formats.euroc import euroc_truth, find_mav, read_euroc_sequence, read_imu
 from sfmapp.formats.kitti import FRAMES_PER_SECOND as KITTI_FPS
 from sfmapp.formats.kitti import is_kitti, read_kitti, read_kitti_sequence
@@ -241,7 +241,7 @@ def _sequence(
     calibration = _calibration(options.camera, folders, recording.calibration, recording.kind == "tum", sizes)
     rig = _rig(source, calibration, sizes, first[0], events, require_camera)
     clock = _clock(recording, first, options, calibration, events)
-    times = clock.frames_s
+    times, elapsed = clock.frames_s, clock.elapsed_s
     body_from_cam = calibration.body_from_cam if calibration else None
     truth = clock.moved(_truth(recording, options.truth, clock.own_s, first, body_from_cam, events))
     _warn_of_foreign_truth(truth, times, events)
@@ -256,7 +256,7 @@ def _sequence(
     if not len(played):
         raise InputError(f"{source}: expected frames from {options.start} to {options.stop}, found {len(kept)} in all")
     if options.reverse:
-        played, times, truth, imu = _mirrored(played, times, truth, imu)
+        played, times, elapsed, truth, imu = _mirrored(played, times, elapsed, truth, imu)
     fps = 1 / float(np.median(np.diff(times[played]))) if len(played) > 1 else clock.frames_per_second
     sequence = FileSequence(
         recording.kind,
@@ -270,6 +270,7 @@ def _sequence(
         imu,
         truth,
         events,
+        None if elapsed is None else elapsed[played],
     )
     _tell(sequence, events)
     return sequence
@@ -283,11 +284,18 @@ class _Clock:
         frames_s: (N,) seconds that they are played with.
         own_s: (N,) what the sequence says, which truth and IMU go by; the same array unless a rate was given instead.
         frames_per_second: the rate that they were made from; None where they were not.
+        own: the sequence's times where they are played as they are; None otherwise.
     """
 
     frames_s: Array
     own_s: Array
     frames_per_second: float | None = None
+    own: Times | None = None
+
+    @property
+    def elapsed_s(self) -> Array | None:
+        """(N,) see :class:`~sfmapp.images.sequence.Frame`."""
+        return None if self.own is None else self.own.elapsed_s
 
     def moved(self, truth: Truth | None) -> Truth | None:
         """Poses at times of the sequence's own clock at those that are played; all others as they are."""
@@ -313,7 +321,7 @@ def _clock(
     for note in (*((own.note,) if own is not None and own.note else ()), *recording.notes):
         events.decided(STAGE, note)
     if own is not None and options.fps is None:
-        return _Clock(own.seconds, own.seconds)
+        return _Clock(own.seconds, own.seconds, own=own)
     fps, reason = options.fps, "as given"
     if fps is None and calibration is not None and calibration.frames_per_second is not None:
         fps, reason = calibration.frames_per_second, "as the calibration says"
@@ -336,7 +344,7 @@ def _imu(
 ) -> Imu | None:
     """The user's IMU, or the sequence's own, unless a rate was given in place of the clock that the two share."""
     if options.imu is not None:
-        return _given_imu(options.imu, body_from_cam, clock.frames_s, events)
+        return _given_imu(options.imu, body_from_cam, clock.own, events)
     if recording.imu is not None and clock.own_s is not clock.frames_s:
         events.warned(STAGE, "the IMU is not used: it shares the clock of the sequence, in whose place --fps was given")
         return None
@@ -401,7 +409,7 @@ def _read_truth(
     return Truth(times[order], poses[order])
 
 
-def _given_imu(given: str, body_from_cam: Array | None, times: Array | None, events: Events) -> Imu:
+def _given_imu(given: str, body_from_cam: Array | None, times: Times | None, events: Events) -> Imu:
     path = Path(given) / "data.csv" if Path(given).is_dir() else Path(given)
     if body_from_cam is None:
         raise InputError(
@@ -415,17 +423,21 @@ def _given_imu(given: str, body_from_cam: Array | None, times: Array | None, eve
 
 
 def _mirrored(
-    played: NDArray[np.int64], times: Array, truth: Truth | None, imu: Imu | None
-) -> tuple[NDArray[np.int64], Array, Truth | None, Imu | None]:
+    played: NDArray[np.int64], times: Array, elapsed: Array | None, truth: Truth | None, imu: Imu | None
+) -> tuple[NDArray[np.int64], Array, Array | None, Truth | None, Imu | None]:
     """Everything backwards in time, on a clock that still ascends: t becomes first + last - t."""
     total = float(times[played[0]] + times[played[-1]])
+    total_elapsed = 0.0 if elapsed is None else float(elapsed[played[0]] + elapsed[played[-1]])
     if truth is not None:
         truth = Truth(total - truth.timestamps_s[::-1], truth.cam_from_world[::-1].copy())
     if imu is not None:
         # a rotation runs the other way round; an acceleration, the second derivative, is what it was
         back = total - imu.timestamps_s[::-1]
-        imu = replace(imu, timestamps_s=back, gyro=-imu.gyro[::-1], accel=imu.accel[::-1].copy())
-    return played[::-1], total - times, truth, imu
+        back_elapsed = None if imu.elapsed_s is None else total_elapsed - imu.elapsed_s[::-1]
+        imu = replace(
+            imu, timestamps_s=back, gyro=-imu.gyro[::-1], accel=imu.accel[::-1].copy(), elapsed_s=back_elapsed
+        )
+    return played[::-1], total - times, None if elapsed is None else total_elapsed - elapsed, truth, imu
 
 
 def _open_video(source: str, options: SequenceOptions, events: Events, require_camera: bool) -> VideoSequence:

@@ -68,7 +68,7 @@ class DecodedFrame:
     how it is stored: see :func:`gray_of`."""
 
     frame: VideoFrame
-    time_s: float | None
+    time_s: Fraction | None
     turn: tuple[bool, bool, bool]
 
 
@@ -195,14 +195,14 @@ def _count_packets(source: str) -> tuple[int | None, float | None]:
 
 def decoded_frames(container: InputContainer) -> Iterator[DecodedFrame | Damaged]:
     """The frames of a container in the order in which they are shown, deinterlaced; damage in between is told."""
-    times: deque[float | None] = deque()
+    times: deque[Fraction | None] = deque()
     turns: deque[tuple[bool, bool, bool]] = deque()
     filters = None
     for item in _raw_frames(container):
         if isinstance(item, Damaged):
             yield item
             continue
-        time_s = float(item.pts * item.time_base) if item.pts is not None and item.time_base is not None else None
+        time_s = item.pts * item.time_base if item.pts is not None and item.time_base is not None else None
         if filters is None and not item.interlaced_frame:
             yield DecodedFrame(item, time_s, _turn_of(item))
             continue
@@ -218,7 +218,7 @@ def decoded_frames(container: InputContainer) -> Iterator[DecodedFrame | Damaged
 
 
 def _paired(
-    frames: Iterator[VideoFrame], times: deque[float | None], turns: deque[tuple[bool, bool, bool]]
+    frames: Iterator[VideoFrame], times: deque[Fraction | None], turns: deque[tuple[bool, bool, bool]]
 ) -> Iterator[DecodedFrame]:
     for frame in frames:
         yield DecodedFrame(frame, times.popleft(), turns.popleft())

@@ -214,7 +214,8 @@ class _FileReader:
         if is_repeated:
             return skipped_twin(idx, name, timestamp_s, self._last_idx)
         self._last_idx = idx
-        return Frame(idx, name, timestamp_s, tuple(images))
+        elapsed_s = None if sequence.elapsed_s is None else float(sequence.elapsed_s[idx])
+        return Frame(idx, name, timestamp_s, tuple(images), elapsed_s)
 
     def _decode(self, camera_idx: int, data: bytes) -> Pixels:
         header, camera = read_header(data), self._sequence.rig.cameras[camera_idx]
@@ -236,6 +237,7 @@ class FileSequence:
         paths: for each frame, one file for each camera of the rig; that of the first alone where the others lack it.
         sampling: for each camera, where the pixels of its frames are found in the files, see :func:`resampled`.
         events: told about frames that are left out.
+        elapsed_s: (N,) see :class:`~sfmapp.images.sequence.Frame`.
     """
 
     kind: SequenceKind
@@ -249,6 +251,7 @@ class FileSequence:
     imu: Imu | None
     truth: Truth | None
     events: Events
+    elapsed_s: NDArray[np.float64] | None = None
     num_frames: int | None = field(init=False)
 
     def __post_init__(self) -> None:

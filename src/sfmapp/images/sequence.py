@@ -67,12 +67,15 @@ class Frame:
         name: the file of the first camera relative to the sequence, or ``000123`` in a video.
         timestamp_s: seconds, strictly ascending.
         images: one (H, W) uint8 grey image for each camera of the rig; the first alone where the others lack it.
+        elapsed_s: seconds since the sequence began, which a clock since 1970 tells to a quarter of a microsecond only;
+            None where nothing more exact than ``timestamp_s`` is known.
     """
 
     idx: int
     name: str
     timestamp_s: float
     images: tuple[NDArray[np.uint8], ...]
+    elapsed_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,7 @@ class Imu:
         imu_from_cam: (7,) pose that takes points of the rig's first camera to the IMU's frame, in metres.
         gyro_noise, accel_noise: white noise densities, rad/s/sqrt(Hz) and m/s^2/sqrt(Hz).
         gyro_walk, accel_walk: random walks of the biases, rad/s^2/sqrt(Hz) and m/s^3/sqrt(Hz).
+        elapsed_s: (M,) on the clock of :attr:`Frame.elapsed_s`; None where that is not known.
     """
 
     timestamps_s: Array
@@ -110,6 +114,7 @@ class Imu:
     accel_noise: float
     gyro_walk: float
     accel_walk: float
+    elapsed_s: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import partial
 from typing import Any
 
@@ -99,7 +100,7 @@ class _Unread:
     """A frame of which it is not yet known whether it is wanted."""
 
     gray: Callable[[], Pixels]
-    time_s: float | None
+    time_s: Fraction | None
 
 
 def _walk_through(source: str) -> _Walk:
@@ -190,7 +191,8 @@ class _VideoReader:
         self._last: Pixels | None = None
         self._last_idx = -1
         self._last_s = -math.inf
-        self._seen_s: list[float] = []  # the first and the last time of the file
+        self._seen: list[Fraction] = []  # the first and the last time of the file
+        self._origin: Fraction | None = None
         self._start = 0.0
         self._has_ended = False
 
@@ -212,7 +214,7 @@ class _VideoReader:
             if item is None:
                 return self._end()
             if isinstance(item, _Unread) and item.time_s is not None:
-                self._seen_s[1:] = [item.time_s]
+                self._seen[1:] = [item.time_s]
             self._position += 1
             if self._position > position:
                 break
@@ -221,6 +223,7 @@ class _VideoReader:
         if isinstance(item, Damaged):
             return Skipped(name, "cannot be decoded: its data are damaged")
         stamp, gray = self._timestamp(position, item.time_s), item.gray()
+        elapsed_s = self._elapsed(stamp, item.time_s)
         camera = self._video.rig.cameras[0]
         if gray.shape != (camera.height, camera.width):
             return Skipped(name, f"{gray.shape[1]}x{gray.shape[0]} pixels, where the video began with other ones")
@@ -228,18 +231,27 @@ class _VideoReader:
         if self._last is not None and np.array_equal(gray, self._last):
             return skipped_twin(idx, name, stamp, self._last_idx)
         self._last, self._last_idx = gray, idx
-        return Frame(idx, name, stamp, (resampled(gray, self._video.sampling[0]),))
+        return Frame(idx, name, stamp, (resampled(gray, self._video.sampling[0]),), elapsed_s)
 
-    def _timestamp(self, position: int, time_s: float | None) -> float:
+    def _timestamp(self, position: int, time_s: Fraction | None) -> float:
         fps = self._video.options.fps
         if fps is not None:
             return position / fps
         if self._is_live:
             return max(time.monotonic() - self._start, self._last_s + 1e-6)
-        if time_s is not None and time_s > self._last_s:
-            return time_s
+        if time_s is not None and float(time_s) > self._last_s:
+            return float(time_s)
         step = 1 / (self._video.facts.fps or DEFAULT_FPS)
         return max(self._last_s + step * self._video.options.step, 0.0)
+
+    def _elapsed(self, stamp: float, time_s: Fraction | None) -> float | None:
+        """Seconds since the first frame that is played; None where nothing is more exact than the time stamps."""
+        if self._is_live or self._video.options.fps is not None:
+            return None
+        exact = time_s if time_s is not None and float(time_s) == stamp else Fraction(stamp)
+        if self._origin is None:
+            self._origin = exact
+        return float(exact - self._origin)
 
     def _end(self) -> Skipped | None:
         """What there is to say of a file that ends before the end that its header names."""
@@ -248,8 +260,8 @@ class _VideoReader:
         if self._video.options.stop is not None or has_ended or self._is_live:
             return None
         name = f"{self._position:06d}"
-        if self._seen_s and facts.end_s is not None:
-            first, last = self._seen_s[0], self._seen_s[-1] + 1 / (facts.fps or DEFAULT_FPS)
+        if self._seen and facts.end_s is not None:
+            first, last = float(self._seen[0]), float(self._seen[-1]) + 1 / (facts.fps or DEFAULT_FPS)
             # of a clock that begins late, headers count from its beginning or from zero
             length = facts.end_s - first if facts.end_s > first else facts.end_s
             if last - first < _CUT_OFF_SHARE * length:

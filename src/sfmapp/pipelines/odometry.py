@@ -8,9 +8,12 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 import sfmapp
 from sfmapp.errors import InterruptedRunError, NoReconstructionError
@@ -60,7 +63,7 @@ class Tracking(Job):
         live: draws what happens; None if nobody looks.
         keyframes: looks at the images of keyframes.
         wish: what the unit of length is to come from; None: an arbitrary one will do.
-        sequence: once it is open.
+        sequence: once it is open. offset_s: of the time of the run, see :class:`Watched`.
     """
 
     frames: FrameLog
@@ -69,6 +72,7 @@ class Tracking(Job):
     keyframes: KeyframeWatch
     wish: ScaleWish | None
     sequence: Sequence | None = None
+    offset_s: float = 0.0
 
 
 def track_sequence(
@@ -139,13 +143,10 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         run.live.begin(run.sequence)
     with run.stage("kernels"):
         run.stages["kernels"] = compile_odometry_kernels(events, inertial=run.sequence.imu is not None)
+    watched = Watched(run.sequence, run)
     with run.measured("odometry"):
-        result = run_odometry(
-            Watched(run.sequence, run), options.odometry, seed=options.seed, threads=run.threads, events=events.deaf()
-        )
+        result = run_odometry(watched, options.odometry, seed=options.seed, threads=run.threads, events=events.deaf())
         run.threads_cpu.sample()
-    if isinstance(run.sequence, FileSequence | VideoSequence):  # frames in memory are all there
-        result = result.with_repeated(run.sequence.repeated)
     run.stages["odometry"] = result.report
     if self_calibrate:
         from sfmapp.pipelines.self_calibrate import doubt
@@ -155,7 +156,10 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         run.keyframes.colour(result)
         if run.wish is not None:
             deaf = events.deaf()
-            run.stages["scale"] = scale_maps(result, run.wish, run.keyframes, run.sequence.imu, deaf)
+            run.stages["scale"] = scale_maps(result, run.wish, run.keyframes, watched.imu, deaf)
+    result, run.offset_s = replace(result, timestamps_s=watched.times_as_given(result)), watched.offset_s
+    if isinstance(run.sequence, FileSequence | VideoSequence):  # frames in memory are all there
+        result = result.with_repeated(run.sequence.repeated)
     failure = None if result.maps else no_map(run, result)
     report = write_odometry(run, result, failure)
     if events.is_cancelled:
@@ -187,7 +191,14 @@ def no_map(run: Tracking, result: OdometryResult) -> NoReconstructionError:
 
 
 class Watched:
-    """A sequence that ends early when the run is asked to stop, and on whose frames the clocks are read."""
+    """A sequence that ends early when the run is asked to stop, and on whose frames the clocks are read.
+
+    Its time is the one that has elapsed since it began, where all its parts know that: where a clock begins has no part
+    in the result.
+
+    Attributes:
+        offset_s: what the time of the run lacks of the sequence's own, to the digits that the latter has.
+    """
 
     kind: SequenceKind
     source: str
@@ -201,6 +212,15 @@ class Watched:
         for name in ("kind", "source", "rig", "num_frames", "frames_per_second", "imu", "truth"):
             setattr(self, name, getattr(sequence, name))
         self._sequence, self._run = sequence, run
+        self.offset_s = 0.0
+        self._given_s: dict[int, float] = {}
+        self._is_relative = self.imu is None or self.imu.elapsed_s is not None
+        if self.imu is not None and self.imu.elapsed_s is not None:
+            self.imu = replace(self.imu, timestamps_s=self.imu.elapsed_s, elapsed_s=None)
+
+    def times_as_given(self, result: OdometryResult) -> NDArray[np.float64]:
+        """(F,) times of the frames of a result on the sequence's own clock."""
+        return np.array([self._given_s[int(idx)] for idx in result.frame_idx], np.float64)
 
     def frames(self) -> Iterator[Frame]:
         """See :class:`~sfmapp.images.sequence.Sequence`."""
@@ -211,7 +231,12 @@ class Watched:
                 if self._run.events.is_cancelled:
                     self._run.events.warned("odometry", f"stopped on request before {frame.name}")
                     return
-                yield frame
+                given_s, elapsed_s = frame.timestamp_s, frame.elapsed_s
+                run_s = elapsed_s if self._is_relative and elapsed_s is not None else given_s
+                if not self._given_s:
+                    self.offset_s = given_s - run_s
+                self._given_s[frame.idx] = given_s
+                yield replace(frame, timestamp_s=run_s)
         finally:
             self._run.threads_cpu.frames_ended()  # while the thread that reads ahead is still there
             frames.close()  # type: ignore[attr-defined]  # a generator: ends its thread
