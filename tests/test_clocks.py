@@ -140,7 +140,7 @@ def test_whole_numbers_of_euroc_are_nanoseconds(tmp_path: Path, rate: int, unit:
 
 @pytest.mark.parametrize("options", [{}, {"reverse": True}, {"start": 3, "step": 2}])
 def test_where_a_clock_begins_has_no_part_in_what_has_elapsed(tmp_path: Path, options: dict[str, object]) -> None:
-    """A time since 1970 is known to a quarter of a microsecond, which would make another trajectory in the last digits."""
+    """Times since 1970 are known to a quarter of a microsecond: the last digits of a trajectory would be others."""
     found = []
     for start in STARTS:
         as_euroc(tmp_path / start, [written(ns, "ns") for ns in stamps_ns(start, 30)])
