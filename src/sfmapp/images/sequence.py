@@ -69,6 +69,7 @@ class Frame:
         images: one (H, W) uint8 grey image for each camera of the rig; the first alone where the others lack it.
         elapsed_s: seconds since the sequence began, which a clock since 1970 tells to a quarter of a microsecond only;
             None where nothing more exact than ``timestamp_s`` is known.
+        given_s: what ``timestamp_s`` was before the time that has elapsed took its place; None while it is that itself.
     """
 
     idx: int
@@ -76,6 +77,12 @@ class Frame:
     timestamp_s: float
     images: tuple[NDArray[np.uint8], ...]
     elapsed_s: float | None = None
+    given_s: float | None = None
+
+    @property
+    def shown_s(self) -> float:
+        """The time on the sequence's own clock, to be told and written."""
+        return self.timestamp_s if self.given_s is None else self.given_s
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ class Odometry:
         self.previous = view.pyramids[0]
         record.time_s = time.thread_time() - start
         snapshot = FrameSnapshot(
-            frame.idx, frame.name, frame.timestamp_s, record.state, frame.images[0], self.tracks.xy.astype(np.float32),
+            frame.idx, frame.name, frame.shown_s, record.state, frame.images[0], self.tracks.xy.astype(np.float32),
             self.is_mapped, record.live, record.map_idx, record.time_s,
         )  # fmt: skip
         self.events.advanced(STAGE, message=frame.name, snapshot=snapshot)

@@ -63,7 +63,7 @@ class Tracking(Job):
         live: draws what happens; None if nobody looks.
         keyframes: looks at the images of keyframes.
         wish: what the unit of length is to come from; None: an arbitrary one will do.
-        sequence: once it is open. offset_s: of the time of the run, see :class:`Watched`.
+        sequence: once it is open.
     """
 
     frames: FrameLog
@@ -72,7 +72,6 @@ class Tracking(Job):
     keyframes: KeyframeWatch
     wish: ScaleWish | None
     sequence: Sequence | None = None
-    offset_s: float = 0.0
 
 
 def track_sequence(
@@ -157,7 +156,7 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         if run.wish is not None:
             deaf = events.deaf()
             run.stages["scale"] = scale_maps(result, run.wish, run.keyframes, watched.imu, deaf)
-    result, run.offset_s = replace(result, timestamps_s=watched.times_as_given(result)), watched.offset_s
+    result = replace(result, timestamps_s=watched.times_as_given(result))
     if isinstance(run.sequence, FileSequence | VideoSequence):  # frames in memory are all there
         result = result.with_repeated(run.sequence.repeated)
     failure = None if result.maps else no_map(run, result)
@@ -195,9 +194,6 @@ class Watched:
 
     Its time is the one that has elapsed since it began, where all its parts know that: where a clock begins has no part
     in the result.
-
-    Attributes:
-        offset_s: what the time of the run lacks of the sequence's own, to the digits that the latter has.
     """
 
     kind: SequenceKind
@@ -212,7 +208,6 @@ class Watched:
         for name in ("kind", "source", "rig", "num_frames", "frames_per_second", "imu", "truth"):
             setattr(self, name, getattr(sequence, name))
         self._sequence, self._run = sequence, run
-        self.offset_s = 0.0
         self._given_s: dict[int, float] = {}
         self._is_relative = self.imu is None or self.imu.elapsed_s is not None
         if self.imu is not None and self.imu.elapsed_s is not None:
@@ -231,12 +226,9 @@ class Watched:
                 if self._run.events.is_cancelled:
                     self._run.events.warned("odometry", f"stopped on request before {frame.name}")
                     return
-                given_s, elapsed_s = frame.timestamp_s, frame.elapsed_s
-                run_s = elapsed_s if self._is_relative and elapsed_s is not None else given_s
-                if not self._given_s:
-                    self.offset_s = given_s - run_s
-                self._given_s[frame.idx] = given_s
-                yield replace(frame, timestamp_s=run_s)
+                self._given_s[frame.idx] = frame.timestamp_s
+                elapsed_s = frame.elapsed_s if self._is_relative else None
+                yield frame if elapsed_s is None else replace(frame, timestamp_s=elapsed_s, given_s=frame.timestamp_s)
         finally:
             self._run.threads_cpu.frames_ended()  # while the thread that reads ahead is still there
             frames.close()  # type: ignore[attr-defined]  # a generator: ends its thread

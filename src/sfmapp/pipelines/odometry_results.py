@@ -7,7 +7,6 @@ import io
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -204,8 +203,7 @@ def _finish_recording(run: Tracking, result: OdometryResult, against: Sequence[A
     if run.live is None:
         return
     fits = [None if fit is None else fit.error.truth_from_estimate for fit in against]
-    shown = replace(result, timestamps_s=result.timestamps_s - run.offset_s)  # as its frames were
-    problem = run.live.end(shown, fits, errors_of_frames(result, against))
+    problem = run.live.end(result, fits, errors_of_frames(result, against))
     if run.live.is_recording:
         manifest["recording"] = "failed" if problem else "written"
     if problem:
