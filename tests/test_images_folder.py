@@ -182,16 +182,18 @@ def test_exif_cameras_are_told_apart_by_all_that_matters(tmp_path: Path) -> None
     save(tmp_path / "c.jpg", width=64, exif=exif_of(focal_mm=20.0))
     save(tmp_path / "d.jpg", exif=exif_of(model="Canon EOS 70D", focal_mm=20.0))
     save(tmp_path / "e.jpg", exif=exif_of(focal_mm=20.0, serial="77"))
+    # how it was held is no matter of the camera; a mirror moves its centre to the other side
     save(tmp_path / "f.jpg", exif=exif_of(focal_mm=20.0, orientation=6))
+    save(tmp_path / "g.jpg", exif=exif_of(focal_mm=20.0, orientation=2))
     save(tmp_path / "sub/a3.jpg", seed=2, exif=exif_of(focal_mm=20.0))
     image_set, report, _ = load(tmp_path)
-    assert sharing(image_set) == [0, 0, 1, 2, 3, 4, 5, 0]
+    assert sharing(image_set) == [0, 0, 1, 2, 3, 4, 0, 5, 0]
     first = image_set.cameras[0]
     assert (first.width, first.height, first.model) == (48, 32, CameraModel.SIMPLE_RADIAL)
     assert first.params.tolist() == pytest.approx([20.0 / 22.3 * 48, 24.0, 16.0, 0.0])
-    assert (image_set.cameras[5].width, image_set.cameras[5].height) == (32, 48)
+    assert (image_set.cameras[5].width, image_set.cameras[5].height) == (48, 32)
     entry = report["cameras"][0]
-    assert (entry["num_images"], entry["focal_source"], entry["camera"]) == (3, "exif_sensor", "Canon EOS 60D")
+    assert (entry["num_images"], entry["focal_source"], entry["camera"]) == (4, "exif_sensor", "Canon EOS 60D")
     assert "sensor 22.3 mm" in entry["focal_reason"]
 
 

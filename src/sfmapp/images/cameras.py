@@ -11,6 +11,7 @@ from statistics import median, pstdev
 from typing import Any
 
 from sfmapp.errors import UsageError
+from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.images.exif import ExifFacts, FocalPrior, focal_prior
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.scene.camera import Camera, simple_camera
@@ -30,7 +31,7 @@ _SOURCE_RANK = ("exif_35mm", "exif_sensor", "default")
 
 @dataclass(frozen=True)
 class Shot:
-    """What cameras are told apart by: a name, a size after orientation, and EXIF."""
+    """What cameras are told apart by: a name, a size in pixels of the file, and EXIF."""
 
     name: str
     width: int
@@ -146,7 +147,7 @@ def _automatic_keys(shots: Sequence[Shot]) -> tuple[list[Hashable], list[str]]:
         if _tells_camera(shot.facts):
             facts = shot.facts
             lens = (facts.make, facts.model, facts.lens, facts.serial, focal_mm[i], focal_35mm[i])
-            keys[i] = ("exif", *lens, shot.width, shot.height)
+            keys[i] = ("exif", *lens, shot.width, shot.height, _is_mirrored(shot))
             rules[i] = "EXIF: same make, model, lens, focal length and size"
             continue
         folder, ending, stem = template = _template(shot)
@@ -159,7 +160,7 @@ def _automatic_keys(shots: Sequence[Shot]) -> tuple[list[Hashable], list[str]]:
             continue
         for i in group:
             if tuple(sorted((shots[i].width, shots[i].height))) == size:
-                keys[i] = ("series", key, shots[i].width, shots[i].height)
+                keys[i] = ("series", key, shots[i].width, shots[i].height, _is_mirrored(shots[i]))
                 rules[i] = "no EXIF: same folder, file type, manner of naming and size"
     return keys, rules
 
@@ -176,6 +177,11 @@ def _without_rounding(focals: Sequence[float | None]) -> list[float | None]:
 
 def _tells_camera(facts: ExifFacts) -> bool:
     return bool(facts.model) and (facts.focal_mm is not None or facts.focal_35mm is not None)
+
+
+def _is_mirrored(shot: Shot) -> bool:
+    """A mirror moves the principal point to the other side; a turn is only how the sensor was held."""
+    return shot.facts.orientation in MIRRORED
 
 
 def _template(shot: Shot) -> tuple[str, str, str]:

@@ -19,6 +19,7 @@ from typing import Any
 
 from sfmapp.errors import InputError
 from sfmapp.events import Events
+from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.images.cameras import Shot, group_cameras
 from sfmapp.images.exif import ExifFacts, read_exif
 from sfmapp.images.headers import Header, UnusableImage, read_header
@@ -151,12 +152,11 @@ def _scan(path: Path, root: Path, mask_root: Path | None, options: ImageOptions)
     except OSError as error:
         return name, f"cannot be read: {error.strerror or error}"
     facts = read_exif(header.exif)
-    is_turned = facts.orientation >= 5
     record = ImageRecord(
         name=name,
         path=path,
-        width=header.height if is_turned else header.width,
-        height=header.width if is_turned else header.height,
+        width=header.width,
+        height=header.height,
         orientation=facts.orientation,
         digest=hashlib.blake2b(data, digest_size=16).hexdigest(),
         has_alpha=header.has_alpha and options.use_alpha,
@@ -209,6 +209,8 @@ def _with_mask(record: ImageRecord, mask_root: Path) -> tuple[ImageRecord, tuple
         if mask_fit(header, record) is None:
             return record, (f"its mask is not used: {size} pixels, the image has {wanted}",)
         masked = replace(record, mask_path=path)
+        if mask_fit(header, record) == "turned":
+            return masked, (f"its mask fits the picture as EXIF turns it ({size} pixels) and is turned back",)
         if {header.width, header.height} != {record.width, record.height}:
             return masked, (f"its mask is scaled: {size} pixels, the image has {wanted}",)
         return masked, ()
@@ -243,9 +245,7 @@ def _tell(
     deep = [scan.record.name for scan in scans if scan.header.bits > 8]
     if deep:
         events.decided(STAGE, f"{len(deep)} images of 16 bits are scaled to 8 bits", names=deep)
-    turned = [scan.record.name for scan in scans if scan.record.orientation != 1]
-    if turned:
-        events.decided(STAGE, f"{len(turned)} images are turned upright as EXIF says", names=turned)
+    _tell_orientation(events, [scan.record for scan in scans])
     without = [image.name for image in image_set.images if image.mask_path is None]
     if 0 < len(without) < len(image_set.images):
         events.decided(STAGE, f"{len(without)} of {len(image_set.images)} images have no mask", names=without)
@@ -258,6 +258,25 @@ def _tell(
         )
     if not image_set.images:
         events.warned(STAGE, "no usable image found: expected files such as .jpg, .png, .tif, .webp")
+
+
+def _tell_orientation(events: Events, records: list[ImageRecord]) -> None:
+    turned = [record.name for record in records if record.orientation != 1]
+    if turned:
+        text = f"{len(turned)} images have an EXIF orientation: the model and what is exported fit the pixels of the "
+        events.decided(STAGE, text + "files, as other programs read them; only what is shown is turned", names=turned)
+    mirrored = [record.name for record in records if record.orientation in MIRRORED]
+    if not mirrored:
+        return
+    advice = "to have it as it is, write the files anew: exiftran -ai, mogrify -auto-orient, or PIL's exif_transpose"
+    if len(mirrored) == len(records):
+        text = f"all images are stored as mirror images (EXIF orientation 2, 4, 5, 7), as will be their model; {advice}"
+    else:
+        text = (
+            f"{_some(mirrored)}: stored as mirror images (EXIF orientation 2, 4, 5, 7), unlike the others, with which "
+            f"they cannot share a model; {advice}"
+        )
+    events.warned(STAGE, text, names=mirrored)
 
 
 def _by_reason(items: Iterable[tuple[str, str]]) -> dict[str, list[str]]:

@@ -22,7 +22,7 @@ from sfmapp.pipelines.listeners import DecisionLog, EventLog
 from sfmapp.pipelines.options import Options, options_from_dict, options_to_dict
 from sfmapp.pipelines.run import Job
 from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import DENSE, RECONSTRUCT, open_workspace, read_manifest
+from sfmapp.pipelines.workspace import DENSE, RECONSTRUCT, has_stored_pixels, open_workspace, read_manifest
 
 # the workspace in the folder of a COLMAP model, if no other place is named
 INSIDE = "sfmapp"
@@ -167,7 +167,7 @@ def _in_workspace(
     else:
         model = folder / "sparse" / "0"
         found = Path(images) if images is not None else image_root(str(manifest.get("source") or ""))
-        is_upright = True
+        is_upright = not has_stored_pixels(manifest)
         if not has_model(model):
             raise NoReconstructionError(f"{folder} holds no model", "run sfmapp reconstruct first")
     earlier = options_from_dict({"images": manifest.get("options", {}).get("images", {})}).images

@@ -102,7 +102,7 @@ def _run(job: DenseJob, record: bool) -> MeshResult:
     except NoReconstructionError as failure:
         dense_results.finish(job, STAGE, key, {}, (scene, patches, None), failure)
         raise
-    is_z_up = bool(up_direction(plan.cam_from_world)[2] > np.sqrt(0.5))
+    is_z_up = bool(up_direction(scene.upright_cam_from_world)[2] > np.sqrt(0.5))
     with job.measured("output"):
         write_mesh_ply(folder / MESH_PLY, mesh)
         write_glb(folder / MESH_GLB, mesh, is_z_up=is_z_up)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfmapp.errors import NoReconstructionError
-from sfmapp.pipelines.workspace import plain_number
+from sfmapp.pipelines.workspace import STORED, plain_number
 from sfmapp.report.document import FORMAT, camera_rows, funnel_of_images, funnel_without_matches, make_checks
 from sfmapp.report.html import render_html
 
@@ -54,7 +54,7 @@ def write_results(
     workspace, manifest = run.workspace, run.workspace.manifest
     if failure is not None and failure.report is not None:
         run.stages["mapping"] = failure.report
-    workspace.begin("mapping", keys.mapping)
+    workspace.begin("mapping", keys.mapping, pixels=STORED)
     with run.stage("output"):
         workspace.write_models(models, [features.keypoints[:, :2].astype(np.float64) for features in run.features])
     with run.stage("recording"):
