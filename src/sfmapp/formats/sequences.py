@@ -36,7 +36,7 @@ from sfmapp.formats.sequence_files import (
 )
 from sfmapp.formats.tum import is_tum, read_tum_sequence, read_tum_truth
 from sfmapp.geometry import rigid3
-from sfmapp.images.exif import focal_prior, read_exif
+from sfmapp.images.exif import ExifFacts, focal_prior, read_exif
 from sfmapp.images.frame_reader import FileSequence, read_regular_file, some
 from sfmapp.images.headers import UnusableImage, read_header
 from sfmapp.images.sequence import STAGE, Imu, Sequence, SequenceOptions, Truth
@@ -176,12 +176,15 @@ def _calibration(
 
 def _guessed_camera(size: Size, first: Path | None) -> Camera:
     """What EXIF or experience says of a camera that nothing else is known of."""
-    exif = b""
+    prior = focal_prior(_exif_of(first), *size)
+    return simple_camera(CameraModel.SIMPLE_RADIAL, *size, prior.focal_px, prior.sigma_px, prior.source)
+
+
+def _exif_of(first: Path | None) -> ExifFacts:
     if first is not None:
         with suppress(UnusableImage):
-            exif = read_header(read_regular_file(first)).exif
-    prior = focal_prior(read_exif(exif), *size)
-    return simple_camera(CameraModel.SIMPLE_RADIAL, *size, prior.focal_px, prior.sigma_px, prior.source)
+            return read_exif(read_header(read_regular_file(first)).exif)
+    return ExifFacts()
 
 
 def _rig(
@@ -268,6 +271,7 @@ def _sequence(
         imu,
         truth,
         events,
+        _exif_of(first[0]).orientation,
     )
     _tell(sequence, events)
     return sequence
@@ -391,6 +395,9 @@ def _tell(sequence: Sequence, events: Events) -> None:
     ]
     parts += ["IMU"] if sequence.imu is not None else []
     parts += ["truth"] if sequence.truth is not None else []
+    if sequence.orientation != 1:
+        text = "the frames have an EXIF orientation: they are used as they are stored, which a calibration has to fit"
+        events.decided(STAGE, text, orientation=sequence.orientation)
     events.decided(
         STAGE,
         ", ".join(parts),

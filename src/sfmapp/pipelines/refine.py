@@ -274,6 +274,7 @@ def _write(
             name: [{"map": m, **truth_row(fit)} for m, fit in enumerate(found) if fit is not None]
             for name, found in fits.items()
         },
+        "orientation": sequence.orientation if sequence is not None else 1,
         "photographs": added.rows if added is not None else [],
         "skipped": [{"name": name, "reason": reason} for name, reason in added.skipped] if added is not None else [],
         "usage": job.usage,
