@@ -14,7 +14,7 @@ from sfmapp.errors import UsageError
 from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.images.exif import ExifFacts, FocalPrior, focal_prior
 from sfmapp.images.image_set import ImageOptions
-from sfmapp.scene.camera import Camera, simple_camera
+from sfmapp.scene.camera import Camera, simple_camera, turned_back
 
 # Trust in what a user gives without fixing it: a focal length copied from a data sheet, or a calibration.
 _SIGMA_USER_FOCAL, _SIGMA_USER_PARAMS = 0.03, 0.01
@@ -52,7 +52,7 @@ def group_cameras(
         cameras in order of first use; camera_idx per shot; JSON-able dicts; (image name, problem) pairs.
 
     Raises:
-        UsageError: ``camera_params`` with images of several sizes.
+        UsageError: ``camera_params`` with images of several sizes, or for pictures that EXIF's orientation has turned.
     """
     sizes = {(shot.width, shot.height) for shot in shots}
     if options.camera_params is not None and len(sizes) > 1:
@@ -72,6 +72,8 @@ def group_cameras(
     for camera_idx, group in enumerate(members):
         shot = shots[group[0]]
         camera, reason = _camera(shot, [priors[i] for i in group], options)
+        if options.camera_params is not None:
+            _check_not_of_upright(camera, [shots[i] for i in group])
         cameras.append(camera)
         entries.append(
             {
@@ -109,6 +111,18 @@ def _camera(shot: Shot, priors: list[FocalPrior], options: ImageOptions) -> tupl
         camera = simple_camera(model, width, height, prior.focal_px, prior.sigma_px, prior.source)
         reason = prior.reason
     return replace(camera, is_fixed=options.fix_intrinsics), reason
+
+
+def _check_not_of_upright(camera: Camera, shots: Sequence[Shot]) -> None:
+    """Parameters that were found with pictures that some reader had turned, as OpenCV's does."""
+    for shot in shots:
+        stored = turned_back(camera, shot.facts.orientation)
+        if stored is not None:
+            raise UsageError(
+                f"camera_params: expected a camera of {camera.width}x{camera.height} pixels, as {shot.name} stores them,"
+                f" found one of {camera.height}x{camera.width}, of pictures turned upright as EXIF says",
+                f"give {','.join(f'{value:.10g}' for value in stored.params)}, the same lens in the pixels of the file",
+            )
 
 
 def _common_prior(priors: list[FocalPrior]) -> FocalPrior:
