@@ -119,8 +119,8 @@ def _check_not_of_upright(camera: Camera, shots: Sequence[Shot]) -> None:
         stored = turned_back(camera, shot.facts.orientation)
         if stored is not None:
             raise UsageError(
-                f"camera_params: expected a camera of {camera.width}x{camera.height} pixels, as {shot.name} stores them,"
-                f" found one of {camera.height}x{camera.width}, of pictures turned upright as EXIF says",
+                f"camera_params: expected a camera of {camera.width}x{camera.height} pixels, as {shot.name} has them, "
+                f"found one of {camera.height}x{camera.width}, of pictures turned upright as EXIF says",
                 f"give {','.join(f'{value:.10g}' for value in stored.params)}, the same lens in the pixels of the file",
             )
 
