@@ -13,7 +13,8 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sfmapp.images.tags import Directory, byte_order, first_directory, read_directory
+from sfmapp.images.tags import Directory, byte_order, read_directory
+from sfmapp.images.tiff import UnreadTiffError, tiff_layout
 
 
 class UnusableImage(Exception):  # noqa: N818 - a verdict on a file, not an error of the program
@@ -80,8 +81,6 @@ def _foreign_format(data: bytes) -> str:
         return "a GIF, which is not read: convert it to PNG"
     if data[4:8] == b"ftyp":
         return "HEIC, AVIF or a video, which is not read: convert it to JPEG"
-    if data[:4] in (b"II+\0", b"MM\0+"):
-        return "a BigTIFF, which is not read: convert it to TIFF or PNG"
     if data[:100].lstrip()[:1] in (b"<", b"{"):
         return "text, not an image (a web page saved under this name?)"
     if not any(data[:4096]):
@@ -170,28 +169,14 @@ def _read_png(data: bytes) -> Header:
     return Header("png", width, height, bits, kind, color in (4, 6) or has_transparency, exif)
 
 
-_TIFF_KIND = {0: "gray", 1: "gray", 2: "rgb", 3: "palette", 5: "cmyk", 6: "rgb"}
-
-
 def _read_tiff(data: bytes) -> Header:
-    first = first_directory(data)
-    width, height = first.number(256), first.number(257)
-    if width is None or height is None:
-        raise UnusableImage("truncated or a broken header")
-    bits = first.numbers(258) or (1,)
-    sample_format = first.numbers(339) or (1,)
-    kind = _TIFF_KIND.get(int(first.number(262) or 0))
-    if any(value != 1 for value in sample_format):
-        raise UnusableImage("floating-point or signed values, which are not read: convert it to 16 bits")
-    if kind is None or any(value not in (1, 2, 4, 8, 16) for value in bits):
-        raise UnusableImage("a TIFF of an unsupported kind: convert it to RGB with 8 or 16 bits")
-    if kind == "cmyk" and max(bits) > 8:
-        raise UnusableImage("a CMYK TIFF of 16 bits, which is not read: convert it to RGB")
-    _check_tiff_data(data, first)
-    _check_single_page(data, first)
-    return Header(
-        "tiff", int(width), int(height), int(bits[0]), kind, kind != "cmyk" and bool(first.numbers(338)), data
-    )
+    try:
+        layout = tiff_layout(data)
+    except UnreadTiffError as reason:
+        raise UnusableImage(str(reason)) from reason
+    _check_tiff_data(data, layout.directory)
+    _check_single_page(data, layout.directory)
+    return Header("tiff", layout.width, layout.height, layout.bits, layout.kind, layout.alpha is not None, data)
 
 
 def _check_tiff_data(data: bytes, first: Directory) -> None:

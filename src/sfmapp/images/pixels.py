@@ -16,6 +16,7 @@ from sfmapp.errors import InputError
 from sfmapp.geometry.orientation import INVERSE, upright_pixels, upright_size
 from sfmapp.images.headers import Header, UnusableImage, read_header
 from sfmapp.images.tags import byte_order, first_directory
+from sfmapp.images.tiff import decode_samples, tiff_layout
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageRecord
@@ -138,6 +139,9 @@ def decode_bytes(data: bytes, header: Header) -> NDArray[Any] | None:
     import cv2
 
     if header.format == "tiff":
+        layout = tiff_layout(data)
+        if not layout.is_read_by_opencv:
+            return decode_samples(data, layout)
         data = _without_orientation(data)
     # IMREAD_UNCHANGED keeps depth, grey and alpha, but does not convert CMYK
     is_plain = header.kind in ("rgb", "palette", "cmyk") and header.bits <= 8 and not header.has_alpha
