@@ -21,8 +21,9 @@ from sfmapp.images.sources import find_images
 from sfmapp.pipelines.listeners import DecisionLog, EventLog
 from sfmapp.pipelines.options import Options, options_from_dict, options_to_dict
 from sfmapp.pipelines.run import Job
+from sfmapp.pipelines.stored_pixels import has_stored_pixels
 from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import DENSE, RECONSTRUCT, has_stored_pixels, open_workspace, read_manifest
+from sfmapp.pipelines.workspace import DENSE, RECONSTRUCT, open_workspace, read_manifest
 
 # the workspace in the folder of a COLMAP model, if no other place is named
 INSIDE = "sfmapp"

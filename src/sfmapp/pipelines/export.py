@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.formats.colmap import has_model, read_model, write_model, write_model_text
-from sfmapp.pipelines.workspace import check_pixels, read_manifest
+from sfmapp.pipelines.stored_pixels import check_pixels
+from sfmapp.pipelines.workspace import read_manifest
 from sfmapp.scene.reconstruction import Reconstruction
 
 _NOTICEABLE_PX = 0.1  # below the noise of a keypoint

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfmapp.errors import NoReconstructionError
-from sfmapp.pipelines.workspace import STORED, plain_number
+from sfmapp.pipelines.stored_pixels import STORED
+from sfmapp.pipelines.workspace import plain_number
 from sfmapp.report.document import FORMAT, camera_rows, funnel_of_images, funnel_without_matches, make_checks
 from sfmapp.report.html import render_html
 

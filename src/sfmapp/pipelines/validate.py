@@ -11,18 +11,16 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError, SfmError
 from sfmapp.evaluation.poses import AUC_THRESHOLDS_DEG, PoseErrors, compare_reconstructions, evaluate_poses
 from sfmapp.evaluation.second_opinion import CameraGroup, SecondOpinion, SecondOpinionOptions, ask_second_opinion
 from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model
 from sfmapp.formats.truth import Truth, read_truth
-from sfmapp.geometry.orientation import INVERSE, ROTATION_OF, upright_poses
 from sfmapp.images.folder import load_images
 from sfmapp.pipelines.options import options_from_dict
-from sfmapp.pipelines.workspace import RECONSTRUCT, check_pixels, read_manifest
+from sfmapp.pipelines.stored_pixels import check_pixels, truth_in_stored_pixels
+from sfmapp.pipelines.workspace import RECONSTRUCT, read_manifest
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageOptions, ImageSet
@@ -30,8 +28,6 @@ if TYPE_CHECKING:
 
 FOLDER = "validation"
 NOT_RECORDED = "not recorded"
-# where the truth is of pictures that were turned, turning it back leaves this share of the rotation errors at most
-_TURNED_SHARE = 0.2
 
 
 @dataclass(frozen=True)
@@ -98,7 +94,8 @@ def validate(
     notes = _changed_photographs(manifest, image_set)
     if known_truth is not None:
         known_truth = _truth_of_photographs(known_truth, image_set, notes)
-        known_truth = _truth_in_stored_pixels(known_truth, model, image_set, notes)
+        orientations = {image.name: image.orientation for image in image_set.images}
+        known_truth = truth_in_stored_pixels(known_truth, model, orientations, notes)
     ours = _numbers(model, len(image_set.images)) | _own_usage(folder, notes)
     opinion = _ask(image_set, image_options, folder / FOLDER / "pycolmap", options, events, notes)
     theirs, agreement = None, None
@@ -242,24 +239,6 @@ def _truth_of_photographs(truth: Truth, image_set: ImageSet, notes: list[str]) -
     if len(kept) < len(names):
         notes.append(f"{len(names) - len(kept)} photographs are not in the truth and are left out of its errors")
     return replace(truth, names=tuple(truth.names[k] for k in kept), cam_from_world=truth.cam_from_world[kept])
-
-
-def _truth_in_stored_pixels(truth: Truth, model: Reconstruction, image_set: ImageSet, notes: list[str]) -> Truth:
-    """The same cameras with axes along those of the files, if they evidently are those of pictures turned upright."""
-    orientation_of = {image.name: INVERSE[ROTATION_OF[image.orientation]] for image in image_set.images}
-    turns = [orientation_of.get(name, 1) for name in truth.names]
-    if all(turn == 1 for turn in turns):
-        return truth
-    turned = replace(truth, cam_from_world=upright_poses(truth.cam_from_world, turns))
-    errors = [_against(model, known).rotation_error_deg for known in (truth, turned)]
-    as_given, as_stored = (float(np.median(e[np.isfinite(e)])) if np.isfinite(e).any() else np.nan for e in errors)
-    if not as_stored < _TURNED_SHARE * as_given:
-        return truth
-    notes.append(
-        "the truth is of pictures turned upright as EXIF says: its cameras were turned back to the pixels of the files "
-        f"(median rotation error {as_stored:.3g} degrees, as given {as_given:.3g})"
-    )
-    return turned
 
 
 def _write_json(path: Path, value: dict[str, Any]) -> None:

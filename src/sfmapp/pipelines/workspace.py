@@ -34,9 +34,6 @@ FORMAT = "sfmapp workspace 1"
 MANIFEST = "run.json"
 # the commands that write workspaces; manifests of before the second one name none
 RECONSTRUCT, ODOMETRY, REFINE, DENSE = "reconstruct", "odometry", "refine", "dense"
-# what the mapping notes: its model counts in the pixels of the files. Earlier versions, which counted in pictures
-# turned upright as EXIF says, noted nothing
-STORED = "stored"
 LOCK = ".lock"
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 _PACKAGE = Path(__file__).resolve().parent.parent
@@ -165,30 +162,6 @@ def read_manifest(folder: Path, command: str | None = None) -> dict[str, Any]:
     if command is not None:
         _check_command(folder, manifest, command)
     return manifest
-
-
-def has_stored_pixels(manifest: dict[str, Any]) -> bool:
-    """Whether the model of a reconstruction counts in the pixels of the files, whatever their EXIF orientation."""
-    return bool(manifest.get("stages", {}).get("mapping", {}).get("pixels") == STORED)
-
-
-def check_pixels(folder: Path, manifest: dict[str, Any]) -> None:
-    """The model of a workspace has to fit its photographs as other programs read them.
-
-    Raises:
-        InputError: it was made by a version that turned pictures upright, and there were some to turn.
-    """
-    if has_stored_pixels(manifest):
-        return
-    report = _read_json(folder / "report.json")
-    stages = report.get("stages", {}) if isinstance(report, dict) else {}
-    turned = [row["name"] for row in stages.get("images", {}).get("images", []) if row.get("orientation", 1) != 1]
-    if turned:
-        raise InputError(
-            f"{folder}: expected a model in the pixels of the files, found one of an earlier version of sfmapp, which "
-            f"turned {len(turned)} of the photographs upright as EXIF says, {turned[0]} for one",
-            f"run it again: sfmapp reconstruct {manifest.get('source') or 'PHOTOS'} -o {folder}",
-        )
 
 
 def _check_command(folder: Path, manifest: dict[str, Any], command: str) -> None:
