@@ -186,6 +186,19 @@ def check_with_pycolmap(model_folder: Path, photos: Path, work: Path) -> None:
     assert np.corrcoef(small)[0, 1] > 0.95
 
 
+def check_database(path: Path, size: tuple[int, int]) -> None:
+    import pycolmap
+
+    database = pycolmap.Database.open(path)
+    assert {(camera.width, camera.height) for camera in database.read_all_cameras()} == {size}
+    for image in database.read_all_images():
+        xy = np.array(database.read_keypoints(image.image_id))[:, :2]
+        assert (xy > 0).all()
+        assert (xy < size).all()
+        assert (xy.max(0) > 0.9 * np.array(size)).all()
+    database.close()
+
+
 @pytest.mark.parametrize("orientation", ALL)
 def test_models_and_exports_fit_the_files_as_pycolmap_reads_them(
     photos: Path, sample: Path, tmp_path: Path, orientation: int
@@ -198,6 +211,7 @@ def test_models_and_exports_fit_the_files_as_pycolmap_reads_them(
     )  # fmt: skip
     assert sum("mirror images" in event.message for event in warned) == (orientation in MIRRORED)
     check_with_pycolmap(tmp_path / "out/sparse/0", tmp_path / "photos", tmp_path / "undistorted")
+    check_database(tmp_path / "out/database.db", upright_size(orientation, 400, 300))
     model = result.reconstruction
     for target in ("colmap-text", "nerfstudio", "bundler"):
         report = export_model(tmp_path / "out", target, tmp_path / target)
@@ -401,3 +415,47 @@ def test_a_replay_counts_in_upright_pixels(orientation: int) -> None:
         if orientation in MIRRORED:
             xy[:, 0] = replay.image_size[k, 0] - xy[:, 0]
         np.testing.assert_allclose(xy, shown, atol=4.0)  # but for the distortion, which pinholes do not have
+
+
+class Logged:
+    """What a live drawing logs, the last of each kind by entity."""
+
+    def __init__(self) -> None:
+        self.last: dict[tuple[str, str], Any] = {}
+
+    def log(self, path: str, archetype: Any, **_: Any) -> None:
+        self.last[path, type(archetype).__name__] = archetype
+
+    def __getattr__(self, _: str) -> Any:
+        return lambda *args, **kwargs: None
+
+
+@pytest.mark.parametrize("orientation", ALL)
+def test_live_frames_are_upright(orientation: int) -> None:
+    from sfmapp.odometry.result import FrameState
+    from sfmapp.viewer.live_rrd import LiveDrawing
+
+    drawing, logged = LiveDrawing(None, None), Logged()
+    drawing._recording = logged  # type: ignore[assignment]
+    camera = Camera(CameraModel.PINHOLE, W, H, np.array([40.0, 40.0, W / 2, H / 2]))
+    drawing.draw({
+        "kind": "begin", "title": "", "camera": camera, "truth_times": None, "truth_cam_from_world": None,
+        "is_metric": False, "orientation": orientation,
+    })  # fmt: skip
+    stored = cv2.resize(np.random.default_rng(0).integers(0, 255, (4, 6), np.uint8), (W, H))
+    xy = np.array([[5.0, 7.0], [40.0, 20.0]])
+    drawing.draw({
+        "kind": "frame", "frame_idx": 0, "timestamp_s": 0.0, "state": int(FrameState.TRACKED), "image": stored,
+        "xy": xy, "is_mapped": np.array([True, False]), "num_tracked": 2, "num_mapped": 1, "map_idx": 0,
+        "cam_from_world": rigid3.IDENTITY, "time_s": 0.01,
+    })  # fmt: skip
+    jpeg = bytes(logged.last["image", "EncodedImage"].blob.as_arrow_array().to_pylist()[0])
+    shown = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert np.abs(shown.astype(float) - turned_by_pillow(stored, orientation)).mean() < 4
+    for name, place in (("mapped", xy[0]), ("tracked", xy[1])):
+        found = logged.last[f"image/{name}", "Points2D"].positions.as_arrow_array().to_pylist()[0]
+        np.testing.assert_allclose(found, upright_xy(orientation, place, W, H))
+    # the world is turned so that the top of the upright picture is up
+    turn = np.array(logged.last["world/scene", "Transform3D"].mat3x3.as_arrow_array().to_pylist()[0]).reshape(3, 3).T
+    top = upright_vectors(INVERSE[orientation], [0.0, -1.0])
+    np.testing.assert_allclose(turn @ [*top, 0.0], [0.0, 0.0, 1.0], atol=1e-6)
