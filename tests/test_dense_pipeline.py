@@ -188,6 +188,20 @@ def test_a_mesh_lies_on_the_wall(wall: Path, tmp_path: Path) -> None:
     assert mesh_workspace(out, FAST, record=False).mesh is not None
 
 
+def test_patches_of_an_earlier_model_make_no_mesh(wall: Path, tmp_path: Path) -> None:
+    folder = copy_of(wall, tmp_path)
+    model, keypoints = read_model(folder / "sparse" / "0")
+    dense(folder / "sparse" / "0", folder / "out2", FAST, images=folder / "images", record=False)
+    moved = model.copy()
+    moved.cam_from_world[:, 4:] += 0.1
+    shutil.rmtree(folder / "sparse" / "0")
+    write_model(folder / "sparse" / "0", moved, keypoints)
+    with pytest.raises(InputError, match="of an earlier one"):
+        mesh_workspace(folder / "out2", FAST, record=False)
+    dense(folder / "out2", options=FAST, record=False)
+    assert mesh_workspace(folder / "out2", FAST, record=False).mesh is not None
+
+
 def test_a_mesh_of_a_cloud(wall: Path, tmp_path: Path) -> None:
     result = mesh_cloud(wall / "out" / "dense" / "fused.ply", tmp_path / "surface", FAST)
     assert result.mesh is not None

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from sfmapp.events import Events
+from sfmapp.events import Event, Events
 from sfmapp.images.folder import ImageOptions, ImageRecord, load_images
 from sfmapp.images.headers import UnusableImage, read_header
 from sfmapp.images.pixels import decode_bytes, read_mask, read_on_white, read_rgb
@@ -175,6 +175,9 @@ def test_near_infrared_is_no_mask(tmp_path: Path) -> None:
     pixels[: H // 2, :, 3] = 0  # water, say: it would all be masked away
     record = load(tmp_path, tiff(pixels, 2, (0,)))
     assert read_mask(record) is None
+    told: list[Event] = []
+    load_images(tmp_path, ImageOptions(), Events(told.append))
+    assert sum("near infrared" in event.message for event in told) == 1
     np.testing.assert_array_equal(read_rgb(record), pixels[..., :3])
     np.testing.assert_array_equal(read_on_white(record)[0], pixels[..., :3])
 

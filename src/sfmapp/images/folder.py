@@ -245,6 +245,10 @@ def _tell(
     deep = [scan.record.name for scan in scans if scan.header.bits > 8]
     if deep:
         events.decided(STAGE, f"{len(deep)} images of 16 bits are scaled to 8 bits", names=deep)
+    banded = [scan.record.name for scan in scans if scan.header.num_left_out]
+    if banded:
+        text = f"{len(banded)} images have bands beside colour and alpha (near infrared?), which are left out"
+        events.decided(STAGE, text, names=banded)
     _tell_orientation(events, [scan.record for scan in scans])
     without = [image.name for image in image_set.images if image.mask_path is None]
     if 0 < len(without) < len(image_set.images):

@@ -31,6 +31,7 @@ class Header:
         bits: per channel, 1 to 16.
         kind: ``gray``, ``rgb``, ``palette`` or ``cmyk``.
         has_alpha: there is, or may be, an alpha channel.
+        num_left_out: bands that are neither colour nor alpha, such as near infrared, and are not read.
         exif: the EXIF block, beginning with its TIFF header; empty if there is none. For TIFF the whole file.
     """
 
@@ -41,6 +42,7 @@ class Header:
     kind: str = "rgb"
     has_alpha: bool = False
     exif: bytes = b""
+    num_left_out: int = 0
 
 
 def read_header(data: bytes) -> Header:
@@ -176,7 +178,9 @@ def _read_tiff(data: bytes) -> Header:
         raise UnusableImage(str(reason)) from reason
     _check_tiff_data(data, layout.directory)
     _check_single_page(data, layout.directory)
-    return Header("tiff", layout.width, layout.height, layout.bits, layout.kind, layout.alpha is not None, data)
+    has_alpha = layout.alpha is not None
+    num_left_out = layout.num_samples - layout.num_colors - has_alpha
+    return Header("tiff", layout.width, layout.height, layout.bits, layout.kind, has_alpha, data, num_left_out)
 
 
 def _check_tiff_data(data: bytes, first: Directory) -> None:

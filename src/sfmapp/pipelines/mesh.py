@@ -19,8 +19,9 @@ from sfmapp.formats.mesh_ply import write_mesh_ply
 from sfmapp.formats.ply import read_vertices, rgb_of, xyz_of
 from sfmapp.geometry.upright import up_direction
 from sfmapp.pipelines import dense_results
-from sfmapp.pipelines.dense_source import DenseJob, dense_job, find_source, plan_source
+from sfmapp.pipelines.dense_source import DenseJob, dense_job, find_source, model_digest, plan_source
 from sfmapp.pipelines.options import Options, options_from_dict, options_to_dict, with_absolute_paths
+from sfmapp.pipelines.stored_pixels import has_stored_pixels
 from sfmapp.pipelines.usage import Stopwatch
 from sfmapp.pipelines.workspace import read_manifest, stage_key
 from sfmapp.scene.mesh import Mesh
@@ -83,6 +84,16 @@ def _run(job: DenseJob, record: bool) -> MeshResult:
     patches, names = read_patches(folder / dense_results.PATCHES)
     with job.stage("views"):
         plan, _ = plan_source(job)
+    made_of = job.workspace.manifest["stages"].get(dense_results.STAGE, {}).get("model")
+    # earlier versions noted no model, and turned photographs that this one takes as they are stored
+    is_other = (
+        has_stored_pixels(job.workspace.manifest) if made_of is None else made_of != model_digest(job.known.model)
+    )
+    if is_other:
+        raise InputError(
+            f"{folder}: expected patches of its model, found those of an earlier one: it was reconstructed again",
+            f"run again: sfmapp dense {folder}",
+        )
     if plan.names != names:
         raise InputError(
             f"{folder}: the patches are of {len(names)} photographs, the model now has {len(plan.names)} others",
