@@ -271,6 +271,16 @@ def test_mirrored_files_among_others_are_told(tmp_path: Path) -> None:
     assert [record.camera_idx for record in image_set.images] == [0, 0, 1, 0, 0, 0]
 
 
+def test_a_mirrored_file_joins_no_model_of_others(photos: Path, tmp_path: Path) -> None:
+    ways = {path.name: 2 if k == 3 else 1 for k, path in enumerate(sorted(photos.iterdir()))}
+    write_photos(photos, tmp_path / "photos", ways)
+    report = reconstruct(tmp_path / "photos", tmp_path / "out", record=False).report
+    lost = [row for row in report["images"] if not row["is_registered"]]
+    assert [ways[row["name"]] for row in lost] == [2]
+    assert lost[0]["failed_at"] == "pairs"
+    assert "mirror image" in lost[0]["reason"]
+
+
 @pytest.mark.parametrize("orientation", range(2, 9))
 @pytest.mark.parametrize("is_upright", [True, False])
 def test_validate_compares_with_a_truth_in_one_frame(

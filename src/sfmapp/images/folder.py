@@ -278,7 +278,7 @@ def _tell_orientation(events: Events, records: list[ImageRecord]) -> None:
     else:
         text = (
             f"{_some(mirrored)}: stored as mirror images (EXIF orientation 2, 4, 5, 7), unlike the others, with which "
-            f"they cannot share a model; {advice}"
+            f"they are not matched; {advice}"
         )
     events.warned(STAGE, text, names=mirrored)
 
