@@ -205,7 +205,7 @@ def _as_grey(data: bytes, layout: TiffLayout, wide: int, parts: slice) -> bytes:
     first, order = layout.directory, byte_order(data) or "<"
     entries: dict[int, tuple[int, ...]] = {
         256: (layout.width * wide,), 257: (layout.height,), 258: (layout.bits,), 259: (layout.compression,), 262: (1,),
-        277: (1,), 284: (1,), 317: (1,), 339: (1,),
+        277: (1,), 284: (1,), 339: (1,),
     }  # fmt: skip
     for tag in (266, 278, 323):
         if first.numbers(tag):
