@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sfmapp.errors import InputError
+from sfmapp.events import Events
 from sfmapp.formats.atomic import replaced_folder
 from sfmapp.formats.colmap_binary import read_binary, write_binary
 from sfmapp.formats.colmap_model import Keypoints, model_from_reconstruction, reconstruction_from_model
@@ -60,11 +61,16 @@ def has_model(folder: str | Path) -> bool:
     return any((Path(folder) / f"images.{ending}").is_file() for ending in ("bin", "txt"))
 
 
-def read_model(folder: str | Path) -> tuple[Reconstruction, Keypoints]:
+def read_model(folder: str | Path, events: Events | None = None) -> tuple[Reconstruction, Keypoints]:
     """Read a model, binary (preferred, as COLMAP does) or text, with rigs and frames or without.
 
     Images, cameras and points stand in ascending order of their ids; every track element is an inlier. Images of rigs
-    with several cameras are on the reconstruction's ``rig``.
+    with several cameras are on the reconstruction's ``rig``. Where points or images were taken away, ids that still
+    name them count as none; cameras that no image uses may be of any model; a model without a file of points has none.
+
+    Args:
+        folder: of the model.
+        events: warned, once for each kind, of what was left out.
 
     Returns:
         The reconstruction, and for each image the pixels (N, 2) float64 of its keypoints.
@@ -73,10 +79,12 @@ def read_model(folder: str | Path) -> tuple[Reconstruction, Keypoints]:
         InputError: a file is missing, truncated, malformed or disagrees with the others, or a camera model is not ours.
     """
     folder = Path(folder)
-    if (folder / "images.bin").exists():
-        return reconstruction_from_model(folder, read_binary(folder))
-    if (folder / "images.txt").exists():
-        return reconstruction_from_model(folder, read_text(folder))
+    if has_model(folder):
+        model = read_binary(folder) if (folder / "images.bin").is_file() else read_text(folder)
+        reconstruction, keypoints, notes = reconstruction_from_model(folder, model)
+        for note in notes:
+            (events or Events()).warned("model", f"{folder}: {note}")
+        return reconstruction, keypoints
     found = "no such folder" if not folder.is_dir() else ", ".join(sorted(p.name for p in folder.iterdir())[:8])
     raise InputError(
         f"{folder}: expected a COLMAP model (images.bin or images.txt), found {found or 'an empty folder'}"

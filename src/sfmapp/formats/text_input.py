@@ -21,7 +21,7 @@ def read_limited_text(path: Path, largest_bytes: int = LARGEST_BYTES) -> str:
         size = path.stat().st_size
         if size > largest_bytes:
             raise InputError(f"{path}: expected at most {largest_bytes} bytes, found {size}")
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # some editors put a byte order mark first
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError:

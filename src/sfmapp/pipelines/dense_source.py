@@ -109,7 +109,7 @@ def plan_source(job: DenseJob) -> tuple[DensePlan, dict[str, Any]]:
     where = job.known
     if not has_model(where.model):
         raise InputError(f"{where.model}: the model that this workspace was made of is gone", "bring it back")
-    model, _ = read_model(where.model)
+    model, _ = read_model(where.model, job.events)
     photographs = find_photographs(
         model, where.images, job.options.images,
         is_upright=where.is_upright, threads=job.threads, events=job.events,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
+from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model, write_model, write_model_text
 from sfmapp.pipelines.workspace import read_manifest
 from sfmapp.scene.reconstruction import Reconstruction
@@ -27,6 +28,7 @@ class _Source:
     model: Reconstruction
     keypoints: list[NDArray[np.float64]]
     image_folder: Path | None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ def export_model(output: str | os.PathLike[str], target: str, path: str | os.Pat
         "num_observations": int(ours.obs_is_inlier.sum()),
         "max_px": _worst_px(ours, theirs),
         "max_coordinate": float(np.abs(theirs.point_xyz - ours.point_xyz).max(initial=0.0)),
-        "notes": list(copy.notes),
+        "notes": [*source.notes, *copy.notes],
     }
 
 
@@ -95,8 +97,10 @@ def _source(output: Path) -> _Source:
             raise NoReconstructionError(f"{output} holds no model to export", "run sfmapp reconstruct first")
     elif not has_model(output) and has_model(output / "sparse" / "0"):
         folder = output / "sparse" / "0"
-    model, keypoints = read_model(folder)
-    return _Source(folder, model, keypoints, image_folder)
+    events, notes = Events(), list[str]()
+    events.subscribe(lambda event: notes.append(event.message))
+    model, keypoints = read_model(folder, events)
+    return _Source(folder, model, keypoints, image_folder, tuple(notes))
 
 
 def _worst_px(ours: Reconstruction, theirs: Reconstruction) -> float:
