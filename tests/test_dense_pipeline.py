@@ -18,7 +18,7 @@ from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError, UsageError
 from sfmapp.events import Event, Events
 from sfmapp.formats.colmap import read_model, write_model
-from sfmapp.formats.ply import read_vertices
+from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.pipelines.dense import dense
 from sfmapp.pipelines.mesh import mesh_cloud, mesh_workspace
 from sfmapp.pipelines.options import Options
@@ -60,8 +60,8 @@ def test_a_text_model_with_distortion_comes_out_where_the_wall_is(wall: Path) ->
     assert np.degrees(np.arccos(np.clip(-patches.normal[:, 2], -1, 1))).mean() < 15.0
     # how far off they are along the ray is what they say, within a factor
     assert 0.2 < np.median(off * PIXEL / patches.sigma) < 3.0
-    cloud = read_vertices(wall / "out" / "dense" / "fused.ply")
-    np.testing.assert_array_equal(cloud["z"], patches.xyz[:, 2])
+    cloud = read_ply_geometry(wall / "out" / "dense" / "fused.ply")
+    np.testing.assert_array_equal(cloud.xyz[:, 2], patches.xyz[:, 2])
     # colours are those of the wall
     wall_image = texture()
     place = np.rint(patches.xyz[:, :2] * 100 + 800 - 0.5).astype(int)

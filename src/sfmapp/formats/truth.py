@@ -15,7 +15,7 @@ from sfmapp.errors import InputError
 from sfmapp.evaluation.poses import match_names
 from sfmapp.formats.colmap import has_model, read_model
 from sfmapp.formats.colmap_model import checked_camera
-from sfmapp.formats.nerfstudio import read_nerfstudio
+from sfmapp.formats.nerfstudio import read_nerfstudio_poses
 from sfmapp.formats.text_input import finite_array, nearest_rotation, read_json_object
 from sfmapp.formats.trajectory import read_tum
 from sfmapp.geometry import rigid3
@@ -94,7 +94,8 @@ def read_truth(path: str | Path) -> Truth:
         return Truth(path, tuple(names), poses, None)
     document = read_json_object(path)
     if "frames" in document:
-        return _from_reconstruction(path, read_nerfstudio(path))
+        names, poses, cameras = read_nerfstudio_poses(path)
+        return Truth(path, tuple(names), poses, None if cameras is None else tuple(cameras))
     return _from_cameras_json(path, document)
 
 

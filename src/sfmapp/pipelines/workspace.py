@@ -35,6 +35,8 @@ MANIFEST = "run.json"
 # the commands that write workspaces; manifests of before the second one name none
 RECONSTRUCT, ODOMETRY, REFINE, DENSE = "reconstruct", "odometry", "refine", "dense"
 LOCK = ".lock"
+# where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0
+USUAL_FOLDERS = ("images", "../images", "../../images")
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 _PACKAGE = Path(__file__).resolve().parent.parent
 _RECORDED_VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "gtsam", "scipy")
