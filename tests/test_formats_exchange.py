@@ -321,6 +321,59 @@ def test_nerfstudio_refusals(tmp_path: Path, changes: dict[str, Any], match: str
         read_nerfstudio(path)
 
 
+def test_nerfstudio_poses_need_neither_points_nor_our_cameras(tmp_path: Path) -> None:
+    """As a truth: panoramas, scenes without sizes, points that are gone or not to be read."""
+    path = tmp_path / "transforms.json"
+    (tmp_path / "bad.ply").write_bytes(b"no points")
+    frames = [
+        {"file_path": ".\\images\\a 1.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 40.0},
+        {"file_path": "/data/b", "transform_matrix": np.eye(4).tolist()},
+    ]
+    path.write_text(json.dumps(nerf_document(frames=frames, ply_file_path="absent.ply")))
+    truth = read_truth(path)
+    assert truth.names == ("images/a 1.png", "/data/b")
+    assert truth.cameras is not None
+    assert [camera.focal for camera in truth.cameras] == [40, 50]
+    assert truth.for_images(["b.jpg", "a 1.jpg"]).names == ("a 1.jpg", "b.jpg")
+    for changes in ({"camera_model": "EQUIRECTANGULAR"}, {"w": None}, {"k3": 0.1}, {"ply_file_path": "bad.ply"}):
+        path.write_text(json.dumps(nerf_document(frames=frames) | changes))
+        np.testing.assert_array_equal(read_truth(path).cam_from_world, truth.cam_from_world)
+    path.write_text(json.dumps(nerf_document(applied_scale=0)))
+    with pytest.raises(InputError, match="applied_scale above 0"):
+        read_truth(path)
+
+
+def test_nerfstudio_points_in_text_with_gaps_and_a_scale(tmp_path: Path) -> None:
+    """The points that ns-process-data writes; and a world that was scaled after it was turned."""
+    rec = scene([synthetic_camera()])
+    write_nerfstudio(tmp_path / "transforms.json", rec)
+    plain = read_nerfstudio(tmp_path / "transforms.json")
+    document = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in document["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= 0.25
+    (tmp_path / "transforms.json").write_text(json.dumps(document | {"applied_scale": 0.25}))
+    points = read_ply_geometry(tmp_path / POINTS_NAME)
+    assert points.rgb is not None
+    rows = [f"{x / 4!r} {y / 4!r} {z / 4!r} {r} {g} {b}" for (x, y, z), (r, g, b) in
+            zip(points.xyz.tolist(), points.rgb.tolist(), strict=True)]  # fmt: skip
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(rows) + 1}\n"
+    head += "".join(f"property double {axis}\n" for axis in "xyz")
+    head += "".join(f"property uint8 {color}\n" for color in ("red", "green", "blue"))
+    (tmp_path / POINTS_NAME).write_text("\n".join([head + "end_header", "nan nan nan 1 2 3", *rows, ""]))
+    back = read_nerfstudio(tmp_path / "transforms.json")
+    np.testing.assert_allclose(back.cam_from_world, plain.cam_from_world, atol=1e-12)
+    np.testing.assert_allclose(back.point_xyz, plain.point_xyz, atol=1e-12)
+    np.testing.assert_array_equal(back.point_rgb, plain.point_rgb)
+
+
+def test_nerfstudio_fisheye_of_instant_ngp(tmp_path: Path) -> None:
+    (tmp_path / "t.json").write_text(json.dumps(nerf_document(is_fisheye=True, k1=0.1, k4=0.01)))
+    camera = read_nerfstudio(tmp_path / "t.json").cameras[0]
+    assert camera.model == CameraModel.OPENCV_FISHEYE
+    assert camera.params[[4, 7]].tolist() == [0.1, 0.01]
+
+
 @pytest.mark.parametrize("text", ["", "[1]", "{", "[" * 100_000, '{"frames": 1' + "0" * 5000 + "}", "\x00"])
 def test_json_from_outside(tmp_path: Path, text: str) -> None:
     (tmp_path / "t.json").write_text(text)

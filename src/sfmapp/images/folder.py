@@ -51,9 +51,10 @@ def load_images(
     """List, check and describe the photographs of a source.
 
     Args:
-        source: a folder (searched recursively; hidden files and folders are left out), a glob pattern (``**`` goes
-            into folders), or a ``.txt`` file with a path per line (relative to the list, or absolute; ``#`` begins a
-            comment).
+        source: a folder (searched recursively; hidden files and folders are left out, and those that sfmapp and other
+            programs made of photographs), a glob pattern (``**`` goes into folders), or a ``.txt`` file with a path per
+            line (relative to the list, or absolute; ``#`` begins a comment). Files without an ending are photographs
+            if they begin as one.
         options: what to read and what is known about the cameras.
         events: told about progress, every file that is skipped, and how cameras were assigned.
         threads: how many files are read at a time; None: as many as there are processors, 8 at most.
@@ -84,6 +85,9 @@ def load_images(
     image_set = ImageSet(images, tuple(cameras), tuple(skipped))
     problems = [(scan.record.name, problem) for scan in scans for problem in scan.problems] + focal_problems
     duplicates = _duplicates(images)
+    if found.results:
+        message = f"{_some(found.results)}: results of sfmapp, whose pictures are no photographs"
+        events.decided(STAGE, message, names=found.results)
     _tell(events, image_set, scans, entries, problems, duplicates)
     if options.mask_path is not None and images and not any(image.mask_path for image in images):
         name = images[0].name
@@ -284,6 +288,7 @@ def _report(
     return {
         "source": printable(source),
         "root": printable(str(found.root)),
+        "results_passed_over": found.results,
         "num_found": len(scans) + len(image_set.skipped),
         "num_used": len(scans),
         "num_skipped": len(image_set.skipped),

@@ -148,6 +148,7 @@ def mesh_cloud(
     xyz, normal, rgb = _oriented_points(Path(cloud), events)
     threads = options.num_workers
     size = _sizes(xyz, threads)
+    _check_precision(Path(cloud), xyz, float(np.median(size)), events)
     mesh, report = make_mesh(xyz, normal, rgb, size, None, options.surface, threads=threads, events=events)
     folder = Path(output)
     write_mesh_ply(folder / MESH_PLY, mesh)
@@ -167,7 +168,7 @@ def _oriented_points(path: Path, events: Events) -> tuple[NDArray[np.float64], N
     for left_out, why in ((~points.is_finite, "a place that is not finite"), (~has_normal, "no normal (zero or NaN)")):
         if left_out.any():
             events.warned(STAGE, f"{path}: {int(left_out.sum())} of {len(usable)} points have {why}, they are left out")
-    if len(usable) and not usable.any():
+    if not usable.any():
         raise InputError(f"{path}: expected points with places and normals, found none among {len(usable)}", advice)
     if points.rgb is None:
         events.decided(STAGE, f"{path} has no colours: the mesh is grey")
@@ -176,6 +177,17 @@ def _oriented_points(path: Path, events: Events) -> tuple[NDArray[np.float64], N
         rgb = points.rgb
     normal = (points.normal[usable] / length[usable, None]).astype(np.float32)
     return points.xyz[usable], normal, rgb[usable]
+
+
+def _check_precision(path: Path, xyz: NDArray[np.float64], spacing: float, events: Events) -> None:
+    """Warn of coordinates that have lost what lies between the points, as georeferenced ones do in single precision."""
+    step = float(np.spacing(np.float32(np.abs(xyz).max())))
+    if step > 0.25 * spacing and (xyz == xyz.astype(np.float32)).all():
+        events.warned(
+            STAGE,
+            f"{path}: the points lie about {spacing:.3g} apart, but coordinates so far from 0 are {step:.3g} apart in "
+            "single precision: write them as double, or move them to the origin first",
+        )
 
 
 def _sizes(xyz: NDArray[np.float64], threads: int) -> NDArray[np.float32]:
