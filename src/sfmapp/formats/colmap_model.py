@@ -27,6 +27,7 @@ FOREIGN_NUM_PARAMS = {6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16, 12: 4, 13: 5, 14:
 """How many parameters the others have, by id: what it takes to read on behind one that no image uses."""
 
 _LARGEST_SIDE_PX = 1_000_000  # a photograph is smaller; a corrupt file says 10^18
+_LARGEST_PARAMETER = 1e9  # so are focal lengths and coefficients; a corrupt file says 10^300
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,10 @@ def checked_camera(
     names = PARAM_NAMES[known]
     if values.shape != (len(names),):
         raise InputError(f"{place}: {known.name} has {len(names)} parameters, found {len(values)}")
-    if not np.isfinite(values).all() or not (values[[name.startswith("f") for name in names]] > 0).all():
+    if (
+        not (np.abs(values) < _LARGEST_PARAMETER).all()
+        or not (values[[name.startswith("f") for name in names]] > 0).all()
+    ):
         raise InputError(f"{place}: expected finite parameters and positive focal lengths, found {values.tolist()}")
     return Camera(known, int(width), int(height), values, focal_source="file")
 

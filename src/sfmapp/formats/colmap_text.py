@@ -21,7 +21,7 @@ from sfmapp.formats.colmap_model import (
     unused_cameras_note,
 )
 from sfmapp.formats.colmap_rigs import Frame, Rig, add_rig, add_sensor, poses_from_frames
-from sfmapp.formats.text_input import read_limited_text
+from sfmapp.formats.text_input import plain_numbers, read_limited_text
 from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import Camera, CameraModel
 
@@ -120,17 +120,10 @@ def _records(path: Path) -> Iterator[tuple[str, list[str]]]:
             yield f"{path}:{number}", line.split()
 
 
-def _refuse_underscores(fields: list[str]) -> None:
-    """Raise ValueError for what only Python takes for a number: 1_000."""
-    if any("_" in field for field in fields):
-        raise ValueError
-
-
 def _floats(place: str, fields: list[str], what: str) -> NDArray[np.float64]:
     """(N,) finite numbers."""
     try:
-        values = np.array([float(field) for field in fields], np.float64)
-        _refuse_underscores(fields)
+        values = np.array(plain_numbers(fields), np.float64)
     except ValueError:
         raise InputError(f"{place}: expected numbers for {what}, found {' '.join(fields)[:80]!r}") from None
     if not np.isfinite(values).all():
@@ -142,7 +135,8 @@ def _ints(place: str, fields: list[str], what: str, low: int = 0, high: int = _L
     """Whole numbers from low to high."""
     try:
         values = [int(field) for field in fields]
-        _refuse_underscores(fields)
+        if any("_" in field for field in fields):  # 1_000 is a number to Python alone
+            raise ValueError
     except ValueError:
         raise InputError(f"{place}: expected whole numbers for {what}, found {' '.join(fields)[:80]!r}") from None
     if any(not low <= value <= high for value in values):
@@ -153,6 +147,11 @@ def _ints(place: str, fields: list[str], what: str, low: int = 0, high: int = _L
 def _need(place: str, fields: list[str], count: int, what: str) -> None:
     if len(fields) < count:
         raise InputError(f"{place}: expected at least {count} fields of {what}, found {len(fields)}")
+
+
+def _no_more(place: str, fields: list[str], what: str) -> None:
+    if fields:
+        raise InputError(f"{place}: expected the end of the line after {what}, found {' '.join(fields)[:80]!r}")
 
 
 def _read_cameras(path: Path, used_ids: Collection[int]) -> tuple[NDArray[np.int64], list[Camera], tuple[str, ...]]:
@@ -243,7 +242,7 @@ def _read_rigs(path: Path) -> dict[int, Rig]:
         for i in range(num_sensors):
             _need(place, rest, 2 if i == 0 else 3, "a sensor")
             kind, (sensor_id,), pose = rest[0], _ints(place, rest[1:2], "a sensor"), rigid3.IDENTITY
-            has_pose = i > 0 and rest[2] != "0"
+            has_pose = i > 0 and bool(_ints(place, rest[2:3], "whether a sensor has a pose", 0, 1)[0])
             rest = rest[2:] if i == 0 else rest[3:]
             if has_pose:
                 _need(place, rest, 7, "the pose of a sensor")
@@ -252,6 +251,7 @@ def _read_rigs(path: Path) -> dict[int, Rig]:
                 rest = rest[7:]
             if kind == "CAMERA" and (i == 0 or has_pose):
                 add_sensor(path, sensors, sensor_id, pose)
+        _no_more(place, rest, f"rig {rig_id} of {num_sensors} sensors")
         add_rig(path, rigs, rig_id, sensors)
     return rigs
 
@@ -264,6 +264,7 @@ def _read_frames(path: Path) -> list[Frame]:
         _need(place, fields[10:], 3 * num_data, "the data of a frame")
         values = _floats(place, fields[2:9], "a pose")[None]
         pose = checked_poses(path, "frame", np.array([frame_id]), values)[0]
+        _no_more(place, fields[10 + 3 * num_data :], f"frame {frame_id} of {num_data} data")
         images = []
         for kind, *ids in zip(fields[10::3], fields[11::3], fields[12::3], strict=False):
             sensor_id, data_id = _ints(place, ids, "the data of a frame")

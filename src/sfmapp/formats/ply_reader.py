@@ -131,14 +131,15 @@ def _read(path: Path, file: BinaryIO) -> PlyGeometry:
             "its lines end as in a text file of Windows: if it was transferred as text, its numbers are damaged; "
             "transfer it as binary",
         )
-    xyz = np.stack([vertices.numbers[axis].astype(np.float64) for axis in "xyz"], 1)
+    with np.errstate(invalid="ignore"):  # of NaN that were made to signal
+        xyz = np.stack([vertices.numbers[axis].astype(np.float64) for axis in "xyz"], 1)
     if triangles is not None and len(triangles):
         lowest, highest = int(triangles.min()), int(triangles.max())
         if lowest < 0 or highest >= len(xyz):
             found = lowest if lowest < 0 else highest
             raise InputError(f"{path}: expected faces of vertices 0 to {len(xyz) - 1}, found {found}")
     normal, color = _columns(vertices, _NORMALS), _columns(vertices, _COLORS)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         normals = None if normal is None else np.stack([axis.astype(np.float32) for axis in normal], 1)
     return PlyGeometry(xyz, triangles, normals, None if color is None else _as_bytes(color))
 

@@ -22,6 +22,8 @@ from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import Camera
 from sfmapp.scene.reconstruction import Reconstruction
 
+_LARGEST_PX = 1e9
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -134,6 +136,8 @@ def _json_camera(path: Path, place: str, entry: dict[str, Any]) -> Camera:
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
     if matrix[0, 1] or matrix[1, 0] or matrix[2].tolist() != [0, 0, 1]:
         raise InputError(f"{place}: expected K without skew and with a last row of 0 0 1, found {matrix.tolist()}")
+    if not (np.abs(matrix) < _LARGEST_PX).all():
+        raise InputError(f"{place}: expected K in pixels, found {matrix.tolist()}")
     # where the size is not given, the principal point is taken for the centre
     width = float(finite_array(f"{place}: width", entry.get("width", round(2 * cx)), ()))
     height = float(finite_array(f"{place}: height", entry.get("height", round(2 * cy)), ()))

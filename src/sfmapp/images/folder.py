@@ -14,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from sfmapp.errors import InputError
@@ -117,7 +117,7 @@ def describe_images(
     folder = Path(root).absolute()
     mask_root = Path(options.mask_path).absolute() if options.mask_path is not None else None
     with ThreadPoolExecutor(threads or min(8, os.cpu_count() or 1)) as pool:
-        outcomes = list(pool.map(lambda name: _scan(folder / name, folder, mask_root, options), names))
+        outcomes = list(pool.map(lambda name: _scan_by_name(name, folder, mask_root, options), names))
     records = [outcome.record if isinstance(outcome, _Scan) else None for outcome in outcomes]
     reasons = [(name, o[1]) for name, o in zip(names, outcomes, strict=True) if not isinstance(o, _Scan)]
     return records, reasons
@@ -137,6 +137,14 @@ def _scan_all(
             yield outcome
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _scan_by_name(name: str, folder: Path, mask_root: Path | None, options: ImageOptions) -> _Scan | tuple[str, str]:
+    """As :func:`_scan`, of a name that a file of others gives: results are written under it as well."""
+    pure = PurePosixPath(name)
+    if pure.is_absolute() or ".." in pure.parts:
+        return name, "its name leads out of the folder of the photographs"
+    return _scan(folder / name, folder, mask_root, options)
 
 
 def _scan(path: Path, root: Path, mask_root: Path | None, options: ImageOptions) -> _Scan | tuple[str, str]:
