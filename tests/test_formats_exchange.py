@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.bundler import read_bundler, write_bundler
-from sfmapp.formats.colmap import write_model
+from sfmapp.formats.colmap import read_model, write_model, write_model_text
 from sfmapp.formats.nerfstudio import POINTS_NAME, read_nerfstudio, write_nerfstudio
 from sfmapp.formats.ply import write_ply
 from sfmapp.formats.ply_reader import read_ply_geometry
@@ -479,6 +479,25 @@ def test_all_forms_of_truth_agree(tmp_path: Path) -> None:
             assert truth.for_images(rec.image_names).names == tuple(rec.image_names[i] for i in registered)
         with pytest.raises(InputError, match="no name fits"):
             truth.for_images(["p.jpg", "q.jpg"])
+
+
+@pytest.mark.parametrize("write", [write_model, write_model_text])
+def test_poses_of_a_colmap_model_are_a_truth_whatever_its_lenses(tmp_path: Path, write: Any) -> None:
+    """As those of ETH3D: thin prism cameras, and observations that nobody asks for."""
+    rec = scene([centered_camera()])
+    write(tmp_path, rec)
+    plain = read_truth(tmp_path)
+    model = pycolmap.Reconstruction(str(tmp_path))
+    for camera in model.cameras.values():
+        camera.model, camera.params = "THIN_PRISM_FISHEYE", [900.0, 900, 500, 375, *[0.01] * 8]
+    (model.write_binary if write is write_model else model.write_text)(str(tmp_path))
+    with pytest.raises(InputError, match="THIN_PRISM_FISHEYE"):
+        read_model(tmp_path)
+    (next(tmp_path.glob("points3D.*"))).write_bytes(b"no points at all")
+    truth = read_truth(tmp_path)
+    assert truth.cameras is None
+    assert truth.names == plain.names
+    np.testing.assert_allclose(truth.cam_from_world, plain.cam_from_world, atol=1e-14)
 
 
 def test_truth_agrees_with_opencv_on_the_half_pixel(tmp_path: Path) -> None:

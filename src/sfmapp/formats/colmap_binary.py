@@ -17,6 +17,7 @@ from sfmapp.formats.colmap_model import (
     NO_RIGS_NOTE,
     ColmapModel,
     Keypoints,
+    PosedImages,
     checked_camera,
     checked_poses,
     unused_cameras_note,
@@ -41,27 +42,40 @@ def write_binary(folder: Path, model: ColmapModel) -> None:
     (folder / "points3D.bin").write_bytes(_points_bytes(model))
 
 
-def read_binary(folder: Path) -> ColmapModel:
-    """Read a binary model, with rigs and frames or without. Raises InputError for anything malformed."""
-    image_ids, camera_of, names, poses, xy, point_ids = _read_images(_Reader(folder / "images.bin"))
-    camera_ids, cameras, notes = _read_cameras(_Reader(folder / "cameras.bin"), set(camera_of.tolist()))
-    rigs, frames = {}, []
+def read_binary_images(folder: Path) -> PosedImages:
+    """The images of a binary model, with rigs and frames or without. Raises InputError for anything malformed."""
+    ids, camera_ids, names, poses, xy, point_ids = _read_images(_Reader(folder / "images.bin"))
+    rigs, frames, notes = dict[int, Rig](), list[Frame](), tuple[str, ...]()
     if (folder / "frames.bin").exists() and (folder / "rigs.bin").exists():
         rigs = _read_rigs(_Reader(folder / "rigs.bin"))
         frames = _read_frames(_Reader(folder / "frames.bin"))
-        poses = poses_from_frames(folder / "frames.bin", image_ids, camera_of, rigs, frames)
+        poses = poses_from_frames(folder / "frames.bin", ids, camera_ids, rigs, frames)
     elif (folder / "frames.bin").exists():
-        notes += (NO_RIGS_NOTE,)
+        notes = (NO_RIGS_NOTE,)
+    return PosedImages(ids, camera_ids, names, poses, xy, point_ids, rigs, frames, notes)
+
+
+def read_binary_cameras(folder: Path, images: PosedImages) -> tuple[NDArray[np.int64], list[Camera], tuple[str, ...]]:
+    """Ids, cameras, and a note of those that are left out: of a model that is not ours, and that no image uses."""
+    return _read_cameras(_Reader(folder / "cameras.bin"), set(images.camera_ids.tolist()))
+
+
+def read_binary(folder: Path) -> ColmapModel:
+    """Read a binary model, with rigs and frames or without. Raises InputError for anything malformed."""
+    images = read_binary_images(folder)
+    camera_ids, cameras, notes = read_binary_cameras(folder, images)
+    notes = (*images.notes, *notes)
     if (folder / "points3D.bin").exists():
         points, track_ptr, track = _read_points(_Reader(folder / "points3D.bin"))
     else:
         points, track_ptr, track = np.zeros(0, _POINT3D), np.zeros(1, np.int64), np.zeros(0, _TRACK)
         notes += (NO_POINTS_NOTE,)
     return ColmapModel(
-        camera_ids, cameras, image_ids, camera_of, names, poses, xy, point_ids,
+        camera_ids, cameras, images.ids, images.camera_ids, images.names, images.cam_from_world, images.points2d_xy,
+        images.points2d_point_ids,
         points["id"].copy(), points["xyz"].copy(), points["rgb"].copy(), points["error"].copy(),
-        track_ptr, track["image_id"].astype(np.int64), track["point2d_idx"].astype(np.int64), rigs, frames,
-        notes,
+        track_ptr, track["image_id"].astype(np.int64), track["point2d_idx"].astype(np.int64),
+        images.rigs, images.frames, notes,
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,6 +63,21 @@ class ColmapModel:
     rigs: dict[int, Rig]
     frames: list[Frame]
     notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """What a model says of its images (I), without cameras and points; arrays as in :class:`ColmapModel`."""
+
+    ids: NDArray[np.int64]
+    camera_ids: NDArray[np.int64]
+    names: list[str]
+    cam_from_world: NDArray[np.float64]
+    points2d_xy: Keypoints
+    points2d_point_ids: list[NDArray[np.int64]]
+    rigs: dict[int, Rig]
+    frames: list[Frame]
+    notes: tuple[str, ...]
 
 
 def unused_cameras_note(left_out: list[str]) -> tuple[str, ...]:
@@ -197,6 +213,16 @@ def _mean_error_px(reconstruction: Reconstruction, used: NDArray[np.bool_]) -> N
     return mean
 
 
+def check_unique(folder: Path, what: str, ids: NDArray[np.int64], names: Sequence[str] = ()) -> None:
+    """Raise InputError if an id or a name is there twice."""
+    values, counts = np.unique(ids, return_counts=True)
+    if (counts > 1).any():
+        raise InputError(f"{folder}: expected every {what} id once, found {what} {values[counts > 1][0]} twice")
+    twice = sorted(name for name, count in Counter(names).items() if count > 1)
+    if twice:
+        raise InputError(f"{folder}: expected every {what} name once, found {twice[0]!r} twice")
+
+
 def reconstruction_from_model(folder: Path, model: ColmapModel) -> tuple[Reconstruction, Keypoints, tuple[str, ...]]:
     """The reconstruction that a model holds, images and points in ascending order of their ids; all ids are checked.
 
@@ -209,13 +235,9 @@ def reconstruction_from_model(folder: Path, model: ColmapModel) -> tuple[Reconst
         InputError: ids that are double or out of range, cameras that are missing; two names alike; images and tracks
             that contradict each other.
     """
-    for what, ids in (("camera", model.camera_ids), ("image", model.image_ids), ("point", model.point_ids)):
-        values, counts = np.unique(ids, return_counts=True)
-        if (counts > 1).any():
-            raise InputError(f"{folder}: expected every {what} id once, found {what} {values[counts > 1][0]} twice")
-    twice = sorted(name for name, count in Counter(model.image_names).items() if count > 1)
-    if twice:
-        raise InputError(f"{folder}: expected every image name once, found {twice[0]!r} twice")
+    check_unique(folder, "camera", model.camera_ids)
+    check_unique(folder, "image", model.image_ids, model.image_names)
+    check_unique(folder, "point", model.point_ids)
     camera_order = np.argsort(model.camera_ids)
     image_order = np.argsort(model.image_ids)
     point_order = np.argsort(model.point_ids)

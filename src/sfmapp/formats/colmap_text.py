@@ -15,6 +15,7 @@ from sfmapp.formats.colmap_model import (
     NO_RIGS_NOTE,
     ColmapModel,
     Keypoints,
+    PosedImages,
     checked_camera,
     checked_names,
     checked_poses,
@@ -78,17 +79,29 @@ def _numbers(values: NDArray[np.float64]) -> str:
     return " ".join(map(repr, values.tolist()))
 
 
-def read_text(folder: Path) -> ColmapModel:
-    """Read a text model, with rigs and frames or without. Raises InputError for anything malformed."""
-    image_ids, camera_of, names, poses, xy, point_ids = _read_images(folder / "images.txt")
-    camera_ids, cameras, notes = _read_cameras(folder / "cameras.txt", set(camera_of.tolist()))
-    rigs, frames = {}, []
+def read_text_images(folder: Path) -> PosedImages:
+    """The images of a text model, with rigs and frames or without. Raises InputError for anything malformed."""
+    ids, camera_ids, names, poses, xy, point_ids = _read_images(folder / "images.txt")
+    rigs, frames, notes = dict[int, Rig](), list[Frame](), tuple[str, ...]()
     if (folder / "frames.txt").exists() and (folder / "rigs.txt").exists():
         rigs = _read_rigs(folder / "rigs.txt")
         frames = _read_frames(folder / "frames.txt")
-        poses = poses_from_frames(folder / "frames.txt", image_ids, camera_of, rigs, frames)
+        poses = poses_from_frames(folder / "frames.txt", ids, camera_ids, rigs, frames)
     elif (folder / "frames.txt").exists():
-        notes += (NO_RIGS_NOTE,)
+        notes = (NO_RIGS_NOTE,)
+    return PosedImages(ids, camera_ids, names, poses, xy, point_ids, rigs, frames, notes)
+
+
+def read_text_cameras(folder: Path, images: PosedImages) -> tuple[NDArray[np.int64], list[Camera], tuple[str, ...]]:
+    """Ids, cameras, and a note of those that are left out: of a model that is not ours, and that no image uses."""
+    return _read_cameras(folder / "cameras.txt", set(images.camera_ids.tolist()))
+
+
+def read_text(folder: Path) -> ColmapModel:
+    """Read a text model, with rigs and frames or without. Raises InputError for anything malformed."""
+    images = read_text_images(folder)
+    camera_ids, cameras, notes = read_text_cameras(folder, images)
+    notes = (*images.notes, *notes)
     table, tracks = np.zeros((0, 8)), list[NDArray[np.int64]]()
     if (folder / "points3D.txt").exists():
         table, tracks = _read_points(folder / "points3D.txt")
@@ -97,10 +110,11 @@ def read_text(folder: Path) -> ColmapModel:
     lengths = np.array([len(track) for track in tracks], np.int64)
     flat = np.concatenate([*tracks, np.zeros((0, 2), np.int64)])
     return ColmapModel(
-        camera_ids, cameras, image_ids, camera_of, names, poses, xy, point_ids,
+        camera_ids, cameras, images.ids, images.camera_ids, images.names, images.cam_from_world, images.points2d_xy,
+        images.points2d_point_ids,
         table[:, 0].astype(np.int64), table[:, 1:4].copy(), table[:, 4:7].astype(np.uint8), table[:, 7].copy(),
-        np.concatenate([[0], np.cumsum(lengths)]), flat[:, 0].copy(), flat[:, 1].copy(), rigs,
-        frames, notes,
+        np.concatenate([[0], np.cumsum(lengths)]), flat[:, 0].copy(), flat[:, 1].copy(),
+        images.rigs, images.frames, notes,
     )  # fmt: skip
 
 

@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
 from sfmapp.evaluation.poses import match_names
-from sfmapp.formats.colmap import has_model, read_model
+from sfmapp.formats.colmap import has_model, read_model_poses
 from sfmapp.formats.colmap_model import checked_camera
 from sfmapp.formats.nerfstudio import read_nerfstudio_poses
 from sfmapp.formats.text_input import finite_array, nearest_rotation, read_json_object
 from sfmapp.formats.trajectory import read_tum
 from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import Camera
-from sfmapp.scene.reconstruction import Reconstruction
 
 _LARGEST_PX = 1e9
 
@@ -33,7 +32,7 @@ class Truth:
         path: the file or folder that they come from.
         names: N names of images, as the file has them; of a trajectory, the timestamps.
         cam_from_world: (N, 7) float64, quaternion x y z w and translation, in the file's own world.
-        cameras: N intrinsics in the house's pixel rule; None where the file holds none.
+        cameras: N intrinsics in the house's pixel rule; None where the file holds none, or others than ours.
     """
 
     path: Path
@@ -86,7 +85,7 @@ def read_truth(path: str | Path) -> Truth:
     if path.is_dir():
         if not has_model(path) and has_model(path / "sparse" / "0"):
             path = path / "sparse" / "0"
-        return _from_reconstruction(path, read_model(path)[0])
+        return _truth(path, *read_model_poses(path))
     if not path.exists():
         raise InputError(f"{path}: expected a COLMAP model, cameras.json or TUM trajectory, found nothing")
     if path.suffix.lower() != ".json":
@@ -96,14 +95,12 @@ def read_truth(path: str | Path) -> Truth:
         return Truth(path, tuple(names), poses, None)
     document = read_json_object(path)
     if "frames" in document:
-        names, poses, cameras = read_nerfstudio_poses(path)
-        return Truth(path, tuple(names), poses, None if cameras is None else tuple(cameras))
+        return _truth(path, *read_nerfstudio_poses(path))
     return _from_cameras_json(path, document)
 
 
-def _from_reconstruction(path: Path, reconstruction: Reconstruction) -> Truth:
-    cameras = tuple(reconstruction.cameras[i] for i in reconstruction.image_camera_idx)
-    return Truth(path, tuple(reconstruction.image_names), reconstruction.cam_from_world, cameras)
+def _truth(path: Path, names: list[str], poses: NDArray[np.float64], cameras: list[Camera] | None) -> Truth:
+    return Truth(path, tuple(names), poses, None if cameras is None else tuple(cameras))
 
 
 def _from_cameras_json(path: Path, document: dict[str, Any]) -> Truth:
