@@ -481,6 +481,19 @@ def test_all_forms_of_truth_agree(tmp_path: Path) -> None:
             truth.for_images(["p.jpg", "q.jpg"])
 
 
+@pytest.mark.parametrize("name", ["sparse/0", "sparse", "colmap/sparse/0", "transforms.json", "cameras.json"])
+def test_a_truth_is_found_in_its_folder(tmp_path: Path, name: str) -> None:
+    rec = scene([centered_camera()])
+    if name == "transforms.json":
+        write_nerfstudio(tmp_path / name, rec)
+    elif name == "cameras.json":
+        json_truth(tmp_path / name, rec)
+    else:
+        write_model(tmp_path / name, rec)
+    expected = rec.cam_from_world[rec.registered_idx, 4:]
+    np.testing.assert_allclose(read_truth(tmp_path).cam_from_world[:, 4:], expected, atol=1e-9)
+
+
 @pytest.mark.parametrize("write", [write_model, write_model_text])
 def test_poses_of_a_colmap_model_are_a_truth_whatever_its_lenses(tmp_path: Path, write: Any) -> None:
     """As those of ETH3D: thin prism cameras, and observations that nobody asks for."""

@@ -114,6 +114,8 @@ def test_results_inside_the_folder_are_no_photographs(tmp_path: Path, version: i
     assert names(load(tmp_path / "photos/**/*.*g")[0]) == wanted
     # what is named is used
     assert names(load(tmp_path / "photos/out/dense/maps")[0]) == ["a.jpg.depth.png"]
+    with pytest.raises(InputError, match="results of sfmapp alone, in dense/"):
+        load(str(tmp_path / "photos/out/**/*.depth.png"))
     (tmp_path / "list.txt").write_text("photos/out/picture.png\nphotos/a.jpg\n")
     assert names(load(tmp_path / "list.txt")[0]) == ["a.jpg", "out/picture.png"]
 
@@ -121,6 +123,9 @@ def test_results_inside_the_folder_are_no_photographs(tmp_path: Path, version: i
 def test_a_workspace_as_the_source_keeps_its_results_to_itself(tmp_path: Path) -> None:
     workspace(tmp_path / "out")
     assert names(load(tmp_path / "out")[0]) == ["picture.png"]
+    (tmp_path / "out/picture.png").unlink()
+    _, _, log = load(tmp_path / "out")
+    assert any("other than in dense/, which holds results of sfmapp" in e.message for e in log if e.kind == "warned")
 
 
 def test_copies_that_other_programs_made_are_left_out_and_told(tmp_path: Path) -> None:

@@ -361,12 +361,10 @@ def _claimed_keypoints(
             f"{named_ids[at[first]]}",
             "images and points are not of one model: take both from the same export",
         )
-    _, firsts = np.unique(at, return_index=True)
-    if len(firsts) < len(at):
-        again = int(np.setdiff1d(np.arange(len(at)), firsts)[0])
-        raise InputError(
-            f"{folder}: expected as many keypoints as observations of points, found {element(again)} claimed twice"
-        )
+    twice = np.bincount(at, minlength=1) > 1
+    if twice.any():
+        again = element(int(np.flatnonzero(twice[at])[0]))
+        raise InputError(f"{folder}: expected as many keypoints as observations of points, found {again} claimed twice")
     return at
 
 

@@ -22,6 +22,8 @@ from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import Camera
 
 _LARGEST_PX = 1e9
+# what a folder is looked through for
+_INSIDE = ("", "sparse/0", "sparse", "colmap/sparse/0", "transforms.json", "cameras.json")
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,8 @@ def _number(text: str) -> float:
 
 
 def read_truth(path: str | Path) -> Truth:
-    """Read reference cameras: a COLMAP model (folder), ``cameras.json``, ``transforms.json`` or a trajectory.
+    """Read reference cameras: a COLMAP model, ``cameras.json``, ``transforms.json``, a folder with one of them, or a
+    trajectory.
 
     ``cameras.json`` holds a list ``cameras`` of ``file``, ``R_w2c``, ``t_w2c`` (``x_cam = R X + t``), ``K`` and
     ``dist`` (k1, k2, p1, p2 or null), with pixel centres at whole numbers as OpenCV has them: half a pixel is added to
@@ -83,8 +86,9 @@ def read_truth(path: str | Path) -> Truth:
     """
     path = Path(path)
     if path.is_dir():
-        if not has_model(path) and has_model(path / "sparse" / "0"):
-            path = path / "sparse" / "0"
+        inside = [path / name for name in _INSIDE if has_model(path / name) or (path / name).is_file()]
+        path = next(iter(inside), path)
+    if path.is_dir():
         return _truth(path, *read_model_poses(path))
     if not path.exists():
         raise InputError(f"{path}: expected a COLMAP model, cameras.json or TUM trajectory, found nothing")

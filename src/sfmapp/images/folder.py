@@ -89,6 +89,9 @@ def load_images(
         message = f"{_some(found.results)}: results of sfmapp, whose pictures are no photographs"
         events.decided(STAGE, message, names=found.results)
     _tell(events, image_set, scans, entries, problems, duplicates)
+    if not images:
+        where = f", other than in {_some(found.results)}, which holds results of sfmapp" if found.results else ""
+        events.warned(STAGE, f"no usable image found{where}: expected files such as .jpg, .png, .tif, .webp")
     if options.mask_path is not None and images and not any(image.mask_path for image in images):
         name = images[0].name
         raise InputError(
@@ -268,8 +271,6 @@ def _tell(
             f"length {entry['focal_px']:.0f} +- {entry['focal_sigma_px']:.0f} px ({entry['focal_reason']})",
             **entry,
         )
-    if not image_set.images:
-        events.warned(STAGE, "no usable image found: expected files such as .jpg, .png, .tif, .webp")
 
 
 def _by_reason(items: Iterable[tuple[str, str]]) -> dict[str, list[str]]:

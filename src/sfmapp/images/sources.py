@@ -140,6 +140,11 @@ def _find_by_pattern(pattern: str, mask_root: Path | None) -> Found:
             _take(found, path)
     _add_other_case(found, pattern, matches)
     if not found.paths and not found.skipped:
+        if found.results:
+            raise InputError(
+                f"the pattern {pattern} matches results of sfmapp alone, in {', '.join(found.results[:3])}",
+                "name the folder of the photographs",
+            )
         raise InputError(f"the pattern {pattern} matches no image", "put it in quotes, and check it with ls")
     return found
 
