@@ -111,6 +111,7 @@ def test_results_inside_the_folder_are_no_photographs(tmp_path: Path, version: i
     assert sorted(report["results_passed_over"]) == ["b/c/runs/second/", "latest/", "out/"]
     assert [e.message for e in log if e.kind == "warned"] == []
     assert any("results of sfmapp" in e.message for e in log if e.kind == "decided")
+    assert "results of sfmapp in" in next(e.message for e in log if e.kind == "finished")
     assert names(load(tmp_path / "photos/**/*.*g")[0]) == wanted
     # what is named is used
     assert names(load(tmp_path / "photos/out/dense/maps")[0]) == ["a.jpg.depth.png"]
@@ -143,6 +144,25 @@ def test_copies_that_other_programs_made_are_left_out_and_told(tmp_path: Path) -
         assert len(load(tmp_path / name)[0].images) == 1
     (tmp_path / "transforms.json").unlink()
     assert len(load(tmp_path)[0].images) == 3  # by their names alone they may be anything
+
+
+@pytest.mark.parametrize(
+    ("copy", "original", "mark"),
+    [
+        ("images/a.jpg", "input/a.jpg", "stereo/patch-match.cfg"),
+        ("undistorted/images/a.jpg", "images/a.jpg", "reconstruction.json"),
+        ("odm_orthophoto/odm_orthophoto.tif", "images/a.jpg", "opensfm/config.yaml"),
+    ],
+)
+def test_projects_of_other_programs(tmp_path: Path, copy: str, original: str, mark: str) -> None:
+    save(tmp_path / copy)
+    save(tmp_path / original, seed=1)
+    assert sorted(names(load(tmp_path)[0])) == sorted([copy, original])
+    (tmp_path / mark).parent.mkdir(exist_ok=True)
+    (tmp_path / mark).write_text("{}")
+    image_set, _, _ = load(tmp_path)
+    assert names(image_set) == [original]
+    assert [name for name, _ in image_set.skipped] == [copy.split("/")[0] + "/"]
 
 
 def test_endings_in_any_case_and_files_without_one(tmp_path: Path) -> None:

@@ -99,7 +99,10 @@ def load_images(
         )
     report = _report(os.fspath(source), found, image_set, scans, entries, problems, duplicates)
     report["seconds"] = round(time.monotonic() - start, 3)
-    events.finished(STAGE, f"{len(images)} images, {len(cameras)} cameras, {len(skipped)} files skipped", **report)
+    passed_over = f", results of sfmapp in {_some(found.results)} passed over" if found.results else ""
+    events.finished(
+        STAGE, f"{len(images)} images, {len(cameras)} cameras, {len(skipped)} files skipped{passed_over}", **report
+    )
     return image_set, report
 
 

@@ -38,10 +38,20 @@ def holds_results(folder: Path, root: Path) -> bool:
 
 def foreign_product(folder: Path) -> str | None:
     """What other programs made the folder for, as a reason to leave it out; None if nothing tells of any."""
-    stereo = folder / "stereo"
-    if (stereo / "patch-match.cfg").is_file() or (stereo / "fusion.cfg").is_file():
+    parent = folder.parent
+    # 3D Gaussian splatting's convert.py has COLMAP undistort input/ to images/ beside it
+    is_undistorted = folder.name == "images" and (parent / "input").is_dir() and _is_for_stereo(parent)
+    if _is_for_stereo(folder) or is_undistorted:
         return f"undistorted copies that COLMAP made for its dense stage: {_ADVICE}"
-    is_project = (folder.parent / "transforms.json").is_file() or (folder.parent / "sparse").is_dir()
-    if is_project and re.fullmatch(r"images_(2|4|8|16)", folder.name) and (folder.parent / "images").is_dir():
-        return f"smaller copies of the photographs in {folder.parent.name}/images: {_ADVICE}"
+    if folder.name == "undistorted" and (parent / "reconstruction.json").is_file():
+        return f"undistorted copies that OpenSfM made: {_ADVICE}"
+    if folder.name.startswith("odm_") and (parent / "opensfm").is_dir():
+        return f"results of OpenDroneMap: {_ADVICE}"
+    is_project = (parent / "transforms.json").is_file() or (parent / "sparse").is_dir()
+    if is_project and re.fullmatch(r"images_(2|4|8|16)", folder.name) and (parent / "images").is_dir():
+        return f"smaller copies of the photographs in {parent.name}/images: {_ADVICE}"
     return None
+
+
+def _is_for_stereo(folder: Path) -> bool:
+    return any((folder / "stereo" / name).is_file() for name in ("patch-match.cfg", "fusion.cfg"))
