@@ -237,6 +237,13 @@ def test_colours_by_any_name_and_type(
     assert found.normal is None
 
 
+def test_fractions_that_overshoot_white(tmp_path: Path) -> None:
+    shares = np.where(RGB == 255, 1.02, RGB / 255)
+    data = cloud("ascii", columns("double", "x y z", XYZ) + columns("float", "r g b", shares))
+    (tmp_path / "a.ply").write_bytes(data)
+    np.testing.assert_array_equal(read_ply_geometry(tmp_path / "a.ply").rgb, RGB)
+
+
 def test_dark_whole_numbers_are_not_fractions(tmp_path: Path) -> None:
     dark = RGB // 255
     (tmp_path / "a.ply").write_bytes(cloud("ascii", columns("double", "x y z", XYZ) + columns("int", "r g b", dark)))

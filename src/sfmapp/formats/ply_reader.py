@@ -26,6 +26,9 @@ _FACE_LISTS = ("vertex_indices", "vertex_index")
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("normalx", "normaly", "normalz"))
 _COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 
+# colours of 1 for white overshoot it where they come of sharpening; those of 255 do not end here
+_LARGEST_FRACTION = 2.0
+
 
 @dataclass(frozen=True)
 class PlyGeometry:
@@ -153,14 +156,14 @@ def _columns(rows: _Rows, choices: tuple[tuple[str, ...], ...]) -> list[NDArray[
 def _as_bytes(channels: list[NDArray[Any]]) -> NDArray[np.uint8]:
     """(N, 3) colours of 8 bits from any numbers.
 
-    Files do not say what white is. Fractions are taken to be of 1 where none goes beyond it, of 255 otherwise; whole
-    numbers to be of 255, or of 65535 where one goes beyond 255.
+    Files do not say what white is. Fractions are taken to be of 1 where none goes far beyond it, of 255 otherwise;
+    whole numbers to be of 255, or of 65535 where one goes beyond 255.
     """
     if all(channel.dtype in (np.dtype("u1"), np.dtype("i1")) for channel in channels):
         return np.stack([channel.view(np.uint8) for channel in channels], 1)
     values = np.nan_to_num(np.stack([channel.astype(np.float64) for channel in channels], 1), posinf=0.0, neginf=0.0)
     highest = values.max(initial=0.0)
-    if highest <= 1.0 and any(channel.dtype.kind == "f" for channel in channels):
+    if highest <= _LARGEST_FRACTION and any(channel.dtype.kind == "f" for channel in channels):
         values *= 255.0
     elif highest > 255.0:
         values /= 257.0
