@@ -3,7 +3,6 @@ benchmark for the evaluation of RGB-D SLAM systems", IROS 2012)."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +47,7 @@ def read_tum(path: str | Path) -> tuple[list[str], NDArray[np.float64]]:
             rows.append(finite_array(place, plain_numbers(fields), (8,)))
         except ValueError:
             raise InputError(f"{place}: expected 8 finite numbers, found {line[:80]!r}") from None
-        if abs(math.hypot(*rows[-1][4:]) - 1) > 1e-2:  # six digits are customary, three occur
+        if abs(np.hypot.reduce(rows[-1][4:]) - 1) > 1e-2:  # six digits are customary, three occur
             raise InputError(f"{place}: expected a quaternion of unit length, found {fields[4:]}")
         names.append(fields[0])
     table = np.array(rows, np.float64).reshape(-1, 8)

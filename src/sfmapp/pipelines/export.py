@@ -90,7 +90,8 @@ def export_model(output: str | os.PathLike[str], target: str, path: str | os.Pat
 def _source(output: Path) -> _Source:
     folder, image_source = output, None
     if (output / "run.json").is_file():
-        image_source = str(read_manifest(output).get("source") or "")
+        manifest = read_manifest(output)
+        image_source = str(manifest.get("source") or "")
         folder = output / "sparse" / "0"
         if not has_model(folder):
             raise NoReconstructionError(f"{output} holds no model to export", "run sfmapp reconstruct first")
