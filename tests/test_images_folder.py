@@ -15,6 +15,7 @@ from PIL import Image
 
 from sfmapp.errors import InputError, InterruptedRunError, UsageError
 from sfmapp.events import Event, Events
+from sfmapp.formats.sequence_files import has_images, list_images
 from sfmapp.images.folder import ImageOptions, ImageSet, load_images
 from sfmapp.images.pixels import read_picture
 from sfmapp.scene.camera import CameraModel
@@ -179,6 +180,17 @@ def test_endings_in_any_case_and_files_without_one(tmp_path: Path) -> None:
     assert [e.message for e in log if e.kind == "warned"] == []
     for image in image_set.images:
         assert read_picture(image).gray.shape == (32, 48)
+
+
+def test_frames_without_an_ending(tmp_path: Path) -> None:
+    for i, name in enumerate(("1403636579763555584", "1403636579813555456", "b.PNG", "1305031102.175304")):
+        save(tmp_path / name, seed=i, format="PNG")
+    (tmp_path / "README").write_text("frames")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty/README").write_text("none")
+    assert [path.name for path in list_images(tmp_path)] == ["1403636579763555584", "1403636579813555456", "b.PNG"]
+    assert has_images(tmp_path)
+    assert not has_images(tmp_path / "empty")
 
 
 def test_pictures_under_other_endings_are_told(tmp_path: Path) -> None:

@@ -85,6 +85,12 @@ def natural_key(name: str) -> tuple[Any, ...]:
     return tuple((int(part), "") if i % 2 else (-1, part) for i, part in enumerate(parts)), name
 
 
+def is_picture(path: Path) -> bool:
+    """Whether a file is a picture by its ending; one without an ending, by its first bytes."""
+    ending = path.suffix.lower()
+    return ending in EXTENSIONS or (not ending and picture_format(path) is not None)
+
+
 def _find_in_folder(root: Path, mask_root: Path | None) -> Found:
     found = Found(root)
     visited: set[tuple[int, int]] = set()
