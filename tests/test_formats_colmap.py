@@ -450,7 +450,7 @@ def test_text_refusals_name_the_line(tmp_path: Path) -> None:
     good = {
         "cameras.txt": b"# c\n1 PINHOLE 100 80 50 50 50 40\n",
         "images.txt": b"1 1 0 0 0 0 0 1 1 a b.jpg\n10 20 5\n",
-        "points3D.txt": b"5 0 0 4 1 2 3 nan 1 0\n",
+        "points3D.txt": b"5 0 0 4 1 2.0 3 nan 1 0\n",
     }
     lay_out(tmp_path, good, "txt")
     rec, keypoints = read_model(tmp_path)
@@ -467,6 +467,7 @@ def test_text_refusals_name_the_line(tmp_path: Path) -> None:
     refuse(tmp_path, good, "points3D.txt", b"6 0 0 4 1 2 3 0 1 0\n", "which names point 5")
     refuse(tmp_path, good, "points3D.txt", b"5 0 0 4 1 2 3 0 1 0 1 0\n", "as many keypoints")
     refuse(tmp_path, good, "points3D.txt", b"5 0 0 4 1 2 300 0 1 0\n", "from 0 to 255")
+    refuse(tmp_path, good, "points3D.txt", b"5 0 0 4 1 2 3.5 0 1 0\n", "whole numbers from 0 to 255")
     refuse(tmp_path, good, "points3D.txt", b"\xff\xfe\n", "UTF-8")
 
 

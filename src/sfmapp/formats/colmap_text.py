@@ -229,8 +229,10 @@ def _read_points(path: Path) -> tuple[NDArray[np.float64], list[NDArray[np.int64
     for place, fields in _records(path):
         _need(place, fields, 8, "a point")
         _ints(place, fields[:1], "the id of a point")
-        _ints(place, fields[4:7], "a colour", 0, 255)
         heads.append(_floats(place, fields[:7], "a point"))
+        color = heads[-1][4:]
+        if ((color < 0) | (color > 255) | (color % 1 != 0)).any():  # COLMAP takes 127.0 as well
+            raise InputError(f"{place}: expected a colour of whole numbers from 0 to 255, found {color.tolist()}")
         track = _ints(place, fields[8:], "a track", 0, 2**32 - 1)
         if len(track) % 2:
             raise InputError(f"{place}: expected two fields per observation, found {len(track)} in all")
