@@ -14,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from sfmapp.errors import InputError
@@ -52,9 +52,10 @@ def load_images(
     """List, check and describe the photographs of a source.
 
     Args:
-        source: a folder (searched recursively; hidden files and folders are left out), a glob pattern (``**`` goes
-            into folders), or a ``.txt`` file with a path per line (relative to the list, or absolute; ``#`` begins a
-            comment).
+        source: a folder (searched recursively; hidden files and folders are left out, and those that sfmapp and other
+            programs made of photographs), a glob pattern (``**`` goes into folders), or a ``.txt`` file with a path per
+            line (relative to the list, or absolute; ``#`` begins a comment). Files without an ending are photographs
+            if they begin as one.
         options: what to read and what is known about the cameras.
         events: told about progress, every file that is skipped, and how cameras were assigned.
         threads: how many files are read at a time; None: as many as there are processors, 8 at most.
@@ -85,7 +86,13 @@ def load_images(
     image_set = ImageSet(images, tuple(cameras), tuple(skipped))
     problems = [(scan.record.name, problem) for scan in scans for problem in scan.problems] + focal_problems
     duplicates = _duplicates(images)
+    if found.results:
+        message = f"{_some(found.results)}: results of sfmapp, whose pictures are no photographs"
+        events.decided(STAGE, message, names=found.results)
     _tell(events, image_set, scans, entries, problems, duplicates)
+    if not images:
+        where = f", other than in {_some(found.results)}, which holds results of sfmapp" if found.results else ""
+        events.warned(STAGE, f"no usable image found{where}: expected files such as .jpg, .png, .tif, .webp")
     if options.mask_path is not None and images and not any(image.mask_path for image in images):
         name = images[0].name
         raise InputError(
@@ -93,7 +100,10 @@ def load_images(
         )
     report = _report(os.fspath(source), found, image_set, scans, entries, problems, duplicates)
     report["seconds"] = round(time.monotonic() - start, 3)
-    events.finished(STAGE, f"{len(images)} images, {len(cameras)} cameras, {len(skipped)} files skipped", **report)
+    passed_over = f", results of sfmapp in {_some(found.results)} passed over" if found.results else ""
+    events.finished(
+        STAGE, f"{len(images)} images, {len(cameras)} cameras, {len(skipped)} files skipped{passed_over}", **report
+    )
     return image_set, report
 
 
@@ -114,7 +124,7 @@ def describe_images(
     folder = Path(root).absolute()
     mask_root = Path(options.mask_path).absolute() if options.mask_path is not None else None
     with ThreadPoolExecutor(threads or min(8, os.cpu_count() or 1)) as pool:
-        outcomes = list(pool.map(lambda name: _scan(folder / name, folder, mask_root, options), names))
+        outcomes = list(pool.map(lambda name: _scan_by_name(name, folder, mask_root, options), names))
     records = [outcome.record if isinstance(outcome, _Scan) else None for outcome in outcomes]
     reasons = [(name, o[1]) for name, o in zip(names, outcomes, strict=True) if not isinstance(o, _Scan)]
     return records, reasons
@@ -134,6 +144,14 @@ def _scan_all(
             yield outcome
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _scan_by_name(name: str, folder: Path, mask_root: Path | None, options: ImageOptions) -> _Scan | tuple[str, str]:
+    """As :func:`_scan`, of a name that a file of others gives: results are written under it as well."""
+    pure = PurePosixPath(name)
+    if pure.is_absolute() or ".." in pure.parts:
+        return name, "its name leads out of the folder of the photographs"
+    return _scan(folder / name, folder, mask_root, options)
 
 
 def _scan(path: Path, root: Path, mask_root: Path | None, options: ImageOptions) -> _Scan | tuple[str, str]:
@@ -260,8 +278,6 @@ def _tell(
             f"length {entry['focal_px']:.0f} +- {entry['focal_sigma_px']:.0f} px ({entry['focal_reason']})",
             **entry,
         )
-    if not image_set.images:
-        events.warned(STAGE, "no usable image found: expected files such as .jpg, .png, .tif, .webp")
 
 
 def _tell_orientation(events: Events, records: list[ImageRecord]) -> None:
@@ -307,6 +323,7 @@ def _report(
     return {
         "source": printable(source),
         "root": printable(str(found.root)),
+        "results_passed_over": found.results,
         "num_found": len(scans) + len(image_set.skipped),
         "num_used": len(scans),
         "num_skipped": len(image_set.skipped),

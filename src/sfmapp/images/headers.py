@@ -7,11 +7,14 @@ raise :class:`UnusableImage` with the reason and nothing else, whatever the byte
 
 from __future__ import annotations
 
+import os
 import re
+import stat
 import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from sfmapp.images.tags import Directory, byte_order, read_directory
 from sfmapp.images.tiff import UnreadTiffError, tiff_layout
@@ -60,6 +63,27 @@ def read_header(data: bytes) -> Header:
     if header.width <= 0 or header.height <= 0:
         raise UnusableImage(f"broken header: it claims {header.width}x{header.height} pixels")
     return header
+
+
+# Marks that no text and hardly another file begins with.
+_MARKS = {
+    b"\xff\xd8\xff": "JPEG", b"\x89PNG\r\n\x1a\n": "PNG", b"II*\0": "TIFF", b"MM\0*": "TIFF", b"GIF87a": "GIF",
+    b"GIF89a": "GIF",
+}  # fmt: skip
+
+
+def picture_format(path: Path) -> str | None:
+    """The format of a file that is a picture by its first bytes, whatever it is called; None for any other file."""
+    try:
+        if not stat.S_ISREG(os.stat(path).st_mode):  # opening a pipe would wait for ever
+            return None
+        with path.open("rb") as file:
+            data = file.read(16)
+    except OSError:
+        return None
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        return "WebP"
+    return next((name for mark, name in _MARKS.items() if data.startswith(mark)), None)
 
 
 def _reader_of(data: bytes) -> Callable[[bytes], Header]:

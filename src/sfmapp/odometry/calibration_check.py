@@ -59,7 +59,7 @@ _MAX_CHANCE, _SHARED_ERRORS, _MIN_HELD_OUT_SIGMAS, _MIN_DIRECTION_SIGMAS, _FOLDS
 _MAX_GAIN = 5.0
 # Rounds until the next would move by less than a share of a sigma; how far one may go, in the focal length's logarithm.
 _ROUNDS, _ROUNDS_FAR, _SETTLED_SIGMAS, _MAX_STEP = 6, 14, 0.5, 0.05
-# A step that makes the cost rise by more than this share has gone too far; steps of the adjustment that follows one, and
+# A step that makes the cost rise by more than this share has gone too far; steps of the adjustment after one, and
 # the share of the cost that ends them: what is left then is a fraction of a standard deviation.
 _MAX_RISE, _FOLLOWING_STEPS, _FOLLOWING_TOLERANCE = 1.05, 30, 1e-4
 # How many steps may be made in one, and how far (cosine) two have to go the same way for that.

@@ -175,6 +175,8 @@ def _alignment(folder: Path, truth_poses: Path, notes: list[str]) -> NDArray[np.
 
 def _points(geometry: PlyGeometry, distance: float, name: str, notes: list[str]) -> NDArray[np.float64]:
     """The points of a cloud, or points spread over a mesh."""
+    if num_lost := int((~geometry.is_finite).sum()):
+        notes.append(f"{name}: {num_lost} of {len(geometry.xyz)} points are not finite and are left out")
     if geometry.triangles is None or not len(geometry.triangles):
         return geometry.xyz
     area = float(triangle_areas(geometry.xyz[geometry.triangles]).sum())
