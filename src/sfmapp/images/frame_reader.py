@@ -238,6 +238,7 @@ class FileSequence:
         sampling: for each camera, where the pixels of its frames are found in the files, see :func:`resampled`.
         events: told about frames that are left out.
         elapsed_s: (N,) see :class:`~sfmapp.images.sequence.Frame`.
+        orientation: that EXIF gives the first; frames are those of the files all the same.
     """
 
     kind: SequenceKind
@@ -252,6 +253,7 @@ class FileSequence:
     truth: Truth | None
     events: Events
     elapsed_s: NDArray[np.float64] | None = None
+    orientation: int = 1
     num_frames: int | None = field(init=False)
 
     def __post_init__(self) -> None:
