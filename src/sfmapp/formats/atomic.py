@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sfmapp.errors import InputError
+from sfmapp.errors import InputError, remedy
 
 
 @contextmanager
@@ -27,7 +27,7 @@ def replaced_file(path: Path) -> Iterator[Path]:
         finally:
             beside.unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}", remedy(error)) from error
 
 
 @contextmanager
@@ -54,7 +54,7 @@ def replaced_folder(folder: Path, owned_names: Collection[str]) -> Iterator[Path
         finally:
             shutil.rmtree(beside, ignore_errors=True)
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written: {error.strerror or error}") from error
+        raise InputError(f"{folder}: cannot be written: {error.strerror or error}", remedy(error)) from error
 
 
 def _swap(beside: Path, folder: Path, owned_names: Collection[str]) -> None:

@@ -80,7 +80,7 @@ class LiveView:
         self._num_frames = sequence.num_frames
         truth = sequence.truth
         command = [
-            sys.executable, "-m", "sfmapp.viewer.live_process",
+            sys.executable, "-P", "-m", "sfmapp.viewer.live_process",
             str(self._recording.absolute()) if self._recording else "", self._screen.url if self._screen else "",
         ]  # fmt: skip
         self._outbox = Outbox(command)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.children import with_parent
 from sfmapp.viewer.listener import Message, RecordingListener, Step
 from sfmapp.viewer.replay import make_replay
 
@@ -72,7 +73,7 @@ def write_recording(
 def draw_in_child(kind: Kind, folder: Path, path: Path, threads: int, timeout_s: float) -> str:
     """Draw what lies in folder into the file path; returns what went wrong, empty for nothing."""
     arguments = [kind, str(folder.absolute()), str(path.absolute()), str(threads)]
-    command = [sys.executable, "-m", "sfmapp.viewer.record_process", *arguments]
+    command = with_parent([sys.executable, "-P", "-m", "sfmapp.viewer.record_process", *arguments])
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
