@@ -16,7 +16,7 @@ from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
 NAME = "sfmapp-kernels"
-ADVICE = f"set {VARIABLE} to a folder that you, and nobody else, can write to"
+ADVICE = f"set {VARIABLE} to a folder that you, and nobody else, can write to; one in OUT will do"
 _PACKAGE = Path(__file__).resolve().parent
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,6 +21,7 @@ from sfmapp.odometry.run import run_odometry
 from sfmapp.pipelines.kernels import compile_odometry_kernels
 from sfmapp.pipelines.listeners import DecisionLog, EventLog
 from sfmapp.pipelines.odometry_keyframes import KeyframeWatch
+from sfmapp.pipelines.odometry_live import GrowingTrajectories
 from sfmapp.pipelines.odometry_results import write_odometry
 from sfmapp.pipelines.odometry_scale import ScaleWish, parse_scale, scale_maps, settled_wish
 from sfmapp.pipelines.odometry_timing import FrameLog, ThreadTimes
@@ -37,6 +38,9 @@ if TYPE_CHECKING:
 NO_MAP_ADVICE = (
     "the camera has to move sideways past something still and textured; OUT/report.html and -v tell what was seen"
 )
+
+
+GIVEN_UP = "given up, for the disk is full, and the rest matters more"
 
 
 class TrackResult(NamedTuple):
@@ -65,6 +69,11 @@ class Tracking(Job):
     keyframes: KeyframeWatch
     wish: ScaleWish | None
     sequence: Sequence | None = None
+
+    def make_room(self) -> bool:
+        """See :meth:`Job.make_room`; a recording under way is one as well, and its end will be told as such."""
+        is_under_way = self.live is not None and self.live.is_recording and self.live.give_up(GIVEN_UP)
+        return super().make_room() or is_under_way
 
 
 def track_sequence(
@@ -103,7 +112,7 @@ def track_sequence(
     threads = options.num_workers
     with ExitStack() as stack:
         workspace = stack.enter_context(open_workspace(Path(output), ODOMETRY))
-        event_log = stack.enter_context(EventLog(workspace.log, source=source, version=sfmapp.__version__))
+        event_log = stack.enter_context(EventLog(workspace.log, events, source=source, version=sfmapp.__version__))
         # sums must not depend on how many threads the linear algebra would use
         stack.enter_context(threadpool_limits(1, "blas"))
         live = LiveView(workspace.recording if record else None, screen) if record or screen else None
@@ -114,7 +123,8 @@ def track_sequence(
             frames=FrameLog(), threads_cpu=ThreadTimes(), live=live,
             keyframes=KeyframeWatch(wish.detector() if wish else None), wish=wish,
         )  # fmt: skip
-        for listener in (event_log, run.log, run.frames, run.keyframes, live):
+        growing = stack.enter_context(closing(GrowingTrajectories(workspace.folder, events, run.make_room)))
+        for listener in (event_log, run.log, growing, run.frames, run.keyframes, live):
             if listener is not None:
                 events.subscribe(listener)
         return _run(run, self_calibrate)
@@ -135,6 +145,7 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         run.live.begin(run.sequence)
     with run.stage("kernels"):
         run.stages["kernels"] = compile_odometry_kernels(events, inertial=run.sequence.imu is not None)
+    run.save_first(lambda: run.workspace.begin(ODOMETRY, ""))
     with run.measured("odometry"):
         result = run_odometry(
             Watched(run.sequence, run), options.odometry, seed=options.seed, threads=run.threads, events=events.deaf()

@@ -33,7 +33,7 @@ from sfmapp.pipelines.options import Options, options_from_dict, with_absolute_p
 from sfmapp.pipelines.results import report_text
 from sfmapp.pipelines.run import Job
 from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import ODOMETRY, REFINE, open_workspace, read_manifest
+from sfmapp.pipelines.workspace import ODOMETRY, REFINE, check_ended, open_workspace, read_manifest
 from sfmapp.report.odometry_document import against_truth, map_row, truth_row
 from sfmapp.report.refine_html import REFINE_FORMAT, render_refine_html
 from sfmapp.scene.reconstruction import Reconstruction
@@ -89,13 +89,14 @@ def refine(
 
     source, options, events = Path(output), with_absolute_paths(options or Options()), events or Events()
     manifest = read_manifest(source, ODOMETRY)
+    check_ended(source, manifest)
     before = read_odometry(source)
     if not before.maps:
         raise NoReconstructionError(f"{source} holds no map to refine", "run sfmapp odometry first")
     threads = options.num_workers
     with ExitStack() as stack:
         workspace = stack.enter_context(open_workspace(Path(refined or source / FOLDER), REFINE))
-        event_log = stack.enter_context(EventLog(workspace.log, source=str(source), version=sfmapp.__version__))
+        event_log = stack.enter_context(EventLog(workspace.log, events, source=str(source), version=sfmapp.__version__))
         stack.enter_context(threadpool_limits(1, "blas"))
         job = Job(str(source), workspace, options, events, watch or Stopwatch(), DecisionLog(), threads)
         for listener in (event_log, job.log):

@@ -21,6 +21,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sfmapp import kernel_cache
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.atomic import replaced_file
 
@@ -164,6 +165,19 @@ def read_manifest(folder: Path, command: str | None = None) -> dict[str, Any]:
     return manifest
 
 
+def check_ended(folder: Path, manifest: dict[str, Any]) -> None:
+    """Refuse an odometry run that is still at work or was cut off: its files may be those of an earlier run.
+
+    Raises:
+        InputError: it is one.
+    """
+    if not manifest.get("stages", {}).get(ODOMETRY, {}).get("is_done", True):
+        raise InputError(
+            f"{folder}: expected a run that has ended, found one that is still at work or was cut off",
+            f"what it has tracked is in {folder / 'trajectory_live.tum'}; sfmapp odometry begins again",
+        )
+
+
 def _check_command(folder: Path, manifest: dict[str, Any], command: str) -> None:
     found = manifest.get("command", RECONSTRUCT)
     if found != command:
@@ -226,7 +240,8 @@ def _manifest_of(folder: Path) -> dict[str, Any] | None:
         raise UsageError(
             f"{folder} was written by another version of sfmapp ({manifest['format']})", "choose another OUT"
         )
-    strangers = sorted(path.name for path in folder.iterdir() if path.name not in (LOCK, f".{MANIFEST}.new"))
+    known = (LOCK, f".{MANIFEST}.new", _kernels_in(folder))
+    strangers = sorted(path.name for path in folder.iterdir() if path.name not in known)
     if strangers:
         found = ", ".join(strangers[:3]) + (", ..." if len(strangers) > 3 else "")
         raise UsageError(
@@ -234,6 +249,12 @@ def _manifest_of(folder: Path) -> dict[str, Any] | None:
             "nothing in it was touched; give -o a new or an empty folder",
         )
     return None
+
+
+def _kernels_in(folder: Path) -> str | None:
+    """Name of what is in a folder because the user had compiled kernels put there, for want of another place."""
+    place = Path(os.environ.get(kernel_cache.VARIABLE) or os.curdir).absolute()
+    return place.relative_to(folder.absolute()).parts[0] if folder.absolute() in place.parents else None
 
 
 def _read_json(path: Path) -> Any:

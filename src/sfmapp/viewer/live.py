@@ -69,6 +69,7 @@ class LiveView:
         self._num_frames: int | None = None
         self._count = self._num_messages = 0
         self._with_next_frame: list[dict[str, Any]] = []
+        self._problem = ""
 
     @property
     def is_recording(self) -> bool:
@@ -114,7 +115,7 @@ class LiveView:
             errors_m: (F,) distance of each frame from the truth, NaN where it is not known.
         """
         if self._outbox is None:
-            return ""
+            return self._problem
         self._send_decisions()
         self._send(
             "end", frame_idx=result.frame_idx, timestamps_s=result.timestamps_s, frame_map=result.frame_map,
@@ -124,12 +125,23 @@ class LiveView:
         outbox, self._outbox = self._outbox, None
         return outbox.close(END_TIMEOUT_S)
 
+    def give_up(self, problem: str) -> bool:
+        """End the child and take away what it has recorded so far; whether there was one."""
+        if self._outbox is None:
+            return False
+        self._problem = problem
+        self._stop()
+        return True
+
     def __enter__(self) -> LiveView:
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._stop()
+
+    def _stop(self) -> None:
         if self._outbox is not None:
             self._outbox.abandon()
             self._outbox = None
