@@ -124,7 +124,7 @@ def track_sequence(
             keyframes=KeyframeWatch(wish.detector() if wish else None), wish=wish,
         )  # fmt: skip
         growing = stack.enter_context(closing(GrowingTrajectories(workspace.folder, events, run.make_room)))
-        for listener in (event_log, run.log, growing, run.frames, run.keyframes, live):
+        for listener in (growing, event_log, run.log, run.frames, run.keyframes, live):
             if listener is not None:
                 events.subscribe(listener)
         return _run(run, self_calibrate)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import struct
 import subprocess
 import sys
@@ -38,6 +39,7 @@ Array = NDArray[np.float64]
 MAX_IMAGE_BYTES, MAX_POINT_BYTES, MAX_BYTES = 1 << 25, 1 << 26, 1 << 28
 # Frames of a recording that are shown with their image: every one of a thousand, every second of two thousand.
 MAX_IMAGES = 1000
+_COLOURS = re.compile(r"\x1b\[[\d;]*m")  # of rerun's messages
 _LEVELS = {"decided": "INFO", "warned": "WARN"}
 # the child opens rerun (seconds on a busy machine) and, at the end, writes what still waits
 END_TIMEOUT_S = 300.0
@@ -255,7 +257,7 @@ class Outbox:
         self._threads[1].join(timeout_s)
         if code == 0 and not self._has_failed:
             return ""
-        lines = b"".join(self._error_text).decode(errors="replace").strip().splitlines()
+        lines = _COLOURS.sub("", b"".join(self._error_text).decode(errors="replace")).strip().splitlines()
         return f"exit code {code}: {lines[-1] if lines else 'it could not keep up'}"
 
     def abandon(self) -> None:

@@ -63,9 +63,12 @@ def write_recording(
         timeout_s: the child is stopped after this long.
     """
     start = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
-        make_replay(image_set, features, reconstructions, steps, messages, title=title, up=up).save(Path(name))
-        problem = draw_in_child("run", Path(name), path, threads, timeout_s)
+    try:
+        with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
+            make_replay(image_set, features, reconstructions, steps, messages, title=title, up=up).save(Path(name))
+            problem = draw_in_child("run", Path(name), path, threads, timeout_s)
+    except OSError as error:
+        problem = error.strerror or str(error)
     size = path.stat().st_size if not problem else 0
     return RecordingReport(None if problem else path, size, time.monotonic() - start, problem)
 
