@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import json
 import sys
 from collections.abc import Sequence
@@ -55,6 +56,8 @@ def _known(error: Exception) -> SfmError | None:
     """What is no bug: a refusal of the system, or kernels that find no place."""
     if isinstance(error, OSError):
         return refusal(error)
+    if isinstance(error, RuntimeError) and str(error).startswith("Symlink loop"):  # of pathlib, before Python 3.13
+        return refusal(OSError(errno.ELOOP, str(error)))
     if is_without_cache(error):
         where = "neither where sfmapp is installed, nor in ~/.cache, nor in /tmp"
         return InputError(f"expected a folder to keep compiled kernels in, found none: {where}", ADVICE)

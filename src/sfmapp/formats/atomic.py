@@ -18,6 +18,8 @@ def replaced_file(path: Path) -> Iterator[Path]:
     Raises:
         InputError: the folder cannot be written.
     """
+    if not path.name:
+        raise InputError(f"{path}: expected the name of a file to write, found a folder")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")

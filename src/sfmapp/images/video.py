@@ -47,6 +47,8 @@ def _open(source: str) -> Any:
     import cv2
 
     device = _DEVICE.fullmatch(source)
+    if any("\ud800" <= letter <= "\udfff" for letter in source):  # OpenCV would crash
+        raise InputError(f"{printable(source)}: expected a name in UTF-8, found other bytes in it", "rename it")
     if device:
         capture = cv2.VideoCapture(int(device[1] or device[2]))
     else:

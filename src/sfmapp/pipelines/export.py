@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.formats.colmap import has_model, read_model, write_model, write_model_text
-from sfmapp.pipelines.workspace import check_ended, read_manifest
+from sfmapp.pipelines.workspace import read_manifest
 from sfmapp.scene.reconstruction import Reconstruction
 
 _NOTICEABLE_PX = 0.1  # below the noise of a keypoint
@@ -88,9 +88,7 @@ def _source(output: Path) -> _Source:
     image_folder = None
     folder = output
     if (output / "run.json").is_file():
-        manifest = read_manifest(output)
-        check_ended(output, manifest)
-        image_source = Path(str(manifest.get("source") or ""))
+        image_source = Path(str(read_manifest(output).get("source") or ""))
         image_folder = image_source if image_source.is_dir() and str(image_source) != "." else None
         folder = output / "sparse" / "0"
         if not has_model(folder):

@@ -33,7 +33,7 @@ from sfmapp.pipelines.options import Options, options_from_dict, with_absolute_p
 from sfmapp.pipelines.results import report_text
 from sfmapp.pipelines.run import Job
 from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import ODOMETRY, REFINE, check_ended, open_workspace, read_manifest
+from sfmapp.pipelines.workspace import ODOMETRY, REFINE, open_workspace, read_manifest
 from sfmapp.report.odometry_document import against_truth, map_row, truth_row
 from sfmapp.report.refine_html import REFINE_FORMAT, render_refine_html
 from sfmapp.scene.reconstruction import Reconstruction
@@ -89,7 +89,6 @@ def refine(
 
     source, options, events = Path(output), with_absolute_paths(options or Options()), events or Events()
     manifest = read_manifest(source, ODOMETRY)
-    check_ended(source, manifest)
     before = read_odometry(source)
     if not before.maps:
         raise NoReconstructionError(f"{source} holds no map to refine", "run sfmapp odometry first")

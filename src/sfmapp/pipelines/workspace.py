@@ -94,7 +94,8 @@ class Workspace:
     def write_text(self, name: str, text: str) -> None:
         """Write a text file of the workspace, beside and renamed."""
         with replaced_file(self.folder / name) as beside:
-            beside.write_text(text, encoding="utf-8")
+            # a name in it may not be text
+            beside.write_text(text, encoding="utf-8", errors="backslashreplace")
 
     def read_json(self, name: str) -> Any:
         """A JSON file of the workspace; None if it is not there or damaged."""
@@ -154,7 +155,7 @@ def read_manifest(folder: Path, command: str | None = None) -> dict[str, Any]:
     """The manifest of an existing workspace, for commands that only look at one; of a certain command if one is given.
 
     Raises:
-        InputError: the folder is not a workspace.
+        InputError: the folder is not a workspace, or holds what is left of an odometry run that was cut off.
         UsageError: it holds the results of another command.
     """
     manifest = _read_json(folder / MANIFEST) if folder.is_dir() else None
@@ -162,15 +163,12 @@ def read_manifest(folder: Path, command: str | None = None) -> dict[str, Any]:
         raise InputError(f"{folder} is not a workspace of sfmapp", "give the OUT of an earlier run")
     if command is not None:
         _check_command(folder, manifest, command)
+    _check_ended(folder, manifest)
     return manifest
 
 
-def check_ended(folder: Path, manifest: dict[str, Any]) -> None:
-    """Refuse an odometry run that is still at work or was cut off: its files may be those of an earlier run.
-
-    Raises:
-        InputError: it is one.
-    """
+def _check_ended(folder: Path, manifest: dict[str, Any]) -> None:
+    """Refuse an odometry run that is still at work or was cut off: its files may be those of an earlier run."""
     if not manifest.get("stages", {}).get(ODOMETRY, {}).get("is_done", True):
         raise InputError(
             f"{folder}: expected a run that has ended, found one that is still at work or was cut off",
