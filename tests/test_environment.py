@@ -29,6 +29,7 @@ from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.trajectory import GrowingTum, read_tum
 from sfmapp.geometry import rigid3
 from sfmapp.pipelines.listeners import EventLog
+from sfmapp.pipelines.workspace import read_manifest
 
 ROOT = os.geteuid() == 0
 FOUR_POSES = "".join(f"{i} {i} 0 {i * i} 0 0 0 1\n" for i in range(4))
@@ -353,3 +354,72 @@ def test_a_trajectory_holds_whole_lines_when_the_disk_fills(tmp_path: Path) -> N
     assert 3 < written < 20
     assert [float(name) for name in names] == [*range(written), 99.0]
     np.testing.assert_allclose(found[:written], poses[:written], atol=1e-12)
+
+
+# ------------------------------------------------------------------------------------- odometry on its way to the disk
+
+FAKE_RUN = """import os, sys
+sys.path.insert(0, sys.argv.pop(1))
+import odometry_fakes as fakes
+fakes.WIDTH, fakes.HEIGHT = 640, 480
+from sfmapp.pipelines import odometry as pipeline
+pipeline.open_sequence = lambda *_, **__: fakes.FakeSequence(pause_s=float(os.environ["PAUSE"]))
+pipeline.run_odometry = fakes.FakeRunner()
+pipeline.compile_odometry_kernels = lambda *_, **__: {}
+from sfmapp.cli.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def fake_odometry(output: Path, pause_s: float = 0.0) -> tuple[list[str], dict[str, str]]:
+    line = [sys.executable, "-c", FAKE_RUN, str(Path(__file__).parent), "odometry", "fake", "-o", str(output), "-q"]
+    return line, os.environ | {"PAUSE": str(pause_s)}
+
+
+def test_a_killed_odometry_leaves_the_poses_it_had(tmp_path: Path, capsys: Capture) -> None:
+    from odometry_fakes import path
+
+    output = tmp_path / "out"
+    live = output / "trajectory_live.tum"
+    output.mkdir()
+    line, env = fake_odometry(output, 0.1)
+    child = subprocess.Popen([*line, "--no-record"], env=env)
+    assert wait_for(lambda: live.is_file() and len(live.read_bytes().splitlines()) > 8, 60.0)
+    child.kill()
+    child.wait()
+    names, poses = read_tum(live)
+    assert len(names) >= 8
+    truth = path(50)[: len(names)]  # of which the fake finds the rotations, and half of the translations
+    np.testing.assert_allclose([float(name) for name in names], np.arange(len(names)) / 10.0)
+    np.testing.assert_allclose(np.abs(np.sum(poses[:, :4] * truth[:, :4], 1)), 1.0, atol=1e-12)
+    np.testing.assert_allclose(poses[:, 4:], 0.5 * truth[:, 4:], atol=0.1)
+    # what is left is no result, and is not taken for one
+    assert main(["evaluate", str(output), str(live), "--no-plot"]) == 3
+    assert "trajectory_live.tum" in capsys.readouterr().err
+    with pytest.raises(InputError, match="cut off"):
+        read_manifest(output)  # which refine and export begin with
+    line, env = fake_odometry(output)
+    assert subprocess.run([*line, "--no-record"], env=env, check=False, timeout=60).returncode == 0
+    assert len(read_tum(live)[0]) == len(read_tum(output / "trajectory.tum")[0]) == 50
+    assert main(["evaluate", str(output), str(live), "--no-plot"]) == 0
+
+
+@pytest.mark.skipif(not ROOT, reason="a small file system has to be mounted, which is root's right")
+@pytest.mark.parametrize(("size_kb", "code"), [(600, 0), (64, 3)])
+def test_on_a_full_disk_the_recording_goes_first_and_poses_stay(size_kb: int, code: int, tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size_kb}k", "tmpfs", disk], check=False).returncode:
+        pytest.skip("no file system can be mounted here")
+    try:
+        line, env = fake_odometry(disk / "out", 0.03)
+        done = subprocess.run(line, env=env, capture_output=True, text=True, timeout=100, check=False)
+        assert done.returncode == code, done.stderr
+        assert "bug" not in done.stderr
+        assert not list((disk / "out").glob("*recording.rrd*"))
+        assert len(read_tum(disk / "out" / "trajectory_live.tum")[0]) == 50
+        assert (disk / "out" / "report.json").is_file() == (code == 0)
+        assert ("sfmapp: " in done.stderr) == (code == 3)
+        assert ("recording: given up" in done.stderr) == (code == 0)
+    finally:
+        subprocess.run(["umount", disk], check=True)
