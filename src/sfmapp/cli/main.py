@@ -16,8 +16,9 @@ from sfmapp.errors import InputError, InterruptedRunError, SfmError, refusal
 from sfmapp.kernel_cache import ADVICE, is_without_cache
 
 EXIT_CODES = """\
-exit codes: 0 done, 1 a bug, 2 usage, 3 bad input, 4 no reconstruction (the report is still written),
-            5 fewer images than asked for, 130 interrupted (reconstruct resumes)"""
+exit codes: 0 done, 1 a bug, 2 usage, 3 bad input, or no room for what is to be written or held in memory,
+            4 no reconstruction (the report is still written), 5 fewer images than asked for,
+            130 interrupted (reconstruct resumes)"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -39,7 +40,7 @@ def _run(args: argparse.Namespace) -> int:
     except SfmError as error:
         return _fail(args, error)
     except MemoryError:
-        return _fail(args, SfmError("out of memory", "try --preset fast, or --set features.max_size_px=1600"))
+        return _fail(args, InputError("out of memory", "try --preset fast, or --set features.max_size_px=1600"))
     except KeyboardInterrupt:
         return _fail(args, InterruptedRunError("interrupted"))
     except Exception as error:

@@ -13,11 +13,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from sfmapp.children import with_parent
 from sfmapp.errors import InputError, SfmError
-from sfmapp.viewer.live import Screen
+
+if TYPE_CHECKING:
+    from sfmapp.viewer.live import Screen
 
 HOST = "127.0.0.1"
 WEB_PORT, DATA_PORT = 9090, 9876
@@ -105,6 +108,8 @@ def open_live_viewer(*, tell: Callable[[str], None], serve: bool | None = None) 
         tell: given a line on how to reach it.
         serve: for a browser in any case (True) or never (False).
     """
+    from sfmapp.viewer.live import Screen  # loads kernels, which a look at a recording needs none of
+
     serve = not has_screen() if serve is None else serve
     data_port, web_port = free_port(DATA_PORT), free_port(WEB_PORT)
     command = server_command(None, web_port, data_port) if serve else window_command(None, str(data_port))
