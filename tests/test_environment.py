@@ -11,6 +11,7 @@ import socket
 import stat
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -298,6 +299,17 @@ def test_a_refusal_of_the_system_is_no_bug(number: int, monkeypatch: pytest.Monk
     first, advice = capsys.readouterr().err.splitlines()
     assert first == f"sfmapp: some/file: {os.strerror(number)}"
     assert advice.strip()
+
+
+def test_without_a_temporary_folder_the_advice_is_what_to_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: ["/dev/null/none"])
+    with pytest.raises(FileNotFoundError) as caught:
+        tempfile.gettempdir()
+    failure = refusal(caught.value)
+    assert failure is not None
+    assert failure.advice is not None
+    assert "TMPDIR" in failure.advice
 
 
 def test_what_only_we_can_have_done_wrong_stays_a_bug() -> None:

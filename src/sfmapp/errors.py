@@ -114,4 +114,11 @@ def refusal(error: OSError) -> InputError | None:
     if advice is None:
         return None
     places = [str(name) for name in (error.filename, error.filename2) if name is not None]
-    return InputError(f"{' to '.join(places)}: {error.strerror}" if places else str(error.strerror), advice)
+    if places:
+        return InputError(f"{' to '.join(places)}: {error.strerror}", advice)
+    if is_full(error):
+        where = "on the disk of the results, of temporary files or of compiled kernels"
+        return InputError(f"{error.strerror}, {where}", "free some; TMPDIR and NUMBA_CACHE_DIR name other places")
+    if "temporary directory" in str(error.strerror):  # of tempfile
+        advice = "set TMPDIR to a folder that you can write to"
+    return InputError(str(error.strerror), advice)
