@@ -43,6 +43,7 @@ class FakeSequence:
     frames_per_second: float | None = FPS
     imu: None = None
     truth: Truth | None = None
+    orientation: int = 1
     length: int = 50
     pause_s: float = 0.0
 

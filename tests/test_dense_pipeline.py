@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dense_models import DEPTH, PINHOLE, row_of_poses, texture, write_wall
 from sfmapp.dense.files import read_patches
@@ -18,7 +19,7 @@ from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError, UsageError
 from sfmapp.events import Event, Events
 from sfmapp.formats.colmap import read_model, write_model
-from sfmapp.formats.ply import read_vertices
+from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.pipelines.dense import dense
 from sfmapp.pipelines.mesh import mesh_cloud, mesh_workspace
 from sfmapp.pipelines.options import Options
@@ -60,8 +61,8 @@ def test_a_text_model_with_distortion_comes_out_where_the_wall_is(wall: Path) ->
     assert np.degrees(np.arccos(np.clip(-patches.normal[:, 2], -1, 1))).mean() < 15.0
     # how far off they are along the ray is what they say, within a factor
     assert 0.2 < np.median(off * PIXEL / patches.sigma) < 3.0
-    cloud = read_vertices(wall / "out" / "dense" / "fused.ply")
-    np.testing.assert_array_equal(cloud["z"], patches.xyz[:, 2])
+    cloud = read_ply_geometry(wall / "out" / "dense" / "fused.ply")
+    np.testing.assert_array_equal(cloud.xyz[:, 2], patches.xyz[:, 2])
     # colours are those of the wall
     wall_image = texture()
     place = np.rint(patches.xyz[:, :2] * 100 + 800 - 0.5).astype(int)
@@ -188,6 +189,20 @@ def test_a_mesh_lies_on_the_wall(wall: Path, tmp_path: Path) -> None:
     assert mesh_workspace(out, FAST, record=False).mesh is not None
 
 
+def test_patches_of_an_earlier_model_make_no_mesh(wall: Path, tmp_path: Path) -> None:
+    folder = copy_of(wall, tmp_path)
+    model, keypoints = read_model(folder / "sparse" / "0")
+    dense(folder / "sparse" / "0", folder / "out2", FAST, images=folder / "images", record=False)
+    moved = model.copy()
+    moved.cam_from_world[:, 4:] += 0.1
+    shutil.rmtree(folder / "sparse" / "0")
+    write_model(folder / "sparse" / "0", moved, keypoints)
+    with pytest.raises(InputError, match="of an earlier one"):
+        mesh_workspace(folder / "out2", FAST, record=False)
+    dense(folder / "out2", options=FAST, record=False)
+    assert mesh_workspace(folder / "out2", FAST, record=False).mesh is not None
+
+
 def test_a_mesh_of_a_cloud(wall: Path, tmp_path: Path) -> None:
     result = mesh_cloud(wall / "out" / "dense" / "fused.ply", tmp_path / "surface", FAST)
     assert result.mesh is not None
@@ -207,6 +222,55 @@ def test_a_mesh_needs_patches_or_normals(tmp_path: Path) -> None:
         mesh_cloud(tmp_path / "bare.ply", tmp_path / "out")
     with pytest.raises(InputError, match="not a workspace"):
         mesh_workspace(tmp_path)
+
+
+def ball(count: int = 3000) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    normal = np.random.default_rng(0).normal(size=(count, 3))
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    return normal * 2.0, normal
+
+
+def write_ball(path: Path, xyz: NDArray[np.float64], normal: NDArray[np.float64]) -> Path:
+    names = ("x", "y", "z", "normal_x", "normal_y", "normal_z")
+    head = f"ply\nformat binary_big_endian 1.0\nelement vertex {len(xyz)}\n"
+    head += "".join(f"property double {name}\n" for name in names) + "end_header\n"
+    path.write_bytes(head.encode() + np.concatenate([xyz, normal], 1).astype(">f8").tobytes())
+    return path
+
+
+def test_a_mesh_of_a_foreign_cloud_without_colours_and_with_gaps(tmp_path: Path) -> None:
+    xyz, normal = ball()
+    xyz[::100, 1], normal[1::100], normal[2::100, 0] = np.nan, 0.0, np.inf
+    said: list[Event] = []
+    path = write_ball(tmp_path / "ball.ply", xyz, normal * 7)
+    mesh = mesh_cloud(path, tmp_path / "out", FAST, events=Events(said.append)).mesh
+    assert mesh is not None
+    np.testing.assert_allclose(np.linalg.norm(mesh.xyz, axis=1), 2.0, atol=0.05)
+    assert (mesh.rgb == mesh.rgb[0, 0]).all()
+    assert 100 < mesh.rgb[0, 0] < 255
+    warned = [event.message for event in said if event.kind == "warned"]
+    assert [("30 of 3000" in message, "60 of 3000" in message) for message in warned] == [(True, False), (False, True)]
+    assert any("no colours" in event.message for event in said if event.kind == "decided")
+
+
+def test_clouds_that_cannot_become_a_mesh_say_why(tmp_path: Path) -> None:
+    xyz, normal = ball(100)
+    for bad, words in ((xyz, normal * 0), (xyz * np.nan, normal), (xyz[:0], normal[:0])):
+        with pytest.raises(InputError, match="places and normals, found none among") as caught:
+            mesh_cloud(write_ball(tmp_path / "a.ply", bad, words), tmp_path / "out", FAST)
+        assert "a.ply" in str(caught.value)
+        assert "normals" in str(caught.value.advice)
+
+
+def test_a_cloud_that_single_precision_has_spoilt_is_told(tmp_path: Path) -> None:
+    said: list[Event] = []
+    xyz, normal = ball()
+    far = xyz + np.array([500_000.0, 5_800_000.0, 100.0])
+    for places in (far, far.astype(np.float32).astype(np.float64)):
+        mesh_cloud(write_ball(tmp_path / "a.ply", places, normal), tmp_path / "out", FAST, events=Events(said.append))
+    warned = [event.message for event in said if event.kind == "warned"]
+    assert len(warned) == 1
+    assert "0.5 apart in single precision" in warned[0]
 
 
 # ----------------------------------------------------------------------------------------------------------- bad input

@@ -23,7 +23,8 @@ from sfmapp.dense.selection import meeting_point, select_neighbors
 from sfmapp.dense.undistort import lay_out, make_canvas
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Event, Events
-from sfmapp.formats.ply import read_ply, read_vertices
+from sfmapp.formats.ply import TYPES
+from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.geometry import rigid3
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.scene.camera import Camera, CameraModel, pixels_to_normalized, project
@@ -422,12 +423,13 @@ def test_the_fused_cloud_has_what_it_promises(tmp_path: Path) -> None:
         "property float nz", "property uchar red", "property uchar green", "property uchar blue",
         "property uchar views", "property float score", "property float sigma",
     ]  # fmt: skip
-    xyz, rgb = read_ply(tmp_path / "fused.ply")
-    np.testing.assert_array_equal(xyz, patches.xyz)
-    np.testing.assert_array_equal(rgb, patches.rgb)
-    vertices = read_vertices(tmp_path / "fused.ply")
+    back = read_ply_geometry(tmp_path / "fused.ply")
+    np.testing.assert_array_equal(back.xyz, patches.xyz)
+    np.testing.assert_array_equal(back.rgb, patches.rgb)
+    np.testing.assert_array_equal(back.normal, patches.normal)
+    body = (tmp_path / "fused.ply").read_bytes().partition(b"end_header\n")[2]
+    vertices = np.frombuffer(body, [(line.split()[2], "<" + TYPES[line.split()[1]]) for line in header[3:]])
     np.testing.assert_array_equal(vertices["views"], patches.num_views)
-    np.testing.assert_array_equal(vertices["nz"], patches.normal[:, 2])
     np.testing.assert_array_equal(vertices["sigma"], patches.sigma)
 
 

@@ -295,3 +295,18 @@ def test_two_cameras_have_a_rotation_error() -> None:
 def test_scene_size_is_the_largest_distance() -> None:
     assert evaluation.scene_size(poses_at([[0, 0, 0], [3, 0, 0], [0, 4, 0]])) == pytest.approx(5.0)
     assert evaluation.scene_size(np.zeros((0, 7))) == 0.0
+
+
+def test_names_by_the_end_of_their_paths() -> None:
+    ours = ["a/1.jpg", "b/1.jpg", "b/2.jpg", "frame.0001.png", "frame.0002.png", "shoot/c/9.jpg"]
+    theirs = [
+        "/data/x/b/1.jpg",
+        "C:/photos/a/1.jpg",
+        "../photos/b/2.jpg",
+        "train/frame.0002",
+        "./frame.0001",
+        "c/9.jpg",
+    ]
+    assert evaluation.match_names(ours, theirs).tolist() == [1, 0, 2, 4, 3, 5]
+    # two that end alike belong to nobody
+    assert evaluation.match_names(["a/1.jpg", "b/1.jpg"], ["x/a/1.jpg", "y/a/1.jpg"]).tolist() == [-1, -1]

@@ -52,6 +52,39 @@ def test_images_are_found_from_transforms_json(workspace: Path, tmp_path: Path) 
             assert (Path(file).parent / name).resolve().parent == (tmp_path / "photos").resolve()
 
 
+@pytest.mark.parametrize("kind", ["folder", "pattern", "list", "nested pattern"])
+def test_images_of_any_source_are_found_from_transforms_json(workspace: Path, tmp_path: Path, kind: str) -> None:
+    photos = tmp_path / "photos"
+    for name in read_model(workspace / "sparse" / "0")[0].image_names:
+        (photos / name).parent.mkdir(parents=True, exist_ok=True)
+        (photos / name).write_bytes(b"a photograph")
+    (tmp_path / "list.txt").write_text("".join(f"{path}\n" for path in photos.rglob("*.*")))
+    sources = {
+        "folder": photos, "pattern": f"{photos}/*.*", "list": tmp_path / "list.txt", "nested pattern": f"{photos}/**",
+    }  # fmt: skip
+    manifest = {"format": "sfmapp workspace 1", "source": str(sources[kind]), "stages": {}, "inputs": {}}
+    (workspace / "run.json").write_text(json.dumps(manifest))
+    report = export_model(workspace, "nerfstudio", tmp_path / "deep" / "nerf")
+    assert report["notes"] == []
+    for name in read_nerfstudio(report["files"][0]).image_names:
+        assert (tmp_path / "deep" / "nerf" / name).read_bytes() == b"a photograph"
+    shutil.rmtree(photos)
+    (note,) = export_model(workspace, "nerfstudio", tmp_path / "deep" / "nerf")["notes"]
+    assert "4 of 4 photographs are not in" in note
+
+
+def test_images_beside_a_colmap_model_are_found_from_transforms_json(workspace: Path, tmp_path: Path) -> None:
+    project = tmp_path / "project"
+    shutil.copytree(workspace / "sparse", project / "sparse")
+    for name in read_model(project / "sparse" / "0")[0].image_names:
+        (project / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        (project / "images" / name).write_bytes(b"a photograph")
+    report = export_model(project, "nerfstudio", tmp_path / "nerf")
+    assert report["notes"] == []
+    for name in read_nerfstudio(report["files"][0]).image_names:
+        assert (tmp_path / "nerf" / name).is_file()
+
+
 def test_a_model_folder_will_do(workspace: Path, tmp_path: Path) -> None:
     report = export_model(workspace / "sparse" / "0", "ply", tmp_path / "cloud.ply")
     assert report["files"] == [str(tmp_path / "cloud.ply")]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -14,6 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sfmapp.errors import InputError, UsageError
+from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model, write_model, write_model_text
 from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import CameraModel
@@ -447,7 +450,7 @@ def test_text_refusals_name_the_line(tmp_path: Path) -> None:
     good = {
         "cameras.txt": b"# c\n1 PINHOLE 100 80 50 50 50 40\n",
         "images.txt": b"1 1 0 0 0 0 0 1 1 a b.jpg\n10 20 5\n",
-        "points3D.txt": b"5 0 0 4 1 2 3 nan 1 0\n",
+        "points3D.txt": b"5 0 0 4 1 2.0 3 nan 1 0\n",
     }
     lay_out(tmp_path, good, "txt")
     rec, keypoints = read_model(tmp_path)
@@ -464,4 +467,182 @@ def test_text_refusals_name_the_line(tmp_path: Path) -> None:
     refuse(tmp_path, good, "points3D.txt", b"6 0 0 4 1 2 3 0 1 0\n", "which names point 5")
     refuse(tmp_path, good, "points3D.txt", b"5 0 0 4 1 2 3 0 1 0 1 0\n", "as many keypoints")
     refuse(tmp_path, good, "points3D.txt", b"5 0 0 4 1 2 300 0 1 0\n", "from 0 to 255")
+    refuse(tmp_path, good, "points3D.txt", b"5 0 0 4 1 2 3.5 0 1 0\n", "whole numbers from 0 to 255")
     refuse(tmp_path, good, "points3D.txt", b"\xff\xfe\n", "UTF-8")
+
+
+# models that others have edited --------------------------------------------------------------------------------------
+
+
+def observations(model: Any) -> set[tuple[str, int, int]]:
+    """Image name, keypoint and point of every observation that pycolmap's images tell of, of points that exist."""
+    return {
+        (image.name, k, point.point3D_id)
+        for image in model.images.values()
+        for k, point in enumerate(image.points2D)
+        if point.has_point3D() and point.point3D_id in model.points3D
+    }
+
+
+def our_observations(folder: Path, said: list[str]) -> set[tuple[str, int, int]]:
+    rec, keypoints = read_model(folder, Events(lambda event: said.append(event.message)))
+    ids = sorted(oracle(folder).points3D)
+    tracks = rec.tracks
+    for image, xy in enumerate(keypoints):
+        obs = tracks.observations_of_image(image)
+        np.testing.assert_array_equal(tracks.obs_xy[obs], xy[tracks.obs_feature_idx[obs]])
+    rows = zip(tracks.obs_image_idx, tracks.obs_feature_idx, tracks.obs_track_idx, strict=True)
+    return {(rec.image_names[i], int(k), ids[t]) for i, k, t in rows}
+
+
+def without_every_third(text: str) -> str:
+    return "\n".join(line for n, line in enumerate(text.split("\n")) if n % 3 or line.startswith("#"))
+
+
+def without_tracks(text: str) -> str:
+    return "\n".join(line if line.startswith("#") else " ".join(line.split()[:8]) for line in text.split("\n"))
+
+
+def without_names(text: str) -> str:
+    """Keypoints of the first image lose their points."""
+    lines = text.split("\n")
+    fields = lines[2].split()
+    lines[2] = " ".join("-1" if k % 3 == 2 else field for k, field in enumerate(fields))
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize(
+    ("name", "edit", "says"),
+    [
+        ("points3D", without_every_third, "name points that are not there"),
+        ("points3D", lambda text: "", "name points that are not there"),
+        ("points3D", without_tracks, "stand with the images alone"),
+        ("images", without_names, None),
+    ],
+)
+def test_filtered_models_mean_what_they_mean_to_colmap(
+    tmp_path: Path, name: str, edit: Callable[[str], str], says: str | None, binary: bool
+) -> None:
+    rec, keypoints = partial_scene()
+    write_model_text(tmp_path, rec, keypoints)
+    for stem in ("rigs", "frames"):
+        (tmp_path / f"{stem}.txt").unlink()
+    path = tmp_path / f"{name}.txt"
+    path.write_text(edit(path.read_text()))
+    if binary:
+        oracle(tmp_path).write_binary(str(tmp_path))
+    theirs = oracle(tmp_path)
+    said: list[str] = []
+    found = our_observations(tmp_path, said)
+    assert found == observations(theirs)
+    if not binary:  # COLMAP puts some of it in order where it writes
+        assert (says is None) == (not said)
+        assert says is None or (len(said) == 1 and says in said[0])
+
+
+def test_a_deleted_image_and_an_emptied_one(tmp_path: Path) -> None:
+    rec, keypoints = partial_scene()
+    write_model_text(tmp_path, rec, keypoints)
+    for stem in ("rigs", "frames"):
+        (tmp_path / f"{stem}.txt").unlink()
+    lines = (tmp_path / "images.txt").read_text().split("\n")
+    full = our_observations(tmp_path, [])
+    gone, emptied = lines[1].split()[9], lines[3].split()[9]
+    (tmp_path / "images.txt").write_text("\n".join([lines[0], lines[3], "", *lines[5:]]))
+    said: list[str] = []
+    found, _ = read_model(tmp_path, Events(lambda event: said.append(event.message)))
+    assert gone not in found.image_names
+    assert emptied in found.image_names
+    assert found.tracks.num_observations == sum(name not in (gone, emptied) for name, _, _ in full)
+    assert len(said) == 1
+    assert f"{sum(name in (gone, emptied) for name, _, _ in full)} observations name images" in said[0]
+
+
+FOREIGN_CAMERAS = {"FULL_OPENCV": 12, "FOV": 5, "THIN_PRISM_FISHEYE": 12, "SIMPLE_FISHEYE": 3, "EUCM": 6}
+
+
+@pytest.mark.parametrize("write", [write_model, write_model_text])
+def test_an_unused_camera_of_any_model_is_no_reason_to_refuse(tmp_path: Path, write) -> None:
+    rec, keypoints = partial_scene()
+    write(tmp_path / "m", rec, keypoints)
+    plain, _ = read_model(tmp_path / "m")
+    model = oracle(tmp_path / "m")
+    for number, name in enumerate(FOREIGN_CAMERAS):
+        camera = pycolmap.Camera(model=name, width=100, height=80, params=[50.0] * FOREIGN_CAMERAS[name])
+        camera.camera_id = 7000 - number
+        model.add_camera_with_trivial_rig(camera)
+    if write is write_model:
+        model.write_binary(str(tmp_path / "m"))
+    else:
+        model.write_text(str(tmp_path / "m"))
+    said: list[str] = []
+    back, _ = read_model(tmp_path / "m", Events(lambda event: said.append(event.message)))
+    assert [camera.model for camera in back.cameras] == [camera.model for camera in plain.cameras]
+    np.testing.assert_array_equal(back.image_camera_idx, plain.image_camera_idx)
+    assert len(said) == 1
+    for name in FOREIGN_CAMERAS:
+        assert name in said[0]
+
+
+def test_text_as_editors_leave_it(tmp_path: Path) -> None:
+    """Windows line ends, a byte order mark, blanks at line ends, comments and blank lines in between."""
+    rec, keypoints = partial_scene()
+    write_model_text(tmp_path, rec, keypoints)
+    plain, _ = read_model(tmp_path)
+    for path in tmp_path.iterdir():
+        lines = path.read_text().split("\n")
+        step = 2 if path.stem == "images" else 1  # the two lines of an image stay together
+        records = ["\n".join(lines[i : i + step]) for i in range(1, len(lines), step)]
+        text = "\ufeff# made by hand\n" + "\n# a comment\n\n".join(records) + "\n# the end"
+        path.write_bytes(text.replace("\n", " \t\r\n").encode())
+    said: list[str] = []
+    back, _ = read_model(tmp_path, Events(lambda event: said.append(event.message)))
+    assert not said
+    assert back.image_names == plain.image_names
+    for name in ("cam_from_world", "point_xyz", "point_rgb"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(plain, name))
+    np.testing.assert_array_equal(back.tracks.obs_xy, plain.tracks.obs_xy)
+
+
+@pytest.mark.parametrize("write", [write_model, write_model_text])
+def test_files_that_are_missing(tmp_path: Path, write) -> None:
+    """Known poses come without points; frames without rigs leave the poses of the images file."""
+    rec = make_scene(0, 6, 20, rig=synthetic_rig()).observed
+    write(tmp_path, rec)
+    plain, _ = read_model(tmp_path)
+    for stem in ("points3D", "rigs"):
+        next(tmp_path.glob(f"{stem}.*")).unlink()
+    said: list[str] = []
+    back, _ = read_model(tmp_path, Events(lambda event: said.append(event.message)))
+    assert len(back.point_xyz) == back.tracks.num_observations == 0
+    assert [any(word in note for note in said) for word in ("no file of points", "none of rigs")] == [True, True]
+    np.testing.assert_allclose(back.cam_from_world, plain.cam_from_world, atol=1e-14)
+
+
+RIG_FILES = {
+    "cameras.txt": b"1 PINHOLE 100 80 50 50 50 40\n2 PINHOLE 100 80 50 50 50 40\n",
+    "rigs.txt": b"1 2 CAMERA 1 CAMERA 2 1 1 0 0 0 1 0 0\n",
+    "frames.txt": b"1 1 1 0 0 0 0 0 0 2 CAMERA 1 1 CAMERA 2 2\n",
+    "images.txt": b"1 1 0 0 0 0 0 0 1 a.jpg\n\n2 1 0 0 0 1 0 0 2 b.jpg\n\n",
+    "points3D.txt": b"",
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "match"),
+    [
+        ("rigs.txt", RIG_FILES["rigs.txt"] * 2, "found rig 1 twice"),
+        ("rigs.txt", b"1 3 CAMERA 1 CAMERA 2 1 1 0 0 0 1 0 0 CAMERA 2 1 1 0 0 0 2 0 0\n", "found camera 2 twice"),
+        ("frames.txt", RIG_FILES["frames.txt"] + b"1 1 1 0 0 0 5 0 0 1 CAMERA 1 9\n", "every frame id once"),
+        ("frames.txt", b"1 1 1 0 0 0 0 0 0 2 CAMERA 2 1 CAMERA 1 2\n", "image 1 of camera 2, but the images"),
+        ("images.txt", b"1 1 0 0 0 0 0 0 1 a.jpg\n2 1 0 0 0 1 0 0 2 b.jpg\n", "three fields per keypoint of image 'a"),
+        ("cameras.txt", b"1 PINHOLE 1_00 80 50 50 50 40\n", "expected whole numbers"),
+        ("images.txt", b"1 0 0 0 0 0 0 0 1 a.jpg\n\n2 1 0 0 0 1 0 0 2 b.jpg\n\n", "image 1: expected a finite pose"),
+        ("images.txt", RIG_FILES["images.txt"].replace(b"b.jpg", b"a.jpg"), "'a.jpg' twice"),
+    ],
+)  # fmt: skip
+def test_contradictions_are_refused(tmp_path: Path, name: str, data: bytes, match: str) -> None:
+    lay_out(tmp_path, RIG_FILES, "txt")
+    assert read_model(tmp_path)[0].rig is not None
+    refuse(tmp_path, RIG_FILES, name, data, match)

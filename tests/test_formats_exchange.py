@@ -16,9 +16,10 @@ from hypothesis.extra import numpy as hnp
 
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.bundler import read_bundler, write_bundler
-from sfmapp.formats.colmap import write_model
+from sfmapp.formats.colmap import read_model, write_model, write_model_text
 from sfmapp.formats.nerfstudio import POINTS_NAME, read_nerfstudio, write_nerfstudio
-from sfmapp.formats.ply import read_ply, write_ply
+from sfmapp.formats.ply import write_ply
+from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.formats.trajectory import read_tum, write_tum
 from sfmapp.formats.truth import read_truth
 from sfmapp.geometry import rigid3
@@ -64,10 +65,10 @@ def damaged(data: st.DataObject, good: bytes) -> bytes:
 def test_ply_round_trip(tmp_path: Path, xyz: np.ndarray, seed: int) -> None:
     rgb = np.random.default_rng(seed).integers(0, 256, (len(xyz), 3), np.uint8)
     write_ply(tmp_path / "p.ply", xyz, rgb)
-    back, colors = read_ply(tmp_path / "p.ply")
-    np.testing.assert_array_equal(colors, rgb)
+    back = read_ply_geometry(tmp_path / "p.ply")
+    np.testing.assert_array_equal(back.rgb, rgb)
     extent = np.ptp(xyz, axis=0).max() if len(xyz) else 0.0
-    np.testing.assert_allclose(back, xyz, rtol=0, atol=1e-6 * extent)
+    np.testing.assert_allclose(back.xyz, xyz, rtol=0, atol=1e-6 * extent)
 
 
 def test_ply_keeps_georeferenced_points(tmp_path: Path) -> None:
@@ -76,16 +77,17 @@ def test_ply_keeps_georeferenced_points(tmp_path: Path) -> None:
     for xyz, kind in ((near, b"float x"), (far, b"double x")):
         write_ply(tmp_path / "p.ply", xyz, np.zeros((50, 3), np.uint8))
         assert kind in (tmp_path / "p.ply").read_bytes()
-        np.testing.assert_allclose(read_ply(tmp_path / "p.ply")[0], xyz, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(read_ply_geometry(tmp_path / "p.ply").xyz, xyz, rtol=0, atol=1e-5)
 
 
 def test_ply_of_colmap(tmp_path: Path) -> None:
     rec = scene([centered_camera()])
     write_model(tmp_path / "m", rec)
     pycolmap.Reconstruction(str(tmp_path / "m")).export_PLY(str(tmp_path / "theirs.ply"))
-    xyz, rgb = read_ply(tmp_path / "theirs.ply")
+    back = read_ply_geometry(tmp_path / "theirs.ply")
+    assert back.rgb is not None
     expected = np.concatenate([rec.point_xyz, rec.point_rgb], 1)[rec.is_triangulated]
-    found = np.concatenate([xyz, rgb], 1)
+    found = np.concatenate([back.xyz, back.rgb], 1)
     np.testing.assert_allclose(found[np.lexsort(found.T)], expected[np.lexsort(expected.T)], rtol=1e-6, atol=1e-6)
 
 
@@ -96,9 +98,9 @@ def test_ply_reader_passes_over_what_it_does_not_need(tmp_path: Path) -> None:
     )
     rows = np.array([(7, 1.5, 2.5, 3), (8, 4.5, 5.5, 6)], [("q", "<i2"), ("x", "<f8"), ("y", "<f4"), ("z", "<i4")])
     (tmp_path / "p.ply").write_bytes(head + rows.tobytes() + b"\x03" + bytes(12))
-    xyz, rgb = read_ply(tmp_path / "p.ply")
-    assert xyz.tolist() == [[1.5, 2.5, 3], [4.5, 5.5, 6]]
-    assert not rgb.any()
+    back = read_ply_geometry(tmp_path / "p.ply")
+    assert back.xyz.tolist() == [[1.5, 2.5, 3], [4.5, 5.5, 6]]
+    assert back.rgb is back.normal is None
 
 
 @FUZZ
@@ -107,30 +109,11 @@ def test_damaged_ply(tmp_path: Path, data: st.DataObject) -> None:
     write_ply(tmp_path / "p.ply", np.eye(3), np.eye(3).astype(np.uint8))
     (tmp_path / "p.ply").write_bytes(damaged(data, (tmp_path / "p.ply").read_bytes()))
     try:
-        xyz, rgb = read_ply(tmp_path / "p.ply")
+        back = read_ply_geometry(tmp_path / "p.ply")
     except InputError:
         return
-    assert len(xyz) == len(rgb) <= 3
-
-
-@pytest.mark.parametrize(
-    ("text", "match"),
-    [
-        ("solid", "PLY header"),
-        ("ply\nformat ascii 1.0\nelement vertex 1\nend_header\n", "little-endian"),
-        ("ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n", "x, y and z"),
-        (
-            "ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nproperty float y\n"
-            "property float z\nend_header\n",
-            "truncated: expected 99999999999",
-        ),
-        ("ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n", "plain"),
-    ],
-)
-def test_ply_refusals(tmp_path: Path, text: str, match: str) -> None:
-    (tmp_path / "p.ply").write_text(text)
-    with pytest.raises(InputError, match=match):
-        read_ply(tmp_path / "p.ply")
+    assert len(back.xyz) <= 3
+    assert back.rgb is None or len(back.rgb) == len(back.xyz)
 
 
 # Bundler -------------------------------------------------------------------------------------------------------------
@@ -275,7 +258,7 @@ def test_nerfstudio_sees_the_same_rays(tmp_path: Path) -> None:
     rec = scene([camera])
     write_nerfstudio(tmp_path / "transforms.json", rec)
     document = json.loads((tmp_path / "transforms.json").read_text())
-    xyz, _ = read_ply(tmp_path / POINTS_NAME)
+    xyz = read_ply_geometry(tmp_path / POINTS_NAME).xyz
     for frame, image in zip(document["frames"], rec.registered_idx, strict=True):
         seen = project(camera, rigid3.apply(rec.cam_from_world[image], rec.point_xyz[rec.is_triangulated]))
         matrix = np.array(frame["transform_matrix"])
@@ -336,6 +319,59 @@ def test_nerfstudio_refusals(tmp_path: Path, changes: dict[str, Any], match: str
     path.write_text(json.dumps(nerf_document(**changes)))
     with pytest.raises(InputError, match=match):
         read_nerfstudio(path)
+
+
+def test_nerfstudio_poses_need_neither_points_nor_our_cameras(tmp_path: Path) -> None:
+    """As a truth: panoramas, scenes without sizes, points that are gone or not to be read."""
+    path = tmp_path / "transforms.json"
+    (tmp_path / "bad.ply").write_bytes(b"no points")
+    frames = [
+        {"file_path": ".\\images\\a 1.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 40.0},
+        {"file_path": "/data/b", "transform_matrix": np.eye(4).tolist()},
+    ]
+    path.write_text(json.dumps(nerf_document(frames=frames, ply_file_path="absent.ply")))
+    truth = read_truth(path)
+    assert truth.names == ("images/a 1.png", "/data/b")
+    assert truth.cameras is not None
+    assert [camera.focal for camera in truth.cameras] == [40, 50]
+    assert truth.for_images(["b.jpg", "a 1.jpg"]).names == ("a 1.jpg", "b.jpg")
+    for changes in ({"camera_model": "EQUIRECTANGULAR"}, {"w": None}, {"k3": 0.1}, {"ply_file_path": "bad.ply"}):
+        path.write_text(json.dumps(nerf_document(frames=frames) | changes))
+        np.testing.assert_array_equal(read_truth(path).cam_from_world, truth.cam_from_world)
+    path.write_text(json.dumps(nerf_document(applied_scale=0)))
+    with pytest.raises(InputError, match="applied_scale above 0"):
+        read_truth(path)
+
+
+def test_nerfstudio_points_in_text_with_gaps_and_a_scale(tmp_path: Path) -> None:
+    """The points that ns-process-data writes; and a world that was scaled after it was turned."""
+    rec = scene([synthetic_camera()])
+    write_nerfstudio(tmp_path / "transforms.json", rec)
+    plain = read_nerfstudio(tmp_path / "transforms.json")
+    document = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in document["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= 0.25
+    (tmp_path / "transforms.json").write_text(json.dumps(document | {"applied_scale": 0.25}))
+    points = read_ply_geometry(tmp_path / POINTS_NAME)
+    assert points.rgb is not None
+    rows = [f"{x / 4!r} {y / 4!r} {z / 4!r} {r} {g} {b}" for (x, y, z), (r, g, b) in
+            zip(points.xyz.tolist(), points.rgb.tolist(), strict=True)]  # fmt: skip
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(rows) + 1}\n"
+    head += "".join(f"property double {axis}\n" for axis in "xyz")
+    head += "".join(f"property uint8 {color}\n" for color in ("red", "green", "blue"))
+    (tmp_path / POINTS_NAME).write_text("\n".join([head + "end_header", "nan nan nan 1 2 3", *rows, ""]))
+    back = read_nerfstudio(tmp_path / "transforms.json")
+    np.testing.assert_allclose(back.cam_from_world, plain.cam_from_world, atol=1e-12)
+    np.testing.assert_allclose(back.point_xyz, plain.point_xyz, atol=1e-12)
+    np.testing.assert_array_equal(back.point_rgb, plain.point_rgb)
+
+
+def test_nerfstudio_fisheye_of_instant_ngp(tmp_path: Path) -> None:
+    (tmp_path / "t.json").write_text(json.dumps(nerf_document(is_fisheye=True, k1=0.1, k4=0.01)))
+    camera = read_nerfstudio(tmp_path / "t.json").cameras[0]
+    assert camera.model == CameraModel.OPENCV_FISHEYE
+    assert camera.params[[4, 7]].tolist() == [0.1, 0.01]
 
 
 @pytest.mark.parametrize("text", ["", "[1]", "{", "[" * 100_000, '{"frames": 1' + "0" * 5000 + "}", "\x00"])
@@ -443,6 +479,38 @@ def test_all_forms_of_truth_agree(tmp_path: Path) -> None:
             assert truth.for_images(rec.image_names).names == tuple(rec.image_names[i] for i in registered)
         with pytest.raises(InputError, match="no name fits"):
             truth.for_images(["p.jpg", "q.jpg"])
+
+
+@pytest.mark.parametrize("name", ["sparse/0", "sparse", "colmap/sparse/0", "transforms.json", "cameras.json"])
+def test_a_truth_is_found_in_its_folder(tmp_path: Path, name: str) -> None:
+    rec = scene([centered_camera()])
+    if name == "transforms.json":
+        write_nerfstudio(tmp_path / name, rec)
+    elif name == "cameras.json":
+        json_truth(tmp_path / name, rec)
+    else:
+        write_model(tmp_path / name, rec)
+    expected = rec.cam_from_world[rec.registered_idx, 4:]
+    np.testing.assert_allclose(read_truth(tmp_path).cam_from_world[:, 4:], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("write", [write_model, write_model_text])
+def test_poses_of_a_colmap_model_are_a_truth_whatever_its_lenses(tmp_path: Path, write: Any) -> None:
+    """As those of ETH3D: thin prism cameras, and observations that nobody asks for."""
+    rec = scene([centered_camera()])
+    write(tmp_path, rec)
+    plain = read_truth(tmp_path)
+    model = pycolmap.Reconstruction(str(tmp_path))
+    for camera in model.cameras.values():
+        camera.model, camera.params = "THIN_PRISM_FISHEYE", [900.0, 900, 500, 375, *[0.01] * 8]
+    (model.write_binary if write is write_model else model.write_text)(str(tmp_path))
+    with pytest.raises(InputError, match="THIN_PRISM_FISHEYE"):
+        read_model(tmp_path)
+    (next(tmp_path.glob("points3D.*"))).write_bytes(b"no points at all")
+    truth = read_truth(tmp_path)
+    assert truth.cameras is None
+    assert truth.names == plain.names
+    np.testing.assert_allclose(truth.cam_from_world, plain.cam_from_world, atol=1e-14)
 
 
 def test_truth_agrees_with_opencv_on_the_half_pixel(tmp_path: Path) -> None:

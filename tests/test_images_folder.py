@@ -15,6 +15,7 @@ from PIL import Image
 
 from sfmapp.errors import InputError, InterruptedRunError, UsageError
 from sfmapp.events import Event, Events
+from sfmapp.formats.sequence_files import has_images, list_images
 from sfmapp.images.folder import ImageOptions, ImageSet, load_images
 from sfmapp.images.pixels import read_picture
 from sfmapp.scene.camera import CameraModel
@@ -83,6 +84,132 @@ def test_folder_is_searched_in_natural_order(tmp_path: Path) -> None:
     for image in image_set.images:
         assert image.path.is_absolute()
         assert (image.width, image.height) == read_picture(image).gray.shape[::-1] == (48, 32)
+
+
+def workspace(folder: Path, version: int = 1) -> Path:
+    """What a run leaves behind, as far as it is told by, with pictures in it."""
+    folder.mkdir(parents=True)
+    (folder / "run.json").write_text(json.dumps({"format": f"sfmapp workspace {version}", "stages": {}}, indent=1))
+    save(folder / "dense/maps/a.jpg.depth.png", seed=3)
+    save(folder / "picture.png", seed=4)
+    return folder
+
+
+@pytest.mark.parametrize("version", [1, 7])
+def test_results_inside_the_folder_are_no_photographs(tmp_path: Path, version: int) -> None:
+    """Of any command and version, at any depth, and however the folder is named; they are told, not warned of."""
+    save(tmp_path / "photos/a.jpg")
+    workspace(tmp_path / "photos/out", version)
+    workspace(tmp_path / "photos/b/c/runs/second", version)
+    save(tmp_path / "photos/b/c/runs/1.jpg", seed=9)
+    os.symlink(tmp_path / "photos/out", tmp_path / "photos/latest")
+    # another program's run.json is nobody's business
+    save(tmp_path / "photos/wandb/2.jpg", seed=10)
+    (tmp_path / "photos/wandb/run.json").write_text('{"project": "sfmapp workspace"}')
+    wanted = ["a.jpg", "b/c/runs/1.jpg", "wandb/2.jpg"]
+    image_set, report, log = load(tmp_path / "photos")
+    assert names(image_set) == wanted
+    assert sorted(report["results_passed_over"]) == ["b/c/runs/second/", "latest/", "out/"]
+    assert [e.message for e in log if e.kind == "warned"] == []
+    assert any("results of sfmapp" in e.message for e in log if e.kind == "decided")
+    assert "results of sfmapp in" in next(e.message for e in log if e.kind == "finished")
+    assert names(load(tmp_path / "photos/**/*.*g")[0]) == wanted
+    # what is named is used
+    assert names(load(tmp_path / "photos/out/dense/maps")[0]) == ["a.jpg.depth.png"]
+    with pytest.raises(InputError, match="results of sfmapp alone, in dense/"):
+        load(str(tmp_path / "photos/out/**/*.depth.png"))
+    (tmp_path / "list.txt").write_text("photos/out/picture.png\nphotos/a.jpg\n")
+    assert names(load(tmp_path / "list.txt")[0]) == ["a.jpg", "out/picture.png"]
+
+
+def test_a_workspace_as_the_source_keeps_its_results_to_itself(tmp_path: Path) -> None:
+    workspace(tmp_path / "out")
+    assert names(load(tmp_path / "out")[0]) == ["picture.png"]
+    (tmp_path / "out/picture.png").unlink()
+    _, _, log = load(tmp_path / "out")
+    assert any("other than in dense/, which holds results of sfmapp" in e.message for e in log if e.kind == "warned")
+
+
+def test_copies_that_other_programs_made_are_left_out_and_told(tmp_path: Path) -> None:
+    for i, name in enumerate(("images/a.jpg", "images_2/a.jpg", "images_4/a.jpg", "dense/images/a.jpg")):
+        save(tmp_path / name, seed=i)
+    (tmp_path / "transforms.json").write_text("{}")
+    (tmp_path / "dense/stereo").mkdir()
+    (tmp_path / "dense/stereo/fusion.cfg").write_text("a.jpg\n")
+    image_set, _, log = load(tmp_path)
+    assert names(image_set) == ["images/a.jpg"]
+    assert [name for name, _ in image_set.skipped] == ["dense/", "images_2/", "images_4/"]
+    assert all("name it as the source" in reason for _, reason in image_set.skipped)
+    assert sum(e.kind == "warned" for e in log) == 2
+    for name in ("images_4", "dense"):
+        assert len(load(tmp_path / name)[0].images) == 1
+    (tmp_path / "transforms.json").unlink()
+    assert len(load(tmp_path)[0].images) == 3  # by their names alone they may be anything
+
+
+@pytest.mark.parametrize(
+    ("copy", "original", "mark"),
+    [
+        ("images/a.jpg", "input/a.jpg", "stereo/patch-match.cfg"),
+        ("undistorted/images/a.jpg", "images/a.jpg", "reconstruction.json"),
+        ("odm_orthophoto/odm_orthophoto.tif", "images/a.jpg", "opensfm/config.yaml"),
+    ],
+)
+def test_projects_of_other_programs(tmp_path: Path, copy: str, original: str, mark: str) -> None:
+    save(tmp_path / copy)
+    save(tmp_path / original, seed=1)
+    assert sorted(names(load(tmp_path)[0])) == sorted([copy, original])
+    (tmp_path / mark).parent.mkdir(exist_ok=True)
+    (tmp_path / mark).write_text("{}")
+    image_set, _, _ = load(tmp_path)
+    assert names(image_set) == [original]
+    assert [name for name, _ in image_set.skipped] == [copy.split("/")[0] + "/"]
+
+
+def test_endings_in_any_case_and_files_without_one(tmp_path: Path) -> None:
+    wanted = ["1.JPE", "2.jfif", "3.Jif", "4.DIB", "5.PNM", "6.Tiff", "7", "IMG.0008", "shoot/DSC_9"]
+    formats = ("JPEG", "JPEG", "JPEG", "BMP", "PPM", "TIFF", "JPEG", "PNG", "WEBP")
+    for i, (name, kind) in enumerate(zip(wanted, formats, strict=True)):
+        save(tmp_path / name, seed=i, format=kind)
+    for name, data in (("LICENSE", b"MIT"), ("empty", b""), ("notes.md", b"# BM"), ("BMW", b"BMW is no bitmap")):
+        (tmp_path / name).write_bytes(data)
+    os.mkfifo(tmp_path / "pipe")
+    image_set, _, log = load(tmp_path)
+    assert names(image_set) == wanted
+    assert image_set.skipped == ()
+    assert [e.message for e in log if e.kind == "warned"] == []
+    for image in image_set.images:
+        assert read_picture(image).gray.shape == (32, 48)
+
+
+def test_frames_without_an_ending(tmp_path: Path) -> None:
+    for i, name in enumerate(("1403636579763555584", "1403636579813555456", "b.PNG", "1305031102.175304")):
+        save(tmp_path / name, seed=i, format="PNG")
+    (tmp_path / "README").write_text("frames")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty/README").write_text("none")
+    assert [path.name for path in list_images(tmp_path)] == ["1403636579763555584", "1403636579813555456", "b.PNG"]
+    assert has_images(tmp_path)
+    assert not has_images(tmp_path / "empty")
+
+
+def test_pictures_under_other_endings_are_told(tmp_path: Path) -> None:
+    for i, name in enumerate(("a.jpg", "a.jpg_original", "a.thm", "b.dat")):
+        save(tmp_path / name, seed=i, format="PNG" if name == "b.dat" else "JPEG")
+    image_set, _, log = load(tmp_path)
+    assert names(image_set) == ["a.jpg"]
+    assert dict(image_set.skipped)["b.dat"] == "holds a PNG picture but ends in .dat: rename it if it is a photograph"
+    assert [name for name, _ in image_set.skipped] == ["a.jpg_original", "a.thm", "b.dat"]
+    assert sum(e.kind == "warned" for e in log) == 3
+
+
+def test_a_pattern_says_what_it_misses_by_the_case_of_letters(tmp_path: Path) -> None:
+    for i, name in enumerate(("a.jpg", "B.JPG", "c.Jpg", "d.png")):
+        save(tmp_path / name, seed=i, format="PNG")
+    image_set, _, _ = load(str(tmp_path / "*.jpg"))
+    assert names(image_set) == ["a.jpg"]
+    assert [name for name, _ in image_set.skipped] == ["B.JPG", "c.Jpg"]
+    assert load(str(tmp_path / "*.[jJ][pP][gG]"))[0].skipped == ()
 
 
 def test_pattern_names_are_relative_to_its_fixed_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,16 +309,18 @@ def test_exif_cameras_are_told_apart_by_all_that_matters(tmp_path: Path) -> None
     save(tmp_path / "c.jpg", width=64, exif=exif_of(focal_mm=20.0))
     save(tmp_path / "d.jpg", exif=exif_of(model="Canon EOS 70D", focal_mm=20.0))
     save(tmp_path / "e.jpg", exif=exif_of(focal_mm=20.0, serial="77"))
+    # how it was held is no matter of the camera; a mirror moves its centre to the other side
     save(tmp_path / "f.jpg", exif=exif_of(focal_mm=20.0, orientation=6))
+    save(tmp_path / "g.jpg", exif=exif_of(focal_mm=20.0, orientation=2))
     save(tmp_path / "sub/a3.jpg", seed=2, exif=exif_of(focal_mm=20.0))
     image_set, report, _ = load(tmp_path)
-    assert sharing(image_set) == [0, 0, 1, 2, 3, 4, 5, 0]
+    assert sharing(image_set) == [0, 0, 1, 2, 3, 4, 0, 5, 0]
     first = image_set.cameras[0]
     assert (first.width, first.height, first.model) == (48, 32, CameraModel.SIMPLE_RADIAL)
     assert first.params.tolist() == pytest.approx([20.0 / 22.3 * 48, 24.0, 16.0, 0.0])
-    assert (image_set.cameras[5].width, image_set.cameras[5].height) == (32, 48)
+    assert (image_set.cameras[5].width, image_set.cameras[5].height) == (48, 32)
     entry = report["cameras"][0]
-    assert (entry["num_images"], entry["focal_source"], entry["camera"]) == (3, "exif_sensor", "Canon EOS 60D")
+    assert (entry["num_images"], entry["focal_source"], entry["camera"]) == (4, "exif_sensor", "Canon EOS 60D")
     assert "sensor 22.3 mm" in entry["focal_reason"]
 
 
@@ -311,7 +440,7 @@ def png_of(width: int, height: int, *chunks: tuple[bytes, bytes]) -> bytes:
         (b"<!DOCTYPE html><html>404</html>", "text, not an image"),
         (b"GIF89a" + b"\0" * 50, "a GIF"),
         (b"\0\0\0\x18ftypheic" + b"\0" * 50, "HEIC"),
-        (b"II+\0" + b"\0" * 50, "BigTIFF"),
+        (b"II+\0" + b"\0" * 50, "truncated or a broken header"),
         (b"\xff\xd8\xff\xe0", "truncated"),
         (b"BM", "broken header"),
         (b"P5 10", "not an image"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from zlib import crc32
 
@@ -55,6 +56,21 @@ def select(
     images: tuple[ImageRecord, ...], features: list[Features], options: PairOptions, seed: int = 0, threads: int = 2
 ) -> tuple[np.ndarray, dict]:
     return select_pairs(ImageSet(images, ()), features, options, seed=seed, threads=threads, events=Events())
+
+
+@pytest.mark.parametrize("method", ["exhaustive", "sequential", "retrieval"])
+def test_files_that_are_mirror_images_are_not_matched_with_others(method: str) -> None:
+    orientation = [1, 2, 3, 4, 5, 6, 7, 8]
+    images = tuple(
+        replace(r, orientation=o) for r, o in zip(records([f"{i}.jpg" for i in orientation]), orientation, strict=True)
+    )
+    pairs, _ = select(images, ring(8, 60, 0), PairOptions(method=method))  # type: ignore[arg-type]
+    assert_well_formed(pairs)
+    assert len(pairs)
+    for i, j in pairs.tolist():
+        assert (orientation[i] in (2, 4, 5, 7)) == (orientation[j] in (2, 4, 5, 7))
+    if method == "exhaustive":
+        assert len(pairs) == 12
 
 
 def as_set(pairs: np.ndarray) -> set[tuple[int, int]]:

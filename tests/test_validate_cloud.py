@@ -129,3 +129,17 @@ def test_colours_change_at_the_limits() -> None:
     colors = error_colors(np.array([0.0, 1.0, 1.5, 2.0, 4.9, 5.1, np.inf]), limits)
     codes = [tuple(color) for color in colors.tolist()]
     assert codes[0] == codes[1] != codes[2] == codes[3] != codes[4] != codes[5] == codes[6]
+
+
+def test_points_that_are_nowhere_are_counted_in_the_notes(workspace: Path, tmp_path: Path) -> None:
+    """A truth as a scanner writes it: text, line ends of Windows, NaN where it saw nothing."""
+    plain = validate_cloud(workspace, save(tmp_path / "truth.ply", floor()))
+    rows = [*(" ".join(map(repr, row)) for row in floor().tolist()), "nan nan nan", "1 2 inf"]
+    head = ["ply", "format ascii 1.0", "obj_info a scanner", f"element vertex {len(rows)}"]
+    head += [f"property double {axis}" for axis in "xyz"] + ["end_header"]
+    (tmp_path / "scan.ply").write_text("\r\n".join([*head, *rows, ""]), newline="")
+    result = validate_cloud(workspace, tmp_path / "scan.ply")
+    assert result.scores == plain.scores | {
+        name: scores | {"num_truth_left_out": 2} for name, scores in plain.scores.items()
+    }
+    assert f"2 of {len(rows)} points are not finite and are left out" in result.table()

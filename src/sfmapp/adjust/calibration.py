@@ -10,7 +10,8 @@ models", 1982); and what some tracks say can be judged by others.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -33,42 +34,28 @@ _DAMPING = 1e-9
 
 @dataclass(frozen=True)
 class CalibrationSystem:
-    """Cost over calibration unknowns (Q,) by track, in units of the noise, halves included: ``g.x + x.H.x / 2``.
+    """Cost over calibration unknowns (Q,) by cluster of tracks, in units of the noise, halves included.
 
     Attributes:
-        track_idx: (T,) the tracks that have something to say; once summed, the first of each cluster.
-        gradient: (T, Q); information: (T, Q, Q).
+        gradient: (C, Q); information: (C, Q, Q), of ``g.x + x.H.x / 2``.
         response: (F, 6, Q) how rotation and translation of each frame's pose, ``x <- exp(w) x + v``, follow a unit of
             each unknown; the first frame stays.
         log_scale: (Q,) how the logarithm of the size of the path follows. scale_variance: its variance if the
             calibration is right and errors are independent; infinite where lengths are not measured.
     """
 
-    track_idx: NDArray[np.int64]
     gradient: Array
     information: Array
     response: Array
     log_scale: Array
     scale_variance: float
 
-    def summed(self, clusters: NDArray[np.int64]) -> CalibrationSystem:
-        """The same by cluster in place of track, which takes no memory to speak of.
-
-        Args:
-            clusters: (T,) number of the cluster of each track, from 0 on without gaps.
-        """
-        count, num = int(clusters.max(initial=-1)) + 1, self.gradient.shape[1]
-        gradient, information = np.zeros((count, num)), np.zeros((count, num, num))
-        np.add.at(gradient, clusters, self.gradient)
-        np.add.at(information, clusters, self.information)
-        first = self.track_idx[np.unique(clusters, return_index=True)[1]]
-        return replace(self, track_idx=first, gradient=gradient, information=information)
-
 
 def reduce_to_calibration(
     model: Reconstruction,
     directions: Array,
     sigma_px: float,
+    clusters: Callable[[NDArray[np.int64]], NDArray[np.int64]],
     loss: Loss = "cauchy",
     loss_sigmas: float = 2.0,
     fields: Array | None = None,
@@ -79,6 +66,7 @@ def reduce_to_calibration(
         model: images of one rig, or of single cameras, all registered, frame by frame; camera s is that of sensor s.
         directions: (C, 11, Q) how canonical intrinsics and turn (radians) of each camera change with each unknown.
         sigma_px: noise of one coordinate. loss, loss_sigmas: as of the adjustment.
+        clusters: number of the cluster, from 0 on without gaps, of each of the tracks (T,) that have something to say.
         fields: (O, N) what smooth fields of displacement are at each observation. Their amplitudes in pixels follow
             the other unknowns: for each camera N along x, then N along y.
     """
@@ -99,8 +87,8 @@ def reduce_to_calibration(
         int(np.diff(tracks.track_ptr).max(initial=1)),
     )  # fmt: skip
     size = 6 * num_frames
-    system, cross = np.zeros((size, size)), np.zeros((size, num))
-    _reduce(*arguments, system, cross)
+    system, cross, said = np.zeros((size, size)), np.zeros((size, num)), np.zeros(tracks.num_tracks, bool)
+    _reduce(*arguments, system, cross, said)
     poses = (np.triu(system) + np.triu(system, 1).T)[6:, 6:]
     poses[np.diag_indices(len(poses))] *= 1 + _DAMPING
     poses[np.diag_indices(len(poses))] += 1e-12 * np.trace(poses) / max(len(poses), 1)
@@ -108,12 +96,13 @@ def reduce_to_calibration(
     solved = np.linalg.solve(poses, np.column_stack([cross[6:], along[6:]]))
     response = np.zeros((size, num))
     response[6:] = -solved[:, :-1]
-    gradient = np.zeros((tracks.num_tracks, num))
+    cluster = np.full(tracks.num_tracks, -1, np.int64)
+    cluster[said] = clusters(np.flatnonzero(said))
+    gradient = np.zeros((int(cluster.max(initial=-1)) + 1, num))
     information = np.zeros((*gradient.shape, num))
-    _by_track(*arguments, response, gradient, information)
-    said = np.flatnonzero(information.any((1, 2)))
+    _by_cluster(*arguments, response, cluster, gradient, information)
     return CalibrationSystem(
-        said, gradient[said], information[said], response.reshape(num_frames, 6, -1), along @ response,
+        gradient, information, response.reshape(num_frames, 6, -1), along @ response,
         float(along[6:] @ solved[:, -1]) if num_sensors > 1 else np.inf,
     )  # fmt: skip
 
@@ -226,9 +215,11 @@ def _project(point_part, rows, columns):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _reduce(  # type: ignore[no-untyped-def]
     track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, fisheye, penalty, directions,
-    fields, loss, scale2, weight, longest, system, cross,
+    fields, loss, scale2, weight, longest, system, cross, said,
 ):  # fmt: skip
-    """Add the tracks, points eliminated, to the upper half of a system over poses (F * 6), and to cross (F * 6, Q)."""
+    """Add the tracks, points eliminated, to the upper half of a system over poses (F * 6), and to cross (F * 6, Q).
+
+    ``said`` (T,) tells which tracks have a point that enough observations hold."""
     num = directions.shape[2]
     J, frames = np.zeros(SCRATCH), np.zeros(longest, np.int64)
     pose_part, lens_part = np.zeros((2 * longest, 6)), np.zeros((2 * longest, num))
@@ -239,6 +230,7 @@ def _reduce(  # type: ignore[no-untyped-def]
             t, track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, fisheye, penalty,
             directions, fields, loss, scale2, weight, J, frames, pose_part, lens_part, point_part, residual,
         )  # fmt: skip
+        said[t] = n > 0
         _project(point_part, 2 * n, lens_part)
         count, frame = 0, -1
         for o in range(n):  # images are sorted within a track: those of a frame follow each other
@@ -266,35 +258,43 @@ def _reduce(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _by_track(  # type: ignore[no-untyped-def]
+def _by_cluster(  # type: ignore[no-untyped-def]
     track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, fisheye, penalty, directions,
-    fields, loss, scale2, weight, longest, response, gradient, information,
+    fields, loss, scale2, weight, longest, response, cluster, gradient, information,
 ):  # fmt: skip
-    """Gradient (T, Q) and information (T, Q, Q) of each track, the poses following with response (F * 6, Q)."""
+    """Gradient (C, Q) and information (C, Q, Q) of clusters of tracks, the poses following with response (F * 6, Q)."""
     num = directions.shape[2]
     J, frames = np.zeros(SCRATCH), np.zeros(longest, np.int64)
     pose_part, lens_part = np.zeros((2 * longest, 6)), np.zeros((2 * longest, num))
     point_part, residual = np.zeros((2 * longest, 3)), np.zeros(2 * longest)
     for t in range(track_ptr.shape[0] - 1):
+        c = cluster[t]
+        if c < 0:
+            continue
         n = _rows(
             t, track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, fisheye, penalty,
             directions, fields, loss, scale2, weight, J, frames, pose_part, lens_part, point_part, residual,
         )  # fmt: skip
         for r in range(2 * n):
             for k in range(6):
+                value, at = pose_part[r, k], 6 * frames[r // 2] + k
                 for q in range(num):
-                    lens_part[r, q] += pose_part[r, k] * response[6 * frames[r // 2] + k, q]
+                    lens_part[r, q] += value * response[at, q]
         _project(point_part, 2 * n, lens_part)
         for r in range(2 * n):
             for q in range(num):
                 value = lens_part[r, q]
-                gradient[t, q] += value * residual[r]  # the rows hold nothing of the point any more
-                for p in range(num):
-                    information[t, q, p] += value * lens_part[r, p]
+                gradient[c, q] += value * residual[r]  # the rows hold nothing of the point any more
+                for p in range(q, num):
+                    information[c, q, p] += value * lens_part[r, p]
+    for c in range(len(information)):
+        for q in range(num):
+            for p in range(q):
+                information[c, q, p] = information[c, p, q]
 
 
 def compile_kernels() -> None:
     """Compile the kernels of this module, or load them from numba's cache."""
     from sfmapp.scene.synthetic import make_scene
 
-    reduce_to_calibration(make_scene(0, 3, 24).observed, np.zeros((1, RAW, 1)), 1.0)
+    reduce_to_calibration(make_scene(0, 3, 24).observed, np.zeros((1, RAW, 1)), 1.0, np.zeros_like)

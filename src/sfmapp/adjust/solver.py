@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Loss = Literal["trivial", "huber", "cauchy"]
 
+# Where the loss begins to bend, in standard deviations: at 2.4 it is 95 % efficient, and a little lower it sheds tails.
+_LOSS_SIGMAS = 2.0
 # Up to this many blocks, and above if this share of all pairs meets, the dense tile factor beats gtsam's sparse one.
 _MAX_DENSE_BLOCKS, _DENSE_SHARE = 160, 0.3
 # Work worth a chunk of its own, and the most memory that the chunks' private sums may take together.
@@ -50,6 +52,12 @@ class AdjustOptions:
     def refine(self) -> tuple[bool, bool, bool]:
         """Focal lengths, distortion, principal points."""
         return self.refine_focal, self.refine_distortion, self.refine_principal_point
+
+    def robust(self, sigma_px: float) -> AdjustOptions:
+        """With a loss that lets go of what is far off the noise, unless another one was asked for."""
+        if self.loss != AdjustOptions().loss:
+            return self
+        return replace(self, loss="cauchy", loss_scale_px=_LOSS_SIGMAS * sigma_px)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.orientation import upright_size
 from sfmapp.images.folder import describe_images
 from sfmapp.images.image_set import ImageOptions, ImageRecord
 from sfmapp.scene.camera import PARAM_NAMES, Camera
@@ -57,8 +58,8 @@ def find_photographs(
         model: cameras, names and poses.
         folder: that the names are relative to.
         options: masks and limits.
-        is_upright: pixels are counted in the photograph turned as EXIF says (sfmapp); False: as stored (COLMAP). Where
-            only one of the two has the shape of the camera's image, that one it is.
+        is_upright: pixels are counted in the photograph turned as EXIF says (old workspaces of sfmapp); False: as
+            stored. Where only one of the two has the shape of the camera's image, that one it is.
         threads: files that are read at a time.
         events: told of photographs that are missing and of copies.
 
@@ -102,10 +103,9 @@ def _tell_missing(folder: Path, missing: list[tuple[str, str]], num_images: int,
 
 def _as_held(record: ImageRecord, camera: Camera, is_upright: bool) -> tuple[ImageRecord, Camera]:
     """The record turned as the camera has it, and the camera in pixels of the photograph, which may be smaller."""
-    upright = record
-    stored = replace(record, orientation=1)
-    if record.orientation >= 5:
-        stored = replace(stored, width=record.height, height=record.width)
+    stored = record
+    width, height = upright_size(record.orientation, record.width, record.height)
+    upright = replace(record, width=width, height=height, orientation=1, turn=record.orientation)
     for held in (upright, stored) if is_upright else (stored, upright):
         scale = np.array([held.width / camera.width, held.height / camera.height])
         if abs(held.width - camera.width * scale[1]) <= 1.0 or abs(held.height - camera.height * scale[0]) <= 1.0:

@@ -150,7 +150,8 @@ def load_scene(
         events.raise_if_cancelled()
         rgb, mask = lay_out(plan.canvases[m], *read_on_white(plan.records[m]))
         events.advanced(STAGE)
-        return DenseView(plan.records[m].name, rgb, mask, plan.canvases[m].k, plan.cam_from_world[m])
+        record = plan.records[m]
+        return DenseView(record.name, rgb, mask, plan.canvases[m].k, plan.cam_from_world[m], record.orientation)
 
     with ThreadPoolExecutor(threads) as pool:
         views = tuple(pool.map(load, wanted.tolist()))

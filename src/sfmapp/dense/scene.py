@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.orientation import upright_poses
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,7 @@ class DenseView:
         mask: (H, W) bool, True where there is something to reconstruct; None for everywhere.
         k: (4,) float64 ``fx, fy, cx, cy`` in pixels of this resolution, the centre of the top-left one (0.5, 0.5).
         cam_from_world: (7,) float64.
+        orientation: EXIF orientation 1 to 8 of these pixels, for whoever shows them to people.
     """
 
     name: str
@@ -27,6 +29,7 @@ class DenseView:
     mask: NDArray[np.bool_] | None
     k: NDArray[np.float64]
     cam_from_world: NDArray[np.float64]
+    orientation: int = 1
 
     @property
     def width(self) -> int:
@@ -87,6 +90,11 @@ class DenseScene:
     def cam_from_world(self) -> NDArray[np.float64]:
         """(V, 7)."""
         return np.array([view.cam_from_world for view in self.views]).reshape(-1, 7)
+
+    @property
+    def upright_cam_from_world(self) -> NDArray[np.float64]:
+        """(V, 7) poses of cameras that are rolled until their pictures are upright, to judge by where up is."""
+        return upright_poses(self.cam_from_world, [view.orientation for view in self.views])
 
     @property
     def centers(self) -> NDArray[np.float64]:

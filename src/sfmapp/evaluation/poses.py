@@ -21,7 +21,7 @@ Definitions:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any
@@ -201,18 +201,49 @@ def scene_size(cam_from_world: ArrayLike) -> float:
 def match_names(names: Sequence[str], reference_names: Sequence[str]) -> NDArray[np.int64]:
     """Position in ``names`` of each reference name, -1 where there is none.
 
-    The full name decides; images that it leaves over are matched by their file name, then by their file name without
-    the suffix, where that is unique on both sides: references often know another folder or file type.
+    The full name decides; images that it leaves over are matched by the end of the path where one name with folders
+    ends in the other, then by their file name, then by their file name without the suffix, where that is unique on both
+    sides: references often know another folder or file type, or leave the file type out.
     """
     index = np.full(len(reference_names), -1, np.int64)
-    keys = (str, lambda name: PurePosixPath(name).name, lambda name: PurePosixPath(name).stem)
-    for key in keys:
+
+    def file_name(name: str) -> str:
+        return PurePosixPath(name).name
+
+    def stem(name: str) -> str:
+        return PurePosixPath(name).stem
+
+    by_end = _by_end(names)
+    for key, their_key in ((str, str), (str, by_end), (file_name, file_name), (stem, file_name), (stem, stem)):
         free = set(range(len(names))) - set(index.tolist())
         ours = _unique({i: key(names[i]) for i in sorted(free)})
-        theirs = _unique({k: key(reference_names[k]) for k in np.flatnonzero(index < 0).tolist()})
+        theirs = _unique({k: their_key(reference_names[k]) for k in np.flatnonzero(index < 0).tolist()})
         for name in ours.keys() & theirs.keys():
             index[theirs[name]] = ours[name]
     return index
+
+
+def _by_end(names: Sequence[str]) -> Callable[[str], str]:
+    """What turns a reference name into the one of ours that ends in it or that it ends in, itself if there is none.
+
+    File names alone are no ends of this kind: they are compared later, where they are unique.
+    """
+
+    def ends(name: str) -> list[str]:
+        parts = name.split("/")
+        return ["/".join(parts[k:]) for k in range(1, len(parts) - 1)]
+
+    ours_of_end: dict[str, set[str]] = {}
+    for name in names:
+        for end in ends(name):
+            ours_of_end.setdefault(end, set()).add(name)
+    known = {name for name in names if "/" in name}
+
+    def ours(name: str) -> str:
+        longer = ours_of_end.get(name, set())
+        return next((end for end in ends(name) if end in known), next(iter(longer)) if len(longer) == 1 else name)
+
+    return ours
 
 
 def _unique(key_of: dict[int, str]) -> dict[str, int]:

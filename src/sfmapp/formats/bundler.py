@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.atomic import replaced_file
-from sfmapp.formats.text_input import nearest_rotation, read_limited_text
+from sfmapp.formats.text_input import nearest_rotation, plain_numbers, read_limited_text
 from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import Camera, CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
@@ -120,7 +120,7 @@ def read_bundler(
     if head.strip() != _HEADER:
         raise InputError(f"{path}: expected {_HEADER!r} in the first line, found {head[:40]!r}")
     try:
-        values = np.array(body.split(), np.float64)
+        values = np.array(plain_numbers(body.split()), np.float64)
     except ValueError:
         raise InputError(f"{path}: expected nothing but numbers after the first line") from None
     if len(values) < 2 or not np.isfinite(values).all() or (values[:2] < 0).any() or (values[:2] % 1).any():
@@ -132,12 +132,12 @@ def read_bundler(
         )
     cameras = values[2 : 2 + 15 * num_images].reshape(-1, 15)
     xyz, rgb, obs_point, views = _read_points(path, values[2 + 15 * num_images :], num_points)
-    image, feature = (views[:, column].astype(np.int64) for column in (0, 1))
-    wrong = (views[:, :2] % 1 != 0).any(1) | (image < 0) | (image >= num_images) | (feature < 0) | (feature > 2**31 - 1)
+    wrong = (views[:, :2] % 1 != 0).any(1) | (views[:, :2] < 0).any(1) | (views[:, :2] >= [num_images, 2**31]).any(1)
     if wrong.any():
         raise InputError(
             f"{path}: expected views of {num_images} cameras, found {views[np.argmax(wrong), :2].tolist()}"
         )
+    image, feature = (views[:, column].astype(np.int64) for column in (0, 1))
     sizes = _image_sizes(path, image_sizes, num_images, views)
     centers = sizes / 2 if principal_points is None else np.asarray(principal_points, np.float64).reshape(-1, 2)
     camera_list, camera_idx, poses = _read_cameras(path, cameras, sizes, centers)

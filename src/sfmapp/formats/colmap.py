@@ -8,11 +8,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sfmapp.errors import InputError
+from sfmapp.events import Events
 from sfmapp.formats.atomic import replaced_folder
-from sfmapp.formats.colmap_binary import read_binary, write_binary
-from sfmapp.formats.colmap_model import Keypoints, model_from_reconstruction, reconstruction_from_model
-from sfmapp.formats.colmap_text import read_text, write_text
+from sfmapp.formats.colmap_binary import read_binary, read_binary_cameras, read_binary_images, write_binary
+from sfmapp.formats.colmap_model import Keypoints, check_unique, model_from_reconstruction, reconstruction_from_model
+from sfmapp.formats.colmap_text import read_text, read_text_cameras, read_text_images, write_text
+from sfmapp.scene.camera import Camera
 from sfmapp.scene.reconstruction import Reconstruction
 
 _STEMS = ("cameras", "images", "points3D", "rigs", "frames")
@@ -60,11 +65,40 @@ def has_model(folder: str | Path) -> bool:
     return any((Path(folder) / f"images.{ending}").is_file() for ending in ("bin", "txt"))
 
 
-def read_model(folder: str | Path) -> tuple[Reconstruction, Keypoints]:
+def read_model_poses(folder: str | Path) -> tuple[list[str], NDArray[np.float64], list[Camera] | None]:
+    """Names and poses of a model whose cameras and points need not be such as :func:`read_model` takes.
+
+    Returns:
+        Names of I images by ascending id, cam_from_world (I, 7), and the camera of each; None if one is of another
+        model than ours, or malformed.
+
+    Raises:
+        InputError: the files of images, rigs or frames are missing, truncated or malformed.
+    """
+    folder = Path(folder)
+    is_binary = _is_binary(folder)
+    images = read_binary_images(folder) if is_binary else read_text_images(folder)
+    check_unique(folder, "image", images.ids, images.names)
+    order = np.argsort(images.ids)
+    names, poses = [images.names[i] for i in order], images.cam_from_world[order]
+    try:
+        ids, cameras, _ = (read_binary_cameras if is_binary else read_text_cameras)(folder, images)
+        camera_of = dict(zip(ids.tolist(), cameras, strict=True))
+        return names, poses, [camera_of[i] for i in images.camera_ids[order].tolist()]
+    except (InputError, KeyError):
+        return names, poses, None
+
+
+def read_model(folder: str | Path, events: Events | None = None) -> tuple[Reconstruction, Keypoints]:
     """Read a model, binary (preferred, as COLMAP does) or text, with rigs and frames or without.
 
     Images, cameras and points stand in ascending order of their ids; every track element is an inlier. Images of rigs
-    with several cameras are on the reconstruction's ``rig``.
+    with several cameras are on the reconstruction's ``rig``. Where points or images were taken away, ids that still
+    name them count as none; cameras that no image uses may be of any model; a model without a file of points has none.
+
+    Args:
+        folder: of the model.
+        events: warned, once for each kind, of what was left out.
 
     Returns:
         The reconstruction, and for each image the pixels (N, 2) float64 of its keypoints.
@@ -73,10 +107,17 @@ def read_model(folder: str | Path) -> tuple[Reconstruction, Keypoints]:
         InputError: a file is missing, truncated, malformed or disagrees with the others, or a camera model is not ours.
     """
     folder = Path(folder)
-    if (folder / "images.bin").exists():
-        return reconstruction_from_model(folder, read_binary(folder))
-    if (folder / "images.txt").exists():
-        return reconstruction_from_model(folder, read_text(folder))
+    model = read_binary(folder) if _is_binary(folder) else read_text(folder)
+    reconstruction, keypoints, notes = reconstruction_from_model(folder, model)
+    for note in notes:
+        (events or Events()).warned("model", f"{folder}: {note}")
+    return reconstruction, keypoints
+
+
+def _is_binary(folder: Path) -> bool:
+    """Whether a model is binary. Raises InputError if the folder holds none of either kind."""
+    if has_model(folder):
+        return (folder / "images.bin").is_file()
     found = "no such folder" if not folder.is_dir() else ", ".join(sorted(p.name for p in folder.iterdir())[:8])
     raise InputError(
         f"{folder}: expected a COLMAP model (images.bin or images.txt), found {found or 'an empty folder'}"

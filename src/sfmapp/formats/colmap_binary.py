@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +11,18 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_model import (
+    FOREIGN_NUM_PARAMS,
+    MODEL_NAMES,
+    NO_POINTS_NOTE,
+    NO_RIGS_NOTE,
     ColmapModel,
     Keypoints,
+    PosedImages,
     checked_camera,
     checked_poses,
+    unused_cameras_note,
 )
-from sfmapp.formats.colmap_rigs import Frame, Rig, poses_from_frames
+from sfmapp.formats.colmap_rigs import Frame, Rig, add_rig, add_sensor, poses_from_frames
 from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel
 
@@ -36,20 +42,40 @@ def write_binary(folder: Path, model: ColmapModel) -> None:
     (folder / "points3D.bin").write_bytes(_points_bytes(model))
 
 
-def read_binary(folder: Path) -> ColmapModel:
-    """Read a binary model, with rigs and frames or without. Raises InputError for anything malformed."""
-    camera_ids, cameras = _read_cameras(_Reader(folder / "cameras.bin"))
-    image_ids, camera_of, names, poses, xy, point_ids = _read_images(_Reader(folder / "images.bin"))
-    rigs, frames = {}, []
-    if (folder / "frames.bin").exists():
+def read_binary_images(folder: Path) -> PosedImages:
+    """The images of a binary model, with rigs and frames or without. Raises InputError for anything malformed."""
+    ids, camera_ids, names, poses, xy, point_ids = _read_images(_Reader(folder / "images.bin"))
+    rigs, frames, notes = dict[int, Rig](), list[Frame](), tuple[str, ...]()
+    if (folder / "frames.bin").exists() and (folder / "rigs.bin").exists():
         rigs = _read_rigs(_Reader(folder / "rigs.bin"))
         frames = _read_frames(_Reader(folder / "frames.bin"))
-        poses = poses_from_frames(folder / "frames.bin", image_ids, rigs, frames)
-    points, track_ptr, track = _read_points(_Reader(folder / "points3D.bin"))
+        poses = poses_from_frames(folder / "frames.bin", ids, camera_ids, rigs, frames)
+    elif (folder / "frames.bin").exists():
+        notes = (NO_RIGS_NOTE,)
+    return PosedImages(ids, camera_ids, names, poses, xy, point_ids, rigs, frames, notes)
+
+
+def read_binary_cameras(folder: Path, images: PosedImages) -> tuple[NDArray[np.int64], list[Camera], tuple[str, ...]]:
+    """Ids, cameras, and a note of those that are left out: of a model that is not ours, and that no image uses."""
+    return _read_cameras(_Reader(folder / "cameras.bin"), set(images.camera_ids.tolist()))
+
+
+def read_binary(folder: Path) -> ColmapModel:
+    """Read a binary model, with rigs and frames or without. Raises InputError for anything malformed."""
+    images = read_binary_images(folder)
+    camera_ids, cameras, notes = read_binary_cameras(folder, images)
+    notes = (*images.notes, *notes)
+    if (folder / "points3D.bin").exists():
+        points, track_ptr, track = _read_points(_Reader(folder / "points3D.bin"))
+    else:
+        points, track_ptr, track = np.zeros(0, _POINT3D), np.zeros(1, np.int64), np.zeros(0, _TRACK)
+        notes += (NO_POINTS_NOTE,)
     return ColmapModel(
-        camera_ids, cameras, image_ids, camera_of, names, poses, xy, point_ids,
+        camera_ids, cameras, images.ids, images.camera_ids, images.names, images.cam_from_world, images.points2d_xy,
+        images.points2d_point_ids,
         points["id"].copy(), points["xyz"].copy(), points["rgb"].copy(), points["error"].copy(),
-        track_ptr, track["image_id"].astype(np.int64), track["point2d_idx"].astype(np.int64), rigs, frames,
+        track_ptr, track["image_id"].astype(np.int64), track["point2d_idx"].astype(np.int64),
+        images.rigs, images.frames, notes,
     )  # fmt: skip
 
 
@@ -185,16 +211,24 @@ class _Reader:
             raise InputError(f"{self.path}: expected the end after {self.pos} bytes, found {len(self.data)} bytes")
 
 
-def _read_cameras(reader: _Reader) -> tuple[NDArray[np.int64], list[Camera]]:
-    ids, cameras = [], []
-    for _ in range(reader.count("cameras", 24 + 3 * 8)):
+def _read_cameras(
+    reader: _Reader, used_ids: Collection[int]
+) -> tuple[NDArray[np.int64], list[Camera], tuple[str, ...]]:
+    """Ids, cameras, and a note of those that are left out: of a model that is not ours, and not used."""
+    ids, cameras, left_out = [], [], []
+    for _ in range(reader.count("cameras", 24 + min(FOREIGN_NUM_PARAMS.values()) * 8)):
         camera_id, model, width, height = reader.unpack("<IiQQ", "a camera")
+        what = f"the parameters of camera {camera_id}"
+        if model in FOREIGN_NUM_PARAMS and camera_id not in used_ids:
+            reader.array(np.dtype("<f8"), FOREIGN_NUM_PARAMS[model], what)
+            left_out.append(f"{camera_id} ({MODEL_NAMES[model]})")
+            continue
         num_params = len(PARAM_NAMES[CameraModel(model)]) if model in CameraModel._value2member_map_ else 0
-        params = reader.array(np.dtype("<f8"), num_params, f"the parameters of camera {camera_id}")
+        params = reader.array(np.dtype("<f8"), num_params, what)
         ids.append(camera_id)
         cameras.append(checked_camera(reader.path, camera_id, model, width, height, params))
     reader.finish()
-    return np.array(ids, np.int64), cameras
+    return np.array(ids, np.int64), cameras, unused_cameras_note(left_out)
 
 
 def _read_images(
@@ -262,8 +296,8 @@ def _read_rigs(reader: _Reader) -> dict[int, Rig]:
                 values = np.array([reader.unpack("<7d", f"the pose of sensor {sensor_id}")])
                 pose = checked_poses(reader.path, "sensor", np.array([sensor_id]), values)[0]
             if sensor_type == _CAMERA:
-                sensors[sensor_id] = pose
-        rigs[rig_id] = Rig(sensors)
+                add_sensor(reader.path, sensors, sensor_id, pose)
+        add_rig(reader.path, rigs, rig_id, sensors)
     reader.finish()
     return rigs
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,8 +24,11 @@ MODEL_NAMES = {model.value: model.name for model in CameraModel} | {
     16: "EUCM", 17: "EQUIRECTANGULAR",
 }  # fmt: skip
 """Names of COLMAP 4.2's camera models by id, ours and others: the others are refused by name."""
+FOREIGN_NUM_PARAMS = {6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16, 12: 4, 13: 5, 14: 3, 15: 4, 16: 6, 17: 2}
+"""How many parameters the others have, by id: what it takes to read on behind one that no image uses."""
 
 _LARGEST_SIDE_PX = 1_000_000  # a photograph is smaller; a corrupt file says 10^18
+_LARGEST_PARAMETER = 1e9  # so are focal lengths and coefficients; a corrupt file says 10^300
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,7 @@ class ColmapModel:
         point_ids: (P,) int64, with point_xyz (P, 3), point_rgb (P, 3) uint8, point_error_px (P,) or -1.
         track_ptr: (P + 1,) int64 into track_image_ids (O,) int64 and track_point2d_idx (O,) int64.
         rigs, frames: none where an older file has none.
+        notes: what was left out in reading, as sentences that follow the name of the folder.
     """
 
     camera_ids: NDArray[np.int64]
@@ -57,6 +62,33 @@ class ColmapModel:
     track_point2d_idx: NDArray[np.int64]
     rigs: dict[int, Rig]
     frames: list[Frame]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """What a model says of its images (I), without cameras and points; arrays as in :class:`ColmapModel`."""
+
+    ids: NDArray[np.int64]
+    camera_ids: NDArray[np.int64]
+    names: list[str]
+    cam_from_world: NDArray[np.float64]
+    points2d_xy: Keypoints
+    points2d_point_ids: list[NDArray[np.int64]]
+    rigs: dict[int, Rig]
+    frames: list[Frame]
+    notes: tuple[str, ...]
+
+
+def unused_cameras_note(left_out: list[str]) -> tuple[str, ...]:
+    """What is said of cameras ("7 (FOV)") that no image uses and whose models are not ours."""
+    if not left_out:
+        return ()
+    return (f"cameras of other models that no image uses are left out: {', '.join(left_out[:5])}",)
+
+
+NO_POINTS_NOTE = "there is no file of points: the model is read without any"
+NO_RIGS_NOTE = "there is a file of frames but none of rigs: the poses are those of the images file"
 
 
 def checked_camera(
@@ -85,7 +117,10 @@ def checked_camera(
     names = PARAM_NAMES[known]
     if values.shape != (len(names),):
         raise InputError(f"{place}: {known.name} has {len(names)} parameters, found {len(values)}")
-    if not np.isfinite(values).all() or not (values[[name.startswith("f") for name in names]] > 0).all():
+    if (
+        not (np.abs(values) < _LARGEST_PARAMETER).all()
+        or not (values[[name.startswith("f") for name in names]] > 0).all()
+    ):
         raise InputError(f"{place}: expected finite parameters and positive focal lengths, found {values.tolist()}")
     return Camera(known, int(width), int(height), values, focal_source="file")
 
@@ -178,31 +213,45 @@ def _mean_error_px(reconstruction: Reconstruction, used: NDArray[np.bool_]) -> N
     return mean
 
 
-def reconstruction_from_model(folder: Path, model: ColmapModel) -> tuple[Reconstruction, Keypoints]:
+def check_unique(folder: Path, what: str, ids: NDArray[np.int64], names: Sequence[str] = ()) -> None:
+    """Raise InputError if an id or a name is there twice."""
+    values, counts = np.unique(ids, return_counts=True)
+    if (counts > 1).any():
+        raise InputError(f"{folder}: expected every {what} id once, found {what} {values[counts > 1][0]} twice")
+    twice = sorted(name for name, count in Counter(names).items() if count > 1)
+    if twice:
+        raise InputError(f"{folder}: expected every {what} name once, found {twice[0]!r} twice")
+
+
+def reconstruction_from_model(folder: Path, model: ColmapModel) -> tuple[Reconstruction, Keypoints, tuple[str, ...]]:
     """The reconstruction that a model holds, images and points in ascending order of their ids; all ids are checked.
 
+    Points and images that were taken away leave ids behind in what names them: those count as none, and a note says so.
+
+    Returns:
+        The reconstruction, the pixels of the keypoints of each image, and notes as :class:`ColmapModel` has them.
+
     Raises:
-        InputError: ids that are double, missing or out of range; two names alike; images and tracks that disagree.
+        InputError: ids that are double or out of range, cameras that are missing; two names alike; images and tracks
+            that contradict each other.
     """
-    for what, ids in (("camera", model.camera_ids), ("image", model.image_ids), ("point", model.point_ids)):
-        values, counts = np.unique(ids, return_counts=True)
-        if (counts > 1).any():
-            raise InputError(f"{folder}: expected every {what} id once, found {what} {values[counts > 1][0]} twice")
-    twice = sorted(name for name, count in Counter(model.image_names).items() if count > 1)
-    if twice:
-        raise InputError(f"{folder}: expected every image name once, found {twice[0]!r} twice")
+    check_unique(folder, "camera", model.camera_ids)
+    check_unique(folder, "image", model.image_ids, model.image_names)
+    check_unique(folder, "point", model.point_ids)
     camera_order = np.argsort(model.camera_ids)
     image_order = np.argsort(model.image_ids)
     point_order = np.argsort(model.point_ids)
     image_ids = model.image_ids[image_order]
     xy = [model.points2d_xy[i] for i in image_order]
-    camera_idx = _positions(folder, "an image", "camera", model.image_camera_ids[image_order], model.camera_ids)
-    rank = np.empty_like(point_order)
-    rank[point_order] = np.arange(len(rank))
-    obs_point = np.repeat(np.arange(len(rank)), np.diff(model.track_ptr))
-    obs_image = _positions(folder, "a point", "image", model.track_image_ids, image_ids)
-    obs_xy = _checked_observations(folder, model, image_order, obs_image, obs_point)
-    tracks = make_tracks(len(image_ids), len(rank), rank[obs_point], obs_image, model.track_point2d_idx, obs_xy)
+    camera_idx = _positions(model.image_camera_ids[image_order], model.camera_ids[camera_order])
+    if (camera_idx < 0).any():
+        missing = model.image_camera_ids[image_order][np.argmax(camera_idx < 0)]
+        raise InputError(f"{folder}: an image names camera {missing}, which the model does not hold")
+    observed, notes = _observations(folder, model, image_order, point_order)
+    flat_xy = np.concatenate([*xy, np.zeros((0, 2))])
+    tracks = make_tracks(
+        len(image_ids), len(point_order), observed.point, observed.image, observed.keypoint, flat_xy[observed.at]
+    )
     reconstruction = Reconstruction(
         [model.cameras[i] for i in camera_order],
         [model.image_names[i] for i in image_order],
@@ -214,57 +263,109 @@ def reconstruction_from_model(folder: Path, model: ColmapModel) -> tuple[Reconst
         model.point_rgb[point_order],
         rig_images(image_ids, model.rigs, model.frames),
     )
-    return reconstruction, xy
+    return reconstruction, xy, (*model.notes, *notes)
 
 
-def _positions(
-    folder: Path, who: str, what: str, ids: NDArray[np.int64], known_ids: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """(N,) ranks of ids (N,) among known_ids."""
-    known = np.sort(known_ids)
-    position = np.searchsorted(known, ids)
-    wrong = position >= len(known)
-    if len(known):
-        wrong |= known[np.minimum(position, len(known) - 1)] != ids
-    if wrong.any():
-        raise InputError(f"{folder}: {who} names {what} {ids[np.argmax(wrong)]}, which the model does not hold")
-    return position
+def _positions(ids: NDArray[np.int64], known: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(N,) ranks of ids (N,) among ascending ones, -1 where they are not among them."""
+    if not len(known):
+        return np.full(len(ids), -1, np.int64)
+    position = np.minimum(np.searchsorted(known, ids), len(known) - 1)
+    return np.where(known[position] == ids, position, -1)
 
 
-def _checked_observations(
-    folder: Path,
-    model: ColmapModel,
-    image_order: NDArray[np.int64],
-    obs_image: NDArray[np.int64],
-    obs_point: NDArray[np.int64],
-) -> NDArray[np.float64]:
-    """(O, 2) pixels of the track elements, after checking that images and points tell the same story."""
+@dataclass(frozen=True)
+class _Observed:
+    """Observations (O,): positions of point and image, of the keypoint in its image, and among those of all images."""
+
+    point: NDArray[np.int64]
+    image: NDArray[np.int64]
+    keypoint: NDArray[np.int64]
+    at: NDArray[np.int64]
+
+
+def _observations(
+    folder: Path, model: ColmapModel, image_order: NDArray[np.int64], point_order: NDArray[np.int64]
+) -> tuple[_Observed, list[str]]:
+    """What the tracks claim and what the keypoints name, put together as COLMAP does; and notes of what was left out.
+
+    An observation counts if one side tells of it and the other does not deny it: tools that filter a model often edit
+    only one of its files.
+    """
     counts = np.array([len(model.points2d_xy[i]) for i in image_order], np.int64)
     start = np.concatenate([[0], np.cumsum(counts)])
-    idx = model.track_point2d_idx
-    wrong = idx >= counts[obs_image] if len(idx) else np.zeros(0, bool)
+    named_ids = np.concatenate([*(model.points2d_point_ids[i] for i in image_order), np.zeros(0, np.int64)])
+    rank = np.empty_like(point_order)
+    rank[point_order] = np.arange(len(rank))
+    point = np.repeat(rank, np.diff(model.track_ptr))
+    image = _positions(model.track_image_ids, model.image_ids[image_order])
+    # an image that is gone, or whose line of keypoints was emptied
+    kept = (image >= 0) & (counts[image] > 0 if len(counts) else False)
+    tracked = _Observed(point[kept], image[kept], model.track_point2d_idx[kept], np.zeros(0, np.int64))
+    names = [model.image_names[i] for i in image_order]
+    at = _claimed_keypoints(folder, tracked, model.point_ids[point_order], names, counts, start, named_ids)
+    notes = []
+    if num_lost := int(len(kept) - kept.sum()):
+        notes.append(f"{num_lost} observations name images or keypoints that are not there: they count as none")
+    unclaimed = named_ids >= 0
+    unclaimed[at] = False
+    rest = np.flatnonzero(unclaimed)
+    rest_point = _positions(named_ids[rest], model.point_ids[point_order])
+    if num_lost := int((rest_point < 0).sum()):
+        notes.append(f"{num_lost} keypoints name points that are not there: they count as none")
+    rest, rest_point = rest[rest_point >= 0], rest_point[rest_point >= 0]
+    if len(rest):
+        notes.append(f"{len(rest)} observations stand with the images alone, not with their points: they are kept")
+    rest_image = np.searchsorted(start, rest, side="right") - 1
+    return _Observed(
+        np.concatenate([tracked.point, rest_point]),
+        np.concatenate([tracked.image, rest_image]),
+        np.concatenate([tracked.keypoint, rest - start[rest_image]]),
+        np.concatenate([at, rest]),
+    ), notes
+
+
+def _claimed_keypoints(
+    folder: Path,
+    tracked: _Observed,
+    point_ids: NDArray[np.int64],
+    names: list[str],
+    counts: NDArray[np.int64],
+    start: NDArray[np.int64],
+    named_ids: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """(O,) where the keypoints of track elements are among those of all images, none of them denied or claimed twice.
+
+    Args:
+        tracked: the elements; its ``at`` is not looked at.
+        point_ids: by position. names, counts, start (I + 1): of the images and their keypoints, in the order of ids.
+        named_ids: (K,) the points that the keypoints name, -1 for none.
+    """
+
+    def element(o: int) -> str:
+        return f"keypoint {tracked.keypoint[o]} of image {names[tracked.image[o]]!r}"
+
+    wrong = tracked.keypoint >= counts[tracked.image]
     if wrong.any():
         first = int(np.argmax(wrong))
         raise InputError(
-            f"{folder}: point {model.point_ids[obs_point[first]]} names keypoint {idx[first]} of image "
-            f"{model.image_names[image_order[obs_image[first]]]!r}, which has {counts[obs_image[first]]}"
+            f"{folder}: point {point_ids[tracked.point[first]]} names {element(first)}, which has "
+            f"{counts[tracked.image[first]]}"
         )
-    flat_xy = np.concatenate([model.points2d_xy[i] for i in image_order] or [np.zeros((0, 2))])
-    flat_ids = np.concatenate([model.points2d_point_ids[i] for i in image_order] or [np.zeros(0, np.int64)])
-    at = start[obs_image] + idx
-    differs = flat_ids[at] != model.point_ids[obs_point]
+    at = start[tracked.image] + tracked.keypoint
+    differs = (named_ids[at] != point_ids[tracked.point]) & (named_ids[at] != -1)
     if differs.any():
         first = int(np.argmax(differs))
         raise InputError(
-            f"{folder}: point {model.point_ids[obs_point[first]]} claims keypoint {idx[first]} of image "
-            f"{model.image_names[image_order[obs_image[first]]]!r}, which names point {flat_ids[at[first]]}"
+            f"{folder}: point {point_ids[tracked.point[first]]} claims {element(first)}, which names point "
+            f"{named_ids[at[first]]}",
+            "images and points are not of one model: take both from the same export",
         )
-    if np.count_nonzero(flat_ids != -1) != len(at):
-        raise InputError(
-            f"{folder}: expected as many keypoints with a point as track elements, found "
-            f"{np.count_nonzero(flat_ids != -1)} and {len(at)}"
-        )
-    return flat_xy[at]
+    twice = np.bincount(at, minlength=1) > 1
+    if twice.any():
+        again = element(int(np.flatnonzero(twice[at])[0]))
+        raise InputError(f"{folder}: expected as many keypoints as observations of points, found {again} claimed twice")
+    return at
 
 
 def checked_names(names: list[str]) -> None:

@@ -125,11 +125,35 @@ def _references(kinds: NDArray[np.int64], frames: list[NDArray[np.int64]]) -> li
     return [root(k) for k in range(len(kinds))]
 
 
+def add_sensor(path: Path, sensors: dict[int, NDArray[np.float64]], camera_id: int, pose: NDArray[np.float64]) -> None:
+    """Put a camera into a rig. Raises InputError if it is there already."""
+    if camera_id in sensors:
+        raise InputError(f"{path}: expected every camera once in a rig, found camera {camera_id} twice")
+    sensors[camera_id] = pose
+
+
+def add_rig(path: Path, rigs: dict[int, Rig], rig_id: int, sensors: dict[int, NDArray[np.float64]]) -> None:
+    """Put a rig among the others. Raises InputError if its id is there already."""
+    if rig_id in rigs:
+        raise InputError(f"{path}: expected every rig id once, found rig {rig_id} twice")
+    rigs[rig_id] = Rig(sensors)
+
+
 def poses_from_frames(
-    path: Path, image_ids: NDArray[np.int64], rigs: dict[int, Rig], frames: list[Frame]
+    path: Path,
+    image_ids: NDArray[np.int64],
+    image_camera_ids: NDArray[np.int64],
+    rigs: dict[int, Rig],
+    frames: list[Frame],
 ) -> NDArray[np.float64]:
-    """(I, 7) cam_from_world of images from the frames they belong to: where a model has frames, these are its poses."""
+    """(I, 7) cam_from_world of images from the frames they belong to: where a model has frames, these are its poses.
+
+    Frames may name images that the model no longer holds.
+    """
     poses: dict[int, NDArray[np.float64]] = {}
+    camera_of = dict(zip(image_ids.tolist(), image_camera_ids.tolist(), strict=True))
+    if len({frame.frame_id for frame in frames}) < len(frames):
+        raise InputError(f"{path}: expected every frame id once, found one twice")
     for frame in frames:
         if frame.rig_id not in rigs:
             raise InputError(f"{path}: a frame names rig {frame.rig_id}, which the rigs file does not hold")
@@ -137,6 +161,11 @@ def poses_from_frames(
         for camera_id, image_id in frame.camera_image_ids:
             if camera_id not in sensors:
                 raise InputError(f"{path}: image {image_id}: camera {camera_id} is not part of rig {frame.rig_id}")
+            if camera_of.get(image_id, camera_id) != camera_id:
+                raise InputError(
+                    f"{path}: frame {frame.frame_id} has image {image_id} of camera {camera_id}, but the images file "
+                    f"has it of camera {camera_of[image_id]}"
+                )
             if image_id in poses:
                 raise InputError(f"{path}: expected every image in one frame, found image {image_id} in two")
             sensor_from_rig = sensors[camera_id]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +11,20 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_binary import poses_wxyz
 from sfmapp.formats.colmap_model import (
+    NO_POINTS_NOTE,
+    NO_RIGS_NOTE,
     ColmapModel,
     Keypoints,
+    PosedImages,
     checked_camera,
     checked_names,
     checked_poses,
+    unused_cameras_note,
 )
-from sfmapp.formats.colmap_rigs import Frame, Rig, poses_from_frames
+from sfmapp.formats.colmap_rigs import Frame, Rig, add_rig, add_sensor, poses_from_frames
+from sfmapp.formats.text_input import plain_numbers, read_limited_text
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import Camera
+from sfmapp.scene.camera import Camera, CameraModel
 
 _LARGEST_ID = 2**53  # ids pass through float64, which is exact up to here
 
@@ -74,46 +79,65 @@ def _numbers(values: NDArray[np.float64]) -> str:
     return " ".join(map(repr, values.tolist()))
 
 
-def read_text(folder: Path) -> ColmapModel:
-    """Read a text model, with rigs and frames or without. Raises InputError for anything malformed."""
-    camera_ids, cameras = _read_cameras(folder / "cameras.txt")
-    image_ids, camera_of, names, poses, xy, point_ids = _read_images(folder / "images.txt")
-    rigs, frames = {}, []
-    if (folder / "frames.txt").exists():
+def read_text_images(folder: Path) -> PosedImages:
+    """The images of a text model, with rigs and frames or without. Raises InputError for anything malformed."""
+    ids, camera_ids, names, poses, xy, point_ids = _read_images(folder / "images.txt")
+    rigs, frames, notes = dict[int, Rig](), list[Frame](), tuple[str, ...]()
+    if (folder / "frames.txt").exists() and (folder / "rigs.txt").exists():
         rigs = _read_rigs(folder / "rigs.txt")
         frames = _read_frames(folder / "frames.txt")
-        poses = poses_from_frames(folder / "frames.txt", image_ids, rigs, frames)
-    table, tracks = _read_points(folder / "points3D.txt")
+        poses = poses_from_frames(folder / "frames.txt", ids, camera_ids, rigs, frames)
+    elif (folder / "frames.txt").exists():
+        notes = (NO_RIGS_NOTE,)
+    return PosedImages(ids, camera_ids, names, poses, xy, point_ids, rigs, frames, notes)
+
+
+def read_text_cameras(folder: Path, images: PosedImages) -> tuple[NDArray[np.int64], list[Camera], tuple[str, ...]]:
+    """Ids, cameras, and a note of those that are left out: of a model that is not ours, and that no image uses."""
+    return _read_cameras(folder / "cameras.txt", set(images.camera_ids.tolist()))
+
+
+def read_text(folder: Path) -> ColmapModel:
+    """Read a text model, with rigs and frames or without. Raises InputError for anything malformed."""
+    images = read_text_images(folder)
+    camera_ids, cameras, notes = read_text_cameras(folder, images)
+    notes = (*images.notes, *notes)
+    table, tracks = np.zeros((0, 8)), list[NDArray[np.int64]]()
+    if (folder / "points3D.txt").exists():
+        table, tracks = _read_points(folder / "points3D.txt")
+    else:
+        notes += (NO_POINTS_NOTE,)
     lengths = np.array([len(track) for track in tracks], np.int64)
     flat = np.concatenate([*tracks, np.zeros((0, 2), np.int64)])
     return ColmapModel(
-        camera_ids, cameras, image_ids, camera_of, names, poses, xy, point_ids,
+        camera_ids, cameras, images.ids, images.camera_ids, images.names, images.cam_from_world, images.points2d_xy,
+        images.points2d_point_ids,
         table[:, 0].astype(np.int64), table[:, 1:4].copy(), table[:, 4:7].astype(np.uint8), table[:, 7].copy(),
-        np.concatenate([[0], np.cumsum(lengths)]), flat[:, 0].copy(), flat[:, 1].copy(), rigs,
-        frames,
+        np.concatenate([[0], np.cumsum(lengths)]), flat[:, 0].copy(), flat[:, 1].copy(),
+        images.rigs, images.frames, notes,
     )  # fmt: skip
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: expected UTF-8 text, found other bytes") from None
+    # not splitlines(), which also ends a line at characters that a name may hold
+    return read_limited_text(path).split("\n")
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith("#")
 
 
 def _records(path: Path) -> Iterator[tuple[str, list[str]]]:
     """Place (for messages) and fields of every line that is neither empty nor a comment."""
     for number, line in enumerate(_lines(path), 1):
-        if line.strip() and not line.lstrip().startswith("#"):
+        if line.strip() and not _is_comment(line):
             yield f"{path}:{number}", line.split()
 
 
 def _floats(place: str, fields: list[str], what: str) -> NDArray[np.float64]:
     """(N,) finite numbers."""
     try:
-        values = np.array([float(field) for field in fields], np.float64)
+        values = np.array(plain_numbers(fields), np.float64)
     except ValueError:
         raise InputError(f"{place}: expected numbers for {what}, found {' '.join(fields)[:80]!r}") from None
     if not np.isfinite(values).all():
@@ -125,6 +149,8 @@ def _ints(place: str, fields: list[str], what: str, low: int = 0, high: int = _L
     """Whole numbers from low to high."""
     try:
         values = [int(field) for field in fields]
+        if any("_" in field for field in fields):  # 1_000 is a number to Python alone
+            raise ValueError
     except ValueError:
         raise InputError(f"{place}: expected whole numbers for {what}, found {' '.join(fields)[:80]!r}") from None
     if any(not low <= value <= high for value in values):
@@ -137,15 +163,24 @@ def _need(place: str, fields: list[str], count: int, what: str) -> None:
         raise InputError(f"{place}: expected at least {count} fields of {what}, found {len(fields)}")
 
 
-def _read_cameras(path: Path) -> tuple[NDArray[np.int64], list[Camera]]:
-    ids, cameras = [], []
+def _no_more(place: str, fields: list[str], what: str) -> None:
+    if fields:
+        raise InputError(f"{place}: expected the end of the line after {what}, found {' '.join(fields)[:80]!r}")
+
+
+def _read_cameras(path: Path, used_ids: Collection[int]) -> tuple[NDArray[np.int64], list[Camera], tuple[str, ...]]:
+    """Ids, cameras, and a note of those that are left out: of a model that is not ours, and not used."""
+    ids, cameras, left_out = [], [], []
     for place, fields in _records(path):
         _need(place, fields, 5, "a camera")
+        if fields[1] not in CameraModel.__members__ and _ints(place, fields[:1], "a camera")[0] not in used_ids:
+            left_out.append(f"{fields[0]} ({fields[1][:40]})")
+            continue
         camera_id, width, height = _ints(place, [fields[0], *fields[2:4]], "a camera")
         params = _floats(place, fields[4:], "the parameters of a camera")
         ids.append(camera_id)
         cameras.append(checked_camera(path, camera_id, fields[1], width, height, params))
-    return np.array(ids, np.int64), cameras
+    return np.array(ids, np.int64), cameras, unused_cameras_note(left_out)
 
 
 def _read_images(
@@ -158,7 +193,7 @@ def _read_images(
     poses, xy, point_ids = [], [], []
     lines = enumerate(_lines(path), 1)
     for number, line in lines:
-        if not line.strip() or line.lstrip().startswith("#"):
+        if not line.strip() or _is_comment(line):
             continue
         place = f"{path}:{number}"
         fields = line.split(maxsplit=9)
@@ -169,10 +204,15 @@ def _read_images(
         names.append(fields[9].rstrip())
         poses.append(_floats(place, fields[1:8], "a pose"))
         # the line that follows belongs to the image even if it is empty
-        number, line = next(lines, (number, ""))
-        table = _floats(f"{path}:{number}", line.split(), "keypoints")
-        if len(table) % 3:
-            raise InputError(f"{path}:{number}: expected three fields per keypoint, found {len(table)} in all")
+        number, line = next(((n, text) for n, text in lines if not _is_comment(text)), (number, ""))
+        keypoints = line.split()
+        if len(keypoints) % 3:
+            raise InputError(
+                f"{path}:{number}: expected three fields per keypoint of image {names[-1]!r}, found "
+                f"{len(keypoints)} in all",
+                "every image takes two lines, of which the second may be empty",
+            )
+        table = _floats(f"{path}:{number}", keypoints, f"the keypoints of image {names[-1]!r}")
         table = table.reshape(-1, 3)
         if ((table[:, 2] < -1) | (table[:, 2] > _LARGEST_ID) | (table[:, 2] % 1 != 0)).any():
             raise InputError(f"{path}:{number}: expected -1 or the id of a point in every third field")
@@ -189,8 +229,10 @@ def _read_points(path: Path) -> tuple[NDArray[np.float64], list[NDArray[np.int64
     for place, fields in _records(path):
         _need(place, fields, 8, "a point")
         _ints(place, fields[:1], "the id of a point")
-        _ints(place, fields[4:7], "a colour", 0, 255)
         heads.append(_floats(place, fields[:7], "a point"))
+        color = heads[-1][4:]
+        if ((color < 0) | (color > 255) | (color % 1 != 0)).any():  # COLMAP takes 127.0 as well
+            raise InputError(f"{place}: expected a colour of whole numbers from 0 to 255, found {color.tolist()}")
         track = _ints(place, fields[8:], "a track", 0, 2**32 - 1)
         if len(track) % 2:
             raise InputError(f"{place}: expected two fields per observation, found {len(track)} in all")
@@ -216,7 +258,7 @@ def _read_rigs(path: Path) -> dict[int, Rig]:
         for i in range(num_sensors):
             _need(place, rest, 2 if i == 0 else 3, "a sensor")
             kind, (sensor_id,), pose = rest[0], _ints(place, rest[1:2], "a sensor"), rigid3.IDENTITY
-            has_pose = i > 0 and rest[2] != "0"
+            has_pose = i > 0 and bool(_ints(place, rest[2:3], "whether a sensor has a pose", 0, 1)[0])
             rest = rest[2:] if i == 0 else rest[3:]
             if has_pose:
                 _need(place, rest, 7, "the pose of a sensor")
@@ -224,8 +266,9 @@ def _read_rigs(path: Path) -> dict[int, Rig]:
                 pose = checked_poses(path, "sensor", np.array([sensor_id]), values)[0]
                 rest = rest[7:]
             if kind == "CAMERA" and (i == 0 or has_pose):
-                sensors[sensor_id] = pose
-        rigs[rig_id] = Rig(sensors)
+                add_sensor(path, sensors, sensor_id, pose)
+        _no_more(place, rest, f"rig {rig_id} of {num_sensors} sensors")
+        add_rig(path, rigs, rig_id, sensors)
     return rigs
 
 
@@ -237,6 +280,7 @@ def _read_frames(path: Path) -> list[Frame]:
         _need(place, fields[10:], 3 * num_data, "the data of a frame")
         values = _floats(place, fields[2:9], "a pose")[None]
         pose = checked_poses(path, "frame", np.array([frame_id]), values)[0]
+        _no_more(place, fields[10 + 3 * num_data :], f"frame {frame_id} of {num_data} data")
         images = []
         for kind, *ids in zip(fields[10::3], fields[11::3], fields[12::3], strict=False):
             sensor_id, data_id = _ints(place, ids, "the data of a frame")

@@ -24,7 +24,7 @@ from sfmapp.formats.sequence_files import (
     times_of_rows,
     warn_of_missing,
 )
-from sfmapp.formats.text_input import nearest_rotation
+from sfmapp.formats.text_input import nearest_rotation, plain_numbers
 from sfmapp.geometry import rigid3
 
 Array = NDArray[np.float64]
@@ -75,7 +75,7 @@ def read_kitti(path: str | Path) -> Array:
     for number, fields in read_rows(path):
         place = f"{path}:{number}"
         try:
-            matrix = np.array([float(field) for field in fields]).reshape(3, 4)
+            matrix = np.array(plain_numbers(fields)).reshape(3, 4)
         except ValueError:
             matrix = np.full((3, 4), np.nan)
         if not np.isfinite(matrix).all():

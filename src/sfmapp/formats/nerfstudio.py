@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.colmap_model import checked_camera
-from sfmapp.formats.ply import read_ply, write_ply
+from sfmapp.formats.ply import write_ply
+from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.formats.text_input import finite_array, nearest_rotation, read_json_object
 from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import Camera, CameraModel
@@ -75,7 +76,8 @@ def _intrinsics(camera: Camera) -> dict[str, Any]:
 def read_nerfstudio(path: str | Path) -> Reconstruction:
     """Read poses, cameras (equal ones shared) and, where the file names them, points without observations.
 
-    Names are the ``file_path`` entries as they stand; the applied transform is undone.
+    Names are the ``file_path`` entries with forward slashes; the applied transform and scale are undone. Points that
+    are not finite are left out.
 
     Raises:
         InputError: the file is not JSON of this form, a matrix is not rigid, a camera is not one of ours, or two
@@ -83,39 +85,71 @@ def read_nerfstudio(path: str | Path) -> Reconstruction:
     """
     path = Path(path)
     document = read_json_object(path)
-    frames = document.get("frames")
-    if not isinstance(frames, list):
-        raise InputError(f"{path}: expected a list of frames, found {type(frames).__name__}")
-    rotation, shift = _applied(path, document)
+    names, poses = _poses(path, document)
     cameras: dict[tuple, int] = {}
     camera_list: list[Camera] = []
-    names, camera_idx, poses = [], [], []
-    for position, frame in enumerate(frames):
-        place = f"{path}: frame {position}"
-        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
-            raise InputError(f"{place}: expected an object with file_path")
-        camera = _camera(path, place, {**document, **frame})
+    camera_idx = []
+    for camera in _cameras(path, document):
         key = (camera.model, camera.width, camera.height, *camera.params.tolist())
         if key not in cameras:
             cameras[key] = len(camera_list)
             camera_list.append(camera)
         camera_idx.append(cameras[key])
-        names.append(frame["file_path"].removeprefix("./"))
-        poses.append(_pose(place, frame.get("transform_matrix"), rotation, shift))
+    xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    if document.get("ply_file_path") is not None:
+        points = read_ply_geometry(_inside(path, document["ply_file_path"]))
+        rotation, shift, scale = _applied(path, document)
+        xyz = (points.xyz[points.is_finite] / scale - shift) @ rotation
+        rgb = (np.zeros(points.xyz.shape, np.uint8) if points.rgb is None else points.rgb)[points.is_finite]
+    none = np.zeros(0, np.int64)
+    tracks = make_tracks(len(names), len(xyz), none, none, none, np.zeros((0, 2)))
+    return Reconstruction(
+        camera_list, names, np.array(camera_idx, np.int32), poses, tracks, xyz, np.zeros(0, bool), rgb
+    )
+
+
+def read_nerfstudio_poses(path: str | Path) -> tuple[list[str], NDArray[np.float64], list[Camera] | None]:
+    """Names and poses (N, 7) as :func:`read_nerfstudio` gives them, of files whose cameras and points need not be ours.
+
+    Returns:
+        Names, cam_from_world, and the camera of each frame; None where the file does not say them, as those of the
+        synthetic NeRF scenes, or has others than ours.
+
+    Raises:
+        InputError: the file is not JSON of this form, a matrix is not rigid, or two frames name the same file.
+    """
+    path = Path(path)
+    document = read_json_object(path)
+    names, poses = _poses(path, document)
+    try:
+        return names, poses, _cameras(path, document)
+    except InputError:
+        return names, poses, None
+
+
+def _poses(path: Path, document: Mapping[str, Any]) -> tuple[list[str], NDArray[np.float64]]:
+    """Names of N frames and their poses (N, 7)."""
+    frames = document.get("frames")
+    if not isinstance(frames, list):
+        raise InputError(f"{path}: expected a list of frames, found {type(frames).__name__}")
+    applied = _applied(path, document)
+    names, poses = [], []
+    for position, frame in enumerate(frames):
+        place = f"{path}: frame {position}"
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
+            raise InputError(f"{place}: expected an object with file_path")
+        names.append(frame["file_path"].replace("\\", "/").removeprefix("./"))  # Windows has other slashes
+        poses.append(_pose(place, frame.get("transform_matrix"), *applied))
     if len(set(names)) < len(names):
         raise InputError(
             f"{path}: expected every file_path once, found {sorted(n for n in names if names.count(n) > 1)[0]!r} twice"
         )
-    xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    if document.get("ply_file_path") is not None:
-        xyz, rgb = read_ply(_inside(path, document["ply_file_path"]))
-        xyz = (xyz - shift) @ rotation
-    none = np.zeros(0, np.int64)
-    tracks = make_tracks(len(names), len(xyz), none, none, none, np.zeros((0, 2)))
-    poses_array = np.array(poses, np.float64).reshape(-1, 7)
-    return Reconstruction(
-        camera_list, names, np.array(camera_idx, np.int32), poses_array, tracks, xyz, np.zeros(0, bool), rgb
-    )
+    return names, np.array(poses, np.float64).reshape(-1, 7)
+
+
+def _cameras(path: Path, document: Mapping[str, Any]) -> list[Camera]:
+    """The camera of each frame."""
+    return [_camera(path, f"{path}: frame {n}", {**document, **frame}) for n, frame in enumerate(document["frames"])]
 
 
 def _inside(path: Path, name: Any) -> Path:
@@ -125,27 +159,33 @@ def _inside(path: Path, name: Any) -> Path:
     return path.parent / name
 
 
-def _applied(path: Path, document: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation (3, 3) and shift (3,) that turned the original world into that of the file."""
+def _applied(path: Path, document: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Rotation R (3, 3), shift t (3,) and scale s that made the world of the file of the original: s (R x + t)."""
+    scale = float(finite_array(f"{path}: applied_scale", document.get("applied_scale", 1.0), ()))
+    if not scale > 0.0:
+        raise InputError(f"{path}: expected an applied_scale above 0, found {scale}")
     value = document.get("applied_transform")
     if value is None:
-        return np.eye(3), np.zeros(3)
+        return np.eye(3), np.zeros(3), scale
     rows = value[:3] if isinstance(value, list) else value
     matrix = finite_array(f"{path}: applied_transform", rows, (3, 4))
-    return nearest_rotation(f"{path}: applied_transform", matrix[:, :3], 1e-6), matrix[:, 3]
+    return nearest_rotation(f"{path}: applied_transform", matrix[:, :3], 1e-6), matrix[:, 3], scale
 
 
-def _pose(place: str, value: Any, rotation: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
+def _pose(
+    place: str, value: Any, rotation: NDArray[np.float64], shift: NDArray[np.float64], scale: float
+) -> NDArray[np.float64]:
     """(7,) cam_from_world of a transform_matrix."""
     rows = value[:3] if isinstance(value, list) and len(value) == 4 else value
     matrix = finite_array(f"{place}: transform_matrix", rows, (3, 4))
     world_from_cam = rotation.T @ nearest_rotation(f"{place}: transform_matrix", matrix[:, :3]) @ _OPENGL_FROM_OPENCV
-    return rigid3.inverse(rigid3.from_matrix(world_from_cam, rotation.T @ (matrix[:, 3] - shift)))
+    return rigid3.inverse(rigid3.from_matrix(world_from_cam, rotation.T @ (matrix[:, 3] / scale - shift)))
 
 
 def _camera(path: Path, place: str, entries: Mapping[str, Any]) -> Camera:
     """The camera of a frame from its own entries and the shared ones."""
-    name = entries.get("camera_model", "OPENCV")
+    # instant-ngp has a flag in place of a name
+    name = entries.get("camera_model", "OPENCV_FISHEYE" if entries.get("is_fisheye") is True else "OPENCV")
     name = _ALIASES.get(name, name) if isinstance(name, str) else str(name)
     if name not in ("OPENCV", "OPENCV_FISHEYE"):
         raise InputError(f"{place}: expected camera_model OPENCV or OPENCV_FISHEYE, found {name[:40]!r}")

@@ -22,7 +22,7 @@ from sfmapp.formats.text_input import read_limited_text
 from sfmapp.images.frame_reader import LARGEST_FRAME_PX, read_regular_file, some
 from sfmapp.images.headers import UnusableImage, read_header
 from sfmapp.images.sequence import STAGE, Imu, SequenceKind, Truth
-from sfmapp.images.sources import EXTENSIONS, natural_key, printable
+from sfmapp.images.sources import is_picture, natural_key, printable
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]
@@ -63,12 +63,16 @@ class Recording:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files of a folder in natural order, hidden ones left out. Raises InputError if it cannot be read."""
+    """The image files of a folder in natural order, hidden ones left out. Raises InputError if it cannot be read.
+
+    Names without an ending are as good as others, but what follows a dot may be the fraction of a time: no number is
+    taken for an ending here.
+    """
     try:
         entries = [Path(entry.path) for entry in os.scandir(folder) if not entry.name.startswith(".")]
     except OSError as error:
         raise InputError(f"{folder}: cannot be read: {error.strerror or error}") from error
-    files = [path for path in entries if path.suffix.lower() in EXTENSIONS]
+    files = [path for path in entries if is_picture(path)]
     return sorted(files, key=lambda path: natural_key(path.name))
 
 
@@ -76,7 +80,7 @@ def has_images(folder: Path) -> bool:
     """Whether a folder holds an image file."""
     try:
         with os.scandir(folder) as entries:
-            return any(Path(entry.name).suffix.lower() in EXTENSIONS for entry in entries if entry.name[0] != ".")
+            return any(is_picture(Path(entry.path)) for entry in entries if entry.name[0] != ".")
     except OSError:
         return False
 

@@ -36,13 +36,14 @@ from sfmapp.formats.sequence_files import (
 )
 from sfmapp.formats.tum import is_tum, read_tum_sequence, read_tum_truth
 from sfmapp.geometry import rigid3
-from sfmapp.images.exif import focal_prior, read_exif
+from sfmapp.geometry.orientation import INVERSE, is_sideways, upright_size
+from sfmapp.images.exif import ExifFacts, focal_prior, read_exif
 from sfmapp.images.frame_reader import FileSequence, read_regular_file, some
 from sfmapp.images.headers import UnusableImage, read_header
 from sfmapp.images.sequence import STAGE, Imu, Sequence, SequenceOptions, Truth
 from sfmapp.images.sources import EXTENSIONS, printable
 from sfmapp.images.video import DEFAULT_FPS, VideoSequence, is_stream, read_video_facts
-from sfmapp.scene.camera import Camera, CameraModel, simple_camera
+from sfmapp.scene.camera import Camera, CameraModel, simple_camera, turned_back, turned_camera
 from sfmapp.scene.rig import Rig
 
 __all__ = ["MissingCameraError", "SequenceOptions", "open_sequence"]
@@ -154,16 +155,23 @@ def _read_layout(folder: Path, events: Events) -> Recording:
 
 
 def _calibration(
-    given: str | None, folders: list[Path], own: Calibration | None, is_published: bool, sizes: tuple[Size, ...]
+    given: str | None,
+    folders: list[Path],
+    own: Calibration | None,
+    is_published: bool,
+    sizes: tuple[Size, ...],
+    orientation: int = 1,
 ) -> Calibration | None:
     """The user's calibration, else the layout's own, else a file beside the frames (before a published one)."""
     if given is not None:
         if os.path.isfile(given):
-            chosen = read_calibration(given, sizes)
+            chosen = _read_calibration(given, sizes, orientation)
         elif "," not in given and any(c in given for c in "./\\"):
             raise InputError(f"camera {given}: expected a calibration file, found nothing")
         else:
-            chosen = Calibration(Rig.single(camera_from_text(given, sizes[0])))
+            camera = camera_from_text(given, sizes[0])
+            _check_not_of_upright(f"camera {given}", camera, orientation)
+            chosen = Calibration(Rig.single(camera))
         # a text gives intrinsics only; where the body is, is still known
         if chosen.body_from_cam is None and own is not None:
             chosen = replace(chosen, body_from_cam=own.body_from_cam)
@@ -171,17 +179,51 @@ def _calibration(
     if own is not None and not is_published:
         return own
     beside = find_calibration(*folders)
-    return own if beside is None else read_calibration(beside, sizes)
+    return own if beside is None else _read_calibration(beside, sizes, orientation)
+
+
+def _read_calibration(path: str | Path, sizes: tuple[Size, ...], orientation: int) -> Calibration:
+    """A calibration in pixels as the files store them; one for pictures that EXIF's orientation has turned is turned
+    back."""
+    try:
+        calibration = read_calibration(path, sizes)
+    except InputError as error:
+        if not is_sideways(orientation) or len(sizes) > 1:
+            raise
+        try:
+            turned = read_calibration(path, [upright_size(orientation, *sizes[0])])
+        except InputError:
+            raise error from None
+        if turned.body_from_cam is not None or turned.lenses[0] is not None:
+            raise
+        camera = turned_camera(turned.rig.cameras[0], INVERSE[orientation])
+        note = f"{path}: made with pictures turned upright as EXIF says, turned back to the pixels of the files"
+        return replace(turned, rig=Rig.single(camera), notes=(*turned.notes, note))
+    _check_not_of_upright(str(path), calibration.rig.cameras[0], orientation)
+    return calibration
+
+
+def _check_not_of_upright(what: str, camera: Camera, orientation: int) -> None:
+    stored = turned_back(camera, orientation)
+    if stored is not None:
+        raise InputError(
+            f"{what}: expected a camera of {camera.width}x{camera.height} pixels, as the files store them, found one "
+            f"of {camera.height}x{camera.width}, of pictures turned upright as EXIF says",
+            f"give --camera {camera.model.name},{','.join(f'{value:.10g}' for value in stored.params)}",
+        )
 
 
 def _guessed_camera(size: Size, first: Path | None) -> Camera:
     """What EXIF or experience says of a camera that nothing else is known of."""
-    exif = b""
+    prior = focal_prior(_exif_of(first), *size)
+    return simple_camera(CameraModel.SIMPLE_RADIAL, *size, prior.focal_px, prior.sigma_px, prior.source)
+
+
+def _exif_of(first: Path | None) -> ExifFacts:
     if first is not None:
         with suppress(UnusableImage):
-            exif = read_header(read_regular_file(first)).exif
-    prior = focal_prior(read_exif(exif), *size)
-    return simple_camera(CameraModel.SIMPLE_RADIAL, *size, prior.focal_px, prior.sigma_px, prior.source)
+            return read_exif(read_header(read_regular_file(first)).exif)
+    return ExifFacts()
 
 
 def _rig(
@@ -237,7 +279,10 @@ def _sequence(
     first = [frame[0] for frame in recording.paths]
     folders = [recording.root, first[0].parent, *([recording.root.parent] if recording.kind == "euroc" else [])]
     sizes = recording.sizes[:1] if options.mono else recording.sizes
-    calibration = _calibration(options.camera, folders, recording.calibration, recording.kind == "tum", sizes)
+    orientation = _exif_of(first[0]).orientation
+    calibration = _calibration(
+        options.camera, folders, recording.calibration, recording.kind == "tum", sizes, orientation
+    )
     rig = _rig(source, calibration, sizes, first[0], events, require_camera)
     times, fps = _timestamps(recording, first, options, calibration, events)
     body_from_cam = calibration.body_from_cam if calibration else None
@@ -268,6 +313,7 @@ def _sequence(
         imu,
         truth,
         events,
+        orientation,
     )
     _tell(sequence, events)
     return sequence
@@ -391,6 +437,9 @@ def _tell(sequence: Sequence, events: Events) -> None:
     ]
     parts += ["IMU"] if sequence.imu is not None else []
     parts += ["truth"] if sequence.truth is not None else []
+    if sequence.orientation != 1:
+        text = "the frames have an EXIF orientation: they are used as they are stored, which a calibration has to fit"
+        events.decided(STAGE, text, orientation=sequence.orientation)
     events.decided(
         STAGE,
         ", ".join(parts),

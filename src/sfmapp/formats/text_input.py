@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import stat
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -22,7 +24,7 @@ def read_limited_text(path: Path, largest_bytes: int = LARGEST_BYTES) -> str:
         size = _size(path)
         if size > largest_bytes:
             raise InputError(f"{path}: expected at most {largest_bytes} bytes, found {size}")
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # some editors put a byte order mark first
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError:
@@ -43,13 +45,28 @@ def read_json_object(path: Path, largest_bytes: int = 2**26) -> dict[str, Any]:
     def refuse(constant: str) -> NoReturn:
         raise InputError(f"{path}: expected finite numbers, found {constant}")
 
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        twice = [name for name, count in Counter(name for name, _ in pairs).items() if count > 1]
+        if twice:
+            raise InputError(f"{path}: expected every name once in an object, found {twice[0][:40]!r} twice")
+        return dict(pairs)
+
     try:
-        value = json.loads(read_limited_text(path, largest_bytes), parse_constant=refuse)
+        text = read_limited_text(path, largest_bytes)
+        value = json.loads(text, parse_constant=refuse, object_pairs_hook=unique)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected JSON: {error}") from None
     if not isinstance(value, dict):
         raise InputError(f"{path}: expected a JSON object, found {type(value).__name__}")
     return value
+
+
+def plain_numbers(fields: Iterable[str]) -> list[float]:
+    """The numbers that fields of text hold. Raises ValueError for others, and for 1_0, a number to Python alone."""
+    fields = list(fields)
+    if any("_" in field for field in fields):
+        raise ValueError("an underscore in a number")
+    return [float(field) for field in fields]
 
 
 def finite_array(place: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:

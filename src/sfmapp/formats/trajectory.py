@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.errors import InputError
 from sfmapp.formats.atomic import replaced_file
-from sfmapp.formats.text_input import finite_array, read_limited_text
+from sfmapp.formats.text_input import finite_array, plain_numbers, read_limited_text
 from sfmapp.geometry import rigid3
 
 _HEAD = "# timestamp tx ty tz qx qy qz qw\n"
@@ -84,10 +84,10 @@ def read_tum(path: str | Path) -> tuple[list[str], NDArray[np.float64]]:
             continue
         place = f"{path}:{number}"
         try:
-            rows.append(finite_array(place, [float(field) for field in fields], (8,)))
+            rows.append(finite_array(place, plain_numbers(fields), (8,)))
         except ValueError:
             raise InputError(f"{place}: expected 8 finite numbers, found {line[:80]!r}") from None
-        if abs(np.linalg.norm(rows[-1][4:]) - 1) > 1e-2:  # six digits are customary, three occur
+        if abs(np.hypot.reduce(rows[-1][4:]) - 1) > 1e-2:  # six digits are customary, three occur
             raise InputError(f"{place}: expected a quaternion of unit length, found {fields[4:]}")
         names.append(fields[0])
     table = np.array(rows, np.float64).reshape(-1, 8)

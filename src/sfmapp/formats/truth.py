@@ -13,14 +13,17 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
 from sfmapp.evaluation.poses import match_names
-from sfmapp.formats.colmap import has_model, read_model
+from sfmapp.formats.colmap import has_model, read_model_poses
 from sfmapp.formats.colmap_model import checked_camera
-from sfmapp.formats.nerfstudio import read_nerfstudio
+from sfmapp.formats.nerfstudio import read_nerfstudio_poses
 from sfmapp.formats.text_input import finite_array, nearest_rotation, read_json_object
 from sfmapp.formats.trajectory import read_tum
 from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import Camera
-from sfmapp.scene.reconstruction import Reconstruction
+
+_LARGEST_PX = 1e9
+# what a folder is looked through for
+_INSIDE = ("", "sparse/0", "sparse", "colmap/sparse/0", "transforms.json", "cameras.json")
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ class Truth:
         path: the file or folder that they come from.
         names: N names of images, as the file has them; of a trajectory, the timestamps.
         cam_from_world: (N, 7) float64, quaternion x y z w and translation, in the file's own world.
-        cameras: N intrinsics in the house's pixel rule; None where the file holds none.
+        cameras: N intrinsics in the house's pixel rule; None where the file holds none, or others than ours.
     """
 
     path: Path
@@ -71,7 +74,8 @@ def _number(text: str) -> float:
 
 
 def read_truth(path: str | Path) -> Truth:
-    """Read reference cameras: a COLMAP model (folder), ``cameras.json``, ``transforms.json`` or a trajectory.
+    """Read reference cameras: a COLMAP model, ``cameras.json``, ``transforms.json``, a folder with one of them, or a
+    trajectory.
 
     ``cameras.json`` holds a list ``cameras`` of ``file``, ``R_w2c``, ``t_w2c`` (``x_cam = R X + t``), ``K`` and
     ``dist`` (k1, k2, p1, p2 or null), with pixel centres at whole numbers as OpenCV has them: half a pixel is added to
@@ -82,9 +86,10 @@ def read_truth(path: str | Path) -> Truth:
     """
     path = Path(path)
     if path.is_dir():
-        if not has_model(path) and has_model(path / "sparse" / "0"):
-            path = path / "sparse" / "0"
-        return _from_reconstruction(path, read_model(path)[0])
+        inside = [path / name for name in _INSIDE if has_model(path / name) or (path / name).is_file()]
+        path = next(iter(inside), path)
+    if path.is_dir():
+        return _truth(path, *read_model_poses(path))
     if not path.exists():
         raise InputError(f"{path}: expected a COLMAP model, cameras.json or TUM trajectory, found nothing")
     if path.suffix.lower() != ".json":
@@ -94,13 +99,12 @@ def read_truth(path: str | Path) -> Truth:
         return Truth(path, tuple(names), poses, None)
     document = read_json_object(path)
     if "frames" in document:
-        return _from_reconstruction(path, read_nerfstudio(path))
+        return _truth(path, *read_nerfstudio_poses(path))
     return _from_cameras_json(path, document)
 
 
-def _from_reconstruction(path: Path, reconstruction: Reconstruction) -> Truth:
-    cameras = tuple(reconstruction.cameras[i] for i in reconstruction.image_camera_idx)
-    return Truth(path, tuple(reconstruction.image_names), reconstruction.cam_from_world, cameras)
+def _truth(path: Path, names: list[str], poses: NDArray[np.float64], cameras: list[Camera] | None) -> Truth:
+    return Truth(path, tuple(names), poses, None if cameras is None else tuple(cameras))
 
 
 def _from_cameras_json(path: Path, document: dict[str, Any]) -> Truth:
@@ -133,6 +137,8 @@ def _json_camera(path: Path, place: str, entry: dict[str, Any]) -> Camera:
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
     if matrix[0, 1] or matrix[1, 0] or matrix[2].tolist() != [0, 0, 1]:
         raise InputError(f"{place}: expected K without skew and with a last row of 0 0 1, found {matrix.tolist()}")
+    if not (np.abs(matrix) < _LARGEST_PX).all():
+        raise InputError(f"{place}: expected K in pixels, found {matrix.tolist()}")
     # where the size is not given, the principal point is taken for the centre
     width = float(finite_array(f"{place}: width", entry.get("width", round(2 * cx)), ()))
     height = float(finite_array(f"{place}: height", entry.get("height", round(2 * cy)), ()))

@@ -11,9 +11,10 @@ from statistics import median, pstdev
 from typing import Any
 
 from sfmapp.errors import UsageError
+from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.images.exif import ExifFacts, FocalPrior, focal_prior
 from sfmapp.images.image_set import ImageOptions
-from sfmapp.scene.camera import Camera, simple_camera
+from sfmapp.scene.camera import Camera, simple_camera, turned_back
 
 # Trust in what a user gives without fixing it: a focal length copied from a data sheet, or a calibration.
 _SIGMA_USER_FOCAL, _SIGMA_USER_PARAMS = 0.03, 0.01
@@ -30,7 +31,7 @@ _SOURCE_RANK = ("exif_35mm", "exif_sensor", "default")
 
 @dataclass(frozen=True)
 class Shot:
-    """What cameras are told apart by: a name, a size after orientation, and EXIF."""
+    """What cameras are told apart by: a name, a size in pixels of the file, and EXIF."""
 
     name: str
     width: int
@@ -51,7 +52,7 @@ def group_cameras(
         cameras in order of first use; camera_idx per shot; JSON-able dicts; (image name, problem) pairs.
 
     Raises:
-        UsageError: ``camera_params`` with images of several sizes.
+        UsageError: ``camera_params`` with images of several sizes, or for pictures that EXIF's orientation has turned.
     """
     sizes = {(shot.width, shot.height) for shot in shots}
     if options.camera_params is not None and len(sizes) > 1:
@@ -71,6 +72,8 @@ def group_cameras(
     for camera_idx, group in enumerate(members):
         shot = shots[group[0]]
         camera, reason = _camera(shot, [priors[i] for i in group], options)
+        if options.camera_params is not None:
+            _check_not_of_upright(camera, [shots[i] for i in group])
         cameras.append(camera)
         entries.append(
             {
@@ -110,6 +113,18 @@ def _camera(shot: Shot, priors: list[FocalPrior], options: ImageOptions) -> tupl
     return replace(camera, is_fixed=options.fix_intrinsics), reason
 
 
+def _check_not_of_upright(camera: Camera, shots: Sequence[Shot]) -> None:
+    """Parameters that were found with pictures that some reader had turned, as OpenCV's does."""
+    for shot in shots:
+        stored = turned_back(camera, shot.facts.orientation)
+        if stored is not None:
+            raise UsageError(
+                f"camera_params: expected a camera of {camera.width}x{camera.height} pixels, as {shot.name} has them, "
+                f"found one of {camera.height}x{camera.width}, of pictures turned upright as EXIF says",
+                f"give {','.join(f'{value:.10g}' for value in stored.params)}, the same lens in the pixels of the file",
+            )
+
+
 def _common_prior(priors: list[FocalPrior]) -> FocalPrior:
     """One prior for images that share a camera: the median of the best source, no surer than they agree."""
     best = min(priors, key=lambda prior: _SOURCE_RANK.index(prior.source)).source
@@ -146,7 +161,7 @@ def _automatic_keys(shots: Sequence[Shot]) -> tuple[list[Hashable], list[str]]:
         if _tells_camera(shot.facts):
             facts = shot.facts
             lens = (facts.make, facts.model, facts.lens, facts.serial, focal_mm[i], focal_35mm[i])
-            keys[i] = ("exif", *lens, shot.width, shot.height)
+            keys[i] = ("exif", *lens, shot.width, shot.height, _is_mirrored(shot))
             rules[i] = "EXIF: same make, model, lens, focal length and size"
             continue
         folder, ending, stem = template = _template(shot)
@@ -159,7 +174,7 @@ def _automatic_keys(shots: Sequence[Shot]) -> tuple[list[Hashable], list[str]]:
             continue
         for i in group:
             if tuple(sorted((shots[i].width, shots[i].height))) == size:
-                keys[i] = ("series", key, shots[i].width, shots[i].height)
+                keys[i] = ("series", key, shots[i].width, shots[i].height, _is_mirrored(shots[i]))
                 rules[i] = "no EXIF: same folder, file type, manner of naming and size"
     return keys, rules
 
@@ -176,6 +191,11 @@ def _without_rounding(focals: Sequence[float | None]) -> list[float | None]:
 
 def _tells_camera(facts: ExifFacts) -> bool:
     return bool(facts.model) and (facts.focal_mm is not None or facts.focal_35mm is not None)
+
+
+def _is_mirrored(shot: Shot) -> bool:
+    """A mirror moves the principal point to the other side; a turn is only how the sensor was held."""
+    return shot.facts.orientation in MIRRORED
 
 
 def _template(shot: Shot) -> tuple[str, str, str]:

@@ -192,7 +192,7 @@ def _degrees(gps: Directory, tag: int, ref_tag: int, negative: str) -> float | N
 
 
 def focal_prior(facts: ExifFacts, width: int, height: int) -> FocalPrior:
-    """The focal length of a width x height picture (after orientation), in pixels, with its standard deviation.
+    """The focal length of a width x height picture (either way round), in pixels, with its standard deviation.
 
     In this order: the 35 mm equivalent, the focal length in mm over the width of the sensor, 1.2 times the long side.
     The 35 mm equivalent relates diagonals (CIPA DCG-001), of the frame that the sensor has: pictures wider than 3:2 are

@@ -14,11 +14,12 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from sfmapp.errors import InputError
 from sfmapp.events import Events
+from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.images.cameras import Shot, group_cameras
 from sfmapp.images.exif import ExifFacts, read_exif
 from sfmapp.images.headers import Header, UnusableImage, read_header
@@ -51,9 +52,10 @@ def load_images(
     """List, check and describe the photographs of a source.
 
     Args:
-        source: a folder (searched recursively; hidden files and folders are left out), a glob pattern (``**`` goes
-            into folders), or a ``.txt`` file with a path per line (relative to the list, or absolute; ``#`` begins a
-            comment).
+        source: a folder (searched recursively; hidden files and folders are left out, and those that sfmapp and other
+            programs made of photographs), a glob pattern (``**`` goes into folders), or a ``.txt`` file with a path per
+            line (relative to the list, or absolute; ``#`` begins a comment). Files without an ending are photographs
+            if they begin as one.
         options: what to read and what is known about the cameras.
         events: told about progress, every file that is skipped, and how cameras were assigned.
         threads: how many files are read at a time; None: as many as there are processors, 8 at most.
@@ -84,7 +86,13 @@ def load_images(
     image_set = ImageSet(images, tuple(cameras), tuple(skipped))
     problems = [(scan.record.name, problem) for scan in scans for problem in scan.problems] + focal_problems
     duplicates = _duplicates(images)
+    if found.results:
+        message = f"{_some(found.results)}: results of sfmapp, whose pictures are no photographs"
+        events.decided(STAGE, message, names=found.results)
     _tell(events, image_set, scans, entries, problems, duplicates)
+    if not images:
+        where = f", other than in {_some(found.results)}, which holds results of sfmapp" if found.results else ""
+        events.warned(STAGE, f"no usable image found{where}: expected files such as .jpg, .png, .tif, .webp")
     if options.mask_path is not None and images and not any(image.mask_path for image in images):
         name = images[0].name
         raise InputError(
@@ -92,7 +100,10 @@ def load_images(
         )
     report = _report(os.fspath(source), found, image_set, scans, entries, problems, duplicates)
     report["seconds"] = round(time.monotonic() - start, 3)
-    events.finished(STAGE, f"{len(images)} images, {len(cameras)} cameras, {len(skipped)} files skipped", **report)
+    passed_over = f", results of sfmapp in {_some(found.results)} passed over" if found.results else ""
+    events.finished(
+        STAGE, f"{len(images)} images, {len(cameras)} cameras, {len(skipped)} files skipped{passed_over}", **report
+    )
     return image_set, report
 
 
@@ -113,7 +124,7 @@ def describe_images(
     folder = Path(root).absolute()
     mask_root = Path(options.mask_path).absolute() if options.mask_path is not None else None
     with ThreadPoolExecutor(threads or min(8, os.cpu_count() or 1)) as pool:
-        outcomes = list(pool.map(lambda name: _scan(folder / name, folder, mask_root, options), names))
+        outcomes = list(pool.map(lambda name: _scan_by_name(name, folder, mask_root, options), names))
     records = [outcome.record if isinstance(outcome, _Scan) else None for outcome in outcomes]
     reasons = [(name, o[1]) for name, o in zip(names, outcomes, strict=True) if not isinstance(o, _Scan)]
     return records, reasons
@@ -135,6 +146,14 @@ def _scan_all(
         pool.shutdown(cancel_futures=True)
 
 
+def _scan_by_name(name: str, folder: Path, mask_root: Path | None, options: ImageOptions) -> _Scan | tuple[str, str]:
+    """As :func:`_scan`, of a name that a file of others gives: results are written under it as well."""
+    pure = PurePosixPath(name)
+    if pure.is_absolute() or ".." in pure.parts:
+        return name, "its name leads out of the folder of the photographs"
+    return _scan(folder / name, folder, mask_root, options)
+
+
 def _scan(path: Path, root: Path, mask_root: Path | None, options: ImageOptions) -> _Scan | tuple[str, str]:
     """Read one file: a scan, or (name, reason) if it cannot be used."""
     name = os.path.relpath(path, root).replace(os.sep, "/")
@@ -151,12 +170,11 @@ def _scan(path: Path, root: Path, mask_root: Path | None, options: ImageOptions)
     except OSError as error:
         return name, f"cannot be read: {error.strerror or error}"
     facts = read_exif(header.exif)
-    is_turned = facts.orientation >= 5
     record = ImageRecord(
         name=name,
         path=path,
-        width=header.height if is_turned else header.width,
-        height=header.width if is_turned else header.height,
+        width=header.width,
+        height=header.height,
         orientation=facts.orientation,
         digest=hashlib.blake2b(data, digest_size=16).hexdigest(),
         has_alpha=header.has_alpha and options.use_alpha,
@@ -209,6 +227,8 @@ def _with_mask(record: ImageRecord, mask_root: Path) -> tuple[ImageRecord, tuple
         if mask_fit(header, record) is None:
             return record, (f"its mask is not used: {size} pixels, the image has {wanted}",)
         masked = replace(record, mask_path=path)
+        if mask_fit(header, record) == "turned":
+            return masked, (f"its mask fits the picture as EXIF turns it ({size} pixels) and is turned back",)
         if {header.width, header.height} != {record.width, record.height}:
             return masked, (f"its mask is scaled: {size} pixels, the image has {wanted}",)
         return masked, ()
@@ -243,9 +263,11 @@ def _tell(
     deep = [scan.record.name for scan in scans if scan.header.bits > 8]
     if deep:
         events.decided(STAGE, f"{len(deep)} images of 16 bits are scaled to 8 bits", names=deep)
-    turned = [scan.record.name for scan in scans if scan.record.orientation != 1]
-    if turned:
-        events.decided(STAGE, f"{len(turned)} images are turned upright as EXIF says", names=turned)
+    banded = [scan.record.name for scan in scans if scan.header.num_left_out]
+    if banded:
+        text = f"{len(banded)} images have bands beside colour and alpha (near infrared?), which are left out"
+        events.decided(STAGE, text, names=banded)
+    _tell_orientation(events, [scan.record for scan in scans])
     without = [image.name for image in image_set.images if image.mask_path is None]
     if 0 < len(without) < len(image_set.images):
         events.decided(STAGE, f"{len(without)} of {len(image_set.images)} images have no mask", names=without)
@@ -256,8 +278,25 @@ def _tell(
             f"length {entry['focal_px']:.0f} +- {entry['focal_sigma_px']:.0f} px ({entry['focal_reason']})",
             **entry,
         )
-    if not image_set.images:
-        events.warned(STAGE, "no usable image found: expected files such as .jpg, .png, .tif, .webp")
+
+
+def _tell_orientation(events: Events, records: list[ImageRecord]) -> None:
+    turned = [record.name for record in records if record.orientation != 1]
+    if turned:
+        text = f"{len(turned)} images have an EXIF orientation: the model and what is exported fit the pixels of the "
+        events.decided(STAGE, text + "files, as other programs read them; only what is shown is turned", names=turned)
+    mirrored = [record.name for record in records if record.orientation in MIRRORED]
+    if not mirrored:
+        return
+    advice = "to have it as it is, write the files anew: exiftran -ai, mogrify -auto-orient, or PIL's exif_transpose"
+    if len(mirrored) == len(records):
+        text = f"all images are stored as mirror images (EXIF orientation 2, 4, 5, 7), as will be their model; {advice}"
+    else:
+        text = (
+            f"{_some(mirrored)}: stored as mirror images (EXIF orientation 2, 4, 5, 7), unlike the others, with which "
+            f"they are not matched; {advice}"
+        )
+    events.warned(STAGE, text, names=mirrored)
 
 
 def _by_reason(items: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
@@ -284,6 +323,7 @@ def _report(
     return {
         "source": printable(source),
         "root": printable(str(found.root)),
+        "results_passed_over": found.results,
         "num_found": len(scans) + len(image_set.skipped),
         "num_used": len(scans),
         "num_skipped": len(image_set.skipped),

@@ -218,6 +218,7 @@ class FileSequence:
         paths: for each frame, one file for each camera of the rig; that of the first alone where the others lack it.
         sampling: for each camera, where the pixels of its frames are found in the files, see :func:`resampled`.
         events: told about frames that are left out.
+        orientation: that EXIF gives the first; frames are those of the files all the same.
     """
 
     kind: SequenceKind
@@ -231,6 +232,7 @@ class FileSequence:
     imu: Imu | None
     truth: Truth | None
     events: Events
+    orientation: int = 1
     num_frames: int | None = field(init=False)
 
     def __post_init__(self) -> None:

@@ -7,13 +7,17 @@ raise :class:`UnusableImage` with the reason and nothing else, whatever the byte
 
 from __future__ import annotations
 
+import os
 import re
+import stat
 import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
-from sfmapp.images.tags import Directory, byte_order, first_directory, read_directory
+from sfmapp.images.tags import Directory, byte_order, read_directory
+from sfmapp.images.tiff import UnreadTiffError, tiff_layout
 
 
 class UnusableImage(Exception):  # noqa: N818 - a verdict on a file, not an error of the program
@@ -30,6 +34,7 @@ class Header:
         bits: per channel, 1 to 16.
         kind: ``gray``, ``rgb``, ``palette`` or ``cmyk``.
         has_alpha: there is, or may be, an alpha channel.
+        num_left_out: bands that are neither colour nor alpha, such as near infrared, and are not read.
         exif: the EXIF block, beginning with its TIFF header; empty if there is none. For TIFF the whole file.
     """
 
@@ -40,6 +45,7 @@ class Header:
     kind: str = "rgb"
     has_alpha: bool = False
     exif: bytes = b""
+    num_left_out: int = 0
 
 
 def read_header(data: bytes) -> Header:
@@ -57,6 +63,27 @@ def read_header(data: bytes) -> Header:
     if header.width <= 0 or header.height <= 0:
         raise UnusableImage(f"broken header: it claims {header.width}x{header.height} pixels")
     return header
+
+
+# Marks that no text and hardly another file begins with.
+_MARKS = {
+    b"\xff\xd8\xff": "JPEG", b"\x89PNG\r\n\x1a\n": "PNG", b"II*\0": "TIFF", b"MM\0*": "TIFF", b"GIF87a": "GIF",
+    b"GIF89a": "GIF",
+}  # fmt: skip
+
+
+def picture_format(path: Path) -> str | None:
+    """The format of a file that is a picture by its first bytes, whatever it is called; None for any other file."""
+    try:
+        if not stat.S_ISREG(os.stat(path).st_mode):  # opening a pipe would wait for ever
+            return None
+        with path.open("rb") as file:
+            data = file.read(16)
+    except OSError:
+        return None
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        return "WebP"
+    return next((name for mark, name in _MARKS.items() if data.startswith(mark)), None)
 
 
 def _reader_of(data: bytes) -> Callable[[bytes], Header]:
@@ -80,8 +107,6 @@ def _foreign_format(data: bytes) -> str:
         return "a GIF, which is not read: convert it to PNG"
     if data[4:8] == b"ftyp":
         return "HEIC, AVIF or a video, which is not read: convert it to JPEG"
-    if data[:4] in (b"II+\0", b"MM\0+"):
-        return "a BigTIFF, which is not read: convert it to TIFF or PNG"
     if data[:100].lstrip()[:1] in (b"<", b"{"):
         return "text, not an image (a web page saved under this name?)"
     if not any(data[:4096]):
@@ -170,28 +195,16 @@ def _read_png(data: bytes) -> Header:
     return Header("png", width, height, bits, kind, color in (4, 6) or has_transparency, exif)
 
 
-_TIFF_KIND = {0: "gray", 1: "gray", 2: "rgb", 3: "palette", 5: "cmyk", 6: "rgb"}
-
-
 def _read_tiff(data: bytes) -> Header:
-    first = first_directory(data)
-    width, height = first.number(256), first.number(257)
-    if width is None or height is None:
-        raise UnusableImage("truncated or a broken header")
-    bits = first.numbers(258) or (1,)
-    sample_format = first.numbers(339) or (1,)
-    kind = _TIFF_KIND.get(int(first.number(262) or 0))
-    if any(value != 1 for value in sample_format):
-        raise UnusableImage("floating-point or signed values, which are not read: convert it to 16 bits")
-    if kind is None or any(value not in (1, 2, 4, 8, 16) for value in bits):
-        raise UnusableImage("a TIFF of an unsupported kind: convert it to RGB with 8 or 16 bits")
-    if kind == "cmyk" and max(bits) > 8:
-        raise UnusableImage("a CMYK TIFF of 16 bits, which is not read: convert it to RGB")
-    _check_tiff_data(data, first)
-    _check_single_page(data, first)
-    return Header(
-        "tiff", int(width), int(height), int(bits[0]), kind, kind != "cmyk" and bool(first.numbers(338)), data
-    )
+    try:
+        layout = tiff_layout(data)
+    except UnreadTiffError as reason:
+        raise UnusableImage(str(reason)) from reason
+    _check_tiff_data(data, layout.directory)
+    _check_single_page(data, layout.directory)
+    has_alpha = layout.alpha is not None
+    num_left_out = layout.num_samples - layout.num_colors - has_alpha
+    return Header("tiff", layout.width, layout.height, layout.bits, layout.kind, has_alpha, data, num_left_out)
 
 
 def _check_tiff_data(data: bytes, first: Directory) -> None:

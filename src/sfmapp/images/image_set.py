@@ -18,8 +18,9 @@ class ImageOptions:
 
     Attributes:
         camera_model: lens model of all cameras.
-        camera_params: parameters of ``camera_model`` in COLMAP's order, in pixels after orientation; they describe one
-            camera, so all images must have one size. None: from EXIF or a default.
+        camera_params: parameters of ``camera_model`` in COLMAP's order, in pixels as the files store them, whatever
+            EXIF's orientation; they describe one camera, so all images must have one size. None: from EXIF or a
+            default.
         focal_px: focal length in pixels of all images; None: from EXIF or a default.
         fix_intrinsics: keep the cameras as they are read; nothing about them is refined.
         camera_sharing: which images share a camera. auto: those that EXIF or their names and sizes show to be of
@@ -80,8 +81,10 @@ class ImageRecord:
     Attributes:
         name: posix path relative to the common root, unique; the image's name in every output.
         path: absolute path of the file.
-        width, height: in pixels, after orientation.
-        orientation: EXIF orientation 1 to 8 that the readers in ``pixels`` apply.
+        width, height: of the pixels that the readers in ``pixels`` give: those of the file, whatever its orientation.
+        orientation: EXIF orientation 1 to 8 of these pixels, for whoever shows them to people.
+        turn: EXIF orientation that the readers undo. Not 1 only for photographs of a foreign model that counts in
+            upright pixels; width, height and orientation are then those after turning.
         camera_idx: index into the cameras of the :class:`ImageSet`.
         digest: hex BLAKE2b (16 bytes) of the file's bytes.
         has_alpha: the file has an alpha channel that may serve as a mask.
@@ -96,6 +99,7 @@ class ImageRecord:
     width: int
     height: int
     orientation: int = 1
+    turn: int = 1
     camera_idx: int = 0
     digest: str = ""
     has_alpha: bool = False

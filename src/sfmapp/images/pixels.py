@@ -1,4 +1,4 @@
-"""Pixels of a photograph, upright and 8 bits deep, whatever the file holds.
+"""Pixels of a photograph as they are stored, 8 bits deep, whatever the file holds.
 
 Grey is OpenCV's, 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601) of the 8-bit colours, rounded; :func:`read_gray` and
 :func:`read_picture` give the same bytes. Values deeper than 8 bits are scaled, never clipped.
@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
+from sfmapp.geometry.orientation import INVERSE, upright_pixels, upright_size
 from sfmapp.images.headers import Header, UnusableImage, read_header
 from sfmapp.images.tags import byte_order, first_directory
+from sfmapp.images.tiff import decode_samples, tiff_layout
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageRecord
@@ -38,15 +40,14 @@ class Picture:
 
 
 def read_picture(record: ImageRecord) -> Picture:
-    """Colour, grey and mask of a photograph, upright, from one decoding.
+    """Colour, grey and mask of a photograph, from one decoding.
 
     Raises:
         InputError: the file is gone, was changed since it was listed, or cannot be decoded.
     """
-    stored, alpha = _decode(record)
-    stored, alpha = _upright(stored, record.orientation), _upright(alpha, record.orientation)
+    color, alpha = _decode(record)
     mask = _alpha_mask(alpha) if record.has_alpha else None
-    return Picture(_as_rgb(stored), _as_gray(stored), _combine(_read_mask_file(record), mask))
+    return Picture(_as_rgb(color), _as_gray(color), _combine(_read_mask_file(record), mask))
 
 
 def read_on_white(record: ImageRecord) -> tuple[Pixels, NDArray[np.bool_] | None]:
@@ -55,29 +56,28 @@ def read_on_white(record: ImageRecord) -> tuple[Pixels, NDArray[np.bool_] | None
     Raises:
         InputError: as :func:`read_picture`.
     """
-    stored, alpha = _decode(record)
-    rgb, alpha = _as_rgb(_upright(stored, record.orientation)), _upright(alpha, record.orientation)
-    mask = _alpha_mask(alpha) if record.has_alpha else None
-    if mask is not None:
+    color, alpha = _decode(record)
+    rgb, mask = _as_rgb(color), _alpha_mask(alpha) if record.has_alpha else None
+    if alpha is not None and mask is not None:
         opacity = alpha[..., None].astype(np.uint16)
         rgb = ((rgb * opacity + 255 * (255 - opacity) + 127) // 255).astype(np.uint8)
     return rgb, _combine(_read_mask_file(record), mask)
 
 
 def read_rgb(record: ImageRecord) -> Pixels:
-    """(H, W, 3) uint8 colours of a photograph, upright. Raises InputError as :func:`read_picture` does."""
-    return _as_rgb(_upright(_decode(record)[0], record.orientation))
+    """(H, W, 3) uint8 colours of a photograph. Raises InputError as :func:`read_picture` does."""
+    return _as_rgb(_decode(record)[0])
 
 
 def read_gray(record: ImageRecord) -> Pixels:
-    """(H, W) uint8 grey values of a photograph, upright. Raises InputError as :func:`read_picture` does."""
-    return _as_gray(_upright(_decode(record)[0], record.orientation))
+    """(H, W) uint8 grey values of a photograph. Raises InputError as :func:`read_picture` does."""
+    return _as_gray(_decode(record)[0])
 
 
 def read_rgb_and_gray(record: ImageRecord) -> tuple[Pixels, Pixels]:
     """(H, W, 3) and (H, W) uint8 from one decoding. Raises InputError as :func:`read_picture` does."""
-    stored = _upright(_decode(record)[0], record.orientation)
-    return _as_rgb(stored), _as_gray(stored)
+    color = _decode(record)[0]
+    return _as_rgb(color), _as_gray(color)
 
 
 def read_mask(record: ImageRecord) -> NDArray[np.bool_] | None:
@@ -86,7 +86,7 @@ def read_mask(record: ImageRecord) -> NDArray[np.bool_] | None:
     Raises:
         InputError: the image or its mask cannot be read.
     """
-    alpha = _upright(_decode(record)[1], record.orientation) if record.has_alpha else None
+    alpha = _decode(record)[1] if record.has_alpha else None
     return _combine(_read_mask_file(record), _alpha_mask(alpha))
 
 
@@ -103,14 +103,14 @@ def _as_gray(pixels: Pixels) -> Pixels:
 
 
 def _decode(record: ImageRecord) -> tuple[Pixels, Pixels | None]:
-    """((H, W) or (H, W, 3) RGB, alpha (H, W) or None) uint8 as stored, not yet upright."""
+    """((H, W) or (H, W, 3) RGB, alpha (H, W) or None) uint8."""
     data = _read_bytes(record)
     try:
         header = read_header(data)
     except UnusableImage as reason:
         raise InputError(f"{record.name}: {reason}") from reason
     size = (header.width, header.height)
-    expected = (record.height, record.width) if record.orientation >= 5 else (record.width, record.height)
+    expected = upright_size(INVERSE[record.turn], record.width, record.height)
     # also the guard against a header that was swapped for one that claims gigapixels
     if size != expected:
         raise InputError(
@@ -121,7 +121,7 @@ def _decode(record: ImageRecord) -> tuple[Pixels, Pixels | None]:
         raise InputError(
             f"{record.name} cannot be decoded: its data are damaged", "copy it again from its source, or leave it out"
         )
-    pixels = to_8_bits(raw)
+    pixels = upright_pixels(to_8_bits(raw), record.turn)
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         return np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3])
     return pixels, None
@@ -139,6 +139,9 @@ def decode_bytes(data: bytes, header: Header) -> NDArray[Any] | None:
     import cv2
 
     if header.format == "tiff":
+        layout = tiff_layout(data)
+        if not layout.is_read_by_opencv:
+            return decode_samples(data, layout)
         data = _without_orientation(data)
     # IMREAD_UNCHANGED keeps depth, grey and alpha, but does not convert CMYK
     is_plain = header.kind in ("rgb", "palette", "cmyk") and header.bits <= 8 and not header.has_alpha
@@ -183,19 +186,6 @@ def to_8_bits(raw: NDArray[Any]) -> Pixels:
     return scaled
 
 
-def _upright(pixels: Any, orientation: int) -> Any:
-    """Undo an EXIF orientation (CIPA DC-008, tag 274): where row 0 and column 0 of the file belong."""
-    if pixels is None or orientation == 1:
-        return pixels
-    if orientation >= 5:
-        pixels = pixels.swapaxes(0, 1)
-    if orientation in (3, 4, 7, 8):
-        pixels = pixels[::-1]
-    if orientation in (2, 3, 6, 7):
-        pixels = pixels[:, ::-1]
-    return np.ascontiguousarray(pixels)
-
-
 def _alpha_mask(alpha: Pixels | None) -> NDArray[np.bool_] | None:
     """More than half opaque; None where the channel says the same everywhere, as it does in most files."""
     if alpha is None:
@@ -221,22 +211,24 @@ def _read_mask_file(record: ImageRecord) -> NDArray[np.bool_] | None:
     if raw is None:
         raise InputError(f"mask {record.mask_path} of {record.name} cannot be decoded or has another shape")
     mask = (raw[..., :3].any(axis=2) if raw.ndim == 3 else raw > 0).astype(np.uint8)
-    if fit == "stored":
-        mask = _upright(mask, record.orientation)
+    if fit == "turned":
+        mask = upright_pixels(mask, INVERSE[record.orientation] if record.turn == 1 else record.turn)
     if mask.shape != (record.height, record.width):
         mask = cv2.resize(mask, (record.width, record.height), interpolation=cv2.INTER_NEAREST)
     return mask.astype(bool)
 
 
 def mask_fit(header: Header, record: ImageRecord) -> str | None:
-    """How a mask lies on its image: ``upright``, ``stored`` (turned like the file), or None if it does not fit.
+    """How a mask lies on its image: ``straight``, ``turned`` (by 90 degrees, as EXIF says), or None if it does not fit.
 
-    A mask of another size fits if its shape is the same to a pixel: it was made for a smaller or larger version.
+    Masks fit the pixels of the file, as COLMAP has it; where only the turned picture has its shape, it was made for
+    that. A mask of another size fits if its shape is the same to a pixel: it was made for a smaller or larger version.
     """
     if min(header.width, header.height) < 16:  # too coarse for its shape to mean anything
         return None
-    for fit, width, height in (("upright", record.width, record.height), ("stored", record.height, record.width)):
-        if fit == "stored" and record.orientation < 5:
+    is_sideways = max(record.orientation, record.turn) >= 5
+    for fit, width, height in (("straight", record.width, record.height), ("turned", record.height, record.width)):
+        if fit == "turned" and not is_sideways:
             break
         scale = max(header.width / width, header.height / height)
         if abs(header.width - width * scale) <= 1.0 and abs(header.height - height * scale) <= 1.0:

@@ -115,6 +115,7 @@ class Sequence(Protocol):
             reading tells.
         frames_per_second: nominal rate; None where unknown.
         imu, truth: None where there is none.
+        orientation: EXIF orientation 1 to 8 of the frames, for whoever shows them to people.
     """
 
     kind: SequenceKind
@@ -124,6 +125,7 @@ class Sequence(Protocol):
     frames_per_second: float | None
     imu: Imu | None
     truth: Truth | None
+    orientation: int
 
     def frames(self) -> Iterator[Frame]:
         """The frames in order, decoded ahead in a thread; what cannot be read is warned of and left out."""

@@ -10,11 +10,18 @@ from pathlib import Path
 from typing import Any
 
 from sfmapp.errors import InputError
+from sfmapp.images.headers import picture_format
+from sfmapp.images.products import foreign_product, holds_results
 
-EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm"})
+EXTENSIONS = frozenset({
+    ".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".png", ".tif", ".tiff", ".bmp", ".dib", ".webp", ".ppm", ".pgm", ".pnm",
+})  # fmt: skip
 # Pictures and videos that people do put into such folders, and that are not read.
-_FOREIGN_PICTURES = {".gif", ".heic", ".heif", ".avif", ".jp2", ".jxl", ".exr", ".hdr", ".psd", ".pbm", ".jfif"}
-_RAW_PICTURES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"}
+_FOREIGN_PICTURES = {".gif", ".heic", ".heif", ".avif", ".jp2", ".jxl", ".exr", ".hdr", ".psd", ".pbm"}
+_RAW_PICTURES = {
+    ".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".orf", ".rw2", ".rwl", ".raf", ".pef", ".srw", ".3fr",
+    ".iiq", ".erf", ".mef", ".mos", ".kdc", ".dcr", ".x3f", ".gpr",
+}  # fmt: skip
 _VIDEOS = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm"}
 _THUMBNAIL_FOLDERS = frozenset({"__MACOSX", "@eaDir"})
 _MAX_LIST_BYTES = 64 << 20
@@ -22,11 +29,19 @@ _MAX_LIST_BYTES = 64 << 20
 
 @dataclass
 class Found:
-    """What a source holds: the common root, the files to look into, and those known to be of no use."""
+    """What a source holds.
+
+    Attributes:
+        root: the folder that all names are relative to.
+        paths: the files to look into.
+        skipped: (name, reason) of those known to be of no use; the names of folders end with a slash.
+        results: names of the folders with results of sfmapp that were passed over, with a slash at the end.
+    """
 
     root: Path
     paths: list[Path] = field(default_factory=list)
     skipped: list[tuple[str, str]] = field(default_factory=list)
+    results: list[str] = field(default_factory=list)
 
 
 def find_images(source: str, mask_path: str | None = None) -> Found:
@@ -70,6 +85,12 @@ def natural_key(name: str) -> tuple[Any, ...]:
     return tuple((int(part), "") if i % 2 else (-1, part) for i, part in enumerate(parts)), name
 
 
+def is_picture(path: Path) -> bool:
+    """Whether a file is a picture by its ending; one without an ending, by its first bytes."""
+    ending = path.suffix.lower()
+    return ending in EXTENSIONS or (not ending and picture_format(path) is not None)
+
+
 def _find_in_folder(root: Path, mask_root: Path | None) -> Found:
     found = Found(root)
     visited: set[tuple[int, int]] = set()
@@ -93,7 +114,7 @@ def _find_in_folder(root: Path, mask_root: Path | None) -> Found:
                 continue
             path = Path(entry.path)
             if os.path.isdir(path) and path.suffix.lower() not in EXTENSIONS:
-                if path != mask_root:
+                if path != mask_root and not _is_product(found, path):
                     (links if entry.is_symlink() else pending).append(path)
             else:
                 _take(found, path)
@@ -107,24 +128,73 @@ def _find_by_pattern(pattern: str, mask_root: Path | None) -> Found:
             break
         fixed.append(part)
     found = Found(Path(*fixed).absolute() if fixed else Path.cwd())
-    for match in sorted(set(glob.glob(pattern, recursive=True))):
+    products: dict[Path, bool] = {}
+
+    def is_in_product(folder: Path) -> bool:
+        if folder == found.root or found.root not in folder.parents:
+            return False
+        if folder not in products:
+            products[folder] = is_in_product(folder.parent) or _is_product(found, folder)
+        return products[folder]
+
+    matches = sorted(set(glob.glob(pattern, recursive=True)))
+    for match in matches:
         path = Path(os.path.abspath(match))
         is_masked = mask_root is not None and mask_root != found.root and mask_root in path.parents
-        if not is_masked and not (os.path.isdir(path) and path.suffix.lower() not in EXTENSIONS):
+        is_folder = os.path.isdir(path) and path.suffix.lower() not in EXTENSIONS
+        if not is_masked and not is_folder and not is_in_product(path.parent):
             _take(found, path)
+    _add_other_case(found, pattern, matches)
     if not found.paths and not found.skipped:
+        if found.results:
+            raise InputError(
+                f"the pattern {pattern} matches results of sfmapp alone, in {', '.join(found.results[:3])}",
+                "name the folder of the photographs",
+            )
         raise InputError(f"the pattern {pattern} matches no image", "put it in quotes, and check it with ls")
     return found
 
 
+def _is_product(found: Found, folder: Path) -> bool:
+    """Whether the pictures of a folder are no photographs but made of them; if so, that is noted."""
+    name = printable(os.path.relpath(folder, found.root)) + "/"
+    if holds_results(folder, found.root):
+        found.results.append(name)
+        return True
+    reason = foreign_product(folder)
+    if reason is not None:
+        found.skipped.append((name, reason))
+    return reason is not None
+
+
+def _add_other_case(found: Found, pattern: str, matches: list[str]) -> None:
+    """Note images that a pattern misses because it has letters of the other case, as *.jpg has for a.JPG."""
+    folder, name = os.path.split(pattern)
+    any_case = re.sub(r"[a-zA-Z](?![^\[]*\])", lambda letter: f"[{letter[0].lower()}{letter[0].upper()}]", name)
+    for match in sorted(set(glob.glob(os.path.join(folder, any_case), recursive=True)) - set(matches)):
+        if Path(match).suffix.lower() in EXTENSIONS and os.path.isfile(match):
+            shown = printable(os.path.relpath(match, found.root))
+            found.skipped.append((shown, f"the pattern differs from its name in upper and lower case: {pattern}"))
+
+
 def _take(found: Found, path: Path) -> None:
+    """Sort a file in by its ending; by its content where it has none, or nothing but a number for one."""
     ending = path.suffix.lower()
     if ending in EXTENSIONS:
         found.paths.append(path)
-    elif ending in _FOREIGN_PICTURES | _RAW_PICTURES | _VIDEOS:
-        name = printable(os.path.relpath(path, found.root))
+        return
+    name = printable(os.path.relpath(path, found.root))
+    if ending in _FOREIGN_PICTURES | _RAW_PICTURES | _VIDEOS:
         advice = "extract frames from them first" if ending in _VIDEOS else "convert them to JPEG or PNG"
         found.skipped.append((name, f"{ending} files are not read: {advice}"))
+        return
+    content = picture_format(path)
+    if content is None:
+        return
+    if not ending or ending[1:].isdecimal():
+        found.paths.append(path)
+    else:  # thumbnails and backups are called such things
+        found.skipped.append((name, f"holds a {content} picture but ends in {ending}: rename it if it is a photograph"))
 
 
 def _find_in_list(list_path: Path) -> Found:

@@ -14,7 +14,22 @@ from typing import Final, TypeAlias
 TagValue: TypeAlias = "tuple[int | float, ...] | str | bytes"
 
 _TYPE_FORMAT: Final = MappingProxyType(
-    {1: "B", 3: "H", 4: "I", 5: "II", 6: "b", 8: "h", 9: "i", 10: "ii", 11: "f", 12: "d", 13: "I"}
+    {
+        1: "B",
+        3: "H",
+        4: "I",
+        5: "II",
+        6: "b",
+        8: "h",
+        9: "i",
+        10: "ii",
+        11: "f",
+        12: "d",
+        13: "I",
+        16: "Q",
+        17: "q",
+        18: "Q",
+    }
 )
 _ASCII, _UNDEFINED = 2, 7
 _RATIONAL_TYPES = (5, 10)
@@ -58,16 +73,40 @@ EMPTY: Final = Directory({}, {}, 0)
 
 
 def byte_order(data: bytes) -> str | None:
-    """``<`` or ``>`` for data that begins like classic TIFF, None for anything else."""
-    return {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    """``<`` or ``>`` for data that begins like TIFF, classic or BigTIFF, None for anything else."""
+    return {b"II*\0": "<", b"MM\0*": ">", b"II+\0": "<", b"MM\0+": ">"}.get(data[:4])
+
+
+@dataclass(frozen=True)
+class _Form:
+    """How directories are written: codes of a count of entries, of values, and of an offset, and the size of an entry.
+
+    BigTIFF has the same directories with offsets of 8 bytes.
+    """
+
+    entries: str
+    values: str
+    offset: str
+    entry_size: int
+    inline_size: int
+    first_at: int
+
+
+_CLASSIC = _Form("H", "I", "I", 12, 4, 4)
+_BIG = _Form("Q", "Q", "Q", 20, 8, 8)
+
+
+def _form(data: bytes) -> _Form:
+    return _BIG if b"+" in data[2:4] else _CLASSIC
 
 
 def first_directory(data: bytes) -> Directory:
     """The first directory of TIFF or EXIF data (which begins with ``II`` or ``MM``); empty where there is none."""
     order = byte_order(data)
-    if order is None or len(data) < 8:
+    if order is None or len(data) < 16:
         return EMPTY
-    return read_directory(data, struct.unpack_from(order + "I", data, 4)[0], order)
+    form = _form(data)
+    return read_directory(data, struct.unpack_from(order + form.offset, data, form.first_at)[0], order)
 
 
 def sub_directory(data: bytes, parent: Directory, tag: int) -> Directory:
@@ -80,30 +119,33 @@ def sub_directory(data: bytes, parent: Directory, tag: int) -> Directory:
 
 def read_directory(data: bytes, offset: int, order: str) -> Directory:
     """The directory at an offset; entries that point outside the data are left out."""
-    if offset < 8 or offset + 2 > len(data):
+    form = _form(data)
+    begin = offset + struct.calcsize("=" + form.entries)
+    if offset < 8 or begin > len(data):
         return EMPTY
-    count = struct.unpack_from(order + "H", data, offset)[0]
+    count = struct.unpack_from(order + form.entries, data, offset)[0]
     if count > _MAX_ENTRIES:
         return EMPTY
     values: dict[int, TagValue] = {}
     places: dict[int, int] = {}
-    end = offset + 2 + 12 * count
-    for entry in range(offset + 2, min(end, len(data) - 11), 12):
-        tag, kind, num = struct.unpack_from(order + "HHI", data, entry)
-        value, place = _read_value(data, entry + 8, kind, num, order)
+    end = begin + form.entry_size * count
+    for entry in range(begin, min(end, len(data) - form.entry_size + 1), form.entry_size):
+        tag, kind, num = struct.unpack_from(order + "HH" + form.values, data, entry)
+        value, place = _read_value(data, entry + form.entry_size - form.inline_size, kind, num, order, form)
         if value is not None:
             values[tag], places[tag] = value, place
-    following = struct.unpack_from(order + "I", data, end)[0] if end + 4 <= len(data) else 0
+    is_there = end + struct.calcsize("=" + form.offset) <= len(data)
+    following = struct.unpack_from(order + form.offset, data, end)[0] if is_there else 0
     return Directory(values, places, following)
 
 
-def _read_value(data: bytes, place: int, kind: int, num: int, order: str) -> tuple[TagValue | None, int]:
+def _read_value(data: bytes, place: int, kind: int, num: int, order: str, form: _Form) -> tuple[TagValue | None, int]:
     code = "B" if kind in (_ASCII, _UNDEFINED) else _TYPE_FORMAT.get(kind)
     if code is None or num == 0 or num > _MAX_VALUES:
         return None, place
     size = struct.calcsize("=" + code) * num
-    if size > 4:  # a value that does not fit into the entry stands elsewhere
-        place = struct.unpack_from(order + "I", data, place)[0]
+    if size > form.inline_size:  # a value that does not fit into the entry stands elsewhere
+        place = struct.unpack_from(order + form.offset, data, place)[0]
     if place + size > len(data):
         return None, place
     raw = data[place : place + size]

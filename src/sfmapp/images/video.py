@@ -109,6 +109,7 @@ class VideoSequence:
     imu: Imu | None = None
     truth: Truth | None = None
     kind: SequenceKind = "video"
+    orientation: int = 1
     num_frames: int | None = field(init=False)
     frames_per_second: float | None = field(init=False)
 

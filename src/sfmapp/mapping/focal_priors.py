@@ -258,6 +258,6 @@ def lean_on_priors(mapped: Mapped, model: Reconstruction, sigmas: dict[int, Foca
         # where the data's information is as good as none, any weight that counts is enough
         over = s.data_px / s.independent_px if np.isfinite(s.independent_px) else FOCAL_INFLATION
         priors[c] = replace(priors[c], focal_sigma=s.prior_px / (noise * over))
-    options = replace(mapper.adjust_options, initial_damping=1e-7, relative_cost_tolerance=1e-7)
+    options = replace(mapper.adjust_options.robust(noise), initial_damping=1e-7, relative_cost_tolerance=1e-7)
     adjust_bundle(model, options, prior_cameras=priors)
     return open_

@@ -22,7 +22,7 @@ from sfmapp.contradictions import Contradiction
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.images.folder import ImageSet
-from sfmapp.mapping import join, mend, structure, verified_pairs
+from sfmapp.mapping import join, mend, near_views, structure, verified_pairs
 from sfmapp.mapping.focal import estimate_focal_ratio
 from sfmapp.mapping.focal_priors import MapFrom, Mapped, settle_focal_lengths
 from sfmapp.mapping.intrinsics_check import check_intrinsics, widened_uncertainty
@@ -103,6 +103,7 @@ def map_images(
         mapped, look_alikes = tell_apart(mapped, correspondences, map_again, events)
         models = mapped.models
         for model in models:
+            mapped.mapper_of(model).polish()
             model.point_rgb = track_colors(model.tracks, features)
         contradictions = contradictions_of(models, correspondences)
         model_reports: list[dict[str, Any]] = [
@@ -416,5 +417,6 @@ def compile_kernels() -> None:
     rank_next_images(model, np.arange(3))
     verified_pairs.compile_kernels()
     join.compile_kernels()
+    near_views.compile_kernels()
     mend.compile_kernels()
     solver.compile_kernels()

@@ -21,6 +21,7 @@ from sfmapp.geometry import resection, rigid3, similarity
 from sfmapp.geometry.lens import distort
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.mapping.merge import merge, num_linking_points
+from sfmapp.mapping.near_views import missing_between
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.verified_pairs import AGREES, CONTRADICTS, pair_agreement
 from sfmapp.scene.camera import pixels_to_normalized
@@ -215,6 +216,9 @@ def holds_together(
     )
     if not (agreeing > AGREES * matches and shared > CONTRADICTS * agreeing):
         return f"adjusted as one, {agreeing} of {matches} verified matches between them agree, {shared} support a point"
+    pairs, visible, shared = missing_between(union, *sides, correspondences)
+    if pairs:
+        return f"adjusted as one, {pairs} pairs stand side by side and share {shared} of the {visible} points in view"
     return ""
 
 

@@ -33,6 +33,10 @@ WEAK_SHARE_OF_ANGLE = 0.1
 # A weak image waits for another model if a pair with an image outside of this one has so many times the matches of its
 # strongest pair inside: no matter of chance, and what comes with one image comes with its neighbours too.
 ELSEWHERE = 2.0
+# An adjustment has settled when no larger share of the observations changes sides; rounds of the last one at most.
+MAX_CHANGED, MAX_POLISHED = 1e-3, 2
+# Synthetic keypoints may be exact; no detector's are better than this.
+MIN_NOISE_PX = 0.02
 # Uncertainties cost an inverse of eight unknowns per image: half a second and 50 MB for this many.
 MAX_UNCERTAINTY_IMAGES = 200
 
@@ -303,7 +307,28 @@ class Mapper:
             changed = int((before != self.reconstruction.obs_is_inlier).sum())
             summary = self.reconstruction.summary()
             self.events.decided(STAGE, f"final adjustment: {changed} observations changed sides", **summary)
-            if changed <= 1e-3 * before.sum():
+            if changed <= MAX_CHANGED * before.sum():
+                return
+
+    def polish(self) -> None:
+        """Adjust a finished map with a loss that lets go of what is far off the noise, until it settles.
+
+        A pixel may be ten standard deviations of precise keypoints: with squares alone, the few observations near the
+        limit decide what many others tell little of, such as the lens.
+        """
+        chosen, reconstruction = self._free_principal_points(), self.reconstruction
+        for _ in range(MAX_POLISHED):
+            before = reconstruction.obs_is_inlier.copy()
+            options = self.adjust_options.robust(structure.residual_scale_px(reconstruction, MIN_NOISE_PX))
+            options = replace(options, max_iterations=100, initial_damping=1e-8, relative_cost_tolerance=1e-5)
+            if chosen.any():
+                options = self.with_free_centers(options, chosen)
+            adjust_bundle(reconstruction, options, variable_centers=chosen, prior_cameras=self.prior_cameras)
+            self._settle_points()
+            changed = int((before != reconstruction.obs_is_inlier).sum())
+            summary = reconstruction.summary()
+            self.events.decided(STAGE, f"robust adjustment: {changed} observations changed sides", **summary)
+            if changed <= MAX_CHANGED * before.sum():
                 return
 
     def agreement(self) -> tuple[int, int]:

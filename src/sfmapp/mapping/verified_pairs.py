@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.lens import undistort
+from sfmapp.mapping import near_views
 from sfmapp.mapping.tracks import USELESS_CONFIGS
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
@@ -226,7 +227,8 @@ class Chains:
 
 
 def contradictions_of(models: Sequence[Reconstruction], correspondences: Correspondences) -> list[list[Contradiction]]:
-    """For each model the verified evidence that stands against it: pairs inside it, and pairs that lead out of it.
+    """For each model the pairs that stand against it: pairs inside it, pairs that lead out of it, and pairs
+    that should have matches and have none.
 
     Args:
         models: over the same tracks, the largest first.
@@ -238,7 +240,9 @@ def contradictions_of(models: Sequence[Reconstruction], correspondences: Corresp
         for m, other in enumerate(models):
             if m > n:
                 of_model += _between(model, other, correspondences, m)
-        found.append(of_model + _left_out(model, models, correspondences))
+        found.append(
+            of_model + _left_out(model, models, correspondences) + near_views.contradiction_of(model, correspondences)
+        )
     return found
 
 

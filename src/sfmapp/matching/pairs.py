@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import UsageError
 from sfmapp.events import Events
+from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.scene.features import Features
 
 if TYPE_CHECKING:
@@ -113,6 +114,9 @@ def select_pairs(
         counts = {name: len(found) for name, found in sources.items()}
         pairs = _unique_pairs(np.concatenate(list(sources.values())))
         reason = _reason(options, len(usable), counts)
+    # a file that is stored as a mirror image shows nothing that one that is not could have seen
+    is_mirrored = np.array([images[i].orientation in MIRRORED for i in usable], bool)
+    pairs = pairs[is_mirrored[pairs[:, 0]] == is_mirrored[pairs[:, 1]]]
     result = usable[pairs].astype(np.int32).reshape(-1, 2)
     report = {
         "method": method,

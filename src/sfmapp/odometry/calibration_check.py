@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from sfmapp.adjust.calibration import RAW, CalibrationSystem, reduce_to_calibration
 from sfmapp.adjust.covariance import similarity_basis
@@ -58,8 +59,9 @@ _MAX_CHANCE, _SHARED_ERRORS, _MIN_HELD_OUT_SIGMAS, _MIN_DIRECTION_SIGMAS, _FOLDS
 _MAX_GAIN = 5.0
 # Rounds until the next would move by less than a share of a sigma; how far one may go, in the focal length's logarithm.
 _ROUNDS, _ROUNDS_FAR, _SETTLED_SIGMAS, _MAX_STEP = 6, 14, 0.5, 0.05
-# A step that makes the cost rise by more than this share has gone too far; steps of the adjustment that follows one.
-_MAX_RISE, _FOLLOWING_STEPS = 1.05, 30
+# A step that makes the cost rise by more than this share has gone too far; steps of the adjustment after one, and
+# the share of the cost that ends them: what is left then is a fraction of a standard deviation.
+_MAX_RISE, _FOLLOWING_STEPS, _FOLLOWING_TOLERANCE = 1.05, 30, 1e-4
 # How many steps may be made in one, and how far (cosine) two have to go the same way for that.
 _MAX_REACH, _SAME_WAY = 4.0, 0.7
 # A prior that the data leave by so many sigmas is not believed any more.
@@ -191,7 +193,7 @@ def question_calibration(model: Reconstruction, cost: float, sigma: float, *, ma
     if first is None:
         is_rig = len(model.cameras) > 1
         return Answer(model, False, {"is_refined": False}, [], _UNKNOWN_SCALE if is_rig else None)
-    limit = _SHARED_ERRORS * float(chi2.isf(_MAX_CHANCE, len(first.x)))
+    limit = _SHARED_ERRORS * float(chdtri(len(first.x), _MAX_CHANCE))
     surprise = float(first.step @ first.data_information @ first.step)
     if surprise < limit / _SHARED_ERRORS:
         return _kept(first, first, unknowns, _report(first, surprise, limit, unknowns), [])
@@ -250,13 +252,13 @@ def adjust_poses(model: Reconstruction, sigma: float, max_steps: int, tolerance:
 def _look(model: Reconstruction, x: Array, cost: float, sigma: float, unknowns: Unknowns) -> _Look | None:
     """What the tracks say around a model; None where they are too few, or say nothing that is finite."""
     num, fields = len(x), _smooth_fields(model)
+    num_wanted = _MIN_CLUSTERS * (num + 2 * len(model.cameras) * fields.shape[1])
+    clusters = partial(_clusters, model, num_wanted=num_wanted)
     try:
-        system = reduce_to_calibration(model, unknowns.directions(model), sigma, fields=fields)
+        system = reduce_to_calibration(model, unknowns.directions(model), sigma, clusters, fields=fields)
     except np.linalg.LinAlgError:
         return None
     gradient, information = system.gradient.sum(0), system.information.sum(0)
-    num_wanted = _MIN_CLUSTERS * len(gradient)
-    system = system.summed(_clusters(model, system.track_idx, num_wanted))
     num_clusters = len(system.gradient)
     if num_clusters < num_wanted or not (np.isfinite(information).all() and np.isfinite(cost)):
         return None
@@ -367,7 +369,8 @@ def _go(look: _Look, step: Array, sigma: float, unknowns: Unknowns) -> _Look | N
     """Change the calibration by a step (Q,), let poses and points follow, and look again."""
     model = _changed(look.model, unknowns.directions(look.model) @ step)
     _move_frames(model, look.system.response[:, :, : len(step)] @ step)
-    return _look(model, look.x + step, adjust_poses(model, sigma, _FOLLOWING_STEPS, 1e-5), sigma, unknowns)
+    cost = adjust_poses(model, sigma, _FOLLOWING_STEPS, _FOLLOWING_TOLERANCE)
+    return _look(model, look.x + step, cost, sigma, unknowns)
 
 
 def _changed(model: Reconstruction, change: Array) -> Reconstruction:
@@ -412,7 +415,8 @@ def _start_afresh(look: _Look, sigma: float, unknowns: Unknowns) -> _Look:
     )  # fmt: skip
     classify(model, np.zeros(tracks.num_tracks, np.int64))
     sigma = residual_scale_px(model, _MIN_SIGMA_PX)
-    again = _look(model, look.x, adjust_poses(model, sigma, _FOLLOWING_STEPS, 1e-5), sigma, unknowns)
+    cost = adjust_poses(model, sigma, _FOLLOWING_STEPS, _FOLLOWING_TOLERANCE)
+    again = _look(model, look.x, cost, sigma, unknowns)
     return look if again is None else replace(_settle(again, sigma, unknowns), cost=look.cost)
 
 

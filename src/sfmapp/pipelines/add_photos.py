@@ -99,6 +99,7 @@ def add_photos(
     mapper.triangulate_images([idx for idx, _ in keyframes])
     mapper.grow()
     mapper.finish()
+    mapper.polish()
     rows = [_row(joined, len(model.image_names) + k, attempts) for k in range(len(found.images))]
     events.finished(STAGE, f"{sum(row['is_registered'] for row in rows)} of {len(rows)} photographs registered")
     return joined, PhotoResult(rows, found.skipped)

@@ -21,7 +21,7 @@ from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.pipelines import dense_results
 from sfmapp.pipelines.dense_results import STAGE
-from sfmapp.pipelines.dense_source import DenseJob, dense_job, find_source, plan_source
+from sfmapp.pipelines.dense_source import DenseJob, dense_job, find_source, model_digest, plan_source
 from sfmapp.pipelines.kernels import compile_dense_kernels
 from sfmapp.pipelines.options import Options, with_absolute_paths
 from sfmapp.pipelines.usage import Stopwatch
@@ -90,7 +90,7 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
             return DenseResult(patches, plan.names, earlier, job.workspace.folder)
         is_resumed = job.workspace.has_key(STAGE, key)
         job.note_source()
-        job.workspace.begin(STAGE, key)
+        job.workspace.begin(STAGE, key, model=model_digest(job.known.model))
         with job.measured("kernels"):
             compile_dense_kernels(job.events)
         patches = _densify(job, plan, report, is_resumed)

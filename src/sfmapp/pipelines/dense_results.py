@@ -40,7 +40,7 @@ _OWN_STAGES = frozenset((STAGE, "views", "maps", "mesh", "texture", "recording")
 
 def dense_key(job: DenseJob, plan: DensePlan) -> str:
     """Of the patches: model, photographs and masks, options, our code."""
-    inputs = [[record.name, record.orientation, input_key(record)] for record in plan.records]
+    inputs = [[record.name, record.turn, input_key(record)] for record in plan.records]
     packages = ("dense", "images", "geometry", "scene")
     return stage_key(packages, options_to_dict(job.options.dense), model_digest(job.known.model), inputs)
 

@@ -21,14 +21,12 @@ from sfmapp.images.sources import find_images
 from sfmapp.pipelines.listeners import DecisionLog, EventLog
 from sfmapp.pipelines.options import Options, options_from_dict, options_to_dict
 from sfmapp.pipelines.run import Job
+from sfmapp.pipelines.stored_pixels import has_stored_pixels
 from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import DENSE, RECONSTRUCT, open_workspace, read_manifest
+from sfmapp.pipelines.workspace import DENSE, RECONSTRUCT, USUAL_FOLDERS, open_workspace, read_manifest
 
 # the workspace in the folder of a COLMAP model, if no other place is named
 INSIDE = "sfmapp"
-
-# where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0
-_USUAL_FOLDERS = ("images", "../images", "../../images")
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ def plan_source(job: DenseJob) -> tuple[DensePlan, dict[str, Any]]:
     where = job.known
     if not has_model(where.model):
         raise InputError(f"{where.model}: the model that this workspace was made of is gone", "bring it back")
-    model, _ = read_model(where.model)
+    model, _ = read_model(where.model, job.events)
     photographs = find_photographs(
         model, where.images, job.options.images,
         is_upright=where.is_upright, threads=job.threads, events=job.events,
@@ -167,7 +165,7 @@ def _in_workspace(
     else:
         model = folder / "sparse" / "0"
         found = Path(images) if images is not None else image_root(str(manifest.get("source") or ""))
-        is_upright = True
+        is_upright = not has_stored_pixels(manifest)
         if not has_model(model):
             raise NoReconstructionError(f"{folder} holds no model", "run sfmapp reconstruct first")
     earlier = options_from_dict({"images": manifest.get("options", {}).get("images", {})}).images
@@ -199,10 +197,10 @@ def _image_folder(model: Path, images: str | os.PathLike[str] | None) -> Path:
         if not Path(images).is_dir():
             raise InputError(f"{images}: expected the folder of the photographs, found no folder")
         return Path(images)
-    for name in _USUAL_FOLDERS:
+    for name in USUAL_FOLDERS:
         if (model / name).is_dir():
             return model / name
-    looked = ", ".join(os.path.normpath(model / name) for name in _USUAL_FOLDERS)
+    looked = ", ".join(os.path.normpath(model / name) for name in USUAL_FOLDERS)
     raise UsageError(f"where are the photographs of {model}?", f"give --images DIR; there is no {looked}")
 
 

@@ -12,8 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
+from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model, write_model, write_model_text
-from sfmapp.pipelines.workspace import read_manifest
+from sfmapp.images.sources import find_images
+from sfmapp.pipelines.stored_pixels import check_pixels
+from sfmapp.pipelines.workspace import USUAL_FOLDERS, read_manifest
 from sfmapp.scene.reconstruction import Reconstruction
 
 _NOTICEABLE_PX = 0.1  # below the noise of a keypoint
@@ -27,6 +30,7 @@ class _Source:
     model: Reconstruction
     keypoints: list[NDArray[np.float64]]
     image_folder: Path | None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -80,23 +84,42 @@ def export_model(output: str | os.PathLike[str], target: str, path: str | os.Pat
         "num_observations": int(ours.obs_is_inlier.sum()),
         "max_px": _worst_px(ours, theirs),
         "max_coordinate": float(np.abs(theirs.point_xyz - ours.point_xyz).max(initial=0.0)),
-        "notes": list(copy.notes),
+        "notes": [*source.notes, *copy.notes],
     }
 
 
 def _source(output: Path) -> _Source:
-    image_folder = None
-    folder = output
+    folder, image_source = output, None
     if (output / "run.json").is_file():
-        image_source = Path(str(read_manifest(output).get("source") or ""))
-        image_folder = image_source if image_source.is_dir() and str(image_source) != "." else None
+        manifest = read_manifest(output)
+        check_pixels(output, manifest)
+        image_source = str(manifest.get("source") or "")
         folder = output / "sparse" / "0"
         if not has_model(folder):
             raise NoReconstructionError(f"{output} holds no model to export", "run sfmapp reconstruct first")
     elif not has_model(output) and has_model(output / "sparse" / "0"):
         folder = output / "sparse" / "0"
-    model, keypoints = read_model(folder)
-    return _Source(folder, model, keypoints, image_folder)
+    events, notes = Events(), list[str]()
+    events.subscribe(lambda event: notes.append(event.message))
+    model, keypoints = read_model(folder, events)
+    return _Source(folder, model, keypoints, _image_folder(folder, image_source), tuple(notes))
+
+
+def _image_folder(model: Path, image_source: str | None) -> Path | None:
+    """The folder that the names of a model are relative to, None where it is not known.
+
+    Args:
+        model: its folder.
+        image_source: what a run was made of: a folder, a pattern or a list; None for a model that no run of ours made.
+    """
+    if image_source is None:
+        return next((model / name for name in USUAL_FOLDERS if (model / name).is_dir()), None)
+    if image_source and os.path.isdir(image_source):
+        return Path(image_source)
+    try:
+        return find_images(image_source).root if image_source else None
+    except InputError:  # it is gone, or no longer holds images
+        return None
 
 
 def _worst_px(ours: Reconstruction, theirs: Reconstruction) -> float:
@@ -143,13 +166,17 @@ def _export_colmap(
 
 
 def _export_ply(source: _Source, path: Path) -> _Copy:
-    from sfmapp.formats.ply import read_ply, write_ply
+    from sfmapp.formats.ply import write_ply
+    from sfmapp.formats.ply_reader import read_ply_geometry
 
     file = _file_in(path, ".ply", "points.ply")
     points = np.flatnonzero(source.model.is_triangulated)
     write_ply(file, source.model.point_xyz[points], source.model.point_rgb[points])
     copy = source.model.copy()
-    copy.point_xyz[points], copy.point_rgb[points] = read_ply(file)
+    back = read_ply_geometry(file)
+    if back.rgb is None or len(back.xyz) != len(points):
+        raise InputError(f"{file}: expected to read back {len(points)} coloured points, found {len(back.xyz)}")
+    copy.point_xyz[points], copy.point_rgb[points] = back.xyz, back.rgb
     return _Copy(copy, [file], "sfmapp")
 
 
@@ -176,11 +203,16 @@ def _export_nerfstudio(source: _Source, path: Path) -> _Copy:
     from sfmapp.formats.nerfstudio import POINTS_NAME, read_nerfstudio, write_nerfstudio
 
     file = _file_in(path, ".json", "transforms.json")
-    images = "images"
-    if source.image_folder is not None:
-        images = Path(os.path.relpath(source.image_folder.resolve(), file.resolve().parent)).as_posix()
-    write_nerfstudio(file, source.model, images)
-    return _Copy(read_nerfstudio(file), [file, file.with_name(POINTS_NAME)], "sfmapp")
+    folder = file.resolve().parent / "images" if source.image_folder is None else source.image_folder.resolve()
+    write_nerfstudio(file, source.model, Path(os.path.relpath(folder, file.resolve().parent)).as_posix())
+    missing = [name for name in source.model.image_names if not (folder / name).exists()]
+    notes: tuple[str, ...] = ()
+    if missing:
+        notes = (
+            f"{len(missing)} of {len(source.model.image_names)} photographs are not in {folder}, where the file says "
+            f"they are, {missing[0]} for one: put them there",
+        )
+    return _Copy(read_nerfstudio(file), [file, file.with_name(POINTS_NAME)], "sfmapp", notes)
 
 
 def _file_in(path: Path, ending: str, name: str) -> Path:

@@ -16,11 +16,12 @@ from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.glb import write_glb
 from sfmapp.formats.mesh_ply import write_mesh_ply
-from sfmapp.formats.ply import read_vertices, rgb_of, xyz_of
+from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.geometry.upright import up_direction
 from sfmapp.pipelines import dense_results
-from sfmapp.pipelines.dense_source import DenseJob, dense_job, find_source, plan_source
+from sfmapp.pipelines.dense_source import DenseJob, dense_job, find_source, model_digest, plan_source
 from sfmapp.pipelines.options import Options, options_from_dict, options_to_dict, with_absolute_paths
+from sfmapp.pipelines.stored_pixels import has_stored_pixels
 from sfmapp.pipelines.usage import Stopwatch
 from sfmapp.pipelines.workspace import read_manifest, stage_key
 from sfmapp.scene.mesh import Mesh
@@ -31,6 +32,8 @@ STAGE = "mesh"
 MESH_PLY, MESH_GLB = "mesh/mesh.ply", "mesh/mesh.glb"
 # what a pixel measures at the points of a PLY, which does not say: so much of the way to the nearest ones
 _NUM_NEAREST = 4
+# of surfaces whose points have no colour
+_GREY = 192
 
 
 class MeshResult(NamedTuple):
@@ -83,6 +86,16 @@ def _run(job: DenseJob, record: bool) -> MeshResult:
     patches, names = read_patches(folder / dense_results.PATCHES)
     with job.stage("views"):
         plan, _ = plan_source(job)
+    made_of = job.workspace.manifest["stages"].get(dense_results.STAGE, {}).get("model")
+    # earlier versions noted no model, and turned photographs that this one takes as they are stored
+    is_other = (
+        has_stored_pixels(job.workspace.manifest) if made_of is None else made_of != model_digest(job.known.model)
+    )
+    if is_other:
+        raise InputError(
+            f"{folder}: expected patches of its model, found those of an earlier one: it was reconstructed again",
+            f"run again: sfmapp dense {folder}",
+        )
     if plan.names != names:
         raise InputError(
             f"{folder}: the patches are of {len(names)} photographs, the model now has {len(plan.names)} others",
@@ -102,7 +115,7 @@ def _run(job: DenseJob, record: bool) -> MeshResult:
     except NoReconstructionError as failure:
         dense_results.finish(job, STAGE, key, {}, (scene, patches, None), failure)
         raise
-    is_z_up = bool(up_direction(plan.cam_from_world)[2] > np.sqrt(0.5))
+    is_z_up = bool(up_direction(scene.upright_cam_from_world)[2] > np.sqrt(0.5))
     with job.measured("output"):
         write_mesh_ply(folder / MESH_PLY, mesh)
         write_glb(folder / MESH_GLB, mesh, is_z_up=is_z_up)
@@ -128,7 +141,7 @@ def mesh_cloud(
     """Make a mesh of a cloud of oriented points: ``mesh/mesh.ply`` and ``mesh/mesh.glb`` in a folder.
 
     Args:
-        cloud: binary little-endian PLY with x y z and nx ny nz, such as ``dense/fused.ply``.
+        cloud: PLY of points with normals, such as ``dense/fused.ply``; without colours the mesh is grey.
         output: the folder; made if need be.
         options: ``surface`` and ``threads`` count here.
         events: listens in, and can ask the run to stop.
@@ -142,21 +155,50 @@ def mesh_cloud(
     options = options or Options()
     if options.surface.texture:
         raise UsageError("a texture needs the photographs, which a PLY does not hold", "give the workspace instead")
-    vertices = read_vertices(Path(cloud))
-    if not {"nx", "ny", "nz"} <= set(vertices.dtype.names or ()):
-        raise InputError(f"{cloud}: expected points with normals nx, ny and nz, found none")
-    xyz = xyz_of(vertices)
-    normal = np.stack([vertices[axis].astype(np.float32) for axis in ("nx", "ny", "nz")], 1)
-    length = np.linalg.norm(normal, axis=1)
-    usable = np.isfinite(length) & (length > 0.0)
-    xyz, normal, rgb = xyz[usable], normal[usable] / length[usable, None], rgb_of(vertices)[usable]
+    events = events or Events()
+    xyz, normal, rgb = _oriented_points(Path(cloud), events)
     threads = options.num_workers
     size = _sizes(xyz, threads)
+    _check_precision(Path(cloud), xyz, float(np.median(size)), events)
     mesh, report = make_mesh(xyz, normal, rgb, size, None, options.surface, threads=threads, events=events)
     folder = Path(output)
     write_mesh_ply(folder / MESH_PLY, mesh)
     write_glb(folder / MESH_GLB, mesh)
     return MeshResult(mesh, report)
+
+
+def _oriented_points(path: Path, events: Events) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.uint8]]:
+    """Places (N, 3), unit normals (N, 3) and colours (N, 3) of the points of a PLY that have a place and a normal."""
+    advice = "compute oriented normals first, for example in CloudCompare, MeshLab or Open3D"
+    points = read_ply_geometry(path)
+    if points.normal is None:
+        raise InputError(f"{path}: expected points with normals nx, ny and nz, found none", advice)
+    length = np.linalg.norm(points.normal.astype(np.float64), axis=1)
+    has_normal = np.isfinite(length) & (length > 0.0)
+    usable = points.is_finite & has_normal
+    for left_out, why in ((~points.is_finite, "a place that is not finite"), (~has_normal, "no normal (zero or NaN)")):
+        if left_out.any():
+            events.warned(STAGE, f"{path}: {int(left_out.sum())} of {len(usable)} points have {why}, they are left out")
+    if not usable.any():
+        raise InputError(f"{path}: expected points with places and normals, found none among {len(usable)}", advice)
+    if points.rgb is None:
+        events.decided(STAGE, f"{path} has no colours: the mesh is grey")
+        rgb = np.full(points.xyz.shape, _GREY, np.uint8)
+    else:
+        rgb = points.rgb
+    normal = (points.normal[usable] / length[usable, None]).astype(np.float32)
+    return points.xyz[usable], normal, rgb[usable]
+
+
+def _check_precision(path: Path, xyz: NDArray[np.float64], spacing: float, events: Events) -> None:
+    """Warn of coordinates that have lost what lies between the points, as georeferenced ones do in single precision."""
+    step = float(np.spacing(np.float32(np.abs(xyz).max())))
+    if step > 0.25 * spacing and (xyz == xyz.astype(np.float32)).all():
+        events.warned(
+            STAGE,
+            f"{path}: the points lie about {spacing:.3g} apart, but coordinates so far from 0 are {step:.3g} apart in "
+            "single precision: write them as double, or move them to the origin first",
+        )
 
 
 def _sizes(xyz: NDArray[np.float64], threads: int) -> NDArray[np.float32]:

@@ -193,9 +193,10 @@ class Watched:
     frames_per_second: float | None
     imu: Imu | None
     truth: Truth | None
+    orientation: int
 
     def __init__(self, sequence: Sequence, run: Tracking) -> None:
-        for name in ("kind", "source", "rig", "num_frames", "frames_per_second", "imu", "truth"):
+        for name in ("kind", "source", "rig", "num_frames", "frames_per_second", "imu", "truth", "orientation"):
             setattr(self, name, getattr(sequence, name))
         self._sequence, self._run = sequence, run
 

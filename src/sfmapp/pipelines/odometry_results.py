@@ -276,6 +276,7 @@ def describe_sequence(sequence: sequences.Sequence, result: OdometryResult) -> M
         "stereo": sequence.rig.is_stereo,
         "imu": sequence.imu is not None,
         "truth": sequence.truth is not None,
+        "orientation": sequence.orientation,
         "cameras": cameras,
     }
 

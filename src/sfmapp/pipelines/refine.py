@@ -165,7 +165,7 @@ def adjusted(
     for _ in range(_MAX_ROUNDS):
         used = model.obs_is_inlier.copy()
         sigma_px = structure.residual_scale_px(model, _MIN_SIGMA_PX)
-        adjust_bundle(model, robust(adjust, sigma_px), prior_cameras=priors)
+        adjust_bundle(model, adjust.robust(sigma_px), prior_cameras=priors)
         sigma_px = structure.residual_scale_px(model, _MIN_SIGMA_PX)
         limit_px = mapping.max_reprojection_error_sigmas * sigma_px
         limit_px = float(np.clip(limit_px, _MIN_LIMIT_PX, mapping.max_reprojection_error_px))
@@ -179,13 +179,6 @@ def adjusted(
         if changed <= 1e-3 * used.sum():
             break
     return model
-
-
-def robust(adjust: AdjustOptions, sigma_px: float) -> AdjustOptions:
-    """Tracks slide and slip: unless the user wants another, a loss that lets go of what is far off the noise."""
-    if adjust.loss != AdjustOptions().loss:
-        return adjust
-    return replace(adjust, loss="cauchy", loss_scale_px=2 * sigma_px)
 
 
 def laid_back(entry: MapResult, model: Reconstruction) -> MapResult:
@@ -274,6 +267,7 @@ def _write(
             name: [{"map": m, **truth_row(fit)} for m, fit in enumerate(found) if fit is not None]
             for name, found in fits.items()
         },
+        "orientation": sequence.orientation if sequence is not None else 1,
         "photographs": added.rows if added is not None else [],
         "skipped": [{"name": name, "reason": reason} for name, reason in added.skipped] if added is not None else [],
         "usage": job.usage,

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfmapp.errors import NoReconstructionError
+from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.pipelines.run import FAILED, NO_MODEL, NOT_WANTED, WRITTEN
+from sfmapp.pipelines.stored_pixels import STORED
 from sfmapp.pipelines.workspace import plain_number
 from sfmapp.report.document import FORMAT, camera_rows, funnel_of_images, funnel_without_matches, make_checks
 from sfmapp.report.html import render_html
@@ -54,7 +56,7 @@ def write_results(
     if failure is not None and failure.report is not None:
         run.stages["mapping"] = failure.report
     keypoints = [features.keypoints[:, :2].astype(np.float64) for features in run.features]
-    run.save_first(lambda: workspace.begin("mapping", keys.mapping))
+    run.save_first(lambda: workspace.begin("mapping", keys.mapping, pixels=STORED))
     with run.stage("output"):
         run.save_first(lambda: workspace.write_models(models, keypoints))
     with run.stage("recording"):
@@ -126,7 +128,13 @@ def _image_rows(run: Run, failure: NoReconstructionError | None) -> list[dict[st
     if run.correspondences is None:
         return funnel_without_matches(names, str(failure))
     mapping = run.stages.get("mapping") or {}
-    return funnel_of_images(names, run.features, run.correspondences, mapping.get("images", []), run.options.mapping)
+    rows = funnel_of_images(names, run.features, run.correspondences, mapping.get("images", []), run.options.mapping)
+    is_mirrored = [record.orientation in MIRRORED for record in run.image_set.images]
+    for row, is_mirror in zip(rows, is_mirrored, strict=True):
+        if row.get("failed_at") == "pairs" and (not is_mirror) in is_mirrored:
+            row["reason"] = "by EXIF's orientation it is stored as a mirror image of what others show, or they of it"
+            row["remedy"] = "Write the mirrored files anew, upright: exiftran -ai, mogrify -auto-orient."
+    return rows
 
 
 def report_text(report: Mapping[str, Any]) -> str:

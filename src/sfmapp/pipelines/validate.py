@@ -19,6 +19,7 @@ from sfmapp.formats.colmap import has_model, read_model
 from sfmapp.formats.truth import Truth, read_truth
 from sfmapp.images.folder import load_images
 from sfmapp.pipelines.options import options_from_dict
+from sfmapp.pipelines.stored_pixels import check_pixels, truth_in_stored_pixels
 from sfmapp.pipelines.workspace import RECONSTRUCT, read_manifest
 
 if TYPE_CHECKING:
@@ -83,6 +84,7 @@ def validate(
     """
     events, folder = events or Events(), Path(output)
     manifest = read_manifest(folder, RECONSTRUCT)
+    check_pixels(folder, manifest)
     model_folder = folder / "sparse" / "0"
     if not has_model(model_folder):
         raise NoReconstructionError(f"{folder} holds no model to validate", "run sfmapp reconstruct first")
@@ -92,6 +94,8 @@ def validate(
     notes = _changed_photographs(manifest, image_set)
     if known_truth is not None:
         known_truth = _truth_of_photographs(known_truth, image_set, notes)
+        orientations = {image.name: image.orientation for image in image_set.images}
+        known_truth = truth_in_stored_pixels(known_truth, model, orientations, notes)
     ours = _numbers(model, len(image_set.images)) | _own_usage(folder, notes)
     opinion = _ask(image_set, image_options, folder / FOLDER / "pycolmap", options, events, notes)
     theirs, agreement = None, None

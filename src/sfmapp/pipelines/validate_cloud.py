@@ -20,6 +20,7 @@ from sfmapp.formats.colmap import has_model, read_model
 from sfmapp.formats.ply_reader import PlyGeometry, read_ply_geometry
 from sfmapp.formats.truth import read_truth
 from sfmapp.geometry import similarity
+from sfmapp.pipelines.stored_pixels import orientations_of, truth_in_stored_pixels
 
 FOLDER = "validation"
 CLOUD, MESH, PATCHES = Path("dense") / "fused.ply", Path("mesh") / "mesh.ply", Path("dense") / "patches.npz"
@@ -160,6 +161,8 @@ def _alignment(folder: Path, truth_poses: Path, notes: list[str]) -> NDArray[np.
         raise InputError(f"{model_folder}: expected a model, to align it with {truth_poses}, found none")
     model = read_model(model_folder)[0]
     truth = read_truth(truth_poses).for_images(model.image_names)
+    # where all centres are on a line, the axes of the cameras tell how the scene is turned about it
+    truth = truth_in_stored_pixels(truth, model, orientations_of(folder), notes)
     errors = evaluate_poses(model.image_names, model.cam_from_world, truth.names, truth.cam_from_world)
     if errors.reference_from_estimate is None:
         raise InputError(f"{truth_poses}: expected two true cameras of photographs of the model, found fewer")
@@ -172,6 +175,8 @@ def _alignment(folder: Path, truth_poses: Path, notes: list[str]) -> NDArray[np.
 
 def _points(geometry: PlyGeometry, distance: float, name: str, notes: list[str]) -> NDArray[np.float64]:
     """The points of a cloud, or points spread over a mesh."""
+    if num_lost := int((~geometry.is_finite).sum()):
+        notes.append(f"{name}: {num_lost} of {len(geometry.xyz)} points are not finite and are left out")
     if geometry.triangles is None or not len(geometry.triangles):
         return geometry.xyz
     area = float(triangle_areas(geometry.xyz[geometry.triangles]).sum())

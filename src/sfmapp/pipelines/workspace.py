@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 from sfmapp import kernel_cache
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.atomic import replaced_file
+from sfmapp.images.products import FORMAT_NAME, MANIFEST
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,11 +32,12 @@ if TYPE_CHECKING:
 
     from sfmapp.scene.reconstruction import Reconstruction
 
-FORMAT = "sfmapp workspace 1"
-MANIFEST = "run.json"
+FORMAT = f"{FORMAT_NAME} 1"
 # the commands that write workspaces; manifests of before the second one name none
 RECONSTRUCT, ODOMETRY, REFINE, DENSE = "reconstruct", "odometry", "refine", "dense"
 LOCK = ".lock"
+# where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0
+USUAL_FOLDERS = ("images", "../images", "../../images")
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 _PACKAGE = Path(__file__).resolve().parent.parent
 _RECORDED_VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "gtsam", "scipy")
@@ -232,7 +234,7 @@ def _new_manifest(command: str) -> dict[str, Any]:
 def _manifest_of(folder: Path) -> dict[str, Any] | None:
     """Manifest of a folder that is a workspace, None if it is empty; refuses any other folder."""
     manifest = _read_json(folder / MANIFEST)
-    if isinstance(manifest, dict) and str(manifest.get("format", "")).startswith("sfmapp workspace"):
+    if isinstance(manifest, dict) and str(manifest.get("format", "")).startswith(FORMAT_NAME):
         if manifest["format"] == FORMAT:
             return manifest
         raise UsageError(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sfmapp.dense.scene import DenseScene, DenseView, Patches
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.orientation import MIRRORED, upright_pinhole, upright_pixels, upright_poses, upright_size
 from sfmapp.geometry.upright import up_direction
 from sfmapp.report.preview import Eye, picture_of_mesh, picture_of_patches
 from sfmapp.scene.mesh import Mesh
@@ -50,20 +51,23 @@ def dense_pictures(scene: DenseScene, patches: Patches, mesh: Mesh | None, *, ce
     rows = []
     for v in _chosen_views(scene, patches):
         view = scene.views[v]
-        photo = Picture("photograph", _jpeg(_shrunk(view.rgb)))
-        rows.append(PictureRow(view.name, (photo, *_pictures(patches, radius, mesh, _eye_of(view)))))
+        photo = Picture("photograph", _jpeg(upright_pixels(_shrunk(view.rgb), view.orientation)))
+        is_mirrored = view.orientation in MIRRORED
+        shown = _pictures(patches, radius, mesh, _eye_of(view), is_mirrored=is_mirrored)
+        rows.append(PictureRow(view.name, (photo, *shown)))
     eye = turned_eye(scene, patches, _chosen_views(scene, patches)[0])
     rows.append(PictureRow("from beside and above", tuple(_pictures(patches, radius, mesh, eye))))
     return rows
 
 
-def _pictures(patches: Patches, radius: NDArray[np.float32], mesh: Mesh | None, eye: Eye) -> list[Picture]:
+def _pictures(
+    patches: Patches, radius: NDArray[np.float32], mesh: Mesh | None, eye: Eye, *, is_mirrored: bool = False
+) -> list[Picture]:
     colored, clay = picture_of_patches(patches.xyz, patches.normal, patches.rgb, radius, eye)
-    shown = [Picture("patches", _jpeg(colored)), Picture("patches in the light of a lamp", _jpeg(clay))]
+    shown = [("patches", colored), ("patches in the light of a lamp", clay)]
     if mesh is not None:
-        image = picture_of_mesh(mesh.xyz, mesh.faces, mesh.normal, eye)
-        shown.append(Picture("mesh in the light of a lamp", _jpeg(image)))
-    return shown
+        shown.append(("mesh in the light of a lamp", picture_of_mesh(mesh.xyz, mesh.faces, mesh.normal, eye)))
+    return [Picture(caption, _jpeg(image[:, ::-1] if is_mirrored else image)) for caption, image in shown]
 
 
 def _chosen_views(scene: DenseScene, patches: Patches) -> list[int]:
@@ -77,9 +81,11 @@ def _chosen_views(scene: DenseScene, patches: Patches) -> list[int]:
 
 
 def _eye_of(view: DenseView) -> Eye:
+    """The view's own eye, its head upright."""
     scale = LONGER_SIDE_PX / max(view.width, view.height)
-    width, height = round(view.width * scale), round(view.height * scale)
-    return Eye(view.k * scale, view.cam_from_world, width, height)
+    k = upright_pinhole(view.orientation, view.k, view.width, view.height) * scale
+    width, height = upright_size(view.orientation, round(view.width * scale), round(view.height * scale))
+    return Eye(k, upright_poses(view.cam_from_world[None], [view.orientation])[0], width, height)
 
 
 def turned_eye(scene: DenseScene, patches: Patches, v: int) -> Eye:
@@ -87,7 +93,7 @@ def turned_eye(scene: DenseScene, patches: Patches, v: int) -> Eye:
     eye = _eye_of(scene.views[v])
     body = _middle_points(patches.xyz)
     target = np.median(body, axis=0)
-    up = up_direction(scene.cam_from_world)
+    up = up_direction(scene.upright_cam_from_world)
     back = scene.centers[v] - target
     # to the side on which the other cameras are: what is seen from there is known
     side = np.cross(up, back)

@@ -40,7 +40,7 @@ def render_html(
     body = [_headline(report), failure_box(report["outcome"]), check_table(report["checks"])]
     if model is not None:
         note = "Points and cameras of the largest model; each triangle opens where its camera looks."
-        body.append(f'<h2>From above</h2>{top_view_svg(model)}<p class="dim">{note}</p>')
+        body.append(f'<h2>From above</h2>{top_view_svg(model, _orientation(report, model))}<p class="dim">{note}</p>')
     if report.get("dense") is not None:
         body.append(dense_section(report["dense"], dense_pictures))
     body.append(_failed(report["images"]) + _skipped(report["skipped"]))
@@ -49,6 +49,13 @@ def render_html(
     body.append(usage_table(report["usage"], report["run"]))
     body.append(log_table("Warnings", report["warnings"]) + log_table("Decisions", report["decisions"]))
     return render_page(f"sfmapp: {report['run']['source']}", body)
+
+
+def _orientation(report: Mapping[str, Any], model: Reconstruction) -> list[int]:
+    """EXIF orientation of the images of a model."""
+    rows = report.get("stages", {}).get("images", {}).get("images", [])
+    known = {row["name"]: row["orientation"] for row in rows}
+    return [known.get(name, 1) for name in model.image_names]
 
 
 def _headline(report: Mapping[str, Any]) -> str:

@@ -28,7 +28,7 @@ def render_odometry_html(
     """The page of a report; ``against``: each map against the truth, empty without one."""
     body = [_headline(report), failure_box(report["outcome"]), check_table(report["checks"])]
     if result is not None and facts is not None and len(result.frame_idx):
-        body.append(trajectory_views(result, truth, against))
+        body.append(trajectory_views(result, truth, against, report["sequence"]["orientation"]))
         body.append("<h2>Frame by frame</h2>" + _plots(result, facts, against))
         body.append(_gaps(report["frames"]["gaps"]))
     body.append(_maps(report["maps"]) + _truth(report.get("truth")))
@@ -54,13 +54,15 @@ def _headline(report: Mapping[str, Any]) -> str:
     return f'<p class="dim">{escape("; ".join(parts))}</p>'
 
 
-def trajectory_views(result: OdometryResult, truth: Truth | None, against: Sequence[Against | None]) -> str:
-    """Each map from above; those that the truth joins share its frame but not one picture."""
+def trajectory_views(
+    result: OdometryResult, truth: Truth | None, against: Sequence[Against | None], orientation: int
+) -> str:
+    """Each map from above; those that the truth joins share its frame but not one picture. ``orientation``: EXIF's."""
     parts = []
     for map_idx in range(min(len(result.maps), MAX_VIEWS)):
         fit = against[map_idx] if against else None
         unit = unit_of(result.maps[map_idx])
-        svg = path_view_svg(_scene(result, map_idx, truth, fit, "m" if fit else unit))
+        svg = path_view_svg(_scene(result, map_idx, truth, fit, "m" if fit else unit), orientation)
         entries = [(PATH_COLOR, "trajectory, keyframes as dots")]
         if fit:
             entries.append((TRUTH_COLOR, f"truth; the trajectory is laid on it ({fit.alignment.upper()})"))

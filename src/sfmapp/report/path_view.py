@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.orientation import upright_poses
 from sfmapp.report.plots import ticks
 from sfmapp.report.top_view import HEIGHT, MAX_POINTS, WIDTH, fit_page, ground_axes
 
@@ -38,10 +39,16 @@ class PathScene:
     unit: str
 
 
-def path_view_svg(scene: PathScene) -> str:
-    """The scene seen along the mean downward direction of the frames, the first direction of view up the page."""
+def path_view_svg(scene: PathScene, orientation: int = 1) -> str:
+    """The scene seen along the mean downward direction of the frames, the first direction of view up the page.
+
+    Args:
+        scene: what is drawn.
+        orientation: EXIF orientation of the frames.
+    """
     with_pose = np.isfinite(scene.cam_from_world[:, 0])
-    axes = ground_axes(rigid3.rotation_matrix(scene.cam_from_world[with_pose]))
+    poses = scene.cam_from_world[with_pose]
+    axes = ground_axes(rigid3.rotation_matrix(upright_poses(poses, np.full(len(poses), orientation))))
     path = rigid3.center(scene.cam_from_world) @ axes.T
     truth = scene.truth_centers @ axes.T
     # the points may lie far beyond the path: they are the background, and get half its size on each side at most

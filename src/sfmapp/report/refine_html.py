@@ -30,7 +30,7 @@ def render_refine_html(
     body = [f'<p class="dim">{escape(facts)}</p>']
     found = check_contradictions(row for entry in report["maps"]["after"] for row in entry["contradictions"])
     body += [failure_box(report["outcome"]), check_table(found), "<h2>Before and after</h2>" + _comparison(report)]
-    body.append(trajectory_views(result, truth, against))
+    body.append(trajectory_views(result, truth, against, report["orientation"]))
     body.append(_photographs(report["photographs"], report["skipped"]))
     body.append(usage_table(report["usage"], run))
     body.append(log_table("Warnings", report["warnings"]) + log_table("Decisions", report["decisions"]))

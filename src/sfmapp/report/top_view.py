@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.orientation import upright_poses
 
 if TYPE_CHECKING:
     from sfmapp.scene.reconstruction import Reconstruction
@@ -20,10 +22,18 @@ WIDTH, HEIGHT = 1000.0, 560.0
 MAX_POINTS = 4000
 
 
-def top_view_svg(model: Reconstruction) -> str:
-    """Points in their colours and cameras as triangles, seen along the mean downward direction of the images."""
+def top_view_svg(model: Reconstruction, orientation: Sequence[int] | None = None) -> str:
+    """Points in their colours and cameras as triangles, seen along the mean downward direction of the images.
+
+    Args:
+        model: of I images.
+        orientation: EXIF orientations of the images; None: all are upright as they are stored.
+    """
     registered = model.registered_idx
-    rotation = rigid3.rotation_matrix(model.cam_from_world[registered])
+    poses = model.cam_from_world
+    if orientation is not None:
+        poses = upright_poses(poses, orientation)
+    rotation = rigid3.rotation_matrix(poses[registered])
     axes = ground_axes(rotation)
     centers = model.centers[registered] @ axes.T
     points_idx = np.flatnonzero(model.is_triangulated)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sfmapp.dense.scene import DenseScene, Patches
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.orientation import ROTATION_OF, upright_pinhole, upright_pixels, upright_poses
 from sfmapp.geometry.upright import up_direction
 from sfmapp.scene.mesh import Mesh
 from sfmapp.viewer.handover import load_fields, save_fields
@@ -38,8 +39,8 @@ class DenseReplay:
         origin: (3,) float64, what was taken off all places; zero unless the scene is far from the world's origin.
         up: (3,) float64 direction in the world that is up.
         view_names: V names.
-        cam_from_world: (V, 7) float64, in the world that begins at ``origin``.
-        view_k: (V, 4) float64 and view_size: (V, 2) int64, of the small photographs.
+        cam_from_world: (V, 7) float64, in the world that begins at ``origin``, rolled until the pictures are upright.
+        view_k: (V, 4) float64 and view_size: (V, 2) int64, of the small photographs, which are upright.
         photo: (B,) uint8 JPEG files one after the other; photo_ptr: (V + 1,) their limits.
         xyz: (N, 3) float32, ordered by wave. rgb: (N, 3) uint8. radius: (N,) float32, world units.
         num_views: (N,) int64. score: (N,) float32. sigma_px: (N,) float32, in pixels of the reference image on the
@@ -106,7 +107,7 @@ def make_dense_replay(
         up: (3,) direction in the world that is up; None: judged from the cameras.
         max_points: to show.
     """
-    poses = scene.cam_from_world
+    poses, upright = scene.cam_from_world, scene.upright_cam_from_world
     origin = _origin(patches.xyz if len(patches) else scene.centers)
     shifted = poses.copy()
     # x_cam = R (x - origin) + (R origin + t)
@@ -117,8 +118,8 @@ def make_dense_replay(
     places = (shown.xyz - origin).astype(np.float32)
     return DenseReplay(
         title=title, num_patches=len(patches), origin=origin,
-        up=np.asarray(up, np.float64) if up is not None else up_direction(poses if len(poses) else None),
-        cam_from_world=shifted, **_photos(scene),
+        up=np.asarray(up, np.float64) if up is not None else up_direction(upright if len(poses) else None),
+        cam_from_world=upright_poses(shifted, [view.orientation for view in scene.views]), **_photos(scene),
         xyz=places, rgb=shown.rgb, radius=_radii(places, shown.size),
         num_views=shown.num_views.astype(np.int64), score=shown.score, sigma_px=shown.sigma / shown.size,
         step_wave=step_wave,
@@ -178,10 +179,13 @@ def _radii(xyz: Float32, size: Float32) -> Float32:
 def _photos(scene: DenseScene) -> dict[str, Any]:
     count = max(1, len(scene.views))
     side = int(np.clip(_PHOTO_SIDE_PX[1] * np.sqrt(_PHOTO_BUDGET / count), *_PHOTO_SIDE_PX))
-    shown = [shrunk_jpeg(view.rgb[:, :, ::-1], side, _PHOTO_QUALITY) for view in scene.views]
+    # a mirror stays: it is in the world, too
+    turns = [ROTATION_OF[view.orientation] for view in scene.views]
+    upright = [upright_pixels(view.rgb, turn) for view, turn in zip(scene.views, turns, strict=True)]
+    shown = [shrunk_jpeg(rgb[:, :, ::-1], side, _PHOTO_QUALITY) for rgb in upright]
     size = np.array([s for _, s in shown], np.int64).reshape(-1, 2)
-    full = np.array([(view.width, view.height) for view in scene.views], np.float64).reshape(-1, 2)
-    k = np.array([view.k for view in scene.views]).reshape(-1, 4)
+    full = np.array([rgb.shape[1::-1] for rgb in upright], np.float64).reshape(-1, 2)
+    k = np.array([upright_pinhole(v.orientation, v.k, v.width, v.height) for v in scene.views]).reshape(-1, 4)
     return {
         "view_names": [view.name for view in scene.views],
         "view_k": k * np.tile(size / full, 2),

@@ -91,7 +91,7 @@ class LiveView:
             "begin", title=os.path.basename(os.path.abspath(sequence.source)) or sequence.source, camera=camera,
             truth_times=None if truth is None else truth.timestamps_s,
             truth_cam_from_world=None if truth is None else truth.cam_from_world,
-            is_metric=sequence.rig.is_stereo,
+            is_metric=sequence.rig.is_stereo, orientation=sequence.orientation,
         )  # fmt: skip
 
     def __call__(self, event: Event) -> None:

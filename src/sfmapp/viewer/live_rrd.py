@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from sfmapp.evaluation.trajectory import Alignment, Trajectory
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.geometry.orientation import upright_pixels, upright_poses, upright_xy
 from sfmapp.geometry.upright import up_direction
 from sfmapp.images.sources import printable
 from sfmapp.odometry.result import FrameState
@@ -81,6 +82,8 @@ class LiveDrawing:
 
     def _begin(self, message: Mapping[str, Any]) -> None:
         recording, self._camera = self._recording, message["camera"]
+        self._orientation = message["orientation"]
+        self._rotation = turn_to_z(up_direction(upright_poses(rigid3.IDENTITY[None], [self._orientation])))
         self._has_truth = message["truth_times"] is not None
         if self._has_truth:
             poses = message["truth_cam_from_world"]
@@ -200,7 +203,8 @@ class LiveDrawing:
         bodies, headings = self._draw_final(message)
         has_pose = (message["frame_map"] == 0) & np.isfinite(message["cam_from_world"][:, 0])
         poses = message["cam_from_world"][has_pose]
-        rotation = turn_to_z(up_direction(poses[:: max(1, len(poses) // 1000)]))
+        poses = poses[:: max(1, len(poses) // 1000)]
+        rotation = turn_to_z(up_direction(upright_poses(poses, np.full(len(poses), self._orientation))))
         recording.log("world/scene", rr.Transform3D(mat3x3=rotation), static=True)
         direction = eye_direction((headings @ rotation.T).mean(0))
         eye = frame_view(np.concatenate(bodies) @ rotation.T, direction)
@@ -244,8 +248,9 @@ class LiveDrawing:
         recording = self._recording
         if message["image"] is None:
             return
-        height, width = message["image"].shape
-        data, (shown_width, _) = shrunk_jpeg(message["image"], _IMAGE_SIDE_PX, _IMAGE_QUALITY)
+        upright = upright_pixels(message["image"], self._orientation)
+        height, width = upright.shape
+        data, (shown_width, _) = shrunk_jpeg(upright, _IMAGE_SIDE_PX, _IMAGE_QUALITY)
         recording.log("image", rr.EncodedImage(contents=data, media_type="image/jpeg"))
         if (message["state"] == FrameState.LOST) != self._is_lost:
             self._is_lost = not self._is_lost
@@ -254,7 +259,8 @@ class LiveDrawing:
             recording.log("image/lost", frame if self._is_lost else rr.Clear(recursive=False))
         empty = np.zeros((0, 2), np.float32)
         xy, is_mapped = (empty, np.zeros(0, bool)) if message["xy"] is None else (message["xy"], message["is_mapped"])
-        xy = xy * (shown_width / width)
+        stored_height, stored_width = message["image"].shape
+        xy = upright_xy(self._orientation, xy, stored_width, stored_height) * (shown_width / width)
         recording.log("image/mapped", rr.Points2D.from_fields(positions=xy[is_mapped]))
         recording.log("image/tracked", rr.Points2D.from_fields(positions=xy[~is_mapped]))
 

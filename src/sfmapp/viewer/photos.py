@@ -8,14 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from sfmapp.geometry.orientation import MIRRORED, upright_pixels
 from sfmapp.images.headers import UnusableImage, read_header
 from sfmapp.images.pixels import decode_bytes, to_8_bits
 
-# EXIF orientation: (swap rows and columns, then flip rows, then flip columns)
-_TURNS = {
-    1: (False, False, False), 2: (False, False, True), 3: (False, True, True), 4: (False, True, False),
-    5: (True, False, False), 6: (True, False, True), 7: (True, True, True), 8: (True, True, False),
-}  # fmt: skip
 # A JPEG this small goes in as it is: encoding it again would cost time and quality.
 _KEEP_BYTES = 400_000
 _QUALITY = 82
@@ -24,7 +20,10 @@ _THUMBNAIL_QUALITY = 75
 
 @dataclass(frozen=True)
 class ScreenPhoto:
-    """A photograph and its thumbnail as JPEG bytes, and their sizes (width, height)."""
+    """An upright photograph and its thumbnail as JPEG bytes, and their sizes (width, height).
+
+    The thumbnail stands among points: of a file that is a mirror image it remains one, as those of its model are.
+    """
 
     photo: bytes
     size: tuple[int, int]
@@ -50,15 +49,15 @@ def load_screen_photo(path: Path, orientation: int, max_side_px: int, thumbnail_
         pixels = None if raw is None else _as_bgr(to_8_bits(raw))
     if pixels is None:
         return None
-    swap, flip_rows, flip_columns = _TURNS.get(orientation, _TURNS[1])
-    pixels = pixels.swapaxes(0, 1) if swap else pixels
-    pixels = np.ascontiguousarray(pixels[:: -1 if flip_rows else 1, :: -1 if flip_columns else 1])
+    pixels = upright_pixels(pixels, orientation)
     is_fit = is_jpeg and orientation == 1 and max(pixels.shape[:2]) <= max_side_px and len(data) <= _KEEP_BYTES
     # a reduced decode may have made it fit: the file itself has not changed
     is_fit = is_fit and (header.height, header.width) == pixels.shape[:2]
     pixels = _shrink(pixels, max_side_px)
     photo = data if is_fit else _jpeg(pixels, _QUALITY)
     thumbnail = _shrink(pixels, thumbnail_px)
+    if orientation in MIRRORED:
+        thumbnail = np.ascontiguousarray(thumbnail[:, ::-1])
     return ScreenPhoto(photo, pixels.shape[1::-1], _jpeg(thumbnail, _THUMBNAIL_QUALITY), thumbnail.shape[1::-1])
 
 

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import similarity
+from sfmapp.geometry.orientation import upright_pinhole, upright_poses, upright_size, upright_vectors, upright_xy
 from sfmapp.geometry.upright import up_direction
 from sfmapp.viewer.handover import load_fields, save_fields
 
 if TYPE_CHECKING:
-    from sfmapp.images.image_set import ImageSet
+    from sfmapp.images.image_set import ImageRecord, ImageSet
     from sfmapp.scene.features import Features
     from sfmapp.scene.reconstruction import Reconstruction
     from sfmapp.viewer.listener import Message, Step
@@ -36,6 +37,9 @@ MAX_LOOSE_KEYPOINTS = 2000
 @dataclass(frozen=True)
 class Replay:
     """A run, ready to be drawn. S steps, I images, M models (largest first), P pose and C cloud snapshots.
+
+    Photographs are shown upright: their cameras are rolled until they are (:mod:`sfmapp.geometry.orientation`), and all
+    pixels are counted in the upright picture.
 
     Attributes:
         title: shown on the recording.
@@ -123,7 +127,9 @@ def make_replay(
         up: (3,) direction in the world that is up; None: judged from the cameras of each model.
     """
     num_images = len(image_set.images)
+    orientation = np.array([record.orientation for record in image_set.images], np.int64)
     final_poses = np.array([r.cam_from_world for r in reconstructions], np.float64).reshape(-1, num_images, 7)
+    upright = upright_poses(final_poses, orientation)
     image_model = np.full(num_images, -1, np.int64)
     for m in reversed(range(len(reconstructions))):
         image_model[~np.isnan(final_poses[m, :, 0])] = m
@@ -131,15 +137,17 @@ def make_replay(
         title=title,
         image_names=[record.name for record in image_set.images],
         image_paths=[str(record.path) for record in image_set.images],
-        image_size=np.array([(r.width, r.height) for r in image_set.images], np.int64).reshape(-1, 2),
-        image_orientation=np.array([r.orientation for r in image_set.images], np.int64),
+        image_size=np.array(
+            [upright_size(r.orientation, r.width, r.height) for r in image_set.images], np.int64
+        ).reshape(-1, 2),
+        image_orientation=orientation,
         image_model=image_model,
-        image_intrinsics=_intrinsics(reconstructions, image_model),
-        model_cam_from_world=final_poses.astype(np.float32),
+        image_intrinsics=_intrinsics(reconstructions, image_model, orientation),
+        model_cam_from_world=upright.astype(np.float32),
         **_final_points(reconstructions),
-        **_history(steps, messages, reconstructions, final_poses, image_model),
-        **_observations(features, reconstructions, image_model),
-        up=np.asarray(up, np.float64) if up is not None else up_direction(final_poses[0] if len(final_poses) else None),
+        **_history(steps, messages, reconstructions, final_poses, image_model, orientation),
+        **_observations(features, reconstructions, image_model, image_set.images),
+        up=np.asarray(up, np.float64) if up is not None else up_direction(upright[0] if len(upright) else None),
     )
 
 
@@ -181,7 +189,7 @@ def _to_final_frame(
 
 def _history(
     steps: Sequence[Step], messages: Sequence[Message], reconstructions: Sequence[Reconstruction],
-    final_poses: NDArray[np.float64], image_model: Ints,
+    final_poses: NDArray[np.float64], image_model: Ints, orientation: Ints,
 ) -> dict[str, Any]:  # fmt: skip
     """All that has a place in time: numbers, poses, points, registrations, messages."""
     # images that were registered together follow each other, so that each is seen; 0 is before the first
@@ -211,7 +219,9 @@ def _history(
         ),
         "pose_step": np.array([ends[k] for k, _, _ in kept], np.int64),
         "pose_model": np.array([model_of[k] for k, _, _ in kept], np.int64),
-        "pose_cam_from_world": np.array([p for _, p, _ in kept], np.float32).reshape(-1, len(image_model), 7),
+        "pose_cam_from_world": upright_poses(
+            np.array([p for _, p, _ in kept], np.float64).reshape(-1, len(image_model), 7), orientation
+        ).astype(np.float32),
         "cloud_step": np.array([ends[k] for k, _ in clouds], np.int64),
         "cloud_model": np.array([model_of[k] for k, _ in clouds], np.int64),
         "cloud_ptr": _offsets([len(xyz) for _, xyz in clouds]),
@@ -248,7 +258,10 @@ def _join(parts: Sequence[NDArray[Any]], width: int, dtype: Any) -> NDArray[Any]
 
 
 def _observations(
-    features: Sequence[Features], reconstructions: Sequence[Reconstruction], image_model: Ints
+    features: Sequence[Features],
+    reconstructions: Sequence[Reconstruction],
+    image_model: Ints,
+    records: Sequence[ImageRecord],
 ) -> dict[str, Any]:
     residuals = [r.residuals_px() for r in reconstructions]
     seen_xy, seen_residual, loose_xy = [], [], []
@@ -261,9 +274,11 @@ def _observations(
             obs = obs[reconstructions[model].obs_is_inlier[obs]]
             is_loose[tracks.obs_feature_idx[obs]] = False
             xy, residual = tracks.obs_xy[obs], residuals[model][obs]
-        seen_xy.append(xy)
-        seen_residual.append(residual)
-        loose_xy.append(feature.keypoints[is_loose][:MAX_LOOSE_KEYPOINTS, :2])
+        record = records[image_idx]
+        loose = feature.keypoints[is_loose][:MAX_LOOSE_KEYPOINTS, :2]
+        seen_xy.append(upright_xy(record.orientation, xy, record.width, record.height))
+        seen_residual.append(upright_vectors(record.orientation, residual))
+        loose_xy.append(upright_xy(record.orientation, loose, record.width, record.height))
     return {
         "obs_ptr": _offsets([len(xy) for xy in seen_xy]),
         "obs_xy": _join(seen_xy, 2, np.float32),
@@ -273,11 +288,13 @@ def _observations(
     }
 
 
-def _intrinsics(reconstructions: Sequence[Reconstruction], image_model: Ints) -> Float32:
+def _intrinsics(reconstructions: Sequence[Reconstruction], image_model: Ints, orientation: Ints) -> Float32:
     out = np.full((len(image_model), 4), np.nan, np.float32)
     for image_idx in np.flatnonzero(image_model >= 0):
         reconstruction = reconstructions[image_model[image_idx]]
-        out[image_idx] = reconstruction.cameras[reconstruction.image_camera_idx[image_idx]].canonical[:4]
+        camera = reconstruction.cameras[reconstruction.image_camera_idx[image_idx]]
+        turn = int(orientation[image_idx])
+        out[image_idx] = upright_pinhole(turn, camera.canonical[:4], camera.width, camera.height)
     return out
 
 

@@ -1,0 +1,99 @@
+"""Models count in the pixels of the files, whatever their EXIF orientation; others do not, and must not be mixed up.
+
+Others are workspaces of earlier versions, which counted in pictures turned upright, and true cameras of such pictures.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sfmapp.errors import InputError
+from sfmapp.evaluation.poses import evaluate_poses
+from sfmapp.geometry import rigid3
+from sfmapp.geometry.orientation import INVERSE, MIRRORED, ROTATION_OF, upright_poses
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sfmapp.formats.truth import Truth
+    from sfmapp.scene.reconstruction import Reconstruction
+
+# what the mapping notes of its model in the manifest; earlier versions noted nothing
+STORED = "stored"
+# where the truth is of pictures that were turned, turning it back leaves this share of the rotation errors at most
+_TURNED_SHARE = 0.2
+
+
+def has_stored_pixels(manifest: Mapping[str, Any]) -> bool:
+    """Whether the model of a reconstruction counts in the pixels of the files."""
+    return bool(manifest.get("stages", {}).get("mapping", {}).get("pixels") == STORED)
+
+
+def orientations_of(folder: Path) -> dict[str, int]:
+    """EXIF orientation of each photograph of a reconstruction, by name, as its report tells; empty without one."""
+    try:
+        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        rows = report.get("stages", {}).get("images", {}).get("images", [])
+        return {str(row["name"]): int(row["orientation"]) for row in rows}
+    except (OSError, ValueError, AttributeError, KeyError, TypeError):
+        return {}
+
+
+def check_pixels(folder: Path, manifest: Mapping[str, Any]) -> None:
+    """The model of a workspace has to fit its photographs as other programs read them.
+
+    Raises:
+        InputError: it was made by a version that turned pictures upright, and there were some to turn.
+    """
+    if has_stored_pixels(manifest):
+        return
+    turned = [name for name, orientation in orientations_of(folder).items() if orientation != 1]
+    if turned:
+        raise InputError(
+            f"{folder}: expected a model in the pixels of the files, found one of an earlier version of sfmapp, which "
+            f"turned {len(turned)} of the photographs upright as EXIF says, {turned[0]} for one",
+            f"run it again: sfmapp reconstruct {manifest.get('source') or 'PHOTOS'} -o {folder}",
+        )
+
+
+def truth_in_stored_pixels(
+    truth: Truth, model: Reconstruction, orientations: Mapping[str, int], notes: list[str]
+) -> Truth:
+    """The same cameras with axes along those of the files, if they evidently are those of pictures turned upright.
+
+    Args:
+        truth: with the names of the photographs.
+        model: whose errors tell.
+        orientations: EXIF's, by name of the photograph.
+        notes: told if the truth was turned.
+    """
+    held = [orientations.get(name, 1) for name in truth.names]
+    if not held or all(orientation == 1 for orientation in held):
+        return truth
+    poses, is_mirrored = truth.cam_from_world, all(orientation in MIRRORED for orientation in held)
+    if is_mirrored:  # and so is the world that their model is of
+        mirror = np.diag([-1.0, 1.0, 1.0])
+        poses = rigid3.from_matrix(mirror @ rigid3.rotation_matrix(poses) @ mirror, poses[:, 4:] @ mirror)
+    poses = upright_poses(poses, [INVERSE[ROTATION_OF[orientation]] for orientation in held])
+    as_given, as_stored = (_rotation_error(model, truth, known) for known in (truth.cam_from_world, poses))
+    if not as_stored < _TURNED_SHARE * as_given:
+        return truth
+    notes.append(
+        "the truth is of pictures turned upright as EXIF says: its cameras were turned back to the pixels of the files"
+        + (", and mirrored as these are" if is_mirrored else "")
+        + f" (median rotation error {as_stored:.3g} degrees, as given {as_given:.3g})"
+    )
+    return replace(truth, cam_from_world=poses)
+
+
+def _rotation_error(model: Reconstruction, truth: Truth, poses: NDArray[np.float64]) -> float:
+    """Median in degrees; NaN without two common images."""
+    errors = evaluate_poses(model.image_names, model.cam_from_world, truth.names, poses).rotation_error_deg
+    known = errors[np.isfinite(errors)]
+    return float(np.median(known)) if len(known) else np.nan
