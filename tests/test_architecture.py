@@ -43,11 +43,12 @@ ALLOWED = {
     "pycolmap": {"formats", "evaluation"},
     "open3d": {"surface"},
     "xatlas": {"surface"},
+    "av": {"images"},
     "rich": {"cli"},
     "argparse": {"cli", "evaluation", "viewer"},
 }
 # modules that "sfmapp --help" may not load
-HEAVY = ("numpy", "numba", "cv2", "gtsam", "pycolmap", "rerun", "scipy", "PIL", "rich")
+HEAVY = ("numpy", "numba", "cv2", "av", "gtsam", "pycolmap", "rerun", "scipy", "PIL", "rich")
 
 
 def modules() -> list[Path]:

@@ -150,6 +150,57 @@ def test_nothing_is_compiled_while_frames_are_tracked(room: Path, tmp_path: Path
     assert watch.compiled == []
 
 
+def test_frames_that_repeat_the_one_before_have_its_pose(room: Path, tmp_path: Path) -> None:
+    """In the trajectory, as it was given out, smoothed, with its covariance, and after a refinement."""
+    from PIL import Image
+
+    (tmp_path / "frames").mkdir()
+    originals = sorted((room / "frames").iterdir())[:30]
+    twins: dict[str, str] = {}
+    for k, path in enumerate(originals):
+        last = f"{2 * k / FPS:.6f}.png"
+        shutil.copy(path, tmp_path / "frames" / last)
+        if k in (0, 7, 8, 20, 29):  # byte for byte, and the same pixels written otherwise
+            name = f"{(2 * k + 1) / FPS:.6f}.png"
+            twins[name] = last
+            if k == 8:
+                Image.open(path).save(tmp_path / "frames" / name, compress_level=1)
+            else:
+                shutil.copy(path, tmp_path / "frames" / name)
+    output = tmp_path / "out"
+    told: list[Event] = []
+    options = options_of(room, "odometry.smooth=true", "sequence.truth=" + str(room / "truth.txt"))
+    result, report = track_sequence(tmp_path / "frames", output, options, record=False, events=Events(told.append))
+    row = {Path(name).name: k for k, name in enumerate(result.frame_names)}
+    assert len(row) == 35
+    assert report["frames"]["repeated"] == 5
+    assert report["frames"]["num_unreadable"] == 0
+    assert any("5 of 35 frames repeat the one before them" in event.message for event in told)
+    refine(output, tmp_path / "refined", options_of(room))
+    tables = {name: read_tum(output / name) for name in ("trajectory.tum", "trajectory_live.tum")}
+    tables |= {"smooth": read_tum(output / "trajectory_smooth.tum")}
+    tables |= {"refined": read_tum(tmp_path / "refined" / "trajectory.tum")}
+    assert result.covariance is not None
+    for twin, original in twins.items():
+        a, b = row[twin], row[original]
+        assert result.frame_state[a] == FrameState.REPEATED != result.frame_state[b]
+        assert np.array_equal(result.cam_from_world[a], result.cam_from_world[b])
+        assert np.array_equal(result.covariance[a], result.covariance[b])
+        for name, (times, poses) in tables.items():
+            of_time = dict(zip(times, poses, strict=True))
+            ours, theirs = (of_time.get(repr(float(result.timestamps_s[k]))) for k in (a, b))
+            if name == "trajectory_live.tum" and theirs is None:  # nothing was known yet
+                assert ours is None
+                continue
+            assert ours is not None, name
+            assert np.array_equal(ours, theirs), name
+    assert len(tables["trajectory_live.tum"][0]) > 10
+    assert np.isfinite(result.cam_from_world).all()
+    assert not (output / "trajectory.kitti.frames").exists()
+    names = [Path(line.split(",")[3]).name for line in (output / "frame_covariance.csv").read_text().splitlines()[1:]]
+    assert set(twins) <= set(names)
+
+
 # ------------------------------------------------------------------------------------------------------------- refined
 
 

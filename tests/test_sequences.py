@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import itertools
 import json
@@ -21,7 +20,7 @@ from hypothesis import strategies as st
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Event, Events
 from sfmapp.formats.kitti import read_kitti, write_kitti
-from sfmapp.formats.sequence_files import ascending, confined, frame_numbers, timestamp_of
+from sfmapp.formats.sequence_files import ascending, confined, frame_numbers
 from sfmapp.formats.sequences import MissingCameraError, SequenceOptions, open_sequence
 from sfmapp.formats.trajectory import write_tum
 from sfmapp.geometry import rigid3
@@ -846,24 +845,6 @@ def test_reading_ahead_is_bounded_in_order_and_passes_failures_on() -> None:
 
 
 # ------------------------------------------------------------------------------------------------------------- values
-
-
-@pytest.mark.parametrize(
-    ("text", "seconds"),
-    [
-        ("0", 0), ("12", 12), ("1305031102.175304", 1305031102.175304), ("1305031102", 1305031102),
-        ("1305031102175", 1305031102.175), ("1305031102175304", 1305031102.175304),
-        ("1403636579763555584", 1403636579.763555584), ("0.000000e+00", 0), ("1.036e-01", 0.1036),
-    ],
-)  # fmt: skip
-def test_units_of_time(text: str, seconds: float) -> None:
-    assert timestamp_of(text) == pytest.approx(seconds, abs=1e-7)
-
-
-@given(st.text(alphabet="0123456789.e+-naif _", max_size=40))
-def test_times_are_finite_or_refused(text: str) -> None:
-    with contextlib.suppress(ValueError):
-        assert np.isfinite(timestamp_of(text))
 
 
 @given(st.lists(st.integers(0, 300), min_size=2, max_size=20, unique=True))

@@ -234,7 +234,8 @@ def test_a_fit_that_is_good_needs_no_resampling() -> None:
         ("c.xml", "<a><b></a>", "expected XML"),
         ("c.txt", "1 2 3", "expected fx fy cx cy"),
         ("c.txt", "1 PINHOLE 640 480 5", "PINHOLE has 4 parameters"),
-        ("c.txt", "1 THIN_PRISM_FISHEYE 640 480 5", "'name: value'"),
+        ("c.txt", "1 THIN_PRISM_FISHEYE 640 480 5", "camera model THIN_PRISM_FISHEYE is not supported"),
+        ("c.txt", "1 FULL_OPENCV 640 480 5 5 320 240", "FULL_OPENCV has 12 parameters, found 4"),
         ("c.yaml", "just text", "'name: value'"),
         ("c.yaml", "", "'name: value'"),
     ],
@@ -243,6 +244,149 @@ def test_calibrations_that_are_none(tmp_path: Path, name: str, text: str, messag
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=message):
         read_calibration(tmp_path / name, [SIZE])
+
+
+EQUI = (0.02, 0.005, -0.002, 0.001)
+RATIONAL = {"k1": 0.50, "k2": -0.10, "p1": 0.0007, "p2": -0.0002, "k3": 0.01, "k4": 0.80, "k5": -0.10, "k6": 0.02}
+FXY = {"fx": 500, "fy": 501, "cx": 319, "cy": 239}
+
+
+def opencv_matrix(rows: int, columns: int, values: object) -> str:
+    return f"!!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: {values}\n"
+
+
+def orb_slam(kind: str, number: str = "1", **coefficients: float) -> str:
+    rows = "".join(f"Camera{number}.{name}: {value}\n" for name, value in (FXY | coefficients).items())
+    return f'%YAML:1.0\n---\nFile.version: "1.0"\nCamera.type: "{kind}"\n{rows}Camera.width: 640\nCamera.height: 480\n'
+
+
+def kalibr(model: str, distortion: str, coefficients: object = EQUI) -> str:
+    return (
+        f"cam0:\n  camera_model: {model}\n  distortion_model: {distortion}\n  distortion_coeffs: {list(coefficients)}\n"  # type: ignore[call-overload]
+        "  intrinsics: [500, 501, 319, 239]\n  resolution: [640, 480]\n"
+    )
+
+
+K4 = dict(zip(("k1", "k2", "k3", "k4"), EQUI, strict=True))
+FISHEYES = {
+    "orb3.yaml": orb_slam("KannalaBrandt8", **K4),
+    "opencv.yml": "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\nfisheye_model: 1\n"
+    f"camera_matrix: {opencv_matrix(3, 3, MATRIX.ravel().tolist())}"
+    f"distortion_coefficients: {opencv_matrix(4, 1, list(EQUI))}",
+    "model.json": json.dumps(FXY | K4 | {"model": "fisheye"}),
+    "flag.json": json.dumps(FXY | K4 | {"fisheye": True}),
+    "lens.json": json.dumps({"K": MATRIX.tolist(), "dist": EQUI, "lens_type": "OPENCV_FISHEYE"}),
+    "nested.json": json.dumps({"K": MATRIX.tolist(), "distortion": {"type": "kannala_brandt4", **K4}}),
+    "pair.json": json.dumps({"model": "fisheye", "cam0": {"K": MATRIX.tolist(), "D": EQUI}}),
+    "rows.json": json.dumps({"distortion_model": "equidistant", "K1": MATRIX.tolist(), "D1": EQUI}),
+    "ros.yaml": ROS.replace("plumb_bob", "equidistant").replace("[-0.28, 0.07, 0.0002, -0.0003, 0]", str(list(EQUI))),
+    "ros2.yaml": ROS.replace("plumb_bob", "fisheye").replace("[-0.28, 0.07, 0.0002, -0.0003, 0]", str(list(EQUI))),
+    "camchain.yaml": kalibr("pinhole", "equidistant"),
+    "vins.yaml": "%YAML:1.0\n---\nmodel_type: KANNALA_BRANDT\ncamera_name: cam0\nimage_width: 640\nimage_height: 480\n"
+    "projection_parameters:\n" + "".join(f"   k{n + 2}: {value}\n" for n, value in enumerate(EQUI))
+    + "   mu: 500\n   mv: 501\n   u0: 319\n   v0: 239\n",
+    "cameras.txt": "1 OPENCV_FISHEYE 640 480 500 501 319.5 239.5 " + " ".join(map(str, EQUI)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FISHEYES)
+def test_fisheye_lenses_by_all_their_names(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text(FISHEYES[name])
+    camera = read_calibration(tmp_path / name, [SIZE]).rig.cameras[0]
+    expected = cv2.fisheye.projectPoints(RAYS[:, None], np.zeros(3), np.zeros(3), MATRIX, np.array(EQUI))[0]
+    np.testing.assert_allclose(project(camera, RAYS), expected.reshape(-1, 2) + 0.5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "lens"),
+    [
+        ("scalars.json", json.dumps(FXY | RATIONAL), list(RATIONAL.values())),
+        ("list.json", json.dumps(FXY | {"dist": list(RATIONAL.values())}), list(RATIONAL.values())),
+        ("named.json", json.dumps(FXY | RATIONAL | {"model": "rational_polynomial"}), list(RATIONAL.values())),
+        ("inside.json", json.dumps({"K": MATRIX.tolist(), "distortion": RATIONAL}), list(RATIONAL.values())),
+        (
+            "prism.json", json.dumps(FXY | {"k1": 0.01, "s1": 0.001, "s4": -0.002, "tau_x": 0.01, "tauy": -0.02}),
+            [0.01, *[0.0] * 7, 0.001, 0, 0, -0.002, 0.01, -0.02],
+        ),
+        ("orb.yaml", orb_slam("PinHole", k1=-0.28, k2=0.07, p1=0.0002, p2=-0.0003, k3=0.1), [*LENS, 0.1]),
+        ("orb1.yaml", orb_slam("Rectified"), [0.0] * 5),
+        ("kalibr.yaml", kalibr("pinhole", "none", []), [0.0] * 5),
+        ("opencv.json", json.dumps(FXY | {"fisheye_model": 0, "k1": 0.1}), [0.1, 0, 0, 0]),
+        (
+            "cameras.txt", "1 FULL_OPENCV 640 480 500 501 319.5 239.5 " + " ".join(map(str, RATIONAL.values())),
+            list(RATIONAL.values()),
+        ),
+    ],
+)  # fmt: skip
+def test_all_coefficients_of_perspective_lenses_count(tmp_path: Path, name: str, text: str, lens: list[float]) -> None:
+    (tmp_path / name).write_text(text)
+    calibration = read_calibration(tmp_path / name, [SIZE])
+    camera, full = calibration.rig.cameras[0], calibration.lenses[0]
+    if full is not None:  # frames are resampled from the lens itself
+        expected = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), MATRIX, np.array(lens))[0].reshape(-1, 2)
+        np.testing.assert_allclose(full.project(RAYS[:, :2]), expected, atol=1e-9)
+    else:
+        assert_is_opencvs(camera, np.array(lens), 1e-9 if len(lens) < 5 or not any(lens[4:]) else 0.3)
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("FISHEYE", [500, 501, 319.5, 239.5]),
+        ("SIMPLE_FISHEYE", [500, 319.5, 239.5]),
+        ("SIMPLE_RADIAL_FISHEYE", [500, 319.5, 239.5, 0.02]),
+        ("RADIAL_FISHEYE", [500, 319.5, 239.5, 0.02, -0.004]),
+        ("SIMPLE_RADIAL", [500, 319.5, 239.5, -0.1]),
+    ],
+)
+def test_colmaps_models_against_pycolmap(tmp_path: Path, model: str, params: list[float]) -> None:
+    import pycolmap
+
+    (tmp_path / "cameras.txt").write_text(f"# a comment\n1 {model} 640 480 {' '.join(map(str, params))}\n")
+    (tmp_path / "c.json").write_text(json.dumps({"model": model, "width": 640, "height": 480, "params": params}))
+    theirs = pycolmap.Camera(model=model, width=640, height=480, params=params)
+    for name in ("cameras.txt", "c.json"):
+        camera = read_calibration(tmp_path / name, [SIZE]).rig.cameras[0]
+        np.testing.assert_allclose(project(camera, RAYS), theirs.img_from_cam(RAYS), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (kalibr("omni", "radtan"), "camera_model pinhole.* found 'omni'"),
+        (kalibr("ds", "none", []), "found 'ds'"),
+        (kalibr("eucm", "none", []), "found 'eucm'"),
+        (kalibr("pinhole", "fov", [0.9]), "distortion model .* found 'fov'"),
+        (kalibr("pinhole", "none"), "no coefficients of a lens without distortion"),
+        (orb_slam("KannalaBrandt8", **K4).replace("KannalaBrandt8", "Scaramuzza"), "type pinhole.* found 'Scaramuzza'"),
+        (orb_slam("KannalaBrandt8", p1=0.1), "found p1 as well"),
+        (orb_slam("PinHole") + "LEFT.K: [1, 2]\n", "rectifies with LEFT.K"),
+        ("model: fisheye\ndistortion_model: plumb_bob\nK: [500, 0, 319, 0, 501, 239, 0, 0, 1]\n", "one type of lens"),
+        ("fisheye_model: 2\nK: [500, 0, 319, 0, 501, 239, 0, 0, 1]\n", "fisheye_model of 0 or 1"),
+        ("".join(f"{name}: {value}\n" for name, value in (FXY | K4).items()), "k4 without k5 and k6"),
+        ("model_type: MEI\nmirror_parameters:\n  xi: 1.9\nprojection_parameters:\n  gamma1: 800\n", "catadioptric"),
+    ],
+)
+def test_types_that_are_not_known_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "c.yaml").write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        read_calibration(tmp_path / "c.yaml", [SIZE])
+    assert caught.value.advice
+
+
+def test_a_pair_of_orb_slam(tmp_path: Path) -> None:
+    """T_c1_c2 takes points of the second camera to the first."""
+    pose = "".join(f"{v}, " for v in [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]).rstrip(", ")
+    text = orb_slam("KannalaBrandt8", **K4) + "".join(f"Camera2.{k}: {v}\n" for k, v in (FXY | K4).items())
+    (tmp_path / "a.yaml").write_text(f"{text}Camera.fps: 20\nStereo.T_c1_c2: {opencv_matrix(4, 4, f'[{pose}]')}")
+    calibration = read_calibration(tmp_path / "a.yaml", [SIZE, SIZE])
+    np.testing.assert_allclose(calibration.rig.cam_from_rig[1], [0, 0, 0, 1, -0.1, 0, 0])
+    assert [camera.model for camera in calibration.rig.cameras] == [CameraModel.OPENCV_FISHEYE] * 2
+    assert calibration.frames_per_second == 20
+    (tmp_path / "b.yaml").write_text(orb_slam("Rectified") + "Stereo.b: 0.12\n")
+    assert read_calibration(tmp_path / "b.yaml", [SIZE, SIZE]).rig.cam_from_rig[1, 4] == -0.12
+    (tmp_path / "c.yaml").write_text(orb_slam("PinHole", "").replace("1.0", "1") + "Camera.bf: 60\n")
+    assert read_calibration(tmp_path / "c.yaml", [SIZE, SIZE]).rig.cam_from_rig[1, 4] == -0.12
 
 
 def test_the_samples_of_opencv(data_root: Path) -> None:

@@ -82,7 +82,7 @@ def _add_sequence_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--stop", metavar="N", help="play the frames before this one")
     group.add_argument("--step", metavar="N", help="play every N-th frame")
     group.add_argument("--reverse", action="store_true", help="play it backwards")
-    group.add_argument("--fps", metavar="RATE", help="frames per second where the sequence does not tell")
+    group.add_argument("--fps", metavar="RATE", help="frames per second, in place of times that the sequence holds")
 
 
 def _add_option_flags(parser: argparse.ArgumentParser) -> None:

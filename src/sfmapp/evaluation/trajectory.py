@@ -81,6 +81,14 @@ class Trajectory:
         return np.asarray(np.isfinite(self.position).all(1) & np.isfinite(self.rotation).all((1, 2)), np.bool_)
 
     @property
+    def world_from_body(self) -> Array:
+        """(N, 7) poses, NaN where there is none."""
+        poses = np.full((len(self), 7), np.nan)
+        kept = self.has_pose
+        poses[kept] = rigid3.from_matrix(self.rotation[kept], self.position[kept])
+        return poses
+
+    @property
     def distance_m(self) -> Array:
         """(N,) length of the path from the first pose to each; no pose may be missing."""
         steps = np.linalg.norm(np.diff(self.position, axis=0), axis=1)

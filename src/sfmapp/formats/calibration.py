@@ -18,16 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import InputError, UsageError
-from sfmapp.formats.colmap_model import checked_camera
+from sfmapp.formats.colmap_model import MODEL_NAMES
 from sfmapp.formats.flat_yaml import parse_flat_yaml
+from sfmapp.formats.lens_types import LensType, is_without_distortion, lens_type, named_coefficients, type_fields
 from sfmapp.formats.opencv_lens import (
     SIGMA_CALIBRATED,
     CalibratedCamera,
     FullLens,
     Size,
+    camera_from_colmap,
     camera_from_opencv,
     scaled_to,
 )
+from sfmapp.formats.slam_settings import orb_slam_fields, vins_fields
 from sfmapp.formats.text_input import nearest_rotation, read_json_object, read_limited_text
 from sfmapp.geometry import rigid3
 from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel, simple_camera
@@ -41,12 +44,6 @@ _MATRIX_NAMES = ("K", "camera_matrix", "cameraMatrix", "Camera_Matrix", "intrins
 _DISTORTION_NAMES = (
     "distortion_coefficients", "distortion_coeffs", "distCoeffs", "dist_coeffs", "dist_coeff", "distortion", "dist",
     "D", "Distortion_Coefficients",
-)  # fmt: skip
-_SCALAR_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
-_FISHEYE_NAMES = ("equidistant", "fisheye", "kannala_brandt", "kb4", "opencv_fisheye")
-_PERSPECTIVE_NAMES = (
-    "radtan", "radial-tangential", "plumb_bob", "rational_polynomial", "brown", "brown_conrady", "opencv", "pinhole",
-    "none", "",
 )  # fmt: skip
 _PAIR_NAMES = (("cam0", "cam1"), ("left", "right"), ("camera_0", "camera_1"), ("image_0", "image_1"))
 
@@ -102,11 +99,12 @@ def camera_from_text(text: str, size: Size) -> Camera:
 def read_calibration(path: str | Path, image_sizes: Sequence[Size]) -> Calibration:
     """Read a calibration, whichever form it has.
 
-    Known are: ``calib.json`` (fx, fy, cx, cy, or K; k1, k2, p1, p2, k3, or dist; width, height; baseline; fps; or two
-    such objects ``cam0`` and ``cam1``), COLMAP's ``cameras.txt`` (its first camera), EuRoC's ``sensor.yaml``, Kalibr's
-    ``camchain.yaml``, ROS's ``camera_info.yaml``, OpenCV's yml and xml (``camera_matrix`` or ``M1``, ``D1``, ``M2``,
-    ``D2``, ``R``, ``T``), KITTI's ``calib.txt``, and plain text of ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` or of the 3 x 3
-    matrix.
+    Known are: ``calib.json`` (fx, fy, cx, cy, or K; k1, k2, p1, p2, k3 and so on, or dist; model; width, height;
+    baseline; fps; or two such objects ``cam0`` and ``cam1``), COLMAP's ``cameras.txt`` (its first camera), EuRoC's
+    ``sensor.yaml``, Kalibr's ``camchain.yaml``, ROS's ``camera_info.yaml``, OpenCV's yml and xml (``camera_matrix`` or
+    ``M1``, ``D1``, ``M2``, ``D2``, ``R``, ``T``), settings of ORB-SLAM and VINS-Fusion, KITTI's ``calib.txt``, and
+    plain text of ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` or of the 3 x 3 matrix. What they call the lens counts: see
+    :mod:`sfmapp.formats.lens_types`.
 
     Args:
         image_sizes: (width, height) of the images of each camera that is wanted; a calibration of another size but the
@@ -127,7 +125,7 @@ def read_calibration(path: str | Path, image_sizes: Sequence[Size]) -> Calibrati
     rows = [
         line.split() for line in text.replace(",", " ").splitlines() if line.strip() and line.lstrip()[0] not in "#%"
     ]
-    if rows and len(rows[0]) >= 5 and rows[0][1] in CameraModel.__members__:
+    if rows and len(rows[0]) >= 4 and rows[0][1] in MODEL_NAMES.values():
         return _from_colmap(str(path), rows[0], image_sizes)
     if rows and all(re.fullmatch(r"[-+.\deE]+", field) for row in rows for field in row):
         return _from_plain_numbers(str(path), [field for row in rows for field in row], image_sizes)
@@ -141,8 +139,7 @@ def _from_colmap(place: str, fields: list[str], image_sizes: Sequence[Size]) -> 
         raise InputError(
             f"{place}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {' '.join(fields)[:80]}"
         ) from None
-    camera = checked_camera(Path(place), fields[0], fields[1], width, height, params)
-    return _of_cameras(place, [_trusted(camera)], image_sizes)
+    return _of_cameras(place, [camera_from_colmap(place, fields[1], (width, height), params)], image_sizes)
 
 
 def _from_plain_numbers(place: str, fields: list[str], image_sizes: Sequence[Size]) -> Calibration:
@@ -163,12 +160,9 @@ def _from_plain_numbers(place: str, fields: list[str], image_sizes: Sequence[Siz
 
 def calibration_from_fields(place: str, fields: dict[str, Any], image_sizes: Sequence[Size]) -> Calibration:
     """As :func:`read_calibration`, of a JSON-able object; ``place`` begins the messages."""
+    fields = vins_fields(place, orb_slam_fields(place, fields))
     rate = fields.get("fps", fields.get("rate_hz"))
-    fps = float(rate) if isinstance(rate, int | float) and 0 < rate < 1e6 else None
-    # settings of ORB-SLAM
-    for prefix in ("Camera.", "Camera1."):
-        if f"{prefix}fx" in fields:
-            fields = {key.removeprefix(prefix): value for key, value in fields.items()}
+    fps = float(rate) if isinstance(rate, int | float) and not isinstance(rate, bool) and 0 < rate < 1e6 else None
     if "P0" in fields:
         calibration = _from_projections(place, fields, image_sizes, 0)
     elif "M1" in fields or "K1" in fields:
@@ -214,13 +208,15 @@ def _from_sections(place: str, fields: dict[str, Any], pair: Sequence[str], imag
         section = fields.get(name)
         if not isinstance(section, dict):
             break
-        cameras.append(_camera(f"{place}: {name}", section, image_sizes[position]))
+        cameras.append(_camera(f"{place}: {name}", {**type_fields(fields), **section}, image_sizes[position]))
         bodies.append(_body_from_cam(f"{place}: {name}", section))
         if "T_cn_cnm1" in section and position == 1:
             chain = read_pose(f"{place}: {name}: T_cn_cnm1", section["T_cn_cnm1"])
     if len(cameras) == 2:
         if chain is None and bodies[0] is not None and bodies[1] is not None:
             chain = rigid3.compose(rigid3.inverse(bodies[1]), bodies[0])
+        if chain is None and "T_cam0_cam1" in fields:
+            chain = rigid3.inverse(read_pose(f"{place}: T_cam0_cam1", fields["T_cam0_cam1"]))
         if chain is None:
             chain = _beside(place, fields)
     return _of_cameras(place, cameras, image_sizes, bodies[0], chain)
@@ -234,6 +230,7 @@ def _from_opencv_pair(place: str, fields: dict[str, Any], image_sizes: Sequence[
             break
         names = {"K": fields.get(f"{letter}{position + 1}"), "D": fields.get(f"D{position + 1}", [])}
         shared = {key: value for key, value in fields.items() if "size" in key or "width" in key or "height" in key}
+        shared |= type_fields(fields)
         cameras.append(_camera(f"{place}: {letter}{position + 1}", {**shared, **names}, image_sizes[position]))
     second = None
     if "R" in fields and "T" in fields:
@@ -297,19 +294,17 @@ def _camera(place: str, fields: dict[str, Any], image_size: Size) -> CalibratedC
     """One camera of a section, at the size that the section states, or else at that of the images."""
     size = _size(place, fields) or image_size
     if isinstance(fields.get("params"), list) and isinstance(fields.get("model"), str):
-        camera = checked_camera(Path(place), 0, fields["model"].upper(), *size, _numbers(place, fields["params"], None))
-        return _trusted(camera)
-    name = str(fields.get("distortion_model", fields.get("distortion_type", ""))).lower()
-    if name not in _FISHEYE_NAMES + _PERSPECTIVE_NAMES:
-        raise InputError(f"{place}: expected a distortion model such as radtan or equidistant, found {name!r}")
-    if str(fields.get("camera_model", "pinhole")).lower() not in ("pinhole", *_FISHEYE_NAMES):
-        raise InputError(f"{place}: expected camera_model pinhole, found {fields['camera_model']!r}")
-    fisheye = name in _FISHEYE_NAMES or str(fields.get("camera_model", "")).lower() in _FISHEYE_NAMES
-    return camera_from_opencv(place, size, _intrinsics(place, fields), _coefficients(place, fields), fisheye)
-
-
-def _trusted(camera: Camera) -> CalibratedCamera:
-    return CalibratedCamera(replace(camera, focal_sigma=SIGMA_CALIBRATED * camera.focal))
+        return camera_from_colmap(place, fields["model"].upper(), size, _numbers(place, fields["params"], None))
+    nested = [fields[name] for name in (*_MATRIX_NAMES, *_DISTORTION_NAMES) if isinstance(fields.get(name), dict)]
+    sections = [fields, *nested]
+    lens = lens_type(place, sections)
+    intrinsics, coefficients = _intrinsics(place, fields), _coefficients(place, fields, lens)
+    if coefficients.any() and is_without_distortion(sections):
+        raise InputError(
+            f"{place}: expected no coefficients of a lens without distortion, found {coefficients}",
+            "name the distortion model, or take the coefficients away",
+        )
+    return camera_from_opencv(place, size, intrinsics, coefficients, lens == LensType.FISHEYE)
 
 
 def _intrinsics(place: str, fields: dict[str, Any]) -> Array:
@@ -331,13 +326,13 @@ def _intrinsics(place: str, fields: dict[str, Any]) -> Array:
     return values[[0, 4, 2, 5]]
 
 
-def _coefficients(place: str, fields: dict[str, Any]) -> Array:
+def _coefficients(place: str, fields: dict[str, Any], lens: LensType | None) -> Array:
+    """Coefficients in OpenCV's order: a list, or numbers with names, in a section of their own or beside the others."""
     name = next((name for name in _DISTORTION_NAMES if fields.get(name) is not None), None)
     if name is not None and not (isinstance(fields[name], dict) and "k1" in fields[name]):
         return _numbers(f"{place}: {name}", fields[name], None)
     section = fields if name is None else fields[name]
-    known = [section.get(key, 0.0) for key in _SCALAR_DISTORTION]
-    return _numbers(f"{place}: k1, k2, p1, p2, k3", known, None)
+    return _numbers(f"{place}: k1, k2, p1, p2, ...", named_coefficients(place, section, lens), None)
 
 
 def _size(place: str, fields: dict[str, Any]) -> Size | None:

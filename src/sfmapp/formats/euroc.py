@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.calibration import Calibration, read_calibration, read_pose
+from sfmapp.formats.clocks import Times, parse_time, read_column
 from sfmapp.formats.flat_yaml import read_flat_yaml
 from sfmapp.formats.sequence_files import (
     Recording,
@@ -26,10 +28,9 @@ from sfmapp.formats.sequence_files import (
     list_images,
     read_number_table,
     read_rows,
-    times_in_names,
-    timestamp_of,
     warn_of_missing,
 )
+from sfmapp.formats.trajectory_input import TrajectoryFile, read_trajectory
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import STAGE, Imu, Truth
 from sfmapp.scene.rig import Rig
@@ -81,35 +82,43 @@ def read_euroc_sequence(mav: Path, events: Events, only: str | None = None) -> R
         common_size([frame[i] for frame in frames if i < len(frame)], str(mav / name / "data"))
         for i, name in enumerate(cameras)
     )
+    times = read_column(str(mav / cameras[0]), [parse_time(stamp) for stamp in stamps], "ns")
     calibration = _read_rig(mav, cameras, sizes)
     body_from_cam = calibration.body_from_cam if calibration else None
-    imu = truth = None
+    imu, truth, notes = None, None, list[str]()
     if (mav / "imu0" / "data.csv").is_file():
         if body_from_cam is None:
             events.warned(STAGE, f"{mav / 'imu0'} is not used: no calibration says where it sits (T_BS)")
         else:
-            imu = read_imu(mav / "imu0" / "data.csv", body_from_cam)
+            imu, note = read_imu(mav / "imu0" / "data.csv", body_from_cam, times)
+            notes.append(note)
     for name in _TRUTH_FOLDERS:
         if (mav / name / "data.csv").is_file():
-            truth = read_euroc_truth(mav / name / "data.csv", body_from_cam)
+            file = read_trajectory(mav / name / "data.csv", like=times.seconds, is_euroc=True)
+            truth = euroc_truth(file, body_from_cam)
+            notes.append(file.note)
             break
-    times = np.array([timestamp_of(stamp) for stamp in stamps])
-    return Recording("euroc", mav, frame_names(mav, first), times, frames, sizes, calibration, imu, truth)
+    names = frame_names(mav, first)
+    told = tuple(note for note in notes if note)
+    return Recording("euroc", mav, names, times, frames, sizes, calibration, imu, truth, notes=told)
 
 
 def _read_frames(camera: Path, events: Events) -> dict[str, Path]:
     """Files by their times as written, in the order of the list."""
     if not (camera / "data.csv").is_file():
         paths = list_images(camera / "data")
-        if times_in_names(paths) is None:
-            raise InputError(f"{camera / 'data.csv'}: expected a list of times and files, found nothing")
+        if not all(re.fullmatch(r"\d{1,20}(\.\d+)?", path.stem) for path in paths):
+            raise InputError(
+                f"{camera / 'data.csv'}: expected a list of times and files, or images whose names are times, found "
+                "neither"
+            )
         return {path.stem: path for path in paths}
     found: dict[str, Path] = {}
     missing: list[str] = []
     for position, (number, fields) in enumerate(read_rows(camera / "data.csv", ",")):
         place = f"{camera / 'data.csv'}:{number}"
         try:
-            timestamp_of(fields[0])
+            parse_time(fields[0])
         except ValueError:
             if position == 0:  # names of the columns
                 continue
@@ -139,16 +148,21 @@ def _read_rig(mav: Path, cameras: list[str], sizes: tuple[Size, ...]) -> Calibra
     return replace(parts[0], rig=rig, lenses=(parts[0].lenses[0], parts[1].lenses[0]), notes=notes)
 
 
-def read_imu(path: Path, body_from_cam: Array) -> Imu:
-    """Measurements of ``data.csv`` (time in ns, gyro in rad/s, accelerometer in m/s^2), noise of ``sensor.yaml`` by it.
+def read_imu(path: Path, body_from_cam: Array, frames: Times | None = None) -> tuple[Imu, str]:
+    """Measurements of ``data.csv`` (time in ns, gyro in rad/s, accelerometer in m/s^2), noise of ``sensor.yaml`` by it;
+    and a note if its times are in another unit.
 
     Args:
         body_from_cam: (7,) pose of the first camera in the frame of the body, which ``T_BS`` of the IMU relates to.
+        frames: times of the frames on the same clock; None if they are not known.
 
     Raises:
         InputError: a file cannot be read or is not what it should be.
     """
-    table = _with_seconds(path, 7)
+    stamps, table = read_number_table(path, 7)
+    like, origin = (None, None) if frames is None else (frames.seconds, frames.origin)
+    times = read_column(str(path), stamps, "ns", like, origin)
+    table[:, 0] = times.seconds
     fields: dict[str, Any] = {}
     if (path.parent / "sensor.yaml").is_file():
         fields = read_flat_yaml(path.parent / "sensor.yaml")
@@ -166,7 +180,7 @@ def read_imu(path: Path, body_from_cam: Array) -> Imu:
     table = table[kept]
     if len(table) < 2:
         raise InputError(f"{path}: expected measurements at two times at least, found {len(table)}")
-    return Imu(
+    imu = Imu(
         table[:, 0],
         table[:, 1:4].copy(),
         table[:, 4:7].copy(),
@@ -175,40 +189,28 @@ def read_imu(path: Path, body_from_cam: Array) -> Imu:
         noise["accelerometer_noise_density"],
         noise["gyroscope_random_walk"],
         noise["accelerometer_random_walk"],
+        None if origin is None or times.elapsed_s is None else times.elapsed_s[kept],
     )
+    return imu, times.note
 
 
-def read_euroc_truth(path: Path, body_from_cam: Array | None) -> Truth:
-    """Poses of ``data.csv`` (time in ns, position, quaternion w x y z of world_from_body), as poses of the camera.
+def euroc_truth(file: TrajectoryFile, body_from_cam: Array | None) -> Truth:
+    """Poses of the body of a trajectory as poses of the camera.
 
     Args:
         body_from_cam: (7,); None: the poses are taken for the camera's own. ``sensor.yaml`` beside the file may say
             with ``T_BS`` that the poses are of something else on the body (a marker).
 
     Raises:
-        InputError: a line is not eight numbers, or a quaternion is not of unit length.
+        InputError: that file is not what it should be.
     """
-    table = _with_seconds(path, 8)
-    norm = np.linalg.norm(table[:, 4:8], axis=1)
-    wrong = np.abs(norm - 1) > 1e-2
-    if wrong.any() or not len(table):
-        what = f"{table[np.argmax(wrong), 4:8].tolist()}" if len(table) else "no line"
-        raise InputError(f"{path}: expected times, positions and quaternions w x y z of unit length, found {what}")
-    quaternion = table[:, [5, 6, 7, 4]] / norm[:, None]
-    world_from_cam = np.concatenate([quaternion, table[:, 1:4]], 1)
-    sensor = path.parent / "sensor.yaml"
+    world_from_cam, has_pose = file.trajectory.world_from_body, file.trajectory.has_pose
+    times = file.trajectory.timestamps_s
+    assert times is not None
+    sensor = file.path.parent / "sensor.yaml"
     fields = read_flat_yaml(sensor) if sensor.is_file() else {}
     if "T_BS" in fields:
         world_from_cam = rigid3.compose(world_from_cam, rigid3.inverse(read_pose(f"{sensor}: T_BS", fields["T_BS"])))
     if body_from_cam is not None:
         world_from_cam = rigid3.compose(world_from_cam, body_from_cam)
-    return in_order(Truth(table[:, 0], rigid3.inverse(world_from_cam)))
-
-
-def _with_seconds(path: Path, num_columns: int) -> Array:
-    """A table whose first column is the time, in seconds; it may be written as whole nanoseconds or as seconds."""
-    table = read_number_table(path, num_columns)
-    # as timestamp_of tells units apart; EuRoC's columns are all of one form
-    if len(table) and np.median(table[:, 0]) >= 1e17:
-        table[:, 0] /= 1e9
-    return table
+    return in_order(Truth(times[has_pose], rigid3.inverse(world_from_cam[has_pose])))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from decimal import Decimal
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
 from sfmapp.events import Events
+from sfmapp.formats.clocks import Times, parse_time, read_column
 from sfmapp.formats.kitti import with_partners
 from sfmapp.formats.sequence_files import (
     Recording,
@@ -19,11 +18,8 @@ from sfmapp.formats.sequence_files import (
     read_rows,
     times_in_names,
     times_of_rows,
-    timestamp_of,
 )
 from sfmapp.images.sources import find_images
-
-Array = NDArray[np.float64]
 
 _PAIRS = (
     ("left", "right"), ("cam0", "cam1"), ("image_left", "image_right"), ("images_left", "images_right"),
@@ -112,8 +108,8 @@ def _truths(root: Path) -> tuple[Path, ...]:
     return tuple(root / name for name in _TRUTHS)
 
 
-def _times(files: list[Path], *folders: Path) -> Array | None:
-    """(N,) seconds from a list beside the images, or from their names; None where neither tells."""
+def _times(files: list[Path], *folders: Path) -> Times | None:
+    """Seconds of the files from a list beside the images, or from their names; None where neither tells."""
     for folder in folders:
         for name in _TIMES:
             if (folder / name).is_file():
@@ -121,26 +117,32 @@ def _times(files: list[Path], *folders: Path) -> Array | None:
     return times_in_names(files)
 
 
-def _listed_times(path: Path, files: list[Path]) -> Array:
+def _listed_times(path: Path, files: list[Path]) -> Times:
     """Times of a list that names the files, before or behind the time, or has a line for each of them."""
     position = {key: i for i, file in reversed(list(enumerate(files))) for key in (file.name, file.stem)}
-    times = np.full(len(files), np.nan)
+    times: list[Decimal | None] = [None] * len(files)
     for _, fields in read_rows(path):
         values = [field for part in fields for field in part.split(",") if field]
         if len(values) < 2:
             continue
-        for name, time in ((values[0], values[1]), (values[1], values[0])):
-            i = position.get(name.rsplit("/", 1)[-1])
-            if i is None:
-                continue
-            try:
-                times[i] = timestamp_of(time)
-            except ValueError:
-                raise InputError(f"{path}: expected a time for {name}, found {time[:80]!r}") from None
-            break
-    if np.isnan(times).all():
+        named = [(values[k].rsplit("/", 1)[-1], values[1 - k]) for k in (0, 1)]
+        told = [(position[name], _time_or_none(time)) for name, time in named if name in position]
+        found = next(((i, time) for i, time in told if time is not None), None)
+        if told and found is None:
+            raise InputError(f"{path}: expected a time and a file name, found {' '.join(values[:2])[:80]!r}")
+        if found is not None:
+            times[found[0]] = found[1]
+    known = [time for time in times if time is not None]
+    if not known:
         return times_of_rows(path, files)
-    if np.isnan(times).any():
-        missing = files[int(np.argmax(np.isnan(times)))].name
+    if len(known) < len(files):
+        missing = files[times.index(None)].name
         raise InputError(f"{path}: expected the times of all {len(files)} images, found none of {missing}")
-    return times
+    return read_column(str(path), known, "ns" if path.name == "data.csv" else "s")
+
+
+def _time_or_none(text: str) -> Decimal | None:
+    try:
+        return parse_time(text)
+    except ValueError:
+        return None

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from decimal import Decimal
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.calibration import Calibration
+from sfmapp.formats.clocks import Times, are_dates, parse_time, read_column, times_of_names
 from sfmapp.formats.text_input import read_limited_text
 from sfmapp.images.frame_reader import LARGEST_FRAME_PX, read_regular_file, some
 from sfmapp.images.headers import UnusableImage, read_header
@@ -41,25 +43,27 @@ class Recording:
     Attributes:
         kind, root: layout, and the folder that names are relative to.
         names: N names of frames.
-        timestamps_s: (N,) as they are written, not yet in order; None where nothing tells.
+        times: of the N frames as they are written, not yet in order; None where nothing tells.
         paths: for each frame one file, or two of a pair; one as well where a pair lacks the second.
         sizes: (width, height) of the images of each camera.
         calibration: None if there is none.
         imu, truth: None where there is none, or where the files that may hold the truth are ``truth_paths``; poses are
             of the first camera.
         truth_paths: where a trajectory of the body may lie; the first that is there counts.
+        notes: how times of the IMU and the truth were read, where that is not what the format says.
     """
 
     kind: SequenceKind
     root: Path
     names: list[str]
-    timestamps_s: Array | None
+    times: Times | None
     paths: list[tuple[Path, ...]]
     sizes: tuple[Size, ...]
     calibration: Calibration | None
     imu: Imu | None = None
     truth: Truth | None = None
     truth_paths: tuple[Path, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -135,13 +139,14 @@ def read_rows(path: Path, separator: str | None = None) -> list[tuple[int, list[
     return rows
 
 
-def read_number_table(path: Path, num_columns: int) -> Array:
-    """(N, num_columns) finite numbers of a csv file; further columns are left aside, and a first line of names too.
+def read_number_table(path: Path, num_columns: int) -> tuple[list[Decimal], Array]:
+    """Times of the first column as they are written, and (N, num_columns) finite numbers of a csv file; further columns
+    are left aside, and a first line of names too.
 
     Raises:
         InputError: a line has too few columns, or one that is no finite number.
     """
-    table = []
+    times, table = [], []
     for position, (number, fields) in enumerate(read_rows(path, ",")):
         try:
             row = [float(field) for field in fields[:num_columns]]
@@ -149,61 +154,53 @@ def read_number_table(path: Path, num_columns: int) -> Array:
             row = []
             if position == 0:
                 continue
+        try:
+            times.append(parse_time(fields[0]))
+        except ValueError:
+            row = []
         if len(row) < num_columns or not all(map(math.isfinite, row)):
             raise InputError(
                 f"{path}:{number}: expected {num_columns} numbers and commas, found {','.join(fields)[:80]!r}"
             )
         table.append(row)
-    return np.array(table, np.float64).reshape(-1, num_columns)
+    return times, np.array(table, np.float64).reshape(-1, num_columns)
 
 
-def timestamp_of(text: str) -> float:
-    """Seconds of a time as files have it: seconds, or a whole number of nano-, micro- or milliseconds since 1970.
-
-    Raises:
-        ValueError: not a finite number.
-    """
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(text)
-    digits = len(text.strip().lstrip("+0")) if re.fullmatch(r"\s*\+?\d+\s*", text) else 0
-    if digits > 20:
-        raise ValueError(text)
-    # 10 digits of seconds last until the year 2286; each further three are a finer unit
-    unit = 1_000_000_000 if digits >= 18 else 1_000_000 if digits >= 15 else 1_000 if digits >= 12 else 1
-    return int(text) / unit if digits else value
-
-
-def read_times(path: Path) -> list[float]:
+def read_times(path: Path) -> Times:
     """Seconds from the first column of a list of times; ``2011-09-26 13:02:25.964`` is one as well, in UTC.
 
     Raises:
         InputError: a line is no time.
     """
-    times = []
+    numbers: list[Decimal] = []
+    moments: list[float] = []
     for number, fields in read_rows(path):
         try:
-            times.append(timestamp_of(fields[0].split(",")[0]))
+            numbers.append(parse_time(fields[0].split(",")[0]))
             continue
         except ValueError:
             pass
         try:
             moment = datetime.fromisoformat(" ".join(fields[:2]))
-            times.append(moment.replace(tzinfo=moment.tzinfo or UTC).timestamp())
+            moments.append(moment.replace(tzinfo=moment.tzinfo or UTC).timestamp())
         except (ValueError, OverflowError):
             raise InputError(f"{path}:{number}: expected a time, found {' '.join(fields)[:80]!r}") from None
-    return times
+    if numbers and moments:
+        raise InputError(f"{path}: expected times of one kind, found {len(numbers)} numbers and {len(moments)} dates")
+    return Times(np.array(moments, np.float64), "s") if moments else read_column(str(path), numbers, "s")
 
 
 def frame_numbers(paths: Sequence[Path]) -> NDArray[np.int64] | None:
-    """(N,) numbers that the file names count with: ``000123.png``, ``frame_0123.jpg``; None if they do not count up."""
-    parts = [re.split(r"(\d+)", path.stem) for path in paths]
+    """(N,) numbers that the file names count with: ``000123.png``, ``frame_0123.jpg``; None if they do not count up,
+    or tell times instead."""
+    stems = [path.stem for path in paths]
+    parts = [re.split(r"(\d+)", stem) for stem in stems]
     if not parts or any(len(part) != len(parts[0]) or part[::2] != parts[0][::2] for part in parts):
         return None
     varying = [i for i in range(1, len(parts[0]), 2) if any(part[i] != parts[0][i] for part in parts)]
     if len(parts) == 1 or len(varying) != 1:
         return np.arange(1) if len(parts) == 1 else None
-    if any(len(part[varying[0]]) > 15 for part in parts):
+    if any(len(part[varying[0]]) > 15 for part in parts) or are_dates(stems) or times_of_names(stems) is not None:
         return None
     numbers = np.array([int(part[varying[0]]) for part in parts], np.int64)
     if (np.diff(numbers) <= 0).any() or numbers[-1] - numbers[0] > _LARGEST_MEAN_GAP * len(numbers):
@@ -211,12 +208,9 @@ def frame_numbers(paths: Sequence[Path]) -> NDArray[np.int64] | None:
     return numbers
 
 
-def times_in_names(paths: Sequence[Path]) -> Array | None:
-    """(N,) seconds where the file names are times: 1305031102.175304, or a dozen digits and more; None if not."""
-    stems = [path.stem for path in paths]
-    if not stems or not all(re.fullmatch(r"\d+\.\d+|\d{12,20}", stem) for stem in stems):
-        return None
-    return np.array([timestamp_of(stem) for stem in stems])
+def times_in_names(paths: Sequence[Path]) -> Times | None:
+    """Seconds of the frames where their names are times (see :func:`~sfmapp.formats.clocks.times_of_names`)."""
+    return times_of_names([path.stem for path in paths])
 
 
 def rows_of_frames(num_rows: int, paths: Sequence[Path]) -> NDArray[np.int64] | None:
@@ -254,20 +248,20 @@ def ascending(timestamps_s: Array) -> NDArray[np.int64]:
     return np.array(chain[::-1], np.int64)
 
 
-def times_of_rows(path: Path, paths: Sequence[Path]) -> Array:
-    """(N,) seconds of the frames from a list of times without names.
+def times_of_rows(path: Path, paths: Sequence[Path]) -> Times:
+    """Seconds of the N frames from a list of times without names.
 
     Raises:
         InputError: a line is no time, or there are not as many lines as frames.
     """
-    times = np.array(read_times(path))
-    rows = rows_of_frames(len(times), paths)
+    times = read_times(path)
+    rows = rows_of_frames(len(times.seconds), paths)
     if rows is None:
         raise InputError(
-            f"{path}: expected a line for each of {len(paths)} frames, found {len(times)}",
+            f"{path}: expected a line for each of {len(paths)} frames, found {len(times.seconds)}",
             "take the file away and give the rate with --fps, or complete it",
         )
-    return times[rows]
+    return times.at(rows)
 
 
 def in_order(truth: Truth) -> Truth:

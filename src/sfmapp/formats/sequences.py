@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import os
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.calibration import Calibration, camera_from_text, read_calibration
-from sfmapp.formats.euroc import find_mav, read_euroc_sequence, read_euroc_truth, read_imu
+from sfmapp.formats.clocks import Times, are_dates
+from sfmapp.formats.euroc import euroc_truth, find_mav, read_euroc_sequence, read_imu
 from sfmapp.formats.kitti import FRAMES_PER_SECOND as KITTI_FPS
 from sfmapp.formats.kitti import is_kitti, read_kitti, read_kitti_sequence
 from sfmapp.formats.opencv_lens import sampling_map
@@ -31,10 +32,10 @@ from sfmapp.formats.sequence_files import (
     ascending,
     frame_numbers,
     has_images,
-    read_rows,
     rows_of_frames,
 )
-from sfmapp.formats.tum import is_tum, read_tum_sequence, read_tum_truth
+from sfmapp.formats.trajectory_input import read_trajectory
+from sfmapp.formats.tum import is_tum, read_tum_sequence, tum_truth
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.orientation import INVERSE, is_sideways, upright_size
 from sfmapp.images.exif import ExifFacts, focal_prior, read_exif
@@ -284,10 +285,12 @@ def _sequence(
         options.camera, folders, recording.calibration, recording.kind == "tum", sizes, orientation
     )
     rig = _rig(source, calibration, sizes, first[0], events, require_camera)
-    times, fps = _timestamps(recording, first, options, calibration, events)
+    clock = _clock(recording, first, options, calibration, events)
+    times, elapsed = clock.frames_s, clock.elapsed_s
     body_from_cam = calibration.body_from_cam if calibration else None
-    truth = _truth(recording, options.truth, times, first, body_from_cam, events)
-    imu = recording.imu if options.imu is None else _given_imu(options.imu, body_from_cam)
+    truth = clock.moved(_truth(recording, options.truth, clock.own_s, first, body_from_cam, events))
+    _warn_of_foreign_truth(truth, times, events)
+    imu = _imu(recording, options, clock, body_from_cam, events)
     kept = ascending(times)
     if len(kept) < len(times):
         lost = np.setdiff1d(np.arange(len(times)), kept)
@@ -298,9 +301,8 @@ def _sequence(
     if not len(played):
         raise InputError(f"{source}: expected frames from {options.start} to {options.stop}, found {len(kept)} in all")
     if options.reverse:
-        played, times, truth, imu = _mirrored(played, times, truth, imu)
-    if len(played) > 1:
-        fps = 1 / float(np.median(np.diff(times[played])))
+        played, times, elapsed, truth, imu = _mirrored(played, times, elapsed, truth, imu)
+    fps = 1 / float(np.median(np.diff(times[played]))) if len(played) > 1 else clock.frames_per_second
     sequence = FileSequence(
         recording.kind,
         source,
@@ -313,18 +315,59 @@ def _sequence(
         imu,
         truth,
         events,
+        None if elapsed is None else elapsed[played],
         orientation,
     )
     _tell(sequence, events)
     return sequence
 
 
-def _timestamps(
+@dataclass(frozen=True)
+class _Clock:
+    """When the frames were taken.
+
+    Attributes:
+        frames_s: (N,) seconds that they are played with.
+        own_s: (N,) what the sequence says, which truth and IMU go by; the same array unless a rate was given instead.
+        frames_per_second: the rate that they were made from; None where they were not.
+        own: the sequence's times where they are played as they are; None otherwise.
+    """
+
+    frames_s: Array
+    own_s: Array
+    frames_per_second: float | None = None
+    own: Times | None = None
+
+    @property
+    def elapsed_s(self) -> Array | None:
+        """(N,) see :class:`~sfmapp.images.sequence.Frame`."""
+        return None if self.own is None else self.own.elapsed_s
+
+    def moved(self, truth: Truth | None) -> Truth | None:
+        """Poses at times of the sequence's own clock at those that are played; all others as they are."""
+        order = ascending(self.own_s)
+        if truth is None or self.own_s is self.frames_s or not len(truth.timestamps_s) or len(order) < 2:
+            return truth
+        if _share_time(truth, self.frames_s) or not _share_time(truth, self.own_s):
+            return truth
+        own, played = self.own_s[order], self.frames_s[order]
+        inside = (truth.timestamps_s >= own[0]) & (truth.timestamps_s <= own[-1])
+        return Truth(np.interp(truth.timestamps_s[inside], own, played), truth.cam_from_world[inside])
+
+
+def _share_time(truth: Truth, times: Array) -> bool:
+    return bool(len(times) and times.min() <= truth.timestamps_s[-1] and truth.timestamps_s[0] <= times.max())
+
+
+def _clock(
     recording: Recording, first: list[Path], options: SequenceOptions, calibration: Calibration | None, events: Events
-) -> tuple[Array, float | None]:
-    """(N,) seconds of all frames, and the nominal rate where they were made from one."""
-    if recording.timestamps_s is not None:
-        return recording.timestamps_s, None
+) -> _Clock:
+    """Times as the user, else the files, else a rate tell them."""
+    own = recording.times
+    for note in (*((own.note,) if own is not None and own.note else ()), *recording.notes):
+        events.decided(STAGE, note)
+    if own is not None and options.fps is None:
+        return _Clock(own.seconds, own.seconds, own=own)
     fps, reason = options.fps, "as given"
     if fps is None and calibration is not None and calibration.frames_per_second is not None:
         fps, reason = calibration.frames_per_second, "as the calibration says"
@@ -334,8 +377,24 @@ def _timestamps(
     # numbers that are left out are time that went by
     numbers = frame_numbers(first)
     numbers = np.arange(len(first)) if numbers is None else numbers - numbers[0]
-    events.decided(STAGE, f"the frames have no times: {fps:g} frames a second ({reason})", frames_per_second=fps)
-    return numbers / fps, fps
+    why = "the frames have no times" if own is None else "the times of the sequence are not used"
+    if own is None and are_dates([path.stem for path in first]):
+        why = "the names of the frames are dates, which are not taken for times"
+    events.decided(STAGE, f"{why}: {fps:g} frames a second ({reason})", frames_per_second=fps)
+    times = numbers / fps
+    return _Clock(times, times if own is None else own.seconds, fps)
+
+
+def _imu(
+    recording: Recording, options: SequenceOptions, clock: _Clock, body_from_cam: Array | None, events: Events
+) -> Imu | None:
+    """The user's IMU, or the sequence's own, unless a rate was given in place of the clock that the two share."""
+    if options.imu is not None:
+        return _given_imu(options.imu, body_from_cam, clock.own, events)
+    if recording.imu is not None and clock.own_s is not clock.frames_s:
+        events.warned(STAGE, "the IMU is not used: it shares the clock of the sequence, in whose place --fps was given")
+        return None
+    return recording.imu
 
 
 def _truth(
@@ -350,30 +409,42 @@ def _truth(
     truth = recording.truth
     beside = next((path for path in recording.truth_paths if path.is_file()), None)
     if given is not None:
-        truth = _read_truth(Path(given), times, first, body_from_cam)
+        truth = _read_truth(Path(given), times, first, body_from_cam, events)
     elif beside is not None:
         try:
-            truth = _read_truth(beside, times, first, body_from_cam)
+            truth = _read_truth(beside, times, first, body_from_cam, events)
         except InputError as error:
             events.warned(STAGE, f"the truth is not used: {error}")
-    if truth is None or not len(truth.timestamps_s):
-        return None
-    if len(times) and not (times.min() <= truth.timestamps_s[-1] and truth.timestamps_s[0] <= times.max()):
+    return truth if truth is not None and len(truth.timestamps_s) else None
+
+
+def _warn_of_foreign_truth(truth: Truth | None, times: Array, events: Events) -> None:
+    if truth is not None and len(truth.timestamps_s) and not _share_time(truth, times):
         span = f"{truth.timestamps_s[0]:.3f} to {truth.timestamps_s[-1]:.3f} s"
         text = f"the truth is of {span}, the frames of {times.min():.3f} to {times.max():.3f} s: they share no time"
         events.warned(STAGE, text)
-    return truth
 
 
-def _read_truth(path: Path, times: Array, first: list[Path], body_from_cam: Array | None) -> Truth:
-    """A trajectory of the first camera (TUM) or of the body (EuRoC; KITTI, whose body is its camera 0)."""
-    rows = read_rows(path)
-    fields = rows[-1][1] if rows else []
-    if "," in "".join(fields):
-        return read_euroc_truth(path, body_from_cam)
-    if len(fields) != 12:
-        return read_tum_truth(path)
+def _read_truth(
+    path: Path, times: Array | None, first: list[Path], body_from_cam: Array | None, events: Events
+) -> Truth:
+    """A trajectory of the first camera (TUM) or of the body (EuRoC; KITTI, whose body is its camera 0).
+
+    ``times`` are those of the frames; None of a video, which are not known before it is read.
+    """
+    file = read_trajectory(path, like=times)
+    if file.note:
+        events.decided(STAGE, file.note)
+    if file.format == "euroc":
+        return euroc_truth(file, body_from_cam)
+    if file.format == "tum":
+        return tum_truth(file)
     poses = read_kitti(path)
+    if times is None:
+        raise InputError(
+            f"{path}: expected a trajectory with times, as the frames of a video are known by them, found KITTI's form",
+            "write it as TUM has it: timestamp tx ty tz qx qy qz qw",
+        )
     chosen = rows_of_frames(len(poses), first)
     if chosen is None:
         raise InputError(f"{path}: expected a pose for each of {len(first)} frames, found {len(poses)}")
@@ -384,28 +455,35 @@ def _read_truth(path: Path, times: Array, first: list[Path], body_from_cam: Arra
     return Truth(times[order], poses[order])
 
 
-def _given_imu(given: str, body_from_cam: Array | None) -> Imu:
+def _given_imu(given: str, body_from_cam: Array | None, times: Times | None, events: Events) -> Imu:
     path = Path(given) / "data.csv" if Path(given).is_dir() else Path(given)
     if body_from_cam is None:
         raise InputError(
             f"{path}: expected to know where the IMU sits, found no T_BS or T_cam_imu in the camera's calibration",
             "give --camera a sensor.yaml of EuRoC or a camchain.yaml of Kalibr, which hold it",
         )
-    return read_imu(path, body_from_cam)
+    imu, note = read_imu(path, body_from_cam, times)
+    if note:
+        events.decided(STAGE, note)
+    return imu
 
 
 def _mirrored(
-    played: NDArray[np.int64], times: Array, truth: Truth | None, imu: Imu | None
-) -> tuple[NDArray[np.int64], Array, Truth | None, Imu | None]:
+    played: NDArray[np.int64], times: Array, elapsed: Array | None, truth: Truth | None, imu: Imu | None
+) -> tuple[NDArray[np.int64], Array, Array | None, Truth | None, Imu | None]:
     """Everything backwards in time, on a clock that still ascends: t becomes first + last - t."""
     total = float(times[played[0]] + times[played[-1]])
+    total_elapsed = 0.0 if elapsed is None else float(elapsed[played[0]] + elapsed[played[-1]])
     if truth is not None:
         truth = Truth(total - truth.timestamps_s[::-1], truth.cam_from_world[::-1].copy())
     if imu is not None:
         # a rotation runs the other way round; an acceleration, the second derivative, is what it was
         back = total - imu.timestamps_s[::-1]
-        imu = replace(imu, timestamps_s=back, gyro=-imu.gyro[::-1], accel=imu.accel[::-1].copy())
-    return played[::-1], total - times, truth, imu
+        back_elapsed = None if imu.elapsed_s is None else total_elapsed - imu.elapsed_s[::-1]
+        imu = replace(
+            imu, timestamps_s=back, gyro=-imu.gyro[::-1], accel=imu.accel[::-1].copy(), elapsed_s=back_elapsed
+        )
+    return played[::-1], total - times, None if elapsed is None else total_elapsed - elapsed, truth, imu
 
 
 def _open_video(source: str, options: SequenceOptions, events: Events, require_camera: bool) -> VideoSequence:
@@ -415,10 +493,10 @@ def _open_video(source: str, options: SequenceOptions, events: Events, require_c
     calibration = _calibration(options.camera, folders, None, False, (size,))
     rig = _rig(source, calibration, (size,), None, events, require_camera)
     body_from_cam = calibration.body_from_cam if calibration else None
-    imu = _given_imu(options.imu, body_from_cam) if options.imu is not None else None
+    imu = _given_imu(options.imu, body_from_cam, None, events) if options.imu is not None else None
     truth = None
     if options.truth is not None:
-        truth = _read_truth(Path(options.truth), np.zeros(0), [], body_from_cam)
+        truth = _read_truth(Path(options.truth), None, [], body_from_cam, events)
     sequence = VideoSequence(source, rig, facts, options, events, _sampling(rig, calibration), imu, truth)
     _tell(sequence, events)
     return sequence

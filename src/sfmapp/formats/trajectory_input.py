@@ -6,11 +6,14 @@ KITTI 12 columns: the rows of world_from_cam (3, 4); line i is frame i      Geig
 EuRoC 8 columns or more, commas: ``timestamp_ns, px, py, pz, qw, qx, qy, qz`` Burri et al., IJRR 2016
 ===== ===================================================================== =========================================
 
-All hold world_from_body: of the camera in TUM's and KITTI's truth, of the IMU in EuRoC's.
+All hold world_from_body: of the camera in TUM's and KITTI's truth, of the IMU in EuRoC's. Times may be in another unit
+(ORB-SLAM3 writes nanoseconds into TUM's form): see :mod:`sfmapp.formats.clocks`. KITTI's rows may be whole 4 x 4
+matrices.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -20,6 +23,7 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
 from sfmapp.evaluation.trajectory import Trajectory
+from sfmapp.formats.clocks import Times, Unit, parse_time, read_column
 from sfmapp.formats.text_input import read_limited_text
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import SequenceKind
@@ -31,6 +35,7 @@ TrajectoryFormat = Literal["tum", "kitti", "euroc"]
 _QUATERNION_TOLERANCE = 1e-2
 # entries of a rotation written with three digits; what is further off is scaled, mirrored or no rotation
 _ROTATION_TOLERANCE = 5e-3
+_MOST_COLUMNS = 16
 # four days at 30 frames a second: a larger number is not one of a frame
 _MOST_FRAMES = 10**7
 
@@ -44,54 +49,83 @@ class TrajectoryFile:
         trajectory: its poses in the order of the file; a line with "nan" in it is a gap.
         is_numbered: ``PATH.frames`` beside a KITTI trajectory names the frame of each line (see
             :func:`sfmapp.formats.kitti.write_kitti`): the others are gaps, and the last ones may be missing.
+        note: how its times were read, where they are not in the unit of the format; empty otherwise.
     """
 
     path: Path
     format: TrajectoryFormat | SequenceKind
     trajectory: Trajectory
     is_numbered: bool = False
+    note: str = ""
 
 
-def read_trajectory(path: str | Path, times: str | Path | None = None) -> TrajectoryFile:
+@dataclass(frozen=True)
+class _Table:
+    """The lines of a file: their numbers, their first fields, values (N, C) of up to 17 columns (nan in gaps), the
+    names of the columns if a line tells them, and whether commas stand between them."""
+
+    numbers: list[int]
+    first: list[str]
+    values: Array
+    titles: list[str]
+    has_commas: bool
+
+
+def read_trajectory(
+    path: str | Path, times: str | Path | None = None, *, like: Array | None = None, is_euroc: bool = False
+) -> TrajectoryFile:
     """Read a trajectory in any of the formats above.
 
     Args:
         path: the file. Lines that begin with ``#`` and empty ones are skipped.
         times: file with the seconds of each line of a KITTI trajectory (``times.txt``); the others have their own.
+        like: seconds of another clock of the same recording, which tells units apart.
+        is_euroc: the file has its place in EuRoC's layout: columns between commas are EuRoC's, whatever the times.
 
     Raises:
         InputError: the file has none of the formats, or a line is not like the others; or the times do not fit.
     """
     path = Path(path)
-    numbers, table, has_commas = _table(path)
-    columns = table.shape[1]
-    if has_commas and columns >= 8:
-        return TrajectoryFile(path, "euroc", _euroc(path, numbers, table))
+    table = _table(path)
+    columns = table.values.shape[1]
+    if table.has_commas and columns >= 8:
+        clock = _clock(path, table, "ns", like)
+        order = [5, 6, 7, 4] if _is_w_first(path, table, is_euroc) else [4, 5, 6, 7]
+        rotation = _rotations(path, table.numbers, table.values[:, order])
+        trajectory = Trajectory(table.values[:, 1:4], rotation, clock.seconds)
+        return TrajectoryFile(path, "euroc", trajectory, note=clock.note)
     if columns == 8:
-        rotation = _rotations(path, numbers, table[:, 4:])
-        return TrajectoryFile(path, "tum", Trajectory(table[:, 1:4], rotation, _timestamps(path, numbers, table[:, 0])))
-    if columns == 12:
-        trajectory = _kitti(path, numbers, table)
-        frames = _frames(path, len(table))
+        clock = _clock(path, table, "s", like)
+        rotation = _rotations(path, table.numbers, table.values[:, 4:])
+        return TrajectoryFile(
+            path, "tum", Trajectory(table.values[:, 1:4], rotation, clock.seconds), note=clock.note
+        )  # fmt: skip
+    if columns == 12 or (columns == 16 and _are_whole_matrices(table.values)):
+        trajectory = _kitti(path, table.numbers, table.values[:, :12])
+        frames = _frames(path, len(table.values))
         if frames is not None:
             trajectory = _spread(trajectory, frames)
         if times is not None:
             trajectory = replace(trajectory, timestamps_s=_times(Path(times), len(trajectory), path))
         return TrajectoryFile(path, "kitti", trajectory, frames is not None)
     raise InputError(
-        f"{path}:{numbers[0]}: expected a trajectory, found {columns} columns",
-        "TUM has 8 columns (timestamp tx ty tz qx qy qz qw), KITTI 12 (the rows of a 3 x 4 matrix), EuRoC's "
-        "data.csv 8 or more with commas between them",
+        f"{path}:{table.numbers[0]}: expected a trajectory, found "
+        f"{columns if columns <= _MOST_COLUMNS else f'more than {_MOST_COLUMNS}'} columns",
+        "TUM has 8 columns (timestamp tx ty tz qx qy qz qw), KITTI 12 (the rows of a 3 x 4 matrix; 16 of a 4 x 4 "
+        "one), EuRoC's data.csv 8 or more with commas between them",
     )
 
 
-def _table(path: Path) -> tuple[list[int], Array, bool]:
-    """Line numbers, values (N, C) of up to 12 columns (nan in gaps), and whether commas stand between them."""
+def _table(path: Path) -> _Table:
     rows: list[list[float]] = []
     numbers: list[int] = []
+    first: list[str] = []
+    titles: list[str] = []
     has_commas, columns = False, 0
     for number, line in enumerate(read_limited_text(path).splitlines(), 1):
         text = line.strip().lstrip("\ufeff")
+        if not rows and text.startswith(("#", "%")) and "," in text:
+            titles = text.lstrip("#% ").split(",")
         if not text or text.startswith(("#", "%")):
             continue
         if not rows:
@@ -101,17 +135,18 @@ def _table(path: Path) -> tuple[list[int], Array, bool]:
             row = [float(field) for field in fields]
         except ValueError:
             if not rows and columns == 0 and not any(map(_is_number, fields)):
-                columns = -1  # one line of titles
+                columns, titles = -1, fields  # one line of titles
                 continue
             raise InputError(f"{path}:{number}: expected numbers, found {text[:80]!r}") from None
         if rows and len(row) != columns:
             raise InputError(f"{path}:{number}: expected {columns} columns as above, found {len(row)}")
         columns = len(row)
-        rows.append(row[:8] if has_commas else row[:13])
+        rows.append(row[:8] if has_commas else row[: _MOST_COLUMNS + 1])
         numbers.append(number)
+        first.append(fields[0])
     if not rows:
         raise InputError(f"{path}: expected a trajectory, found no line of numbers")
-    return numbers, np.array(rows, np.float64), has_commas
+    return _Table(numbers, first, np.array(rows, np.float64), titles, has_commas)
 
 
 def _is_number(text: str) -> bool:
@@ -122,15 +157,28 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _euroc(path: Path, numbers: list[int], table: Array) -> Trajectory:
-    fraction = np.flatnonzero(np.isfinite(table[:, 0]) & (table[:, 0] % 1 != 0))
-    if len(fraction):
+def _is_w_first(path: Path, table: _Table, is_euroc: bool) -> bool:
+    """Whether quaternions between commas are w x y z, as EuRoC's, or x y z w, as of a TUM file with commas.
+
+    Raises:
+        InputError: neither a line of titles, nor the layout, nor times in nanoseconds tell.
+    """
+    for position, title in enumerate(table.titles[:8]):
+        if re.fullmatch(r"q_?(\w*_)?w", title.split("[")[0].strip().lower()):
+            return position == 4
+    values = table.values[:, 0]
+    fraction = np.flatnonzero(np.isfinite(values) & (values % 1 != 0))
+    if len(fraction) and not is_euroc:
         raise InputError(
-            f"{path}:{numbers[fraction[0]]}: expected a timestamp in whole nanoseconds, found {table[fraction[0], 0]}",
+            f"{path}:{table.numbers[fraction[0]]}: expected a timestamp in whole nanoseconds, found "
+            f"{table.first[fraction[0]][:40]}",
             "timestamps in seconds belong into a TUM file, with spaces between the columns",
         )
-    times = _timestamps(path, numbers, table[:, 0]) / 1e9
-    return Trajectory(table[:, 1:4], _rotations(path, numbers, table[:, [5, 6, 7, 4]]), times)
+    return True
+
+
+def _are_whole_matrices(values: Array) -> bool:
+    return bool((np.isnan(values[:, 12:]) | (values[:, 12:] == [0, 0, 0, 1])).all())
 
 
 def _kitti(path: Path, numbers: list[int], table: Array) -> Trajectory:
@@ -153,7 +201,7 @@ def _frames(path: Path, count: int) -> NDArray[np.int64] | None:
     sidecar = path.with_name(path.name + ".frames")
     if not sidecar.is_file():
         return None
-    _, table, _ = _table(sidecar)
+    table = _table(sidecar).values
     frames = table[:, 0]
     whole = np.isfinite(frames).all() and (frames % 1 == 0).all() and (np.diff(frames, prepend=-1) > 0).all()
     if table.shape[1] != 1 or len(frames) != count or not whole or frames[-1] > _MOST_FRAMES:
@@ -181,16 +229,21 @@ def _rotations(path: Path, numbers: list[int], quaternion: Array) -> Array:
     return rigid3.rotation_matrix(quaternion / norm[:, None])
 
 
-def _timestamps(path: Path, numbers: list[int], values: Array) -> Array:
-    if not np.isfinite(values).all():
-        raise InputError(f"{path}:{numbers[int(np.argmin(np.isfinite(values)))]}: expected a timestamp, found none")
-    return values
+def _clock(path: Path, table: _Table, unit: Unit, like: Array | None) -> Times:
+    """The times of the first column. Raises InputError: a line has none."""
+    times = []
+    for number, text in zip(table.numbers, table.first, strict=True):
+        try:
+            times.append(parse_time(text))
+        except ValueError:
+            raise InputError(f"{path}:{number}: expected a timestamp, found {text[:40]!r}") from None
+    return read_column(str(path), times, unit, like)
 
 
 def _times(path: Path, count: int, trajectory: Path) -> Array:
-    _, table, _ = _table(path)
-    if table.shape[1] != 1 or not np.isfinite(table).all():
-        raise InputError(f"{path}: expected one number of seconds on each line, found {table.shape[1]} columns")
-    if len(table) != count:
-        raise InputError(f"{path}: expected a line for each of the {count} of {trajectory}, found {len(table)}")
-    return table[:, 0]
+    table = _table(path)
+    if table.values.shape[1] != 1 or not np.isfinite(table.values).all():
+        raise InputError(f"{path}: expected one number of seconds on each line, found {table.values.shape[1]} columns")
+    if len(table.values) != count:
+        raise InputError(f"{path}: expected a line for each of the {count} of {trajectory}, found {len(table.values)}")
+    return _clock(path, table, "s", None).seconds

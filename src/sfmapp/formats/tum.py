@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.calibration import Calibration
+from sfmapp.formats.clocks import Times, parse_time, read_column
 from sfmapp.formats.opencv_lens import camera_from_opencv, scaled_to
 from sfmapp.formats.sequence_files import (
     Recording,
@@ -22,10 +23,10 @@ from sfmapp.formats.sequence_files import (
     list_images,
     read_rows,
     times_in_names,
-    timestamp_of,
     warn_of_missing,
 )
-from sfmapp.formats.trajectory import read_tum
+from sfmapp.formats.trajectory_input import TrajectoryFile
+from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Truth
 from sfmapp.images.sources import EXTENSIONS
 from sfmapp.scene.rig import Rig
@@ -53,7 +54,7 @@ def read_tum_sequence(folder: Path, events: Events) -> Recording:
     Raises:
         InputError: no image can be read, or a line of ``rgb.txt`` is not what it should be.
     """
-    times: Array | None
+    times: Times | None
     if (folder / "rgb.txt").is_file():
         times, paths = _read_list(folder, events)
     else:
@@ -66,13 +67,13 @@ def read_tum_sequence(folder: Path, events: Events) -> Recording:
     return Recording("tum", folder, names, times, frames, (size,), calibration, truth_paths=truth_paths)
 
 
-def _read_list(folder: Path, events: Events) -> tuple[Array, list[Path]]:
+def _read_list(folder: Path, events: Events) -> tuple[Times, list[Path]]:
     list_path = folder / "rgb.txt"
     times, paths, missing = [], [], []
     for number, fields in read_rows(list_path):
         place = f"{list_path}:{number}"
         try:
-            time = timestamp_of(fields[0])
+            time = parse_time(fields[0])
         except ValueError:
             time = None
         if time is None or len(fields) < 2:
@@ -84,15 +85,14 @@ def _read_list(folder: Path, events: Events) -> tuple[Array, list[Path]]:
         times.append(time)
         paths.append(path)
     warn_of_missing(events, "files that rgb.txt names are not there, or are no images", missing)
-    return np.array(times), paths
+    return read_column(str(list_path), times, "s"), paths
 
 
-def read_tum_truth(path: Path) -> Truth:
-    """A trajectory file as the truth of the camera. Raises InputError if it is none."""
-    names, poses = read_tum(path)
-    if not names:
-        raise InputError(f"{path}: expected lines of 'time tx ty tz qx qy qz qw', found none")
-    return in_order(Truth(np.array([timestamp_of(name) for name in names]), poses))
+def tum_truth(file: TrajectoryFile) -> Truth:
+    """Poses of a trajectory as those of the camera."""
+    times, has_pose = file.trajectory.timestamps_s, file.trajectory.has_pose
+    assert times is not None
+    return in_order(Truth(times[has_pose], rigid3.inverse(file.trajectory.world_from_body[has_pose])))
 
 
 def _published_calibration(folder: Path, size: Size) -> Calibration | None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sfmapp.events import Events
 from sfmapp.images.headers import Header, UnusableImage, read_header
 from sfmapp.images.pixels import decode_bytes
-from sfmapp.images.sequence import STAGE, Frame, Imu, SequenceKind, Truth
+from sfmapp.images.sequence import STAGE, Frame, Imu, RepeatedFrame, SequenceKind, Truth
 from sfmapp.scene.rig import Rig
 
 Pixels = NDArray[np.uint8]
@@ -33,10 +33,17 @@ REPEATED = "repeats the frame before it"
 
 @dataclass(frozen=True)
 class Skipped:
-    """A frame that is left out: its name and the reason, a phrase that follows it and a colon."""
+    """A frame that is left out: its name, the reason, a phrase that follows it and a colon, and what it repeats, if it
+    is for that."""
 
     name: str
     reason: str
+    repeated: RepeatedFrame | None = None
+
+
+def skipped_twin(idx: int, name: str, timestamp_s: float, twin_idx: int) -> Skipped:
+    """A frame that is left out because it repeats another."""
+    return Skipped(name, REPEATED, RepeatedFrame(idx, name, timestamp_s, twin_idx))
 
 
 def read_ahead(read_next: Callable[[], Frame | Skipped | None]) -> Iterator[Frame | Skipped]:
@@ -58,9 +65,14 @@ def read_ahead(read_next: Callable[[], Frame | Skipped | None]) -> Iterator[Fram
 
 
 class ProblemTeller:
-    """Warns of frames that are left out: once however often the sequence is played."""
+    """Warns of frames that are left out: once however often the sequence is played.
+
+    Attributes:
+        repeated: of the present walk, those that are left out because they repeat the one before them.
+    """
 
     def __init__(self, events: Events) -> None:
+        self.repeated: list[RepeatedFrame] = []
         self._events = events
         self._told: set[str] = set()
         self._is_summarised = False
@@ -69,6 +81,7 @@ class ProblemTeller:
         """The frames among the items; problems are told in the consumer's thread, in the order of the frames."""
         problems: list[Skipped] = []
         num_frames = 0
+        self.repeated = []
         try:
             for item in items:
                 if isinstance(item, Frame):
@@ -76,6 +89,8 @@ class ProblemTeller:
                     yield item
                     continue
                 problems.append(item)
+                if item.repeated is not None:
+                    self.repeated.append(item.repeated)
                 if item.reason != REPEATED and item.name not in self._told and len(self._told) < _PROBLEMS_TOLD:
                     self._told.add(item.name)
                     self._events.warned(STAGE, f"skipped {item.name}: {item.reason}", name=item.name)
@@ -92,7 +107,8 @@ class ProblemTeller:
             text = f"{len(broken)} of {num_seen} frames could not be used: {some(broken)}"
             self._events.warned(STAGE, text, names=broken)
         if repeated:
-            text = f"{len(repeated)} of {num_seen} frames repeat the one before them and were skipped: {some(repeated)}"
+            which = f"{len(repeated)} of {num_seen} frames"
+            text = f"{which} repeat the one before them, whose pose they have: {some(repeated)}"
             self._events.warned(STAGE, text, names=repeated)
 
 
@@ -173,19 +189,20 @@ class _FileReader:
         self._white = [255] * len(sequence.rig.cameras)
         self._last_bytes: tuple[bytes, ...] = ()
         self._last_images: tuple[Pixels, ...] = ()
+        self._last_idx = -1
 
     def __call__(self) -> Frame | Skipped | None:
         sequence, idx = self._sequence, self._idx
         if idx >= len(sequence.paths):
             return None
         self._idx += 1
-        name = sequence.names[idx]
+        name, timestamp_s = sequence.names[idx], float(sequence.timestamps_s[idx])
         data: list[bytes] = []
         images: list[Pixels] = []
         try:
             data.extend(map(read_regular_file, sequence.paths[idx]))
             if tuple(data) == self._last_bytes:
-                return Skipped(name, REPEATED)
+                return skipped_twin(idx, name, timestamp_s, self._last_idx)
             images.extend(map(self._decode, range(len(data)), data))
         except UnusableImage as reason:
             # what was read so far tells which of the files is at fault
@@ -195,8 +212,10 @@ class _FileReader:
         is_repeated = bool(self._last_images) and all(map(np.array_equal, images, self._last_images))
         self._last_bytes, self._last_images = tuple(data), tuple(images)
         if is_repeated:
-            return Skipped(name, REPEATED)
-        return Frame(idx, name, float(sequence.timestamps_s[idx]), tuple(images))
+            return skipped_twin(idx, name, timestamp_s, self._last_idx)
+        self._last_idx = idx
+        elapsed_s = None if sequence.elapsed_s is None else float(sequence.elapsed_s[idx])
+        return Frame(idx, name, timestamp_s, tuple(images), elapsed_s)
 
     def _decode(self, camera_idx: int, data: bytes) -> Pixels:
         header, camera = read_header(data), self._sequence.rig.cameras[camera_idx]
@@ -218,6 +237,7 @@ class FileSequence:
         paths: for each frame, one file for each camera of the rig; that of the first alone where the others lack it.
         sampling: for each camera, where the pixels of its frames are found in the files, see :func:`resampled`.
         events: told about frames that are left out.
+        elapsed_s: (N,) see :class:`~sfmapp.images.sequence.Frame`.
         orientation: that EXIF gives the first; frames are those of the files all the same.
     """
 
@@ -232,12 +252,18 @@ class FileSequence:
     imu: Imu | None
     truth: Truth | None
     events: Events
+    elapsed_s: NDArray[np.float64] | None = None
     orientation: int = 1
     num_frames: int | None = field(init=False)
 
     def __post_init__(self) -> None:
         self.num_frames = len(self.names)
         self._teller = ProblemTeller(self.events)
+
+    @property
+    def repeated(self) -> list[RepeatedFrame]:
+        """Frames that the present walk has left out so far, because they repeat the one before them."""
+        return self._teller.repeated
 
     def frames(self) -> Iterator[Frame]:
         """See :class:`~sfmapp.images.sequence.Sequence`."""

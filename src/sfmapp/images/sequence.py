@@ -33,7 +33,8 @@ class SequenceOptions:
         step: play every step-th frame.
         reverse: play backwards. Time still ascends: a frame of time t comes at first + last - t, so that the intervals
             stay what they are; the truth is mirrored with it, and the IMU, whose rates of rotation change sign.
-        fps: frames a second where the sequence holds no times; None: 10 for KITTI, 30 else, with a note.
+        fps: frames a second, in place of the times that the sequence holds; None: its times, and where it holds none
+            10 for KITTI, 30 else, with a note.
         imu: path of IMU measurements in EuRoC's form, ``sensor.yaml`` beside it. None: what the sequence holds.
         truth: path of a trajectory of TUM, KITTI or EuRoC. None: what the sequence holds.
     """
@@ -66,12 +67,37 @@ class Frame:
         name: the file of the first camera relative to the sequence, or ``000123`` in a video.
         timestamp_s: seconds, strictly ascending.
         images: one (H, W) uint8 grey image for each camera of the rig; the first alone where the others lack it.
+        elapsed_s: seconds since the sequence began, which a clock since 1970 tells to a quarter of a microsecond only;
+            None where nothing more exact than ``timestamp_s`` is known.
+        given_s: what ``timestamp_s`` was before the time that has elapsed took its place; None while it is that itself.
     """
 
     idx: int
     name: str
     timestamp_s: float
     images: tuple[NDArray[np.uint8], ...]
+    elapsed_s: float | None = None
+    given_s: float | None = None
+
+    @property
+    def shown_s(self) -> float:
+        """The time on the sequence's own clock, to be told and written."""
+        return self.timestamp_s if self.given_s is None else self.given_s
+
+
+@dataclass(frozen=True)
+class RepeatedFrame:
+    """A frame that shows what the one before it shows, to the byte: a camera that was read twice.
+
+    Attributes:
+        idx, name, timestamp_s: as of :class:`Frame`.
+        twin_idx: ``idx`` of the frame that it repeats.
+    """
+
+    idx: int
+    name: str
+    timestamp_s: float
+    twin_idx: int
 
 
 @dataclass(frozen=True)
@@ -84,6 +110,7 @@ class Imu:
         imu_from_cam: (7,) pose that takes points of the rig's first camera to the IMU's frame, in metres.
         gyro_noise, accel_noise: white noise densities, rad/s/sqrt(Hz) and m/s^2/sqrt(Hz).
         gyro_walk, accel_walk: random walks of the biases, rad/s^2/sqrt(Hz) and m/s^3/sqrt(Hz).
+        elapsed_s: (M,) on the clock of :attr:`Frame.elapsed_s`; None where that is not known.
     """
 
     timestamps_s: Array
@@ -94,6 +121,7 @@ class Imu:
     accel_noise: float
     gyro_walk: float
     accel_walk: float
+    elapsed_s: Array | None = None
 
 
 @dataclass(frozen=True)

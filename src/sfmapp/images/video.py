@@ -1,12 +1,15 @@
-"""Frames from a video file, a stream or a camera, read by OpenCV (FFmpeg, or the system's driver for a camera)."""
+"""Frames from a video file or stream, read by FFmpeg, or from a camera, read by OpenCV with the system's driver."""
 
 from __future__ import annotations
 
 import math
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,16 +17,31 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
-from sfmapp.images.frame_reader import LARGEST_FRAME_PX, REPEATED, ProblemTeller, Skipped, read_ahead, resampled
-from sfmapp.images.sequence import Frame, Imu, SequenceKind, SequenceOptions, Truth
-from sfmapp.images.sources import printable
+from sfmapp.images.containers import (
+    Damaged,
+    VideoFacts,
+    decoded_frames,
+    gray_of,
+    open_container,
+    read_container_facts,
+)
+from sfmapp.images.frame_reader import (
+    LARGEST_FRAME_PX,
+    ProblemTeller,
+    Skipped,
+    read_ahead,
+    resampled,
+    skipped_twin,
+)
+from sfmapp.images.sequence import Frame, Imu, RepeatedFrame, SequenceKind, SequenceOptions, Truth
 from sfmapp.scene.rig import Rig
+
+Pixels = NDArray[np.uint8]
 
 _STREAM = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp|srt|rtp)://", re.IGNORECASE)
 _DEVICE = re.compile(r"camera:(\d{1,3})|/dev/video(\d{1,3})")
 DEFAULT_FPS = 30.0
-_OPEN_TIMEOUT_MS, _READ_TIMEOUT_MS = 15_000, 15_000
-# A file that ends this much before the number of frames in its header was cut off; headers err by a few.
+# A file that ends this much before the end in its header was cut off; headers err by a little.
 _CUT_OFF_SHARE = 0.98
 
 
@@ -32,42 +50,22 @@ def is_stream(source: str) -> bool:
     return bool(_STREAM.match(source) or _DEVICE.fullmatch(source))
 
 
-@dataclass(frozen=True)
-class VideoFacts:
-    """What a video says of itself: size in pixels once turned upright, rate and number of frames, None for unknown."""
-
-    width: int
-    height: int
-    fps: float | None
-    num_frames: int | None
-
-
-def _open(source: str) -> Any:
-    """An opened ``cv2.VideoCapture``, turned upright as its metadata say. Raises InputError."""
+def _open_device(source: str) -> Any:
+    """An opened ``cv2.VideoCapture`` of a camera. Raises InputError."""
     import cv2
 
     device = _DEVICE.fullmatch(source)
-    if any("\ud800" <= letter <= "\udfff" for letter in source):  # OpenCV would crash
-        raise InputError(f"{printable(source)}: expected a name in UTF-8, found other bytes in it", "rename it")
-    if device:
-        capture = cv2.VideoCapture(int(device[1] or device[2]))
-    else:
-        # FFmpeg alone: another backend would take a name with a % for a pattern of image files
-        timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_TIMEOUT_MS]
-        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, timeouts if is_stream(source) else [])
+    assert device is not None
+    capture = cv2.VideoCapture(int(device[1] or device[2]))
     if not capture.isOpened():
         capture.release()
         raise InputError(
-            f"{printable(source)}: expected a video that OpenCV can read, found none",
-            "try to play it, or convert it: ffmpeg -i VIDEO -c:v libx264 video.mp4",
+            f"{source}: expected a camera that can be read, found none", "see whether another program has it"
         )
-    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
     width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
     if not 0 < width * height <= LARGEST_FRAME_PX:
         capture.release()
-        raise InputError(
-            f"{printable(source)}: expected frames of at most {LARGEST_FRAME_PX} pixels, found {width:g}x{height:g}"
-        )
+        raise InputError(f"{source}: expected frames of at most {LARGEST_FRAME_PX} pixels, found {width:g}x{height:g}")
     return capture
 
 
@@ -77,17 +75,55 @@ def read_video_facts(source: str) -> VideoFacts:
     Raises:
         InputError: it cannot be opened, holds no frame, or its size cannot be believed.
     """
+    if _DEVICE.fullmatch(source) is None:
+        return read_container_facts(source, is_stream=is_stream(source))
     import cv2
 
-    capture = _open(source)
+    capture = _open_device(source)
     try:
         is_read, image = capture.read()
         if not is_read or image is None:
-            raise InputError(f"{printable(source)}: expected a video with frames, found none that can be decoded")
-        fps, count = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+            raise InputError(f"{source}: expected a camera that gives frames, found one that gives none")
+        fps = capture.get(cv2.CAP_PROP_FPS)
         known_fps = float(fps) if math.isfinite(fps) and 0.01 <= fps <= 1e4 else None
-        is_counted = not is_stream(source) and math.isfinite(count) and 1 <= count < 1e9
-        return VideoFacts(image.shape[1], image.shape[0], known_fps, int(count) if is_counted else None)
+        return VideoFacts(image.shape[1], image.shape[0], known_fps, None)
+    finally:
+        capture.release()
+
+
+# Pixels are made where they are wanted alone: (H, W) grey, and the time in seconds that the source gives, or None.
+_Walk = Iterator["_Unread | Damaged"]
+
+
+@dataclass(frozen=True)
+class _Unread:
+    """A frame of which it is not yet known whether it is wanted."""
+
+    gray: Callable[[], Pixels]
+    time_s: Fraction | None
+
+
+def _walk_through(source: str) -> _Walk:
+    """The frames of a source, one after another. Raises InputError: it cannot be opened."""
+    if _DEVICE.fullmatch(source) is not None:
+        yield from _frames_of_device(source)
+        return
+    with closing(open_container(source, is_stream=is_stream(source))) as container:
+        for item in decoded_frames(container):
+            yield item if isinstance(item, Damaged) else _Unread(partial(gray_of, item), item.time_s)
+
+
+def _frames_of_device(source: str) -> _Walk:
+    import cv2
+
+    capture = _open_device(source)
+    try:
+        while True:
+            is_read, image = capture.read()
+            if not is_read or image is None:
+                return
+            gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+            yield _Unread(partial(np.asarray, gray), None)
     finally:
         capture.release()
 
@@ -123,6 +159,11 @@ class VideoSequence:
         self.frames_per_second = fps / self.options.step if fps else None
         self._teller = ProblemTeller(self.events)
 
+    @property
+    def repeated(self) -> list[RepeatedFrame]:
+        """Frames that the present walk has left out so far, because they repeat the one before them."""
+        return self._teller.repeated
+
     def frames(self) -> Iterator[Frame]:
         """See :class:`~sfmapp.images.sequence.Sequence`."""
         return self._teller.frames_without_problems(self._items())
@@ -145,66 +186,87 @@ class _VideoReader:
     def __init__(self, video: VideoSequence) -> None:
         self._video = video
         self._is_live = is_stream(video.source)
-        self._capture: Any = None
+        self._walk: _Walk | None = None
         self._position = 0  # of the next frame in the file
         self._idx = 0
-        self._last: NDArray[np.uint8] | None = None
+        self._last: Pixels | None = None
+        self._last_idx = -1
         self._last_s = -math.inf
+        self._seen: list[Fraction] = []  # the first and the last time of the file
+        self._origin: Fraction | None = None
         self._start = 0.0
         self._has_ended = False
 
     def close(self) -> None:
         """Give the file back."""
-        if self._capture is not None:
-            self._capture.release()
+        if self._walk is not None:
+            self._walk.close()  # type: ignore[attr-defined]  # a generator
 
     def __call__(self) -> Frame | Skipped | None:
-        import cv2
-
         options = self._video.options
-        if self._capture is None:
-            self._capture = _open(self._video.source)
+        if self._walk is None:
+            self._walk = _walk_through(self._video.source)
             self._start = time.monotonic()
         position = options.start + self._idx * options.step
         if self._has_ended or (options.stop is not None and position >= options.stop):
             return None
-        while self._position < position:
-            if not self._capture.grab():
+        while True:
+            item = next(self._walk, None)
+            if item is None:
                 return self._end()
+            if isinstance(item, _Unread) and item.time_s is not None:
+                self._seen[1:] = [item.time_s]
             self._position += 1
-        is_read, image = self._capture.read()
-        if not is_read or image is None:
-            return self._end()
-        self._position += 1
+            if self._position > position:
+                break
         idx, name = self._idx, f"{position:06d}"
         self._idx += 1
-        stamp = self._timestamp(position, self._capture.get(cv2.CAP_PROP_POS_MSEC))
-        gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+        if isinstance(item, Damaged):
+            return Skipped(name, "cannot be decoded: its data are damaged")
+        stamp, gray = self._timestamp(position, item.time_s), item.gray()
+        elapsed_s = self._elapsed(stamp, item.time_s)
         camera = self._video.rig.cameras[0]
-        if gray.shape != (camera.height, camera.width) or gray.dtype != np.uint8:
+        if gray.shape != (camera.height, camera.width):
             return Skipped(name, f"{gray.shape[1]}x{gray.shape[0]} pixels, where the video began with other ones")
+        self._last_s = stamp
         if self._last is not None and np.array_equal(gray, self._last):
-            return Skipped(name, REPEATED)
-        self._last, self._last_s = gray, stamp
-        return Frame(idx, name, stamp, (resampled(gray, self._video.sampling[0]),))
+            return skipped_twin(idx, name, stamp, self._last_idx)
+        self._last, self._last_idx = gray, idx
+        return Frame(idx, name, stamp, (resampled(gray, self._video.sampling[0]),), elapsed_s)
 
-    def _timestamp(self, position: int, position_ms: float) -> float:
+    def _timestamp(self, position: int, time_s: Fraction | None) -> float:
         fps = self._video.options.fps
         if fps is not None:
             return position / fps
         if self._is_live:
             return max(time.monotonic() - self._start, self._last_s + 1e-6)
-        stamp = position_ms / 1000
-        if math.isfinite(stamp) and stamp > self._last_s:
-            return stamp
+        if time_s is not None and float(time_s) > self._last_s:
+            return float(time_s)
         step = 1 / (self._video.facts.fps or DEFAULT_FPS)
         return max(self._last_s + step * self._video.options.step, 0.0)
 
-    def _end(self) -> Skipped | None:
-        expected, is_early = self._video.facts.num_frames, False
-        if expected is not None and self._video.options.stop is None and not self._has_ended:
-            is_early = self._position < _CUT_OFF_SHARE * expected
-        self._has_ended = True
-        if not is_early:
+    def _elapsed(self, stamp: float, time_s: Fraction | None) -> float | None:
+        """Seconds since the first frame that is played; None where nothing is more exact than the time stamps."""
+        if self._is_live or self._video.options.fps is not None:
             return None
-        return Skipped(f"{self._position:06d}", f"the video ends here, after {self._position} of {expected} frames")
+        exact = time_s if time_s is not None and float(time_s) == stamp else Fraction(stamp)
+        if self._origin is None:
+            self._origin = exact
+        return float(exact - self._origin)
+
+    def _end(self) -> Skipped | None:
+        """What there is to say of a file that ends before the end that its header names."""
+        facts, has_ended = self._video.facts, self._has_ended
+        self._has_ended = True
+        if self._video.options.stop is not None or has_ended or self._is_live:
+            return None
+        name = f"{self._position:06d}"
+        if self._seen and facts.end_s is not None:
+            first, last = float(self._seen[0]), float(self._seen[-1]) + 1 / (facts.fps or DEFAULT_FPS)
+            # of a clock that begins late, headers count from its beginning or from zero
+            length = facts.end_s - first if facts.end_s > first else facts.end_s
+            if last - first < _CUT_OFF_SHARE * length:
+                return Skipped(name, f"the video ends here, after {last - first:.1f} of {length:.1f} s")
+        elif facts.num_frames is not None and self._position < _CUT_OFF_SHARE * facts.num_frames:
+            return Skipped(name, f"the video ends here, after {self._position} of {facts.num_frames} frames")
+        return None

@@ -32,6 +32,7 @@ from sfmapp.mapping.mapper import STAGE, Mapper
 from sfmapp.mapping.mend import mended
 from sfmapp.mapping.merge import find_merge, merge, num_linking_points
 from sfmapp.mapping.moving_planes import without_moving_planes
+from sfmapp.mapping.one_place import OnePlace, find_one_place
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images
 from sfmapp.mapping.tracks import build_tracks, track_colors
@@ -120,7 +121,8 @@ def map_images(
     }
     events.finished(STAGE, f"{len(models)} model(s)", num_models=len(models))
     if not models:
-        raise no_reconstruction(report)
+        here = find_one_place(correspondences, tracks, image_set.cameras, image_camera_idx)
+        raise no_reconstruction(report, here)
     return models, report
 
 
@@ -343,15 +345,15 @@ def _with_left_over(
     return out
 
 
-def no_reconstruction(report: dict[str, Any]) -> NoReconstructionError:
-    """The failure of a run in which no model could be started, with the reasons of the best pairs."""
+def no_reconstruction(report: dict[str, Any], here: OnePlace | None) -> NoReconstructionError:
+    """The failure of a run in which no model could be started: what all pairs have in common, or the reason of the
+    best."""
     pairs = report["initial_pairs"][0]["pairs"] if report["initial_pairs"] else []
     reason = pairs[0]["reason"] if pairs else "no two images share enough verified matches"
-    error = NoReconstructionError(
-        f"no initial pair: {reason}",
-        "take photographs that overlap by more than half while moving sideways between them; turning on the spot "
-        "gives no depth",
-    )
+    advice = "take photographs that overlap by more than half while moving sideways between them"
+    if here is not None:
+        reason, advice = here.describe()
+    error = NoReconstructionError(f"no initial pair: {reason}", advice)
     error.report = report
     return error
 

@@ -57,7 +57,10 @@ class InitialPair:
         if self.num_points < min_inliers:
             return f"{self.num_points} points in front of both cameras, {min_inliers} wanted"
         if self.median_angle_deg < min_angle_deg:
-            return f"median angle {self.median_angle_deg:.2f} degrees, {min_angle_deg:.2f} wanted"
+            return (
+                f"the images are too nearly from one place: lines of sight meet at {self.median_angle_deg:.2f} degrees "
+                f"in the median, {min_angle_deg:.2f} wanted"
+            )
         return ""
 
     def describe(self, names: list[str]) -> dict[str, Any]:
@@ -137,7 +140,7 @@ def _examine(
         reason = f"{config.name.lower()}: the pair shows no depth"
         return InitialPair((first, second), num_matches, 0, 0.0, nothing, reason)
     if place[first] == place[second] >= 0:
-        reason = "both images belong to a group that turns on the spot: its pairs are rotations without a baseline"
+        reason = "both images belong to a group from one place: its pairs are rotations without a baseline"
         return InitialPair((first, second), num_matches, 0, 0.0, nothing, reason)
     xy1, xy2 = matched_pixels(reconstruction.tracks, correspondences, pair_idx)
     cameras = [reconstruction.cameras[reconstruction.image_camera_idx[i]] for i in (first, second)]

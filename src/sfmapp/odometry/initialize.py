@@ -73,6 +73,7 @@ class Beginning:
         first: pyramid of the first view. corners: (N, 2) where they were in it.
         seen: for every frame since, (N, 2) where the corners are, NaN where they were lost; first the corners.
         reason: why there is no map yet.
+        is_still, is_turn: of the last frame: the picture has hardly moved since the first view, or as by a mere turn.
     """
 
     camera: Camera
@@ -82,6 +83,8 @@ class Beginning:
     corners: Array = field(default_factory=lambda: np.zeros((0, 2)))
     seen: list[Array] = field(default_factory=list)
     reason: str = "no frame yet"
+    is_still: bool = False
+    is_turn: bool = False
     _previous: Pyramid | None = None
 
     def restart(self, pyramid: Pyramid) -> None:
@@ -94,6 +97,7 @@ class Beginning:
 
     def add(self, pyramid: Pyramid) -> TwoViews | None:
         """Follow the corners into the next frame; returns two views as soon as they make a map."""
+        self.is_still = self.is_turn = False
         if self.first is None or self._previous is None:
             self.restart(pyramid)
             self.reason = "waiting for motion"
@@ -107,7 +111,7 @@ class Beginning:
             return None
         flow = np.linalg.norm(self.seen[-1][left] - self.corners[left], axis=1)
         if np.median(flow) < _MIN_FLOW * self.camera.width:
-            self.reason = "hardly any motion in the image"
+            self.reason, self.is_still = "hardly any motion in the image", True
             return None
         return self._two_views(np.flatnonzero(left))
 
@@ -146,6 +150,7 @@ class Beginning:
         usable = found.config in (TwoViewConfig.CALIBRATED, TwoViewConfig.PLANAR, TwoViewConfig.UNCALIBRATED)
         if not usable or not np.isfinite(found.cam2_from_cam1).all():
             self.reason = f"the two views look like {found.config.name}"
+            self.is_turn = found.config in (TwoViewConfig.PANORAMIC, TwoViewConfig.PLANAR_OR_PANORAMIC)
             return None
         if found.median_angle_deg < _MIN_MEDIAN_ANGLE_DEG or num < max(_MIN_POINTS, 0.5 * len(track)):
             self.reason = f"{num} of {len(track)} corners agree, {found.median_angle_deg:.2f} deg of parallax"

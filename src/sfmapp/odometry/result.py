@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.contradictions import Contradiction
+from sfmapp.images.sequence import RepeatedFrame
 from sfmapp.odometry.smoothing import SmoothedTrajectory
 from sfmapp.scene.reconstruction import Reconstruction
 
@@ -23,6 +25,7 @@ class FrameState(IntEnum):
     TRACKED = 1  # its pose was measured against the map
     RELOCALIZED = 2  # the first one found again after a loss
     LOST = 3  # no pose: a gap in the trajectory
+    REPEATED = 4  # shows what the frame before it shows, to the byte: has what that one has
 
 
 @dataclass
@@ -86,3 +89,29 @@ class OdometryResult:
     covariance: Array | None = None
     smoothed: list[SmoothedTrajectory] = field(default_factory=list)
     report: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def twin_rows(self) -> NDArray[np.int64]:
+        """(F,) positions of the frames that were looked at: for those that repeat another, the position of that one."""
+        rows = np.arange(len(self.frame_state))
+        rows[self.frame_state == FrameState.REPEATED] = 0
+        return np.maximum.accumulate(rows)
+
+    def with_repeated(self, repeated: Sequence[RepeatedFrame]) -> OdometryResult:
+        """The same with frames that repeat others, each with the pose, the map and the covariance of its twin."""
+        position = {int(idx): k for k, idx in enumerate(self.frame_idx)}
+        added = [frame for frame in repeated if frame.twin_idx in position and frame.idx not in position]
+        if not added:
+            return self
+        every = np.concatenate([self.frame_idx, np.array([frame.idx for frame in added], np.int64)])
+        order = np.argsort(every, kind="stable")
+        row = np.concatenate([np.arange(len(self.frame_idx)), [position[frame.twin_idx] for frame in added]])[order]
+        state = np.where(order < len(self.frame_idx), self.frame_state[row], np.uint8(FrameState.REPEATED))
+        names = [*self.frame_names, *(frame.name for frame in added)]
+        times = np.concatenate([self.timestamps_s, [frame.timestamp_s for frame in added]])
+        return OdometryResult(
+            every[order], [names[k] for k in order], times[order], self.cam_from_world[row],
+            self.live_cam_from_world[row], self.frame_map[row], state.astype(np.uint8), self.maps,
+            None if self.covariance is None else self.covariance[row],
+            [smoothed.at(row) for smoothed in self.smoothed], self.report,
+        )  # fmt: skip

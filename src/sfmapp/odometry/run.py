@@ -65,6 +65,7 @@ class Odometry:
         self.num_mapped_at_keyframe = 0
         self.lost_since: float | None = None
         self.counts = {"relocalizations": 0, "losses": 0, "loops": 0, "keyframes_culled": 0}
+        self.counts |= {"looked_still": 0, "looked_turned": 0}
 
     def process(self, frame: Frame) -> FrameRecord:
         """Find the pose of the next frame."""
@@ -83,7 +84,7 @@ class Odometry:
         self.previous = view.pyramids[0]
         record.time_s = time.thread_time() - start
         snapshot = FrameSnapshot(
-            frame.idx, frame.name, frame.timestamp_s, record.state, frame.images[0], self.tracks.xy.astype(np.float32),
+            frame.idx, frame.name, frame.shown_s, record.state, frame.images[0], self.tracks.xy.astype(np.float32),
             self.is_mapped, record.live, record.map_idx, record.time_s,
         )  # fmt: skip
         self.events.advanced(STAGE, message=frame.name, snapshot=snapshot)
@@ -97,7 +98,8 @@ class Odometry:
             record.state = FrameState.LOST
             if record.timestamp_s == self.lost_since:
                 self.events.warned(STAGE, f"{record.name}: tracking is lost", frame_idx=record.frame_idx)
-        is_open = self.lost_since is None or record.timestamp_s - self.lost_since >= self.options.max_lost_s
+        # to the millisecond: what a clock that began in 1970 rounds away may not decide
+        is_open = self.lost_since is None or round(record.timestamp_s - self.lost_since, 3) >= self.options.max_lost_s
         if is_open:
             self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
         if self.rig.is_stereo:
@@ -105,6 +107,8 @@ class Odometry:
                 self._begin_stereo(record, view)
             return
         views = self.beginning.add(view.pyramids[0])
+        self.counts["looked_still"] += self.beginning.is_still
+        self.counts["looked_turned"] += self.beginning.is_turn
         if len(self.beginning.seen) == 1:
             self.waiting.clear()  # a new first view: what was before it has no pose
         self.waiting.append((record, view))
@@ -195,7 +199,7 @@ class Odometry:
             return self.step
         before, last, now = (record.timestamp_s for record in self.records[-3:])
         # after a pause nobody knows: what has moved on so far would be nearly out of sight
-        share = min((now - last) / (last - before), _MAX_STEADY_SHARE)
+        share = min(round((now - last) / (last - before), 2), _MAX_STEADY_SHARE)
         step = pose_between(rigid3.IDENTITY, self.step, share) if abs(share - 1) > _STEADY_SHARE else self.step
         turn = None if self.imu is None else imu_rotation(self.imu, last, now)
         self.foretold = None if turn is None else (turn, rigid3.rotation_matrix(step))

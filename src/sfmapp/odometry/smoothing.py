@@ -68,6 +68,13 @@ class SmoothedTrajectory:
     acceleration_noise: float
     turn_noise: float
 
+    def at(self, rows: NDArray[np.int64]) -> SmoothedTrajectory:
+        """The same of the frames at other positions, some of them more than once."""
+        return SmoothedTrajectory(
+            self.cam_from_world[rows], self.covariance[rows], self.is_predicted[rows], self.is_rejected[rows],
+            self.velocity[rows], self.turn_rate[rows], self.nis[rows], self.acceleration_noise, self.turn_noise,
+        )  # fmt: skip
+
 
 def smooth_trajectory(
     timestamps_s: ArrayLike,

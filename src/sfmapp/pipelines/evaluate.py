@@ -155,7 +155,8 @@ def evaluate(
     true_file = (
         read_trajectory(Path(truth), seconds) if not Path(truth).is_dir() else _of_sequence(Path(truth), Path(estimate))
     )
-    our_file = read_trajectory(_trajectory_of(Path(estimate), true_file.trajectory), seconds)
+    ours_path = _trajectory_of(Path(estimate), true_file.trajectory)
+    our_file = read_trajectory(ours_path, seconds, like=true_file.trajectory.timestamps_s)
     ours, theirs = _same_length(our_file, true_file)
     pairs = associate(ours, theirs, max_difference_s=options.max_difference_s, offset_s=options.offset_s)
     if len(pairs) < 2:
@@ -309,6 +310,7 @@ def _notes(result: Evaluation, options: EvaluateOptions) -> list[str]:
     if left and pairs.num_truth > pairs.num_estimate:
         notes.append(f"{left} poses of the estimate have no true one within {options.max_difference_s:g} s")
     for name, file in (("estimate", result.estimate), ("truth", result.truth)):
+        notes += [file.note] if file.note else []
         times = file.trajectory.timestamps_s
         steps = np.diff(times) if times is not None else np.ones(0)
         if (steps < 0).any():

@@ -8,15 +8,21 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 import sfmapp
 from sfmapp.errors import InterruptedRunError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.formats.sequences import open_sequence
+from sfmapp.images.frame_reader import FileSequence
 from sfmapp.images.sequence import Frame, Imu, Sequence, SequenceKind, Truth
+from sfmapp.images.video import VideoSequence
+from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
 from sfmapp.pipelines.kernels import compile_odometry_kernels
 from sfmapp.pipelines.listeners import DecisionLog, EventLog
@@ -32,14 +38,13 @@ from sfmapp.pipelines.workspace import ODOMETRY, open_workspace
 from sfmapp.viewer.live import LiveView, Screen
 
 if TYPE_CHECKING:
-    from sfmapp.odometry.result import OdometryResult
     from sfmapp.scene.rig import Rig
 
 NO_MAP_ADVICE = (
     "the camera has to move sideways past something still and textured; OUT/report.html and -v tell what was seen"
 )
-
-
+# What held for this share of the frames is why there is no map.
+_MOST_FRAMES = 0.5
 GIVEN_UP = "given up, for the disk is full, and the rest matters more"
 
 
@@ -146,10 +151,9 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
     with run.stage("kernels"):
         run.stages["kernels"] = compile_odometry_kernels(events, inertial=run.sequence.imu is not None)
     run.save_first(lambda: run.workspace.begin(ODOMETRY, ""))
+    watched = Watched(run.sequence, run)
     with run.measured("odometry"):
-        result = run_odometry(
-            Watched(run.sequence, run), options.odometry, seed=options.seed, threads=run.threads, events=events.deaf()
-        )
+        result = run_odometry(watched, options.odometry, seed=options.seed, threads=run.threads, events=events.deaf())
         run.threads_cpu.sample()
     run.stages["odometry"] = result.report
     if self_calibrate:
@@ -160,7 +164,10 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         run.keyframes.colour(result)
         if run.wish is not None:
             deaf = events.deaf()
-            run.stages["scale"] = scale_maps(result, run.wish, run.keyframes, run.sequence.imu, deaf)
+            run.stages["scale"] = scale_maps(result, run.wish, run.keyframes, watched.imu, deaf)
+    result = replace(result, timestamps_s=watched.times_as_given(result))
+    if isinstance(run.sequence, FileSequence | VideoSequence):  # frames in memory are all there
+        result = result.with_repeated(run.sequence.repeated)
     failure = None if result.maps else no_map(run, result)
     report = write_odometry(run, result, failure)
     if events.is_cancelled:
@@ -177,14 +184,26 @@ def no_map(run: Tracking, result: OdometryResult) -> NoReconstructionError:
     if seen < 2:
         found = "no frame could be read" if seen == 0 else "only one frame could be read"
         return NoReconstructionError(f"{run.source}: {found}", "-v names the files and what is wrong with them")
+    num_repeated = int((result.frame_state == FrameState.REPEATED).sum())
+    if num_repeated == seen - 1:
+        return NoReconstructionError(f"{run.source}: all {seen} frames show the same picture", NO_MAP_ADVICE)
     text = f"{run.source}: {seen} frames were read, but no map could be begun"
     for against in result.report.get("pairs", []):
         return NoReconstructionError(f"{text}: {against['message']}", against["advice"])
+    looked = {name: result.report.get(f"looked_{name}", 0) for name in ("still", "turned")}
+    if looked["still"] >= _MOST_FRAMES * (seen - num_repeated):
+        text += ": the camera stands still, the picture hardly moves"
+    elif looked["turned"] >= _MOST_FRAMES * (seen - num_repeated):
+        text += ": the camera turns on the spot, or everything is too far away for how far it moves"
     return NoReconstructionError(text, NO_MAP_ADVICE)
 
 
 class Watched:
-    """A sequence that ends early when the run is asked to stop, and on whose frames the clocks are read."""
+    """A sequence that ends early when the run is asked to stop, and on whose frames the clocks are read.
+
+    Its time is the one that has elapsed since it began, where all its parts know that: where a clock begins has no part
+    in the result.
+    """
 
     kind: SequenceKind
     source: str
@@ -199,6 +218,14 @@ class Watched:
         for name in ("kind", "source", "rig", "num_frames", "frames_per_second", "imu", "truth", "orientation"):
             setattr(self, name, getattr(sequence, name))
         self._sequence, self._run = sequence, run
+        self._given_s: dict[int, float] = {}
+        self._is_relative = self.imu is None or self.imu.elapsed_s is not None
+        if self.imu is not None and self.imu.elapsed_s is not None:
+            self.imu = replace(self.imu, timestamps_s=self.imu.elapsed_s, elapsed_s=None)
+
+    def times_as_given(self, result: OdometryResult) -> NDArray[np.float64]:
+        """(F,) times of the frames of a result on the sequence's own clock."""
+        return np.array([self._given_s[int(idx)] for idx in result.frame_idx], np.float64)
 
     def frames(self) -> Iterator[Frame]:
         """See :class:`~sfmapp.images.sequence.Sequence`."""
@@ -209,7 +236,9 @@ class Watched:
                 if self._run.events.is_cancelled:
                     self._run.events.warned("odometry", f"stopped on request before {frame.name}")
                     return
-                yield frame
+                self._given_s[frame.idx] = frame.timestamp_s
+                elapsed_s = frame.elapsed_s if self._is_relative else None
+                yield frame if elapsed_s is None else replace(frame, timestamp_s=elapsed_s, given_s=frame.timestamp_s)
         finally:
             self._run.threads_cpu.frames_ended()  # while the thread that reads ahead is still there
             frames.close()  # type: ignore[attr-defined]  # a generator: ends its thread

@@ -54,7 +54,7 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
     """Write everything, the report last; returns it."""
     assert run.sequence is not None
     workspace, truth = run.workspace, run.sequence.truth
-    facts = run.frames.facts(result.frame_idx)
+    facts = run.frames.facts(result)
     with run.measured("output"):
         # what matters most comes first, should the disk be full
         run.save_first(lambda: write_trajectories(workspace, result, facts))

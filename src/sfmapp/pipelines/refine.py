@@ -224,6 +224,7 @@ def moved_frames(before: OdometryResult, entries: list[MapResult]) -> OdometryRe
             for k in (ahead, after)
         ]
         poses[mine] = between(moved[0], moved[1], np.clip(weight, 0.0, 1.0))
+    poses = poses[before.twin_rows]
     return replace(before, cam_from_world=poses, live_cam_from_world=before.live_cam_from_world, maps=entries)
 
 

@@ -42,6 +42,8 @@ def _headline(report: Mapping[str, Any]) -> str:
     run, frames, parts = report["run"], report["frames"], []
     if frames:
         parts.append(f"{frames['num_with_pose']} of {frames['num_frames']} frames with a pose")
+        if frames.get("repeated"):
+            parts.append(f"{frames['repeated']} of them repeat the one before, whose pose they have")
     if report["maps"]:
         first = report["maps"][0]
         parts.append(f"path {first['path_length']:.4g} {first['unit'] or '(unit arbitrary)'}")
