@@ -135,7 +135,7 @@ def test_a_recording_can_be_looked_at(tmp_path: Path, fake: Patch, capsys: Captu
     assert json.loads((tmp_path / "out" / "run.json").read_text())["recording"] == "written"
 
 
-@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_ctrl_c_writes_what_was_tracked(tmp_path: Path, sign: signal.Signals) -> None:
     script = (
         "import sys; sys.path.insert(0, sys.argv.pop(1))\n"

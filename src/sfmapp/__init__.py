@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from sfmapp.kernel_cache import provide_kernel_cache
+
 if TYPE_CHECKING:
     from sfmapp.pipelines.odometry import TrackResult, track_sequence
     from sfmapp.pipelines.options import Options, load_options
@@ -51,3 +53,6 @@ def __getattr__(name: str) -> Any:
     value = getattr(import_module(_HOMES[name]), name)
     globals()[name] = value
     return value
+
+
+provide_kernel_cache()

@@ -6,13 +6,12 @@ import argparse
 import contextlib
 import json
 import os
-import signal
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from sfmapp.cli.progress import make_listener
+from sfmapp.cli.signals import signals_stop
 
 if TYPE_CHECKING:
     from sfmapp.events import Events
@@ -30,26 +29,17 @@ def add_output_flags(parser: argparse.ArgumentParser, *, has_log: bool = False) 
 
 @contextlib.contextmanager
 def listening(args: argparse.Namespace) -> Iterator[Events]:
-    """Events, shown as the flags ask. Ctrl-C (or SIGTERM) ends the run at its next step, a second one at once."""
+    """Events, shown as the flags ask. Ctrl-C, SIGTERM or SIGHUP ends the run at its next step, a second one at once."""
     from sfmapp.events import Events
 
     listener = make_listener(quiet=args.quiet, verbose=args.verbose, as_json=args.json)
     events = Events(listener)
 
-    def stop(number: int, _: FrameType | None) -> None:
-        for name in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(name, signal.SIG_DFL)
-        events.cancel()
-        if not args.json:  # no print: the signal may have come in the middle of one
-            os.write(2, b"\nstopping at the next step; Ctrl-C again ends at once\n")
-
-    before = {name: signal.signal(name, stop) for name in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield events
-    finally:
-        listener.close()
-        for name, handler in before.items():
-            signal.signal(name, handler)
+    with signals_stop(events.cancel, is_talking=not args.json):
+        try:
+            yield events
+        finally:
+            listener.close()
 
 
 def print_json(value: Any) -> None:

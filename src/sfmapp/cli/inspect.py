@@ -44,8 +44,11 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _view(args: argparse.Namespace) -> int:
+    from sfmapp.errors import UsageError
     from sfmapp.viewer.view import view
 
+    if not 0 < args.port < 1 << 16:
+        raise UsageError(f"--port: expected a number from 1 to 65535, found {args.port}")
     recording, *others = _recordings(args.output)
     for other in others:
         print(f"there is another: sfmapp view {other}", flush=True)

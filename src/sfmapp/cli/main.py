@@ -3,46 +3,66 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
+import errno
 import json
-import os
 import sys
 from collections.abc import Sequence
 
 import sfmapp
 from sfmapp.cli import convert, dense, evaluate, inspect, odometry, reconstruct
-from sfmapp.errors import SfmError
-
-BUG = 1
-INTERRUPTED = 130
+from sfmapp.cli.signals import signals_interrupt
+from sfmapp.cli.streams import standard_streams
+from sfmapp.errors import InputError, InterruptedRunError, SfmError, refusal
+from sfmapp.kernel_cache import ADVICE, is_without_cache
 
 EXIT_CODES = """\
-exit codes: 0 done, 1 a bug, 2 usage, 3 bad input, 4 no reconstruction (the report is still written),
-            5 fewer images than asked for, 130 interrupted (reconstruct resumes)"""
+exit codes: 0 done, 1 a bug, 2 usage, 3 bad input, or no room for what is to be written or held in memory,
+            4 no reconstruction (the report is still written), 5 fewer images than asked for,
+            130 interrupted (reconstruct resumes)"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
-    args = make_parser().parse_args(argv)
+    with standard_streams() as output, signals_interrupt():
+        args = make_parser().parse_args(argv)
+        code = _run(args)
+        output.flush()
+        if output.has_lost_text and code == 0:
+            lost = InputError(f"standard output cannot be written: {output.error}", "all files were written")
+            return _fail(args, lost)
+        return code
+
+
+def _run(args: argparse.Namespace) -> int:
     try:
         code: int = args.run(args)
-        sys.stdout.flush()
         return code
-    except BrokenPipeError:  # whoever read our output has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except SfmError as error:
-        return _fail(args, str(error), error.advice, error.exit_code)
+        return _fail(args, error)
     except MemoryError:
-        return _fail(args, "out of memory", "try --preset fast, or --set features.max_size_px=1600", BUG)
+        return _fail(args, InputError("out of memory", "try --preset fast, or --set features.max_size_px=1600"))
     except KeyboardInterrupt:
-        return _fail(args, "interrupted", None, INTERRUPTED)
+        return _fail(args, InterruptedRunError("interrupted"))
     except Exception as error:
+        if (failure := _known(error)) is not None:
+            return _fail(args, failure)
         if args.verbose:
             raise
         message = " ".join(f"{type(error).__name__}: {error}".split())
         where = "the traceback is in OUT/log.jsonl; -v shows it" if args.has_log else "-v shows where"
-        return _fail(args, f"a bug in sfmapp: {message}", f"please report it ({where})", BUG)
+        return _fail(args, SfmError(f"a bug in sfmapp: {message}", f"please report it ({where})"))
+
+
+def _known(error: Exception) -> SfmError | None:
+    """What is no bug: a refusal of the system, or kernels that find no place."""
+    if isinstance(error, OSError):
+        return refusal(error)
+    if isinstance(error, RuntimeError) and str(error).startswith("Symlink loop"):  # of pathlib, before Python 3.13
+        return refusal(OSError(errno.ELOOP, str(error)))
+    if is_without_cache(error):
+        where = "neither where sfmapp is installed, nor in ~/.cache, nor in /tmp"
+        return InputError(f"expected a folder to keep compiled kernels in, found none: {where}", ADVICE)
+    return None
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -60,12 +80,12 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _fail(args: argparse.Namespace, message: str, advice: str | None, code: int) -> int:
+def _fail(args: argparse.Namespace, failure: SfmError) -> int:
     """Say what went wrong: a line and advice for a person; with --json the same on the output stream."""
-    with contextlib.suppress(BrokenPipeError):
-        print(f"sfmapp: {message}", file=sys.stderr)
-        if advice:
-            print(f"  {advice}", file=sys.stderr)
-        if args.json:
-            print(json.dumps({"exit_code": code, "error": message, "advice": advice}), flush=True)
+    message, advice, code = str(failure), failure.advice, failure.exit_code
+    print(f"sfmapp: {message}", file=sys.stderr)
+    if advice:
+        print(f"  {advice}", file=sys.stderr)
+    if args.json:
+        print(json.dumps({"exit_code": code, "error": message, "advice": advice}), flush=True)
     return code

@@ -136,10 +136,5 @@ class Bars:
 
 
 def _say(line: str) -> None:
-    try:
-        sys.stderr.write(line + "\n")
-        sys.stderr.flush()
-    except BrokenPipeError:  # nobody reads any more, which is no reason to stop working
-        import os
-
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+    sys.stderr.write(line + "\n")
+    sys.stderr.flush()

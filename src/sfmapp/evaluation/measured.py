@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+from sfmapp.children import with_parent
+
 _TICK_S = 0.02
 
 
@@ -46,7 +48,7 @@ def run_measured(
     on_line: Callable[[str], None] = lambda line: None,
     on_tick: Callable[[], None] = lambda: None,
 ) -> ProcessUsage:
-    """Run a command to its end and measure it.
+    """Run a command to its end and measure it. It is killed when this process ends before.
 
     Args:
         command: program and arguments; no shell is involved.
@@ -58,7 +60,9 @@ def run_measured(
     own_peak_mb = _maxrss_mb(resource.getrusage(resource.RUSAGE_SELF))
     with log.open("wb") as errors:
         start = time.perf_counter()
-        child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, stdin=subprocess.DEVNULL, env=env)
+        child = subprocess.Popen(
+            with_parent(command), stdout=subprocess.PIPE, stderr=errors, stdin=subprocess.DEVNULL, env=env
+        )
         try:
             usage, status, high_water_mb = _watch(child, on_line, on_tick)
         except BaseException:

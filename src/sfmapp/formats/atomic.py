@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sfmapp.errors import InputError
+from sfmapp.errors import InputError, remedy
 
 
 @contextmanager
@@ -18,6 +18,8 @@ def replaced_file(path: Path) -> Iterator[Path]:
     Raises:
         InputError: the folder cannot be written.
     """
+    if not path.name:
+        raise InputError(f"{path}: expected the name of a file to write, found a folder")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -27,7 +29,7 @@ def replaced_file(path: Path) -> Iterator[Path]:
         finally:
             beside.unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}", remedy(error)) from error
 
 
 @contextmanager
@@ -54,7 +56,7 @@ def replaced_folder(folder: Path, owned_names: Collection[str]) -> Iterator[Path
         finally:
             shutil.rmtree(beside, ignore_errors=True)
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written: {error.strerror or error}") from error
+        raise InputError(f"{folder}: cannot be written: {error.strerror or error}", remedy(error)) from error
 
 
 def _swap(beside: Path, folder: Path, owned_names: Collection[str]) -> None:

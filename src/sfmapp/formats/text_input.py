@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import stat
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -20,7 +21,7 @@ LARGEST_BYTES = 2**30
 def read_limited_text(path: Path, largest_bytes: int = LARGEST_BYTES) -> str:
     """The UTF-8 text of a file. Raises InputError if it is missing, no text, or larger than the limit."""
     try:
-        size = path.stat().st_size
+        size = _size(path)
         if size > largest_bytes:
             raise InputError(f"{path}: expected at most {largest_bytes} bytes, found {size}")
         return path.read_text(encoding="utf-8-sig")  # some editors put a byte order mark first
@@ -28,6 +29,14 @@ def read_limited_text(path: Path, largest_bytes: int = LARGEST_BYTES) -> str:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError:
         raise InputError(f"{path}: expected UTF-8 text, found other bytes") from None
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file. Raises InputError for a device, such as /dev/zero, which may never end."""
+    found = path.stat()
+    if stat.S_ISCHR(found.st_mode) or stat.S_ISBLK(found.st_mode):
+        raise InputError(f"{path}: expected a file, found a device")
+    return found.st_size
 
 
 def read_json_object(path: Path, largest_bytes: int = 2**26) -> dict[str, Any]:

@@ -3,6 +3,7 @@ benchmark for the evaluation of RGB-D SLAM systems", IROS 2012)."""
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.text_input import finite_array, plain_numbers, read_limited_text
 from sfmapp.geometry import rigid3
 
+_HEAD = "# timestamp tx ty tz qx qy qz qw\n"
+
 
 def write_tum(path: str | Path, timestamps_s: ArrayLike, cam_from_world: NDArray[np.float64]) -> None:
     """Write the poses that are there.
@@ -21,13 +24,50 @@ def write_tum(path: str | Path, timestamps_s: ArrayLike, cam_from_world: NDArray
         timestamps_s: (N,) seconds.
         cam_from_world: (N, 7), NaN where unregistered: such poses are left out.
     """
-    times = np.asarray(timestamps_s, np.float64)
+    lines = _lines(np.asarray(timestamps_s, np.float64), cam_from_world)
+    with replaced_file(Path(path)) as beside:
+        beside.write_text(_HEAD + "".join(lines), encoding="utf-8")
+
+
+class GrowingTum:
+    """A trajectory on disk as it grows: each pose is handed to the system at once, whole, and survives a killed run.
+
+    Raises:
+        OSError: the file cannot be written; what it held before of this trajectory stays readable.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("wb", buffering=0)
+        self._size = 0
+        self._write(_HEAD)
+
+    def append(self, timestamp_s: float, cam_from_world: NDArray[np.float64]) -> None:
+        """Add a pose (7,), if it is one."""
+        for line in _lines(np.array([timestamp_s]), cam_from_world[None]):
+            self._write(line)
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _write(self, line: str) -> None:
+        data = line.encode()
+        try:
+            while data:
+                data = data[self._file.write(data) :]
+        except OSError:
+            with contextlib.suppress(OSError):  # half a line would spoil the file
+                self._file.truncate(self._size)
+                self._file.seek(self._size)
+            raise
+        self._size += len(line)
+
+
+def _lines(timestamps_s: NDArray[np.float64], cam_from_world: NDArray[np.float64]) -> list[str]:
+    """A line for each of the poses (N, 7) that are there."""
     kept = np.isfinite(cam_from_world).all(1)
     world_from_cam = rigid3.inverse(cam_from_world[kept])
-    rows = np.concatenate([times[kept, None], world_from_cam[:, 4:], world_from_cam[:, :4]], 1)
-    lines = ["# timestamp tx ty tz qx qy qz qw", *(" ".join(map(repr, row)) for row in rows.tolist()), ""]
-    with replaced_file(Path(path)) as beside:
-        beside.write_text("\n".join(lines), encoding="utf-8")
+    rows = np.concatenate([timestamps_s[kept, None], world_from_cam[:, 4:], world_from_cam[:, :4]], 1)
+    return [" ".join(map(repr, row)) + "\n" for row in rows.tolist()]
 
 
 def read_tum(path: str | Path) -> tuple[list[str], NDArray[np.float64]]:

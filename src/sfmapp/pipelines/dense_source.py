@@ -87,7 +87,7 @@ def dense_job(where: DenseSource, events: Events, watch: Stopwatch | None = None
     threads = options.num_workers
     with (
         open_workspace(where.output, where.command) as workspace,
-        EventLog(workspace.log, source=source, version=sfmapp.__version__) as event_log,
+        EventLog(workspace.log, events, source=source, version=sfmapp.__version__) as event_log,
         # our workers use the cores; sums must not depend on how many the linear algebra beneath them would use
         threadpool_limits(1, "blas"),
     ):

@@ -41,6 +41,8 @@ Array = NDArray[np.float64]
 _COMPARABLE_COVERAGE = 0.99
 # a unit of length that is off by more than this is none: visual odometry with a scale has a few percent at most
 _METRIC_SCALE = 0.1
+# beyond, squares of errors overflow; the orbit of the earth is shorter
+_LONGEST_PATH_M = 1e15
 _FORMAT_NAMES = {"tum": "TUM", "kitti": "KITTI", "euroc": "EuRoC"}
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+)\s*(f|s|m)")
 _UNITS: dict[str, DeltaUnit] = {"f": "frames", "s": "s", "m": "m"}
@@ -159,6 +161,9 @@ def evaluate(
     pairs = associate(ours, theirs, max_difference_s=options.max_difference_s, offset_s=options.offset_s)
     if len(pairs) < 2:
         raise InputError(f"{our_file.path} and {true_file.path} have one pose in common, which tells nothing")
+    for file, path in ((our_file, pairs.estimate), (true_file, pairs.truth)):
+        if not path.path_m < _LONGEST_PATH_M:
+            raise InputError(f"{file.path}: expected positions in metres, found a path of {path.path_m:.3g} m")
     deltas = options.deltas or _deltas(pairs)
     errors = {how: _errors(pairs, how, deltas, options) for how in dict.fromkeys(options.alignments)}
     result = Evaluation(our_file, true_file, pairs, errors)
@@ -213,6 +218,10 @@ def parse_delta(text: str) -> tuple[float, DeltaUnit]:
 def _trajectory_of(path: Path, truth: Trajectory) -> Path:
     if not path.is_dir():
         return path
+    from sfmapp.pipelines.workspace import MANIFEST, read_manifest
+
+    if (path / MANIFEST).is_file():
+        read_manifest(path)  # says so if the run was cut off
     tum, kitti = path / "trajectory.tum", path / "trajectory.kitti"
     if not tum.is_file():
         raise InputError(f"{path}: expected a trajectory, found a folder without trajectory.tum")

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, BinaryIO
 
-from sfmapp.events import Event
+from sfmapp.events import Event, Events
 from sfmapp.pipelines.workspace import plain_number
 
 # arrays for the recording travel under this key; they are no text
@@ -32,15 +33,22 @@ def without_arrays(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class EventLog:
-    """Appends every event to ``log.jsonl``, a line of JSON each; a run begins with a line of its own."""
+    """Appends every event to ``log.jsonl``, a line of JSON each; a run begins with a line of its own.
 
-    def __init__(self, path: Path, **facts: Any) -> None:
-        self._file = path.open("a", encoding="utf-8", buffering=1)
+    A log that cannot be written, on a full disk for one, is a warning and ends there.
+    """
+
+    def __init__(self, path: Path, events: Events, **facts: Any) -> None:
+        self._path, self._events = path, events
+        self._file: BinaryIO | None = None
+        try:
+            self._file = path.open("ab", buffering=0)
+        except OSError as error:
+            self._give_up(error)
         self._write({"kind": "run", "at": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **facts})
 
     def __call__(self, event: Event) -> None:
-        if not self._file.closed:
-            self._write(event_to_dict(event))
+        self._write(event_to_dict(event))
 
     def __enter__(self) -> EventLog:
         return self
@@ -54,10 +62,26 @@ class EventLog:
 
             text = "".join(traceback.format_exception(error))
             self._write({"kind": "raised", "error": type(error).__name__, "message": str(error), "traceback": text})
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
+            self._file = None
 
     def _write(self, line: dict[str, Any]) -> None:
-        self._file.write(json.dumps(line, default=plain_number) + "\n")
+        if self._file is None:
+            return
+        data = (json.dumps(line, default=plain_number) + "\n").encode()
+        try:
+            while data:
+                data = data[self._file.write(data) :]
+        except OSError as error:
+            self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        file, self._file = self._file, None  # first, for the warning comes back to this listener
+        if file is not None:
+            with contextlib.suppress(OSError):
+                file.close()
+        self._events.warned("log", f"{self._path}: cannot be written: {error.strerror}; the run goes on without it")
 
 
 class DecisionLog:

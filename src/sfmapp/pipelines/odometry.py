@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -27,6 +27,7 @@ from sfmapp.odometry.run import run_odometry
 from sfmapp.pipelines.kernels import compile_odometry_kernels
 from sfmapp.pipelines.listeners import DecisionLog, EventLog
 from sfmapp.pipelines.odometry_keyframes import KeyframeWatch
+from sfmapp.pipelines.odometry_live import GrowingTrajectories
 from sfmapp.pipelines.odometry_results import write_odometry
 from sfmapp.pipelines.odometry_scale import ScaleWish, parse_scale, scale_maps, settled_wish
 from sfmapp.pipelines.odometry_timing import FrameLog, ThreadTimes
@@ -44,6 +45,7 @@ NO_MAP_ADVICE = (
 )
 # What held for this share of the frames is why there is no map.
 _MOST_FRAMES = 0.5
+GIVEN_UP = "given up, for the disk is full, and the rest matters more"
 
 
 class TrackResult(NamedTuple):
@@ -72,6 +74,11 @@ class Tracking(Job):
     keyframes: KeyframeWatch
     wish: ScaleWish | None
     sequence: Sequence | None = None
+
+    def make_room(self) -> bool:
+        """See :meth:`Job.make_room`; a recording under way is one as well, and its end will be told as such."""
+        is_under_way = self.live is not None and self.live.is_recording and self.live.give_up(GIVEN_UP)
+        return super().make_room() or is_under_way
 
 
 def track_sequence(
@@ -110,7 +117,7 @@ def track_sequence(
     threads = options.num_workers
     with ExitStack() as stack:
         workspace = stack.enter_context(open_workspace(Path(output), ODOMETRY))
-        event_log = stack.enter_context(EventLog(workspace.log, source=source, version=sfmapp.__version__))
+        event_log = stack.enter_context(EventLog(workspace.log, events, source=source, version=sfmapp.__version__))
         # sums must not depend on how many threads the linear algebra would use
         stack.enter_context(threadpool_limits(1, "blas"))
         live = LiveView(workspace.recording if record else None, screen) if record or screen else None
@@ -121,7 +128,8 @@ def track_sequence(
             frames=FrameLog(), threads_cpu=ThreadTimes(), live=live,
             keyframes=KeyframeWatch(wish.detector() if wish else None), wish=wish,
         )  # fmt: skip
-        for listener in (event_log, run.log, run.frames, run.keyframes, live):
+        growing = stack.enter_context(closing(GrowingTrajectories(workspace.folder, events, run.make_room)))
+        for listener in (growing, event_log, run.log, run.frames, run.keyframes, live):
             if listener is not None:
                 events.subscribe(listener)
         return _run(run, self_calibrate)
@@ -142,6 +150,7 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         run.live.begin(run.sequence)
     with run.stage("kernels"):
         run.stages["kernels"] = compile_odometry_kernels(events, inertial=run.sequence.imu is not None)
+    run.save_first(lambda: run.workspace.begin(ODOMETRY, ""))
     watched = Watched(run.sequence, run)
     with run.measured("odometry"):
         result = run_odometry(watched, options.odometry, seed=options.seed, threads=run.threads, events=events.deaf())

@@ -16,8 +16,10 @@ from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.formats.colmap import read_model
 from sfmapp.formats.trajectory import read_tum, write_tum
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
+from sfmapp.pipelines.odometry_live import numbered
 from sfmapp.pipelines.odometry_timing import frame_statistics
 from sfmapp.pipelines.results import report_text
+from sfmapp.pipelines.workspace import ODOMETRY
 from sfmapp.report.odometry_document import (
     FORMAT,
     Against,
@@ -54,20 +56,23 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
     workspace, truth = run.workspace, run.sequence.truth
     facts = run.frames.facts(result)
     with run.measured("output"):
-        write_trajectories(workspace, result, facts)
-        workspace.write_text("frames.csv", _frames_csv(result, facts))
-        workspace.write_text("covariance.csv", _covariance_csv(result))
-        workspace.write_text("frame_covariance.csv", _frame_covariance_csv(result))
-        workspace.write_models([entry.reconstruction for entry in result.maps])
+        # what matters most comes first, should the disk be full
+        run.save_first(lambda: write_trajectories(workspace, result, facts))
+        run.save_first(lambda: workspace.write_text("frames.csv", _frames_csv(result, facts)))
+        run.save_first(lambda: workspace.write_models([entry.reconstruction for entry in result.maps]))
+        run.save_first(lambda: workspace.write_text("covariance.csv", _covariance_csv(result)))
+        run.save_first(lambda: workspace.write_text("frame_covariance.csv", _frame_covariance_csv(result)))
     against = [against_truth(result, truth, m) for m in range(len(result.maps))] if truth is not None else []
     with run.measured("recording"):
         _finish_recording(run, result, against)
     report = make_report(run, result, facts, against, failure)
-    workspace.write_text("report.html", render_odometry_html(report, result, facts, truth, against))
+    page = render_odometry_html(report, result, facts, truth, against)
+    run.save_first(lambda: workspace.write_text("report.html", page))
     report["run"] |= run.watch.read()  # the last measurement that can still be written down
-    workspace.write_text("report.json", report_text(report))
+    run.save_first(lambda: workspace.write_text("report.json", report_text(report)))
     workspace.manifest["usage"] = run.usage
-    workspace.save()
+    workspace.finish(ODOMETRY, run.usage["odometry"])
+    run.save_first(workspace.save)
     return report
 
 
@@ -82,11 +87,11 @@ def write_trajectories(workspace: Workspace, result: OdometryResult, facts: Fram
     from sfmapp.formats.kitti import write_kitti
 
     folder = workspace.folder
-    files = {_numbered("trajectory", m): poses_of_map(result, m) for m in range(len(result.maps))}
+    files = {numbered("trajectory", m): poses_of_map(result, m) for m in range(len(result.maps))}
     if facts is not None:
         for place, live_map in enumerate(facts.live_maps()):
             mine = (facts.live_map == live_map)[:, None]
-            files[_numbered("trajectory_live", place)] = np.where(mine, result.live_cam_from_world, np.nan)
+            files[numbered("trajectory_live", place)] = np.where(mine, result.live_cam_from_world, np.nan)
     if result.smoothed:
         files["trajectory_smooth.tum"] = result.smoothed[0].cam_from_world
     for path in folder.glob("trajectory*"):
@@ -96,10 +101,6 @@ def write_trajectories(workspace: Workspace, result: OdometryResult, facts: Fram
         write_tum(folder / name, result.timestamps_s, poses)
     if result.maps:
         write_kitti(folder / "trajectory.kitti", poses_of_map(result, 0), result.frame_idx)
-
-
-def _numbered(stem: str, number: int) -> str:
-    return f"{stem}.tum" if number == 0 else f"{stem}-{number}.tum"
 
 
 def poses_of_map(result: OdometryResult, map_idx: int) -> Any:
@@ -128,7 +129,7 @@ def read_odometry(folder: Path) -> OdometryResult:
     maps = []
     position = {name: k for k, name in enumerate(names)}
     for m, row in enumerate(known):
-        _, found = read_tum(folder / _numbered("trajectory", m))
+        _, found = read_tum(folder / numbered("trajectory", m))
         if len(found) != (frame_map == m).sum():
             raise InputError(
                 f"{folder}: frames.csv and the trajectory of map {m} disagree", "run sfmapp odometry again"

@@ -210,12 +210,20 @@ def _build(options_class: type, values: Any, prefix: str) -> Any:
             arguments[name] = _build(hints[name], value, f"{prefix}{name}.")
         else:
             arguments[name] = _convert(value, hints[name], f"{prefix}{name}")
+            _check_sign(arguments[name], getattr(options_class, name, None), f"{prefix}{name}")
     try:
         return options_class(**arguments)
     except SfmError:
         raise
     except (ValueError, TypeError) as error:
         raise UsageError(f"{prefix.rstrip('.') or 'options'}: {error}", LIST_ADVICE) from error
+
+
+def _check_sign(value: Any, default: Any, where: str) -> None:
+    """Refuse a negative number where the default is positive: a count, a threshold, a length; loops rely on it."""
+    numbers = [x for x in (value, default) if isinstance(x, int | float) and not isinstance(x, bool)]
+    if len(numbers) == 2 and value < 0 < default:
+        raise _impossible(where, value, "a number that is not negative")
 
 
 def _nearest(prefix: str, name: str) -> str:

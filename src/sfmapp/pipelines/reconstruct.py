@@ -77,7 +77,7 @@ def reconstruct(
     threads = options.num_workers
     with (
         open_workspace(Path(output)) as workspace,
-        EventLog(workspace.log, source=source, version=sfmapp.__version__) as event_log,
+        EventLog(workspace.log, events, source=source, version=sfmapp.__version__) as event_log,
         # our workers use the cores; sums must not depend on how many the linear algebra beneath them would use
         threadpool_limits(1, "blas"),
     ):

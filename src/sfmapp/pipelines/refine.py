@@ -95,7 +95,7 @@ def refine(
     threads = options.num_workers
     with ExitStack() as stack:
         workspace = stack.enter_context(open_workspace(Path(refined or source / FOLDER), REFINE))
-        event_log = stack.enter_context(EventLog(workspace.log, source=str(source), version=sfmapp.__version__))
+        event_log = stack.enter_context(EventLog(workspace.log, events, source=str(source), version=sfmapp.__version__))
         stack.enter_context(threadpool_limits(1, "blas"))
         job = Job(str(source), workspace, options, events, watch or Stopwatch(), DecisionLog(), threads)
         for listener in (event_log, job.log):

@@ -11,6 +11,7 @@ import numpy as np
 
 from sfmapp.errors import NoReconstructionError
 from sfmapp.geometry.orientation import MIRRORED
+from sfmapp.pipelines.run import FAILED, NO_MODEL, NOT_WANTED, WRITTEN
 from sfmapp.pipelines.stored_pixels import STORED
 from sfmapp.pipelines.workspace import plain_number
 from sfmapp.report.document import FORMAT, camera_rows, funnel_of_images, funnel_without_matches, make_checks
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
     from sfmapp.pipelines.run import Run
     from sfmapp.scene.reconstruction import Reconstruction
 
-# what the manifest says of a recording
-WRITTEN, FAILED, NO_MODEL, NOT_WANTED = "written", "failed", "no model", "not wanted"
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 
 
@@ -56,18 +55,20 @@ def write_results(
     workspace, manifest = run.workspace, run.workspace.manifest
     if failure is not None and failure.report is not None:
         run.stages["mapping"] = failure.report
-    workspace.begin("mapping", keys.mapping, pixels=STORED)
+    keypoints = [features.keypoints[:, :2].astype(np.float64) for features in run.features]
+    run.save_first(lambda: workspace.begin("mapping", keys.mapping, pixels=STORED))
     with run.stage("output"):
-        workspace.write_models(models, [features.keypoints[:, :2].astype(np.float64) for features in run.features])
+        run.save_first(lambda: workspace.write_models(models, keypoints))
     with run.stage("recording"):
         manifest["recording"] = _record(run, models)
     report = _make_report(run, models, failure)
-    workspace.write_text("report.html", render_html(report, models[0] if models else None))
+    page = render_html(report, models[0] if models else None)
+    run.save_first(lambda: workspace.write_text("report.html", page))
     report["run"] |= run.watch.read()  # the last measurement that can still be written down
-    workspace.write_text("report.json", report_text(report))
+    run.save_first(lambda: workspace.write_text("report.json", report_text(report)))
     workspace.finish("mapping", run.usage.get("mapping", {}))
     manifest["usage"] = run.usage
-    workspace.save()
+    run.save_first(workspace.save)
     return report
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import sfmapp
+from sfmapp.errors import InputError, is_full
 from sfmapp.events import Events
 from sfmapp.pipelines.listeners import DecisionLog
 from sfmapp.pipelines.options import Options, options_to_dict
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet
     from sfmapp.scene.correspondences import Correspondences
     from sfmapp.scene.features import Features
+
+# what the manifest says of a recording
+WRITTEN, FAILED, NO_MODEL, NOT_WANTED = "written", "failed", "no model", "not wanted"
 
 
 @dataclass
@@ -62,6 +66,25 @@ class Job:
         watch = Stopwatch()
         yield
         self.usage[name] = watch.read()
+
+    def save_first(self, write: Callable[[], object]) -> None:
+        """Write what matters most; where the disk is full, once more without the recording."""
+        try:
+            write()
+        except InputError as error:
+            if not is_full(error) or not self.make_room():
+                raise
+            write()
+
+    def make_room(self) -> bool:
+        """Take away the recording, for the disk is full; whether there was one."""
+        recording = self.workspace.recording
+        if not recording.is_file():
+            return False
+        recording.unlink()
+        self.workspace.manifest["recording"] = FAILED
+        self.events.warned("recording", f"{recording} is given up: the disk is full, and the rest matters more")
+        return True
 
     def facts(self) -> dict[str, Any]:
         """What the report says of the run: how it was called, and what it has taken so far."""

@@ -21,6 +21,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sfmapp import kernel_cache
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.images.products import FORMAT_NAME, MANIFEST
@@ -95,7 +96,8 @@ class Workspace:
     def write_text(self, name: str, text: str) -> None:
         """Write a text file of the workspace, beside and renamed."""
         with replaced_file(self.folder / name) as beside:
-            beside.write_text(text, encoding="utf-8")
+            # a name in it may not be text
+            beside.write_text(text, encoding="utf-8", errors="backslashreplace")
 
     def read_json(self, name: str) -> Any:
         """A JSON file of the workspace; None if it is not there or damaged."""
@@ -155,7 +157,7 @@ def read_manifest(folder: Path, command: str | None = None) -> dict[str, Any]:
     """The manifest of an existing workspace, for commands that only look at one; of a certain command if one is given.
 
     Raises:
-        InputError: the folder is not a workspace.
+        InputError: the folder is not a workspace, or holds what is left of an odometry run that was cut off.
         UsageError: it holds the results of another command.
     """
     manifest = _read_json(folder / MANIFEST) if folder.is_dir() else None
@@ -163,7 +165,17 @@ def read_manifest(folder: Path, command: str | None = None) -> dict[str, Any]:
         raise InputError(f"{folder} is not a workspace of sfmapp", "give the OUT of an earlier run")
     if command is not None:
         _check_command(folder, manifest, command)
+    _check_ended(folder, manifest)
     return manifest
+
+
+def _check_ended(folder: Path, manifest: dict[str, Any]) -> None:
+    """Refuse an odometry run that is still at work or was cut off: its files may be those of an earlier run."""
+    if not manifest.get("stages", {}).get(ODOMETRY, {}).get("is_done", True):
+        raise InputError(
+            f"{folder}: expected a run that has ended, found one that is still at work or was cut off",
+            f"what it has tracked is in {folder / 'trajectory_live.tum'}; sfmapp odometry begins again",
+        )
 
 
 def _check_command(folder: Path, manifest: dict[str, Any], command: str) -> None:
@@ -228,7 +240,8 @@ def _manifest_of(folder: Path) -> dict[str, Any] | None:
         raise UsageError(
             f"{folder} was written by another version of sfmapp ({manifest['format']})", "choose another OUT"
         )
-    strangers = sorted(path.name for path in folder.iterdir() if path.name not in (LOCK, f".{MANIFEST}.new"))
+    known = (LOCK, f".{MANIFEST}.new", _kernels_in(folder))
+    strangers = sorted(path.name for path in folder.iterdir() if path.name not in known)
     if strangers:
         found = ", ".join(strangers[:3]) + (", ..." if len(strangers) > 3 else "")
         raise UsageError(
@@ -236,6 +249,12 @@ def _manifest_of(folder: Path) -> dict[str, Any] | None:
             "nothing in it was touched; give -o a new or an empty folder",
         )
     return None
+
+
+def _kernels_in(folder: Path) -> str | None:
+    """Name of what is in a folder because the user had compiled kernels put there, for want of another place."""
+    place = Path(os.environ.get(kernel_cache.VARIABLE) or os.curdir).absolute()
+    return place.relative_to(folder.absolute()).parts[0] if folder.absolute() in place.parents else None
 
 
 def _read_json(path: Path) -> Any:

@@ -32,8 +32,11 @@ def record_dense(
         timeout_s: the child is stopped after this long.
     """
     start = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
-        make_dense_replay(scene, patches, mesh=mesh, title=title, up=up, max_points=max_points).save(Path(name))
-        problem = draw_in_child("dense", Path(name), path, 1, timeout_s)
+    try:
+        with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
+            make_dense_replay(scene, patches, mesh=mesh, title=title, up=up, max_points=max_points).save(Path(name))
+            problem = draw_in_child("dense", Path(name), path, 1, timeout_s)
+    except OSError as error:
+        problem = error.strerror or str(error)
     size = path.stat().st_size if not problem else 0
     return RecordingReport(None if problem else path, size, time.monotonic() - start, problem)

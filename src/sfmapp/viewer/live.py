@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import struct
 import subprocess
 import sys
@@ -38,6 +39,7 @@ Array = NDArray[np.float64]
 MAX_IMAGE_BYTES, MAX_POINT_BYTES, MAX_BYTES = 1 << 25, 1 << 26, 1 << 28
 # Frames of a recording that are shown with their image: every one of a thousand, every second of two thousand.
 MAX_IMAGES = 1000
+_COLOURS = re.compile(r"\x1b\[[\d;]*m")  # of rerun's messages
 _LEVELS = {"decided": "INFO", "warned": "WARN"}
 # the child opens rerun (seconds on a busy machine) and, at the end, writes what still waits
 END_TIMEOUT_S = 300.0
@@ -69,6 +71,7 @@ class LiveView:
         self._num_frames: int | None = None
         self._count = self._num_messages = 0
         self._with_next_frame: list[dict[str, Any]] = []
+        self._problem = ""
 
     @property
     def is_recording(self) -> bool:
@@ -80,7 +83,7 @@ class LiveView:
         self._num_frames = sequence.num_frames
         truth = sequence.truth
         command = [
-            sys.executable, "-m", "sfmapp.viewer.live_process",
+            sys.executable, "-P", "-m", "sfmapp.viewer.live_process",
             str(self._recording.absolute()) if self._recording else "", self._screen.url if self._screen else "",
         ]  # fmt: skip
         self._outbox = Outbox(command)
@@ -114,7 +117,7 @@ class LiveView:
             errors_m: (F,) distance of each frame from the truth, NaN where it is not known.
         """
         if self._outbox is None:
-            return ""
+            return self._problem
         self._send_decisions()
         self._send(
             "end", frame_idx=result.frame_idx, timestamps_s=result.timestamps_s, frame_map=result.frame_map,
@@ -124,12 +127,23 @@ class LiveView:
         outbox, self._outbox = self._outbox, None
         return outbox.close(END_TIMEOUT_S)
 
+    def give_up(self, problem: str) -> bool:
+        """End the child and take away what it has recorded so far; whether there was one."""
+        if self._outbox is None:
+            return False
+        self._problem = problem
+        self._stop()
+        return True
+
     def __enter__(self) -> LiveView:
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._stop()
+
+    def _stop(self) -> None:
         if self._outbox is not None:
             self._outbox.abandon()
             self._outbox = None
@@ -243,7 +257,7 @@ class Outbox:
         self._threads[1].join(timeout_s)
         if code == 0 and not self._has_failed:
             return ""
-        lines = b"".join(self._error_text).decode(errors="replace").strip().splitlines()
+        lines = _COLOURS.sub("", b"".join(self._error_text).decode(errors="replace")).strip().splitlines()
         return f"exit code {code}: {lines[-1] if lines else 'it could not keep up'}"
 
     def abandon(self) -> None:

@@ -28,6 +28,7 @@ from sfmapp.evaluation.trajectory import Alignment, Trajectory
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.geometry.orientation import upright_pixels, upright_poses, upright_xy
 from sfmapp.geometry.upright import up_direction
+from sfmapp.images.sources import printable
 from sfmapp.odometry.result import FrameState
 from sfmapp.viewer.live_scene import FRUSTUM_SHARE, Changed, LiveMap, frustum_lines, unbroken
 from sfmapp.viewer.photos import shrunk_jpeg
@@ -88,7 +89,7 @@ class LiveDrawing:
             poses = message["truth_cam_from_world"]
             self._truth = Trajectory.from_cam_from_world(poses, message["truth_times"])
             self._alignment = "se3" if message["is_metric"] else "sim3"
-        recording.send_recording_name(message["title"])
+        recording.send_recording_name(printable(message["title"]))
         recording.send_blueprint(blueprint(None, self._has_truth), make_active=True, make_default=True)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         # cameras are taken to start level until more of them are known

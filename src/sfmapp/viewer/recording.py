@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.children import with_parent
 from sfmapp.viewer.listener import Message, RecordingListener, Step
 from sfmapp.viewer.replay import make_replay
 
@@ -62,9 +63,12 @@ def write_recording(
         timeout_s: the child is stopped after this long.
     """
     start = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
-        make_replay(image_set, features, reconstructions, steps, messages, title=title, up=up).save(Path(name))
-        problem = draw_in_child("run", Path(name), path, threads, timeout_s)
+    try:
+        with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
+            make_replay(image_set, features, reconstructions, steps, messages, title=title, up=up).save(Path(name))
+            problem = draw_in_child("run", Path(name), path, threads, timeout_s)
+    except OSError as error:
+        problem = error.strerror or str(error)
     size = path.stat().st_size if not problem else 0
     return RecordingReport(None if problem else path, size, time.monotonic() - start, problem)
 
@@ -72,7 +76,7 @@ def write_recording(
 def draw_in_child(kind: Kind, folder: Path, path: Path, threads: int, timeout_s: float) -> str:
     """Draw what lies in folder into the file path; returns what went wrong, empty for nothing."""
     arguments = [kind, str(folder.absolute()), str(path.absolute()), str(threads)]
-    command = [sys.executable, "-m", "sfmapp.viewer.record_process", *arguments]
+    command = with_parent([sys.executable, "-P", "-m", "sfmapp.viewer.record_process", *arguments])
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,

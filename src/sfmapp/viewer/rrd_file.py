@@ -9,6 +9,8 @@ from pathlib import Path
 
 import rerun as rr
 
+from sfmapp.images.sources import printable
+
 
 @contextmanager
 def recording_file(path: Path, application: str, title: str) -> Iterator[rr.RecordingStream]:
@@ -21,7 +23,7 @@ def recording_file(path: Path, application: str, title: str) -> Iterator[rr.Reco
     try:
         recording.save(beside)
         if title:
-            recording.send_recording_name(title)
+            recording.send_recording_name(printable(title))
         yield recording
         recording.flush()
         recording.disconnect()

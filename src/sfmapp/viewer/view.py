@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import os
 import signal
 import socket
@@ -12,16 +13,24 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
+from sfmapp.children import with_parent
 from sfmapp.errors import InputError, SfmError
-from sfmapp.viewer.live import Screen
+
+if TYPE_CHECKING:
+    from sfmapp.viewer.live import Screen
 
 HOST = "127.0.0.1"
 WEB_PORT, DATA_PORT = 9090, 9876
 
 # A viewer that ends sooner than this with an error never opened its window.
 _NEVER_OPENED_S = 10.0
+# A viewer that was told to end and has not after this long is ended.
+_LAST_WORDS_S = 5.0
+_STOPPED = 130
+_WELL_ENDED = (0, -signal.SIGINT, _STOPPED)
 
 
 def view(
@@ -56,7 +65,7 @@ def view(
     if tell is not None:
         tell(f"serving {recording} at {server_url(web_port, data_port)} for browsers on this machine; Ctrl-C ends it")
     code = _run(server_command(recording, web_port, data_port))
-    if code not in (0, -signal.SIGINT, 130):
+    if code not in _WELL_ENDED:
         raise SfmError(f"rerun ended with code {code}", f"try: rerun {recording}")
 
 
@@ -99,13 +108,16 @@ def open_live_viewer(*, tell: Callable[[str], None], serve: bool | None = None) 
         tell: given a line on how to reach it.
         serve: for a browser in any case (True) or never (False).
     """
+    from sfmapp.viewer.live import Screen  # loads kernels, which a look at a recording needs none of
+
     serve = not has_screen() if serve is None else serve
     data_port, web_port = free_port(DATA_PORT), free_port(WEB_PORT)
     command = server_command(None, web_port, data_port) if serve else window_command(None, str(data_port))
-    # a session of its own: the window outlives the run, and a Ctrl-C for the run is none for the viewer
+    # a session of its own: a Ctrl-C for the run is none for the viewer. A window outlives the run, a server does not
     process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    )
+        with_parent(command) if serve else command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
     if serve:
         url = server_url(web_port, data_port)
         tell(f"watch it at {url} in a browser on this machine; when the run is done, Ctrl-C ends it")
@@ -119,13 +131,13 @@ def has_screen() -> bool:
 
 def window_command(recording: Path | None, port: str = "auto") -> list[str]:
     """The native viewer. It, too, listens for data: on this machine only, on any free port."""
-    return [*_RERUN, "--bind", HOST, "--port", port, *([str(recording)] if recording else [])]
+    return [*_rerun(), "--bind", HOST, "--port", port, *([str(recording)] if recording else [])]
 
 
 def server_command(recording: Path | None, web_port: int, data_port: int) -> list[str]:
     """The web viewer and the data it fetches, each on a port of this machine only."""
     ports = ["--web-viewer-port", str(web_port), "--port", str(data_port)]
-    return [*_RERUN, "--serve-web", "--bind", HOST, *ports, *([str(recording)] if recording else [])]
+    return [*_rerun(), "--serve-web", "--bind", HOST, *ports, *([str(recording)] if recording else [])]
 
 
 def server_url(web_port: int, data_port: int) -> str:
@@ -147,21 +159,34 @@ def free_port(preferred: int) -> int:
     raise SfmError(f"no free port on {HOST}")
 
 
-_RERUN = (sys.executable, "-m", "rerun_cli")
+def _rerun() -> list[str]:
+    """The command of rerun: its program itself where it is found, for the package would start it as a child of its own,
+    which stayed when that was ended."""
+    package = importlib.util.find_spec("rerun_cli")
+    if package is not None and package.origin is not None and "RERUN_CLI_PATH" not in os.environ:
+        program = Path(package.origin).with_name("rerun")
+        if program.is_file() and os.access(program, os.X_OK):
+            return [str(program)]
+    return [sys.executable, "-m", "rerun_cli"]
 
 
 def _open_window(recording: Path) -> bool:
     """Show it in a window until that is closed; False if there was none."""
     start = time.monotonic()
     code = _run(window_command(recording))
-    return code in (0, -signal.SIGINT, 130) or time.monotonic() - start > _NEVER_OPENED_S
+    return code in _WELL_ENDED or time.monotonic() - start > _NEVER_OPENED_S
 
 
 def _run(command: Sequence[str]) -> int:
-    """Run to the end; Ctrl-C reaches the child as well, and is its business."""
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    """Run to the end, or until this process is told to stop; 130 for the latter."""
+    process = subprocess.Popen(with_parent(command), stdin=subprocess.DEVNULL)
+    is_stopped = False
     while True:
         try:
-            return process.wait()
-        except KeyboardInterrupt:
+            code = process.wait(_LAST_WORDS_S if is_stopped else None)
+            return _STOPPED if is_stopped else code
+        except KeyboardInterrupt:  # in a terminal it reaches the child as well
+            is_stopped = True
             process.terminate()
+        except subprocess.TimeoutExpired:
+            process.kill()

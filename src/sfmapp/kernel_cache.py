@@ -1,0 +1,120 @@
+"""Where numba may keep compiled kernels when the two places that it knows by itself will not do.
+
+numba writes beside the source, else below the home of the user. In a container, on a cluster or in a CI job the first
+is often read-only and the second not there, and then no module with a kernel can be loaded. Here a folder of this user
+alone below the system's temporary folder steps in. What numba caches is code that it unpickles and runs, so a folder
+counts only if nobody but this user and root can change it or put another in its place.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+VARIABLE = "NUMBA_CACHE_DIR"
+NAME = "sfmapp-kernels"
+ADVICE = f"set {VARIABLE} to a folder that you, and nobody else, can write to; one in OUT will do"
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def provide_kernel_cache() -> None:
+    """Point numba at a place of ours if it has none that is safe; called before any kernel is loaded.
+
+    Where there is none at all nothing is done: numba raises when the first kernel is loaded, which is known by
+    :func:`is_without_cache`.
+    """
+    if not hasattr(os, "geteuid") or _numba_finds_one():
+        return
+    for folder in _temporary_folders():
+        if (private := _private_folder(folder)) is not None:
+            os.environ[VARIABLE] = str(private)  # for the processes that we start as well
+            if "numba" in sys.modules:
+                sys.modules["numba"].config.CACHE_DIR = str(private)
+            return
+
+
+def is_without_cache(error: Exception) -> bool:
+    """Whether an exception is numba's way to say that it found no place."""
+    return isinstance(error, RuntimeError) and str(error).startswith("cannot cache function")
+
+
+def is_ours_alone(folder: Path) -> bool:
+    """Whether nobody but this user and root can change what lies in a folder, nor put another in its place.
+
+    Every folder on the way has to be of this user or of root, and closed to others; in one with the sticky bit, such as
+    /tmp, others can add something but not touch what is ours.
+    """
+    try:
+        folder = folder.resolve(strict=True)
+        ways = [(path, path.stat()) for path in (folder, *folder.parents)]
+    except (OSError, RuntimeError):  # not there, not to be looked into, or a loop of links
+        return False
+    return ways[0][1].st_uid == os.geteuid() and all(
+        found.st_uid in (0, os.geteuid())
+        and (not _open_to_others(found) or (path != folder and bool(found.st_mode & stat.S_ISVTX)))
+        for path, found in ways
+    )
+
+
+def _open_to_others(found: os.stat_result) -> bool:
+    # many systems give each user a group of its own, and its files to that
+    is_open_to_a_group = bool(found.st_mode & stat.S_IWGRP) and found.st_gid not in (0, os.getegid())
+    return is_open_to_a_group or bool(found.st_mode & stat.S_IWOTH)
+
+
+def _numba_finds_one() -> bool:
+    """Whether numba will use a place that the user named, the source's own, or a safe one below the home."""
+    named = os.environ.get(VARIABLE)
+    if named and _can_write(Path(named)):
+        return True  # the user's own choice, maybe one shared by a team
+    if all(_can_write(room / "__pycache__") for room in _PACKAGE.iterdir() if (room / "__init__.py").is_file()):
+        return True
+    home = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "numba"
+    if not home.is_absolute() or not _can_write(home):
+        return False
+    # what does not exist yet will be made by this user in the last folder that does
+    return is_ours_alone(home) if home.exists() else _is_safe_to_make(home)
+
+
+def _is_safe_to_make(folder: Path) -> bool:
+    existing = next(path for path in folder.parents if path.exists())
+    found = existing.stat()
+    is_sticky = bool(found.st_mode & stat.S_ISVTX) and found.st_uid in (0, os.geteuid())
+    return is_ours_alone(existing) or is_sticky
+
+
+def _can_write(folder: Path) -> bool:
+    """Whether files can be made in a folder, which may not exist yet."""
+    try:
+        existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if os.path.lexists(path))
+    except (OSError, StopIteration):
+        return False
+    return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
+
+
+def _temporary_folders() -> Iterator[Path]:
+    # not those of tempfile: its last resort is the working folder, where nobody expects a cache
+    for name in ("TMPDIR", "TEMP", "TMP"):
+        if value := os.environ.get(name):
+            yield Path(value).absolute()
+    yield from map(Path, ("/tmp", "/var/tmp", "/dev/shm"))
+
+
+def _private_folder(parent: Path) -> Path | None:
+    """A folder of this user alone in ``parent``, the same one in every run; None if it cannot be had."""
+    folder = parent / f"{NAME}-{os.geteuid()}"
+    try:
+        folder.mkdir(mode=0o700)
+    except FileExistsError:
+        pass
+    except OSError:
+        return None
+    try:
+        found = folder.lstat()
+    except OSError:
+        return None
+    is_private = stat.S_ISDIR(found.st_mode) and not found.st_mode & 0o077
+    return folder if is_private and _can_write(folder) and is_ours_alone(folder) else None
