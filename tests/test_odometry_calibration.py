@@ -12,6 +12,7 @@ from sfmapp.adjust.calibration import RAW, reduce_to_calibration
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.odometry import calibration_check
 from sfmapp.odometry.calibration_check import Unknowns, _changed
 from sfmapp.odometry.finish import Conclusion, conclude
 from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
@@ -187,3 +188,44 @@ def test_a_contradiction_stands_where_refining_is_not_allowed() -> None:
     spread = np.sqrt(((rigid3.center(path(16, 0.06)) - rigid3.center(path(16, 0.06)).mean(0)) ** 2).sum(1).mean())
     assert shape < 3 * np.sqrt(3) * found.position_sigma_share * spread
     assert found.position_sigma_share < 0.2
+
+
+@pytest.mark.parametrize("stretch", [0.7, 1.3])
+@pytest.mark.parametrize("is_stereo", [False, True])
+def test_a_map_that_was_made_with_a_refined_camera_is_not_torn_by_the_given_one(
+    stretch: float, is_stereo: bool
+) -> None:
+    truth = rig_of(lens(), lens()) if is_stereo else rig_of(lens())
+    given = rig_of(lens(stretch), lens(stretch)) if is_stereo else rig_of(lens(stretch))
+    refined_before = rig_of(lens(1.01), lens(1.01)) if is_stereo else rig_of(lens(1.01))
+    keyframes, poses = drive(truth, refined_before, bend=0.03)
+    conclusion = conclude(keyframes, OPTIONS, Events(), given)
+    report = conclusion.report["camera"]
+    assert report["is_refined"]
+    assert np.allclose(report["given"][0], given.cameras[0].params)
+    assert keyframes.rig.cameras[0].focal == pytest.approx(FOCAL, rel=5e-3)
+    scale, error = errors(keyframes, poses)
+    assert error < 0.05
+    if is_stereo:
+        assert scale == pytest.approx(1.0, abs=3 * conclusion.scale_sigma)
+
+
+def test_what_a_camera_differs_by_is_what_it_was_changed_by() -> None:
+    given = drive(rig_of(lens(), lens()), rig_of(lens(), lens()), num=4)[0].reconstruction(np.arange(4))[0]
+    unknowns = Unknowns.of(given)
+    x = np.random.default_rng(3).normal(0, 1e-4, len(unknowns.names))
+    found = _changed(given, unknowns.directions(given) @ x)
+    # the focal length of a pixel's shape and of a difference are those of first order
+    assert np.allclose(unknowns.between(given, found), x, atol=1e-7)
+
+
+def test_where_nothing_makes_a_wrong_calibration_better_the_map_is_red_and_open(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(calibration_check, "_go", lambda *_: None)
+    conclusion, *_ = concluded(rig_of(lens()), rig_of(lens(0.7)), bend=0.03)
+    assert not conclusion.report["camera"]["is_refined"]
+    [contradiction] = conclusion.contradictions
+    assert contradiction.subject == "given calibration"
+    assert contradiction.position_sigma_share >= 1.0
+    assert contradiction.rotation_sigma_deg >= 180.0

@@ -138,6 +138,21 @@ class Unknowns:
             out[1, np.arange(8, 11), column("turn_x") + np.arange(3)] = 1.0
         return out
 
+    def between(self, given: Reconstruction, found: Reconstruction) -> Array:
+        """(Q,) what the cameras of one model differ by from those of another."""
+        x, column = np.zeros(len(self.names)), self.names.index
+        canonical = [np.array([c.canonical for c in model.cameras]) for model in (given, found)]
+        logs = np.log(canonical[1][:, :2] / canonical[0][:, :2])
+        x[column("focal")] = logs.mean()
+        for c in range(len(logs)):
+            x[column(f"aspect_{c}")] = logs[c, 0] - logs[c, 1]
+            x[column(f"distortion_{c}_0") + np.arange(4)] = canonical[1][c, 4:] - canonical[0][c, 4:]
+        if given.rig is not None and found.rig is not None:
+            x[column("focal_difference")] = logs[1].mean() - logs[0].mean()
+            turn = rigid3.compose(found.rig.cam_from_rig[1], rigid3.inverse(given.rig.cam_from_rig[1]))
+            x[column("turn_x") + np.arange(3)] = rigid3.log_so3(rigid3.rotation_matrix(turn))
+        return x
+
     def named(self, values: Array) -> dict[str, float]:
         """Values (Q,) as they stand in the report."""
         return dict(zip(self.names, values.tolist(), strict=True))
@@ -170,6 +185,11 @@ class _Look:
     covariance: Array
 
     @property
+    def change(self) -> Array:
+        """(Q,) where the images lead from the given calibration: as far as was gone, or the first step."""
+        return self.x if self.x.any() else self.step
+
+    @property
     def data_information(self) -> Array:
         """(Q, Q) what the images alone say, fields and shared errors allowed for."""
         return np.asarray(np.linalg.inv(self.covariance) - np.diag(self.priors**-2.0), np.float64)
@@ -180,27 +200,38 @@ class _Look:
         return math.sqrt(max(float(self.step @ np.linalg.solve(self.covariance, self.step)), 0.0))
 
 
-def question_calibration(model: Reconstruction, cost: float, sigma: float, *, may_refine: bool) -> Answer:
+def question_calibration(
+    model: Reconstruction,
+    cost: float,
+    sigma: float,
+    *,
+    may_refine: bool,
+    found_before: tuple[Reconstruction, float] | None = None,
+) -> Answer:
     """Hold the given calibration of a map against its images.
 
     Args:
         model: adjusted with the cameras as they were given; image S k + s is that of sensor s at the k-th keyframe.
         cost: of that adjustment in units of the noise. sigma: the noise in pixels.
         may_refine: the given calibration may be replaced; otherwise it is only said what contradicts it.
+        found_before: the same, with the cameras that an earlier question has found. Where the given ones are far off,
+            a map that was made with others is torn by them, and leads nowhere.
     """
     unknowns = Unknowns.of(model)
-    first = _look(model, np.zeros(len(unknowns.names)), cost, sigma, unknowns)
-    if first is None:
+    first = begin = _look(model, np.zeros(len(unknowns.names)), cost, sigma, unknowns)
+    if found_before is not None:
+        begin = _look(found_before[0], unknowns.between(model, found_before[0]), found_before[1], sigma, unknowns)
+    if first is None or begin is None:
         is_rig = len(model.cameras) > 1
         return Answer(model, False, {"is_refined": False}, [], _UNKNOWN_SCALE if is_rig else None)
     limit = _SHARED_ERRORS * float(chdtri(len(first.x), _MAX_CHANCE))
     surprise = float(first.step @ first.data_information @ first.step)
-    if surprise < limit / _SHARED_ERRORS:
+    if begin is first and surprise < limit / _SHARED_ERRORS:
         return _kept(first, first, unknowns, _report(first, surprise, limit, unknowns), [])
-    last = _settle(first, sigma, unknowns)
-    surprise = float(last.x @ last.data_information @ last.x)
+    last = _settle(begin, sigma, unknowns)
+    surprise = float(last.change @ last.data_information @ last.change)
     basis, held_out = _held_out(last)
-    far = last.priors > unknowns.sigmas
+    far = unknowns.priors(last.change) > unknowns.sigmas
     known = (np.sqrt(np.diag(last.covariance)) < _MAX_UNSURE * np.abs(last.x))[far].all()
     settled = last.step_sigmas < _SETTLED_SIGMAS * _ROUNDS
     agree = held_out[:-1] > _MIN_DIRECTION_SIGMAS
@@ -227,10 +258,9 @@ def question_calibration(model: Reconstruction, cost: float, sigma: float, *, ma
 
 def _report(look: _Look, surprise: float, limit: float, unknowns: Unknowns) -> dict[str, Any]:
     """What the images would change, how sure they are of it, and how much is needed to be believed."""
-    change = look.x if look.x.any() else look.step
     return {
         "is_refined": False, "surprise": surprise, "max_surprise": limit, "noise_inflation": look.noise,
-        "change": unknowns.named(change), "sigma": unknowns.named(np.sqrt(np.diag(look.covariance))),
+        "change": unknowns.named(look.change), "sigma": unknowns.named(np.sqrt(np.diag(look.covariance))),
     }  # fmt: skip
 
 
@@ -481,7 +511,11 @@ def _contradiction(first: _Look, last: _Look, report: dict[str, Any], unknowns: 
     shift = rigid3.center(moved) - rigid3.center(given)
     size = max(rigid3.spread(first.model.cam_from_world), 1e-12)
     share = 1.0 if report["is_settled"] else _PART_OF_THE_WAY
-    focal = [look.model.cameras[0].focal for look in (first, last)]
+    # where not even a step made it better, the map is torn: anything may be off
+    torn = 0.0 if last.x.any() else 1.0
+    focal = [first.model.cameras[0].focal, last.model.cameras[0].focal]
+    if torn:
+        focal[1] *= math.exp(last.step[0])
     return Contradiction(
         "given calibration",
         f"the images contradict the given calibration by {report['surprise']:.0f} where shared errors make up to "
@@ -489,7 +523,11 @@ def _contradiction(first: _Look, last: _Look, report: dict[str, Any], unknowns: 
         + ("" if report["is_settled"] else " and have not settled there"),
         "calibrate the camera, or give a focal length that is nearer the right one",
         {k: report[k] for k in ("surprise", "max_surprise", "is_settled", "change")},
-        rotation_sigma_deg=share * float(np.degrees(np.sqrt((turn**2).mean()))),
-        position_sigma_share=share * float(np.sqrt((shift**2).mean())) / size,
-        scale_sigma=share * abs(math.log(rigid3.spread(last.model.cam_from_world) / size)) if num_sensors > 1 else 0.0,
+        rotation_sigma_deg=max(share * float(np.degrees(np.sqrt((turn**2).mean()))), 180.0 * torn),
+        position_sigma_share=max(share * float(np.sqrt((shift**2).mean())) / size, torn),
+        scale_sigma=(
+            max(share * abs(math.log(rigid3.spread(last.model.cam_from_world) / size)), torn)
+            if num_sensors > 1
+            else 0.0
+        ),
     )

@@ -62,8 +62,14 @@ class Conclusion:
     noise_covariance: Array | None = None
 
 
-def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -> Conclusion:
-    """Adjust all keyframes and points of a map, in place, and the cameras where the images contradict them."""
+def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events, given: Rig | None = None) -> Conclusion:
+    """Adjust all keyframes and points of a map, in place, and the cameras where the images contradict them.
+
+    Args:
+        keyframes: with the rig that it was made with, which may be a refined one.
+        options, events: the usual.
+        given: the rig as it was given, which is questioned once more, by all there is; None for that of the keyframes.
+    """
     if is_too_large(keyframes):
         return _conclude_large(keyframes, options, events)
     everything = np.arange(len(keyframes.keyframes))
@@ -75,7 +81,11 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -
         if steps == _FIRST_STEPS:
             classify(model, job.num_elsewhere)
         events.raise_if_cancelled()
-    answer = _question(model, cost, sigma, options, events)
+    found_before = None
+    if given is not None and keyframes.rig is not given:
+        found_before, model = (model, cost), _with_rig(model, given)
+        cost = adjust_poses(model, sigma, _MAX_STEPS, _TOLERANCE)
+    answer = _question(model, cost, sigma, options, events, found_before)
     report["camera"] = answer.report
     num_sensors, of_refinement = len(keyframes.rig.cameras), np.zeros((6, 6))
     if answer.is_refined:
@@ -128,9 +138,16 @@ def _conclude_large(keyframes: KeyframeMap, options: OdometryOptions, events: Ev
     return Conclusion(None, "", report, answer.contradictions, answer.scale_sigma)
 
 
-def _question(model: Reconstruction, cost: float, sigma: float, options: OdometryOptions, events: Events) -> Answer:
+def _question(
+    model: Reconstruction,
+    cost: float,
+    sigma: float,
+    options: OdometryOptions,
+    events: Events,
+    found_before: tuple[Reconstruction, float] | None = None,
+) -> Answer:
     """Question the calibration of an adjusted map, and tell of what comes of it."""
-    answer = question_calibration(model, cost, sigma, may_refine=options.refine_camera)
+    answer = question_calibration(model, cost, sigma, may_refine=options.refine_camera, found_before=found_before)
     if answer.is_refined and answer.scale_sigma is not None:
         of_refinement = scale_sigma_of_refinement(model, answer.model) / answer.excess
         answer = replace(answer, scale_sigma=math.hypot(answer.scale_sigma, of_refinement))
@@ -148,6 +165,17 @@ def _question(model: Reconstruction, cost: float, sigma: float, options: Odometr
             "far, the images do not tell how long the lenses are and how the cameras are turned against each other",
         )
     return answer
+
+
+def _with_rig(model: Reconstruction, rig: Rig) -> Reconstruction:
+    """The same map seen by other cameras, which sit elsewhere on the rig; to be adjusted."""
+    out = model.copy()
+    out.cameras = list(rig.cameras)
+    if model.rig is not None:
+        frames = model.rig.rig_from_world(model.cam_from_world)
+        out.rig = replace(model.rig, cam_from_rig=rig.cam_from_rig)
+        out.cam_from_world = out.rig.cam_from_world(np.arange(len(model.image_names)), frames[model.rig.frame_idx])
+    return out
 
 
 def rig_of(model: Reconstruction) -> Rig:

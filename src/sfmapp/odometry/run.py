@@ -365,9 +365,7 @@ class Odometry:
             maps[number] = local.keyframes
             self.events.started("adjustment", f"adjusting {local.newest + 1} keyframes together")
             straightened = self._straighten(local)
-            if not is_too_large(local.keyframes):
-                local.keyframes.rig = self.given_rig  # what is given is questioned once more, by all there is
-            conclusions[number] = conclude(local.keyframes, self.options, self.events)
+            conclusions[number] = conclude(local.keyframes, self.options, self.events, self.given_rig)
             conclusions[number].report["shutter"] = straightened
             conclusions[number].contradictions.extend(self.clock.contradictions(local.keyframes))
             conclusions[number].contradictions.extend(local.witnesses.contradictions(local.keyframes))

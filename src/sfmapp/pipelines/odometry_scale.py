@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from sfmapp.contradictions import widened_scale_sigma
 from sfmapp.errors import UsageError
 from sfmapp.events import Events
+from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu, Sequence
 from sfmapp.odometry.markers import MarkerDetector, MarkerKind, parse_marker, scale_from_markers
 from sfmapp.odometry.result import MapResult, OdometryResult
@@ -224,4 +226,16 @@ def _from_imu(result: OdometryResult, m: int, imu: Imu) -> ScaleEstimate | Scale
     found = align_or_explain(times, poses, imu, is_metric=False, covariance=covariance)
     if isinstance(found, ScaleRefusal):
         return found
-    return ScaleEstimate(found.scale, found.sigma_relative, "imu", found.evidence)
+    sigma = math.hypot(found.sigma_relative, _bend(entry))
+    return ScaleEstimate(found.scale, sigma, "imu", found.evidence)
+
+
+def _bend(entry: MapResult) -> float:
+    """By how much of its size a map may be bent, beyond the noise of its observations: a length that is told by a part
+    of the map is no better known than that for the rest."""
+    if entry.covariance is None or entry.noise_covariance is None:
+        return 0.0
+    variance = np.trace((entry.covariance - entry.noise_covariance)[:, 3:, 3:], axis1=1, axis2=2)
+    spread = rigid3.spread(entry.reconstruction.cam_from_world[entry.keyframe_image_idx])
+    known = np.isfinite(variance)
+    return float(np.sqrt(max(variance[known].mean(), 0.0))) / spread if known.any() and spread > 0 else 0.0
