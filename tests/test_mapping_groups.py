@@ -80,9 +80,11 @@ def test_models_that_see_nothing_in_common_stay_apart_and_say_so():
         target, source = halves(place, pool)
     joint = find_joint(target, source, place.correspondences, MappingOptions())
     assert "points in common" in joint.reason
-    models, _, said = mapped(place)
+    models, report, said = mapped(place)
     assert [int(m.is_registered.sum()) for m in models] == [6, 6]
     assert any("kept apart: they see" in message for message in said)
+    for model, other in ((0, 1), (1, 0)):
+        assert report["models"][model]["apart"].startswith(f"apart from model {other}: they see")
 
 
 def test_models_whose_common_points_are_mismatches_stay_apart():

@@ -187,6 +187,9 @@ def _print_summary(output: Path, report: dict[str, Any]) -> None:
     if len(report["models"]) > 1:
         sizes = ", ".join(str(other["num_registered"]) for other in report["models"])
         print(f"  the photographs fall into {len(report['models'])} models of {sizes} images: sparse/0, sparse/1, ...")
+        for m, other in enumerate(report["models"][1:], 1):
+            if other["apart"]:
+                print(f"  model {m} is {other['apart']}")
     print_contradictions(found for one in report["models"] for found in one["contradictions"])
     if run["is_up_to_date"]:
         print(f"{output} is up to date: nothing to do")

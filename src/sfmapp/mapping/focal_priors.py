@@ -58,6 +58,8 @@ class Mapped:
     focal_report: dict[str, Any]
     attempts: dict[int, Registration]
     mapper_of: Callable[..., Mapper]
+    apart: list[str]
+    """Of each model why it is not one with another."""
     without_prior: tuple[int, ...] = ()
     """Cameras that it began with as unknown although a focal length was given."""
 

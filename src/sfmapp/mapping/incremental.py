@@ -108,8 +108,8 @@ def map_images(
             model.point_rgb = track_colors(model.tracks, features)
         contradictions = contradictions_of(models, correspondences)
         model_reports: list[dict[str, Any]] = [
-            model.summary() | _check(mapped, model, found, map_all, events)
-            for model, found in zip(models, contradictions, strict=True)
+            model.summary() | _check(mapped, model, found, map_all, events) | {"apart": apart}
+            for model, found, apart in zip(models, contradictions, mapped.apart, strict=True)
         ]
     report = {
         "tracks": track_report,
@@ -152,10 +152,10 @@ class _Task:
 
         empty = Reconstruction.empty(cameras, names, self.image_camera_idx, tracks)
         models, initial_reports = _grow_models(empty, mapper_of, options, events)
-        models = _merge_models(_without_parts(models), mapper_of, correspondences, options, events)
+        models, apart = _merge_models(_without_parts(models), mapper_of, correspondences, options, events)
         models = _with_left_over(models, mapper_of, correspondences, events)
         models = [mended(model, correspondences, mapper_of, options, events) for model in models]
-        return Mapped(cameras, models, initial_reports, focal_report, attempts, mapper_of)
+        return Mapped(cameras, models, initial_reports, focal_report, attempts, mapper_of, apart)
 
 
 def _check(
@@ -253,23 +253,43 @@ def _merge_models(
     correspondences: Correspondences,
     options: MappingOptions,
     events: Events,
-) -> list[Reconstruction]:
+) -> tuple[list[Reconstruction], list[str]]:
     """Join smaller models to larger ones where shared images, points or pairs tell how they lie to each other.
 
     What is joined may reach a third one, so that it goes on until nothing can be joined any more.
+
+    Returns:
+        The models, the largest first, and for each why it was not joined to the first of the others that it was held
+        against; empty if there is none.
     """
     merged: list[Reconstruction] = []
+    refused: list[tuple[Reconstruction, Reconstruction, str]] = []
     for source in models:
-        while True:
-            found = ((n, _union(target, source, mapper_of, correspondences, options, events))
-                     for n, target in enumerate(merged))  # fmt: skip
-            n, union = next(((n, union) for n, union in found if union is not None), (-1, None))
+        n = 0
+        while n < len(merged):
+            union, reason = _union(merged[n], source, mapper_of, correspondences, options, events)
             if union is None:
-                break
-            del merged[n]
-            source = union
+                refused.append((merged[n], source, reason))
+                n += 1
+            else:
+                del merged[n]
+                source, n = union, 0
         merged.append(source)
-    return sorted(merged, key=lambda model: -int(model.is_registered.sum()))
+    merged.sort(key=lambda model: -int(model.is_registered.sum()))
+    return merged, [_apart(model, merged, refused) for model in merged]
+
+
+def _apart(
+    model: Reconstruction,
+    models: list[Reconstruction],
+    refused: list[tuple[Reconstruction, Reconstruction, str]],
+) -> str:
+    """Why a model is not one with the first of the others that it was held against."""
+    for m, other in enumerate(models):
+        for target, source, reason in refused:
+            if {id(target), id(source)} == {id(model), id(other)}:
+                return f"apart from model {m}: {reason}"
+    return ""
 
 
 def _union(
@@ -279,8 +299,8 @@ def _union(
     correspondences: Correspondences,
     options: MappingOptions,
     events: Events,
-) -> Reconstruction | None:
-    """Two models in one, or None if they cannot be joined."""
+) -> tuple[Reconstruction | None, str]:
+    """Two models in one, or None and the reason if they cannot be joined."""
     through_image = find_merge(target, source)
     if through_image is not None:
         target_from_source, votes = through_image
@@ -294,7 +314,7 @@ def _union(
         link = num_linking_points(union, new, target.is_registered & ~source.is_registered)
         if link >= options.min_pose_inliers:
             events.decided(STAGE, f"merged two models by {votes} common points: {int(new.sum())} images more")
-            return union
+            return union, ""
     matched = in_common_cameras(target, source, mapper_of)
     joint = find_joint(*matched, correspondences, options)
     reason, union = joint.reason, target
@@ -304,10 +324,10 @@ def _union(
     sizes = f"of {int(target.is_registered.sum())} and {int(source.is_registered.sum())} images"
     if reason:
         events.decided(STAGE, f"two models {sizes} are kept apart: {reason}")
-        return None
+        return None, reason
     share = f"{joint.num_agreeing} of {joint.num_links} points that both see agree"
     events.decided(STAGE, f"joined two models {sizes}: {share}")
-    return union
+    return union, ""
 
 
 def _with_left_over(

@@ -97,7 +97,8 @@ def _make_report(run: Run, models: Sequence[Reconstruction], failure: NoReconstr
     assert run.image_set is not None
     mapped = run.stages.get("mapping", {}).get("models") or []
     summaries = [
-        model.summary() | {"contradictions": row["contradictions"]} for model, row in zip(models, mapped, strict=True)
+        model.summary() | {"contradictions": row["contradictions"], "apart": row["apart"]}
+        for model, row in zip(models, mapped, strict=True)
     ]
     uncertainty = mapped[0]["uncertainty"] if mapped else {}
     images = _image_rows(run, failure)

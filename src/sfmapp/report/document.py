@@ -171,12 +171,17 @@ def make_checks(
             "reprojection error (mean)", -summary["mean_reprojection_error_px"],
             f"{summary['mean_reprojection_error_px']:.2f} px", -1, -2, "px",
         ),
-        check("separate models", -num_models, str(num_models), -1, -2),
+        check("separate models", -num_models, "; ".join([str(num_models), *_apart(models)]), -1, -2),
     ]  # fmt: skip
     for camera in cameras:
         if camera["refined"] and camera["focal_sigma_px"]:
             checks.append(_check_focal(camera))
     return checks + check_contradictions(found for model in models for found in model["contradictions"])
+
+
+def _apart(models: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Why models after the first are none with it."""
+    return [f"model {m} is {model['apart']}" for m, model in enumerate(models) if m and model.get("apart")]
 
 
 def _check_focal(camera: Mapping[str, Any]) -> dict[str, str]:
