@@ -157,9 +157,9 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         run.threads_cpu.sample()
     run.stages["odometry"] = result.report
     if self_calibrate:
-        from sfmapp.pipelines.self_calibrate import doubt
+        from sfmapp.pipelines.self_calibrate import widen
 
-        doubt(result, run.stages["self_calibration"])
+        widen(result, run.stages["self_calibration"])
     with run.measured("scale"):
         run.keyframes.colour(result)
         if run.wish is not None:

@@ -204,10 +204,9 @@ def _verdict(source: str, report: dict[str, Any], lens: LensFit, names: list[str
     }  # fmt: skip
 
 
-def doubt(result: OdometryResult, calibration: dict[str, Any]) -> None:
-    """Note on every map, in place, that it rests on a focal length which is not settled, and how far that reaches."""
-    if calibration["is_settled"]:
-        return
+def widen(result: OdometryResult, calibration: dict[str, Any]) -> None:
+    """Add to the covariances of every map, in place, what the calibration leaves open; where its focal length is not
+    settled, note that as well."""
     relative = calibration["focal_sigma_relative"]
     found = Contradiction(
         "self-calibration",
@@ -218,8 +217,11 @@ def doubt(result: OdometryResult, calibration: dict[str, Any]) -> None:
         rotation_sigma_deg=90.0 * relative, position_sigma_share=np.pi / 2 * relative, scale_sigma=relative,
     )  # fmt: skip
     for m, entry in enumerate(result.maps):
-        covariance = entry.covariance
+        covariance, mine = entry.covariance, result.frame_map == m
+        spread = rigid3.spread(entry.reconstruction.cam_from_world[entry.keyframe_image_idx])
         if covariance is not None:
-            poses = entry.reconstruction.cam_from_world[entry.keyframe_image_idx]
-            covariance = widened(covariance, rigid3.spread(poses), [found])
-        result.maps[m] = replace(entry, covariance=covariance, contradictions=[*entry.contradictions, found])
+            covariance = widened(covariance, spread, [found])
+        if result.covariance is not None:
+            result.covariance[mine] = widened(result.covariance[mine], spread, [found])
+        noted = [] if calibration["is_settled"] else [found]
+        result.maps[m] = replace(entry, covariance=covariance, contradictions=[*entry.contradictions, *noted])
