@@ -120,6 +120,7 @@ def find_source(
     output: str | os.PathLike[str] | None,
     images: str | os.PathLike[str] | None,
     options: Options,
+    asked_for: str = DENSE,
 ) -> DenseSource:
     """Find model, photographs and workspace.
 
@@ -128,6 +129,7 @@ def find_source(
         output: where the results go; None: into the workspace itself, or the folder ``sfmapp`` of the model.
         images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
         options: of the run.
+        asked_for: the command, for what is said.
 
     Raises:
         UsageError: a workspace of another command.
@@ -136,7 +138,7 @@ def find_source(
     """
     folder = Path(source)
     if (folder / "run.json").is_file():
-        return _in_workspace(folder, output, images, options)
+        return _in_workspace(folder, output, images, options, asked_for)
     if not has_model(folder):
         if not has_model(folder / "sparse" / "0"):
             what = "no such folder" if not folder.is_dir() else "neither of them"
@@ -147,14 +149,18 @@ def find_source(
 
 
 def _in_workspace(
-    folder: Path, output: str | os.PathLike[str] | None, images: str | os.PathLike[str] | None, options: Options
+    folder: Path,
+    output: str | os.PathLike[str] | None,
+    images: str | os.PathLike[str] | None,
+    options: Options,
+    asked_for: str,
 ) -> DenseSource:
     manifest = read_manifest(folder)
     command = manifest.get("command", RECONSTRUCT)
     if command not in (RECONSTRUCT, DENSE):
         raise UsageError(
             f"{folder} holds the results of sfmapp {command}, not of sfmapp {RECONSTRUCT}",
-            f"its model can be used all the same: sfmapp dense {folder}/sparse/0 --images DIR -o OUT",
+            f"its model can be used all the same: sfmapp {asked_for} {folder}/sparse/0 --images DIR -o OUT",
         )
     is_own = output is None or Path(output).resolve() == folder.resolve()
     target = folder if output is None else Path(output)
