@@ -22,6 +22,7 @@ from sfmapp.images.exif import read_exif
 from sfmapp.images.headers import read_header
 from sfmapp.images.rewrite import encode, without_turn
 from sfmapp.pipelines.options import load_options
+from sfmapp.pipelines.workspace import FORMAT
 from sfmapp.scene.camera import Camera, CameraModel, pixels_to_normalized
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import RigImages
@@ -430,6 +431,18 @@ def test_names_that_lead_out_are_left_out(tmp_path: Path) -> None:
     assert not (tmp_path / "o" / "outside.png").exists()
     assert (tmp_path / "o" / "u" / "images" / "sub" / "view_2.png").is_file()
     assert read_model(tmp_path / "o" / "u" / "sparse")[0].image_names == ["view_0.png", "sub/view_2.png"]
+
+
+def test_keyframes_of_odometry_on_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_scene(tmp_path / "w", [BARREL] * 2)
+    manifest = {"format": FORMAT, "command": "odometry", "stages": {}, "source": str(tmp_path / "w" / "images")}
+    (tmp_path / "w" / "run.json").write_text(json.dumps(manifest))
+    assert sfmapp.undistort(tmp_path / "w", tmp_path / "out", ONE).report["num_images"] == 2
+    (tmp_path / "film.mp4").write_bytes(b"")
+    (tmp_path / "w" / "run.json").write_text(json.dumps(manifest | {"source": str(tmp_path / "film.mp4")}))
+    assert main(["undistort", str(tmp_path / "w"), "-o", str(tmp_path / "other")]) == 3
+    assert "--images DIR" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.parametrize("flags", [["--blank-pixels", "1.5"], ["--blank-pixels", "nan"], ["--max-size", "0"]])

@@ -21,7 +21,8 @@ examples:
   sfmapp undistort colmap/sparse/0 --images colmap/images -o splat/ --max-size 1600
   sfmapp undistort out/ -o splat/ --blank-pixels 1 --mask-path masks/
 
-SOURCE is a workspace of sfmapp reconstruct, or a COLMAP model with the folder of its photographs. Writes
+SOURCE is a workspace of sfmapp reconstruct, one of sfmapp odometry on a folder of frames (its keyframes), or a COLMAP
+model with the folder of its photographs. Writes
   DIR/images/NAME       the photographs, in the format that they have: JPEG with quality 97, all others without loss, 16
                         bits and alpha kept; copied as they are where there is no distortion; never with a tag to turn
                         them

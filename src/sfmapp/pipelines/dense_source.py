@@ -23,7 +23,15 @@ from sfmapp.pipelines.options import Options, options_from_dict, options_to_dict
 from sfmapp.pipelines.run import Job
 from sfmapp.pipelines.stored_pixels import has_stored_pixels
 from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import DENSE, RECONSTRUCT, USUAL_FOLDERS, open_workspace, read_manifest
+from sfmapp.pipelines.workspace import (
+    DENSE,
+    ODOMETRY,
+    RECONSTRUCT,
+    UNDISTORT,
+    USUAL_FOLDERS,
+    open_workspace,
+    read_manifest,
+)
 
 # the workspace in the folder of a COLMAP model, if no other place is named
 INSIDE = "sfmapp"
@@ -157,6 +165,10 @@ def _in_workspace(
 ) -> DenseSource:
     manifest = read_manifest(folder)
     command = manifest.get("command", RECONSTRUCT)
+    if command == ODOMETRY and asked_for == UNDISTORT and output is not None:
+        return DenseSource(
+            folder / "sparse" / "0", _frame_folder(manifest, images), Path(output), DENSE, False, options
+        )
     if command not in (RECONSTRUCT, DENSE):
         raise UsageError(
             f"{folder} holds the results of sfmapp {command}, not of sfmapp {RECONSTRUCT}",
@@ -179,6 +191,17 @@ def _in_workspace(
         images_options = dataclasses.replace(options.images, mask_path=earlier.mask_path)
         options = dataclasses.replace(options, images=images_options)
     return DenseSource(model, found, target, command if is_own else DENSE, is_upright, options)
+
+
+def _frame_folder(manifest: dict[str, Any], images: str | os.PathLike[str] | None) -> Path:
+    """The folder that the names of an odometry run's keyframes are relative to."""
+    folder = Path(str(manifest.get("source") or "")) if images is None else Path(images)
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder}: expected the folder of the frames, found {'a file' if folder.is_file() else 'no folder'}",
+            "name the folder that holds the keyframes as files: --images DIR",
+        )
+    return folder
 
 
 def image_root(source: str) -> Path:

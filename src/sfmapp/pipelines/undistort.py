@@ -100,7 +100,8 @@ def undistort(
     The same call again resumes one that was cut off.
 
     Args:
-        source: the workspace of a reconstruction, of which the largest model is taken, or the folder of a COLMAP model.
+        source: the workspace of a reconstruction, of which the largest model is taken, or of odometry on a folder of
+            frames, of which the keyframes are, or the folder of a COLMAP model.
         output: a new folder, an empty one, or that of an earlier call.
         options: of these, the masks (``images.mask_path``) and ``threads``.
         images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
