@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from sfmapp.geometry import rigid3
 from sfmapp.images.exif import read_exif
 from sfmapp.images.headers import read_header
 from sfmapp.images.rewrite import encode, without_turn
+from sfmapp.pipelines.dense_source import find_source
 from sfmapp.pipelines.options import load_options
 from sfmapp.pipelines.workspace import FORMAT
 from sfmapp.scene.camera import Camera, CameraModel, pixels_to_normalized
@@ -346,6 +348,24 @@ def test_sixteen_bits_alpha_and_masks_are_carried_along(tmp_path: Path) -> None:
     assert sorted(path.name for path in (out / "masks").iterdir()) == ["view_2.png.png"]
 
 
+def test_other_commands_take_the_folder_with_its_own_pictures(tmp_path: Path) -> None:
+    write_scene(tmp_path, [BARREL] * 2)
+    sfmapp.undistort(tmp_path, tmp_path / "out", ONE)
+    assert main(["export", str(tmp_path / "out"), "--to", "nerfstudio", "-o", str(tmp_path / "out" / "ns"), "-q"]) == 0
+    frames = json.loads((tmp_path / "out" / "ns" / "transforms.json").read_text())["frames"]
+    for frame in frames:
+        picture = (tmp_path / "out" / "ns" / frame["file_path"]).resolve()
+        assert picture.parent == (tmp_path / "out" / "images").resolve()
+    where = find_source(tmp_path / "out", tmp_path / "dense", None, ONE)
+    assert where.model == tmp_path / "out" / "sparse" / "0"
+    assert where.images.resolve() == (tmp_path / "out" / "images").resolve()
+    # pinholes have nothing to undistort
+    again = sfmapp.undistort(tmp_path / "out", tmp_path / "again", ONE)
+    assert again.report["num_copied"] == 2
+    with pytest.raises(UsageError, match="where the results go"):
+        sfmapp.undistort(tmp_path / "out", tmp_path / "out", ONE)
+
+
 # --------------------------------------------------------------------------------------------------- what goes wrong
 
 
@@ -415,6 +435,14 @@ def test_nothing_of_the_users_is_overwritten(tmp_path: Path, capsys: pytest.Capt
     with pytest.raises(UsageError, match="leads out"):
         sfmapp.undistort(tmp_path, out, ONE, max_size=100)
     assert {path: path.read_bytes() for path in (tmp_path / "images").iterdir()} == before
+    # or that of the model
+    (out / "images").unlink()
+    shutil.rmtree(out / "sparse")
+    (out / "sparse").symlink_to(tmp_path / "sparse")
+    model = {path: path.read_bytes() for path in (tmp_path / "sparse" / "0").iterdir()}
+    with pytest.raises(UsageError, match="leads out"):
+        sfmapp.undistort(tmp_path, out, ONE, max_size=100)
+    assert {path: path.read_bytes() for path in (tmp_path / "sparse" / "0").iterdir()} == model
     assert "nothing in it was touched" in capsys.readouterr().err
 
 

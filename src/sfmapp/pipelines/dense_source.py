@@ -145,7 +145,8 @@ def find_source(
         NoReconstructionError: the workspace holds no model.
     """
     folder = Path(source)
-    if (folder / "run.json").is_file():
+    # what undistort has written is a COLMAP model with its photographs where COLMAP has them
+    if (folder / "run.json").is_file() and read_manifest(folder).get("command") != UNDISTORT:
         return _in_workspace(folder, output, images, options, asked_for)
     if not has_model(folder):
         if not has_model(folder / "sparse" / "0"):

@@ -164,7 +164,9 @@ def _opened(where: DenseSource, events: Events) -> Iterator[Workspace]:
     ):
         events.subscribe(event_log)
         workspace.manifest |= {
-            "source": os.path.abspath(where.images),
+            # what the model belongs to, for the commands that take this workspace; and what that was made of
+            "source": os.path.abspath(where.output / IMAGES),
+            "photographs": os.path.abspath(where.images),
             "model": os.path.abspath(where.model),
             "versions": {"sfmapp": sfmapp.__version__, **recorded_versions()},
         }
@@ -188,6 +190,7 @@ def _begin(job: _Job, key: str) -> None:
     """Take away what an earlier run with another key has written, and note what this one is going to."""
     workspace = job.workspace
     names = [record.name for record in job.photographs.records]
+    _target(job, "sparse/0", MODEL_FILES[0])
     if not workspace.has_key(STAGE, key):
         workspace.write_models([])
         earlier = workspace.manifest["stages"].get(STAGE, {}).get("names", [])
