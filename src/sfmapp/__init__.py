@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from sfmapp.pipelines.options import Options, load_options
     from sfmapp.pipelines.reconstruct import RunResult, reconstruct
     from sfmapp.pipelines.refine import RefineResult, refine
+    from sfmapp.pipelines.undistort import UndistortResult, undistort
     from sfmapp.scene.camera import Camera, CameraModel
     from sfmapp.scene.reconstruction import Reconstruction
 
@@ -23,10 +24,12 @@ __all__ = [
     "RefineResult",
     "RunResult",
     "TrackResult",
+    "UndistortResult",
     "load_options",
     "reconstruct",
     "refine",
     "track_sequence",
+    "undistort",
 ]
 
 _HOMES = {
@@ -37,10 +40,12 @@ _HOMES = {
     "RefineResult": "sfmapp.pipelines.refine",
     "RunResult": "sfmapp.pipelines.reconstruct",
     "TrackResult": "sfmapp.pipelines.odometry",
+    "UndistortResult": "sfmapp.pipelines.undistort",
     "load_options": "sfmapp.pipelines.options",
     "reconstruct": "sfmapp.pipelines.reconstruct",
     "refine": "sfmapp.pipelines.refine",
     "track_sequence": "sfmapp.pipelines.odometry",
+    "undistort": "sfmapp.pipelines.undistort",
 }
 
 

@@ -49,6 +49,7 @@ def find_photographs(
     options: ImageOptions,
     *,
     is_upright: bool,
+    with_copies: bool = False,
     threads: int = 1,
     events: Events | None = None,
 ) -> Photographs:
@@ -60,6 +61,7 @@ def find_photographs(
         options: masks and limits.
         is_upright: pixels are counted in the photograph turned as EXIF says (old workspaces of sfmapp); False: as
             stored. Where only one of the two has the shape of the camera's image, that one it is.
+        with_copies: keep images that are copies of others.
         threads: files that are read at a time.
         events: told of photographs that are missing and of copies.
 
@@ -82,7 +84,7 @@ def find_photographs(
         raise InputError(
             f"no mask in {options.mask_path} fits any image", f"expected for example {options.mask_path}/{name}.png"
         )
-    kept, copies = _without_copies(found, model.cam_from_world)
+    kept, copies = (found, []) if with_copies else _without_copies(found, model.cam_from_world)
     if copies:
         events.warned(STAGE, f"{_some(copies)}: copies of other images in the same place, left out", names=copies)
     return Photographs(

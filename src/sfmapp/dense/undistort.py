@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from sfmapp.geometry.lens import distort
 from sfmapp.scene.camera import Camera, pixels_to_normalized
+from sfmapp.scene.undistortion import has_distortion
 
 Array = NDArray[np.float64]
 
@@ -50,7 +52,7 @@ class Canvas:
 
     @property
     def is_distorted(self) -> bool:
-        return self.camera.is_fisheye or bool(self.camera.canonical[4:].any())
+        return has_distortion(self.camera)
 
 
 def make_canvas(camera: Camera, shrink: float) -> Canvas:
@@ -125,15 +127,33 @@ def _undistort(
     canvas: Canvas, rgb: NDArray[np.uint8], opacity: NDArray[np.uint8] | None
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8] | None]:
     """At full resolution: colours, 255 where the photograph shows them, and the mask."""
-    camera, size = canvas.camera, (canvas.height, canvas.width)
-    lens = camera.is_fisheye, camera.canonical, _reach(camera), canvas.left, canvas.top
-    flat, shown = np.empty((*size, 3), np.uint8), np.empty(size, np.uint8)
-    _resample(np.ascontiguousarray(rgb), *lens, flat, shown)
-    if opacity is None:
-        return flat, shown, None
-    flat_opacity = np.empty((*size, 1), np.uint8)
-    _resample(opacity[..., None], *lens, flat_opacity, shown)
-    return flat, shown, flat_opacity[..., 0]
+    camera, size = canvas.camera, (canvas.width, canvas.height)
+    fx, fy, cx, cy = camera.canonical[:4]
+    k = np.array([fx, fy, cx - canvas.left, cy - canvas.top])
+    flat, shown = resample(camera, k, size, rgb)
+    return flat, shown, None if opacity is None else resample(camera, k, size, opacity)[0]
+
+
+def resample(
+    camera: Camera, k: Array, size: tuple[int, int], pixels: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """What a pinhole shows of a photograph.
+
+    Args:
+        camera: of the photograph.
+        k: (4,) ``fx, fy, cx, cy`` of the pinhole, in pixels.
+        size: its width and height in pixels.
+        pixels: (H, W) or (H, W, C), uint8 or uint16; a channel of 16 bits never gets brighter than its brightest pixel,
+            for cameras write fewer bits into them.
+
+    Returns:
+        The same of (h, w), and (h, w) 255 where the photograph shows it: beyond, its border is carried on.
+    """
+    layers = np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None])
+    white = np.full(layers.shape[2], 255.0) if layers.dtype == np.uint8 else layers.max(axis=(0, 1)).astype(np.float64)
+    flat, shown = np.empty((size[1], size[0], layers.shape[2]), layers.dtype), np.empty(size[::-1], np.uint8)
+    _resample(layers, camera.is_fisheye, camera.canonical, _reach(camera), k, white, flat, shown)
+    return flat.reshape(size[1], size[0], *pixels.shape[2:]), shown
 
 
 def _reach(camera: Camera) -> float:
@@ -164,16 +184,16 @@ def _cubic_weights(t):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _resample(pixels, fisheye, row, reach, left, top, out, shown):  # type: ignore[no-untyped-def]
-    """Fill out (h, w, C) of the plane from a photograph (H, W, C); shown (h, w): 255 where it shows any of it.
+def _resample(pixels, fisheye, row, reach, k, white, out, shown):  # type: ignore[no-untyped-def]
+    """Fill out (h, w, C) of the plane of k from a photograph (H, W, C); shown (h, w): 255 where it shows any of it.
 
     The border of the photograph is carried on, so that pixels at the edge have company of their kind.
     """
     height, width, channels = pixels.shape
     for v in range(out.shape[0]):
-        y = (top + v + 0.5 - row[3]) / row[1]
+        y = (v + 0.5 - k[3]) / k[1]
         for u in range(out.shape[1]):
-            x = (left + u + 0.5 - row[2]) / row[0]
+            x = (u + 0.5 - k[2]) / k[0]
             px, py = distort(fisheye, row, x, y)
             is_shown = x * x + y * y < reach * reach and 0.0 <= px <= width and 0.0 <= py <= height
             shown[v, u] = 255 if is_shown else 0
@@ -186,4 +206,4 @@ def _resample(pixels, fisheye, row, reach, left, top, out, shown):  # type: igno
                     line = pixels[min(max(j - 1 + b, 0), height - 1)]
                     for a in range(4):
                         total += wy[b] * wx[a] * line[min(max(i - 1 + a, 0), width - 1), c]
-                out[v, u, c] = np.uint8(min(max(total, 0.0), 255.0))
+                out[v, u, c] = int(min(max(total, 0.0), white[c]))

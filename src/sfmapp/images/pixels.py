@@ -47,7 +47,7 @@ def read_picture(record: ImageRecord) -> Picture:
     """
     color, alpha = _decode(record)
     mask = _alpha_mask(alpha) if record.has_alpha else None
-    return Picture(_as_rgb(color), _as_gray(color), _combine(_read_mask_file(record), mask))
+    return Picture(_as_rgb(color), _as_gray(color), _combine(read_mask_file(record), mask))
 
 
 def read_on_white(record: ImageRecord) -> tuple[Pixels, NDArray[np.bool_] | None]:
@@ -61,7 +61,7 @@ def read_on_white(record: ImageRecord) -> tuple[Pixels, NDArray[np.bool_] | None
     if alpha is not None and mask is not None:
         opacity = alpha[..., None].astype(np.uint16)
         rgb = ((rgb * opacity + 255 * (255 - opacity) + 127) // 255).astype(np.uint8)
-    return rgb, _combine(_read_mask_file(record), mask)
+    return rgb, _combine(read_mask_file(record), mask)
 
 
 def read_rgb(record: ImageRecord) -> Pixels:
@@ -87,7 +87,7 @@ def read_mask(record: ImageRecord) -> NDArray[np.bool_] | None:
         InputError: the image or its mask cannot be read.
     """
     alpha = _decode(record)[1] if record.has_alpha else None
-    return _combine(_read_mask_file(record), _alpha_mask(alpha))
+    return _combine(read_mask_file(record), _alpha_mask(alpha))
 
 
 def _as_rgb(pixels: Pixels) -> Pixels:
@@ -104,6 +104,14 @@ def _as_gray(pixels: Pixels) -> Pixels:
 
 def _decode(record: ImageRecord) -> tuple[Pixels, Pixels | None]:
     """((H, W) or (H, W, 3) RGB, alpha (H, W) or None) uint8."""
+    pixels = to_8_bits(decode_file(record, *read_file(record)))
+    if pixels.ndim == 3 and pixels.shape[2] == 4:
+        return np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3])
+    return pixels, None
+
+
+def read_file(record: ImageRecord) -> tuple[bytes, Header]:
+    """Bytes and header of a photograph. Raises InputError if it is gone or was changed since it was listed."""
     data = _read_bytes(record)
     try:
         header = read_header(data)
@@ -116,15 +124,21 @@ def _decode(record: ImageRecord) -> tuple[Pixels, Pixels | None]:
         raise InputError(
             f"{record.name} was changed while in use: {size[0]}x{size[1]} pixels, was {expected[0]}x{expected[1]}"
         )
+    return data, header
+
+
+def decode_file(record: ImageRecord, data: bytes, header: Header) -> NDArray[Any]:
+    """Pixels of what :func:`read_file` gave, as :func:`decode_bytes` gives them, turned as the record has it.
+
+    Raises:
+        InputError: the data are damaged.
+    """
     raw = decode_bytes(data, header)
-    if raw is None or raw.shape[:2] != size[::-1]:
+    if raw is None or raw.shape[:2] != (header.height, header.width):
         raise InputError(
             f"{record.name} cannot be decoded: its data are damaged", "copy it again from its source, or leave it out"
         )
-    pixels = upright_pixels(to_8_bits(raw), record.turn)
-    if pixels.ndim == 3 and pixels.shape[2] == 4:
-        return np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3])
-    return pixels, None
+    return upright_pixels(raw, record.turn)
 
 
 def _read_bytes(record: ImageRecord) -> bytes:
@@ -142,7 +156,7 @@ def decode_bytes(data: bytes, header: Header) -> NDArray[Any] | None:
         layout = tiff_layout(data)
         if not layout.is_read_by_opencv:
             return decode_samples(data, layout)
-        data = _without_orientation(data)
+        data = without_orientation(data)
     # IMREAD_UNCHANGED keeps depth, grey and alpha, but does not convert CMYK
     is_plain = header.kind in ("rgb", "palette", "cmyk") and header.bits <= 8 and not header.has_alpha
     flags = cv2.IMREAD_COLOR_RGB if is_plain else cv2.IMREAD_UNCHANGED
@@ -159,8 +173,8 @@ def decode_bytes(data: bytes, header: Header) -> NDArray[Any] | None:
     return cv2.cvtColor(raw, cv2.COLOR_BGRA2RGBA if raw.shape[2] == 4 else cv2.COLOR_BGR2RGB)
 
 
-def _without_orientation(data: bytes) -> bytes:
-    """The same TIFF with orientation 1: OpenCV turns TIFFs whatever it is told."""
+def without_orientation(data: bytes) -> bytes:
+    """The same TIFF, or block of EXIF, with orientation 1: OpenCV turns TIFFs whatever it is told."""
     place = first_directory(data).value_offset.get(274)
     if place is None:
         return data
@@ -194,7 +208,12 @@ def _alpha_mask(alpha: Pixels | None) -> NDArray[np.bool_] | None:
     return None if mask.all() or not mask.any() else mask
 
 
-def _read_mask_file(record: ImageRecord) -> NDArray[np.bool_] | None:
+def read_mask_file(record: ImageRecord) -> NDArray[np.bool_] | None:
+    """(H, W) bool, True where the picture may be used, from its mask file alone; None if it has none.
+
+    Raises:
+        InputError: the mask cannot be read.
+    """
     if record.mask_path is None:
         return None
     import cv2

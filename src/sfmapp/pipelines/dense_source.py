@@ -23,7 +23,15 @@ from sfmapp.pipelines.options import Options, options_from_dict, options_to_dict
 from sfmapp.pipelines.run import Job
 from sfmapp.pipelines.stored_pixels import has_stored_pixels
 from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import DENSE, RECONSTRUCT, USUAL_FOLDERS, open_workspace, read_manifest
+from sfmapp.pipelines.workspace import (
+    DENSE,
+    ODOMETRY,
+    RECONSTRUCT,
+    UNDISTORT,
+    USUAL_FOLDERS,
+    open_workspace,
+    read_manifest,
+)
 
 # the workspace in the folder of a COLMAP model, if no other place is named
 INSIDE = "sfmapp"
@@ -120,6 +128,7 @@ def find_source(
     output: str | os.PathLike[str] | None,
     images: str | os.PathLike[str] | None,
     options: Options,
+    asked_for: str = DENSE,
 ) -> DenseSource:
     """Find model, photographs and workspace.
 
@@ -128,6 +137,7 @@ def find_source(
         output: where the results go; None: into the workspace itself, or the folder ``sfmapp`` of the model.
         images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
         options: of the run.
+        asked_for: the command, for what is said.
 
     Raises:
         UsageError: a workspace of another command.
@@ -135,8 +145,9 @@ def find_source(
         NoReconstructionError: the workspace holds no model.
     """
     folder = Path(source)
-    if (folder / "run.json").is_file():
-        return _in_workspace(folder, output, images, options)
+    # what undistort has written is a COLMAP model with its photographs where COLMAP has them
+    if (folder / "run.json").is_file() and read_manifest(folder).get("command") != UNDISTORT:
+        return _in_workspace(folder, output, images, options, asked_for)
     if not has_model(folder):
         if not has_model(folder / "sparse" / "0"):
             what = "no such folder" if not folder.is_dir() else "neither of them"
@@ -147,14 +158,22 @@ def find_source(
 
 
 def _in_workspace(
-    folder: Path, output: str | os.PathLike[str] | None, images: str | os.PathLike[str] | None, options: Options
+    folder: Path,
+    output: str | os.PathLike[str] | None,
+    images: str | os.PathLike[str] | None,
+    options: Options,
+    asked_for: str,
 ) -> DenseSource:
     manifest = read_manifest(folder)
     command = manifest.get("command", RECONSTRUCT)
+    if command == ODOMETRY and asked_for == UNDISTORT and output is not None:
+        return DenseSource(
+            folder / "sparse" / "0", _frame_folder(manifest, images), Path(output), DENSE, False, options
+        )
     if command not in (RECONSTRUCT, DENSE):
         raise UsageError(
             f"{folder} holds the results of sfmapp {command}, not of sfmapp {RECONSTRUCT}",
-            f"its model can be used all the same: sfmapp dense {folder}/sparse/0 --images DIR -o OUT",
+            f"its model can be used all the same: sfmapp {asked_for} {folder}/sparse/0 --images DIR -o OUT",
         )
     is_own = output is None or Path(output).resolve() == folder.resolve()
     target = folder if output is None else Path(output)
@@ -173,6 +192,17 @@ def _in_workspace(
         images_options = dataclasses.replace(options.images, mask_path=earlier.mask_path)
         options = dataclasses.replace(options, images=images_options)
     return DenseSource(model, found, target, command if is_own else DENSE, is_upright, options)
+
+
+def _frame_folder(manifest: dict[str, Any], images: str | os.PathLike[str] | None) -> Path:
+    """The folder that the names of an odometry run's keyframes are relative to."""
+    folder = Path(str(manifest.get("source") or "")) if images is None else Path(images)
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder}: expected the folder of the frames, found {'a file' if folder.is_file() else 'no folder'}",
+            "name the folder that holds the keyframes as files: --images DIR",
+        )
+    return folder
 
 
 def image_root(source: str) -> Path:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 FORMAT = f"{FORMAT_NAME} 1"
 # the commands that write workspaces; manifests of before the second one name none
-RECONSTRUCT, ODOMETRY, REFINE, DENSE = "reconstruct", "odometry", "refine", "dense"
+RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "refine", "dense", "undistort"
 LOCK = ".lock"
 # where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0
 USUAL_FOLDERS = ("images", "../images", "../../images")

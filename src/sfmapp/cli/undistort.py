@@ -1,0 +1,93 @@
+"""``sfmapp undistort``: photographs without distortion, for programs that know only pinholes."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from sfmapp.cli.common import (
+    add_output_flags,
+    limit_library_threads,
+    listening,
+    load_numba_without_blas,
+    print_json,
+    took,
+)
+
+EXAMPLES = """\
+examples:
+  sfmapp undistort out/ -o splat/
+  sfmapp undistort colmap/sparse/0 --images colmap/images -o splat/ --max-size 1600
+  sfmapp undistort out/ -o splat/ --blank-pixels 1 --mask-path masks/
+
+SOURCE is a workspace of sfmapp reconstruct, one of sfmapp odometry on a folder of frames (its keyframes), or a COLMAP
+model with the folder of its photographs. Writes
+  DIR/images/NAME       the photographs, in the format that they have: JPEG with quality 97, all others without loss, 16
+                        bits and alpha kept; copied as they are where there is no distortion; never with a tag to turn
+                        them
+  DIR/masks/NAME.png    black where a mask, or the lack of a photograph, leaves something out
+  DIR/sparse/0/         the model with PINHOLE cameras (cameras.bin, images.bin, points3D.bin, rigs.bin, frames.bin),
+                        for gaussian-splatting, gsplat, Brush and nerfstudio; the same files in DIR/sparse/, where
+                        COLMAP has them and OpenMVS reads them
+The same command again resumes a run that was cut off."""
+
+
+def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the commands of this family to the parser."""
+    parser = commands.add_parser(
+        "undistort", help="photographs without distortion and a PINHOLE model, for splatting and stereo",
+        description="Take the distortion of the lens out of the photographs of a model.", epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("source", metavar="SOURCE", type=Path, help="a workspace, or a COLMAP model")
+    parser.add_argument(
+        "-o", "--output", metavar="DIR", type=Path, required=True, help="where to write; a new folder, or an empty one"
+    )
+    parser.add_argument("--images", metavar="DIR", type=Path, help="folder of the photographs of a COLMAP model")
+    parser.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black is ignored")
+    parser.add_argument(
+        "--blank-pixels", metavar="SHARE", type=float, default=0.0,
+        help="from 0, cropped until no pixel is blank (default), to 1, all that the photograph shows",
+    )  # fmt: skip
+    parser.add_argument("--max-size", metavar="PX", type=int, help="largest side of the pictures; default: no limit")
+    parser.add_argument("--threads", metavar="N", help="workers; default: all cores. Results do not depend on it")
+    add_output_flags(parser, has_log=True)
+    parser.set_defaults(run=_undistort)
+
+
+def _undistort(args: argparse.Namespace) -> int:
+    limit_library_threads()
+    from sfmapp.pipelines.options import load_options
+
+    flags = {"threads": args.threads, "images.mask_path": args.mask_path}
+    options = load_options([], [f"{name}={value}" for name, value in flags.items() if value is not None])
+    load_numba_without_blas()
+    from sfmapp.pipelines.undistort import undistort
+    from sfmapp.pipelines.usage import Stopwatch
+
+    watch = Stopwatch(whole_process=True)
+    with listening(args) as events:
+        result = undistort(
+            args.source, args.output, options, images=args.images, blank_pixels=args.blank_pixels,
+            max_size=args.max_size, events=events, watch=watch,
+        )  # fmt: skip
+    if args.json:
+        print_json({"exit_code": 0, "output": str(result.output), **result.report})
+    elif not args.quiet:
+        _print(result.output, result.report)
+    return 0
+
+
+def _print(output: Path, report: dict[str, Any]) -> None:
+    """A result in three lines."""
+    sizes = sorted({(camera["width"], camera["height"]) for camera in report["cameras"]})
+    shown = ", ".join(f"{width}x{height}" for width, height in sizes[:3]) + (", ..." if len(sizes) > 3 else "")
+    copied = f", {report['num_copied']} of them copied as they were" if report["num_copied"] else ""
+    masks = f", {report['num_masks']} masks" if report["num_masks"] else ""
+    print(
+        f"{report['num_images']} photographs without distortion ({shown}){copied}{masks},"
+        f" {report['num_points']} points, {report['num_observations']} observations ({report['num_dropped']} dropped)"
+    )
+    print(f"{output} is up to date: nothing to do" if report["is_up_to_date"] else took(report["run"]))
+    print(f"photographs {output / 'images'}, model {output / 'sparse' / '0'}")

@@ -1,0 +1,323 @@
+"""Photographs without their distortion and a PINHOLE model beside them, as COLMAP's undistorter lays them out.
+
+``images/`` holds the photographs under their names, ``masks/NAME.png`` what is to be ignored, and the model is in
+``sparse/0``, where the trainers of Gaussian splats and nerfstudio look for it, and in ``sparse`` as well, where COLMAP
+itself has it and OpenMVS reads it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import sfmapp
+from sfmapp.dense.photographs import Photographs, find_photographs
+from sfmapp.dense.undistort import resample
+from sfmapp.errors import InputError, NoReconstructionError, UsageError
+from sfmapp.events import Events
+from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.colmap import read_model
+from sfmapp.images.image_set import ImageRecord
+from sfmapp.images.pixels import decode_file, read_file, read_mask_file
+from sfmapp.images.rewrite import encode, encode_mask, without_turn
+from sfmapp.pipelines.dense_source import DenseSource, find_source, model_digest
+from sfmapp.pipelines.keys import input_key
+from sfmapp.pipelines.listeners import EventLog
+from sfmapp.pipelines.options import Options
+from sfmapp.pipelines.usage import Stopwatch
+from sfmapp.pipelines.workspace import (
+    MODEL_FILES,
+    UNDISTORT,
+    Workspace,
+    open_workspace,
+    recorded_versions,
+    stage_key,
+)
+from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.undistortion import Undistortion, has_distortion, plan_undistortion, undistort_reconstruction
+
+STAGE = UNDISTORT
+IMAGES, MASKS = "images", "masks"
+_NAMES_SHOWN = 3
+
+
+@dataclass(frozen=True)
+class UndistortResult:
+    """What was written.
+
+    Attributes:
+        output: the folder.
+        report: JSON-able: ``num_images``, ``num_copied`` (of them, files that had no distortion), ``num_masks``,
+            ``cameras`` (a row for each pinhole), ``num_points``, ``num_observations``, ``num_dropped`` (observations
+            outside of the pictures, or in photographs that are missing), ``missing`` (name and reason),
+            ``is_up_to_date`` and ``run``.
+    """
+
+    output: Path
+    report: dict[str, Any]
+
+
+@dataclass
+class _Job:
+    """An undistortion under way.
+
+    Attributes:
+        workspace: the folder.
+        photographs: that are there.
+        undistortions: one for each.
+        lost: (name, reason) of photographs that could not be read.
+    """
+
+    workspace: Workspace
+    photographs: Photographs
+    undistortions: list[Undistortion]
+    events: Events
+    lost: list[tuple[str, str]] = field(default_factory=list)
+
+
+def undistort(
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    options: Options | None = None,
+    *,
+    images: str | os.PathLike[str] | None = None,
+    blank_pixels: float = 0.0,
+    max_size: int | None = None,
+    events: Events | None = None,
+    watch: Stopwatch | None = None,
+) -> UndistortResult:
+    """Write the photographs of a model without distortion, and the model with PINHOLE cameras beside them.
+
+    The same call again resumes one that was cut off.
+
+    Args:
+        source: the workspace of a reconstruction, of which the largest model is taken, or of odometry on a folder of
+            frames, of which the keyframes are, or the folder of a COLMAP model.
+        output: a new folder, an empty one, or that of an earlier call.
+        options: of these, the masks (``images.mask_path``) and ``threads``.
+        images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
+        blank_pixels: from 0 for pictures without a blank pixel to 1 for all that the photographs show.
+        max_size: largest side of the pictures in pixels; None for no limit.
+        events: progress, warnings and cancellation.
+        watch: started when the run began.
+
+    Raises:
+        UsageError: a share or size that makes no sense, or an output that holds something else.
+        InputError: no model, or none of its photographs.
+        NoReconstructionError: the workspace holds no model.
+    """
+    if not 0.0 <= blank_pixels <= 1.0:
+        raise UsageError(f"blank_pixels is {blank_pixels:g}, expected a share from 0 to 1")
+    if max_size is not None and max_size < 1:
+        raise UsageError(f"max_size is {max_size}, expected 1 pixel or more")
+    options, events, watch = options or Options(), events or Events(), watch or Stopwatch()
+    where = find_source(source, output, images, options, UNDISTORT)
+    _check_target(where)
+    model, keypoints = read_model(where.model, events)
+    if not len(model.registered_idx):
+        raise NoReconstructionError(f"{where.model}: expected images with a pose, found none")
+    with _opened(where, events) as workspace:
+        photographs = find_photographs(
+            model, where.images, where.options.images,
+            is_upright=where.is_upright, with_copies=True, threads=options.num_workers, events=events,
+        )  # fmt: skip
+        planned = [plan_undistortion(camera, blank_pixels, max_size) for camera in photographs.cameras]
+        job = _Job(workspace, photographs, planned, events)
+        key = stage_key(
+            ("dense", "images", "scene", "geometry", "formats"), [blank_pixels, max_size, where.is_upright],
+            model_digest(where.model), [input_key(record) for record in photographs.records], photographs.missing,
+        )  # fmt: skip
+        report = _known_report(job, key)
+        if report is None:
+            _begin(job, key)
+            _write_photographs(job, options.num_workers)
+            report = _write_model(job, model, keypoints)
+            workspace.finish(STAGE, watch.read(), report=report)
+            workspace.save()
+            report = {"is_up_to_date": False, **report}
+        return UndistortResult(workspace.folder, report | {"run": watch.read()})
+
+
+def _check_target(where: DenseSource) -> None:
+    """Neither the model nor the photographs may be what is written."""
+    root = where.output.resolve()
+    for path, role in ((where.model, "the model"), (where.images, "the folder of the photographs")):
+        resolved = path.resolve()
+        if resolved == root or resolved.is_relative_to(root):
+            raise UsageError(f"{path}: {role} is in {where.output}, where the results go", "choose another folder: -o")
+
+
+@contextmanager
+def _opened(where: DenseSource, events: Events) -> Iterator[Workspace]:
+    with (
+        open_workspace(where.output, UNDISTORT) as workspace,
+        EventLog(workspace.log, events, source=str(where.images), version=sfmapp.__version__) as event_log,
+    ):
+        events.subscribe(event_log)
+        workspace.manifest |= {
+            # what the model belongs to, for the commands that take this workspace; and what that was made of
+            "source": os.path.abspath(where.output / IMAGES),
+            "photographs": os.path.abspath(where.images),
+            "model": os.path.abspath(where.model),
+            "versions": {"sfmapp": sfmapp.__version__, **recorded_versions()},
+        }
+        yield workspace
+
+
+def _target(job: _Job, folder: str, name: str) -> Path:
+    """Where a file goes.
+
+    Raises:
+        UsageError: a link leads out of the output folder, perhaps to the photographs themselves.
+    """
+    root = job.workspace.folder
+    path = root / folder / name
+    if not path.parent.resolve().is_relative_to(root.resolve()):
+        raise UsageError(f"{path}: a link in the way leads out of {root}", "take it away, or choose another folder: -o")
+    return path
+
+
+def _begin(job: _Job, key: str) -> None:
+    """Take away what an earlier run with another key has written, and note what this one is going to."""
+    workspace = job.workspace
+    names = [record.name for record in job.photographs.records]
+    _target(job, "sparse/0", MODEL_FILES[0])
+    if not workspace.has_key(STAGE, key):
+        workspace.write_models([])
+        earlier = workspace.manifest["stages"].get(STAGE, {}).get("names", [])
+        for name in {str(name) for name in earlier}:
+            if not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts:
+                _target(job, IMAGES, name).unlink(missing_ok=True)
+                _target(job, MASKS, f"{name}.png").unlink(missing_ok=True)
+    workspace.begin(STAGE, key, names=names)
+
+
+def _known_report(job: _Job, key: str) -> dict[str, Any] | None:
+    """The report of an earlier run if all that it has written is there."""
+    folder = job.workspace.folder
+    wanted = [folder / IMAGES / record.name for record in job.photographs.records]
+    wanted += [folder / "sparse" / "0" / name for name in MODEL_FILES]
+    if not job.workspace.is_current(STAGE, key) or not all(path.is_file() for path in wanted):
+        return None
+    return {**job.workspace.manifest["stages"][STAGE]["report"], "is_up_to_date": True}
+
+
+def _write_photographs(job: _Job, threads: int) -> None:
+    """Write them all. One that cannot be read is noted in ``job.lost``, and costs the others nothing."""
+    records, events = job.photographs.records, job.events
+    events.started(STAGE, f"{len(records)} photographs", total=len(records))
+
+    def write(i: int) -> tuple[str, str] | None:
+        events.raise_if_cancelled()
+        record = records[i]
+        target = _target(job, IMAGES, record.name)
+        reason = None
+        if not target.is_file():  # it appears whole, after its mask
+            try:
+                picture, mask = _undistorted(record, job.undistortions[i])
+            except InputError as error:
+                reason = record.name, str(error)
+            else:
+                if mask is not None:
+                    _write(_target(job, MASKS, f"{record.name}.png"), encode_mask(mask))
+                _write(target, picture)
+        events.advanced(STAGE)
+        return reason
+
+    pool = ThreadPoolExecutor(threads)
+    try:
+        job.lost += [found for found in pool.map(write, range(len(records))) if found is not None]
+    finally:
+        pool.shutdown(cancel_futures=True)
+    events.finished(STAGE, f"{len(records) - len(job.lost)} photographs written")
+    if job.lost:
+        listed = "; ".join(reason for _, reason in job.lost[:_NAMES_SHOWN])
+        text = f"{len(job.lost)} of {len(records)} photographs cannot be used: {listed}"
+        if len(job.lost) == len(records):
+            raise InputError(text)
+        events.warned(STAGE, text, names=[name for name, _ in job.lost])
+
+
+def _write(path: Path, data: bytes) -> None:
+    with replaced_file(path) as beside:
+        beside.write_bytes(data)
+
+
+def _undistorted(record: ImageRecord, how: Undistortion) -> tuple[bytes, NDArray[np.bool_] | None]:
+    """The file of a photograph, and (h, w) True where it may be used; None for everywhere.
+
+    Raises:
+        InputError: it, or its mask, cannot be read.
+    """
+    data, header = read_file(record)
+    mask = read_mask_file(record)
+    if how.is_identity and record.turn == 1:
+        kept = without_turn(data, header)
+        return encode(decode_file(record, data, header), header.format) if kept is None else kept, mask
+    flat, shown = _lay_out(how, decode_file(record, data, header))
+    usable = shown == 255
+    flat[~usable] = 0
+    if mask is not None:
+        usable &= _lay_out(how, mask.astype(np.uint8) * 255)[0] > 127
+    try:
+        picture = encode(flat, header.format)
+    except InputError as error:
+        raise InputError(f"{record.name}: {error}") from error
+    return picture, usable if mask is not None or not usable.all() else None
+
+
+def _lay_out(how: Undistortion, pixels: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """Pixels of the pinhole, each the mean of those that it covers, and 255 where all of these are shown."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    size, final = (how.plane.width, how.plane.height), (how.camera.width, how.camera.height)
+    if has_distortion(how.source):
+        flat, shown = resample(how.source, how.plane.params, size, pixels)
+    else:
+        flat, shown = pixels, np.full(size[::-1], 255, np.uint8)
+    if final != size:
+        flat, shown = (cv2.resize(layer, final, interpolation=cv2.INTER_AREA) for layer in (flat, shown))
+    return np.array(flat), shown
+
+
+def _write_model(job: _Job, model: Reconstruction, keypoints: list[NDArray[np.float64]]) -> dict[str, Any]:
+    """Write the model of the photographs that were written, and tell of it."""
+    photographs, lost = job.photographs, {name for name, _ in job.lost}
+    kept = [i for i, record in enumerate(photographs.records) if record.name not in lost]
+    undistortions = [job.undistortions[i] for i in kept]
+    flat, moved = undistort_reconstruction(model, keypoints, photographs.image_idx[kept], undistortions)
+    job.workspace.write_models([flat], moved)
+    for name in MODEL_FILES:
+        _share(job.workspace.model() / name, job.workspace.folder / "sparse" / name)
+    names = [photographs.records[i].name for i in kept]
+    masks = [job.workspace.folder / MASKS / f"{name}.png" for name in names]
+    return {
+        "num_images": len(kept),
+        "num_copied": sum(each.is_identity for each in undistortions),
+        "num_masks": sum(path.is_file() for path in masks),
+        "cameras": [{"width": c.width, "height": c.height, "params": c.params.tolist()} for c in flat.cameras],
+        "num_points": int(flat.is_triangulated.sum()),
+        "num_observations": flat.tracks.num_observations,
+        "num_dropped": int(model.obs_is_inlier.sum()) - flat.tracks.num_observations,
+        "missing": [{"name": name, "reason": reason} for name, reason in (*photographs.missing, *job.lost)],
+    }
+
+
+def _share(path: Path, other: Path) -> None:
+    """Have a file in another place as well, without a second copy of its bytes where the file system can."""
+    with replaced_file(other) as beside:
+        beside.unlink(missing_ok=True)
+        with suppress(OSError):
+            os.link(path, beside)
+            return
+        shutil.copyfile(path, beside)
