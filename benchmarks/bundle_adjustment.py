@@ -21,7 +21,7 @@ import numpy as np
 import pycolmap
 
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
-from sfmapp.scene.camera import Camera, CameraModel
+from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene, perturb
 from sfmapp.scene.tracks import make_tracks

@@ -26,9 +26,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from dense_inputs import lego_inputs, photographs_model
 from numpy.typing import NDArray
 
+from dense_inputs import lego_inputs, photographs_model
 from sfmapp.evaluation.clouds import score_cloud
 from sfmapp.evaluation.measured import run_measured
 from sfmapp.formats.ply_reader import read_ply_geometry

@@ -35,8 +35,8 @@ from sfmapp.evaluation.second_opinion import CameraGroup, SecondOpinionOptions, 
 from sfmapp.evaluation.trajectory import Trajectory, absolute_error, associate, kitti_drift, statistics
 from sfmapp.events import Events
 from sfmapp.formats.colmap import read_model
-from sfmapp.formats.sequences import SequenceOptions, open_sequence
 from sfmapp.pipelines.evaluate import evaluate
+from sfmapp.sequences.open import SequenceOptions, open_sequence
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))

@@ -23,11 +23,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.formats.kitti import write_kitti
+from rendered_worlds import sequences as rendered
+from rendered_worlds.sequences import RenderedSequence
+from sfmapp.camera.camera import Camera
 from sfmapp.geometry import rigid3
-from sfmapp.scene import rendered
-from sfmapp.scene.camera import Camera
-from sfmapp.scene.rendered import RenderedSequence
+from sfmapp.sequences.kitti import write_kitti
 
 Array = NDArray[np.float64]
 

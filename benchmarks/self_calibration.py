@@ -14,13 +14,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from rendered_worlds import sequences as rendered
+from rendered_worlds.sequences import RenderedSequence
+from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.pipelines.options import load_options
 from sfmapp.pipelines.self_calibrate import self_calibrated
-from sfmapp.scene import rendered
-from sfmapp.scene.camera import Camera, CameraModel
-from sfmapp.scene.rendered import RenderedSequence
 from sfmapp.scene.rig import Rig
 
 # place: frames rendered, every how many of them is kept, size of a picture

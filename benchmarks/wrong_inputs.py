@@ -28,18 +28,18 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from render_sequences import LAYOUTS, WRITERS, write_images
 
+from render_sequences import LAYOUTS, WRITERS, write_images
+from rendered_worlds import sequences as rendered
+from rendered_worlds.motion import GRAVITY
+from rendered_worlds.sequences import RenderedSequence
+from sfmapp.camera.camera import Camera
 from sfmapp.errors import SfmError
 from sfmapp.evaluation.trajectory import Trajectory, absolute_error, associate
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.pipelines.odometry import track_sequence
 from sfmapp.pipelines.options import load_options
-from sfmapp.scene import rendered
-from sfmapp.scene.camera import Camera
-from sfmapp.scene.motion import GRAVITY
-from sfmapp.scene.rendered import RenderedSequence
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parent.parent

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera, CameraModel, pixels_to_normalized, project
 from sfmapp.formats.colmap import write_model, write_model_text
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import Camera, CameraModel, pixels_to_normalized, project
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
 

@@ -7,12 +7,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from rendered_worlds import textures
+from rendered_worlds.rendering import Renderer, World
+from rendered_worlds.worlds import Skin, WorldBuilder
+from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.dense.scene import DenseScene, DenseView
 from sfmapp.geometry import rigid3
-from sfmapp.scene import textures
-from sfmapp.scene.camera import Camera, CameraModel
-from sfmapp.scene.rendering import Renderer, World
-from sfmapp.scene.worlds import Skin, WorldBuilder
 
 Array = NDArray[np.float64]
 

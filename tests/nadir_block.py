@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfmapp.camera.camera import Camera, project
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import Camera, project
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import SyntheticScene
 from sfmapp.scene.tracks import make_tracks

@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Frame, Sequence, Truth
-from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
-from sfmapp.scene.camera import CameraModel, project, simple_camera
 from sfmapp.scene.rig import Rig
 
 Array = NDArray[np.float64]

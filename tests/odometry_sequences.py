@@ -9,18 +9,18 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from rendered_worlds import sequences as rendered
+from rendered_worlds.rendering import Optics, World
+from rendered_worlds.sequences import RenderedSequence
 from sfmapp.adjust.covariance import similarity_basis
+from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import Frame, Imu, Truth
-from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.odometry.run import run_odometry
-from sfmapp.scene import rendered
-from sfmapp.scene.camera import Camera, CameraModel
-from sfmapp.scene.rendered import RenderedSequence
-from sfmapp.scene.rendering import Optics, World
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.synthetic import SyntheticScene
 

@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import CameraModel, project, simple_camera
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.features import Features
 from sfmapp.scene.reconstruction import Reconstruction

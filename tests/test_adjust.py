@@ -12,16 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfmapp.adjust import kernels, solver
-from sfmapp.adjust.lanes import pointer
 from sfmapp.adjust.problem import pose_rows
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, distort, project
 from sfmapp.errors import InterruptedRunError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel, distort, project
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera
 from sfmapp.scene.tracks import make_tracks
+from sfmapp.simd.f64x8 import pointer
 
 AWAY = np.array([0.0, 0.0, 6.0])
 TIGHT = AdjustOptions(relative_cost_tolerance=1e-14, max_iterations=100)

@@ -7,7 +7,7 @@ import pytest
 
 from sfmapp.adjust.covariance import errors_in_gauge, estimate_covariances
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
-from sfmapp.scene.camera import CameraModel
+from sfmapp.camera.camera import CameraModel
 from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera
 
 OPTIONS = AdjustOptions(relative_cost_tolerance=1e-10, max_iterations=100)

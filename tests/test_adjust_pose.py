@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sfmapp.adjust.pose import refine_pose
+from sfmapp.camera.camera import CameraModel
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import CameraModel
 from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera
 
 

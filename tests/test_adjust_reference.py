@@ -11,8 +11,8 @@ from gtsam.symbol_shorthand import K, X
 
 from sfmapp.adjust.factors import gtsam_pose
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.camera.camera import CameraModel
 from sfmapp.errors import UsageError
-from sfmapp.scene.camera import CameraModel
 from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera
 
 OPTIONS = AdjustOptions(relative_cost_tolerance=1e-13, max_iterations=200)

@@ -13,8 +13,8 @@ from sfmapp.adjust.covariance import errors_in_gauge, estimate_covariances
 from sfmapp.adjust.factors import gtsam_pose
 from sfmapp.adjust.problem import make_problem
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.camera.camera import CameraModel
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import CameraModel
 from sfmapp.scene.rig import Rig, RigImages
 from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera, synthetic_rig
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfmapp.scene.camera import (
+from sfmapp.camera.camera import (
     PARAM_NAMES,
     Camera,
     CameraModel,

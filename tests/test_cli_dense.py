@@ -57,9 +57,9 @@ def test_json_and_flags(wall: Path, capsys: pytest.CaptureFixture[str], tmp_path
     with np.load(result["patches"], allow_pickle=False) as archive:
         reference, xyz = archive["reference"], archive["xyz"]
     # nothing has its reference where the mask is black
+    from sfmapp.camera.camera import project
     from sfmapp.formats.colmap import read_model
     from sfmapp.geometry import rigid3
-    from sfmapp.scene.camera import project
 
     model, _ = read_model(wall / "sparse" / "0")
     for m in range(4):

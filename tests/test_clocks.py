@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from sfmapp.errors import InputError
 from sfmapp.events import Event, Events
 from sfmapp.formats.clocks import are_dates, parse_time, read_column, times_of_names
-from sfmapp.formats.sequences import SequenceOptions, open_sequence
 from sfmapp.formats.trajectory_input import read_trajectory
 from sfmapp.geometry import rigid3
 from sfmapp.pipelines.evaluate import evaluate
+from sfmapp.sequences.open import SequenceOptions, open_sequence
 
 PINHOLE = "PINHOLE,50,50,16,12"
 UNITS = {"s": 0, "ms": 3, "us": 6, "ns": 9}

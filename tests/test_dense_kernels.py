@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from dense_scenes import FOCAL, HEIGHT, WIDTH, scene_of, wall_with_box_and_bars
-from sfmapp.adjust.lanes import offset, pointer
+from rendered_worlds import textures
 from sfmapp.dense.arrays import Images, Limits, image_pointers
 from sfmapp.dense.patch_kernels import measure, plane_in_view, refine
 from sfmapp.dense.pyramid import frame_of, gray_pyramids, make_images, noise_deviation
@@ -34,7 +34,7 @@ from sfmapp.dense.window import (
     warp,
 )
 from sfmapp.geometry import rigid3
-from sfmapp.scene import textures
+from sfmapp.simd.f64x8 import offset, pointer
 
 Array = NDArray[np.float64]
 CONTRAST = 25.0

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.dense.outcome import check, confirmed_share
 from sfmapp.dense.photographs import find_photographs
 from sfmapp.dense.prepare import DensePlan
@@ -16,7 +17,6 @@ from sfmapp.dense.undistort import make_canvas
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.images.image_set import ImageOptions, ImageRecord
-from sfmapp.scene.camera import Camera, CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
 

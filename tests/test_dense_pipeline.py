@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dense_models import DEPTH, PINHOLE, row_of_poses, texture, write_wall
+from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.dense.files import read_patches
 from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError, UsageError
@@ -23,7 +24,6 @@ from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.pipelines.dense import dense
 from sfmapp.pipelines.mesh import mesh_cloud, mesh_workspace
 from sfmapp.pipelines.options import Options
-from sfmapp.scene.camera import Camera, CameraModel
 from sfmapp.surface.options import SurfaceOptions
 
 BARREL = Camera(CameraModel.OPENCV, 200, 140, np.array([165.0, 164.0, 98.4, 72.3, -0.18, 0.03, 1e-3, -1e-3]))

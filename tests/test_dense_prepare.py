@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from dense_models import DEPTH, PINHOLE, make_model, row_of_poses, see_wall, texture, write_wall
+from sfmapp.camera.camera import Camera, CameraModel, pixels_to_normalized, project
 from sfmapp.dense.files import read_patches, write_fused_ply, write_patches
 from sfmapp.dense.maps import splat_view
 from sfmapp.dense.options import DenseOptions
@@ -27,7 +28,6 @@ from sfmapp.formats.ply import TYPES
 from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.geometry import rigid3
 from sfmapp.images.image_set import ImageOptions
-from sfmapp.scene.camera import Camera, CameraModel, pixels_to_normalized, project
 from sfmapp.scene.reconstruction import Reconstruction
 
 RADIAL = Camera(CameraModel.SIMPLE_RADIAL, 200, 140, np.array([180.0, 101.3, 68.6, -0.12]))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sfmapp.camera.camera import Camera, CameraModel, pixels_to_normalized
 from sfmapp.dense.undistort import LARGEST_MARGIN, lay_out, make_canvas
-from sfmapp.scene.camera import Camera, CameraModel, pixels_to_normalized
 
 Array = np.ndarray
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sfmapp.camera.camera import CameraModel
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.formats import ply
 from sfmapp.formats.colmap import read_model, write_model
 from sfmapp.formats.nerfstudio import read_nerfstudio
 from sfmapp.pipelines.export import EXPORTS, export_model
-from sfmapp.scene.camera import CameraModel
 from sfmapp.scene.synthetic import synthetic_camera
 from test_formats_exchange import centered_camera, scene
 

@@ -15,11 +15,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from sfmapp.camera.camera import CameraModel
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model, write_model, write_model_text
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.synthetic import make_scene, synthetic_camera, synthetic_rig

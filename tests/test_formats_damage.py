@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
 
+from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.errors import InputError
 from sfmapp.formats.bundler import read_bundler, write_bundler
 from sfmapp.formats.colmap import read_model, write_model_text
 from sfmapp.formats.flat_yaml import read_flat_yaml
-from sfmapp.formats.kitti import read_kitti, write_kitti
 from sfmapp.formats.nerfstudio import read_nerfstudio, write_nerfstudio
 from sfmapp.formats.text_input import read_json_object
 from sfmapp.formats.trajectory import read_tum, write_tum
@@ -26,9 +26,9 @@ from sfmapp.formats.truth import read_truth
 from sfmapp.geometry import rigid3
 from sfmapp.images.folder import describe_images
 from sfmapp.images.image_set import ImageOptions
-from sfmapp.scene.camera import Camera, CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene, synthetic_rig
+from sfmapp.sequences.kitti import read_kitti, write_kitti
 
 CAMERA = Camera(CameraModel.RADIAL, 1001, 750, np.array([900.0, 500.5, 375.0, -0.08, 0.02]))
 WORDS = (

@@ -17,9 +17,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.errors import InputError
 from sfmapp.formats.database import Database
-from sfmapp.scene.camera import Camera, CameraModel
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.features import Features
 from sfmapp.scene.synthetic import SyntheticScene, make_scene, synthetic_camera, true_correspondences

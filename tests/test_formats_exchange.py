@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.bundler import read_bundler, write_bundler
 from sfmapp.formats.colmap import read_model, write_model, write_model_text
@@ -23,7 +24,6 @@ from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.formats.trajectory import read_tum, write_tum
 from sfmapp.formats.truth import read_truth
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import Camera, CameraModel, project
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene, synthetic_camera
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sfmapp.camera.camera import CameraModel
 from sfmapp.errors import InputError, InterruptedRunError, UsageError
 from sfmapp.events import Event, Events
-from sfmapp.formats.sequence_files import has_images, list_images
 from sfmapp.images.folder import ImageOptions, ImageSet, load_images
 from sfmapp.images.pixels import read_picture
-from sfmapp.scene.camera import CameraModel
+from sfmapp.sequences.files import has_images, list_images
 
 DATA = Path(os.environ.get("SFMAPP_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

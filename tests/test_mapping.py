@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.mapping.incremental import map_images
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.structure import residual_scale_px
-from sfmapp.scene.camera import CameraModel, simple_camera
 from sfmapp.scene.correspondences import TwoViewConfig
 from sfmapp.scene.features import Features
 from sfmapp.scene.reconstruction import Reconstruction

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.mapping.focal import estimate_focal_ratio
-from sfmapp.scene.camera import CameraModel, simple_camera
 from sfmapp.scene.correspondences import TwoViewConfig
 from sfmapp.scene.synthetic import make_scene, true_correspondences
 

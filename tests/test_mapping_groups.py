@@ -9,6 +9,7 @@ import pytest
 
 from photo_groups import Place, make_place, thinned
 from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.mapping import mend, structure
@@ -17,7 +18,6 @@ from sfmapp.mapping.join import find_joint
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import register_image
-from sfmapp.scene.camera import CameraModel, simple_camera
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene, true_correspondences
 

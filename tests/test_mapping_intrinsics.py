@@ -10,11 +10,11 @@ import pytest
 
 from nadir_block import nadir_block
 from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.camera.camera import Camera, CameraModel, simple_camera
 from sfmapp.events import Events
 from sfmapp.mapping.incremental import map_images
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.report.document import camera_rows, make_checks
-from sfmapp.scene.camera import Camera, CameraModel, simple_camera
 from sfmapp.scene.synthetic import SyntheticScene, make_scene
 from test_mapping import center_errors, inputs
 

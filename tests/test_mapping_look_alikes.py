@@ -8,7 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from rendered_worlds.rendering import Optics, Renderer
+from rendered_worlds.worlds import look_alike_world
 from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.events import Events
 from sfmapp.features.extract import FeatureOptions, extract_features
 from sfmapp.geometry import rigid3
@@ -19,12 +22,9 @@ from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.verified_pairs import MIN_MATCHES_AGAINST, Chains, contradictions_of, pair_agreement, standing_pairs
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.stage import match_images
-from sfmapp.scene.camera import Camera, CameraModel
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
-from sfmapp.scene.rendering import Optics, Renderer
 from sfmapp.scene.synthetic import make_look_alike, make_scene, true_correspondences
-from sfmapp.scene.worlds import look_alike_world
 from test_mapping import center_errors, inputs, reconstruct
 
 

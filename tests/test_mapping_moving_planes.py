@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.events import Events
 from sfmapp.mapping.incremental import map_images
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.stage import MatchedPair, join_pairs
 from sfmapp.matching.two_view import Ransac, verify_pair
-from sfmapp.scene.camera import CameraModel, simple_camera
 from sfmapp.scene.features import Features
 from sfmapp.scene.synthetic import make_scene, true_correspondences
 from test_mapping import center_errors

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfmapp.camera.camera import project
 from sfmapp.geometry import rigid3
 from sfmapp.mapping import near_views
 from sfmapp.mapping.near_views import MAX_ANGLE_DEG, MAX_ZOOM, MIN_VISIBLE
 from sfmapp.mapping.verified_pairs import contradictions_of
-from sfmapp.scene.camera import project
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import SyntheticScene, make_scene, true_correspondences
 from sfmapp.scene.tracks import make_tracks

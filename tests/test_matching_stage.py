@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sfmapp.camera.camera import Camera, CameraModel, project, simple_camera
 from sfmapp.errors import InterruptedRunError
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3
 from sfmapp.matching.stage import MatchedPair, MatchingOptions, compile_kernels, join_pairs, match_images, split_pairs
-from sfmapp.scene.camera import Camera, CameraModel, project, simple_camera
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.features import Features
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sfmapp.camera.camera import Camera, CameraModel, project, simple_camera
 from sfmapp.geometry import epipolar, rigid3
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.two_view import Ransac, TwoViewGeometry, error_threshold_px, is_significant, verify_pair
-from sfmapp.scene.camera import Camera, CameraModel, project, simple_camera
 from sfmapp.scene.correspondences import TwoViewConfig
 
 OPTIONS = MatchingOptions()

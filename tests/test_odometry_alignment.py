@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sfmapp.geometry.rigid3 import exp_so3, rotation_angle_deg
-from sfmapp.odometry.affine_alignment import align_patches_affine
-from sfmapp.odometry.alignment import align_patches
-from sfmapp.odometry.epipolar_search import search_along_epipolar
-from sfmapp.odometry.pyramid import build_pyramid
-from sfmapp.odometry.small_image import align_small_images
+from sfmapp.odometry.frontend.affine_alignment import align_patches_affine
+from sfmapp.odometry.frontend.alignment import align_patches
+from sfmapp.odometry.frontend.epipolar_search import search_along_epipolar
+from sfmapp.odometry.frontend.pyramid import build_pyramid
+from sfmapp.odometry.frontend.small_image import align_small_images
 
 Array = NDArray[np.float64]
 Texture = Callable[[Array, Array], Array]
@@ -375,7 +375,7 @@ def test_repeated_structure_is_not_taken_for_a_match() -> None:
 def test_real_stereo_pairs_are_matched(data_root: Path) -> None:
     import cv2
 
-    from sfmapp.odometry.corners import find_corners
+    from sfmapp.odometry.frontend.corners import find_corners
 
     folder = data_root / "stereo-cones"
     if not folder.is_dir():

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.calibration import RAW, reduce_to_calibration
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.odometry import calibration_check
-from sfmapp.odometry.calibration_check import Unknowns, _changed
-from sfmapp.odometry.finish import Conclusion, conclude
-from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
-from sfmapp.scene.camera import Camera, CameraModel, project
+from sfmapp.odometry.refinement import calibration_check
+from sfmapp.odometry.refinement.calibration_check import Unknowns, _changed
+from sfmapp.odometry.refinement.finish import Conclusion, conclude
 from sfmapp.scene.rig import Rig
 
 Array = NDArray[np.float64]

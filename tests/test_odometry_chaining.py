@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sfmapp.camera.camera import CameraModel, pixels_to_normalized, project, simple_camera
 from sfmapp.geometry import rigid3
-from sfmapp.odometry.active_tracks import ActiveTracks, References
-from sfmapp.odometry.chaining import chain_pose
-from sfmapp.scene.camera import CameraModel, pixels_to_normalized, project, simple_camera
+from sfmapp.odometry.frontend.active_tracks import ActiveTracks, References
+from sfmapp.odometry.frontend.chaining import chain_pose
 
 CAMERA = simple_camera(CameraModel.PINHOLE, 640, 480, 500.0, 1.0, "user")
 REFERENCE = rigid3.from_matrix(rigid3.exp_so3(np.array([0.1, -0.2, 0.05])), np.array([1.0, 2.0, -0.5]))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sfmapp.odometry.corners import find_corners
-from sfmapp.odometry.pyramid import build_pyramid
+from sfmapp.odometry.frontend.corners import find_corners
+from sfmapp.odometry.frontend.pyramid import build_pyramid
 
 NONE = np.empty((0, 2))
 

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from rendered_worlds import sequences as rendered
+from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.contradictions import Contradiction
 from sfmapp.errors import InputError, InterruptedRunError, UsageError
 from sfmapp.events import Event, Events
@@ -24,8 +26,6 @@ from sfmapp.pipelines.options import Options, load_options
 from sfmapp.pipelines.refine import refine
 from sfmapp.pipelines.self_calibrate import choose_frames, self_calibrated
 from sfmapp.pipelines.validate import validate
-from sfmapp.scene import rendered
-from sfmapp.scene.camera import Camera, CameraModel
 
 FPS, NUM_FRAMES, NUM_PHOTOS = 30.0, 72, 2
 CAMERA = Camera(CameraModel.PINHOLE, 320, 240, np.array([262.5, 262.5, 160.0, 120.0]))
@@ -305,7 +305,7 @@ def test_a_camera_that_stands_cannot_be_calibrated(room: Path, tmp_path: Path) -
 
 
 def test_frames_for_the_calibration_are_apart(room: Path) -> None:
-    from sfmapp.formats.sequences import open_sequence
+    from sfmapp.sequences.open import open_sequence
 
     sequence = open_sequence(room / "frames", SequenceOptions(), Events(), require_camera=False)
     chosen = [frame.idx for frame in choose_frames(sequence)]

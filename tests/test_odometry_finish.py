@@ -9,12 +9,12 @@ import pytest
 
 import odometry_sequences as played
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.errors import InterruptedRunError
 from sfmapp.events import Events
-from sfmapp.odometry.finish import _left_open, conclude
-from sfmapp.odometry.keyframe_map import KeyframeMap
+from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
-from sfmapp.scene.camera import CameraModel, simple_camera
+from sfmapp.odometry.refinement.finish import _left_open, conclude
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.synthetic import make_scene, synthetic_rig
 

@@ -9,8 +9,10 @@ import pytest
 
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import Imu
-from sfmapp.odometry.gyroscope import GyroTrust, imu_rotation, imu_steps
-from sfmapp.odometry.inertial import (
+from sfmapp.odometry.inertial.faults import align_or_explain
+from sfmapp.odometry.inertial.gyroscope import GyroTrust, imu_rotation, imu_steps
+from sfmapp.odometry.inertial.scale import ScaleRefusal
+from sfmapp.odometry.inertial.visual_inertial import (
     GRAVITY,
     InertialAlignment,
     _integrate,
@@ -19,8 +21,6 @@ from sfmapp.odometry.inertial import (
     _preintegration,
     align_imu,
 )
-from sfmapp.odometry.inertial_faults import align_or_explain
-from sfmapp.odometry.scale import ScaleRefusal
 
 IMU_FROM_CAM = rigid3.from_matrix(rigid3.exp_so3([1.2, -1.1, 1.3]), [0.05, -0.03, 0.08])
 GYRO_BIAS, ACCEL_BIAS = np.array([-0.002, 0.02, 0.07]), np.array([-0.05, 0.12, 0.06])

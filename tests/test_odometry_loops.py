@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
+from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.odometry import relocalize as relocalization
-from sfmapp.odometry.closing import apply_closure, fuse_points, join_maps
-from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
-from sfmapp.odometry.loops import LoopFinder, LoopOptions
-from sfmapp.odometry.places import Candidate, PlaceOptions, Places, View
-from sfmapp.odometry.pose_graph import apply_corrections
-from sfmapp.odometry.relocalize import (
+from sfmapp.odometry.loops.closing import apply_closure, fuse_points, join_maps
+from sfmapp.odometry.loops.detection import LoopFinder, LoopOptions
+from sfmapp.odometry.loops.detection import relocalize as relocalization
+from sfmapp.odometry.loops.places import Candidate, PlaceOptions, Places, View
+from sfmapp.odometry.loops.pose_graph import apply_corrections
+from sfmapp.odometry.loops.relocalize import (
     RelocalizeOptions,
     is_beyond_chance,
     is_convincing,
@@ -23,7 +23,7 @@ from sfmapp.odometry.relocalize import (
     relocalize,
     twist,
 )
-from sfmapp.scene.camera import CameraModel, project, simple_camera
+from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.scene.rig import Rig
 
 Array = np.ndarray

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 import odometry_sequences as played
+from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.geometry import rigid3
-from sfmapp.odometry.alignment import align_patches
-from sfmapp.odometry.backend import LAG, Backend, choose_window, classify, make_job, take_over
+from sfmapp.odometry.frontend.alignment import align_patches
+from sfmapp.odometry.frontend.pyramid import build_pyramid
 from sfmapp.odometry.initialize import Beginning, TwoViews, pose_between
-from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.map.backend import LAG, Backend, choose_window, classify, make_job, take_over
+from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
-from sfmapp.odometry.pyramid import build_pyramid
-from sfmapp.scene.camera import CameraModel, project, simple_camera
 from sfmapp.scene.correspondences import TwoViewConfig
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.synthetic import make_scene, synthetic_rig

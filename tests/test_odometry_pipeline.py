@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from odometry_fakes import FPS, FakeRunner, FakeSequence, path
+from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.errors import InterruptedRunError, NoReconstructionError, UsageError
 from sfmapp.evaluation.trajectory import Trajectory, absolute_error, associate
 from sfmapp.events import Event, Events
@@ -18,10 +19,10 @@ from sfmapp.formats.colmap import read_model
 from sfmapp.formats.trajectory import read_tum
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu, SequenceOptions
-from sfmapp.odometry import inertial_faults
-from sfmapp.odometry.finish import MAX_COVARIANCE_KEYFRAMES, Conclusion
-from sfmapp.odometry.inertial import contradicted
+from sfmapp.odometry.inertial.visual_inertial import contradicted
+from sfmapp.odometry.inertial.visual_inertial import faults as inertial_faults
 from sfmapp.odometry.records import _covariance_gap
+from sfmapp.odometry.refinement.finish import MAX_COVARIANCE_KEYFRAMES, Conclusion
 from sfmapp.odometry.result import FrameState
 from sfmapp.pipelines import odometry as pipeline
 from sfmapp.pipelines.odometry import TrackResult, track_sequence
@@ -32,7 +33,6 @@ from sfmapp.pipelines.reconstruct import reconstruct
 from sfmapp.pipelines.validate import validate
 from sfmapp.report.odometry_document import FrameFacts, make_checks
 from sfmapp.report.plots import Curve, plot_svg, ticks
-from sfmapp.scene.camera import CameraModel, simple_camera
 from sfmapp.scene.rig import Rig
 
 Patch = pytest.MonkeyPatch

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.geometry import rigid3
-from sfmapp.odometry.pose_choice import explaining_poses, is_way_known, tells_apart
-from sfmapp.scene.camera import Camera, CameraModel, project
+from sfmapp.odometry.frontend.pose_choice import explaining_poses, is_way_known, tells_apart
 
 CAMERA = Camera(CameraModel.PINHOLE, 640, 480, np.array([525.0, 525.0, 320.0, 240.0]))
 NOISE_PX, LIMIT_PX, NUM = 0.2, 1.0, 150

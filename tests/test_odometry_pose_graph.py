@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
-from sfmapp.odometry.pose_graph import (
+from sfmapp.odometry.loops.pose_graph import (
     GraphEdges,
     LoopEdge,
     _node,
@@ -22,7 +22,7 @@ from sfmapp.odometry.pose_graph import (
     keyframe_depths,
     optimize_pose_graph,
 )
-from sfmapp.scene.camera import CameraModel, project, simple_camera
+from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.scene.rig import Rig
 
 Array = np.ndarray

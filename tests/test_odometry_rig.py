@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.odometry.finish import conclude
-from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
-from sfmapp.scene.camera import Camera, CameraModel, project
+from sfmapp.odometry.refinement.finish import conclude
 from sfmapp.scene.rig import Rig
 
 Array = NDArray[np.float64]

@@ -13,16 +13,16 @@ import pytest
 
 import odometry_sequences as played
 from odometry_sequences import Played, Told, absolute_error, path_length, run
+from rendered_worlds import sequences as rendered
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.odometry.active_tracks import ActiveTracks
-from sfmapp.odometry.local_map import LocalMap, View
+from sfmapp.odometry.frontend.active_tracks import ActiveTracks
+from sfmapp.odometry.map.local_map import LocalMap, View
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.recognition import Recognition
 from sfmapp.odometry.records import FrameRecord
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import Odometry, run_odometry
-from sfmapp.scene import rendered
 
 Array = np.ndarray
 
@@ -322,7 +322,7 @@ def test_inertial_measurements_are_used_where_there_are_some() -> None:
 @pytest.mark.real
 @pytest.mark.slow
 def test_kitti_is_followed_to_the_end(data_root: Path) -> None:
-    from sfmapp.formats.sequences import SequenceOptions, open_sequence
+    from sfmapp.sequences.open import SequenceOptions, open_sequence
 
     folder = data_root / "kitti00-200"
     if not folder.is_dir():
@@ -348,7 +348,7 @@ def test_kitti_is_followed_to_the_end(data_root: Path) -> None:
 def test_a_real_rotation_never_makes_a_map(data_root: Path) -> None:
     import json
 
-    from sfmapp.formats.sequences import SequenceOptions, open_sequence
+    from sfmapp.sequences.open import SequenceOptions, open_sequence
 
     folder = data_root / "pano-sponza-rot"
     if not folder.is_dir():

@@ -7,16 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sfmapp.camera.camera import Camera, CameraModel, pixels_to_normalized, project
 from sfmapp.errors import UsageError
 from sfmapp.geometry import rigid3
-from sfmapp.odometry.markers import (
+from sfmapp.odometry.inertial.markers import (
     _SQUARE,
     MarkerDetector,
     MarkerSightings,
     parse_marker,
     scale_from_markers,
 )
-from sfmapp.odometry.scale import (
+from sfmapp.odometry.inertial.scale import (
     GroundOptions,
     Length,
     ScaleEstimate,
@@ -29,7 +30,6 @@ from sfmapp.odometry.scale import (
     scale_from_distance,
     scale_from_path,
 )
-from sfmapp.scene.camera import Camera, CameraModel, pixels_to_normalized, project
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import _look_at, make_scene, synthetic_camera
 from sfmapp.scene.tracks import make_tracks

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.records import FrameRecord
 from sfmapp.odometry.result import FrameState
 from sfmapp.odometry.shutter import straighten
-from sfmapp.scene.camera import Camera, CameraModel, project
 from sfmapp.scene.rig import Rig
 
 CAMERA = Camera(CameraModel.PINHOLE, 640, 480, np.array([525.0, 525.0, 320.0, 240.0]), is_fixed=True)

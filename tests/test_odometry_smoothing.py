@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfmapp.geometry import rigid3
-from sfmapp.odometry.smoothing import SmoothingOptions, smooth_trajectory
+from sfmapp.odometry.inertial.smoothing import SmoothingOptions, smooth_trajectory
 
 Q_POSITION, Q_ROTATION = 0.5, 0.3
 

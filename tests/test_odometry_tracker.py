@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.geometry import rigid3
-from sfmapp.odometry.finish import Conclusion
-from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.records import FrameRecord, gather, measure_again
+from sfmapp.odometry.refinement.finish import Conclusion
 from sfmapp.odometry.result import FrameState
 from sfmapp.odometry.tracker import MIN_INLIERS, measure_pose
-from sfmapp.scene.camera import CameraModel, project, simple_camera
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.synthetic import synthetic_camera
 

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sfmapp.camera.camera import CameraModel
 from sfmapp.errors import UsageError
 from sfmapp.pipelines import resources
 from sfmapp.pipelines.options import (
@@ -24,7 +25,6 @@ from sfmapp.pipelines.options import (
     parse_setting,
 )
 from sfmapp.pipelines.workspace import canonical_json
-from sfmapp.scene.camera import CameraModel
 
 
 def test_defaults_survive_the_round_trip_through_json() -> None:

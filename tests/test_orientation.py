@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from tests.test_report_dense import make_scene, wall
 
+from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, project
 from sfmapp.dense.scene import DenseScene, DenseView
 from sfmapp.errors import InputError, UsageError
 from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.events import Event, Events
 from sfmapp.formats.colmap import read_model
-from sfmapp.formats.sequences import SequenceOptions, open_sequence
 from sfmapp.formats.truth import read_truth
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.orientation import (
@@ -46,7 +46,8 @@ from sfmapp.pipelines.options import Options
 from sfmapp.pipelines.reconstruct import reconstruct
 from sfmapp.report.dense_pictures import dense_pictures
 from sfmapp.report.top_view import ground_axes
-from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel, project, turned_back, turned_camera
+from sfmapp.scene.turned_camera import turned_back, turned_camera
+from sfmapp.sequences.open import SequenceOptions, open_sequence
 from sfmapp.viewer.dense_replay import make_dense_replay
 from sfmapp.viewer.replay import make_replay
 

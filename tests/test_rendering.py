@@ -16,17 +16,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from rendered_worlds import sequences as rendered
+from rendered_worlds import textures
+from rendered_worlds.motion import GRAVITY, ImuOptions, Motion, control_spline, measure_inertia, tremor
+from rendered_worlds.rendering import Atlas, Optics, Renderer, World, moved_camera
+from rendered_worlds.sequences import RenderedSequence
+from rendered_worlds.worlds import Skin, WorldBuilder
+from sfmapp.camera.camera import Camera, CameraModel, pixels_to_normalized, project
 from sfmapp.events import Events
-from sfmapp.formats.sequences import open_sequence
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import SequenceOptions
-from sfmapp.scene import rendered, textures
-from sfmapp.scene.camera import Camera, CameraModel, pixels_to_normalized, project
-from sfmapp.scene.motion import GRAVITY, ImuOptions, Motion, control_spline, measure_inertia, tremor
-from sfmapp.scene.rendered import RenderedSequence
-from sfmapp.scene.rendering import Atlas, Optics, Renderer, World, moved_camera
 from sfmapp.scene.rig import Rig
-from sfmapp.scene.worlds import Skin, WorldBuilder
+from sfmapp.sequences.open import open_sequence
 
 Array = NDArray[np.float64]
 

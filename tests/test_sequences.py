@@ -17,16 +17,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sfmapp.camera.camera import CameraModel, project
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Event, Events
-from sfmapp.formats.kitti import read_kitti, write_kitti
-from sfmapp.formats.sequence_files import ascending, confined, frame_numbers
-from sfmapp.formats.sequences import MissingCameraError, SequenceOptions, open_sequence
 from sfmapp.formats.trajectory import write_tum
 from sfmapp.geometry import rigid3
 from sfmapp.images.frame_reader import read_ahead
 from sfmapp.images.sequence import Frame, Sequence
-from sfmapp.scene.camera import CameraModel, project
+from sfmapp.sequences.files import ascending, confined, frame_numbers
+from sfmapp.sequences.kitti import read_kitti, write_kitti
+from sfmapp.sequences.open import MissingCameraError, SequenceOptions, open_sequence
 
 SIZE = (64, 48)
 PINHOLE = "PINHOLE,50,50,32,24"

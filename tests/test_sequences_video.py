@@ -18,8 +18,8 @@ import pytest
 
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Event, Events
-from sfmapp.formats.sequences import MissingCameraError, SequenceOptions, open_sequence
 from sfmapp.images.video import is_stream
+from sfmapp.sequences.open import MissingCameraError, SequenceOptions, open_sequence
 
 PINHOLE = SequenceOptions(camera="PINHOLE,50,50,32,24")
 

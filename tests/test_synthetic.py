@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sfmapp.camera.camera import CameraModel
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import CameraModel
 from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera, true_correspondences
 
 

@@ -15,6 +15,7 @@ from PIL import Image, ImageOps
 
 import sfmapp
 from dense_models import make_model, row_of_poses, see_wall, texture
+from sfmapp.camera.camera import Camera, CameraModel, pixels_to_normalized
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.colmap import read_model, write_model
@@ -25,7 +26,6 @@ from sfmapp.images.rewrite import encode, without_turn
 from sfmapp.pipelines.dense_source import find_source
 from sfmapp.pipelines.options import load_options
 from sfmapp.pipelines.workspace import FORMAT
-from sfmapp.scene.camera import Camera, CameraModel, pixels_to_normalized
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import RigImages
 from sfmapp.scene.undistortion import move_pixels, plan_undistortion, undistort_reconstruction

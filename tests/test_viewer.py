@@ -12,12 +12,12 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.geometry.upright import up_direction
 from sfmapp.images.image_set import ImageRecord, ImageSet
-from sfmapp.scene.camera import CameraModel, simple_camera
 from sfmapp.scene.features import Features
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from odometry_fakes import HEIGHT, WIDTH, FakeRunner, FakeSequence, path
+from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.result import OdometryResult
-from sfmapp.scene.camera import CameraModel, project, simple_camera
 from sfmapp.viewer import live as live_module
 from sfmapp.viewer.live import LiveView, Outbox, read_message, thinned_stride, write_message
 from sfmapp.viewer.live_scene import POINT_BLOCK, LiveMap, frustum_lines, unbroken

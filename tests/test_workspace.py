@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.errors import InputError, UsageError
 from sfmapp.images.image_set import ImageRecord, ImageSet
 from sfmapp.pipelines.keys import stage_keys
 from sfmapp.pipelines.options import Options
 from sfmapp.pipelines.workspace import open_workspace, read_manifest, stage_key
-from sfmapp.scene.camera import CameraModel, simple_camera
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
 

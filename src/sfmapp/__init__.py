@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 from sfmapp.kernel_cache import provide_kernel_cache
 
 if TYPE_CHECKING:
+    from sfmapp.camera.camera import Camera, CameraModel
     from sfmapp.pipelines.odometry import TrackResult, track_sequence
     from sfmapp.pipelines.options import Options, load_options
     from sfmapp.pipelines.reconstruct import RunResult, reconstruct
     from sfmapp.pipelines.refine import RefineResult, refine
     from sfmapp.pipelines.undistort import UndistortResult, undistort
-    from sfmapp.scene.camera import Camera, CameraModel
     from sfmapp.scene.reconstruction import Reconstruction
 
 __version__ = "0.1.0"
@@ -33,8 +33,8 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Camera": "sfmapp.scene.camera",
-    "CameraModel": "sfmapp.scene.camera",
+    "Camera": "sfmapp.camera.camera",
+    "CameraModel": "sfmapp.camera.camera",
     "Options": "sfmapp.pipelines.options",
     "Reconstruction": "sfmapp.scene.reconstruction",
     "RefineResult": "sfmapp.pipelines.refine",

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.kernels import CANON, LOSS_IDS, POINT, POSE, SCRATCH, linearize
-from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.adjust.problem import pose_rows
 from sfmapp.adjust.solver import Loss
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.simd.f64x8 import offset, pointer
 
 Array = NDArray[np.float64]
 

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import constrained_inverse, gauge_of, pose_covariances, reduced_matrix
 from sfmapp.adjust.kernels import SCRATCH, linearize
-from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.adjust.solver import AdjustOptions, Engine, make_engine
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.simd.f64x8 import offset, pointer
 
 Array = NDArray[np.float64]
 

@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.kernels import SCRATCH, linearize, robust_weight
-from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.adjust.problem import Problem
 from sfmapp.adjust.solver import AdjustOptions, Engine, make_engine
+from sfmapp.camera.camera import Camera
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import Camera
 from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.simd.f64x8 import offset, pointer
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.kernels import find_slot
-from sfmapp.adjust.lanes import assign8, subtract8
+from sfmapp.simd.f64x8 import assign8, subtract8
 
 Array = NDArray[np.float64]
 

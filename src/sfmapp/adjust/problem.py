@@ -9,8 +9,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import PARAM_NAMES, Camera, canonical_from_params
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import PARAM_NAMES, Camera, canonical_from_params
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import RigImages
 

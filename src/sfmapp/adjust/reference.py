@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from sfmapp.adjust.factors import ExtraFactors, gtsam_pose
 from sfmapp.adjust.problem import Problem, free_values, make_problem
 from sfmapp.adjust.solver import AdjustOptions, AdjustReport, IntrinsicPriors, write_back
+from sfmapp.camera.camera import PARAM_NAMES, Camera, canonical_from_params
 from sfmapp.errors import UsageError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import PARAM_NAMES, Camera, canonical_from_params
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]

@@ -16,8 +16,8 @@ from sfmapp.adjust import kernels
 from sfmapp.adjust.kernels import find_slot
 from sfmapp.adjust.linear import aligned_zeros, assemble, factorize_tiles, mark_pairs, number_keys, solve_tiles
 from sfmapp.adjust.problem import Problem, free_values, make_problem
+from sfmapp.camera.camera import PARAM_NAMES, Camera
 from sfmapp.events import Events
-from sfmapp.scene.camera import PARAM_NAMES, Camera
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]

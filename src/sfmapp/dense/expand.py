@@ -11,7 +11,6 @@ import numba
 import numpy as np
 from numba import float32 as f32
 
-from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
 from sfmapp.dense.patch_kernels import (
     APART,
@@ -28,6 +27,7 @@ from sfmapp.dense.patch_kernels import (
 )
 from sfmapp.dense.visibility import are_excused
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
+from sfmapp.simd.f64x8 import offset, pointer
 
 CANDIDATES = 3
 # a cell that has failed so often is left alone until the next round

@@ -12,11 +12,11 @@ import numba
 import numpy as np
 from numba import float32 as f32
 
-from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
 from sfmapp.dense.expand import BETTER, CONTRAST, LEAST_CONTRAST, LEAST_DEVIATION, likeness
 from sfmapp.dense.patch_kernels import holds_window, project
 from sfmapp.dense.window import read_reference
+from sfmapp.simd.f64x8 import offset, pointer
 
 
 @numba.njit(cache=True, nogil=True)

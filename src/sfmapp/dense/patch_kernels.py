@@ -8,7 +8,6 @@ import numba
 import numpy as np
 from numba import float32 as f32
 
-from sfmapp.adjust.lanes import offset
 from sfmapp.dense.window import (
     HALF,
     KEPT,
@@ -21,6 +20,7 @@ from sfmapp.dense.window import (
     solve3,
     warp,
 )
+from sfmapp.simd.f64x8 import offset
 
 # how far two patches may lie off each other's planes to be of one surface, in cells
 NEAR = 1.5

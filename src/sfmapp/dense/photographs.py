@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import PARAM_NAMES, Camera
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.orientation import upright_size
 from sfmapp.images.folder import describe_images
 from sfmapp.images.image_set import ImageOptions, ImageRecord
-from sfmapp.scene.camera import PARAM_NAMES, Camera
 from sfmapp.scene.reconstruction import Reconstruction
 
 STAGE = "views"

@@ -15,7 +15,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from sfmapp.geometry.lanes import WIDTH, row
+from sfmapp.simd.f32x16 import WIDTH, row
 
 _F32, _I32 = ir.FloatType(), ir.IntType(32)
 _ROW, _INTS = ir.VectorType(_F32, WIDTH), ir.VectorType(_I32, WIDTH)

@@ -13,7 +13,6 @@ import numba
 import numpy as np
 from numba import float32 as f32
 
-from sfmapp.adjust.lanes import offset, pointer
 from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
 from sfmapp.dense.patch_kernels import (
     NEAR,
@@ -25,6 +24,7 @@ from sfmapp.dense.patch_kernels import (
     project,
     unproject,
 )
+from sfmapp.simd.f64x8 import offset, pointer
 
 # cells to each side that take part, and the pixels over which their weight falls off
 RADIUS_CELLS, FALL_OFF_PX = 3, 2.2

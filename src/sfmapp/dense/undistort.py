@@ -10,8 +10,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.geometry.lens import distort
-from sfmapp.scene.camera import Camera, pixels_to_normalized
+from sfmapp.camera.camera import Camera, pixels_to_normalized
+from sfmapp.camera.lens import distort
 from sfmapp.scene.undistortion import has_distortion
 
 Array = NDArray[np.float64]

@@ -8,10 +8,10 @@ import numba
 import numpy as np
 from numba import float32 as f32
 
-from sfmapp.adjust.lanes import offset
 from sfmapp.dense.arrays import LAYERS
 from sfmapp.dense.patch_kernels import APART, LEAST_COSINE, cell_of, cell_size, off_planes, project
 from sfmapp.dense.window import HALF
+from sfmapp.simd.f64x8 import offset
 
 # of an image: where a window about as large as that of the reference image reaches out of it
 BORDER = float(HALF + 1)

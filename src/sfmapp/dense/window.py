@@ -27,9 +27,9 @@ import numpy as np
 from numba import float32 as f32
 from numpy.typing import NDArray
 
-from sfmapp.adjust.lanes import offset
 from sfmapp.dense.sampling import pixels, sample, sample_with_slopes
-from sfmapp.geometry.lanes import add, divide, fma, load, multiply, splat, store, subtract, total
+from sfmapp.simd.f32x16 import add, divide, fma, load, multiply, splat, store, subtract, total
+from sfmapp.simd.f64x8 import offset
 
 HALF = 3
 SIZE = 32

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.text_input import nearest_rotation, plain_numbers, read_limited_text
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import Camera, CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
 

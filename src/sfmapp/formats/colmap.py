@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.atomic import replaced_folder
 from sfmapp.formats.colmap_binary import read_binary, read_binary_cameras, read_binary_images, write_binary
 from sfmapp.formats.colmap_model import Keypoints, check_unique, model_from_reconstruction, reconstruction_from_model
 from sfmapp.formats.colmap_text import read_text, read_text_cameras, read_text_images, write_text
-from sfmapp.scene.camera import Camera
 from sfmapp.scene.reconstruction import Reconstruction
 
 _STEMS = ("cameras", "images", "points3D", "rigs", "frames")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_model import (
     FOREIGN_NUM_PARAMS,
@@ -24,7 +25,6 @@ from sfmapp.formats.colmap_model import (
 )
 from sfmapp.formats.colmap_rigs import Frame, Rig, add_rig, add_sensor, poses_from_frames
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel
 
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
 _POINT3D = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<i8")])

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.colmap_rigs import Frame, Rig, mount_images, rig_images
-from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
 

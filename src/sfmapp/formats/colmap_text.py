@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_binary import poses_wxyz
 from sfmapp.formats.colmap_model import (
@@ -24,7 +25,6 @@ from sfmapp.formats.colmap_model import (
 from sfmapp.formats.colmap_rigs import Frame, Rig, add_rig, add_sensor, poses_from_frames
 from sfmapp.formats.text_input import plain_numbers, read_limited_text
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import Camera, CameraModel
 
 _LARGEST_ID = 2**53  # ids pass through float64, which is exact up to here
 

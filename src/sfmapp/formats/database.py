@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_model import checked_camera
-from sfmapp.scene.camera import Camera
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.features import Features
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.errors import InputError
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.colmap_model import checked_camera
@@ -23,7 +24,6 @@ from sfmapp.formats.ply import write_ply
 from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.formats.text_input import finite_array, nearest_rotation, read_json_object
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import Camera, CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
 

@@ -48,7 +48,7 @@ class TrajectoryFile:
         path, format: where it is from, and what it turned out to be; a kind of sequence if it is one's truth.
         trajectory: its poses in the order of the file; a line with "nan" in it is a gap.
         is_numbered: ``PATH.frames`` beside a KITTI trajectory names the frame of each line (see
-            :func:`sfmapp.formats.kitti.write_kitti`): the others are gaps, and the last ones may be missing.
+            :func:`sfmapp.sequences.kitti.write_kitti`): the others are gaps, and the last ones may be missing.
         note: how its times were read, where they are not in the unit of the format; empty otherwise.
     """
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
 from sfmapp.evaluation.poses import match_names
 from sfmapp.formats.colmap import has_model, read_model_poses
@@ -19,7 +20,6 @@ from sfmapp.formats.nerfstudio import read_nerfstudio_poses
 from sfmapp.formats.text_input import finite_array, nearest_rotation, read_json_object
 from sfmapp.formats.trajectory import read_tum
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import Camera
 
 _LARGEST_PX = 1e9
 # what a folder is looked through for

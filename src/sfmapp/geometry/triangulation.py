@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.geometry.lens import distort, undistort
+from sfmapp.camera.lens import distort, undistort
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -10,11 +10,12 @@ from pathlib import PurePosixPath
 from statistics import median, pstdev
 from typing import Any
 
+from sfmapp.camera.camera import Camera, simple_camera
 from sfmapp.errors import UsageError
 from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.images.exif import ExifFacts, FocalPrior, focal_prior
 from sfmapp.images.image_set import ImageOptions
-from sfmapp.scene.camera import Camera, simple_camera, turned_back
+from sfmapp.scene.turned_camera import turned_back
 
 # Trust in what a user gives without fixing it: a focal length copied from a data sheet, or a calibration.
 _SIGMA_USER_FOCAL, _SIGMA_USER_PARAMS = 0.03, 0.01

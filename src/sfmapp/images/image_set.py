@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel
 from sfmapp.errors import UsageError
-from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel
 
 CameraSharing = Literal["auto", "all", "per_folder", "per_image"]
 

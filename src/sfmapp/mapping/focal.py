@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.geometry import epipolar
-from sfmapp.scene.camera import Camera, pixels_to_normalized
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.tracks import Tracks
 

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.solver import adjust_bundle
+from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.events import Events
 from sfmapp.images.exif import DEFAULT_FOCAL, DEFAULT_FOCAL_SIGMA
 from sfmapp.mapping import structure
 from sfmapp.mapping.mapper import STAGE, Mapper
 from sfmapp.mapping.register import Registration
-from sfmapp.scene.camera import Camera, CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]

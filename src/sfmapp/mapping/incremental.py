@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.camera.camera import Camera
 from sfmapp.contradictions import Contradiction
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
@@ -37,7 +38,6 @@ from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images
 from sfmapp.mapping.tracks import build_tracks, track_colors
 from sfmapp.mapping.verified_pairs import contradictions_of
-from sfmapp.scene.camera import Camera
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.features import Features
 from sfmapp.scene.reconstruction import Reconstruction

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import pixels_to_normalized
 from sfmapp.geometry import epipolar, rigid3
 from sfmapp.mapping.focal import matched_pixels
 from sfmapp.mapping.options import MappingOptions
-from sfmapp.scene.camera import pixels_to_normalized
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.reconstruction import Reconstruction
 

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.camera.camera import PARAM_NAMES, Camera, simple_camera
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.mapping import structure
 from sfmapp.mapping.focal_priors import MapFrom, Mapped, as_unknown, focal_sigmas, lean_on_priors
 from sfmapp.mapping.mapper import MAX_UNCERTAINTY_IMAGES, STAGE
-from sfmapp.scene.camera import PARAM_NAMES, Camera, simple_camera
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]

@@ -17,14 +17,14 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import pixels_to_normalized
+from sfmapp.camera.lens import distort
 from sfmapp.geometry import resection, rigid3, similarity
-from sfmapp.geometry.lens import distort
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.mapping.merge import merge, num_linking_points
 from sfmapp.mapping.near_views import missing_between
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.verified_pairs import AGREES, CONTRADICTS, pair_agreement
-from sfmapp.scene.camera import pixels_to_normalized
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import estimate_covariances
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.camera.camera import PARAM_NAMES, Camera
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.mapping import structure
@@ -19,7 +20,6 @@ from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
 from sfmapp.mapping.tracks import USELESS_CONFIGS
 from sfmapp.mapping.verified_pairs import MIN_MATCHES, pair_agreement
-from sfmapp.scene.camera import PARAM_NAMES, Camera
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
 

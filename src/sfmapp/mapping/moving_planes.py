@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.scene.camera import Camera
+from sfmapp.camera.camera import Camera
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.tracks import Tracks
 

@@ -16,9 +16,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.lens import distort
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3
-from sfmapp.geometry.lens import distort
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
 

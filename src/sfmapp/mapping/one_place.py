@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.geometry import homography, rigid3
 from sfmapp.mapping.focal import matched_pixels
-from sfmapp.scene.camera import Camera, pixels_to_normalized
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.tracks import Tracks
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.pose import RefinedPose, refine_pose
+from sfmapp.camera.camera import pixels_to_normalized
 from sfmapp.geometry import resection, rigid3
 from sfmapp.mapping.options import MappingOptions
-from sfmapp.scene.camera import pixels_to_normalized
 from sfmapp.scene.reconstruction import Reconstruction
 
 PYRAMID_LEVELS = 6

@@ -18,9 +18,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.lens import undistort
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3
-from sfmapp.geometry.lens import undistort
 from sfmapp.mapping import near_views
 from sfmapp.mapping.tracks import USELESS_CONFIGS
 from sfmapp.scene.correspondences import Correspondences

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera
 from sfmapp.events import Events
 from sfmapp.geometry import epipolar
 from sfmapp.matching import guided
@@ -18,7 +19,6 @@ from sfmapp.matching.coarse_to_fine import is_guidable, match_features
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.products import Ints
 from sfmapp.matching.two_view import Ransac, TwoViewGeometry, error_threshold_px, verify_pair
-from sfmapp.scene.camera import Camera
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.features import Features
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.geometry import epipolar, homography, rigid3
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.search import (
@@ -23,7 +24,6 @@ from sfmapp.matching.search import (
     polish_fundamental,
 )
 from sfmapp.matching.second_motion import geometry_off_plane
-from sfmapp.scene.camera import Camera, pixels_to_normalized
 from sfmapp.scene.correspondences import TwoViewConfig
 
 Array = NDArray[np.float64]

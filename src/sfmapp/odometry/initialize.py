@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.pose import refine_pose
+from sfmapp.camera.camera import Camera, pixels_to_normalized, project
 from sfmapp.geometry import epipolar, homography, rigid3
 from sfmapp.geometry.planar_motion import estimate_planar_motion
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.two_view import Ransac, TwoViewGeometry, verify_pair
-from sfmapp.odometry.alignment import align_patches
-from sfmapp.odometry.corners import find_corners
+from sfmapp.odometry.frontend.alignment import align_patches
+from sfmapp.odometry.frontend.corners import find_corners
+from sfmapp.odometry.frontend.pose_choice import RIVAL_SHARE, explaining_poses, is_way_known, tells_apart
+from sfmapp.odometry.frontend.pyramid import Pyramid
+from sfmapp.odometry.frontend.small_image import align_small_images
 from sfmapp.odometry.options import OdometryOptions
-from sfmapp.odometry.pose_choice import RIVAL_SHARE, explaining_poses, is_way_known, tells_apart
-from sfmapp.odometry.pyramid import Pyramid
-from sfmapp.odometry.small_image import align_small_images
-from sfmapp.scene.camera import Camera, pixels_to_normalized, project
 from sfmapp.scene.correspondences import TwoViewConfig
 
 Array = NDArray[np.float64]

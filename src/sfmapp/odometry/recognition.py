@@ -8,14 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.odometry.closing import apply_closure, join_maps
-from sfmapp.odometry.corners import find_corners
-from sfmapp.odometry.local_map import LocalMap, View
-from sfmapp.odometry.loops import LoopClosure, LoopFinder
-from sfmapp.odometry.places import Places
-from sfmapp.odometry.places import View as PlaceView
+from sfmapp.odometry.frontend.corners import find_corners
+from sfmapp.odometry.loops.closing import apply_closure, join_maps
+from sfmapp.odometry.loops.detection import LoopClosure, LoopFinder
+from sfmapp.odometry.loops.places import Places
+from sfmapp.odometry.loops.places import View as PlaceView
+from sfmapp.odometry.loops.relocalize import RelocalizeOptions, relocalize
+from sfmapp.odometry.map.local_map import LocalMap, View
 from sfmapp.odometry.records import FrameRecord
-from sfmapp.odometry.relocalize import RelocalizeOptions, relocalize
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from sfmapp.contradictions import widened, widened_scale_sigma
 from sfmapp.geometry import rigid3
-from sfmapp.odometry.finish import MAX_COVARIANCE_KEYFRAMES, Conclusion
-from sfmapp.odometry.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.refinement.finish import MAX_COVARIANCE_KEYFRAMES, Conclusion
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.odometry.tracker import measure_pose
 

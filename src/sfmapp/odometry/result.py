@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sfmapp.contradictions import Contradiction
 from sfmapp.images.sequence import RepeatedFrame
-from sfmapp.odometry.smoothing import SmoothedTrajectory
+from sfmapp.odometry.inertial.smoothing import SmoothedTrajectory
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]

@@ -12,23 +12,23 @@ from numpy.typing import NDArray
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Frame, Sequence
-from sfmapp.odometry.active_tracks import ActiveTracks
-from sfmapp.odometry.early_calibration import is_time_to_ask, refine_early
-from sfmapp.odometry.finish import conclude
-from sfmapp.odometry.gyroscope import GyroTrust, imu_rotation
+from sfmapp.odometry.frontend.active_tracks import ActiveTracks
+from sfmapp.odometry.frontend.pyramid import Pyramid, build_pyramid
+from sfmapp.odometry.inertial.gyroscope import GyroTrust, imu_rotation
+from sfmapp.odometry.inertial.smoothing import smooth_trajectory
 from sfmapp.odometry.initialize import Beginning, TwoViews, pose_between
-from sfmapp.odometry.keyframe_map import KeyframeMap
-from sfmapp.odometry.local_map import LocalMap, View
+from sfmapp.odometry.loops.sweep import is_too_large
+from sfmapp.odometry.map.keyframe_map import KeyframeMap
+from sfmapp.odometry.map.local_map import LocalMap, View
 from sfmapp.odometry.options import OdometryOptions
-from sfmapp.odometry.pyramid import Pyramid, build_pyramid
 from sfmapp.odometry.recognition import Recognition
 from sfmapp.odometry.records import FrameRecord, gather, leave_keyframe, measure_again
+from sfmapp.odometry.refinement.early_calibration import is_time_to_ask, refine_early
+from sfmapp.odometry.refinement.finish import conclude
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.shutter import straighten
-from sfmapp.odometry.smoothing import smooth_trajectory
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
 from sfmapp.odometry.stereo_clock import StereoClock
-from sfmapp.odometry.sweep import is_too_large
 from sfmapp.odometry.tracker import MIN_INLIERS, keyframe_reason, measure_pose, track
 
 Array = NDArray[np.float64]

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.camera.camera import project
 from sfmapp.geometry import rigid3
 from sfmapp.mapping.structure import residual_scale_px
-from sfmapp.odometry.backend import Job, make_job, take_over
-from sfmapp.odometry.finish import MIN_EVIDENCE, MIN_SIGMA_PX
-from sfmapp.odometry.keyframe_map import KeyframeMap
+from sfmapp.odometry.map.backend import Job, make_job, take_over
+from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.records import FrameRecord, measure_again
-from sfmapp.scene.camera import project
+from sfmapp.odometry.refinement.finish import MIN_EVIDENCE, MIN_SIGMA_PX
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]

@@ -15,17 +15,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import pixels_to_normalized, project
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Frame
-from sfmapp.odometry.alignment import align_patches
-from sfmapp.odometry.corners import find_corners
-from sfmapp.odometry.keyframe_map import KeyframeMap
-from sfmapp.odometry.local_map import View
-from sfmapp.odometry.pyramid import Pyramid, build_pyramid
-from sfmapp.odometry.stereo import match_stereo
-from sfmapp.scene.camera import pixels_to_normalized, project
+from sfmapp.odometry.frontend.alignment import align_patches
+from sfmapp.odometry.frontend.corners import find_corners
+from sfmapp.odometry.frontend.pyramid import Pyramid, build_pyramid
+from sfmapp.odometry.frontend.stereo import match_stereo
+from sfmapp.odometry.map.keyframe_map import KeyframeMap
+from sfmapp.odometry.map.local_map import View
 from sfmapp.scene.rig import Rig
 
 Array = NDArray[np.float64]

@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.pose import refine_pose
+from sfmapp.camera.camera import Camera, pixels_to_normalized, project
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.resection import estimate_pose
-from sfmapp.odometry.active_tracks import ActiveTracks, References, follow
-from sfmapp.odometry.chaining import chain_pose
-from sfmapp.odometry.local_map import LocalMap
+from sfmapp.odometry.frontend.active_tracks import ActiveTracks, References, follow
+from sfmapp.odometry.frontend.chaining import chain_pose
+from sfmapp.odometry.frontend.pyramid import Pyramid
+from sfmapp.odometry.frontend.small_image import align_small_images
+from sfmapp.odometry.map.local_map import LocalMap
 from sfmapp.odometry.options import OdometryOptions
-from sfmapp.odometry.pyramid import Pyramid
-from sfmapp.odometry.small_image import align_small_images
-from sfmapp.scene.camera import Camera, pixels_to_normalized, project
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

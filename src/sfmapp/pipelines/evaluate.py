@@ -140,7 +140,7 @@ def evaluate(
         estimate: TUM, KITTI or EuRoC text (see :mod:`sfmapp.formats.trajectory_input`), or the folder of an odometry
             run, of which ``trajectory.tum`` is taken (``trajectory.kitti`` if the truth has no timestamps).
         truth: a file of the same formats, not necessarily the same one, or the folder of a sequence (see
-            :func:`sfmapp.formats.sequences.open_sequence`): then it is of the first camera on the clock of the frames,
+            :func:`sfmapp.sequences.open.open_sequence`): then it is of the first camera on the clock of the frames,
             and played as the run was if ``estimate`` is the folder of one.
         times: file with the seconds of the lines of KITTI trajectories.
 
@@ -231,10 +231,10 @@ def _trajectory_of(path: Path, truth: Trajectory) -> Path:
 def _of_sequence(folder: Path, estimate: Path) -> TrajectoryFile:
     """The truth of a sequence, played backwards or in steps as the run was."""
     from sfmapp.events import Events
-    from sfmapp.formats.sequences import open_sequence
     from sfmapp.images.sequence import SequenceOptions
     from sfmapp.pipelines.options import options_from_dict
     from sfmapp.pipelines.workspace import MANIFEST, read_manifest
+    from sfmapp.sequences.open import open_sequence
 
     options = SequenceOptions()
     if (estimate / MANIFEST).is_file():

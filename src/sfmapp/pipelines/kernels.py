@@ -20,20 +20,20 @@ STAGE = "kernels"
 # in the order in which a run needs them
 MODULES = ("sfmapp.features.extract", "sfmapp.matching.stage", "sfmapp.mapping.incremental")
 ODOMETRY_MODULES = (
-    "sfmapp.odometry.small_image",
-    "sfmapp.odometry.corners",
-    "sfmapp.odometry.alignment",
-    "sfmapp.odometry.affine_alignment",
-    "sfmapp.odometry.epipolar_search",
+    "sfmapp.odometry.frontend.small_image",
+    "sfmapp.odometry.frontend.corners",
+    "sfmapp.odometry.frontend.alignment",
+    "sfmapp.odometry.frontend.affine_alignment",
+    "sfmapp.odometry.frontend.epipolar_search",
     "sfmapp.geometry.epipolar",
     "sfmapp.mapping.structure",
     "sfmapp.adjust.solver",
     "sfmapp.adjust.calibration",
-    "sfmapp.odometry.relocalize",
-    "sfmapp.odometry.pose_graph",
+    "sfmapp.odometry.loops.relocalize",
+    "sfmapp.odometry.loops.pose_graph",
 )
 DENSE_MODULES = ("sfmapp.dense.densify",)
-INERTIAL_MODULES = ("sfmapp.odometry.gyroscope", "sfmapp.odometry.inertial")
+INERTIAL_MODULES = ("sfmapp.odometry.inertial.gyroscope", "sfmapp.odometry.inertial.visual_inertial")
 
 
 @contextmanager

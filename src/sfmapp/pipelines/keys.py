@@ -40,9 +40,9 @@ def stage_keys(options: Options, image_set: ImageSet) -> StageKeys:
     whose = [record.camera_idx for record in image_set.images]
     places = [[record.timestamp, record.gps] for record in image_set.images]
     pairs = stage_key(("matching",), plain["pairs"], images, places)
-    matching = stage_key(("matching", "geometry", "scene"), plain["matching"], images, lenses, whose)
+    matching = stage_key(("matching", "geometry", "camera", "simd", "scene"), plain["matching"], images, lenses, whose)
     mapped: tuple[Any, ...] = (plain["adjust"], pairs, matching, priors)
-    mapping = stage_key(("mapping", "adjust", "geometry", "scene"), plain["mapping"], *mapped)
+    mapping = stage_key(("mapping", "adjust", "geometry", "camera", "simd", "scene"), plain["mapping"], *mapped)
     return StageKeys(inputs, features, pairs, matching, mapping)
 
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import estimate_covariances
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.camera.camera import PARAM_NAMES, Camera
 from sfmapp.mapping.structure import residual_scale_px
-from sfmapp.scene.camera import PARAM_NAMES, Camera
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 import sfmapp
 from sfmapp.errors import InterruptedRunError, NoReconstructionError
 from sfmapp.events import Events
-from sfmapp.formats.sequences import open_sequence
 from sfmapp.images.frame_reader import FileSequence
 from sfmapp.images.sequence import Frame, Imu, Sequence, SequenceKind, Truth
 from sfmapp.images.video import VideoSequence
@@ -35,6 +34,7 @@ from sfmapp.pipelines.options import Options, with_absolute_paths
 from sfmapp.pipelines.run import Job
 from sfmapp.pipelines.usage import Stopwatch
 from sfmapp.pipelines.workspace import ODOMETRY, open_workspace
+from sfmapp.sequences.open import open_sequence
 from sfmapp.viewer.live import LiveView, Screen
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Event
-from sfmapp.odometry.markers import MarkerDetector, MarkerSightings
+from sfmapp.odometry.inertial.markers import MarkerDetector, MarkerSightings
 from sfmapp.odometry.result import MapResult, OdometryResult
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sfmapp.camera.camera import PARAM_NAMES, Camera
 from sfmapp.contradictions import Contradiction
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.formats.colmap import read_model
@@ -33,7 +34,6 @@ from sfmapp.report.odometry_document import (
     truth_row,
 )
 from sfmapp.report.odometry_html import render_odometry_html
-from sfmapp.scene.camera import PARAM_NAMES, Camera
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -84,7 +84,7 @@ def write_trajectories(workspace: Workspace, result: OdometryResult, facts: Fram
     Args:
         facts: tell of the maps as they were when the live poses were given out; None: no live poses are written.
     """
-    from sfmapp.formats.kitti import write_kitti
+    from sfmapp.sequences.kitti import write_kitti
 
     folder = workspace.folder
     files = {numbered("trajectory", m): poses_of_map(result, m) for m in range(len(result.maps))}

@@ -14,9 +14,8 @@ from sfmapp.errors import UsageError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu, Sequence
-from sfmapp.odometry.markers import MarkerDetector, MarkerKind, parse_marker, scale_from_markers
-from sfmapp.odometry.result import MapResult, OdometryResult
-from sfmapp.odometry.scale import (
+from sfmapp.odometry.inertial.markers import MarkerDetector, MarkerKind, parse_marker, scale_from_markers
+from sfmapp.odometry.inertial.scale import (
     KnownDistance,
     Length,
     ScaleEstimate,
@@ -29,6 +28,7 @@ from sfmapp.odometry.scale import (
     scale_from_distance,
     scale_from_path,
 )
+from sfmapp.odometry.result import MapResult, OdometryResult
 from sfmapp.pipelines.odometry_keyframes import KeyframeWatch
 
 STAGE = "scale"
@@ -215,7 +215,7 @@ def _covariance_near(result: OdometryResult, entry: MapResult, position: int) ->
 
 
 def _from_imu(result: OdometryResult, m: int, imu: Imu) -> ScaleEstimate | ScaleRefusal:
-    from sfmapp.odometry.inertial_faults import align_or_explain
+    from sfmapp.odometry.inertial.faults import align_or_explain
 
     entry = result.maps[m]
     times = result.timestamps_s[np.searchsorted(result.frame_idx, entry.keyframe_frame_idx)]

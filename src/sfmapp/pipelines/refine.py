@@ -19,7 +19,6 @@ import sfmapp
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
-from sfmapp.formats.sequences import open_sequence
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import Sequence
 from sfmapp.mapping import structure
@@ -37,6 +36,7 @@ from sfmapp.pipelines.workspace import ODOMETRY, REFINE, open_workspace, read_ma
 from sfmapp.report.odometry_document import against_truth, map_row, truth_row
 from sfmapp.report.refine_html import REFINE_FORMAT, render_refine_html
 from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.sequences.open import open_sequence
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import PARAM_NAMES, CameraModel
 from sfmapp.contradictions import Contradiction, widened
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
-from sfmapp.formats.sequences import HOW_TO_CALIBRATE, open_sequence
 from sfmapp.geometry import rigid3
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.images.sequence import Frame, Sequence
@@ -21,7 +21,7 @@ from sfmapp.odometry.result import OdometryResult
 from sfmapp.pipelines.lens_fit import LensFit, fit_lens
 from sfmapp.pipelines.options import Options
 from sfmapp.pipelines.reconstruct import RunResult, reconstruct
-from sfmapp.scene.camera import PARAM_NAMES, CameraModel
+from sfmapp.sequences.open import HOW_TO_CALIBRATE, open_sequence
 
 STAGE = "calibration"
 Pixels = NDArray[np.uint8]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfmapp.scene.camera import PARAM_NAMES, Camera
+from sfmapp.camera.camera import PARAM_NAMES, Camera
 
 if TYPE_CHECKING:
     from sfmapp.images.folder import ImageSet

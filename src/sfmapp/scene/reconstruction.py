@@ -8,9 +8,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.lens import distort
 from sfmapp.geometry import rigid3
-from sfmapp.geometry.lens import distort
-from sfmapp.scene.camera import Camera
 from sfmapp.scene.rig import RigImages
 from sfmapp.scene.tracks import Tracks
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import Camera
 
 Array = NDArray[np.float64]
 

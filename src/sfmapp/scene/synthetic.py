@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, pixels_to_normalized, project, simple_camera
 from sfmapp.geometry import rigid3
-from sfmapp.scene.camera import PARAM_NAMES, Camera, CameraModel, pixels_to_normalized, project, simple_camera
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig, RigImages

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera, project
 from sfmapp.errors import InputError
 from sfmapp.evaluation.trajectory import Alignment, Trajectory, absolute_error, associate
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.scene.camera import Camera, project
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -1,0 +1,190 @@
+"""The last word on a map: all keyframes adjusted at once, the calibration questioned, and how sure the poses are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.contradictions import Contradiction
+from sfmapp.events import Events
+from sfmapp.geometry import rigid3
+from sfmapp.mapping.structure import residual_scale_px
+from sfmapp.odometry.loops.sweep import is_too_large, sweep
+from sfmapp.odometry.map.backend import classify, make_job, take_over
+from sfmapp.odometry.map.covariance import covariance_of_refinement, estimate_map_covariance, scale_sigma_of_refinement
+from sfmapp.odometry.map.keyframe_map import KeyframeMap
+from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.refinement.calibration_check import LOSS_SIGMAS, Answer, adjust_poses, question_calibration
+from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.rig import Rig
+
+Array = NDArray[np.float64]
+
+STAGE = "adjustment"
+# A rolling shutter has to explain this much, in units of the noise. Independent noise alone explains 1; errors of
+# patches are not independent, and exact cameras of rendered sequences show up to 30.
+MIN_EVIDENCE = 90.0
+# Covariances take two dense matrices over all poses.
+MAX_COVARIANCE_KEYFRAMES = 400
+_FIRST_STEPS, _MAX_STEPS, _TOLERANCE = 8, 30, 1e-4
+# A unit of length that is less sure than that is worth a word.
+_SCALE_OPEN = 0.02
+# A map whose positions are not known to a tenth of its size has no shape to speak of.
+_MAX_OPEN_SHARE = 0.1
+# Keyframes of a large map that its cameras are questioned on.
+_NUM_QUESTIONED = 100
+# Residuals are not believed to be better than that, however well a synthetic sequence fits.
+MIN_SIGMA_PX = 0.02
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """What the end of a map has brought.
+
+    Attributes:
+        covariance: (K, 6, 6) of the keyframes; None if not asked for or too many.
+        gauge: what it holds fixed.
+        report: numbers for the report.
+        contradictions: evidence against the map that stands unresolved.
+        scale_sigma: relative standard deviation of the unit of length of a rig; None without one.
+        noise_covariance: (K, 6, 6) what the noise of the observations alone makes of ``covariance``.
+    """
+
+    covariance: Array | None
+    gauge: str
+    report: dict[str, Any]
+    contradictions: list[Contradiction] = field(default_factory=list)
+    scale_sigma: float | None = None
+    noise_covariance: Array | None = None
+
+
+def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events, given: Rig | None = None) -> Conclusion:
+    """Adjust all keyframes and points of a map, in place, and the cameras where the images contradict them.
+
+    Args:
+        keyframes: with the rig that it was made with, which may be a refined one.
+        options, events: the usual.
+        given: the rig as it was given, which is questioned once more, by all there is; None for that of the keyframes.
+    """
+    if is_too_large(keyframes):
+        return _conclude_large(keyframes, options, events)
+    everything = np.arange(len(keyframes.keyframes))
+    job = make_job(keyframes, everything, everything > 0)
+    model, report = job.model, dict[str, Any]()
+    for steps in (_FIRST_STEPS, _MAX_STEPS):  # which observations agree is clear long before all have settled
+        sigma = residual_scale_px(model, MIN_SIGMA_PX)
+        cost = adjust_poses(model, sigma, steps, _TOLERANCE)
+        if steps == _FIRST_STEPS:
+            classify(model, job.num_elsewhere)
+        events.raise_if_cancelled()
+    found_before = None
+    if given is not None and keyframes.rig is not given:
+        found_before, model = (model, cost), _with_rig(model, given)
+        cost = adjust_poses(model, sigma, _MAX_STEPS, _TOLERANCE)
+    answer = _question(model, cost, sigma, options, events, found_before)
+    report["camera"] = answer.report
+    num_sensors, of_refinement = len(keyframes.rig.cameras), np.zeros((6, 6))
+    if answer.is_refined:
+        of_refinement = covariance_of_refinement(model, answer.model, num_sensors) / answer.excess**2
+    job.model = model = answer.model
+    report["sigma_px"] = classify(model, job.num_elsewhere)
+    take_over(job, keyframes)
+    keyframes.rig = rig_of(model)
+    covariance, noise, gauge, contradictions = None, None, "", list(answer.contradictions)
+    if options.covariance and 1 < len(everything) <= MAX_COVARIANCE_KEYFRAMES:
+        noise, gauge, report["covariance"] = estimate_map_covariance(model, num_sensors, LOSS_SIGMAS * sigma)
+        covariance = noise + of_refinement
+        if answer.pose_covariance is not None:
+            covariance += answer.pose_covariance
+        if answer.is_refined:
+            contradictions += _left_open(covariance, rigid3.spread(model.cam_from_world), events)
+    return Conclusion(covariance, gauge, report, contradictions, answer.scale_sigma, noise)
+
+
+def _left_open(covariance: Array, size: float, events: Events) -> list[Contradiction]:
+    """A contradiction where a refined calibration leaves the positions (K, 6, 6) open against the size of the map."""
+    known = covariance[np.isfinite(covariance).all((1, 2)), 3:, 3:]
+    share = math.sqrt(max(float(np.median(np.trace(known, axis1=1, axis2=2))), 0.0)) / size if len(known) else math.inf
+    if share < _MAX_OPEN_SHARE:
+        return []
+    message = (
+        "the images contradict the given calibration, and what they say instead is so unsure that positions are open "
+        f"by {share:.0%} of the size of the map"
+    )
+    events.warned(STAGE, message)
+    evidence = {"position_sigma_share": min(share, 1e6), "max_position_sigma_share": _MAX_OPEN_SHARE}
+    return [Contradiction("given calibration", message, "calibrate the camera, or move more and turn", evidence)]
+
+
+def _conclude_large(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -> Conclusion:
+    """The same piece by piece, without covariances; the cameras are questioned on the newest keyframes alone."""
+    report: dict[str, Any] = {"is_piecewise": True}
+    num = len(keyframes.keyframes)
+    part = np.arange(num - _NUM_QUESTIONED, num)
+    job = make_job(keyframes, part, part > part[0])
+    sigma = residual_scale_px(job.model, MIN_SIGMA_PX)
+    cost = adjust_poses(job.model, sigma, _MAX_STEPS, _TOLERANCE)
+    answer = _question(job.model, cost, sigma, options, events)
+    report["camera"] = answer.report
+    if answer.is_refined:
+        keyframes.rig = rig_of(answer.model)
+        if answer.model.rig is not None:
+            _rescale(keyframes, rigid3.spread(answer.model.cam_from_world) / rigid3.spread(job.model.cam_from_world))
+    sweep(keyframes, options, events)
+    return Conclusion(None, "", report, answer.contradictions, answer.scale_sigma)
+
+
+def _question(
+    model: Reconstruction,
+    cost: float,
+    sigma: float,
+    options: OdometryOptions,
+    events: Events,
+    found_before: tuple[Reconstruction, float] | None = None,
+) -> Answer:
+    """Question the calibration of an adjusted map, and tell of what comes of it."""
+    answer = question_calibration(model, cost, sigma, may_refine=options.refine_camera, found_before=found_before)
+    if answer.is_refined and answer.scale_sigma is not None:
+        of_refinement = scale_sigma_of_refinement(model, answer.model) / answer.excess
+        answer = replace(answer, scale_sigma=math.hypot(answer.scale_sigma, of_refinement))
+        answer.report["scale"]["beyond_the_lens_model"] = of_refinement
+    events.raise_if_cancelled()
+    if answer.is_refined:
+        message = "the images contradict the given calibration, which is refined"
+        events.decided(STAGE, message, **answer.report)
+    for contradiction in answer.contradictions:
+        events.warned(STAGE, contradiction.message, subject=contradiction.subject)
+    if answer.scale_sigma is not None and answer.scale_sigma > _SCALE_OPEN:
+        events.warned(
+            STAGE,
+            f"the unit of length is known to {answer.scale_sigma:.1%} only: on so straight a path, or with points so "
+            "far, the images do not tell how long the lenses are and how the cameras are turned against each other",
+        )
+    return answer
+
+
+def _with_rig(model: Reconstruction, rig: Rig) -> Reconstruction:
+    """The same map seen by other cameras, which sit elsewhere on the rig; to be adjusted."""
+    out = model.copy()
+    out.cameras = list(rig.cameras)
+    if model.rig is not None:
+        frames = model.rig.rig_from_world(model.cam_from_world)
+        out.rig = replace(model.rig, cam_from_rig=rig.cam_from_rig)
+        out.cam_from_world = out.rig.cam_from_world(np.arange(len(model.image_names)), frames[model.rig.frame_idx])
+    return out
+
+
+def rig_of(model: Reconstruction) -> Rig:
+    """The cameras of a map's model, and where they sit."""
+    return Rig(tuple(model.cameras), rigid3.IDENTITY[None] if model.rig is None else model.rig.cam_from_rig)
+
+
+def _rescale(keyframes: KeyframeMap, scale: float) -> None:
+    """Make a map larger, in place: a rig that is turned measures other lengths."""
+    keyframes.point_xyz *= scale
+    for keyframe in keyframes.keyframes:
+        keyframe.rig_from_world[4:] *= scale

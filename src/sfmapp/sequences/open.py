@@ -1,0 +1,532 @@
+"""From what the user points at to a sequence: recognise the layout, find the cameras, put time in order."""
+
+from __future__ import annotations
+
+import glob
+import os
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.camera.camera import Camera, CameraModel, simple_camera
+from sfmapp.errors import InputError
+from sfmapp.events import Events
+from sfmapp.formats.clocks import Times, are_dates
+from sfmapp.formats.trajectory_input import read_trajectory
+from sfmapp.geometry import rigid3
+from sfmapp.geometry.orientation import INVERSE, is_sideways, upright_size
+from sfmapp.images.exif import ExifFacts, focal_prior, read_exif
+from sfmapp.images.frame_reader import FileSequence, read_regular_file, some
+from sfmapp.images.headers import UnusableImage, read_header
+from sfmapp.images.sequence import STAGE, Imu, Sequence, SequenceOptions, Truth
+from sfmapp.images.sources import EXTENSIONS, printable
+from sfmapp.images.video import DEFAULT_FPS, VideoSequence, is_stream, read_video_facts
+from sfmapp.scene.rig import Rig
+from sfmapp.scene.turned_camera import turned_back, turned_camera
+from sfmapp.sequences.calibration_file import Calibration, camera_from_text, read_calibration
+from sfmapp.sequences.euroc import euroc_truth, find_mav, read_euroc_sequence, read_imu
+from sfmapp.sequences.files import (
+    Recording,
+    Size,
+    ascending,
+    frame_numbers,
+    has_images,
+    rows_of_frames,
+)
+from sfmapp.sequences.kitti import FRAMES_PER_SECOND as KITTI_FPS
+from sfmapp.sequences.kitti import is_kitti, read_kitti, read_kitti_sequence
+from sfmapp.sequences.opencv_lens import sampling_map
+from sfmapp.sequences.plain import (
+    find_calibration,
+    find_pair,
+    read_folder_sequence,
+    read_listed_sequence,
+    read_pair_sequence,
+)
+from sfmapp.sequences.tum import is_tum, read_tum_sequence, tum_truth
+
+__all__ = ["MissingCameraError", "SequenceOptions", "open_sequence"]
+
+Array = NDArray[np.float64]
+
+# Files of a sequence that users point at instead of its folder.
+_LISTS = frozenset({"rgb.txt", "data.csv", "times.txt", "timestamps.txt", "calib.txt", "calib.json", "poses.txt"})
+# Where frames lie that do not lie in the folder itself.
+_FRAME_FOLDERS = ("images", "frames", "rgb", "color", "image", "img", "imgs", "data", "input", "undistorted")
+# Nothing that moves carries cameras further apart; a calibration in millimetres says that it does.
+_WIDEST_BASELINE_M = 10.0
+_LAYOUTS = (
+    "a folder with images; image_0 and calib.txt (KITTI); rgb.txt and rgb (TUM); mav0 or cam0/data (EuRoC); "
+    "left and right; or a video"
+)
+HOW_TO_CALIBRATE = (
+    "give --camera PINHOLE,fx,fy,cx,cy or --camera FILE (calib.json, cameras.txt, sensor.yaml, camera_info.yaml, "
+    "OpenCV's yml or xml), to be had by photographing a chessboard (OpenCV's calibrate_camera, Kalibr); or let "
+    "--self-calibrate find the focal length from the first minute"
+)
+
+
+class MissingCameraError(InputError):
+    """Nothing tells the intrinsics of the camera. ``open_sequence(..., require_camera=False)`` goes on without."""
+
+
+def open_sequence(
+    source: str | Path, options: SequenceOptions, events: Events, *, require_camera: bool = True
+) -> Sequence:
+    """Open a sequence; nothing is decoded yet but the first frame of a video.
+
+    Args:
+        source: a folder of KITTI, TUM or EuRoC, a folder of images, one with ``left`` and ``right``, a glob pattern, a
+            list of images, a video file, a URL, or ``camera:0``.
+        options: what to play of it, and what it does not say itself.
+        events: told what was recognised and assumed, and, while frames are read, what is left out.
+        require_camera: False: where nothing tells the intrinsics, the rig has one SIMPLE_RADIAL camera with a focal
+            length from EXIF or a guess (``focal_source`` is ``default`` or begins with ``exif``).
+
+    Raises:
+        MissingCameraError: nothing tells the intrinsics, and they are required.
+        InputError: no sequence is there, or a file of it is not what it should be.
+        UsageError: options that cannot be obeyed.
+    """
+    text = str(source)
+    if "\0" in text:
+        raise InputError(f"{printable(text)}: expected a sequence, found a name that no file can have")
+    try:
+        return _open(text, options, events, require_camera)
+    except OSError as error:
+        raise InputError(f"{printable(text)}: cannot be read: {error}") from error
+
+
+def _open(text: str, options: SequenceOptions, events: Events, require_camera: bool) -> Sequence:
+    path = Path(text)
+    if is_stream(text):
+        return _open_video(text, options, events, require_camera)
+    if not path.exists():
+        if not glob.has_magic(text):
+            raise InputError(f"{printable(text)}: expected a sequence, found nothing", f"a sequence is {_LAYOUTS}")
+        return _sequence(text, read_listed_sequence(text), options, events, require_camera)
+    if path.is_file() and path.name not in _LISTS:
+        if path.suffix.lower() in EXTENSIONS:
+            raise InputError(f"{path}: expected a sequence, found a single image", f"a sequence is {_LAYOUTS}")
+        if path.suffix.lower() == ".txt":
+            return _sequence(text, read_listed_sequence(text), options, events, require_camera)
+        return _open_video(text, options, events, require_camera)
+    folder = (path.parent if path.is_file() else path).absolute()
+    return _sequence(text, _read_layout(folder, events), options, events, require_camera)
+
+
+def _read_layout(folder: Path, events: Events) -> Recording:
+    """What lies in a folder, whichever layout it has."""
+    inside, above = folder.name, folder.parent
+    mav = find_mav(folder)
+    if mav is not None:
+        return read_euroc_sequence(mav, events)
+    if inside == "data" and above.name in ("cam0", "cam1"):
+        return read_euroc_sequence(above.parent, events, above.name)
+    if inside in ("cam0", "cam1") and (folder / "data").is_dir():
+        return read_euroc_sequence(above, events, inside)
+    if is_kitti(folder):
+        return read_kitti_sequence(folder, events)
+    if inside in ("image_0", "image_1", "image_2", "image_3") and has_images(folder):
+        return read_kitti_sequence(above, events, inside)
+    if is_tum(folder) or (inside == "rgb" and is_tum(above)):
+        return read_tum_sequence(folder if is_tum(folder) else above, events)
+    pair = find_pair(folder)
+    if pair is not None:
+        return read_pair_sequence(folder, *pair, events)
+    if has_images(folder):
+        # what belongs to a folder called images or left lies beside it
+        is_part = inside in _FRAME_FOLDERS and not has_images(above)
+        return read_folder_sequence(above if is_part else folder, folder)
+    within = [folder / name for name in _FRAME_FOLDERS if has_images(folder / name)]
+    if not within:
+        within = sorted(path for path in folder.iterdir() if path.is_dir() and has_images(path))
+        if len(within) > 1:
+            names = [printable(path.name) for path in within]
+            raise InputError(f"{folder}: expected one sequence, found folders of images: {some(names)}", "name one")
+    if within:
+        return read_folder_sequence(folder, within[0])
+    found = some(sorted(printable(path.name) for path in folder.iterdir())) or "nothing"
+    raise InputError(f"{folder}: expected a sequence, found {found}", f"a sequence is {_LAYOUTS}")
+
+
+# ---------------------------------------------------------------------------------------------------------- cameras
+
+
+def _calibration(
+    given: str | None,
+    folders: list[Path],
+    own: Calibration | None,
+    is_published: bool,
+    sizes: tuple[Size, ...],
+    orientation: int = 1,
+) -> Calibration | None:
+    """The user's calibration, else the layout's own, else a file beside the frames (before a published one)."""
+    if given is not None:
+        if os.path.isfile(given):
+            chosen = _read_calibration(given, sizes, orientation)
+        elif "," not in given and any(c in given for c in "./\\"):
+            raise InputError(f"camera {given}: expected a calibration file, found nothing")
+        else:
+            camera = camera_from_text(given, sizes[0])
+            _check_not_of_upright(f"camera {given}", camera, orientation)
+            chosen = Calibration(Rig.single(camera))
+        # a text gives intrinsics only; where the body is, is still known
+        if chosen.body_from_cam is None and own is not None:
+            chosen = replace(chosen, body_from_cam=own.body_from_cam)
+        return chosen
+    if own is not None and not is_published:
+        return own
+    beside = find_calibration(*folders)
+    return own if beside is None else _read_calibration(beside, sizes, orientation)
+
+
+def _read_calibration(path: str | Path, sizes: tuple[Size, ...], orientation: int) -> Calibration:
+    """A calibration in pixels as the files store them; one for pictures that EXIF's orientation has turned is turned
+    back."""
+    try:
+        calibration = read_calibration(path, sizes)
+    except InputError as error:
+        if not is_sideways(orientation) or len(sizes) > 1:
+            raise
+        try:
+            turned = read_calibration(path, [upright_size(orientation, *sizes[0])])
+        except InputError:
+            raise error from None
+        if turned.body_from_cam is not None or turned.lenses[0] is not None:
+            raise
+        camera = turned_camera(turned.rig.cameras[0], INVERSE[orientation])
+        note = f"{path}: made with pictures turned upright as EXIF says, turned back to the pixels of the files"
+        return replace(turned, rig=Rig.single(camera), notes=(*turned.notes, note))
+    _check_not_of_upright(str(path), calibration.rig.cameras[0], orientation)
+    return calibration
+
+
+def _check_not_of_upright(what: str, camera: Camera, orientation: int) -> None:
+    stored = turned_back(camera, orientation)
+    if stored is not None:
+        raise InputError(
+            f"{what}: expected a camera of {camera.width}x{camera.height} pixels, as the files store them, found one "
+            f"of {camera.height}x{camera.width}, of pictures turned upright as EXIF says",
+            f"give --camera {camera.model.name},{','.join(f'{value:.10g}' for value in stored.params)}",
+        )
+
+
+def _guessed_camera(size: Size, first: Path | None) -> Camera:
+    """What EXIF or experience says of a camera that nothing else is known of."""
+    prior = focal_prior(_exif_of(first), *size)
+    return simple_camera(CameraModel.SIMPLE_RADIAL, *size, prior.focal_px, prior.sigma_px, prior.source)
+
+
+def _exif_of(first: Path | None) -> ExifFacts:
+    if first is not None:
+        with suppress(UnusableImage):
+            return read_exif(read_header(read_regular_file(first)).exif)
+    return ExifFacts()
+
+
+def _rig(
+    what: str, calibration: Calibration | None, sizes: tuple[Size, ...], first: Path | None, events: Events,
+    require_camera: bool,
+) -> Rig:  # fmt: skip
+    """The cameras that are played: both where both are calibrated and wanted."""
+    if calibration is None:
+        width, height = sizes[0]
+        if require_camera:
+            raise MissingCameraError(
+                f"{what}: expected the intrinsics of its camera ({width}x{height} pixels), found no calibration in it",
+                HOW_TO_CALIBRATE,
+            )
+        camera = _guessed_camera(sizes[0], first)
+        events.decided(
+            STAGE,
+            f"no calibration: a focal length of {camera.focal:.0f} px is assumed to begin with",
+            focal_px=camera.focal, focal_source=camera.focal_source,
+        )  # fmt: skip
+        return Rig.single(camera)
+    for note in calibration.notes:
+        events.decided(STAGE, note)
+    rig = calibration.rig if len(sizes) > 1 else Rig.single(calibration.rig.cameras[0])
+    if len(sizes) > 1 and not rig.is_stereo:
+        events.warned(STAGE, f"{what}: images of two cameras, but no calibration of the pair: the first is used alone")
+    if rig.is_stereo and np.linalg.norm(rig.cam_from_rig[1, 4:]) > _WIDEST_BASELINE_M:
+        baseline = np.linalg.norm(rig.cam_from_rig[1, 4:])
+        events.warned(STAGE, f"{what}: the cameras of the pair are {baseline:.0f} m apart: are lengths in millimetres?")
+    for camera in rig.cameras:
+        fx, fy, cx, cy = camera.canonical[:4]
+        long_side = max(camera.width, camera.height)
+        # 0.2 is a fisheye lens of the widest kind, 20 a telescope
+        is_odd = not (0.2 * long_side < min(fx, fy) <= max(fx, fy) < 20 * long_side)
+        if is_odd or not (0 < cx < camera.width and 0 < cy < camera.height):
+            text = f"fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g} for {camera.width}x{camera.height} pixels"
+            events.warned(STAGE, f"{what}: the calibration is unlike that of any camera: {text}")
+    return rig
+
+
+def _sampling(rig: Rig, calibration: Calibration | None) -> tuple[NDArray[np.float32] | None, ...]:
+    lenses = calibration.lenses if calibration else (None,)
+    return tuple(sampling_map(camera, lens) for camera, lens in zip(rig.cameras, lenses, strict=False))
+
+
+# ------------------------------------------------------------------------------------------------------ what is played
+
+
+def _sequence(
+    source: str, recording: Recording, options: SequenceOptions, events: Events, require_camera: bool
+) -> FileSequence:
+    """The wishes of the user applied to what a layout holds."""
+    first = [frame[0] for frame in recording.paths]
+    folders = [recording.root, first[0].parent, *([recording.root.parent] if recording.kind == "euroc" else [])]
+    sizes = recording.sizes[:1] if options.mono else recording.sizes
+    orientation = _exif_of(first[0]).orientation
+    calibration = _calibration(
+        options.camera, folders, recording.calibration, recording.kind == "tum", sizes, orientation
+    )
+    rig = _rig(source, calibration, sizes, first[0], events, require_camera)
+    clock = _clock(recording, first, options, calibration, events)
+    times, elapsed = clock.frames_s, clock.elapsed_s
+    body_from_cam = calibration.body_from_cam if calibration else None
+    truth = clock.moved(_truth(recording, options.truth, clock.own_s, first, body_from_cam, events))
+    _warn_of_foreign_truth(truth, times, events)
+    imu = _imu(recording, options, clock, body_from_cam, events)
+    kept = ascending(times)
+    if len(kept) < len(times):
+        lost = np.setdiff1d(np.arange(len(times)), kept)
+        names = [recording.names[i] for i in lost]
+        text = f"{len(names)} of {len(times)} frames are skipped, whose times do not ascend: {some(names)}"
+        events.warned(STAGE, text, names=names)
+    played = kept[options.start : options.stop : options.step]
+    if not len(played):
+        raise InputError(f"{source}: expected frames from {options.start} to {options.stop}, found {len(kept)} in all")
+    if options.reverse:
+        played, times, elapsed, truth, imu = _mirrored(played, times, elapsed, truth, imu)
+    fps = 1 / float(np.median(np.diff(times[played]))) if len(played) > 1 else clock.frames_per_second
+    sequence = FileSequence(
+        recording.kind,
+        source,
+        rig,
+        [recording.names[i] for i in played],
+        times[played],
+        [recording.paths[i][: len(rig.cameras)] for i in played],
+        _sampling(rig, calibration),
+        fps,
+        imu,
+        truth,
+        events,
+        None if elapsed is None else elapsed[played],
+        orientation,
+    )
+    _tell(sequence, events)
+    return sequence
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """When the frames were taken.
+
+    Attributes:
+        frames_s: (N,) seconds that they are played with.
+        own_s: (N,) what the sequence says, which truth and IMU go by; the same array unless a rate was given instead.
+        frames_per_second: the rate that they were made from; None where they were not.
+        own: the sequence's times where they are played as they are; None otherwise.
+    """
+
+    frames_s: Array
+    own_s: Array
+    frames_per_second: float | None = None
+    own: Times | None = None
+
+    @property
+    def elapsed_s(self) -> Array | None:
+        """(N,) see :class:`~sfmapp.images.sequence.Frame`."""
+        return None if self.own is None else self.own.elapsed_s
+
+    def moved(self, truth: Truth | None) -> Truth | None:
+        """Poses at times of the sequence's own clock at those that are played; all others as they are."""
+        order = ascending(self.own_s)
+        if truth is None or self.own_s is self.frames_s or not len(truth.timestamps_s) or len(order) < 2:
+            return truth
+        if _share_time(truth, self.frames_s) or not _share_time(truth, self.own_s):
+            return truth
+        own, played = self.own_s[order], self.frames_s[order]
+        inside = (truth.timestamps_s >= own[0]) & (truth.timestamps_s <= own[-1])
+        return Truth(np.interp(truth.timestamps_s[inside], own, played), truth.cam_from_world[inside])
+
+
+def _share_time(truth: Truth, times: Array) -> bool:
+    return bool(len(times) and times.min() <= truth.timestamps_s[-1] and truth.timestamps_s[0] <= times.max())
+
+
+def _clock(
+    recording: Recording, first: list[Path], options: SequenceOptions, calibration: Calibration | None, events: Events
+) -> _Clock:
+    """Times as the user, else the files, else a rate tell them."""
+    own = recording.times
+    for note in (*((own.note,) if own is not None and own.note else ()), *recording.notes):
+        events.decided(STAGE, note)
+    if own is not None and options.fps is None:
+        return _Clock(own.seconds, own.seconds, own=own)
+    fps, reason = options.fps, "as given"
+    if fps is None and calibration is not None and calibration.frames_per_second is not None:
+        fps, reason = calibration.frames_per_second, "as the calibration says"
+    if fps is None:
+        fps = KITTI_FPS if recording.kind == "kitti" else DEFAULT_FPS
+        reason = "KITTI's rate" if recording.kind == "kitti" else "assumed; --fps changes it"
+    # numbers that are left out are time that went by
+    numbers = frame_numbers(first)
+    numbers = np.arange(len(first)) if numbers is None else numbers - numbers[0]
+    why = "the frames have no times" if own is None else "the times of the sequence are not used"
+    if own is None and are_dates([path.stem for path in first]):
+        why = "the names of the frames are dates, which are not taken for times"
+    events.decided(STAGE, f"{why}: {fps:g} frames a second ({reason})", frames_per_second=fps)
+    times = numbers / fps
+    return _Clock(times, times if own is None else own.seconds, fps)
+
+
+def _imu(
+    recording: Recording, options: SequenceOptions, clock: _Clock, body_from_cam: Array | None, events: Events
+) -> Imu | None:
+    """The user's IMU, or the sequence's own, unless a rate was given in place of the clock that the two share."""
+    if options.imu is not None:
+        return _given_imu(options.imu, body_from_cam, clock.own, events)
+    if recording.imu is not None and clock.own_s is not clock.frames_s:
+        events.warned(STAGE, "the IMU is not used: it shares the clock of the sequence, in whose place --fps was given")
+        return None
+    return recording.imu
+
+
+def _truth(
+    recording: Recording,
+    given: str | None,
+    times: Array,
+    first: list[Path],
+    body_from_cam: Array | None,
+    events: Events,
+) -> Truth | None:
+    """The user's trajectory, or the one that lies beside the frames: of that one, nothing wrong stops the run."""
+    truth = recording.truth
+    beside = next((path for path in recording.truth_paths if path.is_file()), None)
+    if given is not None:
+        truth = _read_truth(Path(given), times, first, body_from_cam, events)
+    elif beside is not None:
+        try:
+            truth = _read_truth(beside, times, first, body_from_cam, events)
+        except InputError as error:
+            events.warned(STAGE, f"the truth is not used: {error}")
+    return truth if truth is not None and len(truth.timestamps_s) else None
+
+
+def _warn_of_foreign_truth(truth: Truth | None, times: Array, events: Events) -> None:
+    if truth is not None and len(truth.timestamps_s) and not _share_time(truth, times):
+        span = f"{truth.timestamps_s[0]:.3f} to {truth.timestamps_s[-1]:.3f} s"
+        text = f"the truth is of {span}, the frames of {times.min():.3f} to {times.max():.3f} s: they share no time"
+        events.warned(STAGE, text)
+
+
+def _read_truth(
+    path: Path, times: Array | None, first: list[Path], body_from_cam: Array | None, events: Events
+) -> Truth:
+    """A trajectory of the first camera (TUM) or of the body (EuRoC; KITTI, whose body is its camera 0).
+
+    ``times`` are those of the frames; None of a video, which are not known before it is read.
+    """
+    file = read_trajectory(path, like=times)
+    if file.note:
+        events.decided(STAGE, file.note)
+    if file.format == "euroc":
+        return euroc_truth(file, body_from_cam)
+    if file.format == "tum":
+        return tum_truth(file)
+    poses = read_kitti(path)
+    if times is None:
+        raise InputError(
+            f"{path}: expected a trajectory with times, as the frames of a video are known by them, found KITTI's form",
+            "write it as TUM has it: timestamp tx ty tz qx qy qz qw",
+        )
+    chosen = rows_of_frames(len(poses), first)
+    if chosen is None:
+        raise InputError(f"{path}: expected a pose for each of {len(first)} frames, found {len(poses)}")
+    poses = poses[chosen]
+    if body_from_cam is not None:
+        poses = rigid3.compose(rigid3.inverse(body_from_cam), poses)
+    order = [i for i in ascending(times) if np.isfinite(poses[i]).all()]
+    return Truth(times[order], poses[order])
+
+
+def _given_imu(given: str, body_from_cam: Array | None, times: Times | None, events: Events) -> Imu:
+    path = Path(given) / "data.csv" if Path(given).is_dir() else Path(given)
+    if body_from_cam is None:
+        raise InputError(
+            f"{path}: expected to know where the IMU sits, found no T_BS or T_cam_imu in the camera's calibration",
+            "give --camera a sensor.yaml of EuRoC or a camchain.yaml of Kalibr, which hold it",
+        )
+    imu, note = read_imu(path, body_from_cam, times)
+    if note:
+        events.decided(STAGE, note)
+    return imu
+
+
+def _mirrored(
+    played: NDArray[np.int64], times: Array, elapsed: Array | None, truth: Truth | None, imu: Imu | None
+) -> tuple[NDArray[np.int64], Array, Array | None, Truth | None, Imu | None]:
+    """Everything backwards in time, on a clock that still ascends: t becomes first + last - t."""
+    total = float(times[played[0]] + times[played[-1]])
+    total_elapsed = 0.0 if elapsed is None else float(elapsed[played[0]] + elapsed[played[-1]])
+    if truth is not None:
+        truth = Truth(total - truth.timestamps_s[::-1], truth.cam_from_world[::-1].copy())
+    if imu is not None:
+        # a rotation runs the other way round; an acceleration, the second derivative, is what it was
+        back = total - imu.timestamps_s[::-1]
+        back_elapsed = None if imu.elapsed_s is None else total_elapsed - imu.elapsed_s[::-1]
+        imu = replace(
+            imu, timestamps_s=back, gyro=-imu.gyro[::-1], accel=imu.accel[::-1].copy(), elapsed_s=back_elapsed
+        )
+    return played[::-1], total - times, None if elapsed is None else total_elapsed - elapsed, truth, imu
+
+
+def _open_video(source: str, options: SequenceOptions, events: Events, require_camera: bool) -> VideoSequence:
+    facts = read_video_facts(source)
+    size = (facts.width, facts.height)
+    folders = [] if is_stream(source) else [Path(source).absolute().parent]
+    calibration = _calibration(options.camera, folders, None, False, (size,))
+    rig = _rig(source, calibration, (size,), None, events, require_camera)
+    body_from_cam = calibration.body_from_cam if calibration else None
+    imu = _given_imu(options.imu, body_from_cam, None, events) if options.imu is not None else None
+    truth = None
+    if options.truth is not None:
+        truth = _read_truth(Path(options.truth), None, [], body_from_cam, events)
+    sequence = VideoSequence(source, rig, facts, options, events, _sampling(rig, calibration), imu, truth)
+    _tell(sequence, events)
+    return sequence
+
+
+def _tell(sequence: Sequence, events: Events) -> None:
+    camera = sequence.rig.cameras[0]
+    count = "frames" if sequence.num_frames is None else f"{sequence.num_frames} frames"
+    baseline = float(np.linalg.norm(sequence.rig.cam_from_rig[-1, 4:]))
+    parts = [
+        {"kitti": "KITTI", "tum": "TUM RGB-D", "euroc": "EuRoC", "folder": "images", "video": "video"}[sequence.kind],
+        f"{count} of {camera.width}x{camera.height}",
+        f"stereo, {100 * baseline:.1f} cm apart" if sequence.rig.is_stereo else "one camera",
+        f"{sequence.frames_per_second:.4g} a second" if sequence.frames_per_second else "of unknown rate",
+        f"{camera.model.name}, f {camera.focal:.1f} px",
+    ]
+    parts += ["IMU"] if sequence.imu is not None else []
+    parts += ["truth"] if sequence.truth is not None else []
+    if sequence.orientation != 1:
+        text = "the frames have an EXIF orientation: they are used as they are stored, which a calibration has to fit"
+        events.decided(STAGE, text, orientation=sequence.orientation)
+    events.decided(
+        STAGE,
+        ", ".join(parts),
+        kind=sequence.kind,
+        num_frames=sequence.num_frames,
+        frames_per_second=sequence.frames_per_second,
+        num_cameras=len(sequence.rig.cameras),
+        baseline_m=baseline if sequence.rig.is_stereo else None,
+        has_imu=sequence.imu is not None,
+        has_truth=sequence.truth is not None,
+    )
