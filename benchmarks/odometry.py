@@ -84,7 +84,7 @@ def run_sfmapp(case: Case, out: Path, args: argparse.Namespace) -> dict[str, Any
     """One run of the command in a fresh workspace."""
     script = Path(sys.executable).with_name("sfmapp")
     command = [str(script), "odometry", str(case.sequence), "-o", str(out), "--seed", str(args.seed), "-q"]
-    command += ["--no-record", *(["--threads", str(args.threads)] if args.threads else [])]
+    command += ["--no-recording", *(["--threads", str(args.threads)] if args.threads else [])]
     command += [*case.flags, *(flag for setting in args.set for flag in ("--set", setting))]
     usage = run_measured(command, out.with_suffix(".log"))
     if usage.exit_code:
