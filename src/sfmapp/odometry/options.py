@@ -24,3 +24,12 @@ class OdometryOptions:
     refine_camera: bool = True  # there, refine the calibration where the images clearly contradict it
     smooth: bool = False  # also give the trajectory through an error-state filter: steadier, short gaps bridged
     covariance: bool = True  # covariances of the keyframes, at the end
+
+
+@dataclass(frozen=True)
+class ScaleOptions:
+    """Where metres come from when there is one camera."""
+
+    # marker:DICT:METRES, distance:FRAME:FRAME:METRES, distance:path:METRES, camera_height:METRES, imu or arbitrary;
+    # auto: the IMU where there is one
+    source: str | None = None
