@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, Protocol
 
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel
 from sfmapp.errors import UsageError
+from sfmapp.option_checks import Range, check_options, positive
 
 CameraSharing = Literal["auto", "all", "per_folder", "per_image"]
 
@@ -51,16 +52,10 @@ class ImageOptions:
             if model not in CameraModel.__members__:
                 raise UsageError(f"camera_model is {model!r}", f"one of {', '.join(CameraModel.__members__)}")
             object.__setattr__(self, "camera_model", CameraModel[model])
-        if self.camera_sharing not in get_args(CameraSharing):
-            raise UsageError(
-                f"camera_sharing is {self.camera_sharing!r}", f"one of {', '.join(get_args(CameraSharing))}"
-            )
-        if self.focal_px is not None and not 0.0 < self.focal_px < float("inf"):
-            raise UsageError(f"focal_px is {self.focal_px:g}, expected a positive number of pixels")
+        ranges = {"focal_px": positive(), "max_image_bytes": Range(1), "max_pixels": Range(1)}
+        check_options("images", self, ranges)
         if self.camera_params is not None:
             self._check_params(tuple(float(value) for value in self.camera_params))
-        if self.max_image_bytes <= 0 or self.max_pixels <= 0:
-            raise UsageError("max_image_bytes and max_pixels must be positive")
 
     def _check_params(self, params: tuple[float, ...]) -> None:
         object.__setattr__(self, "camera_params", params)

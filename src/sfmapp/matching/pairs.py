@@ -21,16 +21,15 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.errors import UsageError
 from sfmapp.events import Events
 from sfmapp.geometry.orientation import MIRRORED
+from sfmapp.option_checks import Range, check_options
 from sfmapp.scene.features import Features
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageRecord, ImageSet
 
 STAGE = "pairs"
-METHODS = ("auto", "exhaustive", "retrieval", "sequential")
 
 # descriptors that the vocabulary is learnt from: a thousand for each of 64 words, 32 MB as float32
 _SAMPLE_SIZE = 65536
@@ -39,6 +38,15 @@ _KMEANS_ROUNDS = 12
 _VLAD_LENGTH = 4000
 _BLOCK_BYTES = 64 << 20
 _EARTH_RADIUS_M = 6_371_000.0
+
+_RANGES = {
+    "exhaustive_limit": Range(0),
+    "num_neighbors": Range(1),
+    "num_words": Range(1),
+    "num_query_features": Range(1),
+    "sequence_overlap": Range(1),
+    "num_gps_neighbors": Range(0),
+}
 
 
 @dataclass(frozen=True)
@@ -63,14 +71,7 @@ class PairOptions:
     """GPS: nearest images, per image."""
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise UsageError(f"pairs.method must be one of {', '.join(METHODS)}, got {self.method!r}")
-        for name in ("exhaustive_limit", "num_gps_neighbors"):
-            if getattr(self, name) < 0:
-                raise UsageError(f"pairs.{name} must not be negative, got {getattr(self, name)}")
-        for name in ("num_neighbors", "num_words", "num_query_features", "sequence_overlap"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"pairs.{name} must be at least 1, got {getattr(self, name)}")
+        check_options("pairs", self, _RANGES)
 
 
 def select_pairs(
