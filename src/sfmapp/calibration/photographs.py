@@ -187,9 +187,8 @@ class GivenCameras:
             stored = turned_back(camera, orientation)
             if stored is not None:
                 raise InputError(
-                    f"{self.place}: expected a camera of {camera.width}x{camera.height} pixels, as the file of "
-                    f"{photograph} has them, found one of {camera.height}x{camera.width}, of pictures turned upright as "
-                    "EXIF says",
+                    f"{self.place}: expected a camera of {camera.width}x{camera.height} pixels, as {photograph} has "
+                    f"them, found one of {camera.height}x{camera.width}, of pictures turned upright as EXIF says",
                     f"give --camera {camera.model.name},{','.join(f'{value:.10g}' for value in stored.params)}",
                 )
 
