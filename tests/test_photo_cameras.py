@@ -20,7 +20,7 @@ from sfmapp.events import Event, Events
 from sfmapp.formats.colmap import read_model
 from sfmapp.images.folder import load_images
 from sfmapp.images.image_set import ImageOptions, ImageSet
-from sfmapp.pipelines.demo import compare_with_truth
+from sfmapp.pipelines.demo import compare_with_ground_truth
 from sfmapp.scene.turned_camera import turned_camera
 
 W, H = 400, 300
@@ -495,11 +495,11 @@ def test_two_calibrated_cameras_give_the_poses_that_are_true(
         seen = pixels_to_normalized(given, np.mgrid[20:W:40, 20:H:40].reshape(2, -1).T + 0.5)
         rays = np.concatenate([seen, np.ones((len(seen), 1))], 1)
         assert np.abs(project(found, rays) - project(given, rays)).max() < 2.0
-    errors = compare_with_truth(output, sample)
+    errors = compare_with_ground_truth(output, sample)
     assert errors["rotation_error_deg"]["max"] < 0.1
     # half the error, and more, that there is where the lenses are to be found from so few photographs
     run(courtyard, tmp_path / "unknown")
-    unknown = compare_with_truth(tmp_path / "unknown", sample)
+    unknown = compare_with_ground_truth(tmp_path / "unknown", sample)
     assert errors["center_error"]["max"] < 0.5 * unknown["center_error"]["max"]
 
     # nothing is done again unless the calibration has changed

@@ -28,11 +28,10 @@ from sfmapp.images.sequence import SequenceOptions
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.pairs import PairOptions
-from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.options import OdometryOptions, ScaleOptions
 from sfmapp.option_checks import Range, check_options
-from sfmapp.pipelines import resources
-from sfmapp.pipelines.odometry_scale import ScaleOptions
 from sfmapp.surface.options import SurfaceOptions
+from sfmapp.workspace import resources
 
 LIST_ADVICE = "sfmapp reconstruct --list-options shows every option with its default"
 
@@ -96,7 +95,7 @@ def options_from_dict(values: Mapping[str, Any]) -> Options:
 def with_absolute_paths(options: Options) -> Options:
     """The same options, good in any working directory."""
     images = _with_absolute_paths(options.images, "camera", "mask_path")
-    sequence = _with_absolute_paths(options.sequence, "camera", "imu", "truth")
+    sequence = _with_absolute_paths(options.sequence, "camera", "imu", "ground_truth")
     return dataclasses.replace(options, images=images, sequence=sequence)
 
 
