@@ -11,10 +11,11 @@ from sfmapp.matching.binary import match_binary
 from sfmapp.matching.descriptors import match_sift
 from sfmapp.matching.guided import GuidedImage, change_of_shape, match_guided
 from sfmapp.matching.options import MatchingOptions
-from sfmapp.matching.products import DIMS, Ints
+from sfmapp.matching.products import Ints
 from sfmapp.matching.search import Ransac, find_fundamental, is_significant, polish_fundamental
 from sfmapp.matching.second_motion import has_second_motion
 from sfmapp.scene.features import Features
+from sfmapp.simd.i16x32 import DIMS
 
 # The coarse epipolar lines are off by more than the noise of the matches that they rest on.
 _BAND_PER_THRESHOLD = 2.0

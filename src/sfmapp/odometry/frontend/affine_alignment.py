@@ -28,7 +28,8 @@ from sfmapp.odometry.frontend.alignment import (
 )
 from sfmapp.odometry.frontend.pyramid import Bytes, Pyramid, build_pyramid
 from sfmapp.simd import f32x16 as lanes
-from sfmapp.simd.f64x8 import offset, pointer
+from sfmapp.simd.bilinear import sample_bytes
+from sfmapp.simd.pointers import offset, pointer
 
 _CHUNK = 128  # points to a task
 # working memory: for each row of a patch seven vectors of w J~ (six parameters) and w T~, then six of J~
@@ -122,7 +123,7 @@ def _sums(
     for r in range(2 * half + 1):
         u = lanes.fma(a, across, lanes.splat(np.float32(x - 0.5 - c + warp[0, 1] * (r - half))))
         v = lanes.fma(b, across, lanes.splat(np.float32(y - 0.5 - r0 + warp[1, 1] * (r - half))))
-        value = lanes.subtract(lanes.sample(image, layout[1], u, v), less)
+        value = lanes.subtract(sample_bytes(image, layout[1], u, v), less)
         at, w = 112 * r, lanes.load(p, GRADED + 64 * r + 48)
         weighted = lanes.multiply(w, value)
         s0, s1 = lanes.fma(lanes.load(q, at), value, s0), lanes.fma(lanes.load(q, at + 16), value, s1)

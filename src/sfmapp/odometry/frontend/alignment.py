@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from sfmapp.odometry.frontend.pyramid import PAD, Bytes, Pyramid, build_pyramid
 from sfmapp.simd import f32x16 as lanes
-from sfmapp.simd.f64x8 import offset, pointer
+from sfmapp.simd.bilinear import sample_bytes
+from sfmapp.simd.pointers import offset, pointer
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -104,7 +105,7 @@ def sample_warped(
             dy = grow * (row - 0.5 * (size - 1))
             u = lanes.fma(a, dx, lanes.splat(np.float32(x - 0.5 - c + warp[0, 1] * dy)))
             v = lanes.fma(b, dx, lanes.splat(np.float32(y - 0.5 - r + warp[1, 1] * dy)))
-            value = lanes.subtract(lanes.sample(image, layout[1], u, v), less)
+            value = lanes.subtract(sample_bytes(image, layout[1], u, v), less)
             lanes.store(out, _SAMPLES + 32 * row + 16 * part, value)
 
 
