@@ -18,9 +18,10 @@ from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model
 from sfmapp.formats.truth import Truth, read_truth
 from sfmapp.images.folder import load_images
-from sfmapp.pipelines.options import options_from_dict
 from sfmapp.pipelines.stored_pixels import check_pixels, truth_in_stored_pixels
-from sfmapp.pipelines.workspace import RECONSTRUCT, read_manifest
+from sfmapp.workspace.layout import RECONSTRUCT
+from sfmapp.workspace.manifest import read_manifest
+from sfmapp.workspace.options import options_from_dict
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageOptions, ImageSet
