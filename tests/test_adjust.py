@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from sfmapp.adjust import kernels, solver
 from sfmapp.adjust.problem import pose_rows
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
-from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, distort, project
+from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, project
+from sfmapp.camera.lens import ROW, distort
 from sfmapp.errors import InterruptedRunError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3

@@ -351,7 +351,8 @@ def substitute_points(  # type: ignore[no-untyped-def]
                     continue
                 linearize(
                     offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]),
-                    offset(lens, ROW * c), x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c], other >= 0, J,
+                    offset(lens, ROW * c), x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
+                    other >= 0, J,
                 )  # fmt: skip
                 e0 = e1 = 0.0
                 if block >= 0:
