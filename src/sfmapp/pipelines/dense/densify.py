@@ -82,7 +82,8 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
     try:
         with job.stage("views"):
             plan, report["views"] = plan_source(job)
-        key = dense_results.dense_key(job, plan)
+        clusters = make_clusters(plan, job.options.dense.cell_px, job.options.dense.max_memory_mb)
+        key = dense_results.dense_key(job, plan, clusters)
         files = (dense_results.FUSED, dense_results.PATCHES)
         if (earlier := dense_results.earlier_report(job, STAGE, key, files)) is not None:
             patches, _ = read_patches(job.workspace.folder / dense_results.PATCHES)
@@ -93,7 +94,7 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
         job.workspace.begin(STAGE, key, model=model_digest(job.known.model))
         with job.measured("kernels"):
             compile_dense_kernels(job.events)
-        patches = _densify(job, plan, report, is_resumed)
+        patches = _densify(job, plan, clusters, report, is_resumed)
         dense_results.write_cloud(job, plan, patches)
         if warning := outcome.check(patches, report["shares"], plan, job.options.dense.min_views):
             job.events.warned(STAGE, warning)
@@ -110,10 +111,11 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
     return DenseResult(patches, plan.names, report, job.workspace.folder)
 
 
-def _densify(job: DenseJob, plan: DensePlan, report: dict[str, Any], is_resumed: bool) -> Patches:
+def _densify(
+    job: DenseJob, plan: DensePlan, clusters: list[Cluster], report: dict[str, Any], is_resumed: bool
+) -> Patches:
     """Patches of all clusters, within the region; what came of it goes into the report."""
     options = job.options.dense
-    clusters = make_clusters(plan, options.cell_px, options.max_memory_mb)
     if len(clusters) > 1:
         sizes = [len(cluster.core) for cluster in clusters]
         job.events.decided(
