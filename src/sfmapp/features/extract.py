@@ -17,7 +17,7 @@ from sfmapp.events import Events
 from sfmapp.features.orb import extract_orb
 from sfmapp.features.sift import Scratch, compile_kernels, extract_sift
 from sfmapp.option_checks import RESOURCE, Range, check_options, positive
-from sfmapp.scene.features import Features
+from sfmapp.scene.features import DescriptorMetric, Features
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageRecord, ImageSet
@@ -28,6 +28,7 @@ __all__ = ["FeatureOptions", "compile_kernels", "extract_features", "extract_ima
 STAGE = "features"
 # fewer keypoints than this and an image will hardly be registered: the report says so
 FEW_FEATURES = 100
+_METRICS = {"sift": DescriptorMetric.ROOT_SIFT, "orb": DescriptorMetric.HAMMING}
 
 _RANGES = {
     "max_num_features": Range(1),
@@ -180,13 +181,14 @@ def features_from_picture(
         keypoints[:, 2] *= factor.mean()
     x = np.clip(keypoints[:, 0].astype(np.int64), 0, width - 1)
     y = np.clip(keypoints[:, 1].astype(np.int64), 0, height - 1)
-    return Features(keypoints, descriptors, picture.rgb[y, x]), scale, threshold
+    return Features(keypoints, descriptors, picture.rgb[y, x], _METRICS[options.kind]), scale, threshold
 
 
 def empty_features(kind: str) -> Features:
     """No keypoints."""
     length = 32 if kind == "orb" else 128
-    return Features(np.zeros((0, 4), np.float32), np.zeros((0, length), np.uint8), np.zeros((0, 3), np.uint8))
+    descriptors = np.zeros((0, length), np.uint8)
+    return Features(np.zeros((0, 4), np.float32), descriptors, np.zeros((0, 3), np.uint8), _METRICS[kind])
 
 
 def _why_none(picture: Picture) -> str:

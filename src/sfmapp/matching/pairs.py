@@ -34,8 +34,6 @@ STAGE = "pairs"
 # descriptors that the vocabulary is learnt from: a thousand for each of 64 words, 32 MB as float32
 _SAMPLE_SIZE = 65536
 _KMEANS_ROUNDS = 12
-# RootSIFT times 512 has a length of 512 and below; ORB's 256 bits reach the same length when a bit counts 32
-_BIT_VALUE = 32
 # length of an image vector in whole numbers: its square must stay below 2^24
 _VLAD_LENGTH = 4000
 _BLOCK_BYTES = 64 << 20
@@ -193,7 +191,7 @@ def retrieval_pairs(
 
     def fill(i: int) -> None:
         events.raise_if_cancelled()
-        vectors[i] = image_vector(_whole_numbers(features[i].descriptors[: options.num_query_features]), words)
+        vectors[i] = image_vector(features[i].whole_numbers(options.num_query_features), words)
 
     with ThreadPoolExecutor(max(1, threads)) as pool:
         list(pool.map(fill, range(len(features))))
@@ -227,18 +225,11 @@ def _sample_descriptors(
     chosen = rng.permutation(len(features))[:_SAMPLE_SIZE]
     parts = []
     for i in np.sort(chosen):
-        descriptors = features[i].descriptors[:num_per_image]
+        descriptors = features[i].whole_numbers(num_per_image)
         if len(descriptors) > share:
             descriptors = descriptors[np.sort(rng.choice(len(descriptors), share, replace=False))]
         parts.append(descriptors)
-    return _whole_numbers(np.concatenate(parts))
-
-
-def _whole_numbers(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(N, D) float32 of whole numbers with rows not longer than about 512: RootSIFT as it is, bits spread out."""
-    if descriptors.shape[1] == 128:
-        return descriptors.astype(np.float32)
-    return np.unpackbits(descriptors, axis=1).astype(np.float32) * np.float32(_BIT_VALUE)
+    return np.concatenate(parts)
 
 
 def _nearest_word(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:

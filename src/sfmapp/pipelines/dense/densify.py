@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from sfmapp.pipelines.dense import results as dense_results
 from sfmapp.pipelines.dense.results import STAGE
 from sfmapp.pipelines.dense.source import DenseJob, dense_job, find_source, model_digest, plan_source
 from sfmapp.workspace.kernels import compile_dense_kernels
+from sfmapp.workspace.keys import input_key, stage_key
 from sfmapp.workspace.options import Options, with_absolute_paths
 from sfmapp.workspace.usage import Stopwatch
 
@@ -83,7 +85,7 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
         with job.stage("views"):
             plan, report["views"] = plan_source(job)
         clusters = make_clusters(plan, job.options.dense.cell_px, job.options.dense.max_memory_mb)
-        key = dense_results.dense_key(job, plan, clusters)
+        key = _key(job, plan, clusters)
         files = (dense_results.FUSED, dense_results.PATCHES)
         if (earlier := dense_results.earlier_report(job, STAGE, key, files)) is not None:
             patches, _ = read_patches(job.workspace.folder / dense_results.PATCHES)
@@ -109,6 +111,14 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
     dense_results.write_extras(job, plan, patches, scene, maps=maps, record=record)
     report = dense_results.finish(job, STAGE, key, report, (scene, patches, None))
     return DenseResult(patches, plan.names, report, job.workspace.folder)
+
+
+def _key(job: DenseJob, plan: DensePlan, clusters: Sequence[Cluster]) -> str:
+    """Of the patches: model, photographs and masks, options, our code; and the clusters, which is all that follows
+    from how much memory there may be."""
+    inputs = [[record.name, record.turn, input_key(record)] for record in plan.records]
+    cores = [cluster.core.tolist() for cluster in clusters]
+    return stage_key((__name__,), job.options.dense, model_digest(job.known.model), inputs, cores)
 
 
 def _densify(

@@ -11,26 +11,22 @@ from typing import Any
 
 import numpy as np
 
-from sfmapp.dense.clusters import Cluster
 from sfmapp.dense.files import read_patches, write_fused_ply, write_patches
 from sfmapp.dense.maps import write_maps
 from sfmapp.dense.prepare import DensePlan, coarser_plan, load_scene
 from sfmapp.dense.scene import DenseScene, Patches
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.formats.colmap import read_model
-from sfmapp.pipelines.dense.source import DenseJob, model_digest
+from sfmapp.pipelines.dense.source import DenseJob
 from sfmapp.report.dense_document import dense_document
 from sfmapp.report.dense_html import render_dense_html
 from sfmapp.report.dense_pictures import PictureRow, dense_pictures
 from sfmapp.report.html import render_html
 from sfmapp.scene.mesh import Mesh
-from sfmapp.workspace.keys import input_key, stage_key
 from sfmapp.workspace.layout import DENSE
 from sfmapp.workspace.plain_json import report_text
 
 STAGE = "dense"
-# where it begins: its views and photographs are found there as well
-CODE = ("sfmapp.pipelines.dense.densify",)
 FORMAT = "sfmapp dense report 1"
 FUSED, PATCHES, MAPS, PARTS = "dense/fused.ply", "dense/patches.npz", "dense/maps", "dense/clusters"
 RECORDING = "dense/recording.rrd"
@@ -38,14 +34,6 @@ RECORDING = "dense/recording.rrd"
 PICTURE_PX = 640
 # whose messages in the report of a workspace are ours to replace
 _OWN_STAGES = frozenset((STAGE, "views", "maps", "mesh", "texture", "recording"))
-
-
-def dense_key(job: DenseJob, plan: DensePlan, clusters: Sequence[Cluster]) -> str:
-    """Of the patches: model, photographs and masks, options, our code; and the clusters, which is all that follows
-    from how much memory there may be."""
-    inputs = [[record.name, record.turn, input_key(record)] for record in plan.records]
-    cores = [cluster.core.tolist() for cluster in clusters]
-    return stage_key(CODE, job.options.dense, model_digest(job.known.model), inputs, cores)
 
 
 def earlier_report(job: DenseJob, stage: str, key: str, files: Sequence[str]) -> dict[str, Any] | None:
