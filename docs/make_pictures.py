@@ -5,7 +5,6 @@ python docs/make_pictures.py FOUNTAIN TRACK     # OUT of reconstruct, dense and 
 
 from __future__ import annotations
 
-import base64
 import re
 import sys
 from pathlib import Path
@@ -19,7 +18,7 @@ from sfmapp.formats.colmap import read_model
 from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.upright import up_direction
-from sfmapp.report.preview import VirtualCamera, picture_of_mesh, picture_of_patches, shaded
+from sfmapp.report.preview import VirtualCamera, picture_of_mesh, picture_of_patches
 from sfmapp.scene.mesh import vertex_normals
 from sfmapp.scene.reconstruction import Reconstruction
 
@@ -118,11 +117,6 @@ def svg_of(report: Path) -> str:
     return (
         svg.replace("currentColor", "#555").replace("<text ", '<text font-family="sans-serif" font-size="14" ') + "\n"
     )
-
-
-def pictures_in(report: Path) -> list[bytes]:
-    """The JPEGs in a report, in order."""
-    return [base64.b64decode(data) for data in re.findall(r"data:image/jpeg;base64,([^\"']+)", report.read_text())]
 
 
 def save(name: str, rgb: NDArray[np.uint8]) -> None:
