@@ -397,6 +397,21 @@ def test_exif_that_clearly_says_another_focal_length_is_told(tmp_path: Path, foc
     assert all("a.jpg, b.jpg" in message for message in told)
 
 
+def test_numbers_that_no_camera_has_are_told(tmp_path: Path) -> None:
+    numbers = {"fx": 1.1, "fy": 1.1, "cx": 0.5, "cy": 0.5, "width": W, "height": H}
+    (tmp_path / "calib.json").write_text(json.dumps(numbers))
+    (told,) = warnings_of(load(write_photos(tmp_path / "photos"), tmp_path / "calib.json")[2])
+    assert "a.png, b.png, c.png: the calibration is unlike that of any camera: fx 1.1" in told
+
+
+def test_a_calibration_of_another_size_that_it_does_not_state_is_told(tmp_path: Path) -> None:
+    (tmp_path / "calib.json").write_text(json.dumps({"K": MATRIX.tolist(), "dist": LENS}))
+    photos = write_photos(tmp_path / "photos", size=(2 * W, 2 * H))
+    (told,) = warnings_of(load(photos, tmp_path / "calib.json")[2])
+    assert "states no image size, and its principal point (196, 152) is far from the middle of 800x600 pixels" in told
+    assert not warnings_of(load(write_photos(tmp_path / "fitting"), tmp_path / "calib.json")[2])
+
+
 @pytest.mark.parametrize(
     ("other", "name"),
     [

@@ -237,6 +237,18 @@ def _size(place: str, fields: dict[str, Any]) -> Size | None:
     return int(width), int(height)
 
 
+def oddity(camera: Camera) -> str | None:
+    """What is odd about a calibration that is unlike that of any camera; None for nothing."""
+    fx, fy, cx, cy = camera.canonical[:4]
+    long_side = max(camera.width, camera.height)
+    # 0.2 is a fisheye lens of the widest kind, 20 a telescope
+    is_odd = not (0.2 * long_side < min(fx, fy) <= max(fx, fy) < 20 * long_side)
+    if is_odd or not (0 < cx < camera.width and 0 < cy < camera.height):
+        text = f"fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g} for {camera.width}x{camera.height} pixels"
+        return f"the calibration is unlike that of any camera: {text}"
+    return None
+
+
 def read_pose(place: str, value: Any) -> Array:
     """(7,) pose of a rigid 4 x 4 matrix in any of the forms that files have. Raises InputError if it is none."""
     matrix = numbers(place, value, (4, 4))

@@ -9,7 +9,9 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePath, PurePosixPath
 
-from sfmapp.calibration.fields import camera_from_text, camera_of_fields, cameras_in, is_calibration_path
+import numpy as np
+
+from sfmapp.calibration.fields import camera_from_text, camera_of_fields, cameras_in, is_calibration_path, oddity
 from sfmapp.calibration.files import read_fields
 from sfmapp.calibration.opencv_lens import CalibratedCamera, Size, scaled_to
 from sfmapp.camera.camera import Camera
@@ -24,6 +26,8 @@ CameraAt = Callable[[Size], CalibratedCamera]
 _NUMBERED = re.compile(r"(?:cam|camera|image|images|img)[_-]?(\d+)")
 _OF_A_PAIR = re.compile(r"(?:(?:cam|camera|image|images|img)[_-]?)?(left|right)")
 _NAMES_SHOWN = 4
+# a share of a side of the picture: lenses are decentred by some per cent at most, crops by more
+_FAR_OFF_CENTER = 0.15
 
 
 @dataclass(frozen=True)
@@ -44,11 +48,13 @@ class GivenCamera:
         name: in the file; may be empty where there is one only.
         camera: with ``focal_source`` ``user`` and a sigma of its focal length.
         reason: where it is from, and what was changed on the way.
+        problem: what is odd about it; None for nothing.
     """
 
     name: str
     camera: Camera
     reason: str
+    problem: str | None = None
 
 
 @dataclass(frozen=True)
@@ -145,12 +151,17 @@ class GivenCameras:
 
     # ----------------------------------------------------------------------------------------------- of which pixels
 
+    def _states_size(self, name: str, photograph: Photograph) -> bool:
+        """False: the camera takes the size of whatever photograph it is asked for."""
+        width, height = photograph.size
+        found = self.cameras[name]((2 * width, 2 * height)).camera
+        return (found.width, found.height) != (2 * width, 2 * height)
+
     def _check_states_size(self, name: str, photographs: Sequence[Photograph]) -> None:
-        """Refuse a camera that takes the size of whatever photograph it is asked for, if these have several."""
-        found = [self.cameras[name](photograph.size).camera for photograph in photographs]
-        sizes = [photograph.size for photograph in photographs]
-        if len(sizes) > 1 and [(camera.width, camera.height) for camera in found] == sizes:
-            shown = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)[:_NAMES_SHOWN])
+        """Refuse a camera that states no size for photographs of several."""
+        if len(photographs) > 1 and not self._states_size(name, photographs[0]):
+            sizes = sorted(photograph.size for photograph in photographs)
+            shown = ", ".join(f"{width}x{height}" for width, height in sizes[:_NAMES_SHOWN])
             raise InputError(
                 f"{self.place}: expected a camera of one image size, found none stated, and photographs of several: "
                 f"{shown}",
@@ -180,7 +191,20 @@ class GivenCameras:
             )
         source = ": ".join([PurePath(self.place).name, *([name] if name else [])])
         reason = ", ".join([source, *(note.removeprefix(f"{self.place}: ") for note in found.notes)])
-        return GivenCamera(name, replace(found.camera, focal_source="user"), reason)
+        problem = oddity(found.camera) or self._other_size(name, found.camera)
+        return GivenCamera(name, replace(found.camera, focal_source="user"), reason, problem)
+
+    def _other_size(self, name: str, camera: Camera) -> str | None:
+        """What speaks for a calibration with pictures of another size, where it states none."""
+        size = np.array([camera.width, camera.height])
+        off = np.abs(camera.canonical[2:4] / size - 0.5).max()
+        if off < _FAR_OFF_CENTER or self._states_size(name, Photograph("", (camera.width, camera.height))):
+            return None
+        cx, cy = camera.canonical[2:4]
+        return (
+            f"the calibration states no image size, and its principal point ({cx:.0f}, {cy:.0f}) is far from the "
+            f"middle of {camera.width}x{camera.height} pixels: if it is of another size, write width and height into it"
+        )
 
     def _check_not_of_upright(self, camera: Camera, photograph: str, sideways: Collection[int]) -> None:
         for orientation in sideways:
