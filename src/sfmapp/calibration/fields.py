@@ -181,7 +181,7 @@ def rectified_intrinsics(place: str, fields: Fields, name: str) -> list[float]:
 
 def camera_of_fields(place: str, fields: dict[str, Any], image_size: Size) -> CalibratedCamera:
     """One camera of a section, at the size that the section states, or else at that of the images."""
-    size = _size(place, fields) or image_size
+    size = stated_size(place, fields) or image_size
     if isinstance(fields.get("params"), list) and isinstance(fields.get("model"), str):
         return camera_from_colmap(place, fields["model"].upper(), size, numbers(place, fields["params"], None))
     nested = [fields[name] for name in (*_MATRIX_NAMES, *_DISTORTION_NAMES) if isinstance(fields.get(name), dict)]
@@ -224,7 +224,8 @@ def _coefficients(place: str, fields: dict[str, Any], lens: LensType | None) -> 
     return numbers(f"{place}: k1, k2, p1, p2, ...", named_coefficients(place, section, lens), None)
 
 
-def _size(place: str, fields: dict[str, Any]) -> Size | None:
+def stated_size(place: str, fields: Fields) -> Size | None:
+    """Width and height of the images that a camera was calibrated with; None where that is not said."""
     pairs = (("width", "height"), ("image_width", "image_height"))
     found = next(([fields[w], fields[h]] for w, h in pairs if w in fields and h in fields), None)
     if found is None:
