@@ -391,7 +391,7 @@ def test_a_lens_of_more_coefficients_is_held_by_the_nearest_or_refused(tmp_path:
     expected = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), MATRIX, k3)[0].reshape(-1, 2) + 0.5
     assert np.abs(project(image_set.cameras[0], RAYS) - expected).max() < 0.1
     assert "the nearest lens with k1, k2, p1, p2 is off by" in report["cameras"][0]["focal_reason"]
-    wide = {"fx": 180.0, "fy": 180.0, "cx": 199.5, "cy": 149.5, "dist": [-0.25, 0.09, 0, 0, -0.016]}
+    wide = {"fx": 220.0, "fy": 220.0, "cx": 199.5, "cy": 149.5, "dist": [-0.25, 0.09, 0, 0, -0.016]}
     path.write_text(json.dumps(wide | {"width": W, "height": H}))
     with pytest.raises(InputError, match=r"calib.json.*5 coefficients.*off by 0\.\d px") as caught:
         load(photos, path)
