@@ -1,4 +1,13 @@
-"""Photographs and video into cameras, points and surfaces, on an ordinary CPU, from pip alone."""
+"""Photographs and video into cameras, points and surfaces, on an ordinary CPU, from pip alone.
+
+Three levels. One call: ``reconstruct``, ``track_sequence``, ``densify``, ``make_mesh``, and what is done with their
+results. The stages, in memory: ``load_images``, ``extract_features``, ``match_images``, ``map_images``. The parts:
+``adjust_bundle``, ``triangulate``, ``estimate_pose``, ``verify_pair``.
+
+Conventions: a pose ``cam_from_world`` is a quaternion x, y, z, w and a translation, x_cam = R x_world + t, with camera
+axes x right, y down, z forward. The centre of the top-left pixel is (0.5, 0.5). ``events``, ``threads`` and ``seed``
+can always be left out; of these, results depend on the seed alone.
+"""
 
 from __future__ import annotations
 
@@ -7,45 +16,129 @@ from typing import TYPE_CHECKING, Any
 from sfmapp.kernel_cache import provide_kernel_cache
 
 if TYPE_CHECKING:
+    from sfmapp.adjust.solver import AdjustOptions
+    from sfmapp.api.geometry import adjust_bundle, estimate_pose, triangulate, verify_pair
+    from sfmapp.api.images import load_images
+    from sfmapp.api.reconstruction import Reconstruction, load
+    from sfmapp.api.stages import Matcher, extract_features, map_images, match_images
     from sfmapp.camera.camera import Camera, CameraModel
+    from sfmapp.errors import (
+        InputError,
+        InterruptedRunError,
+        NoReconstructionError,
+        SfmError,
+        TooFewImagesError,
+        UsageError,
+    )
+    from sfmapp.events import Event, Events
+    from sfmapp.features.extract import FeatureOptions
+    from sfmapp.geometry.rigid3 import Rigid3
+    from sfmapp.images.image_set import ImageOptions, ImageSet, ImageSource
+    from sfmapp.mapping.options import MappingOptions
+    from sfmapp.matching.options import MatchingOptions
+    from sfmapp.matching.pairs import PairOptions
     from sfmapp.pipelines.odometry import TrackResult, track_sequence
     from sfmapp.pipelines.options import Options, load_options
     from sfmapp.pipelines.reconstruct import RunResult, reconstruct
     from sfmapp.pipelines.refine import RefineResult, refine
     from sfmapp.pipelines.undistort import UndistortResult, undistort
-    from sfmapp.scene.reconstruction import Reconstruction
+    from sfmapp.scene.correspondences import Correspondences
+    from sfmapp.scene.features import DescriptorMetric, Features
+    from sfmapp.scene.tracks import Tracks
 
 __version__ = "0.1.0"
 __all__ = [
+    "AdjustOptions",
     "Camera",
     "CameraModel",
+    "Correspondences",
+    "DescriptorMetric",
+    "Event",
+    "Events",
+    "FeatureOptions",
+    "Features",
+    "ImageOptions",
+    "ImageSet",
+    "ImageSource",
+    "InputError",
+    "InterruptedRunError",
+    "MappingOptions",
+    "Matcher",
+    "MatchingOptions",
+    "NoReconstructionError",
     "Options",
+    "PairOptions",
     "Reconstruction",
     "RefineResult",
+    "Rigid3",
     "RunResult",
+    "SfmError",
+    "TooFewImagesError",
     "TrackResult",
+    "Tracks",
     "UndistortResult",
+    "UsageError",
+    "adjust_bundle",
+    "estimate_pose",
+    "extract_features",
+    "load",
+    "load_images",
     "load_options",
+    "map_images",
+    "match_images",
     "reconstruct",
     "refine",
     "track_sequence",
+    "triangulate",
     "undistort",
+    "verify_pair",
 ]
 
 _HOMES = {
-    "Camera": "sfmapp.camera.camera",
-    "CameraModel": "sfmapp.camera.camera",
-    "Options": "sfmapp.pipelines.options",
-    "Reconstruction": "sfmapp.scene.reconstruction",
-    "RefineResult": "sfmapp.pipelines.refine",
-    "RunResult": "sfmapp.pipelines.reconstruct",
-    "TrackResult": "sfmapp.pipelines.odometry",
-    "UndistortResult": "sfmapp.pipelines.undistort",
-    "load_options": "sfmapp.pipelines.options",
-    "reconstruct": "sfmapp.pipelines.reconstruct",
-    "refine": "sfmapp.pipelines.refine",
-    "track_sequence": "sfmapp.pipelines.odometry",
-    "undistort": "sfmapp.pipelines.undistort",
+    "AdjustOptions": "adjust.solver",
+    "Camera": "camera.camera",
+    "CameraModel": "camera.camera",
+    "Correspondences": "scene.correspondences",
+    "DescriptorMetric": "scene.features",
+    "Event": "events",
+    "Events": "events",
+    "FeatureOptions": "features.extract",
+    "Features": "scene.features",
+    "ImageOptions": "images.image_set",
+    "ImageSet": "images.image_set",
+    "ImageSource": "images.image_set",
+    "InputError": "errors",
+    "InterruptedRunError": "errors",
+    "MappingOptions": "mapping.options",
+    "Matcher": "api.stages",
+    "MatchingOptions": "matching.options",
+    "NoReconstructionError": "errors",
+    "Options": "pipelines.options",
+    "PairOptions": "matching.pairs",
+    "Reconstruction": "api.reconstruction",
+    "RefineResult": "pipelines.refine",
+    "Rigid3": "geometry.rigid3",
+    "RunResult": "pipelines.reconstruct",
+    "SfmError": "errors",
+    "TooFewImagesError": "errors",
+    "TrackResult": "pipelines.odometry",
+    "Tracks": "scene.tracks",
+    "UndistortResult": "pipelines.undistort",
+    "UsageError": "errors",
+    "adjust_bundle": "api.geometry",
+    "estimate_pose": "api.geometry",
+    "extract_features": "api.stages",
+    "load": "api.reconstruction",
+    "load_images": "api.images",
+    "load_options": "pipelines.options",
+    "map_images": "api.stages",
+    "match_images": "api.stages",
+    "reconstruct": "pipelines.reconstruct",
+    "refine": "pipelines.refine",
+    "track_sequence": "pipelines.odometry",
+    "triangulate": "api.geometry",
+    "undistort": "pipelines.undistort",
+    "verify_pair": "api.geometry",
 }
 
 
@@ -55,9 +148,14 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    value = getattr(import_module(_HOMES[name]), name)
+    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
     globals()[name] = value
     return value
+
+
+def __dir__() -> list[str]:
+    """What is promised, and no more."""
+    return sorted([*__all__, "__version__"])
 
 
 provide_kernel_cache()
