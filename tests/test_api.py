@@ -104,7 +104,7 @@ def test_stages_in_memory_need_no_file(photos: Path, monkeypatch: pytest.MonkeyP
 
 def test_own_features_and_matcher(scene: SyntheticScene) -> None:
     """Keypoints without descriptors, matched by what point they show: the model is the scene."""
-    truth = scene.truth
+    truth = scene.ground_truth
     names = truth.image_names
     blank = {name: np.zeros((truth.cameras[0].height, truth.cameras[0].width), np.uint8) for name in names}
     images = sfmapp.load_images(blank, camera=truth.cameras[0])
@@ -121,9 +121,7 @@ def test_own_features_and_matcher(scene: SyntheticScene) -> None:
             calls.append((i, j))
             return np.stack(np.intersect1d(shown[i], shown[j], return_indices=True)[1:], 1)
 
-    correspondences = sfmapp.match_images(
-        images, features, matcher=ByPoint()
-    )
+    correspondences = sfmapp.match_images(images, features, matcher=ByPoint())
     assert len(calls) == 15
     (model,) = sfmapp.map_images(images, features, correspondences)
     assert model.is_registered.all()
@@ -150,7 +148,7 @@ def test_pairs_by_name_or_position_and_what_is_no_pair(scene: SyntheticScene) ->
 
 
 def test_triangulated_points_are_where_they_are(scene: SyntheticScene) -> None:
-    truth = scene.truth
+    truth = scene.ground_truth
     xy = np.full((6, truth.tracks.num_tracks, 2), np.nan)
     xy[truth.tracks.obs_image_idx, truth.tracks.obs_track_idx] = truth.tracks.obs_xy
     xy[0, :10] += 100.0  # wrong in one of the views
@@ -168,27 +166,27 @@ def test_the_pose_of_one_camera_from_points(model: sfmapp.CameraModel) -> None:
     if "f" not in PARAM_NAMES[model] and "fx" not in PARAM_NAMES[model]:
         pytest.skip("an equirectangular picture has no focal length")
     scene = make_scene(1, 3, 300, synthetic_camera(model), sigma_px=0.5)
-    seen = scene.truth.tracks.observations_of_image(1)
-    xyz = scene.truth.point_xyz[scene.truth.tracks.obs_track_idx[seen]]
+    seen = scene.ground_truth.tracks.observations_of_image(1)
+    xyz = scene.ground_truth.point_xyz[scene.ground_truth.tracks.obs_track_idx[seen]]
     xy = scene.observed.tracks.obs_xy[seen].copy()
     rng = np.random.default_rng(0)
     wrong = rng.permutation(len(xy))[: len(xy) // 4]
     xy[wrong] += rng.uniform(50, 300, (len(wrong), 2))
-    found = sfmapp.estimate_pose(xyz, xy, scene.truth.cameras[0])
+    found = sfmapp.estimate_pose(xyz, xy, scene.ground_truth.cameras[0])
     assert not found.is_inlier[wrong].any()
     assert found.is_inlier.sum() == len(xy) - len(wrong)
-    error = rigid3.compose(found.cam_from_world, rigid3.inverse(scene.truth.cam_from_world[1]))
+    error = rigid3.compose(found.cam_from_world, rigid3.inverse(scene.ground_truth.cam_from_world[1]))
     deviation = np.concatenate([rigid3.log_so3(rigid3.rotation_matrix(error)), error[4:]])
     # six degrees of freedom: a squared Mahalanobis distance of 22.5 is exceeded once in a thousand
     assert deviation @ np.linalg.solve(found.covariance, deviation) < 22.5
     with pytest.raises(sfmapp.NoReconstructionError, match="four of"):
-        sfmapp.estimate_pose(xyz, rng.uniform(0, 500, xy.shape), scene.truth.cameras[0], max_error_px=0.01)
+        sfmapp.estimate_pose(xyz, rng.uniform(0, 500, xy.shape), scene.ground_truth.cameras[0], max_error_px=0.01)
 
 
 def test_two_views_verified_by_hand(scene: SyntheticScene) -> None:
     pairs = true_correspondences(scene)
     i, j = pairs.pair_image_idx[0]
-    truth, camera = scene.truth, dataclasses.replace(scene.truth.cameras[0], focal_source="user")
+    truth, camera = scene.ground_truth, dataclasses.replace(scene.ground_truth.cameras[0], focal_source="user")
     common = np.intersect1d(
         truth.tracks.obs_track_idx[truth.tracks.observations_of_image(i)],
         truth.tracks.obs_track_idx[truth.tracks.observations_of_image(j)],
@@ -237,7 +235,7 @@ def test_views_show_the_arrays(scene: SyntheticScene) -> None:
 
 @pytest.mark.parametrize("text", [False, True])
 def test_load_refine_and_save_round_trip(scene: SyntheticScene, tmp_path: Path, text: bool) -> None:
-    sfmapp.Reconstruction.of(scene.truth).save(tmp_path / "sparse/0", text=text)
+    sfmapp.Reconstruction.of(scene.ground_truth).save(tmp_path / "sparse/0", text=text)
     model = sfmapp.load(tmp_path)
     assert model.cam_from_world.tolist() == sfmapp.load(tmp_path / "sparse/0").cam_from_world.tolist()
     np.testing.assert_allclose(model.residuals_px(), 0.0, atol=1e-9)

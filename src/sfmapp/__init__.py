@@ -19,6 +19,19 @@ if TYPE_CHECKING:
     from sfmapp.adjust.solver import AdjustOptions
     from sfmapp.api.geometry import adjust_bundle, estimate_pose, triangulate, verify_pair
     from sfmapp.api.images import load_images
+    from sfmapp.api.jobs import (
+        RunResult,
+        TrackResult,
+        densify,
+        evaluate,
+        export,
+        make_mesh,
+        reconstruct,
+        refine,
+        track_sequence,
+        undistort,
+        validate,
+    )
     from sfmapp.api.reconstruction import Reconstruction, load
     from sfmapp.api.stages import Matcher, extract_features, map_images, match_images
     from sfmapp.camera.camera import Camera, CameraModel
@@ -33,22 +46,21 @@ if TYPE_CHECKING:
     from sfmapp.events import Event, Events
     from sfmapp.features.extract import FeatureOptions
     from sfmapp.geometry.rigid3 import Rigid3
+    from sfmapp.images.array_sequence import ArraySequence
     from sfmapp.images.image_set import ImageOptions, ImageSet, ImageSource
     from sfmapp.mapping.options import MappingOptions
     from sfmapp.matching.options import MatchingOptions
     from sfmapp.matching.pairs import PairOptions
-    from sfmapp.pipelines.odometry import TrackResult, track_sequence
-    from sfmapp.pipelines.options import Options, load_options
-    from sfmapp.pipelines.reconstruct import RunResult, reconstruct
-    from sfmapp.pipelines.refine import RefineResult, refine
-    from sfmapp.pipelines.undistort import UndistortResult, undistort
     from sfmapp.scene.correspondences import Correspondences
     from sfmapp.scene.features import DescriptorMetric, Features
+    from sfmapp.scene.rig import Rig
     from sfmapp.scene.tracks import Tracks
+    from sfmapp.workspace.options import Options, load_options
 
 __version__ = "0.1.0"
 __all__ = [
     "AdjustOptions",
+    "ArraySequence",
     "Camera",
     "CameraModel",
     "Correspondences",
@@ -69,21 +81,24 @@ __all__ = [
     "Options",
     "PairOptions",
     "Reconstruction",
-    "RefineResult",
+    "Rig",
     "Rigid3",
     "RunResult",
     "SfmError",
     "TooFewImagesError",
     "TrackResult",
     "Tracks",
-    "UndistortResult",
     "UsageError",
     "adjust_bundle",
+    "densify",
     "estimate_pose",
+    "evaluate",
+    "export",
     "extract_features",
     "load",
     "load_images",
     "load_options",
+    "make_mesh",
     "map_images",
     "match_images",
     "reconstruct",
@@ -91,11 +106,13 @@ __all__ = [
     "track_sequence",
     "triangulate",
     "undistort",
+    "validate",
     "verify_pair",
 ]
 
 _HOMES = {
     "AdjustOptions": "adjust.solver",
+    "ArraySequence": "images.array_sequence",
     "Camera": "camera.camera",
     "CameraModel": "camera.camera",
     "Correspondences": "scene.correspondences",
@@ -113,31 +130,35 @@ _HOMES = {
     "Matcher": "api.stages",
     "MatchingOptions": "matching.options",
     "NoReconstructionError": "errors",
-    "Options": "pipelines.options",
+    "Options": "workspace.options",
     "PairOptions": "matching.pairs",
     "Reconstruction": "api.reconstruction",
-    "RefineResult": "pipelines.refine",
+    "Rig": "scene.rig",
     "Rigid3": "geometry.rigid3",
-    "RunResult": "pipelines.reconstruct",
+    "RunResult": "api.jobs",
     "SfmError": "errors",
     "TooFewImagesError": "errors",
-    "TrackResult": "pipelines.odometry",
+    "TrackResult": "api.jobs",
     "Tracks": "scene.tracks",
-    "UndistortResult": "pipelines.undistort",
     "UsageError": "errors",
     "adjust_bundle": "api.geometry",
+    "densify": "api.jobs",
     "estimate_pose": "api.geometry",
+    "evaluate": "api.jobs",
+    "export": "api.jobs",
     "extract_features": "api.stages",
     "load": "api.reconstruction",
     "load_images": "api.images",
-    "load_options": "pipelines.options",
+    "load_options": "workspace.options",
+    "make_mesh": "api.jobs",
     "map_images": "api.stages",
     "match_images": "api.stages",
-    "reconstruct": "pipelines.reconstruct",
-    "refine": "pipelines.refine",
-    "track_sequence": "pipelines.odometry",
+    "reconstruct": "api.jobs",
+    "refine": "api.jobs",
+    "track_sequence": "api.jobs",
     "triangulate": "api.geometry",
-    "undistort": "pipelines.undistort",
+    "undistort": "api.jobs",
+    "validate": "api.jobs",
     "verify_pair": "api.geometry",
 }
 

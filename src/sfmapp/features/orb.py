@@ -21,7 +21,7 @@ def extract_orb(
         max_num_features: the strongest so many are kept.
 
     Returns:
-        (N, 4) float32 x, y in house pixels, scale in pixels, orientation in radians, largest scale first;
+        (N, 4) float32 x, y in COLMAP's pixels, scale in pixels, orientation in radians, largest scale first;
         (N, 32) uint8 of packed bits.
     """
     import cv2

@@ -76,7 +76,7 @@ class _Octave:
     step: float
 
     def xy(self) -> NDArray[np.float64]:
-        """(N, 2) house pixels. The corner of the first pixel is the origin at every resolution up to the doubled
+        """(N, 2) COLMAP's pixels. The corner of the first pixel is the origin at every resolution up to the doubled
         one; from there on every second pixel is dropped, which keeps the centre of the first."""
         return self.found[:, :2] * self.step + 0.5 / _UPSAMPLING
 
@@ -103,7 +103,7 @@ def extract_sift(
         scratch: memory that the next image in this thread can use again; None: taken anew.
 
     Returns:
-        (N, 4) float32 x, y in house pixels, scale in pixels, orientation in radians from x towards y (which points
+        (N, 4) float32 x, y in COLMAP's pixels, scale in pixels, orientation in radians from x towards y (which points
         down), largest scale first; (N, 128) uint8 descriptors as COLMAP stores them; the contrast threshold in use.
     """
     threshold = _threshold(gray, contrast_threshold)

@@ -66,7 +66,7 @@ class TwoViews:
 
 
 @dataclass
-class Beginning:
+class MapInitializer:
     """Follows corners from a first view until two views make a map.
 
     Attributes:
