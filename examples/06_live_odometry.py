@@ -24,7 +24,7 @@ def main(video: str, focal_px: str) -> None:
     camera = sfmapp.Camera(sfmapp.CameraModel.PINHOLE, width, height, [focal, focal, width / 2, height / 2])
     frames = sfmapp.ArraySequence(grab(capture), camera, fps=30)
     # NaN as long as there is no map
-    odometry, _ = sfmapp.track_sequence(frames, on_frame=lambda frame: print(frame.name, frame.cam_from_world))
+    odometry, _ = sfmapp.track_sequence(frames, on_frame=lambda frame: print(frame.name, frame.cam_from_world.round(3)))
     tracked = np.isfinite(odometry.cam_from_world[:, 0])
     keyframes = odometry.maps[0].reconstruction
     print(f"{tracked.sum()} of {len(tracked)} frames have a pose, {len(keyframes.images)} are keyframes")

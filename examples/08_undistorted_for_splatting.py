@@ -9,7 +9,7 @@ import sfmapp
 
 
 def main(photos: str, output: str, splat: str) -> None:
-    sfmapp.reconstruct(photos, output)
+    sfmapp.reconstruct(photos, output, record=False)
     result = sfmapp.undistort(output, splat, blank_pixels=0.0, max_size=1600)
     model = sfmapp.load(result.output)
     for camera in model.cameras:

@@ -153,10 +153,9 @@ def triangulate(
     empty = arrays.Reconstruction.empty(
         lenses, [str(i) for i in range(len(poses))], np.arange(len(poses), dtype=np.int32), tracks
     )
-    canonical, fisheye = empty.canonical_cameras()
     triangulate_tracks(
         np.arange(tracks.num_tracks), tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy,
-        rigid3.rotation_matrix(poses), poses[:, 4:].copy(), empty.image_camera_idx, canonical, fisheye,
+        rigid3.rotation_matrix(poses), poses[:, 4:].copy(), empty.image_camera_idx, empty.canonical_cameras(),
         max_error_px, math.radians(min_angle_deg), empty.point_xyz, empty.obs_is_inlier,
     )  # fmt: skip
     is_inlier = np.zeros(pixels.shape[:2], bool)
@@ -202,7 +201,7 @@ def estimate_pose(
             "check the camera, and that pixels and points belong together row by row",
         )
     refined = refine_pose(
-        camera.canonical, camera.is_fisheye, found.cam_from_world, points[found.is_inlier], pixels[found.is_inlier],
+        camera.canonical, found.cam_from_world, points[found.is_inlier], pixels[found.is_inlier],
         inlier_px=inlier_px,
     )  # fmt: skip
     errors = np.linalg.norm(project(camera, rigid3.apply(refined.cam_from_world, points)) - pixels, axis=1)
