@@ -282,3 +282,18 @@ def test_copies_stay_what_they_are(scene: SyntheticScene) -> None:
     copy.cam_from_world[0] = 0.0
     assert (model.cam_from_world[0] != 0.0).any()
     assert sfmapp.Reconstruction.of(model) is model
+
+
+def test_one_call_gives_the_same_with_and_without_a_folder(photos: Path, tmp_path: Path) -> None:
+    options = sfmapp.load_options(settings=["features.max_num_features=800"])
+    in_memory, report = sfmapp.reconstruct(photos, options=options, seed=2, threads=1)
+    assert report is None
+    written, _ = sfmapp.reconstruct(photos, tmp_path / "out", options, record=False, seed=2, threads=2)
+    assert in_memory.cam_from_world.tobytes() == written.cam_from_world.tobytes()
+    assert in_memory.points.xyz.tobytes() == written.point_xyz.tobytes()
+    in_memory.save(tmp_path / "saved")
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        saved, ours = tmp_path / "saved" / name, tmp_path / "out" / "sparse" / "0" / name
+        assert saved.read_bytes() == ours.read_bytes(), name
+    with pytest.raises(sfmapp.UsageError, match="photographs that are files"):
+        sfmapp.reconstruct({"a": np.zeros((20, 20), np.uint8)}, tmp_path / "none")
