@@ -56,7 +56,8 @@ class KeyframeImages:
         Args:
             frame_idx, image_idx: (K,) the frame that each keyframe is, and its image in the reconstruction.
         """
-        images, ids, corners = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((0, 4, 2))]
+        none = MarkerSightings.none()
+        images, ids, corners = [none.image_idx], [none.marker_id], [none.corners]
         for frame, image in zip(frame_idx.tolist(), image_idx, strict=True):
             if (seen := self._seen.get(frame)) is not None:
                 images.append(np.full(len(seen.marker_id), image, np.int64))
