@@ -105,7 +105,7 @@ def resolve_scale_request(scale_request: ScaleRequest | None, is_auto: bool, seq
 def scale_maps(
     result: OdometryResult, scale_request: ScaleRequest, imu: Imu | None, events: Events
 ) -> list[dict[str, Any]]:
-    """Put each map in metres that the wish can be had for, in place; returns a row for each, with the evidence."""
+    """Put each map in metres that the request can be met for, in place; returns a row for each, with the evidence."""
     rows = []
     for m in range(len(result.maps)):
         found = _estimate(result, m, scale_request, imu)

@@ -63,7 +63,7 @@ class Tracking(Job):
         frames: what was told of each frame.
         threads_cpu: CPU time by thread.
         live: draws what happens; None if nobody looks.
-        wish: what the unit of length is to come from; None: an arbitrary one will do.
+        scale_request: what the unit of length is to come from; None: an arbitrary one will do.
         sequence: once it is open.
     """
 
