@@ -1,0 +1,1 @@
+"""What Python sees: one call, the stages, the parts."""

@@ -36,6 +36,7 @@ def match_sift(
 
 
 def passes_ratio(best: Indices, second: Indices, max_ratio: float, max_distance: float) -> NDArray[np.bool_]:
+    """Whether best matches, given as inner products like the second best, pass Lowe's ratio and the distance."""
     d_best = np.sqrt(np.maximum(2.0 - best * (2.0 / _SIFT_NORM2), 0.0))
     d_second = np.sqrt(np.maximum(2.0 - second * (2.0 / _SIFT_NORM2), 0.0))
     return (d_best < max_ratio * d_second) & (d_best <= max_distance)

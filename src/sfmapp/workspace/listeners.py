@@ -29,6 +29,7 @@ def event_to_dict(event: Event) -> dict[str, Any]:
 
 
 def without_arrays(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The data of an event without the arrays that only recordings want."""
     return {key: value for key, value in data.items() if key != ARRAYS_KEY}
 
 

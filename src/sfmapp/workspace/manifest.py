@@ -57,10 +57,12 @@ def manifest_of(folder: Path) -> dict[str, Any] | None:
 
 
 def new_manifest(command: str) -> dict[str, Any]:
+    """The manifest of a workspace that a command begins."""
     return {"format": FORMAT, "command": command, "stages": {}, "inputs": {}}
 
 
 def check_command(folder: Path, manifest: dict[str, Any], command: str) -> None:
+    """Raise UsageError if the workspace is that of another command."""
     found = manifest.get("command", RECONSTRUCT)
     if found != command:
         raise UsageError(
@@ -90,6 +92,7 @@ def recorded_versions() -> dict[str, str]:
 
 
 def read_json(path: Path) -> Any:
+    """A JSON file; None if it is not there or damaged."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

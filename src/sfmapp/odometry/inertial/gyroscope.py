@@ -138,6 +138,7 @@ def integrate_rotation(steps: Array, gyro_bias: Array, turn: Array) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def multiply(a: Array, b: Array, out: Array) -> None:
+    """Product of two 3 x 3 matrices; out is neither of them."""
     for i in range(3):
         for j in range(3):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
