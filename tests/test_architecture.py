@@ -1,4 +1,4 @@
-"""The house rules that a machine can hold: imports run downward, heavy packages stay where they belong."""
+"""The rules that a machine can hold: imports run downward, heavy packages stay where they belong."""
 
 from __future__ import annotations
 

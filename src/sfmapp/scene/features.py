@@ -13,7 +13,7 @@ class Features:
     """Keypoints of one image, largest scale first (ties by x, then y), so that a prefix is the coarse subset.
 
     Attributes:
-        keypoints: (N, 4) float32: x, y in house pixels of the oriented, full-size image (top-left pixel centre at
+        keypoints: (N, 4) float32: x, y in COLMAP's pixels of the oriented, full-size image (top-left pixel centre at
             0.5, 0.5); scale in pixels (COLMAP's sigma); orientation in radians.
         descriptors: (N, 128) uint8 RootSIFT times 512 as COLMAP stores it, or (N, 32) uint8 packed bits for ORB.
         rgb: (N, 3) uint8 colour of the pixel under each keypoint.
