@@ -38,6 +38,7 @@ FLOORS = (
     ("contradictions",),
     ("events",),
     ("errors", "children", "kernel_cache"),
+    ("reporting",),
 )
 LEVEL = {room: level for level, floor in enumerate(FLOORS) for room in floor}
 ALLOWED = {
@@ -102,7 +103,7 @@ def test_library_does_not_print_exit_or_configure_logging(path: Path) -> None:
 
 def test_every_room_has_a_floor() -> None:
     rooms = {path.parent.name for path in SOURCE.glob("*/__init__.py")}
-    assert rooms | {"contradictions", "events", "errors", "children", "kernel_cache"} == set(LEVEL)
+    assert rooms | {"contradictions", "events", "errors", "children", "kernel_cache", "reporting"} == set(LEVEL)
 
 
 @pytest.mark.parametrize("job", ["demo", "test"])

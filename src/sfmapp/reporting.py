@@ -3,7 +3,7 @@
 A report is made by subclassing :class:`Report`; HTML, terminal and JSON are renderings of the same objects. Nothing is
 computed from a report that was written: what a later run needs stands in the results or in ``run.json``.
 
-:func:`json_default` is the one place that knows how values become JSON, :func:`from_plain` the one that reads them back.
+:func:`json_default` alone knows how values become JSON, and :func:`from_plain` how they come back.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Plain: TypeAlias = "bool | int | float | str | Sequence[Plain] | Mapping[str, Pl
 @dataclass_transform(frozen_default=True, kw_only_default=True, eq_default=False, field_specifiers=(field,))
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Report(Mapping[str, Any]):
-    """Base of all reports. A subclass is a frozen dataclass whose arguments are given by name, unless it says ``kw_only=False``.
+    """Base of all reports: a subclass is a frozen dataclass, its arguments given by name (unless ``kw_only=False``).
 
     It reads as a mapping from the names of its fields to their values as well, so ``report["models"][0]["num_points"]``
     is ``report.models[0].num_points``, and equals any mapping with the same entries. Fields hold numbers, text, other

@@ -62,14 +62,14 @@ class CloudScoreSummary(Report):
     """Scores of a cloud; see :mod:`sfmapp.evaluation.clouds`.
 
     Attributes:
-        num_points, num_truth: points that were scored, of the result and of the ground truth.
+        num_points, num_ground_truth: points that were scored, of the result and of the ground truth.
         median_error: distance of the points that are near a true one; None without any.
         scores: by ascending distance.
     """
 
     num_points: int
     num_points_left_out: int
-    num_truth: int
-    num_truth_left_out: int
+    num_ground_truth: int
+    num_ground_truth_left_out: int
     median_error: float | None
     scores: Sequence[ScoreAt]

@@ -8,13 +8,13 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from statistics import median, pstdev
-from typing import Any
 
 from sfmapp.camera.camera import Camera, simple_camera
 from sfmapp.errors import UsageError
 from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.images.exif import ExifFacts, FocalPrior, focal_prior
 from sfmapp.images.image_set import ImageOptions
+from sfmapp.images.report import CameraPrior
 from sfmapp.scene.turned_camera import turned_back
 
 # Trust in what a user gives without fixing it: a focal length copied from a data sheet, or a calibration.
@@ -42,7 +42,7 @@ class Shot:
 
 def group_cameras(
     shots: Sequence[Shot], options: ImageOptions
-) -> tuple[list[Camera], list[int], list[dict[str, Any]], list[tuple[str, str]]]:
+) -> tuple[list[Camera], list[int], list[CameraPrior], list[tuple[str, str]]]:
     """Cameras, the camera index of each shot, a report entry per camera, and warnings.
 
     ``auto`` shares a camera between shots with the same make, model, lens, serial number, focal length and size. Where
@@ -50,7 +50,7 @@ def group_cameras(
     if nearly all of it has one size; otherwise the photographs may come from anyone, and each has a camera of its own.
 
     Returns:
-        cameras in order of first use; camera_idx per shot; JSON-able dicts; (image name, problem) pairs.
+        cameras in order of first use; camera_idx per shot; what is known of each camera; (image name, problem) pairs.
 
     Raises:
         UsageError: ``camera_params`` with images of several sizes, or for pictures that EXIF's orientation has turned.
@@ -77,22 +77,22 @@ def group_cameras(
             _check_not_of_upright(camera, [shots[i] for i in group])
         cameras.append(camera)
         entries.append(
-            {
-                "camera_idx": camera_idx,
-                "num_images": len(group),
-                "model": camera.model.name,
-                "width": camera.width,
-                "height": camera.height,
-                "params": [float(value) for value in camera.params],
-                "focal_px": camera.focal,
-                "focal_sigma_px": camera.focal_sigma,
-                "focal_source": camera.focal_source,
-                "focal_reason": reason,
-                "is_fixed": camera.is_fixed,
-                "make": shot.facts.make,
-                "camera": shot.facts.model,
-                "sharing": rules[group[0]],
-            }
+            CameraPrior(
+                camera_idx=camera_idx,
+                num_images=len(group),
+                model=camera.model.name,
+                width=camera.width,
+                height=camera.height,
+                params=[float(value) for value in camera.params],
+                focal_px=camera.focal,
+                focal_sigma_px=camera.focal_sigma,
+                focal_source=camera.focal_source,
+                focal_reason=reason,
+                is_fixed=camera.is_fixed,
+                make=shot.facts.make,
+                camera=shot.facts.model,
+                sharing=rules[group[0]],
+            )
         )
     return cameras, [index[key] for key in keys], entries, warnings
 

@@ -47,11 +47,22 @@ class FocalReport(Report):
     kept: Literal["as_given", "as_unknown"] | None = None
 
 
-class DroppedPair(Report):
-    """A verified pair that mapping was repeated without."""
+class NamedPair(Report):
+    """A verified pair of images; ``num_agreeing``: matches that agree with the model, ``num_shared_points``: those that
+    are points of it."""
 
     images: Sequence[str]
     num_matches: int
+    num_agreeing: int | None = None
+    num_shared_points: int | None = None
+
+
+class NearPair(Report):
+    """A pair of images side by side: points that both should see, and those that they do."""
+
+    images: Sequence[str]
+    num_visible: int
+    num_shared: int
 
 
 class LookAlikesReport(Report):
@@ -67,7 +78,7 @@ class LookAlikesReport(Report):
     num_matches_dropped: int | None = None
     num_matches_against_before: int | None = None
     num_matches_against: int | None = None
-    pairs: Sequence[DroppedPair] | None = None
+    pairs: Sequence[NamedPair] | None = None
 
 
 class InitialPairReport(Report):
@@ -109,13 +120,13 @@ class FocalEvidence(Report):
     """What the photographs tell of a focal length; empty where no uncertainty is known.
 
     Attributes:
-        data_sigma_px: standard deviation by the photographs alone; None: they do not tell it.
+        data_sigma_px: standard deviation by the photographs alone; absent: they do not tell it.
         prior_sigma_px: that of what was known before.
         is_determined: they tell more than was known.
         is_prior_left_out: they refute what was known.
     """
 
-    data_sigma_px: float | None
+    data_sigma_px: float | None = None
     prior_sigma_px: float | None = None
     is_determined: bool | None = None
     is_prior_left_out: bool | None = None
@@ -162,12 +173,17 @@ class Uncertainty(Report):
     images: Mapping[str, ImageSigmas] | None = None
 
 
-class ModelReport(ModelSummary):
+class ModelEntry(ModelSummary):
     """A model; ``apart``: why it is not one with another, empty if there is no reason."""
 
-    uncertainty: Uncertainty
     contradictions: Sequence[Contradiction]
     apart: str
+
+
+class ModelReport(ModelEntry):
+    """A model and how sure it is."""
+
+    uncertainty: Uncertainty
 
 
 class MappingReport(Report):

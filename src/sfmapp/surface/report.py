@@ -14,7 +14,7 @@ class TextureReport(Report):
         scale: texels for a pixel of the photographs, a side.
         width, height: texels.
         seen: share of the area that a photograph shows.
-        seam_before, seam_after: root mean square difference of the colours at seams, of 255, before and after levelling.
+        seam_before, seam_after: root mean square difference of the colours at seams, of 255; after levelling.
     """
 
     num_charts: int
