@@ -27,7 +27,6 @@ from sfmapp.evaluation.trajectory import Trajectory
 from sfmapp.formats.clocks import Times, Unit, parse_time, read_column
 from sfmapp.formats.text_input import read_limited_text
 from sfmapp.geometry import rigid3
-from sfmapp.images.sequence import SequenceKind
 
 Array = NDArray[np.float64]
 TrajectoryFormat = Literal["tum", "kitti", "euroc"]
@@ -54,7 +53,7 @@ class TrajectoryFile:
     """
 
     path: Path
-    format: TrajectoryFormat | SequenceKind
+    format: TrajectoryFormat | Literal["folder", "video"]
     trajectory: Trajectory
     is_numbered: bool = False
     note: str = ""

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.calibration.reading import Calibration, read_calibration, read_pose
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.clocks import Times, parse_time, read_column
@@ -21,7 +22,6 @@ from sfmapp.formats.trajectory_input import TrajectoryFile, read_trajectory
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import STAGE, GroundTruth, Imu
 from sfmapp.scene.rig import Rig
-from sfmapp.sequences.calibration_file import Calibration, read_calibration, read_pose
 from sfmapp.sequences.files import (
     Recording,
     Size,

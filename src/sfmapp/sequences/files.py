@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.calibration.reading import Calibration
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.clocks import Times, are_dates, parse_time, read_column, times_of_names
@@ -24,7 +25,6 @@ from sfmapp.images.frame_reader import LARGEST_FRAME_PX, read_regular_file, some
 from sfmapp.images.headers import UnusableImage, read_header
 from sfmapp.images.sequence import STAGE, GroundTruth, Imu, SequenceKind
 from sfmapp.images.sources import is_picture, natural_key, printable
-from sfmapp.sequences.calibration_file import Calibration
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]

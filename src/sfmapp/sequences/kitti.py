@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sfmapp.calibration.reading import kitti_calibration
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.text_input import nearest_rotation, plain_numbers
 from sfmapp.geometry import rigid3
-from sfmapp.sequences.calibration_file import kitti_calibration
 from sfmapp.sequences.files import (
     Recording,
     common_size,

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.calibration.opencv_lens import sampling_map
+from sfmapp.calibration.reading import Calibration, camera_from_text, read_calibration
 from sfmapp.camera.camera import Camera, CameraModel, simple_camera
 from sfmapp.errors import InputError
 from sfmapp.events import Events
@@ -26,7 +28,6 @@ from sfmapp.images.sources import EXTENSIONS, printable
 from sfmapp.images.video import DEFAULT_FPS, VideoSequence, is_stream, read_video_facts
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.turned_camera import turned_back, turned_camera
-from sfmapp.sequences.calibration_file import Calibration, camera_from_text, read_calibration
 from sfmapp.sequences.euroc import euroc_ground_truth, find_mav, read_euroc_sequence, read_imu
 from sfmapp.sequences.files import (
     Recording,
@@ -38,7 +39,6 @@ from sfmapp.sequences.files import (
 )
 from sfmapp.sequences.kitti import FRAMES_PER_SECOND as KITTI_FPS
 from sfmapp.sequences.kitti import is_kitti, read_kitti, read_kitti_sequence
-from sfmapp.sequences.opencv_lens import sampling_map
 from sfmapp.sequences.plain import (
     find_calibration,
     find_pair,

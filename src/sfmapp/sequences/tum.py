@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.calibration.opencv_lens import camera_from_opencv, scaled_to
+from sfmapp.calibration.reading import Calibration
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.clocks import Times, parse_time, read_column
@@ -16,7 +18,6 @@ from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import GroundTruth
 from sfmapp.images.sources import EXTENSIONS
 from sfmapp.scene.rig import Rig
-from sfmapp.sequences.calibration_file import Calibration
 from sfmapp.sequences.files import (
     Recording,
     Size,
@@ -29,7 +30,6 @@ from sfmapp.sequences.files import (
     times_in_names,
     warn_of_missing,
 )
-from sfmapp.sequences.opencv_lens import camera_from_opencv, scaled_to
 
 Array = NDArray[np.float64]
 

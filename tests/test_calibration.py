@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sfmapp.calibration.opencv_lens import FullLens, camera_from_opencv, sampling_map
+from sfmapp.calibration.reading import read_calibration
 from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.errors import InputError
 from sfmapp.formats.flat_yaml import parse_flat_yaml
 from sfmapp.geometry import rigid3
-from sfmapp.sequences.calibration_file import read_calibration
-from sfmapp.sequences.opencv_lens import FullLens, camera_from_opencv, sampling_map
 
 SIZE = (640, 480)
 MATRIX = np.array([[500.0, 0, 319.0], [0, 501.0, 239.0], [0, 0, 1]])

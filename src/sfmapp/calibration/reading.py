@@ -17,15 +17,8 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, simple_camera
-from sfmapp.errors import InputError, UsageError
-from sfmapp.formats.colmap_model import MODEL_NAMES
-from sfmapp.formats.flat_yaml import parse_flat_yaml
-from sfmapp.formats.text_input import nearest_rotation, read_json_object, read_limited_text
-from sfmapp.geometry import rigid3
-from sfmapp.scene.rig import Rig
-from sfmapp.sequences.lens_types import LensType, is_without_distortion, lens_type, named_coefficients, type_fields
-from sfmapp.sequences.opencv_lens import (
+from sfmapp.calibration.lens_types import LensType, is_without_distortion, lens_type, named_coefficients, type_fields
+from sfmapp.calibration.opencv_lens import (
     SIGMA_CALIBRATED,
     CalibratedCamera,
     FullLens,
@@ -34,7 +27,14 @@ from sfmapp.sequences.opencv_lens import (
     camera_from_opencv,
     scaled_to,
 )
-from sfmapp.sequences.slam_settings import orb_slam_fields, vins_fields
+from sfmapp.calibration.slam_settings import orb_slam_fields, vins_fields
+from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, simple_camera
+from sfmapp.errors import InputError, UsageError
+from sfmapp.formats.colmap_model import MODEL_NAMES
+from sfmapp.formats.flat_yaml import parse_flat_yaml
+from sfmapp.formats.text_input import nearest_rotation, read_json_object, read_limited_text
+from sfmapp.geometry import rigid3
+from sfmapp.scene.rig import Rig
 
 Array = NDArray[np.float64]
 
@@ -104,7 +104,7 @@ def read_calibration(path: str | Path, image_sizes: Sequence[Size]) -> Calibrati
     ``sensor.yaml``, Kalibr's ``camchain.yaml``, ROS's ``camera_info.yaml``, OpenCV's yml and xml (``camera_matrix`` or
     ``M1``, ``D1``, ``M2``, ``D2``, ``R``, ``T``), settings of ORB-SLAM and VINS-Fusion, KITTI's ``calib.txt``, and
     plain text of ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` or of the 3 x 3 matrix. What they call the lens counts: see
-    :mod:`sfmapp.sequences.lens_types`.
+    :mod:`sfmapp.calibration.lens_types`.
 
     Args:
         image_sizes: (width, height) of the images of each camera that is wanted; a calibration of another size but the
