@@ -21,7 +21,7 @@ from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.errors import InputError
 from sfmapp.formats.database import Database
 from sfmapp.scene.correspondences import Correspondences
-from sfmapp.scene.features import Features
+from sfmapp.scene.features import DescriptorMetric, Features
 from sfmapp.scene.synthetic import SyntheticScene, make_scene, synthetic_camera, true_correspondences
 
 
@@ -30,7 +30,8 @@ def features_of(scene: SyntheticScene, image: int, orb: bool = False) -> Feature
     xy = scene.keypoints(image)
     keypoints = np.concatenate([xy, rng.uniform(1, 9, (len(xy), 1)), rng.uniform(-3, 3, (len(xy), 1))], 1)
     descriptors = rng.integers(0, 256, (len(xy), 32 if orb else 128), np.uint8)
-    return Features(keypoints.astype(np.float32), descriptors, rng.integers(0, 256, (len(xy), 3), np.uint8))
+    metric = DescriptorMetric.HAMMING if orb else DescriptorMetric.ROOT_SIFT
+    return Features(keypoints.astype(np.float32), descriptors, rng.integers(0, 256, (len(xy), 3), np.uint8), metric)
 
 
 def filled(
@@ -48,7 +49,7 @@ def filled(
 
 def assert_equal(a: Correspondences | Features, b: Correspondences | Features) -> None:
     for field in dataclasses.fields(a):
-        ours, theirs = getattr(a, field.name), getattr(b, field.name)
+        ours, theirs = np.asarray(getattr(a, field.name)), np.asarray(getattr(b, field.name))
         assert ours.dtype == theirs.dtype, field.name
         np.testing.assert_array_equal(ours, theirs, err_msg=field.name)
 

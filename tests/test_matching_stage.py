@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from sfmapp.camera.camera import Camera, CameraModel, project, simple_camera
-from sfmapp.errors import InterruptedRunError
+from sfmapp.errors import InputError, InterruptedRunError
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3
+from sfmapp.matching import euclidean
 from sfmapp.matching.stage import MatchedPair, MatchingOptions, compile_kernels, join_pairs, match_images, split_pairs
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
-from sfmapp.scene.features import Features
+from sfmapp.scene.features import DescriptorMetric, Features
 
 CAMERA = simple_camera(CameraModel.SIMPLE_RADIAL, 1000, 800, 900.0, 20.0, "exif_35mm")
 
@@ -138,7 +139,7 @@ def test_a_stop_keeps_what_is_done_and_tells_of_progress() -> None:
 def test_odd_inputs_give_empty_pairs() -> None:
     features, _, _ = make_features(2, 300, seed=4)
     empty = Features(np.empty((0, 4), np.float32), np.empty((0, 128), np.uint8), np.empty((0, 3), np.uint8))
-    one = Features(*(getattr(features[0], f.name)[:1] for f in fields(Features)))
+    one = Features(features[0].keypoints[:1], features[0].descriptors[:1], features[0].rgb[:1])
     alike = Features(
         features[0].keypoints, np.tile(features[0].descriptors[:1], (len(features[0]), 1)), features[0].rgb
     )
@@ -173,11 +174,74 @@ def test_binary_descriptors_match_as_well() -> None:
     rng = np.random.default_rng(7)
     features, shown, _ = make_features(2, 500, seed=7)
     bits = rng.integers(0, 256, (500, 32)).astype(np.uint8)
-    binary = [Features(f.keypoints, bits[idx], f.rgb) for f, idx in zip(features, shown, strict=True)]
+    binary = [
+        Features(f.keypoints, bits[idx], f.rgb, DescriptorMetric.HAMMING)
+        for f, idx in zip(features, shown, strict=True)
+    ]
     found, _ = run(binary)
     assert found.config[0] == TwoViewConfig.CALIBRATED
     matches = found.matches_of_pair(0)
     assert (shown[0][matches[:, 0]] == shown[1][matches[:, 1]]).all()
+
+
+@pytest.mark.parametrize("length", [64, 128, 256])
+@pytest.mark.parametrize("size", [1.0, 37.0])
+def test_descriptors_of_a_network_match_by_their_own_metric(length: int, size: float) -> None:
+    rng = np.random.default_rng(8)
+    features, shown, _ = make_features(2, 500, seed=8)
+    unit = rng.normal(0, 1, (500, length))
+    unit *= size / np.linalg.norm(unit, axis=1, keepdims=True)
+    noise = 0.1 * size / np.sqrt(length)
+    learned = [
+        Features.from_arrays(f.keypoints, unit[idx] + rng.normal(0, noise, (len(idx), length)))
+        for f, idx in zip(features, shown, strict=True)
+    ]
+    assert learned[0].descriptors.dtype == np.float32
+    found, _ = run(learned)
+    assert found.config[0] == TwoViewConfig.CALIBRATED
+    matches = found.matches_of_pair(0)
+    assert len(matches) > 100
+    assert (shown[0][matches[:, 0]] == shown[1][matches[:, 1]]).all()
+
+
+def test_euclidean_matches_are_those_of_plain_distances(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(9)
+    a = rng.normal(0, 1, (230, 16)).astype(np.float32)
+    b = np.concatenate([a[40:] + rng.normal(0, 0.3, (190, 16)).astype(np.float32), a[:5]])
+    monkeypatch.setattr(euclidean, "_BLOCK_PRODUCTS", 7 * len(b))  # many blocks, the last one short
+    distance = np.linalg.norm(a[:, None].astype(np.float64) - b[None], axis=2)
+    unit = np.sqrt((np.square(a).sum() + np.square(b).sum()) / (len(a) + len(b)))
+    expected = []
+    for i in range(len(a)):
+        j = int(distance[i].argmin())
+        of_row, of_column = np.sort(distance[i]), np.sort(distance[:, j])
+        is_mutual = distance[:, j].argmin() == i and of_row[0] <= 0.5 * unit
+        if is_mutual and of_row[0] < 0.8 * of_row[1] and of_column[0] < 0.8 * of_column[1]:
+            expected.append((i, j))
+    assert 50 < len(expected) < 200
+    np.testing.assert_array_equal(euclidean.match_euclidean(a, b, 0.8, 0.5), expected)
+    assert euclidean.match_euclidean(a[:0], b, 0.8, 0.5).shape == (0, 2)
+    assert euclidean.match_euclidean(a[:1], a[:1], 0.8, 0.5).tolist() == [[0, 0]]
+
+
+def test_features_of_two_kinds_and_wrong_arrays_are_refused() -> None:
+    xy = np.zeros((3, 2))
+    learned = Features.from_arrays(xy, np.ones((3, 64)))
+    bits = Features.from_arrays(xy, np.ones((3, 32), np.uint8), metric="hamming")
+    with pytest.raises(InputError, match="two kinds"):
+        run([learned, bits])
+    for wrong in (
+        {"keypoints": np.zeros((3, 5))},
+        {"keypoints": np.array([[np.nan, 0.0]])},
+        {"keypoints": xy, "descriptors": np.ones((2, 64))},
+        {"keypoints": xy, "descriptors": np.ones((3, 128)), "metric": "root_sift"},
+        {"keypoints": xy, "descriptors": np.ones((3, 64), np.uint8), "metric": "root_sift"},
+        {"keypoints": xy, "descriptors": np.ones((3, 32)), "metric": "hamming"},
+        {"keypoints": xy, "descriptors": np.ones((3, 64)), "metric": "cosine"},
+        {"keypoints": xy, "rgb": np.ones((3, 3))},
+    ):
+        with pytest.raises(InputError, match="expected"):
+            Features.from_arrays(**wrong)
 
 
 def test_kernels_compile_on_their_own() -> None:

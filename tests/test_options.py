@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 
 from sfmapp.camera.camera import CameraModel
 from sfmapp.errors import UsageError
+from sfmapp.odometry.options import OdometryOptions
+from sfmapp.option_checks import Range, positive
 from sfmapp.pipelines import resources
 from sfmapp.pipelines.options import (
     Options,
@@ -99,6 +101,53 @@ def test_wrong_settings_are_refused_by_name(setting: str, named: str, advice: st
     assert named in str(caught.value)
     if advice:
         assert advice in str(caught.value.advice)
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "matching.max_ratio=0", "matching.max_ratio=1.2", "matching.max_distance=-0.1", "matching.min_inliers=2",
+        "matching.min_e_f_ratio=1.1", "matching.max_error_px=0", "matching.max_ransac_trials=0",
+        "mapping.min_pose_inliers=0", "mapping.min_pose_inlier_ratio=50", "mapping.max_reprojection_error_px=-1",
+        "mapping.global_growth=0.5", "mapping.min_model_images=1", "mapping.min_initial_angle_deg=180",
+        "mapping.refine_principal_point=sometimes", "adjust.loss=welsch", "adjust.loss_scale_px=0",
+        "adjust.max_iterations=0", "adjust.initial_damping=-1e-4", "adjust.distortion_sigma=0",
+        "odometry.max_tracks=-600", "odometry.max_tracks=1e9", "odometry.keyframe_loss=65", "odometry.window=1",
+        "odometry.window_anchors=-1", "odometry.min_triangulation_deg=0", "odometry.max_lost_s=-1",
+        "odometry.motion=flying", "pairs.num_words=0", "features.memory_mb=0", "sequence.step=0", "images.max_pixels=0",
+    ],
+)  # fmt: skip
+def test_values_out_of_range_are_refused_by_name(setting: str) -> None:
+    name = setting.partition("=")[0]
+    with pytest.raises(UsageError, match=f"^{name}: expected .*, got "):
+        load_options(settings=[setting])
+
+
+def test_a_range_says_what_it_holds() -> None:
+    assert [str(r) for r in (Range(2, 8), Range(1), positive(), positive(2), Range(0.5, is_open=True))] == [
+        "2 to 8", "1 or more", "a positive number", "a positive number up to 2", "more than 0.5"
+    ]  # fmt: skip
+    assert [value in positive(2) for value in (0.0, 1e-300, 2.0, 2.1, float("nan"))] == [
+        False,
+        True,
+        True,
+        False,
+        False,
+    ]
+    assert [value in Range(0, 1) for value in (-1e-9, 0, 1, 1.1)] == [False, True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "expected"),
+    [
+        ({"max_tracks": 600.0}, "a whole number"), ({"max_tracks": True}, "a whole number"),
+        ({"keyframe_loss": "0.5"}, "a finite number"), ({"max_lost_s": float("inf")}, "a finite number"),
+        ({"loops": 1}, "true or false"), ({"motion": "wheels"}, "one of free, planar"), ({"window": None}, "a whole"),
+    ],
+)  # fmt: skip
+def test_options_made_in_code_are_checked_as_well(wrong: dict[str, Any], expected: str) -> None:
+    with pytest.raises(UsageError, match=f"odometry.{next(iter(wrong))}: expected {expected}"):
+        OdometryOptions(**wrong)
 
 
 @pytest.mark.parametrize("text", ["seed = ", "[nosuch]\na = 1", "[features]\nkind = 3", "features = 3", "seed = true"])

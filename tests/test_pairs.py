@@ -25,7 +25,8 @@ def records(names: list[str], **more: object) -> tuple[ImageRecord, ...]:
 
 def features_of(descriptors: np.ndarray) -> Features:
     num = len(descriptors)
-    return Features(np.zeros((num, 4), np.float32), descriptors, np.zeros((num, 3), np.uint8))
+    metric = "root_sift" if descriptors.shape[1] == 128 else "hamming"
+    return Features.from_arrays(np.zeros((num, 2)), descriptors, metric=metric)
 
 
 def plain(num: int) -> list[Features]:
@@ -45,6 +46,9 @@ def ring(num_images: int, num_seen: int, seed: int, width: int = 128) -> list[Fe
         if width == 128:
             changed = seen * rng.uniform(0.7, 1.3, seen.shape)
             descriptors = np.rint(512 * np.sqrt(changed / changed.sum(axis=1, keepdims=True))).clip(0, 255)
+        elif width == 64:
+            result.append(Features.from_arrays(np.zeros((num_seen, 2)), seen * rng.uniform(0.7, 1.3, seen.shape) - 0.5))
+            continue
         else:
             bits = (seen > np.median(points)) ^ (rng.random(seen.shape) < 0.05)
             descriptors = np.packbits(bits, axis=1)
@@ -102,7 +106,7 @@ def test_images_without_features_are_left_out_and_named() -> None:
     assert report["images_without_features"] == ["c"]
 
 
-@pytest.mark.parametrize("width", [128, 256])
+@pytest.mark.parametrize("width", [64, 128, 256])
 def test_retrieval_finds_the_neighbours_of_a_ring(width: int) -> None:
     num = 70
     features = ring(num, 120, seed=3, width=width)
@@ -120,7 +124,7 @@ def test_retrieval_finds_the_neighbours_of_a_ring(width: int) -> None:
     assert report["min_pairs_per_image"] >= 4
 
 
-@pytest.mark.parametrize("width", [128, 256])
+@pytest.mark.parametrize("width", [64, 128, 256])
 def test_same_pairs_on_any_number_of_threads(width: int) -> None:
     from threadpoolctl import threadpool_limits
 

@@ -18,6 +18,7 @@ from sfmapp.adjust.linear import aligned_zeros, assemble, factorize_tiles, mark_
 from sfmapp.adjust.problem import Problem, free_values, make_problem
 from sfmapp.camera.camera import PARAM_NAMES, Camera
 from sfmapp.events import Events
+from sfmapp.option_checks import Range, check_options, positive
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -30,6 +31,14 @@ _LOSS_SIGMAS = 2.0
 _MAX_DENSE_BLOCKS, _DENSE_SHARE = 160, 0.3
 # Work worth a chunk of its own, and the most memory that the chunks' private sums may take together.
 _CHUNK_OBSERVATIONS, _MAX_CHUNKS, _CHUNK_BYTES = 16384, 8, 1 << 26
+_RANGES = {
+    "loss_scale_px": positive(),
+    "max_iterations": Range(1, 100_000),
+    "relative_cost_tolerance": Range(0.0, 1.0),
+    "initial_damping": positive(),
+    "principal_point_sigma_px": positive(),
+    "distortion_sigma": positive(),
+}
 
 
 @dataclass(frozen=True)
@@ -47,6 +56,9 @@ class AdjustOptions:
     principal_point_sigma_px: float | None = None  # prior around the a priori principal point; None for no prior
     distortion_sigma: float | None = None  # prior of each coefficient around its a priori value; None for no prior
     backend: Literal["schur", "gtsam"] = "schur"  # schur: our kernels; gtsam: one factor per observation, the reference
+
+    def __post_init__(self) -> None:
+        check_options("adjust", self, _RANGES)
 
     @property
     def refine(self) -> tuple[bool, bool, bool]:

@@ -5,6 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sfmapp.errors import UsageError
+from sfmapp.option_checks import Range, check_options, positive
+
+_RANGES = {
+    "level": Range(0, 6),
+    "ground_sampling": positive(),
+    "cell_px": Range(1, 8),
+    "min_views": Range(2, 8),
+    "max_neighbors": Range(2, 16),
+    "max_memory_mb": Range(500),
+}
 
 
 @dataclass(frozen=True)
@@ -33,20 +43,9 @@ class DenseOptions:
     max_memory_mb: int = 3000
 
     def __post_init__(self) -> None:
-        if self.level is not None and not 0 <= self.level <= 6:
-            raise UsageError(f"dense.level: expected 0 to 6, got {self.level}")
-        if self.ground_sampling is not None and not 0.0 < self.ground_sampling < float("inf"):
-            raise UsageError(f"dense.ground_sampling: expected a positive length, got {self.ground_sampling:g}")
+        check_options("dense", self, _RANGES)
         if self.level is not None and self.ground_sampling is not None:
             raise UsageError("dense.level and dense.ground_sampling both set the resolution", "leave one of them out")
-        if not 1 <= self.cell_px <= 8:
-            raise UsageError(f"dense.cell_px: expected 1 to 8, got {self.cell_px}")
-        if not 2 <= self.min_views <= 8:
-            raise UsageError(f"dense.min_views: expected 2 to 8, got {self.min_views}")
-        if not 2 <= self.max_neighbors <= 16:
-            raise UsageError(f"dense.max_neighbors: expected 2 to 16, got {self.max_neighbors}")
-        if self.max_memory_mb < 500:
-            raise UsageError(f"dense.max_memory_mb: expected 500 or more, got {self.max_memory_mb}")
         if self.region is not None:
             corners = tuple(float(value) for value in self.region)
             object.__setattr__(self, "region", corners)

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from sfmapp.errors import InputError, UsageError
+from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.features.orb import extract_orb
 from sfmapp.features.report import FeaturesReport, ImageFeatures
 from sfmapp.features.sift import Scratch, compile_kernels, extract_sift
-from sfmapp.scene.features import Features
+from sfmapp.option_checks import Range, check_options, positive
+from sfmapp.scene.features import DescriptorMetric, Features
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageRecord, ImageSet
@@ -28,6 +29,16 @@ __all__ = ["FeatureOptions", "compile_kernels", "extract_features", "extract_ima
 STAGE = "features"
 # fewer keypoints than this and an image will hardly be registered: the report says so
 FEW_FEATURES = 100
+_METRICS = {"sift": DescriptorMetric.ROOT_SIFT, "orb": DescriptorMetric.HAMMING}
+
+_RANGES = {
+    "max_num_features": Range(1),
+    "max_size_px": Range(1),
+    "contrast_threshold": positive(),
+    "edge_threshold": positive(),
+    "max_num_orientations": Range(1),
+    "memory_mb": Range(1),
+}
 
 
 @dataclass(frozen=True)
@@ -50,16 +61,7 @@ class FeatureOptions:
     """Memory that all workers together may take; None for half of what is free at the start."""
 
     def __post_init__(self) -> None:
-        if self.kind not in ("sift", "orb"):
-            raise UsageError(f"features.kind must be sift or orb, got {self.kind!r}")
-        for name in ("max_num_features", "max_size_px", "max_num_orientations"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"features.{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("contrast_threshold", "edge_threshold"):
-            if not getattr(self, name) > 0:
-                raise UsageError(f"features.{name} must be positive, got {getattr(self, name)}")
-        if self.memory_mb is not None and self.memory_mb < 1:
-            raise UsageError(f"features.memory_mb must be at least 1, got {self.memory_mb}")
+        check_options("features", self, _RANGES)
 
 
 def extract_features(
@@ -181,13 +183,14 @@ def features_from_picture(
         keypoints[:, 2] *= factor.mean()
     x = np.clip(keypoints[:, 0].astype(np.int64), 0, width - 1)
     y = np.clip(keypoints[:, 1].astype(np.int64), 0, height - 1)
-    return Features(keypoints, descriptors, picture.rgb[y, x]), scale, threshold
+    return Features(keypoints, descriptors, picture.rgb[y, x], _METRICS[options.kind]), scale, threshold
 
 
 def empty_features(kind: str) -> Features:
     """No keypoints."""
     length = 32 if kind == "orb" else 128
-    return Features(np.zeros((0, 4), np.float32), np.zeros((0, length), np.uint8), np.zeros((0, 3), np.uint8))
+    descriptors = np.zeros((0, length), np.uint8)
+    return Features(np.zeros((0, 4), np.float32), descriptors, np.zeros((0, 3), np.uint8), _METRICS[kind])
 
 
 def _why_none(picture: Picture) -> str:

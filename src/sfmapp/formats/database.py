@@ -22,7 +22,7 @@ from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_model import checked_camera
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
-from sfmapp.scene.features import Features
+from sfmapp.scene.features import DescriptorMetric, Features
 
 _VERSION = 4020100
 """COLMAP 4.2.1's own mark, in the pragma user_version: an older one would make it migrate the file."""
@@ -30,6 +30,7 @@ _VERSION = 4020100
 _MAX_IMAGES = 2**31 - 1
 _CAMERA_SENSOR = 0
 _SIFT, _UNDEFINED = 0, -1  # COLMAP's types of descriptors
+_SIFT_LENGTH, _ORB_LENGTH = 128, 32
 _WGS84 = 0
 _CALIBRATED_RIG = 9
 
@@ -335,7 +336,9 @@ class Database:
         """
         image_id = self._image_ids[image_idx]
         keypoints, descriptors = features.keypoints, features.descriptors
-        kind = _SIFT if descriptors.shape[1] == 128 else _UNDEFINED
+        if features.metric == DescriptorMetric.L2:
+            raise ValueError("a database holds RootSIFT and bits; descriptors of the metric l2 have no place in it")
+        kind = _SIFT if features.metric == DescriptorMetric.ROOT_SIFT else _UNDEFINED
         with self._writing() as db:
             db.execute(
                 "INSERT OR REPLACE INTO keypoints VALUES (?, ?, ?, ?)",
@@ -372,7 +375,7 @@ class Database:
         if keypoint_row is None or descriptor_row is None:
             raise InputError(f"{self.path}: expected keypoints and descriptors of {what}, found none")
         keypoints = _scale_and_orientation(self._table(f"keypoints of {what}", "<f4", (2, 4, 6), *keypoint_row))
-        descriptors = self._table(f"descriptors of {what}", "u1", (32, 128), *descriptor_row)
+        descriptors = self._table(f"descriptors of {what}", "u1", (_ORB_LENGTH, _SIFT_LENGTH), *descriptor_row)
         if not np.isfinite(keypoints).all():
             raise InputError(f"{self.path}: keypoints of {what}: expected finite numbers, found NaN or infinity")
         if len(descriptors) != len(keypoints):
@@ -383,7 +386,9 @@ class Database:
         rgb = np.zeros((len(keypoints), 3), np.uint8)
         if rgb_row is not None:
             rgb = self._table(f"colours of {what}", "u1", (3,), len(keypoints), 3, *rgb_row)
-        return Features(keypoints, descriptors, rgb)
+        # databases of older versions of COLMAP say nothing about the kind, and hold SIFT
+        metric = DescriptorMetric.ROOT_SIFT if descriptors.shape[1] == _SIFT_LENGTH else DescriptorMetric.HAMMING
+        return Features(keypoints, descriptors, rgb, metric)
 
     def _one(self, table: str, column: str, columns: str, value: int) -> tuple | None:
         if table not in self._tables:

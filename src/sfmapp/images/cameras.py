@@ -18,7 +18,7 @@ from sfmapp.images.report import CameraPrior
 from sfmapp.scene.turned_camera import turned_back
 
 # Trust in what a user gives without fixing it: a focal length copied from a data sheet, or a calibration.
-_SIGMA_USER_FOCAL, _SIGMA_USER_PARAMS = 0.03, 0.01
+_SIGMA_USER_FOCAL, SIGMA_USER_PARAMS = 0.03, 0.01
 # Frames of one video or one shoot have one size; a few strays must not split them, while photographs collected from
 # many people come in many sizes, none of which holds nearly all.
 _SERIES_SHARE = 0.9
@@ -101,7 +101,7 @@ def _camera(shot: Shot, priors: list[FocalPrior], options: ImageOptions) -> tupl
     model, width, height = options.camera_model, shot.width, shot.height
     if options.camera_params is not None:
         camera = simple_camera(model, width, height, 1.0, source="user").with_params(options.camera_params)
-        camera = replace(camera, focal_sigma=_SIGMA_USER_PARAMS * camera.focal)
+        camera = replace(camera, focal_sigma=SIGMA_USER_PARAMS * camera.focal)
         reason = "camera_params"
     elif options.focal_px is not None:
         sigma = _SIGMA_USER_FOCAL * options.focal_px

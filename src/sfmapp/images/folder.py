@@ -84,7 +84,7 @@ def load_images(
     )
     images = tuple(replace(scan.record, camera_idx=idx) for scan, idx in zip(scans, camera_idx, strict=True))
     skipped.sort(key=lambda item: natural_key(item[0]))
-    image_set = ImageSet(images, tuple(cameras), tuple(skipped))
+    image_set = ImageSet(images, tuple(cameras), tuple(skipped), found.root)
     problems = [(scan.record.name, problem) for scan in scans for problem in scan.problems] + focal_problems
     duplicates = _duplicates(images)
     if found.results:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, Protocol
+
+from numpy.typing import NDArray
 
 from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel
 from sfmapp.errors import UsageError
+from sfmapp.option_checks import Range, check_options, positive
 
 CameraSharing = Literal["auto", "all", "per_folder", "per_image"]
 
@@ -48,16 +52,10 @@ class ImageOptions:
             if model not in CameraModel.__members__:
                 raise UsageError(f"camera_model is {model!r}", f"one of {', '.join(CameraModel.__members__)}")
             object.__setattr__(self, "camera_model", CameraModel[model])
-        if self.camera_sharing not in get_args(CameraSharing):
-            raise UsageError(
-                f"camera_sharing is {self.camera_sharing!r}", f"one of {', '.join(get_args(CameraSharing))}"
-            )
-        if self.focal_px is not None and not 0.0 < self.focal_px < float("inf"):
-            raise UsageError(f"focal_px is {self.focal_px:g}, expected a positive number of pixels")
+        ranges = {"focal_px": positive(), "max_image_bytes": Range(1), "max_pixels": Range(1)}
+        check_options("images", self, ranges)
         if self.camera_params is not None:
             self._check_params(tuple(float(value) for value in self.camera_params))
-        if self.max_image_bytes <= 0 or self.max_pixels <= 0:
-            raise UsageError("max_image_bytes and max_pixels must be positive")
 
     def _check_params(self, params: tuple[float, ...]) -> None:
         object.__setattr__(self, "camera_params", params)
@@ -74,13 +72,45 @@ class ImageOptions:
             raise UsageError("camera_params must be finite numbers, focal lengths positive")
 
 
+class ImageSource(Protocol):
+    """Photographs that are no files of their own: in memory, in an archive, in a database.
+
+    Whatever has these three can be given wherever photographs are wanted. ``pixels`` and ``mask`` are called from
+    several threads at a time, more than once for each image.
+
+    Example:
+        >>> class Archive:
+        ...     def __init__(self, path):
+        ...         self._file = numpy.load(path)
+        ...         self.names = self._file.files
+        ...     def pixels(self, name):
+        ...         return self._file[name]
+        ...     def mask(self, name):
+        ...         return None
+        >>> result = sfmapp.reconstruct(Archive("views.npz"))
+    """
+
+    @property
+    def names(self) -> Sequence[str]:
+        """I names, unique, with forward slashes: those of the images in every output."""
+        ...
+
+    def pixels(self, name: str) -> NDArray[Any]:
+        """(H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA, uint8 or uint16."""
+        ...
+
+    def mask(self, name: str) -> NDArray[Any] | None:
+        """(H, W), zero or False where nothing may be detected; None for no mask."""
+        ...
+
+
 @dataclass(frozen=True)
 class ImageRecord:
     """One usable photograph.
 
     Attributes:
         name: posix path relative to the common root, unique; the image's name in every output.
-        path: absolute path of the file.
+        path: absolute path of the file; of one that has none, its name.
         width, height: of the pixels that the readers in ``pixels`` give: those of the file, whatever its orientation.
         orientation: EXIF orientation 1 to 8 of these pixels, for whoever shows them to people.
         turn: EXIF orientation that the readers undo. Not 1 only for photographs of a foreign model that counts in
@@ -92,6 +122,7 @@ class ImageRecord:
         timestamp: when it was taken, seconds since 1970 (a clock without a zone is read as UTC), None where unknown.
         gps: latitude and longitude in degrees and altitude in metres (None where unknown), None where unknown.
         make, model: of the camera, empty where unknown.
+        source: what gives its pixels where it is no file; None: the file does.
     """
 
     name: str
@@ -108,6 +139,7 @@ class ImageRecord:
     gps: tuple[float, float, float | None] | None = None
     make: str = ""
     model: str = ""
+    source: ImageSource | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -118,8 +150,20 @@ class ImageSet:
         images: the usable ones.
         cameras: what ``camera_idx`` of the images points to, in order of first use.
         skipped: (name, reason) of the files that are not used.
+        root: folder that the names are relative to: the source itself, or what a pattern or a list spans. None where
+            the photographs are no files.
     """
 
     images: tuple[ImageRecord, ...]
     cameras: tuple[Camera, ...]
     skipped: tuple[tuple[str, str], ...] = ()
+    root: Path | None = None
+
+    @property
+    def names(self) -> list[str]:
+        """I names."""
+        return [image.name for image in self.images]
+
+    def camera_of(self, image_idx: int) -> Camera:
+        """What is known beforehand of the camera that took an image."""
+        return self.cameras[self.images[image_idx].camera_idx]

@@ -19,7 +19,7 @@ from sfmapp.images.tags import byte_order, first_directory
 from sfmapp.images.tiff import decode_samples, tiff_layout
 
 if TYPE_CHECKING:
-    from sfmapp.images.image_set import ImageRecord
+    from sfmapp.images.image_set import ImageRecord, ImageSource
 
 Pixels = NDArray[np.uint8]
 
@@ -104,10 +104,32 @@ def _as_gray(pixels: Pixels) -> Pixels:
 
 def _decode(record: ImageRecord) -> tuple[Pixels, Pixels | None]:
     """((H, W) or (H, W, 3) RGB, alpha (H, W) or None) uint8."""
-    pixels = to_8_bits(decode_file(record, *read_file(record)))
+    raw = decode_file(record, *read_file(record)) if record.source is None else _given(record, record.source)
+    pixels = to_8_bits(raw)
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         return np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3])
     return pixels, None
+
+
+def _given(record: ImageRecord, source: ImageSource) -> NDArray[Any]:
+    """Pixels of a photograph that is no file. Raises InputError if they are not what they were at first."""
+    raw = checked_pixels(record.name, source.pixels(record.name))
+    if raw.shape[:2] != (record.height, record.width):
+        size = f"{raw.shape[1]}x{raw.shape[0]}"
+        raise InputError(f"{record.name} was changed while in use: {size} pixels, was {record.width}x{record.height}")
+    return raw
+
+
+def checked_pixels(name: str, raw: Any) -> NDArray[Any]:
+    """An array that somebody gives as a photograph. Raises InputError if it has not the form of one."""
+    pixels = np.asarray(raw)
+    is_picture = pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] in (3, 4))
+    if not is_picture or not pixels.size or pixels.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"{name}: expected pixels (H, W), (H, W, 3) or (H, W, 4) of uint8 or uint16, found {pixels.dtype} "
+            f"{pixels.shape}"
+        )
+    return np.ascontiguousarray(pixels)
 
 
 def read_file(record: ImageRecord) -> tuple[bytes, Header]:
@@ -214,6 +236,8 @@ def read_mask_file(record: ImageRecord) -> NDArray[np.bool_] | None:
     Raises:
         InputError: the mask cannot be read.
     """
+    if record.source is not None:
+        return _given_mask(record, record.source)
     if record.mask_path is None:
         return None
     import cv2
@@ -235,6 +259,18 @@ def read_mask_file(record: ImageRecord) -> NDArray[np.bool_] | None:
     if mask.shape != (record.height, record.width):
         mask = cv2.resize(mask, (record.width, record.height), interpolation=cv2.INTER_NEAREST)
     return mask.astype(bool)
+
+
+def _given_mask(record: ImageRecord, source: ImageSource) -> NDArray[np.bool_] | None:
+    given = source.mask(record.name)
+    if given is None:
+        return None
+    mask = np.asarray(given)
+    if mask.shape != (record.height, record.width):
+        raise InputError(
+            f"mask of {record.name}: expected an array of shape ({record.height}, {record.width}), found {mask.shape}"
+        )
+    return mask != 0
 
 
 def mask_fit(header: Header, record: ImageRecord) -> str | None:

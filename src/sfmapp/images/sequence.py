@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import UsageError
+from sfmapp.option_checks import Range, check_options
 from sfmapp.scene.rig import Rig
 
 Array = NDArray[np.float64]
@@ -50,12 +50,9 @@ class SequenceOptions:
     ground_truth: str | None = None
 
     def __post_init__(self) -> None:
-        if self.start < 0 or self.step < 1:
-            raise UsageError(f"start is {self.start} and step is {self.step}", "start counts from 0, step is 1 or more")
+        check_options("sequence", self, {"start": Range(0), "step": Range(1), "fps": Range(1e-3, 1e5)})
         if self.stop is not None and self.stop <= self.start:
             raise UsageError(f"stop is {self.stop}, which is not behind start ({self.start})")
-        if self.fps is not None and not (math.isfinite(self.fps) and 1e-3 <= self.fps <= 1e5):
-            raise UsageError(f"fps is {self.fps}", "give the frames per second, such as 30")
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from sfmapp.option_checks import SHARE, Range, check_options, positive
+
+_RANGES = {
+    "min_initial_inliers": Range(5, 100_000),
+    "min_initial_angle_deg": positive(90.0),
+    "min_pose_inliers": Range(3, 100_000),  # three points are the fewest that a pose can be had from
+    "min_pose_inlier_ratio": SHARE,
+    "max_pose_error_px": positive(1000.0),
+    "max_reprojection_error_px": positive(1000.0),
+    "max_reprojection_error_sigmas": Range(1.0, 1000.0),
+    "min_triangulation_angle_deg": Range(0.0, 90.0),
+    "local_window": Range(2, 10_000),
+    "global_growth": Range(1.0, 100.0),
+    "principal_point_sigma": positive(1.0),
+    "min_model_images": Range(2, 100_000),
+}
+
 
 @dataclass(frozen=True)
 class MappingOptions:
@@ -43,3 +60,6 @@ class MappingOptions:
     """Go on with the images that are left over when a model cannot grow any more."""
     estimate_focal: bool = True
     """Search a first focal length from the pairs where neither the user nor EXIF knows one."""
+
+    def __post_init__(self) -> None:
+        check_options("mapping", self, _RANGES)

@@ -7,14 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.errors import InputError
 from sfmapp.matching.binary import match_binary
 from sfmapp.matching.descriptors import match_sift
+from sfmapp.matching.euclidean import match_euclidean
 from sfmapp.matching.guided import GuidedImage, change_of_shape, match_guided
 from sfmapp.matching.options import MatchingOptions
-from sfmapp.matching.products import DIMS, Ints
+from sfmapp.matching.products import Ints
 from sfmapp.matching.search import Ransac, find_fundamental, is_significant, polish_fundamental
 from sfmapp.matching.second_motion import has_second_motion
-from sfmapp.scene.features import Features
+from sfmapp.scene.features import DescriptorMetric, Features
 
 # The coarse epipolar lines are off by more than the noise of the matches that they rest on.
 _BAND_PER_THRESHOLD = 2.0
@@ -43,7 +45,7 @@ class Putative:
 
 def is_guidable(features: Features, options: MatchingOptions) -> bool:
     """Whether an image has so many SIFT features that guided matching pays."""
-    return features.descriptors.shape[1] == DIMS and len(features) >= 2 * options.coarse_features
+    return features.metric == DescriptorMetric.ROOT_SIFT and len(features) >= 2 * options.coarse_features
 
 
 def match_features(
@@ -58,10 +60,15 @@ def match_features(
     Args:
         backgrounds: from ``background_of``; the pair is matched in full unless both are there.
         threshold_px: what counts as fitting the coarse epipolar geometry.
+
+    Raises:
+        InputError: descriptors of two kinds.
     """
     first, second = (f.descriptors for f in features)
-    if first.shape[1] != DIMS:
-        return Putative(match_binary(first, second, options.max_ratio, options.max_distance))
+    metric = _common_metric(*features)
+    if metric != DescriptorMetric.ROOT_SIFT:
+        match = match_binary if metric == DescriptorMetric.HAMMING else match_euclidean
+        return Putative(match(first, second, options.max_ratio, options.max_distance))
     num_coarse = None
     if backgrounds[0] is not None and backgrounds[1] is not None:
         images = GuidedImage.of(features[0], backgrounds[0]), GuidedImage.of(features[1], backgrounds[1])
@@ -70,6 +77,16 @@ def match_features(
             return found
         num_coarse = found.num_coarse
     return Putative(match_sift(first, second, options.max_ratio, options.max_distance), None, num_coarse)
+
+
+def _common_metric(first: Features, second: Features) -> DescriptorMetric:
+    length1, length2 = first.descriptors.shape[1], second.descriptors.shape[1]
+    if first.metric != second.metric or length1 != length2:
+        raise InputError(
+            f"descriptors of two kinds cannot be compared: {length1} numbers with the metric {first.metric}, "
+            f"{length2} with {second.metric}"
+        )
+    return first.metric
 
 
 def _match_coarse_to_fine(

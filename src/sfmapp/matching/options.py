@@ -4,6 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from sfmapp.option_checks import SHARE, Range, check_options, positive
+
+_RANGES = {
+    "max_ratio": positive(1.0),
+    "max_distance": positive(2.0),
+    "coarse_features": Range(0),
+    "max_error_px": positive(1000.0),
+    "min_inliers": Range(5, 100_000),  # five matches are the fewest that an essential matrix can be had from
+    "min_e_f_ratio": SHARE,
+    "max_h_ratio": SHARE,
+    "max_ransac_trials": Range(1, 10**7),
+}
+
 
 @dataclass(frozen=True)
 class MatchingOptions:
@@ -30,3 +43,6 @@ class MatchingOptions:
     max_h_ratio: float = 0.8
     # Most RANSAC hypotheses for each model.
     max_ransac_trials: int = 5000
+
+    def __post_init__(self) -> None:
+        check_options("matching", self, _RANGES)

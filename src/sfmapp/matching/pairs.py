@@ -21,27 +21,33 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.errors import UsageError
 from sfmapp.events import Events
 from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.matching.report import PairsReport
+from sfmapp.option_checks import Range, check_options
 from sfmapp.scene.features import Features
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageRecord, ImageSet
 
 STAGE = "pairs"
-METHODS = ("auto", "exhaustive", "retrieval", "sequential")
 
 # descriptors that the vocabulary is learnt from: a thousand for each of 64 words, 32 MB as float32
 _SAMPLE_SIZE = 65536
 _KMEANS_ROUNDS = 12
-# RootSIFT times 512 has a length of 512 and below; ORB's 256 bits reach the same length when a bit counts 32
-_BIT_VALUE = 32
 # length of an image vector in whole numbers: its square must stay below 2^24
 _VLAD_LENGTH = 4000
 _BLOCK_BYTES = 64 << 20
 _EARTH_RADIUS_M = 6_371_000.0
+
+_RANGES = {
+    "exhaustive_limit": Range(0),
+    "num_neighbors": Range(1),
+    "num_words": Range(1),
+    "num_query_features": Range(1),
+    "sequence_overlap": Range(1),
+    "num_gps_neighbors": Range(0),
+}
 
 
 @dataclass(frozen=True)
@@ -66,14 +72,7 @@ class PairOptions:
     """GPS: nearest images, per image."""
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise UsageError(f"pairs.method must be one of {', '.join(METHODS)}, got {self.method!r}")
-        for name in ("exhaustive_limit", "num_gps_neighbors"):
-            if getattr(self, name) < 0:
-                raise UsageError(f"pairs.{name} must not be negative, got {getattr(self, name)}")
-        for name in ("num_neighbors", "num_words", "num_query_features", "sequence_overlap"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"pairs.{name} must be at least 1, got {getattr(self, name)}")
+        check_options("pairs", self, _RANGES)
 
 
 def select_pairs(
@@ -193,7 +192,7 @@ def retrieval_pairs(
 
     def fill(i: int) -> None:
         events.raise_if_cancelled()
-        vectors[i] = image_vector(_whole_numbers(features[i].descriptors[: options.num_query_features]), words)
+        vectors[i] = image_vector(features[i].whole_numbers(options.num_query_features), words)
 
     with ThreadPoolExecutor(max(1, threads)) as pool:
         list(pool.map(fill, range(len(features))))
@@ -227,18 +226,11 @@ def _sample_descriptors(
     chosen = rng.permutation(len(features))[:_SAMPLE_SIZE]
     parts = []
     for i in np.sort(chosen):
-        descriptors = features[i].descriptors[:num_per_image]
+        descriptors = features[i].whole_numbers(num_per_image)
         if len(descriptors) > share:
             descriptors = descriptors[np.sort(rng.choice(len(descriptors), share, replace=False))]
         parts.append(descriptors)
-    return _whole_numbers(np.concatenate(parts))
-
-
-def _whole_numbers(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(N, D) float32 of whole numbers with rows not longer than about 512: RootSIFT as it is, bits spread out."""
-    if descriptors.shape[1] == 128:
-        return descriptors.astype(np.float32)
-    return np.unpackbits(descriptors, axis=1).astype(np.float32) * np.float32(_BIT_VALUE)
+    return np.concatenate(parts)
 
 
 def _nearest_word(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:

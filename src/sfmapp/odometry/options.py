@@ -5,6 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from sfmapp.option_checks import SHARE, Range, check_options, positive
+
+_RANGES = {
+    "max_tracks": Range(50, 10_000),
+    "keyframe_parallax": positive(1.0),
+    "keyframe_loss": SHARE,
+    "cull_seen": SHARE,
+    "window": Range(2, 1000),
+    "window_anchors": Range(0, 1000),
+    "min_triangulation_deg": positive(90.0),
+    "min_stereo_deg": positive(90.0),
+    "max_lost_s": Range(0.0, 1e6),
+}
+
 
 @dataclass(frozen=True)
 class OdometryOptions:
@@ -24,3 +38,6 @@ class OdometryOptions:
     refine_camera: bool = True  # there, refine the calibration where the images clearly contradict it
     smooth: bool = False  # also give the trajectory through an error-state filter: steadier, short gaps bridged
     covariance: bool = True  # covariances of the keyframes, at the end
+
+    def __post_init__(self) -> None:
+        check_options("odometry", self, _RANGES)

@@ -29,6 +29,7 @@ from sfmapp.mapping.options import MappingOptions
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.pairs import PairOptions
 from sfmapp.odometry.options import OdometryOptions
+from sfmapp.option_checks import Range, check_options
 from sfmapp.pipelines import resources
 from sfmapp.pipelines.odometry_scale import ScaleOptions
 from sfmapp.surface.options import SurfaceOptions
@@ -65,12 +66,7 @@ class Options:
     min_registered: int | None = None
 
     def __post_init__(self) -> None:
-        if self.seed < 0:
-            raise UsageError(f"seed: expected 0 or more, got {self.seed}")
-        if self.threads is not None and self.threads < 1:
-            raise UsageError(f"threads: expected 1 or more, got {self.threads}")
-        if self.min_registered is not None and self.min_registered < 2:
-            raise UsageError(f"min_registered: expected 2 or more, got {self.min_registered}")
+        check_options("", self, {"seed": Range(0), "threads": Range(1), "min_registered": Range(2)})
 
     @property
     def num_workers(self) -> int:
@@ -210,20 +206,12 @@ def _build(options_class: type, values: Any, prefix: str) -> Any:
             arguments[name] = _build(hints[name], value, f"{prefix}{name}.")
         else:
             arguments[name] = _convert(value, hints[name], f"{prefix}{name}")
-            _check_sign(arguments[name], getattr(options_class, name, None), f"{prefix}{name}")
     try:
         return options_class(**arguments)
     except SfmError:
         raise
     except (ValueError, TypeError) as error:
         raise UsageError(f"{prefix.rstrip('.') or 'options'}: {error}", LIST_ADVICE) from error
-
-
-def _check_sign(value: Any, default: Any, where: str) -> None:
-    """Refuse a negative number where the default is positive: a count, a threshold, a length; loops rely on it."""
-    numbers = [x for x in (value, default) if isinstance(x, int | float) and not isinstance(x, bool)]
-    if len(numbers) == 2 and value < 0 < default:
-        raise _impossible(where, value, "a number that is not negative")
 
 
 def _nearest(prefix: str, name: str) -> str:

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sfmapp.errors import UsageError
+from sfmapp.option_checks import Range, check_options
+
+_RANGES = {
+    "depth": Range(4, 13),
+    "trim_distance": Range(0.5, 1000.0),  # patch spacings
+    "trim_density": Range(0.0, 0.99),
+    "max_hole": Range(0.0, 0.99),
+    "min_island": Range(0.0, 0.99),
+    "texture_px": Range(256, 16384),
+}
 
 
 @dataclass(frozen=True)
@@ -36,13 +45,4 @@ class SurfaceOptions:
     texture_px: int = 4096
 
     def __post_init__(self) -> None:
-        if self.depth is not None and not 4 <= self.depth <= 13:
-            raise UsageError(f"surface.depth: expected 4 to 13, got {self.depth}")
-        if not 0.5 <= self.trim_distance <= 1000.0:
-            raise UsageError(f"surface.trim_distance: expected 0.5 to 1000 patch spacings, got {self.trim_distance:g}")
-        for name in ("trim_density", "max_hole", "min_island"):
-            share = getattr(self, name)
-            if not 0.0 <= share < 1.0:
-                raise UsageError(f"surface.{name}: expected a share from 0 to less than 1, got {share:g}")
-        if not 256 <= self.texture_px <= 16384:
-            raise UsageError(f"surface.texture_px: expected 256 to 16384, got {self.texture_px}")
+        check_options("surface", self, _RANGES)

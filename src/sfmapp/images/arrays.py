@@ -1,0 +1,106 @@
+"""Photographs in memory, described like those of a folder."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.camera.camera import Camera
+from sfmapp.errors import InputError
+from sfmapp.images.cameras import SIGMA_USER_PARAMS, Shot, group_cameras
+from sfmapp.images.exif import ExifFacts
+from sfmapp.images.image_set import ImageOptions, ImageRecord, ImageSet, ImageSource
+from sfmapp.images.pixels import checked_pixels
+
+
+@dataclass(frozen=True)
+class ArraySource:
+    """An :class:`ImageSource` of arrays.
+
+    Attributes:
+        images: pixels by name.
+        masks: masks by name; images without one are used whole.
+    """
+
+    images: Mapping[str, NDArray[Any]]
+    masks: Mapping[str, NDArray[Any]]
+
+    @property
+    def names(self) -> Sequence[str]:
+        """See :class:`ImageSource`."""
+        return list(self.images)
+
+    def pixels(self, name: str) -> NDArray[Any]:
+        """See :class:`ImageSource`."""
+        return self.images[name]
+
+    def mask(self, name: str) -> NDArray[Any] | None:
+        """See :class:`ImageSource`."""
+        return self.masks.get(name)
+
+
+def describe_source(
+    source: ImageSource,
+    options: ImageOptions | None = None,
+    *,
+    camera: Camera | None = None,
+) -> ImageSet:
+    """The images of a source in its own order, with their cameras.
+
+    Args:
+        source: every image of it is looked at once.
+        options: what is known about the cameras; names and sizes count as they do for files without EXIF.
+        camera: what took them all, in place of the options; its parameters count as known to a per cent, exactly if
+            ``is_fixed``.
+
+    Returns:
+        The set. Its ``root`` is None.
+
+    Raises:
+        InputError: two images of one name, a name that leads out of its folder, or an array that is no picture, or of
+            another size than the camera's.
+    """
+    options = options or ImageOptions()
+    names = list(source.names)
+    if len(set(names)) < len(names):
+        raise InputError(f"images: expected unique names, found {len(names) - len(set(names))} of them twice")
+    records = [_described(source, name, options) for name in names]
+    if camera is None:
+        shots = [Shot(record.name, record.width, record.height, ExifFacts()) for record in records]
+        cameras, camera_idx, _, _ = group_cameras(shots, options)
+        images = tuple(replace(record, camera_idx=idx) for record, idx in zip(records, camera_idx, strict=True))
+        return ImageSet(images, tuple(cameras))
+    for record in records:
+        if (record.width, record.height) != (camera.width, camera.height):
+            raise InputError(
+                f"{record.name}: {record.width}x{record.height} pixels, but its camera has "
+                f"{camera.width}x{camera.height}"
+            )
+    return ImageSet(tuple(records), (known_camera(camera),))
+
+
+def known_camera(camera: Camera) -> Camera:
+    """A camera that a user gives: its focal length is known, whatever source it does or does not name."""
+    if camera.focal_source != "default":
+        return camera
+    return replace(camera, focal_source="user", focal_sigma=camera.focal_sigma or SIGMA_USER_PARAMS * camera.focal)
+
+
+def _described(source: ImageSource, name: str, options: ImageOptions) -> ImageRecord:
+    pure = PurePosixPath(name)
+    if not name or pure.is_absolute() or ".." in pure.parts:
+        raise InputError(f"images: expected names relative to one folder, found {name!r}")
+    pixels = checked_pixels(name, source.pixels(name))
+    digest = hashlib.blake2b(f"{pixels.dtype} {pixels.shape}".encode(), digest_size=16)
+    digest.update(pixels.data)
+    if (mask := source.mask(name)) is not None:
+        digest.update(np.ascontiguousarray(mask).data)
+    height, width = pixels.shape[:2]
+    has_alpha = pixels.ndim == 3 and pixels.shape[2] == 4 and options.use_alpha
+    return ImageRecord(name, Path(name), width, height, digest=digest.hexdigest(), has_alpha=has_alpha, source=source)
