@@ -1,4 +1,4 @@
-"""Models and ground truths that the dense benchmark needs and the shared data do not hold."""
+"""Models and ground ground truths that the dense benchmark needs and the shared data do not hold."""
 
 from __future__ import annotations
 

@@ -38,8 +38,8 @@ from sfmapp.errors import SfmError
 from sfmapp.evaluation.trajectory import Trajectory, absolute_error, associate
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.result import OdometryResult
-from sfmapp.pipelines.odometry import track_sequence
-from sfmapp.pipelines.options import load_options
+from sfmapp.pipelines.odometry.track import track_sequence
+from sfmapp.workspace.options import load_options
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parent.parent

@@ -12,7 +12,7 @@ import pytest
 
 from odometry_fakes import FakeRunner, FakeSequence
 from sfmapp.cli.main import main
-from sfmapp.pipelines import odometry as pipeline
+from sfmapp.pipelines.odometry import track as pipeline
 
 Patch = pytest.MonkeyPatch
 Capture = pytest.CaptureFixture[str]

@@ -29,8 +29,8 @@ from sfmapp.events import Event, Events
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.trajectory import GrowingTum, read_tum
 from sfmapp.geometry import rigid3
-from sfmapp.pipelines.listeners import EventLog
-from sfmapp.pipelines.workspace import read_manifest
+from sfmapp.workspace.listeners import EventLog
+from sfmapp.workspace.manifest import read_manifest
 
 ROOT = os.geteuid() == 0
 FOUR_POSES = "".join(f"{i} {i} 0 {i * i} 0 0 0 1\n" for i in range(4))
@@ -374,7 +374,7 @@ FAKE_RUN = """import os, sys
 sys.path.insert(0, sys.argv.pop(1))
 import odometry_fakes as fakes
 fakes.WIDTH, fakes.HEIGHT = 640, 480
-from sfmapp.pipelines import odometry as pipeline
+from sfmapp.pipelines.odometry import track as pipeline
 pipeline.open_sequence = lambda *_, **__: fakes.FakeSequence(pause_s=float(os.environ["PAUSE"]))
 pipeline.run_odometry = fakes.FakeRunner()
 pipeline.compile_odometry_kernels = lambda *_, **__: {}

@@ -20,12 +20,12 @@ from sfmapp.formats.trajectory import read_tum, write_tum
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import SequenceOptions
 from sfmapp.odometry.result import FrameState
-from sfmapp.pipelines.odometry import TrackResult, track_sequence
-from sfmapp.pipelines.odometry_results import read_odometry
-from sfmapp.pipelines.options import Options, load_options
-from sfmapp.pipelines.refine import refine
-from sfmapp.pipelines.self_calibrate import choose_frames, self_calibrated
+from sfmapp.pipelines.odometry.refine import refine
+from sfmapp.pipelines.odometry.results import read_odometry
+from sfmapp.pipelines.odometry.self_calibrate import choose_frames, self_calibrated
+from sfmapp.pipelines.odometry.track import TrackResult, track_sequence
 from sfmapp.pipelines.validate import validate
+from sfmapp.workspace.options import Options, load_options
 
 FPS, NUM_FRAMES, NUM_PHOTOS = 30.0, 72, 2
 CAMERA = Camera(CameraModel.PINHOLE, 320, 240, np.array([262.5, 262.5, 160.0, 120.0]))

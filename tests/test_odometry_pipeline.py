@@ -24,16 +24,16 @@ from sfmapp.odometry.inertial.visual_inertial import faults as inertial_faults
 from sfmapp.odometry.records import _covariance_gap
 from sfmapp.odometry.refinement.final_adjustment import MAX_COVARIANCE_KEYFRAMES, FinalAdjustment
 from sfmapp.odometry.result import FrameState
-from sfmapp.pipelines import odometry as pipeline
-from sfmapp.pipelines.odometry import TrackResult, track_sequence
-from sfmapp.pipelines.odometry_scale import parse_scale
-from sfmapp.pipelines.odometry_timing import ThreadTimes
-from sfmapp.pipelines.options import Options, load_options, options_from_dict
-from sfmapp.pipelines.reconstruct import reconstruct
+from sfmapp.pipelines.odometry import track as pipeline
+from sfmapp.pipelines.odometry.scale import parse_scale
+from sfmapp.pipelines.odometry.timing import ThreadTimes
+from sfmapp.pipelines.odometry.track import TrackResult, track_sequence
+from sfmapp.pipelines.sparse.reconstruct import reconstruct
 from sfmapp.pipelines.validate import validate
 from sfmapp.report.odometry_document import FrameTable, make_checks
 from sfmapp.report.plots import Curve, plot_svg, ticks
 from sfmapp.scene.rig import Rig
+from sfmapp.workspace.options import Options, load_options, options_from_dict
 
 Patch = pytest.MonkeyPatch
 

@@ -40,16 +40,16 @@ from sfmapp.geometry.orientation import (
 from sfmapp.geometry.upright import up_direction
 from sfmapp.images.folder import ImageOptions, load_images
 from sfmapp.pipelines import validate as validation
-from sfmapp.pipelines.dense_source import find_source
+from sfmapp.pipelines.dense.source import find_source
 from sfmapp.pipelines.export import export_model
-from sfmapp.pipelines.options import Options
-from sfmapp.pipelines.reconstruct import reconstruct
+from sfmapp.pipelines.sparse.reconstruct import reconstruct
 from sfmapp.report.dense_pictures import dense_pictures
 from sfmapp.report.top_view import ground_axes
 from sfmapp.scene.turned_camera import turned_back, turned_camera
 from sfmapp.sequences.open import SequenceOptions, open_sequence
 from sfmapp.viewer.dense_replay import make_dense_replay
 from sfmapp.viewer.replay import make_replay
+from sfmapp.workspace.options import Options
 
 ALL = range(1, 9)
 W, H = 48, 32
@@ -288,8 +288,8 @@ def test_validate_compares_with_a_ground_truth_in_one_frame(
     tmp_path: Path, orientation: int, is_upright: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from sfmapp.formats.colmap import write_model
-    from sfmapp.pipelines.workspace import FORMAT
     from sfmapp.scene.synthetic import make_scene as make_cameras
+    from sfmapp.workspace.layout import FORMAT
 
     model = make_cameras(num_images=6, num_points=60, seed=1).ground_truth
     for name in model.image_names:

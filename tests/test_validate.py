@@ -17,9 +17,9 @@ from sfmapp.events import Events
 from sfmapp.formats.colmap import write_model
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.pipelines import validate as pipeline
-from sfmapp.pipelines.workspace import FORMAT
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene
+from sfmapp.workspace.layout import FORMAT
 
 NUM_IMAGES = 6
 

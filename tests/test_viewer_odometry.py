@@ -290,7 +290,7 @@ def test_a_recording_that_cannot_be_written_is_a_problem_in_words(tmp_path: Path
 
 
 def test_drawing_does_not_load_rerun_here() -> None:
-    code = "import sys, sfmapp.viewer.live, sfmapp.pipelines.odometry; print('rerun' in sys.modules)"
+    code = "import sys, sfmapp.viewer.live, sfmapp.pipelines.odometry.track; print('rerun' in sys.modules)"
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert done.stdout.strip() == "False"

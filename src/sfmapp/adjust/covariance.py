@@ -4,8 +4,8 @@ The information is that of the adjustment at its minimum, undamped: reprojection
 priors and gtsam factors as they are. What the observations cannot tell, in a free network the seven degrees of a
 similarity (six where a rig with a baseline measures lengths), is taken out by inner constraints (Triggs et al. 1999,
 section 9): among all equivalent reconstructions the errors are those of the one whose poses lie nearest to the ground
-truth, in the sum of ``|v|^2 + s^2 |w|^2`` over the poses, where w and v are rotation and translation errors and s is
-the rms distance of the centres from their mean. Compare with a known ground truth by :func:`errors_in_gauge`. For
+ground truth, in the sum of ``|v|^2 + s^2 |w|^2`` over the poses, where w and v are rotation and translation errors and
+s is the rms distance of the centres from their mean. Compare with a known ground truth by :func:`errors_in_gauge`. For
 covariances relative
 to one image or frame hold that constant: with a baseline nothing is then left open, without one the scale.
 """

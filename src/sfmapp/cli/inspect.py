@@ -63,7 +63,7 @@ def _view(args: argparse.Namespace) -> int:
 def _recordings(output: Path) -> list[Path]:
     """A recording that is named, or those of a run, the one that shows most of it first."""
     from sfmapp.errors import InputError
-    from sfmapp.pipelines.workspace import read_manifest
+    from sfmapp.workspace.manifest import read_manifest
 
     if output.suffix == ".rrd":
         return [output]

@@ -18,8 +18,8 @@ from sfmapp.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from sfmapp.pipelines.options import Options
     from sfmapp.viewer.view import LiveViewer
+    from sfmapp.workspace.options import Options
 
 EXAMPLES = """\
 examples:
@@ -96,7 +96,7 @@ def _add_option_flags(parser: argparse.ArgumentParser) -> None:
 def _options(args: argparse.Namespace) -> Options:
     """The effective options of a command line."""
     limit_library_threads()
-    from sfmapp.pipelines.options import load_options
+    from sfmapp.workspace.options import load_options
 
     named = ("camera", "ground_truth", "imu", "start", "stop", "step", "fps")
     flags: dict[str, Any] = {"seed": args.seed, "threads": args.threads, "scale.source": args.scale}
@@ -113,8 +113,8 @@ def _odometry(args: argparse.Namespace) -> int:
         args.parser.error("SEQUENCE and -o OUT are needed")
     options = _options(args)
     load_numba_without_blas()
-    from sfmapp.pipelines.odometry import track_sequence
-    from sfmapp.pipelines.usage import Stopwatch
+    from sfmapp.pipelines.odometry.track import track_sequence
+    from sfmapp.workspace.usage import Stopwatch
 
     watch, viewer = Stopwatch(whole_process=True), _open_viewer(args)
     try:
@@ -138,13 +138,13 @@ def _odometry(args: argparse.Namespace) -> int:
 
 def _refine(args: argparse.Namespace) -> int:
     limit_library_threads()
-    from sfmapp.pipelines.options import load_options
+    from sfmapp.workspace.options import load_options
 
     flags = {"seed": args.seed, "threads": args.threads}
     options = load_options(args.preset, [*args.set, *(f"{k}={v}" for k, v in flags.items() if v is not None)])
     load_numba_without_blas()
-    from sfmapp.pipelines.refine import FOLDER, refine
-    from sfmapp.pipelines.usage import Stopwatch
+    from sfmapp.pipelines.odometry.refine import FOLDER, refine
+    from sfmapp.workspace.usage import Stopwatch
 
     watch, output = Stopwatch(whole_process=True), args.output or args.run_folder / FOLDER
     with listening(args) as events:

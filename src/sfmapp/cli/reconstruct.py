@@ -18,7 +18,7 @@ from sfmapp.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from sfmapp.pipelines.options import Options
+    from sfmapp.workspace.options import Options
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 
@@ -79,7 +79,7 @@ def _add_option_flags(parser: argparse.ArgumentParser) -> None:
 def _options(args: argparse.Namespace) -> Options:
     """The effective options of a command line."""
     limit_library_threads()
-    from sfmapp.pipelines.options import load_options
+    from sfmapp.workspace.options import load_options
 
     flags = {
         "seed": args.seed,
@@ -116,8 +116,8 @@ def _reconstruct(args: argparse.Namespace) -> int:
 def _go_on(args: argparse.Namespace, options: Options) -> dict[str, Any]:
     """Dense patches and maybe a mesh of what was reconstructed; what ``--json`` prints of them."""
     from sfmapp.cli.dense import dense_result, mesh_result, print_dense, print_mesh
-    from sfmapp.pipelines.dense import dense
-    from sfmapp.pipelines.mesh import mesh_workspace
+    from sfmapp.pipelines.dense.densify import dense
+    from sfmapp.pipelines.dense.mesh import mesh_workspace
 
     is_talking = not args.json and not args.quiet
     with listening(args) as events:
@@ -138,7 +138,7 @@ def _go_on(args: argparse.Namespace, options: Options) -> dict[str, Any]:
 def _demo(args: argparse.Namespace) -> int:
     options = _options(args)
     from sfmapp.pipelines.demo import compare_with_ground_truth
-    from sfmapp.pipelines.resources import sample_folder
+    from sfmapp.workspace.resources import sample_folder
 
     sample = sample_folder()
     report = _run(args, str(sample / "images"), options)
@@ -160,8 +160,8 @@ def _demo(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace, images: str, options: Options) -> dict[str, Any]:
     load_numba_without_blas()
-    from sfmapp.pipelines.reconstruct import reconstruct
-    from sfmapp.pipelines.usage import Stopwatch
+    from sfmapp.pipelines.sparse.reconstruct import reconstruct
+    from sfmapp.workspace.usage import Stopwatch
 
     watch = Stopwatch(whole_process=True)
     with listening(args) as events:

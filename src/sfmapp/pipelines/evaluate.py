@@ -226,7 +226,8 @@ def parse_delta(text: str) -> tuple[float, DeltaUnit]:
 def _trajectory_of(path: Path, ground_truth: Trajectory) -> Path:
     if not path.is_dir():
         return path
-    from sfmapp.pipelines.workspace import MANIFEST, read_manifest
+    from sfmapp.workspace.layout import MANIFEST
+    from sfmapp.workspace.manifest import read_manifest
 
     if (path / MANIFEST).is_file():
         read_manifest(path)  # says so if the run was cut off
@@ -240,9 +241,10 @@ def _of_sequence(folder: Path, estimate: Path) -> TrajectoryFile:
     """The ground truth of a sequence, played backwards or in steps as the run was."""
     from sfmapp.events import Events
     from sfmapp.images.sequence import SequenceOptions
-    from sfmapp.pipelines.options import options_from_dict
-    from sfmapp.pipelines.workspace import MANIFEST, read_manifest
     from sfmapp.sequences.open import open_sequence
+    from sfmapp.workspace.layout import MANIFEST
+    from sfmapp.workspace.manifest import read_manifest
+    from sfmapp.workspace.options import options_from_dict
 
     options = SequenceOptions()
     if (estimate / MANIFEST).is_file():

@@ -18,9 +18,10 @@ from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model
 from sfmapp.formats.ground_truth import GroundTruth, read_ground_truth
 from sfmapp.images.folder import load_images
-from sfmapp.pipelines.options import options_from_dict
 from sfmapp.pipelines.stored_pixels import check_pixels, ground_truth_in_stored_pixels
-from sfmapp.pipelines.workspace import RECONSTRUCT, read_manifest
+from sfmapp.workspace.layout import RECONSTRUCT
+from sfmapp.workspace.manifest import read_manifest
+from sfmapp.workspace.options import options_from_dict
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageOptions, ImageSet
@@ -40,7 +41,7 @@ class Validation:
             and, with a ground truth, ``ground_truth`` as :meth:`PoseErrors.summary` gives it. ``pycolmap`` is None if
             it failed.
         agreement: of the poses after a robust similarity fit, pycolmap being the reference; None without two models.
-        ground_truth: name of the ground truth, None without.
+        ground truth: name of the ground truth, None without.
         notes: what a reader of the table has to know.
     """
 
@@ -73,7 +74,7 @@ def validate(
 
     Args:
         output: the workspace of a run.
-        ground_truth: COLMAP model, ``cameras.json`` or TUM trajectory; None: no ground truth.
+        ground truth: COLMAP model, ``cameras.json`` or TUM trajectory; None: no ground truth.
         options: of pycolmap; None: its defaults, but with the camera model, the sharing and the intrinsics that the
             user gave to our run.
         events: progress and cancellation.

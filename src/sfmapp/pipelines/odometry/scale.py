@@ -29,21 +29,12 @@ from sfmapp.odometry.inertial.scale import (
     scale_from_path,
 )
 from sfmapp.odometry.result import MapResult, OdometryResult
-from sfmapp.pipelines.odometry_keyframes import KeyframeWatch
+from sfmapp.pipelines.odometry.keyframes import KeyframeWatch
 
 STAGE = "scale"
 # Clocks that differ by less are as good as one: exposures alone shift them by so much.
 _WORTH_SAYING_S = 5e-3
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class ScaleOptions:
-    """Where metres come from when there is one camera."""
-
-    # marker:DICT:METRES, distance:FRAME:FRAME:METRES, distance:path:METRES, camera_height:METRES, imu or arbitrary;
-    # auto: the IMU where there is one
-    source: str | None = None
 
 
 @dataclass(frozen=True)

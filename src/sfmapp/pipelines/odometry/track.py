@@ -23,19 +23,20 @@ from sfmapp.images.sequence import Frame, GroundTruth, Imu, Sequence, SequenceKi
 from sfmapp.images.video import VideoSequence
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
-from sfmapp.pipelines.kernels import compile_odometry_kernels
-from sfmapp.pipelines.listeners import DecisionLog, EventLog
-from sfmapp.pipelines.odometry_keyframes import KeyframeWatch
-from sfmapp.pipelines.odometry_live import GrowingTrajectories
-from sfmapp.pipelines.odometry_results import write_odometry
-from sfmapp.pipelines.odometry_scale import ScaleRequest, parse_scale, resolve_scale_request, scale_maps
-from sfmapp.pipelines.odometry_timing import FrameLog, ThreadTimes
-from sfmapp.pipelines.options import Options, with_absolute_paths
-from sfmapp.pipelines.run import Job
-from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import ODOMETRY, open_workspace
+from sfmapp.pipelines.odometry.keyframes import KeyframeWatch
+from sfmapp.pipelines.odometry.live import GrowingTrajectories
+from sfmapp.pipelines.odometry.results import write_odometry
+from sfmapp.pipelines.odometry.scale import ScaleRequest, parse_scale, resolve_scale_request, scale_maps
+from sfmapp.pipelines.odometry.timing import FrameLog, ThreadTimes
 from sfmapp.sequences.open import open_sequence
 from sfmapp.viewer.live import LiveView, Screen
+from sfmapp.workspace.job import Job
+from sfmapp.workspace.kernels import compile_odometry_kernels
+from sfmapp.workspace.layout import ODOMETRY
+from sfmapp.workspace.listeners import DecisionLog, EventLog
+from sfmapp.workspace.options import Options, with_absolute_paths
+from sfmapp.workspace.usage import Stopwatch
+from sfmapp.workspace.workspace import open_workspace
 
 if TYPE_CHECKING:
     from sfmapp.scene.rig import Rig
@@ -141,7 +142,7 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
     run.note_inputs({})
     with run.stage("sequence"):
         if self_calibrate:
-            from sfmapp.pipelines.self_calibrate import self_calibrated
+            from sfmapp.pipelines.odometry.self_calibrate import self_calibrated
 
             options, run.stages["self_calibration"] = self_calibrated(run.source, options, events)
         run.sequence = open_sequence(run.source, options.sequence, events)
@@ -159,7 +160,7 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         run.threads_cpu.sample()
     run.stages["odometry"] = result.report
     if self_calibrate:
-        from sfmapp.pipelines.self_calibrate import widen
+        from sfmapp.pipelines.odometry.self_calibrate import widen
 
         widen(result, run.stages["self_calibration"])
     with run.measured("scale"):

@@ -24,19 +24,21 @@ from sfmapp.images.sequence import Sequence
 from sfmapp.mapping import structure
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.odometry.result import MapResult, OdometryResult
-from sfmapp.pipelines.add_photos import PhotoResult, add_photos
-from sfmapp.pipelines.kernels import kernels_compiling
-from sfmapp.pipelines.listeners import DecisionLog, EventLog
-from sfmapp.pipelines.odometry_results import read_odometry, write_trajectories
-from sfmapp.pipelines.options import Options, options_from_dict, with_absolute_paths
-from sfmapp.pipelines.results import report_text
-from sfmapp.pipelines.run import Job
-from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import ODOMETRY, REFINE, open_workspace, read_manifest
+from sfmapp.pipelines.odometry.add_photos import PhotoResult, add_photos
+from sfmapp.pipelines.odometry.results import read_odometry, write_trajectories
 from sfmapp.report.odometry_document import fit_to_ground_truth, ground_truth_row, map_row
 from sfmapp.report.refine_html import REFINE_FORMAT, render_refine_html
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.sequences.open import open_sequence
+from sfmapp.workspace.job import Job
+from sfmapp.workspace.kernels import kernels_compiling
+from sfmapp.workspace.layout import ODOMETRY, REFINE
+from sfmapp.workspace.listeners import DecisionLog, EventLog
+from sfmapp.workspace.manifest import read_manifest
+from sfmapp.workspace.options import Options, options_from_dict, with_absolute_paths
+from sfmapp.workspace.plain_json import report_text
+from sfmapp.workspace.usage import Stopwatch
+from sfmapp.workspace.workspace import open_workspace
 
 Array = NDArray[np.float64]
 

@@ -28,11 +28,10 @@ from sfmapp.images.sequence import SequenceOptions
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.pairs import PairOptions
-from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.options import OdometryOptions, ScaleOptions
 from sfmapp.option_checks import Range, check_options
-from sfmapp.pipelines import resources
-from sfmapp.pipelines.odometry_scale import ScaleOptions
 from sfmapp.surface.options import SurfaceOptions
+from sfmapp.workspace import resources
 
 LIST_ADVICE = "sfmapp reconstruct --list-options shows every option with its default"
 

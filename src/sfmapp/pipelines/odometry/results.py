@@ -17,10 +17,8 @@ from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.formats.colmap import read_model
 from sfmapp.formats.trajectory import read_tum, write_tum
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
-from sfmapp.pipelines.odometry_live import numbered
-from sfmapp.pipelines.odometry_timing import frame_statistics
-from sfmapp.pipelines.results import report_text
-from sfmapp.pipelines.workspace import ODOMETRY
+from sfmapp.pipelines.odometry.live import numbered
+from sfmapp.pipelines.odometry.timing import frame_statistics
 from sfmapp.report.odometry_document import (
     FORMAT,
     FrameTable,
@@ -34,13 +32,15 @@ from sfmapp.report.odometry_document import (
     map_row,
 )
 from sfmapp.report.odometry_html import render_odometry_html
+from sfmapp.workspace.layout import ODOMETRY
+from sfmapp.workspace.plain_json import report_text
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from sfmapp.images import sequence as sequences
-    from sfmapp.pipelines.odometry import Tracking
-    from sfmapp.pipelines.workspace import Workspace
+    from sfmapp.pipelines.odometry.track import Tracking
+    from sfmapp.workspace.workspace import Workspace
 
 _OUR_TRAJECTORY = re.compile(r"trajectory(_live)?(-\d+)?\.tum|trajectory_smooth\.tum|trajectory\.kitti(\.frames)?")
 _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")

@@ -18,10 +18,10 @@ from sfmapp.geometry import rigid3
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.images.sequence import Frame, Sequence
 from sfmapp.odometry.result import OdometryResult
-from sfmapp.pipelines.lens_fit import LensFit, fit_lens
-from sfmapp.pipelines.options import Options
-from sfmapp.pipelines.reconstruct import RunResult, reconstruct
+from sfmapp.pipelines.odometry.lens_fit import LensFit, fit_lens
+from sfmapp.pipelines.sparse.reconstruct import RunResult, reconstruct
 from sfmapp.sequences.open import HOW_TO_CALIBRATE, open_sequence
+from sfmapp.workspace.options import Options
 
 STAGE = "calibration"
 Pixels = NDArray[np.uint8]
