@@ -403,7 +403,7 @@ class Odometry:
             "num_frames": len(self.records), "num_tracked": int(tracked.sum()), "num_maps": len(result.maps),
             "num_keyframes": [len(m.keyframe_frame_idx) for m in result.maps],
             "tracking_cpu_s": sum(record.time_s for record in self.records), "backend_cpu_s": backend, **self.counts,
-            "right_late_frames": self.clock.shift, "pairs": [c.describe() for c in self.clock.contradictions()],
+            "right_late_frames": self.clock.shift, "pairs": self.clock.contradictions(),
         }  # fmt: skip
 
 

@@ -88,6 +88,13 @@ class LogLine(Report):
     data: Mapping[str, Plain] | None = None
 
 
+class ProgressLine(LogLine):
+    """Of a stage that begins or goes on: steps that are done, of how many in all; None where that is not known."""
+
+    done: int
+    total: int | None
+
+
 # ----------------------------------------------------------------------------------------------------- reconstruction
 
 

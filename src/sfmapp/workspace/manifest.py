@@ -9,11 +9,12 @@ import contextlib
 import json
 import os
 import platform
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from sfmapp import kernel_cache
-from sfmapp.errors import InputError, UsageError
+from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.images.products import FORMAT_NAME
 from sfmapp.workspace.layout import FORMAT, LOCK, MANIFEST, ODOMETRY, RECONSTRUCT
 
@@ -67,6 +68,24 @@ def check_command(folder: Path, manifest: dict[str, Any], command: str) -> None:
             f"{folder} holds the results of sfmapp {found}, not of sfmapp {command}",
             f"nothing in it was touched; give the folder of a sfmapp {command}, or a new one to write to",
         )
+
+
+class AsBeforeError(NoReconstructionError):
+    """An earlier run has ended so and written its report, and nothing has changed."""
+
+
+def raise_as_before(stage: Mapping[str, Any]) -> None:
+    """Raise what the run of a stage has ended with, where it came to nothing.
+
+    Args:
+        stage: its entry of the manifest.
+
+    Raises:
+        AsBeforeError: it did.
+    """
+    outcome = stage.get("outcome") or {}
+    if outcome.get("exit_code") == NoReconstructionError.exit_code:
+        raise AsBeforeError(f"{outcome['message']} (as before: nothing has changed)", outcome["advice"])
 
 
 def recorded_versions() -> dict[str, str]:
