@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model, write_model, write_model_text
 from sfmapp.images.sources import find_images
 from sfmapp.pipelines.stored_pixels import check_pixels
+from sfmapp.report.model import ExportReport
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.workspace.layout import USUAL_FOLDERS
 from sfmapp.workspace.manifest import read_manifest
@@ -44,7 +44,7 @@ class _Copy:
     notes: tuple[str, ...] = ()
 
 
-def export_model(output: str | os.PathLike[str], target: str, path: str | os.PathLike[str]) -> dict[str, Any]:
+def export_model(output: str | os.PathLike[str], target: str, path: str | os.PathLike[str]) -> ExportReport:
     """Write a model in another format, read it back and re-project every inlier with what was read.
 
     Args:
@@ -53,10 +53,7 @@ def export_model(output: str | os.PathLike[str], target: str, path: str | os.Pat
         path: where to write: a folder for COLMAP's formats, a file or folder for the others.
 
     Returns:
-        JSON-able: ``format``, ``files``, ``reader`` (what read it back), ``num_images``, ``num_points``,
-        ``num_observations``, ``max_px`` (worst difference of a reprojection, in pixels), ``max_coordinate`` (worst
-        difference of a coordinate of a point, in units of the world) and ``notes``, what a user of the files has to
-        know.
+        What was written, and how well it was read back.
 
     Raises:
         UsageError: an unknown format, a camera or name that it cannot hold, or the model's own folder as the target.
@@ -76,17 +73,17 @@ def export_model(output: str | os.PathLike[str], target: str, path: str | os.Pat
             f"{path}: expected to read back {len(ours.image_names)} images and {len(ours.point_xyz)} points, found "
             f"{len(theirs.image_names)} and {len(theirs.point_xyz)}"
         )
-    return {
-        "format": target,
-        "files": [os.fspath(file) for file in copy.files],
-        "reader": copy.reader,
-        "num_images": len(ours.image_names),
-        "num_points": int(ours.is_triangulated.sum()),
-        "num_observations": int(ours.obs_is_inlier.sum()),
-        "max_px": _worst_px(ours, theirs),
-        "max_coordinate": float(np.abs(theirs.point_xyz - ours.point_xyz).max(initial=0.0)),
-        "notes": [*source.notes, *copy.notes],
-    }
+    return ExportReport(
+        format=target,
+        files=[os.fspath(file) for file in copy.files],
+        reader=copy.reader,
+        num_images=len(ours.image_names),
+        num_points=int(ours.is_triangulated.sum()),
+        num_observations=int(ours.obs_is_inlier.sum()),
+        max_px=_worst_px(ours, theirs),
+        max_coordinate=float(np.abs(theirs.point_xyz - ours.point_xyz).max(initial=0.0)),
+        notes=[*source.notes, *copy.notes],
+    )
 
 
 def _source(output: Path) -> _Source:

@@ -338,6 +338,27 @@ class UndistortReport(UndistortNumbers):
     run: Usage
 
 
+class ExportReport(Report):
+    """What ``sfmapp export`` has written and read back.
+
+    Attributes:
+        reader: what read it back.
+        max_px: worst difference of a reprojection.
+        max_coordinate: worst difference of a coordinate of a point, in units of the world.
+        notes: what a user of the files has to know.
+    """
+
+    format: str
+    files: Sequence[str]
+    reader: str
+    num_images: int
+    num_points: int
+    num_observations: int
+    max_px: float
+    max_coordinate: float
+    notes: Sequence[str]
+
+
 # ----------------------------------------------------------------------------------------------------------- odometry
 
 
