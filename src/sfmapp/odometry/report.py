@@ -35,6 +35,14 @@ class OdometryReport(Report):
     pairs: Sequence[Contradiction]
 
 
+class MapFacts(Report):
+    """What a map has beside its model and its trajectory, as ``run.json`` keeps it; see :class:`MapResult`."""
+
+    scale_source: str
+    scale_sigma: float | None
+    contradictions: Sequence[Contradiction]
+
+
 class ScaleReport(Report):
     """Where the metres of a map come from, or why there are none.
 
