@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfmapp.camera.camera import Camera
-from sfmapp.errors import InputError, NoReconstructionError
+from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError
 from sfmapp.formats.colmap import read_model
 from sfmapp.formats.trajectory import read_tum, write_tum
 from sfmapp.odometry.report import MapFacts
@@ -24,6 +24,7 @@ from sfmapp.report.model import (
     CameraParams,
     GroundTruthReport,
     OdometryRunReport,
+    Outcome,
     SequenceCamera,
     SequenceReport,
 )
