@@ -303,7 +303,7 @@ def test_a_short_path_tells_why_there_is_no_t_rel(tmp_path: Path) -> None:
     assert "drift (%)" in result.table()
     assert "t_rel (%)" not in result.table()
     assert any("no t_rel" in note for note in result.notes)
-    found = result.to_dict()["alignments"]["se3"]
+    found = result.report()["alignments"]["se3"]
     assert found["kitti"] is None
     assert [entry["length_m"] for entry in found["drift_by_length"]] == pytest.approx(
         [0.1 * k * result.pairs.ground_truth.path_m for k in range(1, 9)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from sfmapp.pipelines.odometry.timing import ThreadTimes
 from sfmapp.pipelines.odometry.track import TrackResult, track_sequence
 from sfmapp.pipelines.sparse.reconstruct import reconstruct
 from sfmapp.pipelines.validate import validate
+from sfmapp.report.model import MedianMax
 from sfmapp.report.odometry_document import FrameTable, make_checks
 from sfmapp.report.plots import Curve, plot_svg, ticks
 from sfmapp.scene.rig import Rig
@@ -119,9 +121,10 @@ def test_missing_covariances_are_said_and_not_green(finished: tuple[Path, TrackR
     """None at all is red, some amber; all, or none asked for, is no row."""
     report = finished[1].report
     facts = FrameTable(np.full(1, np.nan), np.full(1, np.nan), np.full(1, np.nan), np.full(1, -1))
-    for gap, sigma, light in (("", {"median": 1.0}, None), ("2 of 9", {"median": 1.0}, "amber"), ("open", None, "red")):
-        maps = [report["maps"][0] | {"covariance_gap": gap, "position_sigma": sigma}]
-        rows = [row for row in make_checks(report["frames"], maps, {}, facts) if "uncertainty" in row["name"]]
+    known = MedianMax(median=1.0, max=1.0)
+    for gap, sigma, light in (("", known, None), ("2 of 9", known, "amber"), ("open", None, "red")):
+        maps = [replace(report["maps"][0], covariance_gap=gap, position_sigma=sigma)]
+        rows = [row for row in make_checks(report["frames"], maps, None, facts) if "uncertainty" in row["name"]]
         assert [row["light"] for row in rows] == ([] if light is None else [light])
         assert [row["value"] for row in rows] == ([] if light is None else [gap])
 

@@ -12,7 +12,7 @@ import numpy as np
 from sfmapp.errors import NoReconstructionError
 from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.mapping.report import MappingReport, ModelEntry, Uncertainty
-from sfmapp.pipelines.stored_pixels import STORED
+from sfmapp.pipelines.stored_pixels import STORED, noted_orientations
 from sfmapp.report.document import FORMAT, camera_rows, funnel_of_images, funnel_without_matches, make_checks
 from sfmapp.report.html import render_html
 from sfmapp.report.model import ImageReport, Outcome, ReconstructionReport
@@ -60,7 +60,8 @@ def write_results(
     if failure is not None and isinstance(failure.report, MappingReport):
         run.stages = replace(run.stages, mapping=failure.report)
     keypoints = [features.keypoints[:, :2].astype(np.float64) for features in run.features]
-    run.save_first(lambda: workspace.begin("mapping", keys.mapping, pixels=STORED))
+    facts = {"pixels": STORED, "orientations": noted_orientations(run.image_set.images)} if run.image_set else {}
+    run.save_first(lambda: workspace.begin("mapping", keys.mapping, **facts))
     with run.stage("output"):
         run.save_first(lambda: workspace.write_models(models, keypoints))
     with run.stage("recording"):
