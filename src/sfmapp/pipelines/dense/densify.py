@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -26,6 +27,7 @@ from sfmapp.pipelines.dense.results import STAGE
 from sfmapp.pipelines.dense.source import DenseJob, dense_job, find_source, model_digest, plan_source
 from sfmapp.report.model import DenseReport, Outcome
 from sfmapp.workspace.kernels import compile_dense_kernels
+from sfmapp.workspace.keys import input_key, stage_key
 from sfmapp.workspace.manifest import AsBeforeError
 from sfmapp.workspace.options import Options, with_absolute_paths
 from sfmapp.workspace.usage import Stopwatch
@@ -87,7 +89,8 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
         with job.stage("views"):
             plan, views = plan_source(job)
             report = replace(report, views=views)
-        key = dense_results.dense_key(job, plan)
+        clusters = make_clusters(plan, job.options.dense.cell_px, job.options.dense.max_memory_mb)
+        key = _key(job, plan, clusters)
         files = (dense_results.FUSED, dense_results.PATCHES)
         if (earlier := dense_results.earlier_dense(job, key, files)) is not None:
             patches, _ = read_patches(job.workspace.folder / dense_results.PATCHES)
@@ -98,7 +101,7 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
         job.workspace.begin(STAGE, key, model=model_digest(job.known.model))
         with job.measured("kernels"):
             compile_dense_kernels(job.events)
-        patches, report = _densify(job, plan, report, is_resumed)
+        patches, report = _densify(job, plan, clusters, report, is_resumed)
         dense_results.write_cloud(job, plan, patches)
         assert report.shares is not None
         if warning := outcome.check(patches, report.shares, plan, job.options.dense.min_views):
@@ -117,10 +120,19 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
     return DenseResult(patches, plan.names, report, job.workspace.folder)
 
 
-def _densify(job: DenseJob, plan: DensePlan, report: DenseReport, is_resumed: bool) -> tuple[Patches, DenseReport]:
+def _key(job: DenseJob, plan: DensePlan, clusters: Sequence[Cluster]) -> str:
+    """Of the patches: model, photographs and masks, options, our code; and the clusters, which is all that follows
+    from how much memory there may be."""
+    inputs = [[record.name, record.turn, input_key(record)] for record in plan.records]
+    cores = [cluster.core.tolist() for cluster in clusters]
+    return stage_key((__name__,), job.options.dense, model_digest(job.known.model), inputs, cores)
+
+
+def _densify(
+    job: DenseJob, plan: DensePlan, clusters: list[Cluster], report: DenseReport, is_resumed: bool
+) -> tuple[Patches, DenseReport]:
     """Patches of all clusters, within the region, and the report with what came of it."""
     options = job.options.dense
-    clusters = make_clusters(plan, options.cell_px, options.max_memory_mb)
     if len(clusters) > 1:
         sizes = [len(cluster.core) for cluster in clusters]
         job.events.decided(

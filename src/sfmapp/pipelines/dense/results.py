@@ -19,7 +19,7 @@ from sfmapp.dense.report import CloudNumbers, DensifyReport
 from sfmapp.dense.scene import DenseScene, Patches
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap import read_model
-from sfmapp.pipelines.dense.source import DenseJob, model_digest
+from sfmapp.pipelines.dense.source import DenseJob
 from sfmapp.report.dense_document import dense_document
 from sfmapp.report.dense_html import render_dense_html
 from sfmapp.report.dense_pictures import PictureRow, dense_pictures
@@ -37,10 +37,8 @@ from sfmapp.report.model import (
 from sfmapp.reporting import R, Step, document_text, from_plain
 from sfmapp.scene.mesh import Mesh
 from sfmapp.surface.report import MeshReport
-from sfmapp.workspace.keys import input_key, stage_key
 from sfmapp.workspace.layout import DENSE, REPORT
 from sfmapp.workspace.manifest import raise_as_before
-from sfmapp.workspace.options import options_to_dict
 
 STAGE: Literal["dense"] = "dense"
 MESH = "mesh"
@@ -52,13 +50,6 @@ PICTURE_PX = 640
 Document: TypeAlias = ReconstructionReport | DenseRunReport
 # whose messages in the report of a workspace are ours to replace
 _OWN_STAGES = frozenset((STAGE, "views", "maps", "mesh", "texture", "recording"))
-
-
-def dense_key(job: DenseJob, plan: DensePlan) -> str:
-    """Of the patches: model, photographs and masks, options, our code."""
-    inputs = [[record.name, record.turn, input_key(record)] for record in plan.records]
-    packages = ("dense", "images", "geometry", "scene")
-    return stage_key(packages, options_to_dict(job.options.dense), model_digest(job.known.model), inputs)
 
 
 def earlier_dense(job: DenseJob, key: str, files: Sequence[str]) -> DenseReport | None:
