@@ -20,8 +20,8 @@ from sfmapp.formats.colmap import read_model
 from sfmapp.formats.trajectory import read_tum
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu, SequenceOptions
+from sfmapp.odometry.inertial import faults as inertial_faults
 from sfmapp.odometry.inertial.visual_inertial import contradicted
-from sfmapp.odometry.inertial.visual_inertial import faults as inertial_faults
 from sfmapp.odometry.records import _covariance_gap
 from sfmapp.odometry.refinement.final_adjustment import MAX_COVARIANCE_KEYFRAMES, FinalAdjustment
 from sfmapp.odometry.result import FrameState

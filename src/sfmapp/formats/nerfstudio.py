@@ -68,7 +68,7 @@ def write_nerfstudio(path: str | Path, reconstruction: Reconstruction, image_fol
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:
     model = CameraModel.OPENCV_FISHEYE if camera.is_fisheye else CameraModel.OPENCV
-    fx, fy, cx, cy, *distortion = camera.canonical.tolist()
+    fx, fy, cx, cy, *distortion = camera.canonical[:8].tolist()
     size = {"camera_model": model.name, "w": camera.width, "h": camera.height}
     return size | {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy} | dict(zip(_DISTORTION[model], distortion, strict=True))
 
@@ -125,6 +125,17 @@ def read_nerfstudio_poses(path: str | Path) -> tuple[list[str], NDArray[np.float
         return names, poses, _cameras(path, document)
     except InputError:
         return names, poses, None
+
+
+def read_nerfstudio_cameras(path: str | Path) -> tuple[list[str], list[Camera]]:
+    """Names of the frames, as :func:`read_nerfstudio` gives them, and the camera of each.
+
+    Raises:
+        InputError: the file is not JSON of this form, or a camera is not one of ours.
+    """
+    path = Path(path)
+    document = read_json_object(path)
+    return _poses(path, document)[0], _cameras(path, document)
 
 
 def _poses(path: Path, document: Mapping[str, Any]) -> tuple[list[str], NDArray[np.float64]]:
