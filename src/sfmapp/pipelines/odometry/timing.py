@@ -80,7 +80,7 @@ class ThreadTimes:
         return sum(seconds for (found, _), seconds in self._by_thread.items() if found == name)
 
     def timing(
-        self, num_frames: int, tracking_s: float, rate: float | None, tracking_ms: FrameTimes | None
+        self, num_frames: int, tracking_s: float, rate: float | None, tracking_ms: FrameTimes | None = None
     ) -> TimingReport | None:
         """Time of a frame: CPU milliseconds in all and of each part, and how that compares with the camera's rate;
         None without a frame."""
