@@ -8,6 +8,7 @@ computed from a report that was written: what a later run needs stands in the re
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import types
@@ -152,8 +153,10 @@ def _read(kind: Any, value: Any, place: str) -> Any:
         if value is None and type(None) in arguments:
             return None
         others = [argument for argument in arguments if argument is not type(None)]
-        return _read(others[0], value, place) if len(others) == 1 else value
-    if isinstance(kind, type) and issubclass(kind, Report):
+        if not all(_is_report(other) for other in others):
+            return _read(others[0], value, place) if len(others) == 1 else value
+        return _read_one_of(others, value, place)
+    if _is_report(kind):
         return _read_report(kind, _checked(value, dict, place), place)
     if origin is tuple and arguments[-1] is not ...:
         entries = _checked(value, list, place)
@@ -171,6 +174,18 @@ def _read(kind: Any, value: Any, place: str) -> Any:
     if kind in (bool, int, float, str):
         return _checked(value, (int, float) if kind is float else kind, place, is_flag=kind is bool)
     return value
+
+
+def _is_report(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Report)
+
+
+def _read_one_of(kinds: Sequence[type[Report]], value: Any, place: str) -> Report:
+    """The first kind that fits; what is wrong with the last where none does."""
+    for kind in kinds[:-1]:
+        with contextlib.suppress(ValueError):
+            return _read_report(kind, _checked(value, dict, place), place)
+    return _read_report(kinds[-1], _checked(value, dict, place), place)
 
 
 def _read_report(kind: type[Report], value: dict[str, object], place: str) -> Report:
