@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rendered_worlds import sequences as rendered
+from schemas import check_schema
 from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.contradictions import Contradiction
 from sfmapp.errors import InputError, InterruptedRunError, UsageError
@@ -252,6 +253,7 @@ def test_a_disturbed_map_is_put_right(room: Path, tracked: tuple[Path, TrackResu
 
 def test_photographs_join_the_map(room: Path, tracked: tuple[Path, TrackResult], tmp_path: Path) -> None:
     _, report = refine(tracked[0], tmp_path / "refined", options_of(room), photos=room / "photos")
+    check_schema("refine", json.loads((tmp_path / "refined" / "report.json").read_text()))
     assert [row["is_registered"] for row in report["photographs"]] == [True] * NUM_PHOTOS
     model, _ = read_model(tmp_path / "refined" / "sparse" / "0")
     is_photo = np.array([name.startswith("photos/") for name in model.image_names])
@@ -331,4 +333,6 @@ def test_a_run_without_a_camera_says_how_to_get_one(room: Path, tmp_path: Path) 
 def test_states_are_those_that_the_table_names(tracked: tuple[Path, TrackResult]) -> None:
     lines = (tracked[0] / "frames.csv").read_text().splitlines()[1:]
     assert {line.split(",")[3] for line in lines} <= {state.name.lower() for state in FrameState}
-    assert json.loads((tracked[0] / "report.json").read_text())["format"] == "sfmapp odometry report 2"
+    report = json.loads((tracked[0] / "report.json").read_text())
+    assert report["format"] == "sfmapp odometry report 2"
+    check_schema("odometry", report)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from odometry_fakes import FPS, FakeRunner, FakeSequence, path
+from schemas import check_schema
 from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.errors import InterruptedRunError, NoReconstructionError, UsageError
 from sfmapp.evaluation.trajectory import Trajectory, absolute_error, associate
@@ -167,6 +168,7 @@ def test_a_stereo_map_holds_both_cameras(tmp_path: Path, monkeypatch: Patch) -> 
 
 def test_the_report_compares_with_the_ground_truth(finished: tuple[Path, TrackResult]) -> None:
     report = json.loads((finished[0] / "report.json").read_text())
+    check_schema("odometry", report)
     final, live = report["ground_truth"]
     assert (final["poses"], final["alignment"], final["num_pairs"], live["poses"]) == ("final", "sim3", 45, "live")
     assert 0.01 < final["ate_m"]["rmse"] < 0.06

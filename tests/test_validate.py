@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from schemas import check_schema
 from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError, SfmError
 from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.evaluation.second_opinion import SecondOpinion
@@ -115,6 +116,7 @@ def test_the_same_model_in_another_world_agrees(
         assert side["reprojection_error_px"] < 1e-9
         assert side["ground_truth"]["center_error"]["max"] < 1e-9
         assert side["ground_truth"]["auc"]["0.5"] == pytest.approx(1.0, abs=1e-4)
+    check_schema("validate", plain(result))
     table = result.table()
     assert max(map(len, table.splitlines())) <= 100
     for words in ("registered images", "6 of 6", "2.0 s", "10.0 s   5.00 x less", "4.50 x less", "2.00 x more",

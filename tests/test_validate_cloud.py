@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from schemas import check_schema
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.colmap import write_model
@@ -58,6 +59,7 @@ def test_known_errors_are_told_at_one_two_and_five_pixels(workspace: Path, tmp_p
     assert [score["completeness"] for score in (one, two, five)] == [45.5 / 60, 46.5 / 60, 49.5 / 60]
     assert two["f_score"] == pytest.approx(2 * two["completeness"] / (1 + two["completeness"]), abs=1e-12)
     assert json.loads((workspace / "validation" / "cloud.json").read_text()) == plain(result)
+    check_schema("validate-cloud", plain(result))
     assert (workspace / "validation" / "cloud_error.rrd").stat().st_size > 10_000
     table = result.table()
     for words in ("2700 points, 3600 true points", "50.00 %", "100.00 %", "F-score"):
