@@ -35,6 +35,7 @@ from sfmapp.pipelines.validate import validate
 from sfmapp.report.model import MedianMax
 from sfmapp.report.odometry_document import FrameTable, make_checks
 from sfmapp.report.plots import Curve, plot_svg, ticks
+from sfmapp.reporting import Usage
 from sfmapp.scene.rig import Rig
 from sfmapp.workspace.options import Options, load_options, options_from_dict
 
@@ -44,7 +45,7 @@ Patch = pytest.MonkeyPatch
 def use(monkeypatch: Patch, sequence: FakeSequence, runner: object) -> None:
     monkeypatch.setattr(pipeline, "open_sequence", lambda *_, **__: sequence)
     monkeypatch.setattr(pipeline, "run_odometry", runner)
-    monkeypatch.setattr(pipeline, "compile_odometry_kernels", lambda *_, **__: {})
+    monkeypatch.setattr(pipeline, "compile_odometry_kernels", lambda *_, **__: Usage(wall_s=0.0, cpu_s=0.0))
 
 
 def run(output: Path, *settings: str, events: Events | None = None) -> TrackResult:
