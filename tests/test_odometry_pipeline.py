@@ -321,12 +321,12 @@ def test_workspaces_of_other_commands_are_refused(
 # -------------------------------------------------------------------------------------------------------------- scale
 
 
-@pytest.mark.parametrize("distance", ["distance:000000.png:000040:{:.4f}", "distance:0:40:{:.4f}"])
-def test_a_known_distance_makes_metres(distance: str, tmp_path: Path, monkeypatch: Patch) -> None:
+@pytest.mark.parametrize("source", ["distance:000000.png:000040:{:.4f}", "distance:0:40:{:.4f}"])
+def test_a_known_distance_makes_metres(source: str, tmp_path: Path, monkeypatch: Patch) -> None:
     use(monkeypatch, FakeSequence(), FakeRunner())
     centers = rigid3.center(path(50))
     length = float(np.linalg.norm(centers[40] - centers[0]))
-    result = run(tmp_path / "out", f"scale.source={distance.format(length)}")
+    result = run(tmp_path / "out", f"scale.source={source.format(length)}")
     row = result.report["maps"][0]
     assert (row["unit"], row["scale_source"]) == ("m", "distance")
     assert result.report["ground_truth"][0]["alignment"] == "se3"
