@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import sfmapp
 from sfmapp.dense.photographs import find_photographs
 from sfmapp.dense.prepare import DensePlan, plan_views
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
@@ -21,11 +19,9 @@ from sfmapp.images.sources import find_images
 from sfmapp.pipelines.stored_pixels import has_stored_pixels
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.layout import DENSE, ODOMETRY, RECONSTRUCT, UNDISTORT, USUAL_FOLDERS
-from sfmapp.workspace.listeners import DecisionLog, EventLog
 from sfmapp.workspace.manifest import read_manifest
 from sfmapp.workspace.options import Options, options_from_dict, options_to_dict
 from sfmapp.workspace.usage import Stopwatch
-from sfmapp.workspace.workspace import open_workspace
 
 # the workspace in the folder of a COLMAP model, if no other place is named
 INSIDE = "sfmapp"
@@ -80,23 +76,13 @@ class DenseJob(Job):
         self.workspace.save()
 
 
-@contextmanager
-def dense_job(where: DenseSource, events: Events, watch: Stopwatch | None = None) -> Iterator[DenseJob]:
-    """Open the workspace of a dense run or of its mesh, and listen in."""
-    from threadpoolctl import threadpool_limits
-
-    options, source = where.options, str(where.images)
-    threads = options.num_workers
-    with (
-        open_workspace(where.output, where.command) as workspace,
-        EventLog(workspace.log, events, source=source, version=sfmapp.__version__) as event_log,
-        # our workers use the cores; sums must not depend on how many the linear algebra beneath them would use
-        threadpool_limits(1, "blas"),
-    ):
-        job = DenseJob(source, workspace, options, events, watch or Stopwatch(), DecisionLog(), threads, where=where)
-        for listener in (event_log, job.log):
-            events.subscribe(listener)
-        yield job
+def dense_job(
+    where: DenseSource, events: Events | None, watch: Stopwatch | None = None
+) -> AbstractContextManager[DenseJob]:
+    """Open the workspace of a dense run or of its mesh."""
+    return DenseJob.opened(
+        where.command, where.images, where.output, where.options, events=events, watch=watch, where=where
+    )
 
 
 def plan_source(job: DenseJob) -> tuple[DensePlan, dict[str, Any]]:
