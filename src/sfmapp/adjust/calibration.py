@@ -22,7 +22,7 @@ from sfmapp.adjust.problem import pose_rows
 from sfmapp.adjust.solver import Loss
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
-from sfmapp.simd.f64x8 import offset, pointer
+from sfmapp.simd.pointers import offset, pointer
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from sfmapp.adjust.kernels import SCRATCH, linearize
 from sfmapp.adjust.solver import AdjustOptions, Engine, make_engine
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
-from sfmapp.simd.f64x8 import offset, pointer
+from sfmapp.simd.pointers import offset, pointer
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,8 @@ import math
 
 import numba
 
-from sfmapp.simd.f64x8 import add2, assign3, offset, pointer, spread, store8, subtract3
+from sfmapp.simd.f64x8 import add2, assign3, spread, store8, subtract3
+from sfmapp.simd.pointers import offset, pointer
 
 # The numbers by which kernels know the losses.
 LOSS_IDS: dict[str, int] = {"trivial": 0, "huber": 1, "cauchy": 2}
