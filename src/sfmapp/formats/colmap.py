@@ -21,6 +21,8 @@ from sfmapp.formats.colmap_text import read_text, read_text_cameras, read_text_i
 from sfmapp.scene.reconstruction import Reconstruction
 
 _STEMS = ("cameras", "images", "points3D", "rigs", "frames")
+# of a binary model, which is what we write
+MODEL_FILES = tuple(f"{stem}.bin" for stem in _STEMS)
 _FILES = frozenset(f"{stem}.{ending}" for stem in _STEMS for ending in ("bin", "txt"))
 
 
@@ -35,7 +37,7 @@ def write_model(folder: str | Path, reconstruction: Reconstruction, keypoints: K
     Args:
         folder: where the five files go.
         reconstruction: images without a pose and points without coordinates are left out.
-        keypoints: forevery image, registered or not, (N, 2) or wider, pixels: all become keypoints of the model, so
+        keypoints: for every image, registered or not, (N, 2) or wider, pixels: all become keypoints of the model, so
             that their positions agree with the database; tracked ones take the pixel from the tracks, which may have
             been refined. None: just the tracked ones, in the order of their positions.
 
@@ -58,6 +60,11 @@ def write_model_text(folder: str | Path, reconstruction: Reconstruction, keypoin
     model = model_from_reconstruction(reconstruction, keypoints)
     with replaced_folder(Path(folder), _FILES) as beside:
         write_text(beside, model)
+
+
+def is_model_file(path: Path) -> bool:
+    """Whether a file is by its name one of a model, binary or text."""
+    return path.name in _FILES
 
 
 def has_model(folder: str | Path) -> bool:

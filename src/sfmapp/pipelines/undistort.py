@@ -24,7 +24,7 @@ from sfmapp.dense.undistort import resample
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.atomic import replaced_file
-from sfmapp.formats.colmap import read_model
+from sfmapp.formats.colmap import MODEL_FILES, read_model
 from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import decode_file, read_file, read_mask_file
 from sfmapp.images.rewrite import encode, encode_mask, without_turn
@@ -33,7 +33,7 @@ from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.undistortion import Undistortion, has_distortion, plan_undistortion, undistort_reconstruction
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.keys import input_key, stage_key
-from sfmapp.workspace.layout import MODEL_FILES, UNDISTORT
+from sfmapp.workspace.layout import UNDISTORT
 from sfmapp.workspace.manifest import recorded_versions
 from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
@@ -235,7 +235,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _undistorted(record: ImageRecord, how: Undistortion) -> tuple[bytes, NDArray[np.bool_] | None]:
-    """The file of a photograph, and (h, w) True where it may be used; None foreverywhere.
+    """The file of a photograph, and (h, w) True where it may be used; None for everywhere.
 
     Raises:
         InputError: it, or its mask, cannot be read.

@@ -14,7 +14,7 @@ from sfmapp.dense.photographs import find_photographs
 from sfmapp.dense.prepare import DensePlan, plan_views
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
-from sfmapp.formats.colmap import has_model, read_model
+from sfmapp.formats.colmap import has_model, is_model_file, read_model
 from sfmapp.images.sources import find_images
 from sfmapp.pipelines.stored_pixels import has_stored_pixels
 from sfmapp.workspace.job import Job
@@ -218,6 +218,6 @@ def model_digest(model: Path) -> str:
     """Hash of the files of a model."""
     digest = hashlib.blake2b(digest_size=16)
     for path in sorted(model.iterdir()):
-        if path.suffix in (".bin", ".txt") and path.stem in ("cameras", "images", "points3D", "rigs", "frames"):
+        if is_model_file(path):
             digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()

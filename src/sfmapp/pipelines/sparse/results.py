@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfmapp.errors import NoReconstructionError
+from sfmapp.formats.colmap import MODEL_FILES
 from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.pipelines.stored_pixels import STORED
 from sfmapp.report.document import FORMAT, camera_rows, funnel_of_images, funnel_without_matches, make_checks
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from sfmapp.pipelines.sparse.keys import StageKeys
     from sfmapp.pipelines.sparse.run import Run
     from sfmapp.scene.reconstruction import Reconstruction
-
-MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 
 
 def earlier_report(run: Run, keys: StageKeys) -> dict[str, Any] | None:
