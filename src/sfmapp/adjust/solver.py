@@ -43,19 +43,33 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class AdjustOptions:
-    """How a bundle adjustment is done. Lengths are in pixels; the noise of an observation counts as one pixel."""
+    """How a bundle adjustment is done. Lengths are in pixels; the noise of an observation counts as one pixel.
 
-    loss: Loss = "trivial"  # robust loss on the length of each residual; huber and cauchy as in Ceres and gtsam
-    loss_scale_px: float = 1.0  # residual length at which the loss begins to bend
-    max_iterations: int = 50  # Levenberg-Marquardt steps, rejected ones included
-    relative_cost_tolerance: float = 1e-6  # stop when an accepted step lowers the cost by less than this share
-    initial_damping: float = 1e-4  # first share of the diagonal that is added to it; Ceres' 1 / trust region radius
-    refine_focal: bool = True  # focal lengths may change
-    refine_distortion: bool = True  # distortion coefficients may change
-    refine_principal_point: bool = False  # principal points may change
-    principal_point_sigma_px: float | None = None  # prior around the a priori principal point; None for no prior
-    distortion_sigma: float | None = None  # prior of each coefficient around its a priori value; None for no prior
-    backend: Literal["schur", "gtsam"] = "schur"  # schur: our kernels; gtsam: one factor per observation, the reference
+    Attributes:
+        loss: robust loss on the length of each residual; huber and cauchy as in Ceres and gtsam
+        loss_scale_px: residual length at which the loss begins to bend
+        max_iterations: Levenberg-Marquardt steps, rejected ones included
+        relative_cost_tolerance: stop when an accepted step lowers the cost by less than this share
+        initial_damping: first share of the diagonal that is added to it; Ceres' 1 / trust region radius
+        refine_focal: focal lengths may change
+        refine_distortion: distortion coefficients may change
+        refine_principal_point: principal points may change
+        principal_point_sigma_px: prior around the a priori principal point; None for no prior
+        distortion_sigma: prior of each coefficient around its a priori value; None for no prior
+        backend: schur: our kernels; gtsam: one factor per observation, the reference
+    """
+
+    loss: Loss = "trivial"
+    loss_scale_px: float = 1.0
+    max_iterations: int = 50
+    relative_cost_tolerance: float = 1e-6
+    initial_damping: float = 1e-4
+    refine_focal: bool = True
+    refine_distortion: bool = True
+    refine_principal_point: bool = False
+    principal_point_sigma_px: float | None = None
+    distortion_sigma: float | None = None
+    backend: Literal["schur", "gtsam"] = "schur"
 
     def __post_init__(self) -> None:
         check_options("adjust", self, _RANGES)
