@@ -160,7 +160,7 @@ def field_comments(options_class: type) -> dict[str, str]:
     """What ``Attributes:`` in the docstring of a class says about each of its fields; empty for nothing."""
     comments = {f.name: "" for f in dataclasses.fields(options_class)}
     _, _, section = inspect.cleandoc(options_class.__doc__ or "").partition("Attributes:\n")
-    for entry in textwrap.dedent(section).split("\n\n")[0].replace("\n    ", " ").splitlines():
+    for entry in textwrap.dedent(section.split("\n\n")[0]).replace("\n    ", " ").splitlines():
         names, _, text = entry.partition(":")
         comments |= {name: text.strip() for name in map(str.strip, names.split(",")) if name in comments}
     return comments
