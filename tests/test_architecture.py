@@ -68,10 +68,6 @@ INNER_FLOORS = {
         ("stored_pixels",),
     ),
 }
-# imports that close a circle and wait to be mended
-OPEN_CIRCLES = {
-    "sfmapp.adjust.solver": {"sfmapp.adjust.reference", "sfmapp.adjust.covariance", "sfmapp.adjust.clustered"}
-}
 LEVEL = {room: level for level, floor in enumerate(FLOORS) for room in floor}
 ALLOWED = {
     "rerun": {"viewer"},
@@ -164,7 +160,7 @@ def test_imports_run_downward_inside_a_room(room: str) -> None:
 
 def test_imports_run_in_no_circle() -> None:
     """File by file, imports within functions and for type checkers included: who knows whom is no riddle."""
-    graph = {name: imports(name) & modules().keys() - OPEN_CIRCLES.get(name, set()) for name in modules()}
+    graph = {name: imports(name) & modules().keys() for name in modules()}
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:

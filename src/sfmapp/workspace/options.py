@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import SfmError, UsageError
 from sfmapp.features.extract import FeatureOptions

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
