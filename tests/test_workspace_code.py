@@ -173,5 +173,5 @@ def test_a_change_of_what_stages_share_touches_just_those_that_import_it(
     module: str, package: Callable[[Path], Path]
 ) -> None:
     importing = {stage for stage, entries in STAGES.items() if f"sfmapp.{module}" in parsed_closure(entries)}
-    assert 0 < len(importing)
+    assert len(importing) > 0
     test_a_change_touches_the_stages_that_run_it(module, importing, package)

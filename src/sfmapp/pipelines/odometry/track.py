@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.errors import InterruptedRunError, NoReconstructionError
+from sfmapp.errors import InterruptedRunError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.images.frame_reader import FileSequence
 from sfmapp.images.sequence import Frame, GroundTruth, Imu, Sequence, SequenceKind
@@ -49,7 +49,7 @@ class TrackResult(NamedTuple):
 
 
 def track_sequence(
-    source: str | os.PathLike[str],
+    source: str | os.PathLike[str] | Sequence,
     output: str | os.PathLike[str],
     options: Options | None = None,
     *,
@@ -62,7 +62,8 @@ def track_sequence(
     """Follow a camera (or a stereo rig) through a sequence.
 
     Args:
-        source: a folder of frames, a video file or stream, or the folder of a KITTI, TUM or EuRoC sequence.
+        source: a folder of frames, a video file or stream, or the folder of a KITTI, TUM or EuRoC sequence; or an
+            open sequence, such as one of frames in memory.
         output: folder of the results: new, empty, or of an earlier odometry run, whose results are replaced.
         options: of all stages; ``sequence`` and ``odometry`` count here. See :func:`sfmapp.load_options`.
         events: listens in, and can ask the run to stop: what was tracked until then is written.
@@ -77,10 +78,14 @@ def track_sequence(
         NoReconstructionError: no map could be made; the report is written.
         InterruptedRunError: ``events`` was asked to stop.
     """
+    sequence = None if isinstance(source, str | os.PathLike) else source
+    name = os.fspath(source) if isinstance(source, str | os.PathLike) else source.source
+    if sequence is not None and self_calibrate:
+        raise UsageError("frames in memory come with their camera, and cannot be looked at twice to calibrate it")
     request = parse_scale(options.scale.source) if options is not None and options.scale.source is not None else None
     with Tracking.opened(
-        ODOMETRY, source, output, options, events=events, watch=watch, scale_request=request,
-        keyframes=KeyframeWatch(request.detector() if request else None),
+        ODOMETRY, name, output, options, events=events, watch=watch, scale_request=request,
+        keyframes=KeyframeWatch(request.detector() if request else None), sequence=sequence,
     ) as run:  # fmt: skip
         run.listen_in(record, screen)
         return _run(run, self_calibrate)
@@ -95,7 +100,8 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
             from sfmapp.pipelines.odometry.self_calibrate import self_calibrated
 
             options, run.stages["self_calibration"] = self_calibrated(run.source, options, events)
-        run.sequence = open_sequence(run.source, options.sequence, events)
+        if run.sequence is None:
+            run.sequence = open_sequence(run.source, options.sequence, events)
         run.scale_request = resolve_scale_request(run.scale_request, options.scale.source is None, run.sequence)
     if run.live is not None:
         run.live.begin(run.sequence)
