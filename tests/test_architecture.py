@@ -175,7 +175,7 @@ def test_modules_named_in_strings_exist() -> None:
         missing = set(named_modules(path)) - known
         assert not missing, f"{path} names {missing}"
     for name, home in sfmapp._HOMES.items():
-        assert home in known, f"{name} lives in {home}"
+        assert f"sfmapp.{home}" in known, f"{name} lives in {home}"
 
 
 def test_children_can_be_run() -> None:

@@ -111,7 +111,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "AdjustOptions": "adjust.solver",
+    "AdjustOptions": "adjust.options",
     "ArraySequence": "images.array_sequence",
     "Camera": "camera.camera",
     "CameraModel": "camera.camera",
