@@ -20,7 +20,6 @@ from sfmapp.images.sequence import Frame, GroundTruth, Imu, Sequence, SequenceKi
 from sfmapp.images.video import VideoSequence
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
-from sfmapp.pipelines.odometry.keyframes import KeyframeWatch
 from sfmapp.pipelines.odometry.results import write_odometry
 from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps
 from sfmapp.pipelines.odometry.tracking import Tracking
@@ -84,9 +83,8 @@ def track_sequence(
         raise UsageError("frames in memory come with their camera, and cannot be looked at twice to calibrate it")
     request = parse_scale(options.scale.source) if options is not None and options.scale.source is not None else None
     with Tracking.opened(
-        ODOMETRY, name, output, options, events=events, watch=watch, scale_request=request,
-        keyframes=KeyframeWatch(request.detector() if request else None), sequence=sequence,
-    ) as run:  # fmt: skip
+        ODOMETRY, name, output, options, events=events, watch=watch, scale_request=request, sequence=sequence
+    ) as run:
         run.listen_in(record, screen)
         return _run(run, self_calibrate)
 
@@ -111,7 +109,12 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
     watched = Watched(run.sequence, run)
     with run.measured("odometry"):
         result = run_odometry(
-            watched, options.odometry, seed=options.seed, threads=run.threads, events=events.without_cancellation()
+            watched,
+            options.odometry,
+            seed=options.seed,
+            threads=run.threads,
+            events=events.without_cancellation(),
+            markers=None if run.scale_request is None else run.scale_request.detector(),
         )
         run.threads_cpu.sample()
     run.stages["odometry"] = result.report
@@ -120,12 +123,9 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
 
         widen(result, run.stages["self_calibration"])
     with run.measured("scale"):
-        run.keyframes.colour(result)
         if run.scale_request is not None:
             without_cancellation = events.without_cancellation()
-            run.stages["scale"] = scale_maps(
-                result, run.scale_request, run.keyframes, watched.imu, without_cancellation
-            )
+            run.stages["scale"] = scale_maps(result, run.scale_request, watched.imu, without_cancellation)
     result = replace(result, timestamps_s=watched.times_as_given(result))
     if isinstance(run.sequence, FileSequence | VideoSequence):  # frames in memory are all there
         result = result.with_repeated(run.sequence.repeated)

@@ -13,7 +13,6 @@ from sfmapp.workspace.job import Job
 
 if TYPE_CHECKING:
     from sfmapp.images.sequence import Sequence
-    from sfmapp.pipelines.odometry.keyframes import KeyframeWatch
     from sfmapp.pipelines.odometry.scale import ScaleRequest
 
 GIVEN_UP = "given up, for the disk is full, and the rest matters more"
@@ -25,7 +24,6 @@ class Tracking(Job):
 
     Attributes:
         scale_request: what the unit of length is to come from; None: an arbitrary one will do.
-        keyframes: looks at the images of keyframes.
         frames: what was told of each frame.
         threads_cpu: CPU time by thread.
         live: draws what happens; None if nobody looks.
@@ -33,7 +31,6 @@ class Tracking(Job):
     """
 
     scale_request: ScaleRequest | None
-    keyframes: KeyframeWatch
     frames: FrameLog = field(default_factory=FrameLog)
     threads_cpu: ThreadTimes = field(default_factory=ThreadTimes)
     live: LiveView | None = None
@@ -47,7 +44,7 @@ class Tracking(Job):
         growing = GrowingTrajectories(self.workspace.folder, self.events, self.make_room)
         self.until_end.enter_context(closing(growing))
         self.listen(growing, first=True)  # whatever happens next, this pose is on the disk
-        for listener in (self.frames, self.keyframes, self.live):
+        for listener in (self.frames, self.live):
             self.listen(listener)
 
     def make_room(self) -> bool:
