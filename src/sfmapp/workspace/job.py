@@ -22,6 +22,8 @@ from typing import Any, Self
 import sfmapp
 from sfmapp.errors import InputError, is_full
 from sfmapp.events import Events, Listener
+from sfmapp.report.model import RunFacts
+from sfmapp.reporting import Usage
 from sfmapp.workspace.listeners import DecisionLog, EventLog
 from sfmapp.workspace.manifest import recorded_versions
 from sfmapp.workspace.options import Options, options_to_dict, with_absolute_paths
@@ -43,8 +45,7 @@ class Job:
         events: what happens is told here; subscribe with :meth:`listen`, so that it ends with the job.
         watch: since the run began.
         log: the decisions and warnings so far.
-        usage: wall and CPU seconds and peak memory of each stage, by name.
-        stages: the report of each stage, by name.
+        usage: what each stage took, by name.
     """
 
     source: str
@@ -54,8 +55,7 @@ class Job:
     watch: Stopwatch
     log: DecisionLog
     until_end: ExitStack
-    usage: dict[str, dict[str, Any]] = field(default_factory=dict)
-    stages: dict[str, Any] = field(default_factory=dict)
+    usage: dict[str, Usage] = field(default_factory=dict)
     started: datetime = field(default_factory=lambda: datetime.now(UTC))
 
     @classmethod
@@ -144,17 +144,18 @@ class Job:
         self.events.warned("recording", f"{recording} is given up: the disk is full, and the rest matters more")
         return True
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> RunFacts:
         """What the report says of the run: how it was called, and what it has taken so far."""
-        return {
-            "source": self.source,
-            "seed": self.options.seed,
-            "threads": self.threads,
-            "options": options_to_dict(self.options),
-            "versions": self.workspace.manifest["versions"],
-            "started": self.started.isoformat(timespec="seconds"),
-            "is_up_to_date": False,
-        } | self.watch.read()
+        return RunFacts(
+            source=self.source,
+            seed=self.options.seed,
+            threads=self.threads,
+            options=options_to_dict(self.options),
+            versions=self.workspace.manifest["versions"],
+            started=self.started.isoformat(timespec="seconds"),
+            is_up_to_date=False,
+            **self.watch.read(),
+        )
 
     def note_inputs(self, inputs: dict[str, str]) -> None:
         """Write down what this run works on and how, before it begins; ``inputs``: digests by name."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from sfmapp.pipelines.odometry.live import GrowingTrajectories
 from sfmapp.pipelines.odometry.timing import FrameLog, ThreadTimes
+from sfmapp.report.model import OdometryStages
 from sfmapp.viewer.live import LiveView, Screen
 from sfmapp.workspace.job import Job
 
@@ -28,6 +29,7 @@ class Tracking(Job):
         threads_cpu: CPU time by thread.
         live: draws what happens; None if nobody looks.
         sequence: once it is open.
+        stages: what each part has said.
     """
 
     scale_request: ScaleRequest | None
@@ -35,6 +37,7 @@ class Tracking(Job):
     threads_cpu: ThreadTimes = field(default_factory=ThreadTimes)
     live: LiveView | None = None
     sequence: Sequence | None = None
+    stages: OdometryStages = field(default_factory=OdometryStages)
 
     def listen_in(self, record: bool, screen: Screen | None) -> None:
         """Let everybody listen who looks at a run while it is under way: ``recording.rrd`` and a viewer, if wanted."""
