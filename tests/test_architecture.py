@@ -60,7 +60,7 @@ INNER_FLOORS = {
         ("frontend",),
         ("keyframe_images", "motion_model", "snapshot"),
         ("result", "state"),
-        ("inertial",),
+        ("inertial", "report"),
         ("options",),
     ),
     "pipelines": (
