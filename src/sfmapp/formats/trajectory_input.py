@@ -6,9 +6,9 @@ KITTI 12 columns: the rows of world_from_cam (3, 4); line i is frame i      Geig
 EuRoC 8 columns or more, commas: ``timestamp_ns, px, py, pz, qw, qx, qy, qz`` Burri et al., IJRR 2016
 ===== ===================================================================== =========================================
 
-All hold world_from_body: of the camera in TUM's and KITTI's ground truth, of the IMU in EuRoC's. Times may be in another
-unit (ORB-SLAM3 writes nanoseconds into TUM's form): see :mod:`sfmapp.formats.clocks`. KITTI's rows may be whole 4 x 4
-matrices.
+All hold world_from_body: of the camera in TUM's and KITTI's ground truth, of the IMU in EuRoC's. Times may be in
+another unit (ORB-SLAM3 writes nanoseconds into TUM's form): see :mod:`sfmapp.formats.clocks`. KITTI's rows may be whole
+4 x 4 matrices.
 """
 
 from __future__ import annotations
