@@ -144,8 +144,8 @@ def test_spoilt_text_is_refused_by_name_or_can_be_true(files: Path, name: str, d
 @pytest.mark.parametrize(
     ("name", "old", "new", "match"),
     [
-        ("trajectory.tum", "\n1.0 ", "\n1.0 1_0 ", "expected 8 finite numbers"),
-        ("poses.txt", "1.000000000e+00 ", "1_0 ", "expected 12 finite numbers"),
+        ("trajectory.tum", "\n1.0 ", "\n1.0 1_0 ", "expected numbers"),
+        ("poses.txt", "1.000000000e+00 ", "1_0 ", "expected numbers"),
         ("bundle.out", "900.0 ", "9_00.0 ", "nothing but numbers"),
         ("transforms.json", '"fl_x": 900.0', '"fl_x": 900.0, "fl_x": 800.0', "'fl_x' twice"),
         ("cameras.json", "[[900.0, 0.0, 500.5]", "[[900.0, 0.0, 1e308]", "expected K in pixels"),

@@ -68,5 +68,4 @@ def test_points_that_disagree_on_the_scale_do_not_vote():
     center = source.centers[5]
     source.point_xyz[:] = center + (source.point_xyz - center) * rng.uniform(0.2, 5.0, (len(source.point_xyz), 1))
     found = find_merge(target, source)
-    assert found is not None  # some agree by chance
-    assert found[1] < 0.2 * (target.is_triangulated & source.is_triangulated).sum()
+    assert found is None or found[1] < 0.2 * (target.is_triangulated & source.is_triangulated).sum()
