@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from rendered_worlds import sequences as rendered
 from rendered_worlds.sequences import RenderedSequence
 from sfmapp.camera.camera import Camera
+from sfmapp.formats.trajectory import write_kitti
 from sfmapp.geometry import rigid3
-from sfmapp.sequences.kitti import write_kitti
 
 Array = NDArray[np.float64]
 

@@ -27,7 +27,8 @@ from sfmapp.cli.streams import Stream
 from sfmapp.errors import InputError, is_full, refusal
 from sfmapp.events import Event, Events
 from sfmapp.formats.atomic import replaced_file
-from sfmapp.formats.trajectory import GrowingTum, read_tum
+from sfmapp.formats.trajectory import GrowingTum
+from sfmapp.formats.trajectory_input import read_tum
 from sfmapp.geometry import rigid3
 from sfmapp.workspace.listeners import EventLog
 from sfmapp.workspace.manifest import read_manifest

@@ -22,7 +22,8 @@ from sfmapp.formats.ground_truth import read_ground_truth
 from sfmapp.formats.nerfstudio import POINTS_NAME, read_nerfstudio, write_nerfstudio
 from sfmapp.formats.ply import write_ply
 from sfmapp.formats.ply_reader import read_ply_geometry
-from sfmapp.formats.trajectory import read_tum, write_tum
+from sfmapp.formats.trajectory import write_tum
+from sfmapp.formats.trajectory_input import read_tum
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene, synthetic_camera

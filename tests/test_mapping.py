@@ -80,14 +80,6 @@ def test_exact_observations_give_the_exact_scene():
     assert models[0].summary()["rms_reprojection_error_px"] < 1e-4
 
 
-def test_wrong_observations_are_left_out():
-    # a random observation is not matched by the true correspondences, but what is mapped must not suffer
-    scene = make_scene(3, 12, 1200, sigma_px=0.5, outlier_ratio=0.2)
-    models, _ = reconstruct(scene)
-    assert models[0].is_registered.all()
-    assert np.median(center_errors(models[0], scene.ground_truth)) < 4e-3
-
-
 def test_gtsam_as_the_backend_comes_to_the_same():
     scene = make_scene(11, 8, 300, sigma_px=0.4)
     image_set, features, found = inputs(scene)

@@ -17,7 +17,8 @@ from sfmapp.contradictions import Contradiction
 from sfmapp.errors import InputError, InterruptedRunError, UsageError
 from sfmapp.events import Event, Events
 from sfmapp.formats.colmap import read_model
-from sfmapp.formats.trajectory import read_tum, write_tum
+from sfmapp.formats.trajectory import write_tum
+from sfmapp.formats.trajectory_input import read_tum
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import SequenceOptions
 from sfmapp.odometry.result import FrameState

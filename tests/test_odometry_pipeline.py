@@ -18,7 +18,7 @@ from sfmapp.errors import InterruptedRunError, NoReconstructionError, UsageError
 from sfmapp.evaluation.trajectory import Trajectory, absolute_error, associate
 from sfmapp.events import Event, Events
 from sfmapp.formats.colmap import read_model
-from sfmapp.formats.trajectory import read_tum
+from sfmapp.formats.trajectory_input import read_tum
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu, SequenceOptions
 from sfmapp.odometry.inertial import faults as inertial_faults

@@ -20,12 +20,12 @@ from hypothesis import strategies as st
 from sfmapp.camera.camera import CameraModel, project
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Event, Events
-from sfmapp.formats.trajectory import write_tum
+from sfmapp.formats.trajectory import write_kitti, write_tum
+from sfmapp.formats.trajectory_input import read_trajectory
 from sfmapp.geometry import rigid3
 from sfmapp.images.frame_reader import read_ahead
 from sfmapp.images.sequence import Frame, Sequence
 from sfmapp.sequences.files import ascending, confined, frame_numbers
-from sfmapp.sequences.kitti import read_kitti, write_kitti
 from sfmapp.sequences.open import MissingCameraError, SequenceOptions, open_sequence
 
 SIZE = (64, 48)
@@ -215,13 +215,14 @@ def test_kitti_poses_round_trip(tmp_path_factory: pytest.TempPathFactory, count:
     if gaps:
         poses[np.random.default_rng(seed).random(count) < 0.3] = np.nan
     write_kitti(path, poses)
-    read = read_kitti(path)
     has_pose = np.isfinite(poses).all(1)
     assert path.with_name("trajectory.kitti.frames").exists() == (not has_pose.all())
     assert len(path.read_text().splitlines()) == has_pose.sum()
     if not has_pose.any():
-        assert len(read) == 0
+        with pytest.raises(InputError, match="found no line of numbers"):
+            read_trajectory(path)
         return
+    read = read_trajectory(path).cam_from_world
     last = np.flatnonzero(has_pose)[-1] + 1
     np.testing.assert_array_equal(np.isfinite(read).all(1), has_pose[:last])
     first = poses[has_pose][0]
@@ -231,7 +232,7 @@ def test_kitti_poses_round_trip(tmp_path_factory: pytest.TempPathFactory, count:
 def test_kitti_poses_of_frames_that_were_left_out(tmp_path: Path) -> None:
     path = tmp_path / "t.kitti"
     write_kitti(path, some_poses(3), [0, 2, 5])
-    assert np.isfinite(read_kitti(path)[:, 0]).tolist() == [True, False, True, False, False, True]
+    assert np.isfinite(read_trajectory(path).cam_from_world[:, 0]).tolist() == [True, False, True, False, False, True]
     write_kitti(path, some_poses(3))
     assert not (tmp_path / "t.kitti.frames").exists()
     # the first row of a trajectory is the identity, as the benchmark has it
@@ -239,12 +240,40 @@ def test_kitti_poses_of_frames_that_were_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["1 2 3\n", "nan " * 12, "2 0 0 0 0 2 0 0 0 0 2 0", "1 0 0 0 0 1 0 0 0 0 -1 0", "a " * 12]
+    "text",
+    ["1 2 3\n", "2 0 0 0 0 2 0 0 0 0 2 0", "1 0 0 0 0 1 0 0 0 0 -1 0", "1 0 0 0 0 1 0 0 0 0 1 1_0", "1 " + "a " * 11],
 )
-def test_kitti_poses_that_are_none_are_refused(tmp_path: Path, text: str) -> None:
+def test_kitti_poses_that_are_none_are_refused(tmp_path: Path, told: Told, text: str) -> None:
     (tmp_path / "poses.txt").write_text(text)
     with pytest.raises(InputError, match=r"poses\.txt:1"):
-        read_kitti(tmp_path / "poses.txt")
+        read_trajectory(tmp_path / "poses.txt")
+    write_images(tmp_path / "image_0", numbered(1))
+    with pytest.raises(InputError, match=r"poses\.txt:1"):
+        open_sequence(tmp_path, SequenceOptions(camera=PINHOLE, ground_truth=str(tmp_path / "poses.txt")), told.events)
+
+
+@pytest.mark.parametrize(("digits", "is_read"), [(6, True), (3, True), (1, False)])
+def test_rotations_of_few_digits_are_read_alike_for_odometry_and_for_evaluation(
+    tmp_path: Path, told: Told, digits: int, is_read: bool
+) -> None:
+    """The benchmark's own files have six digits; people write three."""
+    poses = some_poses(4, 3)
+    matrices = np.concatenate([rigid3.rotation_matrix(poses), poses[:, 4:, None]], 2).reshape(-1, 12)
+    path = tmp_path / "given.txt"
+    path.write_text("".join(" ".join(f"{v:.{digits}f}" for v in row) + "\n" for row in matrices))
+    write_images(tmp_path / "image_0", numbered(4))
+    options = SequenceOptions(camera=PINHOLE, ground_truth=str(path))
+    if not is_read:
+        for read in (lambda: read_trajectory(path), lambda: open_sequence(tmp_path, options, told.events)):
+            with pytest.raises(InputError, match="expected a rotation"):
+                read()
+        return
+    found = open_sequence(tmp_path, options, told.events).ground_truth
+    assert found is not None
+    np.testing.assert_array_equal(found.cam_from_world, read_trajectory(path).cam_from_world)
+    rotation = rigid3.rotation_matrix(found.cam_from_world)
+    np.testing.assert_allclose(rotation @ rotation.swapaxes(1, 2), np.tile(np.eye(3), (4, 1, 1)), atol=1e-12)
+    assert_same_poses(found.cam_from_world, rigid3.inverse(poses), 3 * 10.0**-digits)
 
 
 # --------------------------------------------------------------------------------------------------------------- TUM

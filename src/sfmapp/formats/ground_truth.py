@@ -18,7 +18,7 @@ from sfmapp.formats.colmap import has_model, read_model_poses
 from sfmapp.formats.colmap_model import checked_camera
 from sfmapp.formats.nerfstudio import read_nerfstudio_poses
 from sfmapp.formats.text_input import finite_array, nearest_rotation, read_json_object
-from sfmapp.formats.trajectory import read_tum
+from sfmapp.formats.trajectory_input import read_tum
 from sfmapp.geometry import rigid3
 
 _LARGEST_PX = 1e9

@@ -1,5 +1,10 @@
-"""Trajectories as text: one pose per line, ``timestamp tx ty tz qx qy qz qw``, world_from_cam (Sturm et al., "A
-benchmark for the evaluation of RGB-D SLAM systems", IROS 2012)."""
+"""Writing trajectories as text; :mod:`sfmapp.formats.trajectory_input` reads them.
+
+TUM's form has one pose per line, ``timestamp tx ty tz qx qy qz qw``, world_from_cam (Sturm et al., "A benchmark for the
+evaluation of RGB-D SLAM systems", IROS 2012). KITTI's has a line per frame: the 12 numbers, row by row, of the 3 x 4
+matrix world_from_cam of camera 0 (left grey), relative to the first frame; there are no times and no gaps: line i is
+frame i (Geiger, Lenz, Urtasun, CVPR 2012).
+"""
 
 from __future__ import annotations
 
@@ -9,9 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfmapp.errors import InputError
 from sfmapp.formats.atomic import replaced_file
-from sfmapp.formats.text_input import finite_array, plain_numbers, read_limited_text
 from sfmapp.geometry import rigid3
 
 _HEAD = "# timestamp tx ty tz qx qy qz qw\n"
@@ -70,27 +73,36 @@ def _lines(timestamps_s: NDArray[np.float64], cam_from_world: NDArray[np.float64
     return [" ".join(map(repr, row)) + "\n" for row in rows.tolist()]
 
 
-def read_tum(path: str | Path) -> tuple[list[str], NDArray[np.float64]]:
-    """Read timestamps as they are written, for names come as timestamps too, and cam_from_world (N, 7) float64.
+def write_kitti(path: str | Path, cam_from_world: NDArray[np.float64], frame_idx: ArrayLike | None = None) -> None:
+    """Write a trajectory, relative to its first pose.
+
+    The benchmark's tools take line i for frame i and know no gaps. So a frame without a pose has no line, and nothing
+    is invented for it: then ``PATH.frames`` beside it names the frame of each line, one number a line. Where that file
+    is missing the trajectory is whole, and tools may read it as it is.
+
+    Args:
+        cam_from_world: (F, 7), NaN where there is no pose.
+        frame_idx: (F,) ascending positions of the frames in the sequence, where some were left out; None: 0 to F - 1.
 
     Raises:
-        InputError: a line does not hold eight finite numbers and a quaternion of unit length.
+        InputError: the file cannot be written.
     """
     path = Path(path)
-    names, rows = [], []
-    for number, line in enumerate(read_limited_text(path).splitlines(), 1):
-        fields = line.split()
-        if not fields or fields[0].startswith("#"):
-            continue
-        place = f"{path}:{number}"
-        try:
-            rows.append(finite_array(place, plain_numbers(fields), (8,)))
-        except ValueError:
-            raise InputError(f"{place}: expected 8 finite numbers, found {line[:80]!r}") from None
-        if abs(np.hypot.reduce(rows[-1][4:]) - 1) > 1e-2:  # six digits are customary, three occur
-            raise InputError(f"{place}: expected a quaternion of unit length, found {fields[4:]}")
-        names.append(fields[0])
-    table = np.array(rows, np.float64).reshape(-1, 8)
-    norm = np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
-    unit = np.where(np.abs(norm - 1) > 1e-12, table[:, 4:] / np.where(norm > 0, norm, 1), table[:, 4:])
-    return names, rigid3.inverse(np.concatenate([unit, table[:, 1:4]], 1))
+    numbers = np.arange(len(cam_from_world)) if frame_idx is None else np.asarray(frame_idx, np.int64)
+    has_pose = np.isfinite(cam_from_world).all(1)
+    poses = np.asarray(cam_from_world, np.float64)[has_pose]
+    relative = rigid3.compose(poses[:1], rigid3.inverse(poses)) if len(poses) else poses
+    matrices = np.concatenate([rigid3.rotation_matrix(relative), relative[:, 4:, None]], 2).reshape(-1, 12)
+    with replaced_file(path) as beside:
+        beside.write_text("".join(" ".join(f"{v:.9e}" for v in row) + "\n" for row in matrices), encoding="utf-8")
+    sidecar = frames_beside(path)
+    if has_pose.all() and np.array_equal(numbers, np.arange(len(numbers))):
+        sidecar.unlink(missing_ok=True)
+        return
+    with replaced_file(sidecar) as beside:
+        beside.write_text("".join(f"{number}\n" for number in numbers[has_pose]), encoding="utf-8")
+
+
+def frames_beside(path: Path) -> Path:
+    """Where the numbers of the frames of a KITTI trajectory are, if it has gaps."""
+    return path.with_name(path.name + ".frames")

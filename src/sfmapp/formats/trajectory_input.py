@@ -7,9 +7,8 @@ EuRoC 8 columns or more, commas: ``timestamp_ns, px, py, pz, qw, qx, qy, qz`` Bu
 ===== ===================================================================== =========================================
 
 All hold world_from_body: of the camera in TUM's and KITTI's ground truth, of the IMU in EuRoC's. Times may be in
-    another unit
-(ORB-SLAM3 writes nanoseconds into TUM's form): see :mod:`sfmapp.formats.clocks`. KITTI's rows may be whole 4 x 4
-matrices.
+another unit (ORB-SLAM3 writes nanoseconds into TUM's form): see :mod:`sfmapp.formats.clocks`. KITTI's rows may be whole
+4 x 4 matrices.
 """
 
 from __future__ import annotations
@@ -25,7 +24,8 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError
 from sfmapp.evaluation.trajectory import Trajectory
 from sfmapp.formats.clocks import Times, Unit, parse_time, read_column
-from sfmapp.formats.text_input import read_limited_text
+from sfmapp.formats.text_input import plain_numbers, read_limited_text
+from sfmapp.formats.trajectory import frames_beside
 from sfmapp.geometry import rigid3
 
 Array = NDArray[np.float64]
@@ -48,8 +48,10 @@ class TrajectoryFile:
         path, format: where it is from, and what it turned out to be; a kind of sequence if it is one's ground truth.
         trajectory: its poses in the order of the file; a line with "nan" in it is a gap.
         is_numbered: ``PATH.frames`` beside a KITTI trajectory names the frame of each line (see
-            :func:`sfmapp.sequences.kitti.write_kitti`): the others are gaps, and the last ones may be missing.
+            :func:`sfmapp.formats.trajectory.write_kitti`): the others are gaps, and the last ones may be missing.
         note: how its times were read, where they are not in the unit of the format; empty otherwise.
+        poses: (N, 7) world_from_body, unit quaternions of those in the file, or of the rotations nearest to the
+            matrices in it, NaN in gaps; None: as in ``trajectory``.
     """
 
     path: Path
@@ -57,6 +59,12 @@ class TrajectoryFile:
     trajectory: Trajectory
     is_numbered: bool = False
     note: str = ""
+    poses: Array | None = None
+
+    @property
+    def cam_from_world(self) -> Array:
+        """(N, 7) poses of the body the other way round, NaN in gaps."""
+        return rigid3.inverse(self.trajectory.world_from_body if self.poses is None else self.poses)
 
 
 @dataclass(frozen=True)
@@ -91,23 +99,21 @@ def read_trajectory(
     if table.has_commas and columns >= 8:
         clock = _clock(path, table, "ns", like)
         order = [5, 6, 7, 4] if _is_w_first(path, table, is_euroc) else [4, 5, 6, 7]
-        rotation = _rotations(path, table.numbers, table.values[:, order])
-        trajectory = Trajectory(table.values[:, 1:4], rotation, clock.seconds)
-        return TrajectoryFile(path, "euroc", trajectory, note=clock.note)
+        poses = _poses(path, table.numbers, table.values[:, 1:4], table.values[:, order])
+        return TrajectoryFile(path, "euroc", _trajectory(poses, clock.seconds), note=clock.note, poses=poses)
     if columns == 8:
         clock = _clock(path, table, "s", like)
-        rotation = _rotations(path, table.numbers, table.values[:, 4:])
-        return TrajectoryFile(
-            path, "tum", Trajectory(table.values[:, 1:4], rotation, clock.seconds), note=clock.note
-        )  # fmt: skip
+        poses = _poses(path, table.numbers, table.values[:, 1:4], table.values[:, 4:])
+        return TrajectoryFile(path, "tum", _trajectory(poses, clock.seconds), note=clock.note, poses=poses)
     if columns == 12 or (columns == 16 and _are_whole_matrices(table.values)):
-        trajectory = _kitti(path, table.numbers, table.values[:, :12])
+        matrix, poses = _matrices(path, table.numbers, table.values[:, :12])
         frames = _frames(path, len(table.values))
         if frames is not None:
-            trajectory = _spread(trajectory, frames)
+            matrix, poses = (_spread(rows, frames) for rows in (matrix, poses))
+        trajectory = Trajectory(matrix[:, :, 3], matrix[:, :, :3])
         if times is not None:
             trajectory = replace(trajectory, timestamps_s=_times(Path(times), len(trajectory), path))
-        return TrajectoryFile(path, "kitti", trajectory, frames is not None)
+        return TrajectoryFile(path, "kitti", trajectory, frames is not None, poses=poses)
     raise InputError(
         f"{path}:{table.numbers[0]}: expected a trajectory, found "
         f"{columns if columns <= _MOST_COLUMNS else f'more than {_MOST_COLUMNS}'} columns",
@@ -116,7 +122,30 @@ def read_trajectory(
     )
 
 
-def _table(path: Path) -> _Table:
+def read_tum(path: str | Path) -> tuple[list[str], Array]:
+    """Names and poses of a TUM trajectory without gaps, which may be empty.
+
+    Returns:
+        The timestamps as they are written, for names of images come as timestamps too, and cam_from_world (N, 7).
+
+    Raises:
+        InputError: a line does not hold eight finite numbers and a quaternion of unit length.
+    """
+    path = Path(path)
+    table = _table(path, may_be_empty=True)
+    if not table.first:
+        return [], np.zeros((0, 7))
+    if table.has_commas or table.values.shape[1] != 8:
+        raise InputError(
+            f"{path}:{table.numbers[0]}: expected 8 numbers (TUM trajectory: timestamp tx ty tz qx qy qz qw)"
+        )
+    is_gap = ~np.isfinite(table.values).all(1)
+    if is_gap.any():
+        raise InputError(f"{path}:{table.numbers[int(np.argmax(is_gap))]}: expected 8 finite numbers, found others")
+    return table.first, rigid3.inverse(_poses(path, table.numbers, table.values[:, 1:4], table.values[:, 4:]))
+
+
+def _table(path: Path, *, may_be_empty: bool = False) -> _Table:
     rows: list[list[float]] = []
     numbers: list[int] = []
     first: list[str] = []
@@ -132,7 +161,7 @@ def _table(path: Path) -> _Table:
             has_commas = "," in text
         fields = text.rstrip(",").split(",") if has_commas else text.split()
         try:
-            row = [float(field) for field in fields]
+            row = plain_numbers(fields)
         except ValueError:
             if not rows and columns == 0 and not any(map(_is_number, fields)):
                 columns, titles = -1, fields  # one line of titles
@@ -144,7 +173,7 @@ def _table(path: Path) -> _Table:
         rows.append(row[:8] if has_commas else row[: _MOST_COLUMNS + 1])
         numbers.append(number)
         first.append(fields[0])
-    if not rows:
+    if not rows and not may_be_empty:
         raise InputError(f"{path}: expected a trajectory, found no line of numbers")
     return _Table(numbers, first, np.array(rows, np.float64), titles, has_commas)
 
@@ -181,7 +210,8 @@ def _are_whole_matrices(values: Array) -> bool:
     return bool((np.isnan(values[:, 12:]) | (values[:, 12:] == [0, 0, 0, 1])).all())
 
 
-def _kitti(path: Path, numbers: list[int], table: Array) -> Trajectory:
+def _matrices(path: Path, numbers: list[int], table: Array) -> tuple[Array, Array]:
+    """World_from_body as matrices (N, 3, 4), as they are, and as poses (N, 7), made rotations."""
     matrix = table.reshape(-1, 3, 4)
     rotation = matrix[:, :, :3]
     with np.errstate(invalid="ignore"):  # gaps are nan
@@ -193,12 +223,15 @@ def _kitti(path: Path, numbers: list[int], table: Array) -> Trajectory:
         raise InputError(
             f"{path}:{numbers[first]}: expected a rotation in columns 1-3, 5-7, 9-11, found {rotation[first].tolist()}"
         )
-    return Trajectory(matrix[:, :, 3], rotation)
+    poses, kept = np.full((len(matrix), 7), np.nan), np.isfinite(matrix).all((1, 2))
+    u, _, vt = np.linalg.svd(rotation[kept])
+    poses[kept] = rigid3.from_matrix(u @ vt, matrix[kept, :, 3])
+    return matrix, poses
 
 
 def _frames(path: Path, count: int) -> NDArray[np.int64] | None:
     """The frame of each line of a KITTI trajectory with gaps; None where no file tells."""
-    sidecar = path.with_name(path.name + ".frames")
+    sidecar = frames_beside(path)
     if not sidecar.is_file():
         return None
     table = _table(sidecar).values
@@ -209,15 +242,19 @@ def _frames(path: Path, count: int) -> NDArray[np.int64] | None:
     return frames.astype(np.int64)
 
 
-def _spread(trajectory: Trajectory, frames: NDArray[np.int64]) -> Trajectory:
-    count = int(frames[-1]) + 1
-    position, rotation = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
-    position[frames], rotation[frames] = trajectory.position, trajectory.rotation
-    return Trajectory(position, rotation)
+def _spread(rows: Array, frames: NDArray[np.int64]) -> Array:
+    """Rows at the positions of their frames, NaN between them."""
+    spread = np.full((int(frames[-1]) + 1, *rows.shape[1:]), np.nan)
+    spread[frames] = rows
+    return spread
 
 
-def _rotations(path: Path, numbers: list[int], quaternion: Array) -> Array:
-    """Rotations (N, 3, 3) of quaternions x y z w that are of unit length but for rounding."""
+def _trajectory(poses: Array, seconds: Array) -> Trajectory:
+    return Trajectory(poses[:, 4:], rigid3.rotation_matrix(poses), seconds)
+
+
+def _poses(path: Path, numbers: list[int], position: Array, quaternion: Array) -> Array:
+    """Poses (N, 7) of positions and of quaternions x y z w that are of unit length but for rounding."""
     norm = np.linalg.norm(quaternion, axis=1)
     wrong = np.abs(norm - 1) > _QUATERNION_TOLERANCE  # false for nan
     if wrong.any():
@@ -226,7 +263,9 @@ def _rotations(path: Path, numbers: list[int], quaternion: Array) -> Array:
             f"{path}:{numbers[first]}: expected a quaternion of unit length, found x y z w = "
             f"{' '.join(map('{:g}'.format, quaternion[first]))}"
         )
-    return rigid3.rotation_matrix(quaternion / norm[:, None])
+    # those of full precision keep their digits
+    unit = np.where(np.abs(norm - 1)[:, None] > 1e-12, quaternion / norm[:, None], quaternion)
+    return np.concatenate([unit, position], 1)
 
 
 def _clock(path: Path, table: _Table, unit: Unit, like: Array | None) -> Times:

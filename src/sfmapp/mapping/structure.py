@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3, triangulation
+from sfmapp.geometry.noise import sigma_of_lengths
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.scene.reconstruction import Reconstruction
 
@@ -54,8 +55,7 @@ def filter_observations(
 def residual_scale_px(reconstruction: Reconstruction, at_least: float = math.nan) -> float:
     """Robust standard deviation of one residual coordinate of the inliers in pixels.
 
-    The length of a residual of two normal coordinates is Rayleigh distributed with median 1.1774 sigma. Inliers that
-    have come to lie behind their camera have no residual and are left out.
+    Inliers that have come to lie behind their camera have no residual and are left out.
 
     Args:
         reconstruction: what is measured.
@@ -65,7 +65,7 @@ def residual_scale_px(reconstruction: Reconstruction, at_least: float = math.nan
     lengths = lengths[np.isfinite(lengths)]
     if not len(lengths):
         return at_least
-    scale = float(np.median(lengths) / 1.1774)
+    scale = sigma_of_lengths(lengths)
     return at_least if scale < at_least else scale
 
 

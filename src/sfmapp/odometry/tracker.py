@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sfmapp.adjust.pose import refine_pose
 from sfmapp.camera.camera import Camera, pixels_to_normalized, project
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.noise import sigma_of_lengths
 from sfmapp.geometry.resection import estimate_pose
 from sfmapp.odometry.frontend.active_tracks import ActiveTracks, References, follow
 from sfmapp.odometry.frontend.chaining import chain_pose
@@ -149,7 +150,7 @@ def measure_pose(camera: Camera, start: Array, xyz: Array, xy: Array) -> tuple[A
     error = np.linalg.norm(project(camera, rigid3.apply(best.cam_from_world, xyz)) - xy, axis=1)
     if best.is_inlier.sum() < max(MIN_INLIERS, _MIN_INLIER_SHARE * len(xyz)):
         return None
-    sigma = float(np.median(error[best.is_inlier])) / 1.1774
+    sigma = sigma_of_lengths(error[best.is_inlier])
     inlier = error < np.clip(_OUTLIER_SIGMAS * sigma, *_OUTLIER_RANGE_PX)
     if inlier.sum() < MIN_INLIERS:
         return None

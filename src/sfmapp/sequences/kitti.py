@@ -1,28 +1,20 @@
-"""KITTI's odometry benchmark (Geiger, Lenz, Urtasun, CVPR 2012): its sequences and its trajectories.
-
-A trajectory has a line per frame: the 12 numbers, row by row, of the 3 x 4 matrix world_from_cam of camera 0 (left
-grey), relative to the first frame. There are no times and no gaps: line i is frame i.
-"""
+"""The sequences of KITTI's odometry benchmark (Geiger, Lenz, Urtasun, CVPR 2012)."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sfmapp.calibration.reading import kitti_calibration
 from sfmapp.errors import InputError
 from sfmapp.events import Events
-from sfmapp.formats.atomic import replaced_file
-from sfmapp.formats.text_input import nearest_rotation, plain_numbers
-from sfmapp.geometry import rigid3
 from sfmapp.sequences.files import (
     Recording,
     common_size,
     frame_names,
     list_images,
-    read_rows,
     times_of_rows,
     warn_of_missing,
 )
@@ -32,73 +24,6 @@ Array = NDArray[np.float64]
 FRAMES_PER_SECOND = 10.0
 """KITTI's rate, where a sequence has lost its times."""
 _PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))
-
-
-def write_kitti(path: str | Path, cam_from_world: Array, frame_idx: ArrayLike | None = None) -> None:
-    """Write a trajectory, relative to its first pose.
-
-    The benchmark's tools take line i for frame i and know no gaps. So a frame without a pose has no line, and nothing
-    is invented for it: then ``PATH.frames`` beside it names the frame of each line, one number a line. Where that file
-    is missing the trajectory is whole, and tools may read it as it is.
-
-    Args:
-        cam_from_world: (F, 7), NaN where there is no pose.
-        frame_idx: (F,) ascending positions of the frames in the sequence, where some were left out; None: 0 to F - 1.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    path = Path(path)
-    numbers = np.arange(len(cam_from_world)) if frame_idx is None else np.asarray(frame_idx, np.int64)
-    has_pose = np.isfinite(cam_from_world).all(1)
-    poses = np.asarray(cam_from_world, np.float64)[has_pose]
-    relative = rigid3.compose(poses[:1], rigid3.inverse(poses)) if len(poses) else poses
-    matrices = np.concatenate([rigid3.rotation_matrix(relative), relative[:, 4:, None]], 2).reshape(-1, 12)
-    with replaced_file(path) as beside:
-        beside.write_text("".join(" ".join(f"{v:.9e}" for v in row) + "\n" for row in matrices), encoding="utf-8")
-    sidecar = _sidecar(path)
-    if has_pose.all() and np.array_equal(numbers, np.arange(len(numbers))):
-        sidecar.unlink(missing_ok=True)
-        return
-    with replaced_file(sidecar) as beside:
-        beside.write_text("".join(f"{number}\n" for number in numbers[has_pose]), encoding="utf-8")
-
-
-def read_kitti(path: str | Path) -> Array:
-    """cam_from_world (F, 7) of a trajectory, frame by frame; NaN for frames that ``PATH.frames`` leaves out.
-
-    Raises:
-        InputError: a line does not hold 12 finite numbers with a rotation, or the frames beside it do not fit.
-    """
-    path = Path(path)
-    poses = []
-    for number, fields in read_rows(path):
-        place = f"{path}:{number}"
-        try:
-            matrix = np.array(plain_numbers(fields)).reshape(3, 4)
-        except ValueError:
-            matrix = np.full((3, 4), np.nan)
-        if not np.isfinite(matrix).all():
-            raise InputError(f"{place}: expected 12 finite numbers (KITTI poses), found {' '.join(fields)[:80]!r}")
-        # the benchmark's own files are rounded to six digits
-        poses.append(rigid3.from_matrix(nearest_rotation(place, matrix[:, :3]), matrix[:, 3]))
-    table = rigid3.inverse(np.array(poses).reshape(-1, 7))
-    sidecar = _sidecar(path)
-    if not sidecar.is_file():
-        return table
-    rows = [" ".join(fields) for _, fields in read_rows(sidecar)]
-    if len(rows) != len(table) or not all(row.isdecimal() and len(row) < 10 for row in rows):
-        raise InputError(f"{sidecar}: expected {len(table)} numbers of frames, one a line, found {len(rows)} lines")
-    numbers = np.array([int(row) for row in rows], np.int64)
-    if (np.diff(numbers) <= 0).any():
-        raise InputError(f"{sidecar}: expected ascending numbers of frames")
-    whole = np.full((int(numbers[-1]) + 1 if len(numbers) else 0, 7), np.nan)
-    whole[numbers] = table
-    return whole
-
-
-def _sidecar(path: Path) -> Path:
-    return path.with_name(path.name + ".frames")
 
 
 def is_kitti(folder: Path) -> bool:

@@ -38,7 +38,7 @@ from sfmapp.sequences.files import (
     rows_of_frames,
 )
 from sfmapp.sequences.kitti import FRAMES_PER_SECOND as KITTI_FPS
-from sfmapp.sequences.kitti import is_kitti, read_kitti, read_kitti_sequence
+from sfmapp.sequences.kitti import is_kitti, read_kitti_sequence
 from sfmapp.sequences.plain import (
     find_calibration,
     find_pair,
@@ -442,7 +442,7 @@ def _read_ground_truth(
         return euroc_ground_truth(file, body_from_cam)
     if file.format == "tum":
         return tum_ground_truth(file)
-    poses = read_kitti(path)
+    poses = file.cam_from_world
     if times is None:
         raise InputError(
             f"{path}: expected a trajectory with times, as the frames of a video are known by them, found KITTI's form",

@@ -14,7 +14,6 @@ from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.clocks import Times, parse_time, read_column
 from sfmapp.formats.trajectory_input import TrajectoryFile
-from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import GroundTruth
 from sfmapp.images.sources import EXTENSIONS
 from sfmapp.scene.rig import Rig
@@ -92,7 +91,7 @@ def tum_ground_truth(file: TrajectoryFile) -> GroundTruth:
     """Poses of a trajectory as those of the camera."""
     times, has_pose = file.trajectory.timestamps_s, file.trajectory.has_pose
     assert times is not None
-    return in_order(GroundTruth(times[has_pose], rigid3.inverse(file.trajectory.world_from_body[has_pose])))
+    return in_order(GroundTruth(times[has_pose], file.cam_from_world[has_pose]))
 
 
 def _published_calibration(folder: Path, size: Size) -> Calibration | None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.solver import adjust_bundle
+from sfmapp.geometry.noise import sigma_of_lengths
 from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
@@ -31,8 +32,6 @@ _OUTLIER_SIGMAS, _OUTLIER_RANGE_PX = 4.0, (1.0, 4.0)
 _LOSS_SIGMAS, _MIN_LOSS_PX = 2.0, 0.1
 # Local steps: a window starts close to its minimum, and the next keyframe adjusts it again.
 _WINDOW_STEPS = 6
-# Median length of a residual of two unit normal coordinates (Rayleigh).
-_RAYLEIGH_MEDIAN = 1.1774
 
 
 @dataclass
@@ -104,7 +103,7 @@ def classify(model: Reconstruction, num_elsewhere: NDArray[np.int64]) -> float:
     """Mark the observations that agree with the model and drop points without support; returns sigma in pixels."""
     error = np.linalg.norm(model.residuals_px(), axis=1)
     used = error[model.obs_is_inlier & np.isfinite(error)]
-    sigma = float(np.median(used)) / _RAYLEIGH_MEDIAN if len(used) else 1.0
+    sigma = sigma_of_lengths(used) if len(used) else 1.0
     limit = float(np.clip(_OUTLIER_SIGMAS * sigma, *_OUTLIER_RANGE_PX))
     model.obs_is_inlier = error < limit  # False for NaN
     support = np.bincount(model.tracks.obs_track_idx, model.obs_is_inlier, model.tracks.num_tracks)

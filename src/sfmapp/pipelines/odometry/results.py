@@ -14,7 +14,8 @@ import numpy as np
 from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError
 from sfmapp.formats.colmap import read_model
-from sfmapp.formats.trajectory import read_tum, write_tum
+from sfmapp.formats.trajectory import write_kitti, write_tum
+from sfmapp.formats.trajectory_input import read_tum
 from sfmapp.odometry.report import MapFacts
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.pipelines.odometry.live import numbered
@@ -99,8 +100,6 @@ def write_trajectories(workspace: Workspace, result: OdometryResult, facts: Fram
     Args:
         facts: tell of the maps as they were when the live poses were given out; None: no live poses are written.
     """
-    from sfmapp.sequences.kitti import write_kitti
-
     folder = workspace.folder
     files = {numbered("trajectory", m): poses_of_map(result, m) for m in range(len(result.maps))}
     if facts is not None:
