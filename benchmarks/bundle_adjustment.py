@@ -149,10 +149,15 @@ def run_sfmapp(start: Reconstruction, loss: str, scale_px: float, tolerance: flo
     return {"cpu_s": cpu, "wall_s": wall, "iterations": report.num_iterations}, state
 
 
-def compare(name: str, truth: Reconstruction, args: argparse.Namespace) -> list[dict[str, Any]]:
+def compare(name: str, ground_truth: Reconstruction, args: argparse.Namespace) -> list[dict[str, Any]]:
     """Rows of the table for one model: every loss, medians over the repeats, solvers taking turns."""
     start = perturb(
-        truth, rotation_deg=0.1, translation_fraction=0.003, point_fraction=0.003, focal_fraction=0.02, seed=args.seed
+        ground_truth,
+        rotation_deg=0.1,
+        translation_fraction=0.003,
+        point_fraction=0.003,
+        focal_fraction=0.02,
+        seed=args.seed,
     )
     rows = []
     for loss in args.loss:
@@ -165,7 +170,8 @@ def compare(name: str, truth: Reconstruction, args: argparse.Namespace) -> list[
                 samples[solver].append(sample)
                 cost[solver] = neutral_cost(state, loss, args.scale_px)
         row: dict[str, Any] = {
-            "model": name, "images": len(truth.image_names), "observations": truth.tracks.num_observations,
+            "model": name, "images": len(ground_truth.image_names),
+            "observations": ground_truth.tracks.num_observations,
             "loss": loss, "start": neutral_cost(start, loss, args.scale_px),
         }  # fmt: skip
         for solver in samples:

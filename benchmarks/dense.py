@@ -57,7 +57,7 @@ class Case:
         images, model: photographs and COLMAP text model of their cameras.
         level, cell_px: resolution and cell.
         has_masks: the alpha of the photographs says where there is something.
-        truth: PLY of the true surface, None for none; distances: where to score, in its units.
+        ground_truth: PLY of the true surface, None for none; distances: where to score, in its units.
         box: low and high corner of what is scored.
         repeat_views: so many views are given a second time, for the memory of larger sets.
         peer_images: photographs for programs that know no alpha; None: the same, "" for no peer.
@@ -69,7 +69,7 @@ class Case:
     level: int
     cell_px: int
     has_masks: bool = False
-    truth: Path | None = None
+    ground_truth: Path | None = None
     distances: tuple[float, ...] = ()
     box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     repeat_views: int = 0
@@ -86,7 +86,7 @@ def find_cases(scenes: Path, work: Path, only: str) -> Iterator[Case]:
         lego = lego_inputs(DATA / "nerf-lego-small", work / "lego")
         for has_masks, name in ((True, "lego with masks"), (False, "lego without masks")):
             yield Case(
-                name, DATA / "nerf-lego-small" / "images", lego.model, 0, 1, has_masks, lego.truth,
+                name, DATA / "nerf-lego-small" / "images", lego.model, 0, 1, has_masks, lego.ground_truth,
                 (0.005 * lego.size, 0.01 * lego.size), peer_images=lego.images_on_white, has_peer=not has_masks,
             )  # fmt: skip
     for scene, levels in (("courtyard", (1, 0)), ("railing", (1,))):
@@ -99,7 +99,7 @@ def find_cases(scenes: Path, work: Path, only: str) -> Iterator[Case]:
             pixel = facts["gsd"] * 2**level
             yield Case(
                 f"{scene} level {level}", folder / "images", folder / "model_points", level, 1,
-                truth=folder / "truth.ply", distances=(pixel, 2 * pixel, 5 * pixel), box=(low, high),
+                ground_truth=folder / "ground_truth.ply", distances=(pixel, 2 * pixel, 5 * pixel), box=(low, high),
             )  # fmt: skip
         if scene == "courtyard":
             yield Case(
@@ -155,24 +155,24 @@ def run_prototype(case: Case, work: Path) -> dict[str, Any]:
 
 
 def scores(case: Case, xyz: NDArray[np.float64]) -> dict[str, Any]:
-    """Accuracy, completeness and F of a cloud; of a truth with labels, completeness by label and width."""
-    if case.truth is None:
+    """Accuracy, completeness and F of a cloud; of a ground truth with labels, completeness by label and width."""
+    if case.ground_truth is None:
         return {}
-    score = score_cloud(xyz, read_ply_geometry(case.truth).xyz, case.distances, box=case.box, threads=2)
+    score = score_cloud(xyz, read_ply_geometry(case.ground_truth).xyz, case.distances, box=case.box, threads=2)
     found: dict[str, Any] = {"score": score.summary()}
-    labels = truth_labels(case.truth)
+    labels = ground_truth_labels(case.ground_truth)
     if labels is not None:
-        is_scored = ~np.isnan(score.truth_distance)
+        is_scored = ~np.isnan(score.ground_truth_distance)
         surfaces = {"rest": labels == 0, "railing": labels > 0}
         surfaces |= {f"bars of {width} px": labels == width for width in np.unique(labels[labels > 0]).tolist()}
         found["completeness_by_surface"] = {
-            name: [float((score.truth_distance[mine & is_scored] <= d).mean()) for d in score.distances]
+            name: [float((score.ground_truth_distance[mine & is_scored] <= d).mean()) for d in score.distances]
             for name, mine in surfaces.items()
         }
     return found
 
 
-def truth_labels(path: Path) -> NDArray[np.uint8] | None:
+def ground_truth_labels(path: Path) -> NDArray[np.uint8] | None:
     """Widths in pixels (0: no bar) as ``make_dense_scene.py`` leaves them in the property green; None without."""
     with path.open("rb") as file:
         head = file.read(4096)

@@ -19,9 +19,9 @@ from rendered_worlds.sequences import RenderedSequence
 from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.errors import InputError
 from sfmapp.events import Events
-from sfmapp.pipelines.options import load_options
-from sfmapp.pipelines.self_calibrate import self_calibrated
+from sfmapp.pipelines.odometry.self_calibrate import self_calibrated
 from sfmapp.scene.rig import Rig
+from sfmapp.workspace.options import load_options
 
 # place: frames rendered, every how many of them is kept, size of a picture
 PLACES = {"room": (360, 6, (640, 480)), "hall": (240, 4, (752, 480)), "street": (200, 2, (1241, 376))}

@@ -40,7 +40,7 @@ def photos(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def sample() -> Path:
     """Folder of the bundled sample, with images/ and cameras.json."""
     from sfmapp.errors import InputError
-    from sfmapp.pipelines.resources import sample_folder
+    from sfmapp.workspace.resources import sample_folder
 
     try:
         return sample_folder()

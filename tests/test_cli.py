@@ -186,7 +186,7 @@ def test_a_bug_is_1_in_one_line(
     def bug(*_: object, **__: object) -> None:
         raise ValueError("two\nlines")
 
-    monkeypatch.setattr("sfmapp.pipelines.reconstruct.load_images", bug)
+    monkeypatch.setattr("sfmapp.pipelines.sparse.reconstruct.load_images", bug)
     line = ["reconstruct", str(tmp_path), "-o", str(tmp_path / "out")]
     assert main(line) == 1
     said = capsys.readouterr().err
@@ -314,16 +314,16 @@ def test_bars_on_a_terminal_end_with_a_line_per_stage() -> None:
 
 
 @pytest.mark.slow
-def test_the_demo_prints_its_error_against_the_truth(sample: Path, tmp_path: Path) -> None:
+def test_the_demo_prints_its_error_against_the_ground_truth(sample: Path, tmp_path: Path) -> None:
     num_images = len(list((sample / "images").iterdir()))
     done = command("demo", "-o", tmp_path / "demo", "--json", "--min-registered", num_images)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
-    assert result["truth"]["num_common"] == num_images
+    assert result["ground_truth"]["num_common"] == num_images
     # a tenth of a pixel of noise at the sample's distances and 150 points per view and more
-    assert result["truth"]["center_error_share"]["max"] < 2e-3
-    assert result["truth"]["rotation_error_deg"]["max"] < 0.1
+    assert result["ground_truth"]["center_error_share"]["max"] < 2e-3
+    assert result["ground_truth"]["rotation_error_deg"]["max"] < 0.1
     again = command("demo", "-o", tmp_path / "demo")
     assert again.returncode == 0
-    assert "against the truth" in again.stdout
+    assert "against the ground truth" in again.stdout
     assert "nothing to do" in again.stdout

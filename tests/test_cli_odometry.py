@@ -12,7 +12,7 @@ import pytest
 
 from odometry_fakes import FakeRunner, FakeSequence
 from sfmapp.cli.main import main
-from sfmapp.pipelines import odometry as pipeline
+from sfmapp.pipelines.odometry import track as pipeline
 
 Patch = pytest.MonkeyPatch
 Capture = pytest.CaptureFixture[str]
@@ -37,7 +37,16 @@ def test_help_names_the_commands_and_their_flags(capsys: Capture) -> None:
             main(line)
         assert caught.value.code == 0
     said = capsys.readouterr().out
-    for flag in ("--camera", "--mono", "--self-calibrate", "--truth", "--imu", "--scale", "--view", "--no-record"):
+    for flag in (
+        "--camera",
+        "--mono",
+        "--self-calibrate",
+        "--ground-truth",
+        "--imu",
+        "--scale",
+        "--view",
+        "--no-record",
+    ):
         assert flag in said
     for flag in ("--start", "--stop", "--step", "--reverse", "--fps", "--seed", "--threads", "--set", "--json"):
         assert flag in said
@@ -100,7 +109,7 @@ def test_a_person_is_told_what_came_of_it(tmp_path: Path, fake: Patch, capsys: C
     assert "45 of 50 frames have a pose" in said
     assert "unit: arbitrary" in said
     assert "no pose from frame 20 to 24 (0.6 s)" in said
-    assert "against the truth: off by 0.0" in said
+    assert "against the ground truth: off by 0.0" in said
     assert "CPU ms a frame" in said
     assert "sfmapp view" not in said
     assert main(["odometry", "fake", "-o", str(tmp_path / "out"), "--no-record", "-q"]) == 0

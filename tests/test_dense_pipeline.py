@@ -21,10 +21,10 @@ from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError
 from sfmapp.events import Event, Events
 from sfmapp.formats.colmap import read_model, write_model
 from sfmapp.formats.ply_reader import read_ply_geometry
-from sfmapp.pipelines.dense import dense
-from sfmapp.pipelines.mesh import mesh_cloud, mesh_workspace
-from sfmapp.pipelines.options import Options
+from sfmapp.pipelines.dense.densify import dense
+from sfmapp.pipelines.dense.mesh import mesh_cloud, mesh_workspace
 from sfmapp.surface.options import SurfaceOptions
+from sfmapp.workspace.options import Options
 
 BARREL = Camera(CameraModel.OPENCV, 200, 140, np.array([165.0, 164.0, 98.4, 72.3, -0.18, 0.03, 1e-3, -1e-3]))
 PIXEL = DEPTH / PINHOLE.focal

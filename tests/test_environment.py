@@ -29,8 +29,8 @@ from sfmapp.events import Event, Events
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.trajectory import GrowingTum, read_tum
 from sfmapp.geometry import rigid3
-from sfmapp.pipelines.listeners import EventLog
-from sfmapp.pipelines.workspace import read_manifest
+from sfmapp.workspace.listeners import EventLog
+from sfmapp.workspace.manifest import read_manifest
 
 ROOT = os.geteuid() == 0
 FOUR_POSES = "".join(f"{i} {i} 0 {i * i} 0 0 0 1\n" for i in range(4))
@@ -374,7 +374,7 @@ FAKE_RUN = """import os, sys
 sys.path.insert(0, sys.argv.pop(1))
 import odometry_fakes as fakes
 fakes.WIDTH, fakes.HEIGHT = 640, 480
-from sfmapp.pipelines import odometry as pipeline
+from sfmapp.pipelines.odometry import track as pipeline
 pipeline.open_sequence = lambda *_, **__: fakes.FakeSequence(pause_s=float(os.environ["PAUSE"]))
 pipeline.run_odometry = fakes.FakeRunner()
 pipeline.compile_odometry_kernels = lambda *_, **__: {}
@@ -401,10 +401,10 @@ def test_a_killed_odometry_leaves_the_poses_it_had(tmp_path: Path, capsys: Captu
     child.wait()
     names, poses = read_tum(live)
     assert len(names) >= 8
-    truth = path(50)[: len(names)]  # of which the fake finds the rotations, and half of the translations
+    ground_truth = path(50)[: len(names)]  # of which the fake finds the rotations, and half of the translations
     np.testing.assert_allclose([float(name) for name in names], np.arange(len(names)) / 10.0)
-    np.testing.assert_allclose(np.abs(np.sum(poses[:, :4] * truth[:, :4], 1)), 1.0, atol=1e-12)
-    np.testing.assert_allclose(poses[:, 4:], 0.5 * truth[:, 4:], atol=0.1)
+    np.testing.assert_allclose(np.abs(np.sum(poses[:, :4] * ground_truth[:, :4], 1)), 1.0, atol=1e-12)
+    np.testing.assert_allclose(poses[:, 4:], 0.5 * ground_truth[:, 4:], atol=0.1)
     # what is left is no result, and is not taken for one
     assert main(["evaluate", str(output), str(live), "--no-plot"]) == 3
     assert "trajectory_live.tum" in capsys.readouterr().err

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sfmapp.errors import NoReconstructionError
-from sfmapp.pipelines.odometry import track_sequence
-from sfmapp.pipelines.options import load_options
-from sfmapp.pipelines.reconstruct import reconstruct
+from sfmapp.pipelines.odometry.track import track_sequence
+from sfmapp.pipelines.sparse.reconstruct import reconstruct
+from sfmapp.workspace.options import load_options
 
 FOCAL, SIZE = 480.0, (400, 300)
 MATRIX = np.array([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1]])

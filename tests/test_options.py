@@ -16,8 +16,8 @@ from sfmapp.camera.camera import CameraModel
 from sfmapp.errors import UsageError
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.option_checks import Range, positive
-from sfmapp.pipelines import resources
-from sfmapp.pipelines.options import (
+from sfmapp.workspace import resources
+from sfmapp.workspace.options import (
     Options,
     field_comments,
     list_options,
@@ -26,7 +26,7 @@ from sfmapp.pipelines.options import (
     options_to_dict,
     parse_setting,
 )
-from sfmapp.pipelines.workspace import canonical_json
+from sfmapp.workspace.plain_json import canonical_json
 
 
 def test_defaults_survive_the_round_trip_through_json() -> None:

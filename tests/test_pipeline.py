@@ -14,9 +14,9 @@ import pytest
 import sfmapp
 from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError, TooFewImagesError
 from sfmapp.events import Event, Events
-from sfmapp.pipelines.options import Options, load_options
-from sfmapp.pipelines.reconstruct import RunResult, reconstruct
+from sfmapp.pipelines.sparse.reconstruct import RunResult, reconstruct
 from sfmapp.viewer.recording import RecordingReport
+from sfmapp.workspace.options import Options, load_options
 
 MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 
@@ -95,7 +95,7 @@ def test_the_manifest_tells_how_it_was_made(photos: Path, finished: Path) -> Non
     assert manifest["source"] == str(photos)
     assert manifest["versions"]["sfmapp"] == sfmapp.__version__
     assert {"numpy", "numba", "gtsam", "opencv-contrib-python-headless"} <= set(manifest["versions"])
-    assert load_options(settings=[]) == sfmapp.pipelines.options.options_from_dict(manifest["options"])
+    assert load_options(settings=[]) == sfmapp.workspace.options.options_from_dict(manifest["options"])
     assert len(manifest["inputs"]) == 7
     assert all(entry["is_done"] for entry in manifest["stages"].values())
 
@@ -386,7 +386,7 @@ def raising(monkeypatch: pytest.MonkeyPatch) -> None:
     def bug(*_: object, **__: object) -> None:
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr("sfmapp.pipelines.reconstruct.select_pairs", bug)
+    monkeypatch.setattr("sfmapp.pipelines.sparse.reconstruct.select_pairs", bug)
 
 
 @pytest.mark.usefixtures("raising")

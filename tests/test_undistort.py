@@ -23,12 +23,12 @@ from sfmapp.geometry import rigid3
 from sfmapp.images.exif import read_exif
 from sfmapp.images.headers import read_header
 from sfmapp.images.rewrite import encode, without_turn
-from sfmapp.pipelines.dense_source import find_source
-from sfmapp.pipelines.options import load_options
-from sfmapp.pipelines.workspace import FORMAT
+from sfmapp.pipelines.dense.source import find_source
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import RigImages
 from sfmapp.scene.undistortion import move_pixels, plan_undistortion, undistort_reconstruction
+from sfmapp.workspace.layout import FORMAT
+from sfmapp.workspace.options import load_options
 
 Array = NDArray[np.float64]
 

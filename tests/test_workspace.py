@@ -16,11 +16,13 @@ import pytest
 from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.errors import InputError, UsageError
 from sfmapp.images.image_set import ImageRecord, ImageSet
-from sfmapp.pipelines.keys import stage_keys
-from sfmapp.pipelines.options import Options
-from sfmapp.pipelines.workspace import open_workspace, read_manifest, stage_key
+from sfmapp.pipelines.sparse.keys import stage_keys
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
+from sfmapp.workspace.keys import stage_key
+from sfmapp.workspace.manifest import read_manifest
+from sfmapp.workspace.options import Options
+from sfmapp.workspace.workspace import open_workspace
 
 
 def tiny_model(num_images: int = 3) -> Reconstruction:
@@ -103,7 +105,7 @@ def test_two_runs_in_one_folder_exclude_each_other(tmp_path: Path) -> None:
 
 def test_the_lock_of_a_killed_run_is_no_obstacle(tmp_path: Path) -> None:
     code = (
-        "import sys, time; from pathlib import Path; from sfmapp.pipelines.workspace import open_workspace\n"
+        "import sys, time; from pathlib import Path; from sfmapp.workspace.workspace import open_workspace\n"
         "with open_workspace(Path(sys.argv[1])): print('locked', flush=True); time.sleep(60)"
     )
     child = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True)

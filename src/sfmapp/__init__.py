@@ -8,12 +8,12 @@ from sfmapp.kernel_cache import provide_kernel_cache
 
 if TYPE_CHECKING:
     from sfmapp.camera.camera import Camera, CameraModel
-    from sfmapp.pipelines.odometry import TrackResult, track_sequence
-    from sfmapp.pipelines.options import Options, load_options
-    from sfmapp.pipelines.reconstruct import RunResult, reconstruct
-    from sfmapp.pipelines.refine import RefineResult, refine
+    from sfmapp.pipelines.odometry.refine import RefineResult, refine
+    from sfmapp.pipelines.odometry.track import TrackResult, track_sequence
+    from sfmapp.pipelines.sparse.reconstruct import RunResult, reconstruct
     from sfmapp.pipelines.undistort import UndistortResult, undistort
     from sfmapp.scene.reconstruction import Reconstruction
+    from sfmapp.workspace.options import Options, load_options
 
 __version__ = "0.1.0"
 __all__ = [
@@ -35,16 +35,16 @@ __all__ = [
 _HOMES = {
     "Camera": "sfmapp.camera.camera",
     "CameraModel": "sfmapp.camera.camera",
-    "Options": "sfmapp.pipelines.options",
+    "Options": "sfmapp.workspace.options",
     "Reconstruction": "sfmapp.scene.reconstruction",
-    "RefineResult": "sfmapp.pipelines.refine",
-    "RunResult": "sfmapp.pipelines.reconstruct",
-    "TrackResult": "sfmapp.pipelines.odometry",
+    "RefineResult": "sfmapp.pipelines.odometry.refine",
+    "RunResult": "sfmapp.pipelines.sparse.reconstruct",
+    "TrackResult": "sfmapp.pipelines.odometry.track",
     "UndistortResult": "sfmapp.pipelines.undistort",
-    "load_options": "sfmapp.pipelines.options",
-    "reconstruct": "sfmapp.pipelines.reconstruct",
-    "refine": "sfmapp.pipelines.refine",
-    "track_sequence": "sfmapp.pipelines.odometry",
+    "load_options": "sfmapp.workspace.options",
+    "reconstruct": "sfmapp.pipelines.sparse.reconstruct",
+    "refine": "sfmapp.pipelines.odometry.refine",
+    "track_sequence": "sfmapp.pipelines.odometry.track",
     "undistort": "sfmapp.pipelines.undistort",
 }
 

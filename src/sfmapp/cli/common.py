@@ -44,7 +44,7 @@ def listening(args: argparse.Namespace) -> Iterator[Events]:
 
 def print_json(value: Any) -> None:
     """The machine-readable result of a command: one JSON document on stdout."""
-    from sfmapp.pipelines.workspace import plain_number
+    from sfmapp.workspace.plain_json import plain_number
 
     print(json.dumps(value, default=plain_number), flush=True)
 
@@ -82,7 +82,7 @@ def load_numba_without_blas() -> None:
 
 def list_options(args: argparse.Namespace) -> int:
     """Print every option with its type, default and comment."""
-    from sfmapp.pipelines import options
+    from sfmapp.workspace import options
 
     rows = options.list_options()
     if args.json:

@@ -17,7 +17,7 @@ from sfmapp.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from sfmapp.pipelines.options import Options
+    from sfmapp.workspace.options import Options
 
 DENSE_EXAMPLES = """\
 examples:
@@ -100,7 +100,7 @@ def _add_dense_flags(parser: argparse.ArgumentParser) -> None:
 def _options(args: argparse.Namespace, flags: dict[str, str | None]) -> Options:
     """The effective options of a command line; ``flags``: by name of the option, None where not given."""
     limit_library_threads()
-    from sfmapp.pipelines.options import load_options
+    from sfmapp.workspace.options import load_options
 
     flags = {"threads": args.threads} | flags
     settings = [*args.set, *(f"{name}={value}" for name, value in flags.items() if value is not None)]
@@ -121,8 +121,8 @@ def _dense(args: argparse.Namespace) -> int:
     }
     options = _options(args, flags)
     load_numba_without_blas()
-    from sfmapp.pipelines.dense import dense
-    from sfmapp.pipelines.usage import Stopwatch
+    from sfmapp.pipelines.dense.densify import dense
+    from sfmapp.workspace.usage import Stopwatch
 
     watch = Stopwatch(whole_process=True)
     with listening(args) as events:
@@ -148,8 +148,8 @@ def _mesh(args: argparse.Namespace) -> int:
     flags = {"surface.texture": "true" if args.texture else None, "surface.depth": args.depth}
     options = _options(args, flags)
     load_numba_without_blas()
-    from sfmapp.pipelines.mesh import mesh_cloud, mesh_workspace
-    from sfmapp.pipelines.usage import Stopwatch
+    from sfmapp.pipelines.dense.mesh import mesh_cloud, mesh_workspace
+    from sfmapp.workspace.usage import Stopwatch
 
     watch = Stopwatch(whole_process=True)
     with listening(args) as events:

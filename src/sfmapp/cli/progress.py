@@ -38,8 +38,8 @@ class JsonLines:
     """Every event as one line of JSON."""
 
     def __call__(self, event: Event) -> None:
-        from sfmapp.pipelines.listeners import event_to_dict
-        from sfmapp.pipelines.workspace import plain_number
+        from sfmapp.workspace.listeners import event_to_dict
+        from sfmapp.workspace.plain_json import plain_number
 
         _say(json.dumps(event_to_dict(event), default=plain_number))
 

@@ -58,13 +58,13 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def _undistort(args: argparse.Namespace) -> int:
     limit_library_threads()
-    from sfmapp.pipelines.options import load_options
+    from sfmapp.workspace.options import load_options
 
     flags = {"threads": args.threads, "images.mask_path": args.mask_path}
     options = load_options([], [f"{name}={value}" for name, value in flags.items() if value is not None])
     load_numba_without_blas()
     from sfmapp.pipelines.undistort import undistort
-    from sfmapp.pipelines.usage import Stopwatch
+    from sfmapp.workspace.usage import Stopwatch
 
     watch = Stopwatch(whole_process=True)
     with listening(args) as events:

@@ -41,3 +41,12 @@ class OdometryOptions:
 
     def __post_init__(self) -> None:
         check_options("odometry", self, _RANGES)
+
+
+@dataclass(frozen=True)
+class ScaleOptions:
+    """Where metres come from when there is one camera."""
+
+    # marker:DICT:METRES, distance:FRAME:FRAME:METRES, distance:path:METRES, camera_height:METRES, imu or arbitrary;
+    # auto: the IMU where there is one
+    source: str | None = None

@@ -16,8 +16,9 @@ from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model, write_model, write_model_text
 from sfmapp.images.sources import find_images
 from sfmapp.pipelines.stored_pixels import check_pixels
-from sfmapp.pipelines.workspace import USUAL_FOLDERS, read_manifest
 from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.workspace.layout import USUAL_FOLDERS
+from sfmapp.workspace.manifest import read_manifest
 
 _NOTICEABLE_PX = 0.1  # below the noise of a keypoint
 

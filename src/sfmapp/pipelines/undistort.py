@@ -29,21 +29,16 @@ from sfmapp.formats.colmap import read_model
 from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import decode_file, read_file, read_mask_file
 from sfmapp.images.rewrite import encode, encode_mask, without_turn
-from sfmapp.pipelines.dense_source import DenseSource, find_source, model_digest
-from sfmapp.pipelines.keys import input_key
-from sfmapp.pipelines.listeners import EventLog
-from sfmapp.pipelines.options import Options
-from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import (
-    MODEL_FILES,
-    UNDISTORT,
-    Workspace,
-    open_workspace,
-    recorded_versions,
-    stage_key,
-)
+from sfmapp.pipelines.dense.source import DenseSource, find_source, model_digest
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.undistortion import Undistortion, has_distortion, plan_undistortion, undistort_reconstruction
+from sfmapp.workspace.keys import input_key, stage_key
+from sfmapp.workspace.layout import MODEL_FILES, UNDISTORT
+from sfmapp.workspace.listeners import EventLog
+from sfmapp.workspace.manifest import recorded_versions
+from sfmapp.workspace.options import Options
+from sfmapp.workspace.usage import Stopwatch
+from sfmapp.workspace.workspace import Workspace, open_workspace
 
 STAGE = UNDISTORT
 IMAGES, MASKS = "images", "masks"
@@ -253,7 +248,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _undistorted(record: ImageRecord, how: Undistortion) -> tuple[bytes, NDArray[np.bool_] | None]:
-    """The file of a photograph, and (h, w) True where it may be used; None for everywhere.
+    """The file of a photograph, and (h, w) True where it may be used; None foreverywhere.
 
     Raises:
         InputError: it, or its mask, cannot be read.

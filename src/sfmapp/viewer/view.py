@@ -90,7 +90,7 @@ class LiveViewer:
                 self.close()
 
     def leave(self) -> None:
-        """After a run that failed: a window stays with what was shown, a server would run for ever."""
+        """After a run that failed: a window stays with what was shown, a server would run forever."""
         if self._is_server:
             self.close()
 

@@ -17,16 +17,16 @@ from sfmapp.formats.colmap import read_model
 from sfmapp.images.folder import load_images
 from sfmapp.matching.pairs import select_pairs
 from sfmapp.matching.stage import match_images
-from sfmapp.pipelines import results
-from sfmapp.pipelines.kernels import kernels_compiling
-from sfmapp.pipelines.keys import StageKeys, stage_keys
-from sfmapp.pipelines.listeners import DecisionLog, EventLog
-from sfmapp.pipelines.options import Options, with_absolute_paths
-from sfmapp.pipelines.run import Run
-from sfmapp.pipelines.store import Store
-from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import open_workspace
+from sfmapp.pipelines.sparse import results
+from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
+from sfmapp.pipelines.sparse.run import Run
 from sfmapp.viewer.listener import RecordingListener
+from sfmapp.workspace.kernels import kernels_compiling
+from sfmapp.workspace.listeners import DecisionLog, EventLog
+from sfmapp.workspace.options import Options, with_absolute_paths
+from sfmapp.workspace.store import Store
+from sfmapp.workspace.usage import Stopwatch
+from sfmapp.workspace.workspace import open_workspace
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet
@@ -92,7 +92,7 @@ def reconstruct(
     if options.min_registered is not None and found < options.min_registered:
         raise TooFewImagesError(
             f"{found} images are registered, {options.min_registered} were asked for",
-            f"{output}/report.html tells for every image why",
+            f"{output}/report.html tells forevery image why",
         )
     return RunResult(model, report)
 
@@ -122,7 +122,11 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
     options, events, threads = run.options, run.events, run.threads
     if len(image_set.images) < 2:
         raise _too_few_photographs(image_set)
-    with kernels_compiling(events, run.usage), Store(run.workspace.database, image_set, keys) as store:
+    feature_keys = [keys.of_features(record.name) for record in image_set.images]
+    with (
+        kernels_compiling(events, run.usage),
+        Store(run.workspace.database, image_set, feature_keys, keys.matching) as store,
+    ):
         with run.stage("features", keys.features):
             run.features, run.stages["features"] = extract_features(
                 image_set, options.features, threads=threads, events=events,

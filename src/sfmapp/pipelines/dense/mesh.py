@@ -18,15 +18,16 @@ from sfmapp.formats.glb import write_glb
 from sfmapp.formats.mesh_ply import write_mesh_ply
 from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.geometry.upright import up_direction
-from sfmapp.pipelines import dense_results
-from sfmapp.pipelines.dense_source import DenseJob, dense_job, find_source, model_digest, plan_source
-from sfmapp.pipelines.options import Options, options_from_dict, options_to_dict, with_absolute_paths
+from sfmapp.pipelines.dense import results as dense_results
+from sfmapp.pipelines.dense.source import DenseJob, dense_job, find_source, model_digest, plan_source
 from sfmapp.pipelines.stored_pixels import has_stored_pixels
-from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import read_manifest, stage_key
 from sfmapp.scene.mesh import Mesh
 from sfmapp.surface.mesh import make_mesh
 from sfmapp.surface.texture import texture_mesh
+from sfmapp.workspace.keys import stage_key
+from sfmapp.workspace.manifest import read_manifest
+from sfmapp.workspace.options import Options, options_from_dict, options_to_dict, with_absolute_paths
+from sfmapp.workspace.usage import Stopwatch
 
 STAGE = "mesh"
 MESH_PLY, MESH_GLB = "mesh/mesh.ply", "mesh/mesh.glb"

@@ -1,7 +1,7 @@
 """The poses of an odometry run on their way to the disk while it is under way.
 
 A run that is killed leaves ``trajectory_live.tum`` (and ``trajectory_live-1.tum`` of its second map) with every pose
-that was given out until then; at the end :func:`~sfmapp.pipelines.odometry_results.write_trajectories` replaces them.
+that was given out until then; at the end :func:`~sfmapp.pipelines.odometry.results.write_trajectories` replaces them.
 """
 
 from __future__ import annotations

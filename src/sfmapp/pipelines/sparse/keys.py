@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from sfmapp.pipelines.options import Options, options_to_dict
-from sfmapp.pipelines.workspace import stage_key
+from sfmapp.workspace.keys import input_key, stage_key
+from sfmapp.workspace.options import Options, options_to_dict
 
 if TYPE_CHECKING:
-    from sfmapp.images.image_set import ImageRecord, ImageSet
+    from sfmapp.images.image_set import ImageSet
 
 
 @dataclass(frozen=True)
@@ -28,6 +27,10 @@ class StageKeys:
     matching: str
     mapping: str
 
+    def of_features(self, name: str) -> str:
+        """Key of the features of an image."""
+        return f"{self.features}:{self.inputs[name]}"
+
 
 def stage_keys(options: Options, image_set: ImageSet) -> StageKeys:
     """Keys of all stages for these photographs and options."""
@@ -44,11 +47,3 @@ def stage_keys(options: Options, image_set: ImageSet) -> StageKeys:
     mapped: tuple[Any, ...] = (plain["adjust"], pairs, matching, priors)
     mapping = stage_key(("mapping", "adjust", "geometry", "camera", "simd", "scene"), plain["mapping"], *mapped)
     return StageKeys(inputs, features, pairs, matching, mapping)
-
-
-def input_key(record: ImageRecord) -> str:
-    """Digest of an image's file and of whatever masks it."""
-    key = record.digest + ("+alpha" if record.has_alpha else "")
-    if record.mask_path is None:
-        return key
-    return f"{key}+mask:{hashlib.blake2b(record.mask_path.read_bytes(), digest_size=16).hexdigest()}"

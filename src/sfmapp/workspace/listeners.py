@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 from sfmapp.events import Event, Events
-from sfmapp.pipelines.workspace import plain_number
+from sfmapp.workspace.plain_json import plain_number
 
 # arrays for the recording travel under this key; they are no text
 ARRAYS_KEY = "snapshot"

@@ -19,12 +19,12 @@ from sfmapp.dense.prepare import DensePlan, load_scene
 from sfmapp.dense.scene import Patches
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
-from sfmapp.pipelines import dense_results
-from sfmapp.pipelines.dense_results import STAGE
-from sfmapp.pipelines.dense_source import DenseJob, dense_job, find_source, model_digest, plan_source
-from sfmapp.pipelines.kernels import compile_dense_kernels
-from sfmapp.pipelines.options import Options, with_absolute_paths
-from sfmapp.pipelines.usage import Stopwatch
+from sfmapp.pipelines.dense import results as dense_results
+from sfmapp.pipelines.dense.results import STAGE
+from sfmapp.pipelines.dense.source import DenseJob, dense_job, find_source, model_digest, plan_source
+from sfmapp.workspace.kernels import compile_dense_kernels
+from sfmapp.workspace.options import Options, with_absolute_paths
+from sfmapp.workspace.usage import Stopwatch
 
 
 class DenseResult(NamedTuple):

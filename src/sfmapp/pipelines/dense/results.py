@@ -17,16 +17,16 @@ from sfmapp.dense.prepare import DensePlan, coarser_plan, load_scene
 from sfmapp.dense.scene import DenseScene, Patches
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.formats.colmap import read_model
-from sfmapp.pipelines.dense_source import DenseJob, model_digest
-from sfmapp.pipelines.keys import input_key
-from sfmapp.pipelines.options import options_to_dict
-from sfmapp.pipelines.results import report_text
-from sfmapp.pipelines.workspace import DENSE, stage_key
+from sfmapp.pipelines.dense.source import DenseJob, model_digest
 from sfmapp.report.dense_document import dense_document
 from sfmapp.report.dense_html import render_dense_html
 from sfmapp.report.dense_pictures import PictureRow, dense_pictures
 from sfmapp.report.html import render_html
 from sfmapp.scene.mesh import Mesh
+from sfmapp.workspace.keys import input_key, stage_key
+from sfmapp.workspace.layout import DENSE
+from sfmapp.workspace.options import options_to_dict
+from sfmapp.workspace.plain_json import report_text
 
 STAGE = "dense"
 FORMAT = "sfmapp dense report 1"

@@ -25,12 +25,12 @@ from sfmapp.mapping.tracks import build_tracks, track_colors
 from sfmapp.matching.pairs import select_pairs
 from sfmapp.matching.stage import match_images
 from sfmapp.odometry.result import OdometryResult
-from sfmapp.pipelines.options import Options
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.features import Features
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import RigImages
 from sfmapp.scene.tracks import Tracks, make_tracks
+from sfmapp.workspace.options import Options
 
 STAGE = "photographs"
 # Photographs are matched with so many keyframes at most, evenly over the map: neighbours show the same.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 
 from sfmapp.formats.database import Database
 from sfmapp.matching.stage import MatchedPair, join_pairs, split_pairs
-from sfmapp.pipelines.keys import StageKeys
 from sfmapp.scene.features import Features
 
 if TYPE_CHECKING:
@@ -26,11 +26,12 @@ BATCH = 32
 class Store:
     """The database of a workspace for one set of images; a context manager. Rows hold while their keys do."""
 
-    def __init__(self, path: Path, image_set: ImageSet, keys: StageKeys) -> None:
+    def __init__(self, path: Path, image_set: ImageSet, feature_keys: Sequence[str], pair_key: str) -> None:
+        """``feature_keys``: of each image; ``pair_key``: of all matches."""
         self._database = Database(path)
         self._pending: dict[Pair, MatchedPair] = {}
-        self._pair_key = keys.matching
-        self._feature_keys = [f"{keys.features}:{keys.inputs[record.name]}" for record in image_set.images]
+        self._pair_key = pair_key
+        self._feature_keys = list(feature_keys)
         self._database.set_images(
             image_set.cameras,
             [record.name for record in image_set.images],

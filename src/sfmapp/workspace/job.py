@@ -7,21 +7,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import sfmapp
 from sfmapp.errors import InputError, is_full
 from sfmapp.events import Events
-from sfmapp.pipelines.listeners import DecisionLog
-from sfmapp.pipelines.options import Options, options_to_dict
-from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import Workspace, recorded_versions
-from sfmapp.viewer.listener import RecordingListener
-
-if TYPE_CHECKING:
-    from sfmapp.images.image_set import ImageSet
-    from sfmapp.scene.correspondences import Correspondences
-    from sfmapp.scene.features import Features
+from sfmapp.workspace.listeners import DecisionLog
+from sfmapp.workspace.manifest import recorded_versions
+from sfmapp.workspace.options import Options, options_to_dict
+from sfmapp.workspace.usage import Stopwatch
+from sfmapp.workspace.workspace import Workspace
 
 # what the manifest says of a recording
 WRITTEN, FAILED, NO_MODEL, NOT_WANTED = "written", "failed", "no model", "not wanted"
@@ -109,18 +104,3 @@ class Job:
             "inputs": inputs,
         }
         self.workspace.save()
-
-
-@dataclass
-class Run(Job):
-    """State of a reconstruction under way.
-
-    Attributes:
-        recorder: watches the run for a recording; None if none is wanted.
-        image_set, features, correspondences: results so far.
-    """
-
-    recorder: RecordingListener | None = None
-    image_set: ImageSet | None = None
-    features: list[Features] = field(default_factory=list)
-    correspondences: Correspondences | None = None

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sfmapp.errors import NoReconstructionError
 from sfmapp.geometry.orientation import MIRRORED
-from sfmapp.pipelines.run import FAILED, NO_MODEL, NOT_WANTED, WRITTEN
 from sfmapp.pipelines.stored_pixels import STORED
-from sfmapp.pipelines.workspace import plain_number
 from sfmapp.report.document import FORMAT, camera_rows, funnel_of_images, funnel_without_matches, make_checks
 from sfmapp.report.html import render_html
+from sfmapp.workspace.job import FAILED, NO_MODEL, NOT_WANTED, WRITTEN
+from sfmapp.workspace.plain_json import report_text
 
 if TYPE_CHECKING:
-    from sfmapp.pipelines.keys import StageKeys
-    from sfmapp.pipelines.run import Run
+    from sfmapp.pipelines.sparse.keys import StageKeys
+    from sfmapp.pipelines.sparse.run import Run
     from sfmapp.scene.reconstruction import Reconstruction
 
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
@@ -136,15 +135,3 @@ def _image_rows(run: Run, failure: NoReconstructionError | None) -> list[dict[st
             row["reason"] = "by EXIF's orientation it is stored as a mirror image of what others show, or they of it"
             row["remedy"] = "Write the mirrored files anew, upright: exiftran -ai, mogrify -auto-orient."
     return rows
-
-
-def report_text(report: Mapping[str, Any]) -> str:
-    """JSON with a line for each entry of the outermost objects and lists: readable, and written in one go."""
-    parts = []
-    for key, value in report.items():
-        if isinstance(value, list) and value:
-            text = "[\n  " + ",\n  ".join(json.dumps(entry, default=plain_number) for entry in value) + "\n ]"
-        else:
-            text = json.dumps(value, default=plain_number)
-        parts.append(f" {json.dumps(key)}: {text}")
-    return "{\n" + ",\n".join(parts) + "\n}\n"

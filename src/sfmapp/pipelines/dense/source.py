@@ -18,20 +18,14 @@ from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model
 from sfmapp.images.sources import find_images
-from sfmapp.pipelines.listeners import DecisionLog, EventLog
-from sfmapp.pipelines.options import Options, options_from_dict, options_to_dict
-from sfmapp.pipelines.run import Job
 from sfmapp.pipelines.stored_pixels import has_stored_pixels
-from sfmapp.pipelines.usage import Stopwatch
-from sfmapp.pipelines.workspace import (
-    DENSE,
-    ODOMETRY,
-    RECONSTRUCT,
-    UNDISTORT,
-    USUAL_FOLDERS,
-    open_workspace,
-    read_manifest,
-)
+from sfmapp.workspace.job import Job
+from sfmapp.workspace.layout import DENSE, ODOMETRY, RECONSTRUCT, UNDISTORT, USUAL_FOLDERS
+from sfmapp.workspace.listeners import DecisionLog, EventLog
+from sfmapp.workspace.manifest import read_manifest
+from sfmapp.workspace.options import Options, options_from_dict, options_to_dict
+from sfmapp.workspace.usage import Stopwatch
+from sfmapp.workspace.workspace import open_workspace
 
 # the workspace in the folder of a COLMAP model, if no other place is named
 INSIDE = "sfmapp"

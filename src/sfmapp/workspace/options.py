@@ -28,11 +28,10 @@ from sfmapp.images.sequence import SequenceOptions
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.pairs import PairOptions
-from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.options import OdometryOptions, ScaleOptions
 from sfmapp.option_checks import Range, check_options
-from sfmapp.pipelines import resources
-from sfmapp.pipelines.odometry_scale import ScaleOptions
 from sfmapp.surface.options import SurfaceOptions
+from sfmapp.workspace import resources
 
 LIST_ADVICE = "sfmapp reconstruct --list-options shows every option with its default"
 
@@ -99,7 +98,7 @@ def with_absolute_paths(options: Options) -> Options:
     if masks is not None:
         images = dataclasses.replace(options.images, mask_path=os.path.abspath(masks))
         options = dataclasses.replace(options, images=images)
-    given = {name: path for name in ("camera", "imu", "truth") if (path := getattr(sequence, name)) is not None}
+    given = {name: path for name in ("camera", "imu", "ground_truth") if (path := getattr(sequence, name)) is not None}
     # a camera may be a file or numbers
     found = {name: os.path.abspath(path) for name, path in given.items() if name != "camera" or os.path.exists(path)}
     return dataclasses.replace(options, sequence=dataclasses.replace(sequence, **found)) if found else options

@@ -1,0 +1,29 @@
+"""State of a reconstruction under way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from sfmapp.viewer.listener import RecordingListener
+from sfmapp.workspace.job import Job
+
+if TYPE_CHECKING:
+    from sfmapp.images.image_set import ImageSet
+    from sfmapp.scene.correspondences import Correspondences
+    from sfmapp.scene.features import Features
+
+
+@dataclass
+class Run(Job):
+    """State of a reconstruction under way.
+
+    Attributes:
+        recorder: watches the run for a recording; None if none is wanted.
+        image_set, features, correspondences: results so far.
+    """
+
+    recorder: RecordingListener | None = None
+    image_set: ImageSet | None = None
+    features: list[Features] = field(default_factory=list)
+    correspondences: Correspondences | None = None

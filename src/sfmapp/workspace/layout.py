@@ -1,0 +1,26 @@
+"""Names of what a workspace holds, and of the commands that write one."""
+
+from __future__ import annotations
+
+from sfmapp.images.products import FORMAT_NAME, MANIFEST
+
+__all__ = [
+    "DENSE",
+    "FORMAT",
+    "LOCK",
+    "MANIFEST",
+    "MODEL_FILES",
+    "ODOMETRY",
+    "RECONSTRUCT",
+    "REFINE",
+    "UNDISTORT",
+    "USUAL_FOLDERS",
+]
+
+FORMAT = f"{FORMAT_NAME} 1"
+# the commands that write workspaces; manifests of before the second one name none
+RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "refine", "dense", "undistort"
+LOCK = ".lock"
+# where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0
+USUAL_FOLDERS = ("images", "../images", "../../images")
+MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
