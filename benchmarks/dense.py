@@ -13,7 +13,6 @@ import argparse
 import hashlib
 import json
 import os
-import platform
 import re
 import shutil
 import subprocess
@@ -21,7 +20,6 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dense_inputs import lego_inputs, photographs_model
+from machine import RESULTS, ROOT, describe_machine
 from sfmapp.evaluation.clouds import score_cloud
 from sfmapp.evaluation.measured import run_measured
 from sfmapp.formats.ply_reader import read_ply_geometry
 
-ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))
 PROTOTYPE = ROOT.parent / "shared" / "research" / "prototypes"
 
@@ -244,18 +242,12 @@ def markdown(report: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def environment() -> dict[str, Any]:
-    """What the numbers depend on."""
-
-    def git(*words: str) -> str:
-        return subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True).stdout.strip()
-
-    model = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
+def published() -> dict[str, Any]:
+    """The figures of the note as the results hold them."""
+    names = ("cpu_s", "num_points", "f_scores")
     return {
-        "date": datetime.now(UTC).isoformat(timespec="minutes"),
-        "commit": git("rev-parse", "--short", "HEAD")
-        + ("+changes" if git("status", "--porcelain", "--untracked-files=no", "src") else ""),
-        "cpu": model[0].split(":")[1].strip() if model else platform.processor(),
+        case: {program: dict(zip(names, figures, strict=True)) for program, figures in programs.items()}
+        for case, programs in PUBLISHED.items()
     }
 
 
@@ -265,10 +257,10 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, default=ROOT / "out" / "dense", help="folder of the rendered scenes")
     parser.add_argument("--only", default="", help="cases whose names begin with this; others keep their results")
     parser.add_argument("--program", choices=["sfmapp", "prototype"], help="run just one of the two")
-    parser.add_argument("-o", "--output", type=Path, default=ROOT / "benchmarks" / "results" / "dense.json")
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "dense.json")
     args = parser.parse_args()
     runs = json.loads(args.output.read_text())["runs"] if args.output.is_file() else []
-    report: dict[str, Any] = environment() | {"runs": runs}
+    report: dict[str, Any] = describe_machine() | {"published": published(), "runs": runs}
     with tempfile.TemporaryDirectory(prefix="dense-") as name:
         work = Path(name)
         for case in find_cases(args.scenes, work, args.only):

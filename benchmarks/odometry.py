@@ -17,19 +17,18 @@ import argparse
 import hashlib
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
 
+from machine import RESULTS, ROOT, describe_machine
 from sfmapp.errors import SfmError
 from sfmapp.evaluation.measured import ProcessUsage, run_measured
 from sfmapp.evaluation.second_opinion import CameraGroup, SecondOpinionOptions, ask_second_opinion
@@ -39,7 +38,6 @@ from sfmapp.formats.colmap import read_model
 from sfmapp.pipelines.evaluate import evaluate
 from sfmapp.sequences.open import SequenceOptions, open_sequence
 
-ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))
 # one of each kind, as render_sequences.py lays them out
 RENDERED = (("street", ()), ("street", ("--mono",)), ("hall", ()), ("hall", ("--mono",)), ("room", ()))
@@ -85,7 +83,7 @@ def run_sfmapp(case: Case, out: Path, args: argparse.Namespace) -> dict[str, Any
     """One run of the command in a fresh workspace."""
     script = Path(sys.executable).with_name("sfmapp")
     command = [str(script), "odometry", str(case.sequence), "-o", str(out), "--seed", str(args.seed), "-q"]
-    command += ["--no-record", *(["--threads", str(args.threads)] if args.threads else [])]
+    command += ["--no-recording", *(["--threads", str(args.threads)] if args.threads else [])]
     command += [*case.flags, *(flag for setting in args.set for flag in ("--set", setting))]
     usage = run_measured(command, out.with_suffix(".log"))
     if usage.exit_code:
@@ -286,21 +284,7 @@ def _cell(value: float | None, form: str) -> str:
 
 def environment(args: argparse.Namespace) -> dict[str, Any]:
     """What the numbers depend on."""
-    from importlib.metadata import version
-
-    def git(*words: str) -> str:
-        return subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True).stdout.strip()
-
-    model = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
-    is_dirty = bool(git("status", "--porcelain", "--untracked-files=no", "src", "pipelines"))
-    names = ("sfmapp", "pycolmap", "numpy", "numba", "opencv-contrib-python-headless", "gtsam")
-    return {
-        "date": datetime.now(UTC).isoformat(timespec="minutes"),
-        "commit": git("rev-parse", "--short", "HEAD") + ("+changes" if is_dirty else ""),
-        "versions": {name: version(name) for name in names},
-        "python": platform.python_version(),
-        "cpu": model[0].split(":")[1].strip() if model else platform.processor(),
-        "cores": len(os.sched_getaffinity(0)),
+    return describe_machine() | {
         "seed": args.seed,
         "repeats": args.repeats,
         "threads": args.threads,
@@ -323,12 +307,10 @@ def main() -> None:
     parser.add_argument("--only", action="append", metavar="TEXT", help="only the cases with this in their names")
     parser.add_argument("--peer", action="store_true", help="pycolmap as well, on every second frame: minutes")
     parser.add_argument("--work", type=Path, default=None, help="folder for the workspaces, which are removed again")
-    parser.add_argument(
-        "-o", "--output", type=Path, default=None, help="default: benchmarks/results/odometry-DATE.json"
-    )
+    parser.add_argument("-o", "--output", type=Path, default=None, help="default: benchmarks/results/odometry.json")
     args = parser.parse_args()
     report: dict[str, Any] = environment(args) | {"runs": []}
-    output = args.output or ROOT / "benchmarks" / "results" / f"odometry-{report['date'][:10]}.json"
+    output = args.output or RESULTS / "odometry.json"
     output.parent.mkdir(parents=True, exist_ok=True)
     cases = [case for case in find_cases(args) if not args.only or any(text in case.name for text in args.only)]
     if not cases:

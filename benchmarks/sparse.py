@@ -13,18 +13,16 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+from machine import RESULTS, ROOT, describe_machine
 from sfmapp.errors import SfmError
 from sfmapp.evaluation.measured import ProcessUsage, run_measured
 from sfmapp.evaluation.poses import evaluate_poses
@@ -32,7 +30,6 @@ from sfmapp.evaluation.second_opinion import SecondOpinionOptions, ask_second_op
 from sfmapp.formats.colmap import has_model, read_model
 from sfmapp.formats.ground_truth import read_ground_truth
 
-ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))
 DEFAULT_SETS = ("fountain-P11", "herz-jesus-P8", "lund-door", "temple-sparse-ring")
 GROUND_TRUTH_NAMES = (
@@ -228,20 +225,7 @@ def _cell(row: dict[str, Any], path: str, form: str) -> str:
 
 def environment(args: argparse.Namespace) -> dict[str, Any]:
     """What the numbers depend on."""
-    from importlib.metadata import version
-
-    def git(*words: str) -> str:
-        return subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True).stdout.strip()
-
-    model = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
-    is_dirty = bool(git("status", "--porcelain", "--untracked-files=no", "src", "pipelines"))
-    return {
-        "date": datetime.now(UTC).isoformat(timespec="minutes"),
-        "commit": git("rev-parse", "--short", "HEAD") + ("+changes" if is_dirty else ""),
-        "versions": {p: version(p) for p in (*PROGRAMS, "numpy", "numba", "opencv-contrib-python-headless", "gtsam")},
-        "python": platform.python_version(),
-        "cpu": model[0].split(":")[1].strip() if model else platform.processor(),
-        "cores": len(os.sched_getaffinity(0)),
+    return describe_machine() | {
         "seeds": args.seeds,
         "threads": args.threads,
         "camera_mode": args.camera_mode,
@@ -260,11 +244,11 @@ def main() -> None:
     parser.add_argument("--only", choices=PROGRAMS, help="run just one of the two")
     parser.add_argument("--set", action="append", default=[], metavar="STAGE.OPTION=VALUE", help="option of sfmapp")
     parser.add_argument("--work", type=Path, default=None, help="folder for the workspaces, which are removed again")
-    parser.add_argument("-o", "--output", type=Path, default=None, help="default: benchmarks/results/sparse-DATE.json")
+    parser.add_argument("-o", "--output", type=Path, default=None, help="default: benchmarks/results/sparse.json")
     args = parser.parse_args()
     args.numba_cache = Path(tempfile.mkdtemp(prefix="numba-", dir=args.work))
     report: dict[str, Any] = environment(args) | {"runs": []}
-    output = args.output or ROOT / "benchmarks" / "results" / f"sparse-{report['date'][:10]}.json"
+    output = args.output or RESULTS / "sparse.json"
     output.parent.mkdir(parents=True, exist_ok=True)
     try:
         for data in find_sets(args.folders):
@@ -279,6 +263,7 @@ def main() -> None:
                 output.write_text(json.dumps(report, indent=1) + "\n")
     finally:
         shutil.rmtree(args.numba_cache, ignore_errors=True)
+    output.with_suffix(".md").write_text(markdown(report) + "\n")
     print(markdown(report))
 
 

@@ -29,6 +29,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from machine import RESULTS, ROOT, describe_machine
 from render_sequences import LAYOUTS, WRITERS, write_images
 from rendered_worlds import sequences as rendered
 from rendered_worlds.motion import GRAVITY
@@ -42,7 +43,6 @@ from sfmapp.pipelines.odometry.track import track_sequence
 from sfmapp.workspace.options import load_options
 
 Array = NDArray[np.float64]
-ROOT = Path(__file__).resolve().parent.parent
 # as many standard deviations as an honest statement is off by at most
 MAX_SIGMAS = 3.0
 
@@ -289,15 +289,14 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--frames", type=int, default=160)
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "wrong_inputs")
-    parser.add_argument("--json", type=Path, help="write every run here too")
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "wrong_inputs.json", help="every run in numbers")
     args = parser.parse_args()
     rows = []
     print("| fault | seed | verdict | error m of path | in sigmas | scale | red |\n|---|---|---|---|---|---|---|")
     for row in measure(args):
         rows.append(row)
         print(line(row), flush=True)
-    if args.json:
-        args.json.write_text(json.dumps(rows, indent=1) + "\n")
+    args.output.write_text(json.dumps(describe_machine() | {"runs": rows}, indent=1) + "\n")
     wrong = [row for row in rows if row["verdict"] == "SURE AND WRONG"]
     print(f"\n{len(rows)} runs, {len(wrong)} sure and wrong", file=sys.stderr)
 

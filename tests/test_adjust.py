@@ -22,7 +22,7 @@ from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera
 from sfmapp.scene.tracks import make_tracks
-from sfmapp.simd.f64x8 import pointer
+from sfmapp.simd.pointers import pointer
 
 AWAY = np.array([0.0, 0.0, 6.0])
 TIGHT = AdjustOptions(relative_cost_tolerance=1e-14, max_iterations=100)

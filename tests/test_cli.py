@@ -79,6 +79,16 @@ def test_what_cannot_be_parsed_is_usage(args: list[str], tmp_path: Path, monkeyp
 
 
 @pytest.mark.parametrize(
+    "line", ["odometry walk.mp4 -o out --no-record", "dense out --masks m", "reconstruct p -o out --no-rec"]
+)
+def test_a_flag_has_one_spelling(line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(line.split())
+    assert caught.value.code == 2
+    assert "unrecognized arguments: --" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("flags", "words"),
     [
         (

@@ -18,7 +18,6 @@ from rendered_worlds import textures
 from sfmapp.dense.arrays import Images, Limits, image_pointers
 from sfmapp.dense.patch_kernels import measure, plane_in_view, refine
 from sfmapp.dense.pyramid import frame_of, gray_pyramids, make_images, noise_deviation
-from sfmapp.dense.sampling import pack_quads
 from sfmapp.dense.scene import DenseScene, DenseView
 from sfmapp.dense.window import (
     HALF,
@@ -34,7 +33,8 @@ from sfmapp.dense.window import (
     warp,
 )
 from sfmapp.geometry import rigid3
-from sfmapp.simd.f64x8 import offset, pointer
+from sfmapp.simd.bilinear import pack_quads
+from sfmapp.simd.pointers import offset, pointer
 
 Array = NDArray[np.float64]
 CONTRAST = 25.0

@@ -395,7 +395,7 @@ def test_a_killed_odometry_leaves_the_poses_it_had(tmp_path: Path, capsys: Captu
     live = output / "trajectory_live.tum"
     output.mkdir()
     line, env = fake_odometry(output, 0.1)
-    child = subprocess.Popen([*line, "--no-record"], env=env)
+    child = subprocess.Popen([*line, "--no-recording"], env=env)
     assert wait_for(lambda: live.is_file() and len(live.read_bytes().splitlines()) > 8, 60.0)
     child.kill()
     child.wait()
@@ -411,7 +411,7 @@ def test_a_killed_odometry_leaves_the_poses_it_had(tmp_path: Path, capsys: Captu
     with pytest.raises(InputError, match="cut off"):
         read_manifest(output)  # which refine and export begin with
     line, env = fake_odometry(output)
-    assert subprocess.run([*line, "--no-record"], env=env, check=False, timeout=60).returncode == 0
+    assert subprocess.run([*line, "--no-recording"], env=env, check=False, timeout=60).returncode == 0
     assert len(read_tum(live)[0]) == len(read_tum(output / "trajectory.tum")[0]) == 50
     assert main(["evaluate", str(output), str(live), "--no-plot"]) == 0
 

@@ -23,7 +23,7 @@ from sfmapp.adjust.solver import Loss
 from sfmapp.camera.lens import ROW
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
-from sfmapp.simd.f64x8 import offset, pointer
+from sfmapp.simd.pointers import offset, pointer
 
 Array = NDArray[np.float64]
 

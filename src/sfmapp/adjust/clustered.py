@@ -22,7 +22,7 @@ from sfmapp.adjust.solver import AdjustOptions, Engine, make_engine
 from sfmapp.camera.lens import ROW
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
-from sfmapp.simd.f64x8 import offset, pointer
+from sfmapp.simd.pointers import offset, pointer
 
 Array = NDArray[np.float64]
 

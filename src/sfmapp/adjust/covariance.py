@@ -27,7 +27,7 @@ from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import ROW
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
-from sfmapp.simd.f64x8 import offset, pointer
+from sfmapp.simd.pointers import offset, pointer
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -21,7 +21,8 @@ import numba
 
 from sfmapp.camera import brown, radial_fisheye
 from sfmapp.camera.lens import FAMILY, RADIAL_FISHEYE, ROW, distort
-from sfmapp.simd.f64x8 import add2, assign3, offset, pointer, spread, store8, subtract3
+from sfmapp.simd.f64x8 import add2, assign3, spread, store8, subtract3
+from sfmapp.simd.pointers import offset, pointer
 
 # The numbers by which kernels know the losses.
 LOSS_IDS: dict[str, int] = {"trivial": 0, "huber": 1, "cauchy": 2}

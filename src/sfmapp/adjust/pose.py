@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.adjust.kernels import CANON, LOSS_IDS, POINT, SCRATCH, add_loss, fill_rows, linearize, retract, total_loss
 from sfmapp.camera.lens import ROW
-from sfmapp.simd.f64x8 import add2, pointer
+from sfmapp.simd.f64x8 import add2
+from sfmapp.simd.pointers import pointer
 
 Array = NDArray[np.float64]
 

@@ -52,7 +52,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     _add_sequence_flags(parser)
     group = parser.add_argument_group("looking at it")
     group.add_argument("--view", action="store_true", help="watch in rerun while it runs")
-    group.add_argument("--no-record", action="store_true", help="do not write recording.rrd, which replays the run")
+    group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, which replays the run")
     _add_option_flags(parser)
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_odometry, parser=parser)
@@ -120,7 +120,7 @@ def _odometry(args: argparse.Namespace) -> int:
     try:
         with listening(args) as events:
             result = track_sequence(
-                args.sequence, args.output, options, events=events, record=not args.no_record,
+                args.sequence, args.output, options, events=events, record=not args.no_recording,
                 screen=viewer.screen if viewer else None, self_calibrate=args.self_calibrate, watch=watch,
             )  # fmt: skip
     except BaseException:
@@ -228,5 +228,5 @@ def _print_summary(args: argparse.Namespace, report: dict[str, Any]) -> None:
         f"{took(run)}; {timing['cpu_ms_per_frame']:.1f} CPU ms a frame,"
         f" {timing['frames_per_second']:.1f} frames a second"
     )
-    looks = "" if args.no_record else f"; look at it: sfmapp view {output}"
+    looks = "" if args.no_recording else f"; look at it: sfmapp view {output}"
     print(f"trajectory {output / 'trajectory.tum'}, report {output / 'report.html'}{looks}")

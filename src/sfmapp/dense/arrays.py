@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.simd.f64x8 import pointer
+from sfmapp.simd.pointers import pointer
 
 # surfaces that a cell can hold, one behind the other
 LAYERS = 2

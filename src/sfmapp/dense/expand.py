@@ -27,7 +27,7 @@ from sfmapp.dense.patch_kernels import (
 )
 from sfmapp.dense.visibility import are_excused
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
-from sfmapp.simd.f64x8 import offset, pointer
+from sfmapp.simd.pointers import offset, pointer
 
 CANDIDATES = 3
 # a cell that has failed so often is left alone until the next round

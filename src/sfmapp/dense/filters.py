@@ -9,7 +9,7 @@ from numba import float32 as f32
 from sfmapp.dense.arrays import LAYERS, cell_pointers, copy_patch, image_pointers, store_pointers
 from sfmapp.dense.expand import place
 from sfmapp.dense.patch_kernels import NEAR, cell_of, cell_size, off_planes, project
-from sfmapp.simd.f64x8 import offset
+from sfmapp.simd.pointers import offset
 
 # cells to each side that are asked for patches of the same surface, and how many of them have to have one
 ASKED_CELLS = 2

@@ -16,7 +16,7 @@ from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_poi
 from sfmapp.dense.expand import BETTER, CONTRAST, LEAST_CONTRAST, LEAST_DEVIATION, zncc_with_patch
 from sfmapp.dense.patch_kernels import holds_window, project
 from sfmapp.dense.window import read_reference
-from sfmapp.simd.f64x8 import offset, pointer
+from sfmapp.simd.pointers import offset, pointer
 
 
 @numba.njit(cache=True, nogil=True)

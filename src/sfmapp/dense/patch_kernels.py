@@ -20,7 +20,7 @@ from sfmapp.dense.window import (
     solve3,
     warp,
 )
-from sfmapp.simd.f64x8 import offset
+from sfmapp.simd.pointers import offset
 
 # how far two patches may lie off each other's planes to be of one surface, in cells
 NEAR = 1.5

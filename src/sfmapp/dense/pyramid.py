@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.dense.arrays import Images
-from sfmapp.dense.sampling import pack_quads
 from sfmapp.dense.scene import DenseScene, DenseView
 from sfmapp.geometry import rigid3
+from sfmapp.simd.bilinear import pack_quads
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]

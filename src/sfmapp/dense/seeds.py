@@ -25,7 +25,7 @@ from sfmapp.dense.expand import (
 )
 from sfmapp.dense.patch_kernels import cell_of, holds_window, judge, measure, project, refine
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
-from sfmapp.simd.f64x8 import offset, pointer
+from sfmapp.simd.pointers import offset, pointer
 
 # NCC of a fronto-parallel window with one image, and on average with two, from which a place is worth refining
 LEAST_LIKENESS, LEAST_SUPPORT = f32(0.55), f32(0.5)

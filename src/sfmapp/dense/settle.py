@@ -24,7 +24,7 @@ from sfmapp.dense.patch_kernels import (
     project,
     unproject,
 )
-from sfmapp.simd.f64x8 import offset, pointer
+from sfmapp.simd.pointers import offset, pointer
 
 # cells to each side that take part, and the pixels over which their weight falls off
 RADIUS_CELLS, FALL_OFF_PX = 3, 2.2

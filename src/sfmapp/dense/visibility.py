@@ -11,7 +11,7 @@ from numba import float32 as f32
 from sfmapp.dense.arrays import LAYERS
 from sfmapp.dense.patch_kernels import APART, LEAST_COSINE, cell_of, cell_size, off_planes, project
 from sfmapp.dense.window import HALF
-from sfmapp.simd.f64x8 import offset
+from sfmapp.simd.pointers import offset
 
 # of an image: where a window about as large as that of the reference image reaches out of it
 BORDER = float(HALF + 1)

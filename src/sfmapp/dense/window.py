@@ -27,9 +27,9 @@ import numpy as np
 from numba import float32 as f32
 from numpy.typing import NDArray
 
-from sfmapp.dense.sampling import pixels, sample, sample_with_slopes
+from sfmapp.simd.bilinear import quad_pixels, sample_quads, sample_quads_with_slopes
 from sfmapp.simd.f32x16 import add, divide, fma, load, multiply, splat, store, subtract, total
-from sfmapp.simd.f64x8 import offset
+from sfmapp.simd.pointers import offset
 
 HALF = 3
 SIZE = 32
@@ -81,7 +81,7 @@ def read_reference(quads, width, u, v, contrast, work):  # type: ignore[no-untyp
     scale, one = splat(f32(1.0) / contrast), splat(f32(1.0))
     weights = mean = square = splat(f32(0.0))
     for k in range(0, SIZE, 16):
-        value = subtract(pixels(base, width, load(work, DX + k), load(work, DY + k)), center)
+        value = subtract(quad_pixels(base, width, load(work, DX + k), load(work, DY + k)), center)
         difference = multiply(value, scale)
         weight = divide(one, fma(difference, difference, one))
         weight = multiply(multiply(weight, weight), load(work, FALL_OFF + k))
@@ -142,7 +142,7 @@ def correlate(quads, width, x, y, xu, yu, xv, yv, work):  # type: ignore[no-unty
     center = splat(work[CENTER])
     for k in range(0, SIZE, 16):
         du, dv = load(work, DX + k), load(work, DY + k)
-        value = sample(quads, width, fma(dv, xv_, fma(du, xu_, x0)), fma(dv, yv_, fma(du, yu_, y0)))
+        value = sample_quads(quads, width, fma(dv, xv_, fma(du, xu_, x0)), fma(dv, yv_, fma(du, yu_, y0)))
         value = subtract(value, center)
         weighted = multiply(load(work, WEIGHT + k), value)
         mean, square = add(mean, weighted), fma(weighted, value, square)
@@ -169,7 +169,9 @@ def correlate_with_terms(quads, width, x, y, xu, yu, xv, yv, ex, ey, work):  # t
     n00 = n01 = n02 = n11 = n12 = n22 = zero
     for k in range(0, SIZE, 16):
         du, dv = load(work, DX + k), load(work, DY + k)
-        value, gx, gy = sample_with_slopes(quads, width, fma(dv, xv_, fma(du, xu_, x0)), fma(dv, yv_, fma(du, yu_, y0)))
+        value, gx, gy = sample_quads_with_slopes(
+            quads, width, fma(dv, xv_, fma(du, xu_, x0)), fma(dv, yv_, fma(du, yu_, y0))
+        )
         value, slope = subtract(value, center), fma(gx, ex_, multiply(gy, ey_))
         weight, reference = load(work, WEIGHT + k), load(work, REFERENCE + k)
         weighted = multiply(weight, value)

@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numba
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
+
+from sfmapp.simd.bits import count_bits
 
 Words = NDArray[np.uint64]
 Indices = NDArray[np.int32]
-
-
-@intrinsic
-def _count_bits(typingctx: Any, word: Any) -> Any:
-    """LLVM's population count of a uint64."""
-
-    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
-        return builder.ctpop(args[0])
-
-    return types.uint64(types.uint64), codegen
 
 
 @numba.njit(cache=True, nogil=True)
@@ -34,7 +21,7 @@ def _nearest(a: Words, b: Words, rows: Indices, columns: Indices) -> None:
         for j in range(b.shape[0]):
             distance = np.int32(0)
             for k in range(num_words):
-                distance += np.int32(_count_bits(a[i, k] ^ b[j, k]))
+                distance += np.int32(count_bits(a[i, k] ^ b[j, k]))
             if distance < second:
                 if distance < best:
                     best, second, place = distance, best, j

@@ -16,10 +16,6 @@ from numpy.typing import NDArray
 
 from sfmapp.matching.descriptors import passes_ratio
 from sfmapp.matching.products import (
-    DIMS,
-    GROUPS,
-    LANES,
-    ROWS,
     Ints,
     background_products,
     keep_two_largest,
@@ -27,9 +23,9 @@ from sfmapp.matching.products import (
     pack_groups,
     pack_rows,
     scratch,
-    tile,
 )
 from sfmapp.scene.features import Features
+from sfmapp.simd.i16x32 import DIMS, GROUPS, LANES, ROWS, tile
 
 Array = NDArray[np.float64]
 

@@ -1,113 +1,23 @@
 """The two largest dot products of every descriptor of one image with those of another.
 
 SIFT descriptors are whole numbers, so their products are exact: the same on every machine and in every order of
-summation. A processor multiplies 16-bit numbers and adds neighbouring pairs in one instruction (pmaddwd, vpdpwssd,
-smlal): twice the rate of floats, and nothing is written to memory. Numba's own loops do not find that instruction, so
-the innermost tile is written in LLVM's portable language, in the one pattern that every back end knows.
+summation. They come in small tiles, which stay in registers and the first cache: the matrix of all products is never
+written to memory.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from typing import Any
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 from numpy.typing import NDArray
+
+from sfmapp.simd.i16x32 import DIMS, GROUPS, LANES, ROWS, tile
 
 Ints = NDArray[np.int32]
 
-DIMS = 128
-LANES = 16  # descriptors that share a vector of 32-bit sums
-ROWS, GROUPS = 4, 2  # descriptors of image 1, and groups of LANES of image 2, in a tile: 8 vectors of sums
 _GROUPS_IN_CACHE = 16  # 256 descriptors of image 2, 64 kB, stay in the cache while image 1 passes by
-
-_I16, _I32, _I64 = ir.IntType(16), ir.IntType(32), ir.IntType(64)
-_SUMS = ir.VectorType(_I32, LANES)
-_PRODUCTS = ir.VectorType(_I32, 2 * LANES)
-_PAIRS = ir.VectorType(_I16, 2 * LANES)
-
-
-def _int64(value: int) -> ir.Constant:
-    return ir.Constant(_I64, value)
-
-
-def _load(builder: ir.IRBuilder, pointer: Any, offset: Any, kind: ir.Type, align: int) -> Any:
-    value = builder.load(builder.bitcast(builder.gep(pointer, [offset]), kind.as_pointer()))
-    value.align = align
-    return value
-
-
-def _broadcast(builder: ir.IRBuilder, value: Any) -> Any:
-    undefined = ir.Constant(_SUMS, ir.Undefined)
-    return builder.shuffle_vector(
-        builder.insert_element(undefined, value, ir.Constant(_I32, 0)), undefined, ir.Constant(_SUMS, None)
-    )
-
-
-def _add_pairs(builder: ir.IRBuilder, products: Any) -> Any:
-    undefined = ir.Constant(_PRODUCTS, ir.Undefined)
-    halves = [ir.Constant(_SUMS, [2 * lane + odd for lane in range(LANES)]) for odd in (0, 1)]
-    return builder.add(*(builder.shuffle_vector(products, undefined, half) for half in halves))
-
-
-@intrinsic
-def tile(
-    typing_context: Any, a: Any, packed: Any, sums: Any, masks: Any, second1: Any, second2: Any, row: Any, group: Any
-) -> tuple[Any, Callable[..., Any]]:
-    """Products of rows ``row..row + ROWS`` of a with groups ``group..group + GROUPS`` of packed.
-
-    They go to sums (ROWS, GROUPS * LANES) int32; masks (ROWS,) uint32 gets a bit for each product that exceeds the
-    second best of its row (second1) or of its column (second2), which after a while is rare.
-    """
-
-    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
-        def pointer(k: int, kind: ir.Type) -> Any:
-            data = context.make_array(signature.args[k])(context, builder, args[k]).data
-            return builder.bitcast(data, kind.as_pointer())
-
-        p_a, p_packed = pointer(0, _I16), pointer(1, _I16)
-        p_sums, p_masks, p_second1, p_second2 = (pointer(k, _I32) for k in (2, 3, 4, 5))
-        row, group = args[6], args[7]
-        zero = ir.Constant(_SUMS, None)
-        totals = [[cgutils.alloca_once_value(builder, zero) for _ in range(GROUPS)] for _ in range(ROWS)]
-        for slot in (slot for line in totals for slot in line):  # alloca_once initialises at the function's entry only
-            builder.store(zero, slot)
-        with cgutils.for_range(builder, _int64(DIMS // 2)) as loop:
-            columns = []
-            for g in range(GROUPS):
-                start = builder.mul(builder.add(group, _int64(g)), _int64(DIMS * LANES))
-                offset = builder.add(start, builder.mul(loop.index, _int64(2 * LANES)))
-                columns.append(builder.sext(_load(builder, p_packed, offset, _PAIRS, 2), _PRODUCTS))
-            for r in range(ROWS):
-                start = builder.mul(builder.add(row, _int64(r)), _int64(DIMS))
-                pair = _load(builder, p_a, builder.add(start, builder.mul(loop.index, _int64(2))), _I32, 2)
-                line = builder.sext(builder.bitcast(_broadcast(builder, pair), _PAIRS), _PRODUCTS)
-                for g in range(GROUPS):
-                    products = builder.mul(line, columns[g], flags=("nsw",))
-                    total = builder.add(builder.load(totals[r][g]), _add_pairs(builder, products))
-                    builder.store(total, totals[r][g])
-        for r in range(ROWS):
-            bound1 = _broadcast(builder, _load(builder, p_second1, builder.add(row, _int64(r)), _I32, 4))
-            mask = ir.Constant(_I32, 0)
-            for g in range(GROUPS):
-                total = builder.load(totals[r][g])
-                target = builder.gep(p_sums, [_int64((r * GROUPS + g) * LANES)])
-                builder.store(total, builder.bitcast(target, _SUMS.as_pointer())).align = 4
-                column = builder.mul(builder.add(group, _int64(g)), _int64(LANES))
-                bound2 = _load(builder, p_second2, column, _SUMS, 4)
-                above = builder.or_(builder.icmp_signed(">", total, bound1), builder.icmp_signed(">", total, bound2))
-                bits = builder.zext(builder.bitcast(above, ir.IntType(LANES)), _I32)
-                mask = builder.or_(mask, builder.shl(bits, ir.Constant(_I32, LANES * g)))
-            builder.store(mask, builder.gep(p_masks, [_int64(r)]))
-        return context.get_dummy_value()
-
-    return types.void(a, packed, sums, masks, second1, second2, row, group), codegen
 
 
 @numba.njit(cache=True, nogil=True)

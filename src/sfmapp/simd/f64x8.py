@@ -20,83 +20,37 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from sfmapp.simd.llvm import F64, I32, data, fma, int64, load, splat, store
+
 WIDTH = 8
 
-_DOUBLE, _LANES = ir.DoubleType(), ir.VectorType(ir.DoubleType(), WIDTH)
-_I32, _I64 = ir.IntType(32), ir.IntType(64)
-
-
-@intrinsic
-def pointer(typingctx, array):  # type: ignore[no-untyped-def]
-    """Pointer to the first element of an array that the caller keeps alive.
-
-    Handed to another kernel, an array costs two atomic operations for its reference count, on every call, and indexing
-    it looks at the sign of the index; a pointer does neither. A local array must be used again after its last pointer.
-    """
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return context.make_array(signature.args[0])(context, builder, args[0]).data
-
-    return types.CPointer(array.dtype)(array), codegen
-
-
-@intrinsic
-def offset(typingctx, base, count):  # type: ignore[no-untyped-def]
-    """The pointer ``count`` elements further on."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.gep(args[0], [args[1]])
-
-    return base(base, types.intp), codegen
-
-
-def _data(context: Any, builder: Any, signature: Any, args: Any, n: int) -> Any:
-    kind = signature.args[n]
-    return args[n] if isinstance(kind, types.CPointer) else context.make_array(kind)(context, builder, args[n]).data
+_LANES = ir.VectorType(F64, WIDTH)
 
 
 def _load(builder: Any, pointer: Any) -> Any:
-    value = builder.load(builder.bitcast(pointer, _LANES.as_pointer()))
-    value.align = 8
-    return value
-
-
-def _store(builder: Any, value: Any, pointer: Any) -> None:
-    store = builder.store(value, builder.bitcast(pointer, _LANES.as_pointer()))
-    store.align = 8
-
-
-def _fma(builder: Any, a: Any, b: Any, c: Any) -> Any:
-    kind = ir.FunctionType(_LANES, [_LANES] * 3)
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.fma.v8f64"), [a, b, c])
-
-
-def _splat(builder: Any, scalar: Any) -> Any:
-    empty = ir.Constant(_LANES, ir.Undefined)
-    one = builder.insert_element(empty, scalar, ir.Constant(_I32, 0))
-    return builder.shuffle_vector(one, empty, ir.Constant(ir.VectorType(_I32, WIDTH), [0] * WIDTH))
+    return load(builder, pointer, _LANES, 8)
 
 
 def _update(depth: int, mode: str) -> Callable[..., Any]:
     """The code generator of one update: ``depth`` terms in the sum, mode ``add``, ``subtract`` or ``assign``."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        def data(n: int) -> Any:
-            return _data(context, builder, signature, args, n)
+        def place_of(n: int) -> Any:
+            return data(context, builder, signature, args, n)
 
-        target = builder.gep(data(0), [args[1]])
-        left = builder.gep(data(2), [args[3]])
-        right = builder.gep(data(4), [args[5]])
-        rows = [_load(builder, builder.gep(right, [ir.Constant(_I64, WIDTH * k)])) for k in range(depth)]
+        target = builder.gep(place_of(0), [args[1]])
+        left = builder.gep(place_of(2), [args[3]])
+        right = builder.gep(place_of(4), [args[5]])
+        rows = [_load(builder, builder.gep(right, [int64(WIDTH * k)])) for k in range(depth)]
         if mode == "subtract":
             rows = [builder.fneg(row) for row in rows]
         with cgutils.for_range(builder, args[6]) as loop:
-            place = builder.gep(target, [builder.mul(loop.index, ir.Constant(_I64, WIDTH))])
+            place = builder.gep(target, [builder.mul(loop.index, int64(WIDTH))])
             total = ir.Constant(_LANES, None) if mode == "assign" else _load(builder, place)
             for k in range(depth):
-                scalar = builder.load(builder.gep(left, [builder.add(loop.index, ir.Constant(_I64, WIDTH * k))]))
-                total = _fma(builder, _splat(builder, scalar), rows[k], total)
-            _store(builder, total, place)
+                scalar = builder.load(builder.gep(left, [builder.add(loop.index, int64(WIDTH * k))]))
+                total = fma(builder, splat(builder, scalar, _LANES), rows[k], total)
+            store(builder, total, place, 8)
         return context.get_dummy_value()
 
     return codegen
@@ -108,71 +62,79 @@ def _signature(c: Any, a: Any, b: Any) -> Any:
 
 
 @intrinsic
-def add2(typingctx, C, c, A, a, B, b, rows):  # type: ignore[no-untyped-def]
+def add2(typingctx: Any, C: Any, c: Any, A: Any, a: Any, B: Any, b: Any, rows: Any) -> Any:
     """``C += A^T B``, two terms."""
     return _signature(C, A, B), _update(2, "add")
 
 
 @intrinsic
-def subtract3(typingctx, C, c, A, a, B, b, rows):  # type: ignore[no-untyped-def]
+def subtract3(typingctx: Any, C: Any, c: Any, A: Any, a: Any, B: Any, b: Any, rows: Any) -> Any:
     """``C -= A^T B``, three terms."""
     return _signature(C, A, B), _update(3, "subtract")
 
 
 @intrinsic
-def assign3(typingctx, C, c, A, a, B, b, rows):  # type: ignore[no-untyped-def]
+def assign3(typingctx: Any, C: Any, c: Any, A: Any, a: Any, B: Any, b: Any, rows: Any) -> Any:
     """``C = A^T B``, three terms."""
     return _signature(C, A, B), _update(3, "assign")
 
 
 @intrinsic
-def subtract8(typingctx, C, c, A, a, B, b, rows):  # type: ignore[no-untyped-def]
+def subtract8(typingctx: Any, C: Any, c: Any, A: Any, a: Any, B: Any, b: Any, rows: Any) -> Any:
     """``C -= A^T B``, eight terms."""
     return _signature(C, A, B), _update(8, "subtract")
 
 
 @intrinsic
-def assign8(typingctx, C, c, A, a, B, b, rows):  # type: ignore[no-untyped-def]
+def assign8(typingctx: Any, C: Any, c: Any, A: Any, a: Any, B: Any, b: Any, rows: Any) -> Any:
     """``C = A^T B``, eight terms."""
     return _signature(C, A, B), _update(8, "assign")
 
 
 @intrinsic
-def store8(typingctx, C, c, v0, v1, v2, v3, v4, v5, v6, v7):  # type: ignore[no-untyped-def]
+def store8(
+    typingctx: Any, C: Any, c: Any, v0: Any, v1: Any, v2: Any, v3: Any, v4: Any, v5: Any, v6: Any, v7: Any
+) -> Any:
     """``C[c : c + 8] = v0..v7`` in one store: a vector load soon after waits long for eight single stores."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         row = ir.Constant(_LANES, ir.Undefined)
         for k in range(WIDTH):
-            row = builder.insert_element(row, args[2 + k], ir.Constant(_I32, k))
-        _store(builder, row, builder.gep(_data(context, builder, signature, args, 0), [args[1]]))
+            row = builder.insert_element(row, args[2 + k], ir.Constant(I32, k))
+        store(builder, row, builder.gep(data(context, builder, signature, args, 0), [args[1]]), 8)
         return context.get_dummy_value()
 
     return types.void(C, types.intp, *[types.float64] * WIDTH), codegen
 
 
 @intrinsic
-def spread(typingctx, C, c, base, A, a, slots, units, first, last):  # type: ignore[no-untyped-def]
-    """Two rows ``C[c + 8 x :] = base[8 x :] + sum_n A[a + 2 slots[n] + x] units[8 n :]`` for first <= n < last."""
+def spread(
+    typingctx: Any, C: Any, c: Any, base: Any, A: Any, a: Any, slots: Any, units: Any, first: Any, last: Any
+) -> Any:
+    """Two rows ``C[c + 8 x :] = base[8 x :] + sum_n A[a + 2 slots[n] + x] units[8 n :]`` for first <= n < last.
+
+    slots: int64.
+    """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        def data(n: int) -> Any:
-            return _data(context, builder, signature, args, n)
+        def place_of(n: int) -> Any:
+            return data(context, builder, signature, args, n)
 
-        target, left, slot, unit = builder.gep(data(0), [args[1]]), builder.gep(data(3), [args[4]]), data(5), data(6)
+        target, left = builder.gep(place_of(0), [args[1]]), builder.gep(place_of(3), [args[4]])
+        slot, unit = place_of(5), place_of(6)
         sums = []
         for x in range(2):
             total = cgutils.alloca_once(builder, _LANES)
-            builder.store(_load(builder, builder.gep(data(2), [ir.Constant(_I64, WIDTH * x)])), total)
+            builder.store(_load(builder, builder.gep(place_of(2), [int64(WIDTH * x)])), total)
             sums.append(total)
-        with cgutils.for_range_slice(builder, args[7], args[8], ir.Constant(_I64, 1), inc=True) as (n, _):
-            row = _load(builder, builder.gep(unit, [builder.mul(n, ir.Constant(_I64, WIDTH))]))
-            place = builder.mul(builder.load(builder.gep(slot, [n])), ir.Constant(_I64, 2))
+        with cgutils.for_range_slice(builder, args[7], args[8], int64(1), inc=True) as (n, _):
+            row = _load(builder, builder.gep(unit, [builder.mul(n, int64(WIDTH))]))
+            place = builder.mul(builder.load(builder.gep(slot, [n])), int64(2))
             for x in range(2):
-                scalar = builder.load(builder.gep(left, [builder.add(place, ir.Constant(_I64, x))]))
-                builder.store(_fma(builder, _splat(builder, scalar), row, builder.load(sums[x])), sums[x])
+                scalar = builder.load(builder.gep(left, [builder.add(place, int64(x))]))
+                builder.store(fma(builder, splat(builder, scalar, _LANES), row, builder.load(sums[x])), sums[x])
         for x in range(2):
-            _store(builder, builder.load(sums[x]), builder.gep(target, [ir.Constant(_I64, WIDTH * x)]))
+            store(builder, builder.load(sums[x]), builder.gep(target, [int64(WIDTH * x)]), 8)
         return context.get_dummy_value()
 
     i = types.intp

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from sfmapp.events import Event
 from sfmapp.odometry.result import FrameState
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
+from sfmapp.packages import MissingPackageError, require
 from sfmapp.viewer.listener import MAX_MESSAGES
 
 if TYPE_CHECKING:
@@ -79,6 +80,11 @@ class LiveView:
 
     def begin(self, sequence: sequences.Sequence) -> None:
         """Start the child, which first learns what will be played."""
+        try:
+            require("rerun")
+        except MissingPackageError as missing:
+            self._problem = f"{missing}: {missing.advice}"
+            return
         camera = sequence.rig.cameras[0]
         self._num_frames = sequence.num_frames
         ground_truth = sequence.ground_truth

@@ -23,7 +23,6 @@ ODOMETRY_MODULES = (
     "sfmapp.odometry.frontend.small_image",
     "sfmapp.odometry.frontend.corners",
     "sfmapp.odometry.frontend.alignment",
-    "sfmapp.odometry.frontend.affine_alignment",
     "sfmapp.odometry.frontend.epipolar_search",
     "sfmapp.geometry.epipolar",
     "sfmapp.mapping.structure",

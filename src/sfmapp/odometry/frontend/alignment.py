@@ -8,8 +8,7 @@ squares solution needs nothing of T but its gradients less what T itself and a c
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -17,28 +16,28 @@ from numpy.typing import NDArray
 
 from sfmapp.odometry.frontend.pyramid import PAD, Bytes, Pyramid, build_pyramid
 from sfmapp.simd import f32x16 as lanes
-from sfmapp.simd.f64x8 import offset, pointer
+from sfmapp.simd.bilinear import sample_bytes
+from sfmapp.simd.pointers import offset, pointer
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
-MAX_HALF_WIDTH = 7  # a row of a patch is one vector
-_CHUNK = 256  # points to a task
+_MAX_HALF_WIDTH = 7  # a row of a patch is one vector
 # float32 a point needs: 17 sampled rows of 32; 15 rows of T, gradient x, y, weight; 15 rows of w g~x, w g~y, w T~
-_SAMPLES, GRADED, _SUMS = 0, 17 * 32, 17 * 32 + 15 * 64
+_SAMPLES, _GRADED, _SUMS = 0, 17 * 32, 17 * 32 + 15 * 64
 SCRATCH = _SUMS + 15 * 48
 # last step, in pixels of the level: a tenth of the noise of a good track at the finest, and what the next level makes
 # good at the others
 _FINE_STEP_PX, _COARSE_STEP_PX = 0.01, 0.1
+_MAX_ITERATIONS = 15  # on each level
 # standard deviation that noise of one grey level in both images would give the position; where it is more, what the
 # sensor really adds moves the patch by its own gradients
-MAX_SIGMA_PX = 0.25
+_MAX_SIGMA_PX = 0.25
 # a gain taken for larger or smaller only makes the steps shorter or longer
 _MIN_GAIN, _MAX_GAIN = 0.6, 1.6
 
 
-@dataclass(frozen=True)
-class Alignment:
+class Alignment(NamedTuple):
     """Where patches of one image lie in another.
 
     Attributes:
@@ -73,7 +72,7 @@ def _sample_shifted(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def is_within_pad(layout: NDArray[np.int64], x: float, y: float, warp: Doubles, half: float) -> bool:
+def _is_within_pad(layout: NDArray[np.int64], x: float, y: float, warp: Doubles, half: float) -> bool:
     """Whether a warped square about (x, y) of a level stays on what the level and its border hold; False with NaN."""
     reach_x, reach_y = half * (abs(warp[0, 0]) + abs(warp[0, 1])), half * (abs(warp[1, 0]) + abs(warp[1, 1]))
     room = PAD - 1.0
@@ -84,7 +83,7 @@ def is_within_pad(layout: NDArray[np.int64], x: float, y: float, warp: Doubles, 
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def sample_warped(
+def _sample_warped(
     data: Bytes, layout: NDArray[np.int64], x: float, y: float, warp: Doubles, grow: float, size: int, scratch: Floats,
     shift: float,
 ) -> None:  # fmt: skip
@@ -104,7 +103,7 @@ def sample_warped(
             dy = grow * (row - 0.5 * (size - 1))
             u = lanes.fma(a, dx, lanes.splat(np.float32(x - 0.5 - c + warp[0, 1] * dy)))
             v = lanes.fma(b, dx, lanes.splat(np.float32(y - 0.5 - r + warp[1, 1] * dy)))
-            value = lanes.subtract(lanes.sample(image, layout[1], u, v), less)
+            value = lanes.subtract(sample_bytes(image, layout[1], u, v), less)
             lanes.store(out, _SAMPLES + 32 * row + 16 * part, value)
 
 
@@ -114,7 +113,7 @@ def _differentiate(scratch: Floats, window: Floats, rows: int) -> None:
     p, w = pointer(scratch), pointer(window)
     half = lanes.splat(np.float32(0.5))
     for r in range(rows):
-        at, to = _SAMPLES + 32 * (r + 1) + 1, GRADED + 64 * r
+        at, to = _SAMPLES + 32 * (r + 1) + 1, _GRADED + 64 * r
         lanes.store(p, to, lanes.load(p, at))
         lanes.store(p, to + 16, lanes.multiply(half, lanes.subtract(lanes.load(p, at + 1), lanes.load(p, at - 1))))
         lanes.store(p, to + 32, lanes.multiply(half, lanes.subtract(lanes.load(p, at + 32), lanes.load(p, at - 32))))
@@ -128,7 +127,7 @@ def _project(scratch: Floats, rows: int, hessian: Doubles) -> bool:
     zero = lanes.splat(np.float32(0))
     sw, st, sx, sy = zero, zero, zero, zero
     for r in range(rows):
-        at = GRADED + 64 * r
+        at = _GRADED + 64 * r
         w = lanes.load(p, at + 48)
         sw = lanes.add(sw, w)
         st = lanes.fma(w, lanes.load(p, at), st)
@@ -139,7 +138,7 @@ def _project(scratch: Floats, rows: int, hessian: Doubles) -> bool:
     at_, ax, ay = lanes.splat(mt), lanes.splat(mx), lanes.splat(my)
     stt, sxt, syt = zero, zero, zero
     for r in range(rows):
-        at = GRADED + 64 * r
+        at = _GRADED + 64 * r
         w = lanes.load(p, at + 48)
         wt = lanes.multiply(w, lanes.subtract(lanes.load(p, at), at_))
         lanes.store(p, _SUMS + 48 * r + 32, wt)
@@ -152,7 +151,7 @@ def _project(scratch: Floats, rows: int, hessian: Doubles) -> bool:
     cx, cy = lanes.splat(-lanes.total(sxt) / variance), lanes.splat(-lanes.total(syt) / variance)
     sxx, sxy, syy = zero, zero, zero
     for r in range(rows):
-        at = GRADED + 64 * r
+        at = _GRADED + 64 * r
         w, t = lanes.load(p, at + 48), lanes.subtract(lanes.load(p, at), at_)
         gx = lanes.fma(cx, t, lanes.subtract(lanes.load(p, at + 16), ax))
         gy = lanes.fma(cy, t, lanes.subtract(lanes.load(p, at + 32), ay))
@@ -205,7 +204,7 @@ def correlate(
         start += step
         down0, down1 = lanes.load_bytes(image, start), lanes.load_bytes(image, start + 1)
         value = lanes.fma(a00, up0, lanes.fma(a01, up1, lanes.fma(a10, down0, lanes.fma(a11, down1, less))))
-        w = lanes.load(p, GRADED + 64 * r + 48)
+        w = lanes.load(p, _GRADED + 64 * r + 48)
         weighted = lanes.multiply(w, value)
         sw, si, sii = lanes.add(sw, w), lanes.add(si, weighted), lanes.fma(weighted, value, sii)
         st = lanes.fma(lanes.load(p, _SUMS + 48 * r + 32), value, st)
@@ -240,9 +239,9 @@ def prepare_patch(
     shift = float(data[start + int(np.floor(v)) * step + int(np.floor(u))])
     if is_warped:
         grow = 2.0 ** (level - source)
-        if not is_within_pad(layouts[source], u, v, warp, (half + 1) * grow):
+        if not _is_within_pad(layouts[source], u, v, warp, (half + 1) * grow):
             return -1.0
-        sample_warped(data, layouts[source], u, v, warp, grow, 2 * half + 3, scratch, shift)
+        _sample_warped(data, layouts[source], u, v, warp, grow, 2 * half + 3, scratch, shift)
     else:
         left, top = u - 0.5 - (half + 1), v - 0.5 - (half + 1)
         c, r = int(np.floor(left)), int(np.floor(top))
@@ -252,13 +251,13 @@ def prepare_patch(
         return -1.0
     h00, h01, h11 = hessian[0], hessian[1], hessian[2]
     weakest = 0.5 * (h00 + h11) - np.sqrt(0.25 * (h00 - h11) ** 2 + h01 * h01)
-    return shift if weakest * MAX_SIGMA_PX**2 > 2.0 else -1.0
+    return shift if weakest * _MAX_SIGMA_PX**2 > 2.0 else -1.0
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _iterate(
     data: Bytes, layout: NDArray[np.int64], position: Doubles, half: int, scratch: Floats, hessian: Doubles,
-    shift: float, max_iterations: int, small: float,
+    shift: float, small: float,
 ) -> bool:  # fmt: skip
     """Move a position, in pixels of the level, to where the patch fits; False, and unmoved, where it does not."""
     start, step, height, width = layout
@@ -266,7 +265,7 @@ def _iterate(
     determinant = h00 * h11 - h01 * h01
     x, y = position[0], position[1]
     last_x, last_y = 0.0, 0.0
-    for _ in range(max_iterations):
+    for _ in range(_MAX_ITERATIONS):
         if not (0.0 <= x <= width and 0.0 <= y <= height) or abs(x - position[0]) + abs(y - position[1]) > 2.0 * half:
             return False
         left, top = x - 0.5 - half, y - 0.5 - half
@@ -296,40 +295,36 @@ def _is_inside(layout: NDArray[np.int64], x: float, y: float, margin: float) -> 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _align(
-    data1: Bytes, layout1: NDArray[np.int64], xy1: Doubles, data2: Bytes, layout2: NDArray[np.int64], xy2: Doubles,
-    warps: Doubles, coarsest: int, finest: int, half: int, max_iterations: int, window: Floats, zncc: Floats,
-    is_converged: NDArray[np.bool_],
+    reference: Pyramid, xy: Doubles, target: Pyramid, found: Alignment, warps: Doubles, coarsest: int, half: int,
+    window: Floats,
 ) -> None:  # fmt: skip
+    """Move the positions of ``found``, which are guesses at first, and fill the rest of it."""
     scratch, hessian, position = np.zeros(SCRATCH, np.float32), np.empty(4), np.empty(2)
-    rows = 2 * half + 1
-    for i in range(xy1.shape[0]):
-        zncc[i], is_converged[i] = 0.0, False
-        is_warped = warps.shape[0] > 0
+    data1, layout1, data2, layout2 = reference.data, reference.layout, target.data, target.layout
+    rows, margin, is_warped = 2 * half + 1, half + 0.5, warps.shape[0] > 0
+    for i in range(xy.shape[0]):
+        x, y = xy[i]
+        found.zncc[i], found.is_converged[i] = 0.0, False
         warp = warps[i if is_warped else 0]
-        if not _is_inside(layout1[0], xy1[i, 0], xy1[i, 1], 0.0):
+        if not _is_inside(layout1[0], x, y, 0.0):
             continue
-        for level in range(coarsest, finest - 1, -1):
+        for level in range(coarsest, -1, -1):
             scale = 0.5**level
-            position[0], position[1] = xy2[i, 0] * scale, xy2[i, 1] * scale
-            shift = prepare_patch(
-                data1, layout1, level, xy1[i, 0], xy1[i, 1], warp, is_warped, half, window, scratch, hessian
-            )
+            position[0], position[1] = found.xy[i, 0] * scale, found.xy[i, 1] * scale
+            shift = prepare_patch(data1, layout1, level, x, y, warp, is_warped, half, window, scratch, hessian)
             if shift < 0.0:
                 continue
-            small = _FINE_STEP_PX if level == finest else _COARSE_STEP_PX
-            is_good = _iterate(data2, layout2[level], position, half, scratch, hessian, shift, max_iterations, small)
-            if not is_good:
+            small = _FINE_STEP_PX if level == 0 else _COARSE_STEP_PX
+            if not _iterate(data2, layout2[level], position, half, scratch, hessian, shift, small):
                 continue
-            xy2[i, 0], xy2[i, 1] = position[0] / scale, position[1] / scale
-            if level == finest:
+            found.xy[i, 0], found.xy[i, 1] = position[0] / scale, position[1] / scale
+            if level == 0:
                 left, top = position[0] - 0.5 - half, position[1] - 0.5 - half
                 c, r = int(np.floor(left)), int(np.floor(top))
-                start, step = layout2[level, 0] + r * layout2[level, 1] + c, layout2[level, 1]
-                zncc[i] = correlate(data2, start, step, left - c, top - r, rows, scratch, shift, hessian[3])
-                margin = half + 0.5
-                is_converged[i] = _is_inside(layout2[level], position[0], position[1], margin) and _is_inside(
-                    layout1[level], xy1[i, 0] * scale, xy1[i, 1] * scale, margin
-                )
+                start, step = layout2[0, 0] + r * layout2[0, 1] + c, layout2[0, 1]
+                found.zncc[i] = correlate(data2, start, step, left - c, top - r, rows, scratch, shift, hessian[3])
+                is_inside = _is_inside(layout2[0], position[0], position[1], margin)
+                found.is_converged[i] = is_inside and _is_inside(layout1[0], x, y, margin)
 
 
 def patch_window(half_width: int) -> Floats:
@@ -347,8 +342,7 @@ def patch_window(half_width: int) -> Floats:
 
 def align_patches(
     reference: Pyramid, reference_xy: Doubles, target: Pyramid, target_xy: Doubles, *,
-    affine: Doubles | None = None, coarsest_level: int = 4, finest_level: int = 0, half_width: int = 7,
-    max_iterations: int = 15, threads: int = 1,
+    affine: Doubles | None = None, coarsest_level: int = 4, half_width: int = 7,
 ) -> Alignment:  # fmt: skip
     """Find patches of one image in another, from guesses, to sub-pixel accuracy.
 
@@ -358,35 +352,17 @@ def align_patches(
         target_xy: (N, 2) float64 pixels, where they are expected.
         affine: (N, 2, 2) float64, takes an offset in the target to that in the reference; None: identity.
         coarsest_level: where to begin; about half_width * 2**level pixels are reached from there.
-        finest_level: where to end.
         half_width: pixels of a level from the centre of a patch to its outermost pixels, at most 7.
-        max_iterations: on each level.
-        threads: how many share the work; the results do not depend on it.
     """
-    if not 1 <= half_width <= MAX_HALF_WIDTH:
-        raise ValueError(f"half_width {half_width} is not within 1..{MAX_HALF_WIDTH}")
-    xy1 = np.ascontiguousarray(reference_xy, np.float64).reshape(-1, 2)
-    xy2 = np.array(target_xy, np.float64, order="C").reshape(-1, 2)
+    if not 1 <= half_width <= _MAX_HALF_WIDTH:
+        raise ValueError(f"half_width {half_width} is not within 1..{_MAX_HALF_WIDTH}")
+    xy = np.ascontiguousarray(reference_xy, np.float64).reshape(-1, 2)
+    guess = np.array(target_xy, np.float64, order="C").reshape(-1, 2)
     warps = np.empty((0, 2, 2)) if affine is None else np.ascontiguousarray(affine, np.float64).reshape(-1, 2, 2)
-    zncc, is_converged = np.zeros(len(xy1), np.float32), np.zeros(len(xy1), np.bool_)
-    window = patch_window(half_width)
-    coarsest = min(max(coarsest_level, finest_level), reference.num_levels - 1, target.num_levels - 1)
-
-    def work(first: int) -> None:
-        part = slice(first, first + _CHUNK)
-        _align(
-            reference.data, reference.layout, xy1[part], target.data, target.layout, xy2[part], warps[part],
-            coarsest, finest_level, half_width, max_iterations, window, zncc[part], is_converged[part],
-        )  # fmt: skip
-
-    starts = range(0, len(xy1), _CHUNK)
-    if threads > 1 and len(starts) > 1:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(work, starts))
-    else:
-        for first in starts:
-            work(first)
-    return Alignment(xy2, zncc, is_converged)
+    found = Alignment(guess, np.zeros(len(xy), np.float32), np.zeros(len(xy), np.bool_))
+    coarsest = min(max(coarsest_level, 0), reference.num_levels - 1, target.num_levels - 1)
+    _align(reference, xy, target, found, warps, coarsest, half_width, patch_window(half_width))
+    return found
 
 
 def compile_kernels() -> None:

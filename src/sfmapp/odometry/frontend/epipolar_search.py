@@ -7,8 +7,6 @@ image itself shows decides.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numba
@@ -25,9 +23,11 @@ from sfmapp.odometry.frontend.alignment import (
     patch_window,
     prepare_patch,
 )
-from sfmapp.odometry.frontend.pyramid import Bytes, Pyramid, build_pyramid
+from sfmapp.odometry.frontend.pyramid import Pyramid, build_pyramid
 
-_CHUNK = 64  # points to a task
+_LEVEL = 1  # on which candidates are compared
+_HALF_WIDTH = 5
+_MIN_ZNCC = 0.8  # on both levels
 # pixels of the search level from the best candidate within which others are the same peak
 _PEAK_PX = 2.5
 # What is missing to a correlation of 1 is the square of the difference of the patches; a match is the only one where
@@ -39,24 +39,33 @@ _NOISE = 0.02
 _MAX_LEAVE_PX = 3.0
 
 
+class _Peaks(NamedTuple):
+    """The first and the second peak of each curve.
+
+    Attributes:
+        candidate: (N, 2) int64, -1 where there is none.
+        zncc: (N, 2) float32.
+    """
+
+    candidate: NDArray[np.int64]
+    zncc: Floats
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _search(
-    data1: Bytes, layout1: NDArray[np.int64], xy1: Doubles, data2: Bytes, layout2: NDArray[np.int64], segments: Doubles,
-    counts: NDArray[np.int64], warps: Doubles, level: int, half: int, window: Floats, scores: Floats,
-    best: NDArray[np.int64], best_score: Floats,
+    reference: Pyramid, xy: Doubles, target: Pyramid, segments: Doubles, counts: NDArray[np.int64], level: int,
+    window: Floats, peaks: _Peaks,
 ) -> None:  # fmt: skip
-    """The first and second peak of each point: candidates, -1 where there is none, and correlations."""
-    scratch, hessian = np.zeros(SCRATCH, np.float32), np.empty(4)
-    start, step, height, width = layout2[level]
-    scale = 0.5**level
-    is_warped = warps.shape[0] > 0
-    for i in range(xy1.shape[0]):
+    scratch, hessian, scores = np.zeros(SCRATCH, np.float32), np.empty(4), np.empty(segments.shape[1], np.float32)
+    start, step, height, width = target.layout[level]
+    first, scale, half, unwarped = reference.layout[0], 0.5**level, _HALF_WIDTH, np.eye(2)
+    best, best_score = peaks.candidate, peaks.zncc
+    for i in range(xy.shape[0]):
         best[i, 0], best[i, 1], best_score[i, 0], best_score[i, 1] = -1, -1, 0.0, 0.0
-        if not (0.0 <= xy1[i, 0] <= layout1[0, 3] and 0.0 <= xy1[i, 1] <= layout1[0, 2]):
+        if not (0.0 <= xy[i, 0] <= first[3] and 0.0 <= xy[i, 1] <= first[2]):
             continue
-        warp = warps[i if is_warped else 0]
         shift = prepare_patch(
-            data1, layout1, level, xy1[i, 0], xy1[i, 1], warp, is_warped, half, window, scratch, hessian
+            reference.data, reference.layout, level, xy[i, 0], xy[i, 1], unwarped, False, half, window, scratch, hessian
         )
         if not hessian[3] > 0.0:
             continue
@@ -66,9 +75,10 @@ def _search(
             if 0.0 <= x <= width and 0.0 <= y <= height:
                 left, top = x - 0.5 - half, y - 0.5 - half
                 c, r = int(np.floor(left)), int(np.floor(top))
+                at, fx, fy = start + r * step + c, left - c, top - r
                 scores[k] = correlate(
-                    data2, start + r * step + c, step, left - c, top - r, 2 * half + 1, scratch, abs(shift), hessian[3]
-                )
+                    target.data, at, step, fx, fy, 2 * half + 1, scratch, abs(shift), hessian[3]
+                )  # fmt: skip
             if scores[k] > best_score[i, 0]:
                 best[i, 0], best_score[i, 0] = k, scores[k]
         if best[i, 0] < 0:
@@ -104,77 +114,46 @@ def _is_unique(first: Floats, second: Floats) -> NDArray[np.bool_]:
 
 
 def search_along_epipolar(
-    reference: Pyramid, reference_xy: Doubles, target: Pyramid, segments: Doubles, counts: NDArray[np.int64], *,
-    affine: Doubles | None = None, search_level: int = 1, half_width: int = 5, min_zncc: float = 0.8, threads: int = 1,
-) -> Matches:  # fmt: skip
+    reference: Pyramid, reference_xy: Doubles, target: Pyramid, segments: Doubles, counts: NDArray[np.int64]
+) -> Matches:
     """Find points of one image in another where only a curve is known for each.
 
     Args:
         reference, target: pyramids of the two images.
         reference_xy: (N, 2) float64 pixels.
-        segments: (N, P, 2) float64 pixels, places in the target, in order along each curve, a pixel of the search level
-            apart or less; those outside the image are passed over.
+        segments: (N, P, 2) float64 pixels, places in the target, in order along each curve, two pixels apart or less;
+            those outside the image are passed over.
         counts: (N,) how many of the P are given.
-        affine: (N, 2, 2) float64, takes an offset in the target to that in the reference; None: identity.
-        search_level: on which candidates are compared.
-        half_width: see ``align_patches``.
-        min_zncc: least correlation, on both levels.
-        threads: how many share the work; the results do not depend on it.
     """
     xy1 = np.ascontiguousarray(reference_xy, np.float64).reshape(-1, 2)
     places = np.ascontiguousarray(segments, np.float64)
     counts = np.ascontiguousarray(counts, np.int64)
-    warps = np.empty((0, 2, 2)) if affine is None else np.ascontiguousarray(affine, np.float64).reshape(-1, 2, 2)
-    num, level = len(xy1), min(search_level, reference.num_levels - 1, target.num_levels - 1)
-    best, score = np.full((num, 2), -1, np.int64), np.zeros((num, 2), np.float32)
-    window = patch_window(half_width)
+    num, level = len(xy1), min(_LEVEL, reference.num_levels - 1, target.num_levels - 1)
+    peaks = _Peaks(np.full((num, 2), -1, np.int64), np.zeros((num, 2), np.float32))
+    _search(reference, xy1, target, places, counts, level, patch_window(_HALF_WIDTH), peaks)
+    best, score = peaks.candidate, peaks.zncc
 
-    def work(first: int) -> None:
-        part = slice(first, first + _CHUNK)
-        _search(
-            reference.data, reference.layout, xy1[part], target.data, target.layout, places[part], counts[part],
-            warps[part], level, half_width, window, np.empty(places.shape[1], np.float32), best[part], score[part],
-        )  # fmt: skip
-
-    _for_chunks(work, num, threads)
-    found = np.flatnonzero(score[:, 0] >= min_zncc)
-    first = _align(reference, xy1, target, places, best[:, 0], warps, found, level, half_width, threads)
+    found = np.flatnonzero(score[:, 0] >= _MIN_ZNCC)
+    first = _align(reference, xy1[found], target, places[found, best[found, 0]], level)
     is_found = np.zeros(num, np.bool_)
-    is_found[found] = first.is_converged & (first.zncc >= min_zncc)
+    is_found[found] = first.is_converged & (first.zncc >= _MIN_ZNCC)
     xy, zncc = np.full((num, 2), np.nan), np.zeros(num, np.float32)
     xy[found], zncc[found] = first.xy, first.zncc
     rivals = np.flatnonzero(is_found & ~_is_unique(score[:, 0], score[:, 1]))
-    second = _align(reference, xy1, target, places, best[:, 1], warps, rivals, level, half_width, threads)
+    second = _align(reference, xy1[rivals], target, places[rivals, best[rivals, 1]], level)
     rival = np.where(second.is_converged, second.zncc, 0.0)
-    is_found[rivals] = _is_unique(zncc[rivals], rival) | _is_unique(rival, zncc[rivals]) & (rival >= min_zncc)
+    is_found[rivals] = _is_unique(zncc[rivals], rival) | _is_unique(rival, zncc[rivals]) & (rival >= _MIN_ZNCC)
     better = rival > zncc[rivals]
     xy[rivals[better]], zncc[rivals[better]] = second.xy[better], second.zncc[better]
     xy[~is_found] = np.nan
     return Matches(xy, zncc, is_found)
 
 
-def _align(
-    reference: Pyramid, xy1: Doubles, target: Pyramid, places: Doubles, chosen: NDArray[np.int64], warps: Doubles,
-    rows: NDArray[np.int64], level: int, half_width: int, threads: int,
-) -> Alignment:  # fmt: skip
-    """Align some points from their chosen candidates; not converged where the result is far from its candidate."""
-    start = places[rows, chosen[rows]]
-    result = align_patches(
-        reference, xy1[rows], target, start, affine=warps[rows] if len(warps) else None, coarsest_level=level,
-        half_width=half_width, threads=threads,
-    )  # fmt: skip
+def _align(reference: Pyramid, xy: Doubles, target: Pyramid, start: Doubles, level: int) -> Alignment:
+    """Align some points from their candidates; not converged where the result is far from its candidate."""
+    result = align_patches(reference, xy, target, start, coarsest_level=level, half_width=_HALF_WIDTH)
     near = np.abs(result.xy - start).max(axis=1, initial=0.0) <= _MAX_LEAVE_PX * 2.0**level
     return Alignment(result.xy, result.zncc, result.is_converged & near)
-
-
-def _for_chunks(work: Callable[[int], None], num: int, threads: int) -> None:
-    starts = range(0, num, _CHUNK)
-    if threads > 1 and len(starts) > 1:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(work, starts))
-    else:
-        for first in starts:
-            work(first)
 
 
 def compile_kernels() -> None:

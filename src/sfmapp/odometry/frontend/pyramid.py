@@ -7,7 +7,7 @@ frequency is 0.35, where a 2 x 2 box leaves 0.71 to alias.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -21,8 +21,7 @@ PAD = 16
 _MIN_SIDE = 20
 
 
-@dataclass(frozen=True)
-class Pyramid:
+class Pyramid(NamedTuple):
     """An image and its reductions.
 
     Attributes:

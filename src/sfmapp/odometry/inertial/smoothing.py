@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -99,28 +100,92 @@ def smooth_trajectory(
         raise ValueError("the times of a trajectory must ascend strictly")
     measured: Bools = np.asarray(np.isfinite(poses).all(1) & np.isfinite(covariances).all((1, 2)), bool)
     measured[measured] = np.linalg.eigvalsh(covariances[measured])[:, 0] > 0
-    position, rotation, noise = _measurements(poses, covariances, measured)
-    q_position, q_rotation = _process_noises(times, position, rotation, noise, measured, options)
-    num = len(times)
-    states, filtered = np.full((num, 18), np.nan), np.full((num, _SIZE, _SIZE), np.nan)
-    predicted_states, predicted = np.full((num, 18), np.nan), np.full((num, _SIZE, _SIZE), np.nan)
-    nis, rejected = np.full(num, np.nan), np.zeros(num, bool)
-    speed, turn = _typical_rates(times, position, rotation, measured)
+    poses_in = _measurements(times, poses, covariances, measured)
+    speed, turn = _typical_rates(poses_in)
+    motion = _Motion(
+        *_process_noises(poses_in, options), _DIFFUSE * speed, _DIFFUSE * turn, options.max_nis, options.max_rejected
+    )
+    found = _Filtered.of_length(len(times))
     for start, stop in _segments(times, measured, options.max_gap_s):
         part = slice(start, stop)
-        _filter(
-            times[part], position[part], rotation[part], noise[part], measured[part], q_position, q_rotation,
-            _DIFFUSE * speed, _DIFFUSE * turn, options.max_nis, options.max_rejected, predicted_states[part],
-            predicted[part], states[part], filtered[part], nis[part], rejected[part],
-        )  # fmt: skip
+        _filter(poses_in.part(part), motion, found.part(part))
         if not options.is_causal:
-            _smooth(times[part], predicted_states[part], predicted[part], states[part], filtered[part])
-    has_pose = np.isfinite(states[:, 0])
-    return _trajectory(states, filtered, has_pose & ~(measured & ~rejected), rejected, nis, q_position, q_rotation)
+            _smooth(times[part], found.predicted_states[part], found.predicted[part], found.states[part],
+                    found.covariances[part])  # fmt: skip
+    return _trajectory(poses_in, found, motion)
 
 
-def _measurements(poses: Array, covariances: Array, measured: Bools) -> tuple[Array, Array, Array]:
-    """Positions (F, 3), rotations world_from_cam (F, 3, 3), covariances (F, 6, 6) in the order of the error state."""
+class _Measured(NamedTuple):
+    """Poses (F) as the filter reads them.
+
+    Attributes:
+        times: (F,) seconds.
+        position: (F, 3), rotation: (F, 3, 3) world_from_cam, noise: (F, 6, 6) covariance in the order of the error
+            state; zeros and identity in gaps.
+        is_there: (F,) bool, not in gaps.
+    """
+
+    times: Array
+    position: Array
+    rotation: Array
+    noise: Array
+    is_there: Bools
+
+    def part(self, rows: slice) -> _Measured:
+        return _Measured(
+            self.times[rows], self.position[rows], self.rotation[rows], self.noise[rows], self.is_there[rows]
+        )
+
+
+class _Motion(NamedTuple):
+    """What the filter expects of the motion.
+
+    Attributes:
+        q_position, q_rotation: power densities of acceleration and angular acceleration.
+        speed, turn_rate: standard deviations of what nothing is known of.
+        max_nis, max_rejected: see :class:`SmoothingOptions`.
+    """
+
+    q_position: float
+    q_rotation: float
+    speed: float
+    turn_rate: float
+    max_nis: float
+    max_rejected: int
+
+
+class _Filtered(NamedTuple):
+    """What the filter finds.
+
+    Attributes:
+        predicted_states, states: (F, 18) before and after the measurement of a frame.
+        predicted, covariances: (F, 12, 12) theirs.
+        nis: (F,), rejected: (F,) bool, see :class:`SmoothedTrajectory`.
+    """
+
+    predicted_states: Array
+    predicted: Array
+    states: Array
+    covariances: Array
+    nis: Array
+    rejected: Bools
+
+    @staticmethod
+    def of_length(num: int) -> _Filtered:
+        return _Filtered(
+            np.full((num, 18), np.nan), np.full((num, _SIZE, _SIZE), np.nan), np.full((num, 18), np.nan),
+            np.full((num, _SIZE, _SIZE), np.nan), np.full(num, np.nan), np.zeros(num, bool),
+        )  # fmt: skip
+
+    def part(self, rows: slice) -> _Filtered:
+        """Views of some of the frames."""
+        return _Filtered(
+            self.predicted_states[rows], self.predicted[rows], self.states[rows], self.covariances[rows],
+            self.nis[rows], self.rejected[rows],
+        )  # fmt: skip
+
+
+def _measurements(times: Array, poses: Array, covariances: Array, measured: Bools) -> _Measured:
     num = len(poses)
     position, rotation, noise = np.zeros((num, 3)), np.tile(np.eye(3), (num, 1, 1)), np.zeros((num, 6, 6))
     position[measured] = rigid3.center(poses[measured])
@@ -128,7 +193,7 @@ def _measurements(poses: Array, covariances: Array, measured: Bools) -> tuple[Ar
     # x_cam <- exp(w) x_cam + v turns R_world_from_cam by exp(-w) on the right and moves the centre by -R v
     change = _error_from_tangent(rotation[measured])
     noise[measured] = change @ covariances[measured] @ change.swapaxes(1, 2)
-    return position, rotation, noise
+    return _Measured(times, position, rotation, noise, measured)
 
 
 def _error_from_tangent(rotation: Array) -> Array:
@@ -151,14 +216,14 @@ def _segments(times: Array, measured: Bools, max_gap_s: float) -> list[tuple[int
     return [(int(a), int(b)) for a, b in zip(starts, stops, strict=True)]
 
 
-def _typical_rates(times: Array, position: Array, rotation: Array, measured: Bools) -> tuple[float, float]:
+def _typical_rates(measured: _Measured) -> tuple[float, float]:
     """Root mean square speed and turn rate between measurements, never zero."""
-    index = np.flatnonzero(measured)
+    index = np.flatnonzero(measured.is_there)
     if len(index) < 2:
         return 1.0, 1.0
-    dt = np.diff(times[index])
-    speed = np.linalg.norm(np.diff(position[index], axis=0), axis=1) / dt
-    turn = np.linalg.norm(_turns(rotation, index[:-1], index[1:]), axis=1) / dt
+    dt = np.diff(measured.times[index])
+    speed = np.linalg.norm(np.diff(measured.position[index], axis=0), axis=1) / dt
+    turn = np.linalg.norm(_turns(measured.rotation, index[:-1], index[1:]), axis=1) / dt
     tiny = 1e-12
     return float(np.sqrt((speed**2).mean())) + tiny, float(np.sqrt((turn**2).mean())) + tiny
 
@@ -167,24 +232,22 @@ def _turns(rotation: Array, first: NDArray[np.int64], second: NDArray[np.int64])
     return rigid3.log_so3(rotation[first].swapaxes(1, 2) @ rotation[second])
 
 
-def _process_noises(
-    times: Array, position: Array, rotation: Array, noise: Array, measured: Bools, options: SmoothingOptions
-) -> tuple[float, float]:
+def _process_noises(measured: _Measured, options: SmoothingOptions) -> tuple[float, float]:
     """Power densities (squares of the options' noises) of acceleration and angular acceleration."""
-    index = np.flatnonzero(measured)
+    position, rotation, index = measured.position, measured.rotation, np.flatnonzero(measured.is_there)
     q: list[float] = []
     for given, is_rotation in ((options.acceleration_noise, False), (options.turn_noise, True)):
         if given is not None:
             q.append(given**2)
             continue
         own = slice(3, 6) if is_rotation else slice(0, 3)
-        variance = np.trace(noise[index, own, own], axis1=1, axis2=2) / 3.0
+        variance = np.trace(measured.noise[index, own, own], axis1=1, axis2=2) / 3.0
 
         def moves(first: NDArray[np.int64], second: NDArray[np.int64], turning: bool = is_rotation) -> Array:
             i, j = index[first], index[second]
             return _turns(rotation, i, j) if turning else position[j] - position[i]
 
-        q.append(_fit_density(times[index], variance, moves))
+        q.append(_fit_density(measured.times[index], variance, moves))
     return q[0], q[1]
 
 
@@ -228,25 +291,39 @@ def _match_quantile(change2: Array, blur: Array, gain: Array, floor: float) -> f
     return math.exp(0.5 * (low + high))
 
 
-def _trajectory(
-    states: Array, covariance: Array, is_predicted: Bools, rejected: Bools, nis: Array, q_position: float,
-    q_rotation: float,
-) -> SmoothedTrajectory:  # fmt: skip
+def _trajectory(measured: _Measured, found: _Filtered, motion: _Motion) -> SmoothedTrajectory:
     """Out of the filter's arrays and its order of the error state."""
-    num = len(states)
+    states, num = found.states, len(found.states)
     cam_from_world, out = np.full((num, 7), np.nan), np.full((num, 6, 6), np.nan)
     has_pose = np.isfinite(states[:, 0])
     rotation = states[has_pose, 3:12].reshape(-1, 3, 3)
     cam_from_world[has_pose] = rigid3.inverse(rigid3.from_matrix(rotation, states[has_pose, :3]))
     change = np.linalg.inv(_error_from_tangent(rotation))
-    out[has_pose] = change @ covariance[has_pose, :6, :6] @ change.swapaxes(1, 2)
+    out[has_pose] = change @ found.covariances[has_pose, :6, :6] @ change.swapaxes(1, 2)
+    is_predicted = has_pose & ~(measured.is_there & ~found.rejected)
     return SmoothedTrajectory(
-        cam_from_world, out, is_predicted, rejected, states[:, 12:15].copy(), states[:, 15:].copy(), nis,
-        math.sqrt(q_position), math.sqrt(q_rotation),
+        cam_from_world, out, is_predicted, found.rejected, states[:, 12:15].copy(), states[:, 15:].copy(), found.nis,
+        math.sqrt(motion.q_position), math.sqrt(motion.q_rotation),
     )  # fmt: skip
 
 
 # ---- kernels. A state is a row (18,): position, rotation row by row, velocity, turn rate.
+
+
+class _Scratch(NamedTuple):
+    """Room for matrices of the filter.
+
+    Attributes:
+        phi, product, factor, keep: (12, 12). gain: (12, 6). turn, slope: (3, 3).
+    """
+
+    phi: Array
+    product: Array
+    factor: Array
+    keep: Array
+    gain: Array
+    turn: Array
+    slope: Array
 
 
 @numba.njit(cache=True, nogil=True)
@@ -389,32 +466,31 @@ def _add_process_noise(p: Array, dt: float, q_position: float, q_rotation: float
 
 @numba.njit(cache=True, nogil=True)
 def _update(
-    state: Array, p: Array, innovation: Array, noise: Array, factor: Array, gain: Array, keep: Array, scratch: Array,
-    turn: Array, slope: Array, out_state: Array, out: Array,
-) -> None:  # fmt: skip
-    """Kalman update in Joseph's form; factor is Cholesky's of the innovation's covariance."""
-    step = np.zeros(12)
+    state: Array, p: Array, innovation: Array, noise: Array, scratch: _Scratch, out_state: Array, out: Array
+) -> None:
+    """Kalman update in Joseph's form; the factor of the scratch is Cholesky's of the innovation's covariance."""
+    gain, keep, product, step = scratch.gain, scratch.keep, scratch.product, np.zeros(12)
     for i in range(12):
         for j in range(6):
             gain[i, j] = p[i, j]
-    _solve_rows(factor, 6, gain, 12)
+    _solve_rows(scratch.factor, 6, gain, 12)
     keep[:] = 0.0
     for i in range(12):
         keep[i, i] = 1.0
         for j in range(6):
             keep[i, j] -= gain[i, j]
             step[i] += gain[i, j] * innovation[j]
-    _sandwich(keep, p, scratch, out)
+    _sandwich(keep, p, product, out)
     for i in range(12):
         for j in range(6):
-            scratch[i, j] = 0.0
+            product[i, j] = 0.0
             for k in range(6):
-                scratch[i, j] += gain[i, k] * noise[k, j]
+                product[i, j] += gain[i, k] * noise[k, j]
     for i in range(12):
         for j in range(12):
             for k in range(6):
-                out[i, j] += scratch[i, k] * gain[j, k]
-    _move(state, step, turn, slope, out_state)
+                out[i, j] += product[i, k] * gain[j, k]
+    _move(state, step, scratch.turn, scratch.slope, out_state)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -433,16 +509,15 @@ def _begin(
 
 @numba.njit(cache=True, nogil=True)
 def _predict(
-    before: Array, p_before: Array, dt: float, q_position: float, q_rotation: float, scratch: Array, phi: Array,
-    turn: Array, slope: Array, state: Array, p: Array,
-) -> None:  # fmt: skip
+    before: Array, p_before: Array, dt: float, motion: _Motion, scratch: _Scratch, state: Array, p: Array
+) -> None:
     step = np.zeros(12)
     for i in range(3):
         step[i], step[3 + i] = before[12 + i] * dt, before[15 + i] * dt
-    _move(before, step, turn, slope, state)
-    _transition(before, dt, turn, slope, phi)
-    _sandwich(phi, p_before, scratch, p)
-    _add_process_noise(p, dt, q_position, q_rotation)
+    _move(before, step, scratch.turn, scratch.slope, state)
+    _transition(before, dt, scratch.turn, scratch.slope, scratch.phi)
+    _sandwich(scratch.phi, p_before, scratch.product, p)
+    _add_process_noise(p, dt, motion.q_position, motion.q_rotation)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -473,40 +548,37 @@ def _forget(p: Array, innovation: Array, speed: float, turn_rate: float) -> None
 
 
 @numba.njit(cache=True, nogil=True)
-def _filter(
-    times: Array, position: Array, rotation: Array, noise: Array, measured: Bools, q_position: float,
-    q_rotation: float, speed: float, turn_rate: float, max_nis: float, max_rejected: int, predicted_states: Array,
-    predicted: Array, states: Array, covariances: Array, nis: Array, rejected: Bools,
-) -> None:  # fmt: skip
-    """Fill predicted and updated states (F, 18) and covariances (F, 12, 12); the first frame is measured."""
-    phi, scratch, factor, s = np.empty((12, 12)), np.empty((12, 12)), np.empty((12, 12)), np.empty((6, 6))
-    gain, keep = np.empty((12, 6)), np.empty((12, 12))
-    turn, slope, innovation, whitened = np.empty((3, 3)), np.empty((3, 3)), np.empty(6), np.empty((1, 6))
-    _begin(position[0], rotation[0], noise[0], speed, turn_rate, states[0], covariances[0])
-    predicted_states[0], predicted[0] = states[0], covariances[0]
+def _filter(measured: _Measured, motion: _Motion, found: _Filtered) -> None:
+    """Fill what is found; the first frame is measured."""
+    scratch = _Scratch(
+        np.empty((12, 12)), np.empty((12, 12)), np.empty((12, 12)), np.empty((12, 12)), np.empty((12, 6)),
+        np.empty((3, 3)), np.empty((3, 3)),
+    )  # fmt: skip
+    s, innovation, whitened = np.empty((6, 6)), np.empty(6), np.empty((1, 6))
+    position, rotation, noise, times = measured.position, measured.rotation, measured.noise, measured.times
+    states, covariances = found.states, found.covariances
+    _begin(position[0], rotation[0], noise[0], motion.speed, motion.turn_rate, states[0], covariances[0])
+    found.predicted_states[0], found.predicted[0] = states[0], covariances[0]
     in_a_row = 0
     for f in range(1, len(times)):
-        state, p = predicted_states[f], predicted[f]
-        _predict(
-            states[f - 1], covariances[f - 1], times[f] - times[f - 1], q_position, q_rotation, scratch, phi, turn,
-            slope, state, p,
-        )  # fmt: skip
+        state, p = found.predicted_states[f], found.predicted[f]
+        _predict(states[f - 1], covariances[f - 1], times[f] - times[f - 1], motion, scratch, state, p)
         states[f], covariances[f] = state, p
-        if not measured[f]:
+        if not measured.is_there[f]:
             continue
         for i in range(3):
             innovation[i] = position[f, i] - state[i]
         _log_relative(state[3:12], rotation[f].ravel(), innovation[3:])
-        nis[f] = _normalize(p, noise[f], innovation, s, factor, whitened)
-        if nis[f] > max_nis:
+        found.nis[f] = _normalize(p, noise[f], innovation, s, scratch.factor, whitened)
+        if found.nis[f] > motion.max_nis:
             in_a_row += 1
-            if in_a_row <= max_rejected:
-                rejected[f] = True
+            if in_a_row <= motion.max_rejected:
+                found.rejected[f] = True
                 continue
-            _forget(p, innovation, speed, turn_rate)
-            _normalize(p, noise[f], innovation, s, factor, whitened)
+            _forget(p, innovation, motion.speed, motion.turn_rate)
+            _normalize(p, noise[f], innovation, s, scratch.factor, whitened)
         in_a_row = 0
-        _update(state, p, innovation, noise[f], factor, gain, keep, scratch, turn, slope, states[f], covariances[f])
+        _update(state, p, innovation, noise[f], scratch, states[f], covariances[f])
 
 
 @numba.njit(cache=True, nogil=True)
