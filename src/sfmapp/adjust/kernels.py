@@ -20,7 +20,16 @@ import math
 import numba
 
 from sfmapp.camera import brown, radial_fisheye
-from sfmapp.camera.lens import FAMILY, RADIAL_FISHEYE, ROW, distort
+from sfmapp.camera.lens import (
+    FAMILY,
+    LAST_ON_PLANE,
+    RADIAL_FISHEYE,
+    ROW,
+    across_seam,
+    distort,
+    project,
+    project_jacobian,
+)
 from sfmapp.simd.f64x8 import add2, assign3, spread, store8, subtract3
 from sfmapp.simd.pointers import offset, pointer
 
@@ -72,6 +81,23 @@ def total_loss(scale2: float, total: float, product: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _linearize_ray(c, px, py, pz, xo, yo, loss, scale2, penalty, J):  # type: ignore[no-untyped-def]
+    """What the lens says in :func:`linearize`, for any family and in every direction: whether it looks there, the
+    squared residual, the weighted residual and the weighted derivatives of u and of v by the point in the camera."""
+    # the row of the lens is laid out so that its derivatives by the parameters come to lie where ours do
+    row = offset(J, CANON - 8)
+    project_jacobian(c, px, py, pz, row)
+    if math.isnan(row[0]):
+        return False, penalty, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    e0, e1 = across_seam(c, row[0] - xo), row[1] - yo
+    s2 = e0 * e0 + e1 * e1
+    w = math.sqrt(robust_weight(loss, scale2, s2))
+    for n in range(2 * FAMILY):
+        J[CANON + n] *= w
+    return True, s2, w * e0, w * e1, w * row[2], w * row[3], w * row[4], w * row[5], w * row[6], w * row[7]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def linearize(  # type: ignore[no-untyped-def]
     pose, mounted, mount, c, x0, x1, x2, xo, yo, loss, scale2, penalty, intrinsics, J
 ):
@@ -86,12 +112,16 @@ def linearize(  # type: ignore[no-untyped-def]
     py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]
     pz = pose[6] * x0 + pose[7] * x1 + pose[8] * x2 + pose[11]
     s2 = penalty
-    if pz > _MIN_COS * (abs(px) + abs(py)):
+    family = c[FAMILY]
+    seen = pz > _MIN_COS * (abs(px) + abs(py))
+    if family > LAST_ON_PLANE or (family == RADIAL_FISHEYE and not seen):
+        seen, s2, e0, e1, g00, g01, g02, g10, g11, g12 = _linearize_ray(c, px, py, pz, xo, yo, loss, scale2, penalty, J)
+    elif seen:
         iz = 1.0 / pz
         u = px * iz
         v = py * iz
         fx, fy = c[0], c[1]
-        if c[FAMILY] == RADIAL_FISHEYE:
+        if family == RADIAL_FISHEYE:
             ud, vd, a, b, d, k0u, k0v, k1u, k1v, k2u, k2v, k3u, k3v = radial_fisheye.jacobian(c, u, v)
         else:
             ud, vd, a, b, d, k0u, k0v, k1u, k1v, k2u, k2v, k3u, k3v = brown.jacobian(c, u, v)
@@ -104,14 +134,24 @@ def linearize(  # type: ignore[no-untyped-def]
         g00, g01, g10, g11 = fx * a * iz, fx * b * iz, fy * b * iz, fy * d * iz
         g02 = -(g00 * u + g01 * v)
         g12 = -(g10 * u + g11 * v)
+        e0 *= w
+        e1 *= w
+        if intrinsics:  # fx, fy, cx, cy, d0..d3, for each the change of u and v
+            J[CANON], J[CANON + 1], J[CANON + 2], J[CANON + 3] = w * ud, 0.0, 0.0, w * vd
+            J[CANON + 4], J[CANON + 5], J[CANON + 6], J[CANON + 7] = w, 0.0, 0.0, w
+            J[CANON + 8], J[CANON + 9] = fx * k0u, fy * k0v
+            J[CANON + 10], J[CANON + 11] = fx * k1u, fy * k1v
+            J[CANON + 12], J[CANON + 13] = fx * k2u, fy * k2v
+            J[CANON + 14], J[CANON + 15] = fx * k3u, fy * k3v
+    if seen:
         p00 = g00 * pose[0] + g01 * pose[3] + g02 * pose[6]
         p01 = g00 * pose[1] + g01 * pose[4] + g02 * pose[7]
         p02 = g00 * pose[2] + g01 * pose[5] + g02 * pose[8]
         p10 = g10 * pose[0] + g11 * pose[3] + g12 * pose[6]
         p11 = g10 * pose[1] + g11 * pose[4] + g12 * pose[7]
         p12 = g10 * pose[2] + g11 * pose[5] + g12 * pose[8]
-        store8(J, POINT, p00, p01, p02, w * e0, 0.0, 0.0, 0.0, 0.0)
-        store8(J, POINT + 8, p10, p11, p12, w * e1, 0.0, 0.0, 0.0, 0.0)
+        store8(J, POINT, p00, p01, p02, e0, 0.0, 0.0, 0.0, 0.0)
+        store8(J, POINT + 8, p10, p11, p12, e1, 0.0, 0.0, 0.0, 0.0)
         if mounted:  # the point and the derivatives as the rig has them
             px, py, pz = px - mount[9], py - mount[10], pz - mount[11]
             px, py, pz = (
@@ -131,13 +171,6 @@ def linearize(  # type: ignore[no-untyped-def]
             )
         store8(J, POSE, py * g02 - pz * g01, pz * g00 - px * g02, px * g01 - py * g00, g00, g01, g02, 0.0, 0.0)
         store8(J, POSE + 8, py * g12 - pz * g11, pz * g10 - px * g12, px * g11 - py * g10, g10, g11, g12, 0.0, 0.0)
-        if intrinsics:  # fx, fy, cx, cy, d0..d3, for each the change of u and v
-            J[CANON], J[CANON + 1], J[CANON + 2], J[CANON + 3] = w * ud, 0.0, 0.0, w * vd
-            J[CANON + 4], J[CANON + 5], J[CANON + 6], J[CANON + 7] = w, 0.0, 0.0, w
-            J[CANON + 8], J[CANON + 9] = fx * k0u, fy * k0v
-            J[CANON + 10], J[CANON + 11] = fx * k1u, fy * k1v
-            J[CANON + 12], J[CANON + 13] = fx * k2u, fy * k2v
-            J[CANON + 14], J[CANON + 15] = fx * k3u, fy * k3v
     else:
         for n in range(SCRATCH):
             J[n] = 0.0
@@ -151,7 +184,13 @@ def squared_residual(pose, c, x0, x1, x2, xo, yo, penalty):  # type: ignore[no-u
     py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]
     pz = pose[6] * x0 + pose[7] * x1 + pose[8] * x2 + pose[11]
     s2 = penalty
-    if pz > _MIN_COS * (abs(px) + abs(py)):
+    seen = pz > _MIN_COS * (abs(px) + abs(py))
+    if c[FAMILY] > LAST_ON_PLANE or (c[FAMILY] == RADIAL_FISHEYE and not seen):
+        ud, vd = project(c, px, py, pz)
+        if not math.isnan(ud):
+            e0, e1 = across_seam(c, ud - xo), vd - yo
+            s2 = e0 * e0 + e1 * e1
+    elif seen:
         iz = 1.0 / pz
         u = px * iz
         v = py * iz

@@ -9,8 +9,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera, canonical_from_params
+from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import ROW
+from sfmapp.camera.models import PARAM_NAMES, canonical_from_params, kind_of
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import RigImages
@@ -98,7 +99,7 @@ def free_params(camera: Camera, focal: bool, distortion: bool, principal_point: 
     if camera.is_fixed:
         return np.zeros(0, np.int64)
     wanted = [
-        focal if name[0] == "f" else principal_point if name[0] == "c" else distortion
+        {"focal": focal, "center": principal_point, "distortion": distortion, "size": False}[kind_of(name)]
         for name in PARAM_NAMES[camera.model]
     ]
     return np.flatnonzero(wanted)

@@ -16,7 +16,8 @@ from sfmapp.adjust import kernels
 from sfmapp.adjust.kernels import find_slot
 from sfmapp.adjust.linear import aligned_zeros, assemble, factorize_tiles, mark_pairs, number_keys, solve_tiles
 from sfmapp.adjust.problem import Problem, free_values, make_problem
-from sfmapp.camera.camera import PARAM_NAMES, Camera
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES, kind_of
 from sfmapp.events import Events
 from sfmapp.option_checks import Range, check_options, positive
 from sfmapp.scene.reconstruction import Reconstruction
@@ -252,9 +253,10 @@ class IntrinsicPriors:
 
     @staticmethod
     def _sigma(name: str, camera: Camera, options: AdjustOptions) -> float | None:
-        if name[0] == "f":
+        kind = kind_of(name)
+        if kind == "focal":
             return camera.focal_sigma
-        return options.principal_point_sigma_px if name[0] == "c" else options.distortion_sigma
+        return options.principal_point_sigma_px if kind == "center" else options.distortion_sigma
 
     def cost(self, canonical: Array) -> float:
         error = canonical[self.camera, self.slot] - self.mean

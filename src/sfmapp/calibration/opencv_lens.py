@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import PARAM_NAMES, Camera, pixels_to_normalized
+from sfmapp.camera.models import kind_of
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_model import checked_camera
 
@@ -212,7 +213,7 @@ def scaled_to(place: str, calibrated: CalibratedCamera, size: Size) -> Calibrate
             f"{camera.width}x{camera.height}",
             "calibrate the camera at the size of the images, or give --camera",
         )
-    is_length = [name[0] in "fc" for name in PARAM_NAMES[camera.model]]
+    is_length = [kind_of(name) != "distortion" or name == "s" for name in PARAM_NAMES[camera.model]]
     sigma = camera.focal_sigma and camera.focal_sigma * scale
     params = np.where(is_length, camera.params * scale, camera.params)
     note = f"{place}: calibrated at {camera.width}x{camera.height}, scaled to the images' {size[0]}x{size[1]}"

@@ -29,8 +29,9 @@ from sfmapp.calibration.opencv_lens import (
 )
 from sfmapp.calibration.slam_settings import orb_slam_fields, vins_fields
 from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, simple_camera
+from sfmapp.camera.models import kind_of
+from sfmapp.camera.names import MODEL_NAMES
 from sfmapp.errors import InputError, UsageError
-from sfmapp.formats.colmap_model import MODEL_NAMES
 from sfmapp.formats.flat_yaml import parse_flat_yaml
 from sfmapp.formats.text_input import nearest_rotation, read_json_object, read_limited_text
 from sfmapp.geometry import rigid3
@@ -89,7 +90,7 @@ def camera_from_text(text: str, size: Size) -> Camera:
         raise UsageError(
             f"camera is {text!r}: {model.name} has {len(PARAM_NAMES[model])} parameters, found {len(params)}", expected
         )
-    focals = params[[name.startswith("f") for name in PARAM_NAMES[model]]]
+    focals = params[[kind_of(name) in ("focal", "size") for name in PARAM_NAMES[model]]]
     if not np.isfinite(params).all() or not (focals > 0).all():
         raise UsageError(f"camera is {text!r}, expected finite numbers and positive focal lengths: {expected}")
     camera = simple_camera(model, *size, 1.0, source="user").with_params(params)
@@ -125,7 +126,7 @@ def read_calibration(path: str | Path, image_sizes: Sequence[Size]) -> Calibrati
     rows = [
         line.split() for line in text.replace(",", " ").splitlines() if line.strip() and line.lstrip()[0] not in "#%"
     ]
-    if rows and len(rows[0]) >= 4 and rows[0][1] in MODEL_NAMES.values():
+    if rows and len(rows[0]) >= 4 and rows[0][1] in MODEL_NAMES:
         return _from_colmap(str(path), rows[0], image_sizes)
     if rows and all(re.fullmatch(r"[-+.\deE]+", field) for row in rows for field in row):
         return _from_plain_numbers(str(path), [field for row in rows for field in row], image_sizes)

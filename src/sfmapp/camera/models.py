@@ -7,7 +7,7 @@ row of the table; a new family is a module beside this one and its case in :mod:
 from __future__ import annotations
 
 import math
-from enum import IntEnum
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -26,38 +26,9 @@ from sfmapp.camera.lens import (
     SKEW,
     THIN_PRISM_FISHEYE,
 )
+from sfmapp.camera.names import CameraModel
 
 Array = NDArray[np.float64]
-
-
-class CameraModel(IntEnum):
-    """The camera models, with COLMAP's names and numbers; those that COLMAP does not have from 1000 on."""
-
-    SIMPLE_PINHOLE = 0
-    PINHOLE = 1
-    SIMPLE_RADIAL = 2
-    RADIAL = 3
-    OPENCV = 4
-    OPENCV_FISHEYE = 5
-    FULL_OPENCV = 6
-    FOV = 7
-    SIMPLE_RADIAL_FISHEYE = 8
-    RADIAL_FISHEYE = 9
-    THIN_PRISM_FISHEYE = 10
-    RAD_TAN_THIN_PRISM_FISHEYE = 11
-    SIMPLE_DIVISION = 12
-    DIVISION = 13
-    SIMPLE_FISHEYE = 14
-    FISHEYE = 15
-    EUCM = 16
-    EQUIRECTANGULAR = 17
-    PINHOLE_SKEW = 1000
-    OPENCV_THIN_PRISM = 1001
-
-    @property
-    def is_colmaps(self) -> bool:
-        """Whether COLMAP has this model."""
-        return self < 1000
 
 
 class _Row(NamedTuple):
@@ -70,7 +41,7 @@ _ONE = {"f": (0, 1), "cx": (2,), "cy": (3,)}
 _TWO = {"fx": (0,), "fy": (1,), "cx": (2,), "cy": (3,)}
 
 
-def _row(family: int, first: dict[str, tuple[int, ...]], names: str = "", slots: tuple[int, ...] = ()) -> _Row:
+def _row(family: int, first: Mapping[str, tuple[int, ...]], names: str = "", slots: tuple[int, ...] = ()) -> _Row:
     bends = names.split()
     places = slots or tuple(range(4, 4 + len(bends)))
     return _Row(family, (*first, *bends), (*first.values(), *((place,) for place in places)))
@@ -103,7 +74,6 @@ _TABLE = {
 
 # Names of the parameters of each model, in the order in which they are stored.
 PARAM_NAMES: dict[CameraModel, tuple[str, ...]] = {model: row.params for model, row in _TABLE.items()}
-MODEL_NAMES: tuple[str, ...] = tuple(model.name for model in CameraModel)
 
 # What each parameter of a lens without distortion is, where that is not zero.
 _NEUTRAL = {"alpha": 0.0, "beta": 1.0}

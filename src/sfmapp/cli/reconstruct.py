@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sfmapp.camera.names import MODEL_NAMES
 from sfmapp.cli.common import (
     add_output_flags,
     limit_library_threads,
@@ -20,7 +21,6 @@ from sfmapp.cli.common import (
 if TYPE_CHECKING:
     from sfmapp.workspace.options import Options
 
-CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 
 EXAMPLES = """\
 examples:
@@ -70,7 +70,7 @@ def _add_option_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--set", metavar="STAGE.OPTION=VALUE", action="append", default=[], help="may be repeated")
     group.add_argument("--seed", metavar="N", help="start of every random choice; the same seed, the same bytes")
     group.add_argument("--threads", metavar="N", help="workers; default: all cores. Results do not depend on it")
-    group.add_argument("--camera-model", metavar="MODEL", help=", ".join(CAMERA_MODELS))
+    group.add_argument("--camera-model", metavar="MODEL", help=", ".join(MODEL_NAMES))
     group.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black is ignored")
     group.add_argument("--min-registered", metavar="N", help="exit code 5 if fewer images are registered")
     group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, which replays the run")

@@ -10,7 +10,7 @@ from pathlib import PurePosixPath
 from statistics import median, pstdev
 from typing import Any
 
-from sfmapp.camera.camera import Camera, simple_camera
+from sfmapp.camera.camera import Camera, CameraModel, simple_camera
 from sfmapp.errors import UsageError
 from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.images.exif import ExifFacts, FocalPrior, focal_prior
@@ -111,6 +111,8 @@ def _camera(shot: Shot, priors: list[FocalPrior], options: ImageOptions) -> tupl
         prior = _common_prior(priors)
         camera = simple_camera(model, width, height, prior.focal_px, prior.sigma_px, prior.source)
         reason = prior.reason
+    if model == CameraModel.EQUIRECTANGULAR:  # its size says all
+        return replace(camera, focal_source="user", focal_sigma=None, is_fixed=True), "the size of a panorama"
     return replace(camera, is_fixed=options.fix_intrinsics), reason
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, pixels_to_normalized, project, simple_camera
+from sfmapp.camera.models import kind_of
 from sfmapp.geometry import rigid3
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.reconstruction import Reconstruction
@@ -176,14 +177,14 @@ def perturb(
     out.move_images(registered, poses[pose_of_image])
     out.point_xyz += point_fraction * size * rng.normal(size=out.point_xyz.shape)
     for c, camera in enumerate(out.cameras):
-        is_focal = np.array([name.startswith("f") for name in PARAM_NAMES[camera.model]])
+        is_focal = np.array([kind_of(name) == "focal" for name in PARAM_NAMES[camera.model]])
         factor = 1.0 + focal_fraction * rng.normal()
         out.cameras[c] = camera.with_params(np.where(is_focal, camera.params * factor, camera.params))
     return out
 
 
 def true_correspondences(scene: SyntheticScene, min_matches: int = 15) -> Correspondences:
-    """What a perfect matcher would find: forevery pair of images the shared tracks (outliers left out), with the true
+    """What a perfect matcher would find: for every pair of images the shared tracks (outliers left out), with the true
     two-view geometry. Pairs with fewer than ``min_matches`` stay in as failures.
 
     Feature positions are those of ``scene.observed.tracks.obs_feature_idx``.
