@@ -2,7 +2,8 @@
 
 Layout. An unknown block is a row of up to eight numbers: the six of a pose (rotation, then translation, of
 ``x_cam <- exp(w) x_cam + v``), followed by at most two intrinsics where a camera takes part through one image only; or
-the free intrinsics of a camera that several images share. Blocks meet in 8 x 8 tiles. Points are never blocks: they are
+the free intrinsics of a camera that several images share; those beyond the eighth are a second block right behind it.
+Blocks meet in 8 x 8 tiles. Points are never blocks: they are
 eliminated one by one (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 1999, section 6.1) from the factor
 ``L L^T`` of their damped 3 x 3 normal matrix: with Z = W L^-T the reduced system loses Z_a Z_b^T per pair of blocks.
 
@@ -37,8 +38,10 @@ from sfmapp.simd.pointers import offset, pointer
 LOSS_IDS: dict[str, int] = {"trivial": 0, "huber": 1, "cauchy": 2}
 
 # Offsets in the scratch row of one observation: two rows each of pose (and merged intrinsics); canonical intrinsics,
-# interleaved; free intrinsics; and point, with the residual in the fourth place.
+# interleaved; free intrinsics, those of the first block and of the second; and point, with the residual in the fourth
+# place.
 POSE, CANON, INTR, POINT, SCRATCH = 0, 16, 48, 80, 96
+_SECOND = INTR + 16
 # What one chunk needs besides, in doubles: the scratch row, the point's normal equations and its eliminator.
 _NORMAL, _SMALL, _ZEROS, _FIXED = 96, 120, 144, 160
 # Smallest depth that counts as in front of the camera, relative to the distance.
@@ -219,7 +222,7 @@ def scratch_size(first, last, point_ptr, num_blocks, num_free):  # type: ignore[
     longest = 1
     for p in range(first, last):
         longest = max(longest, point_ptr[p + 1] - point_ptr[p])
-    places = min(2 * longest, num_blocks) + 1
+    places = min(3 * longest, num_blocks) + 1
     return _FIXED + 8 * num_free + 24 * places, 2 * num_blocks + places
 
 
@@ -234,6 +237,14 @@ def _place(W, where, mark, blocks, p, block, count):  # type: ignore[no-untyped-
             store8(W, count * 24 + 8 * row, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         return count + 1
     return count
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _split(free_column, first, last):  # type: ignore[no-untyped-def]
+    """Where the derivatives first..last of a camera pass from its block to the second one."""
+    while last > first and free_column[last - 1] >= 8:
+        last -= 1
+    return last
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -293,7 +304,8 @@ def reduce_points(  # type: ignore[no-untyped-def]
         block_dim: (B,) rows in use of each block.
         hash_keys, hash_values: tile of block pair a <= b under key a B + b; empty if that number is the tile's as well.
         tiles: (N * 64,) out: sum of -Z_a Z_b^T. own: (B * 64,) out: J^T J of each block with itself, not eliminated.
-        cross: (I * 64,) out: J_pose^T J_intrinsics of images whose camera has a block of its own.
+        cross: (I * 64,) out: J_pose^T J_intrinsics of images whose camera has a block of its own. Where a camera has a
+            second one ((2 I + C) * 64,): behind it the same of that, and J_first^T J_second of each camera.
         gradient: (2 * B * 8,) out: J^T r before elimination, and what elimination adds to it.
         point_factor: (P, 12) out: L^-1 (l00 l10 l11 l20 l21 l22), gradient, damped diagonal increment; all zero for a
             point that has no depth at all.
@@ -308,7 +320,7 @@ def reduce_points(  # type: ignore[no-untyped-def]
     normal, small, zeros, units = offset(J, _NORMAL), offset(J, _SMALL), offset(J, _ZEROS), offset(J, _FIXED)
     W = offset(units, 8 * free_slot.shape[0])
     for n in range(free_slot.shape[0]):
-        units[n * 8 + free_column[n]] = 1.0
+        units[n * 8 + free_column[n] % 8] = 1.0
     cost, product = 0.0, 1.0
     for p in range(first, last):
         x0, x1, x2 = xyz[p, 0], xyz[p, 1], xyz[p, 2]
@@ -336,7 +348,8 @@ def reduce_points(  # type: ignore[no-untyped-def]
                     count = _place(W, where, mark, blocks, p, block, count)
                     add2(W, where[block] * 24, J, POINT, J, POSE, 3)
             if other >= 0 and other != block:
-                spread(J, INTR, zeros, J, CANON, free_slot, units, free_ptr[c], free_ptr[c + 1])
+                split = _split(free_column, free_ptr[c], free_ptr[c + 1])
+                spread(J, INTR, zeros, J, CANON, free_slot, units, free_ptr[c], split)
                 add2(own, other * 64, J, INTR, J, INTR, block_dim[other])
                 add2(gradient, other * 8, J, POINT + 3, J, INTR, 1)
                 if block >= 0:
@@ -344,6 +357,17 @@ def reduce_points(  # type: ignore[no-untyped-def]
                 if moves:
                     count = _place(W, where, mark, blocks, p, other, count)
                     add2(W, where[other] * 24, J, POINT, J, INTR, 3)
+                if split < free_ptr[c + 1]:
+                    second, images = other + 1, image_block.shape[0]
+                    spread(J, _SECOND, zeros, J, CANON, free_slot, units, split, free_ptr[c + 1])
+                    add2(own, second * 64, J, _SECOND, J, _SECOND, block_dim[second])
+                    add2(gradient, second * 8, J, POINT + 3, J, _SECOND, 1)
+                    add2(cross, (2 * images + c) * 64, J, INTR, J, _SECOND, 8)
+                    if block >= 0:
+                        add2(cross, (images + i) * 64, J, POSE, J, _SECOND, 6)
+                    if moves:
+                        count = _place(W, where, mark, blocks, p, second, count)
+                        add2(W, where[second] * 24, J, POINT, J, _SECOND, 3)
         if not moves or not _factor_point(normal, damping, offset(pointer(point_factor), 12 * p), small):
             continue
         for n in range(count):

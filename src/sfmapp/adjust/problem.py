@@ -27,7 +27,7 @@ class FreeIntrinsics:
     Attributes:
         params: for each local camera, (Q,) positions in ``Camera.params``; empty where the camera is constant.
         ptr: (C + 1,) int64; slot, column: for camera c in ``ptr[c]:ptr[c + 1]`` the canonical slot of each derivative
-            and the column of the block that it belongs to.
+            and the column of the block that it belongs to, from 8 on that of a second block behind it.
     """
 
     params: list[NDArray[np.int64]]
@@ -66,6 +66,12 @@ class Problem:
     block_dim: NDArray[np.int64]
     penalty: Array
     free: FreeIntrinsics
+
+    @property
+    def second_block(self) -> NDArray[np.int32]:
+        """(C,) the block with what a camera has beyond eight free parameters, -1 where it has no more."""
+        is_wide = np.array([len(params) > 8 for params in self.free.params], bool)
+        return np.where(is_wide & (self.camera_block >= 0), self.camera_block + 1, -1).astype(np.int32)
 
     @property
     def num_blocks(self) -> int:
@@ -245,7 +251,7 @@ def _number_blocks(
             dims[only[c]] += len(free)
         else:
             camera_block[c] = len(dims)
-            dims.append(len(free))
+            dims += [min(len(free), 8)] + [len(free) - 8] * (len(free) > 8)
     return pose_block, camera_block, np.array(dims, np.int64)
 
 

@@ -24,7 +24,11 @@ from sfmapp.scene.tracks import make_tracks
 Array = NDArray[np.float64]
 Layout = Literal["ring", "grid", "forward"]
 
-_DISTORTION = {"k1": -0.08, "k2": 0.02, "p1": 5e-4, "p2": -4e-4, "k3": -0.004, "k4": 0.001}
+_DISTORTION = {
+    "k1": -0.08, "k2": 0.02, "p1": 5e-4, "p2": -4e-4, "k3": -0.004, "k4": 0.001, "k5": 5e-4, "k6": 2e-4, "k0": -0.03,
+    "p0": 3e-4, "s0": 2e-4, "s1": -3e-4, "s2": 2e-4, "s3": 1e-4, "s4": -2e-4, "sx1": 4e-4, "sy1": -3e-4, "k": -0.07,
+    "omega": 0.6, "alpha": 0.55, "beta": 0.05, "s": 2.5,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
