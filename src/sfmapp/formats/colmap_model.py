@@ -106,7 +106,7 @@ def checked_camera(
         not (np.abs(values) < _LARGEST_PARAMETER).all()
         or not (values[[kind_of(name) in ("focal", "size") for name in names]] > 0).all()
     ):
-        raise InputError(f"{place}: expected finite parameters, lengths above 0, found {values.tolist()}")
+        raise InputError(f"{place}: expected finite parameters and positive focal lengths, found {values.tolist()}")
     return Camera(known, int(width), int(height), values, focal_source="file")
 
 
