@@ -18,6 +18,7 @@ SOURCE = Path(sfmapp.__file__).parent
 # from the top of the house to the ground; a room may import from its own floor only where it is the same room
 FLOORS = (
     ("cli",),
+    ("api",),
     ("pipelines",),
     ("workspace",),
     ("report", "viewer"),
