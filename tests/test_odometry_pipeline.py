@@ -19,8 +19,8 @@ from sfmapp.formats.colmap import read_model
 from sfmapp.formats.trajectory import read_tum
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu, SequenceOptions
+from sfmapp.odometry.inertial import faults as inertial_faults
 from sfmapp.odometry.inertial.visual_inertial import contradicted
-from sfmapp.odometry.inertial.visual_inertial import faults as inertial_faults
 from sfmapp.odometry.records import _covariance_gap
 from sfmapp.odometry.refinement.final_adjustment import MAX_COVARIANCE_KEYFRAMES, FinalAdjustment
 from sfmapp.odometry.result import FrameState
@@ -315,12 +315,12 @@ def test_workspaces_of_other_commands_are_refused(
 # -------------------------------------------------------------------------------------------------------------- scale
 
 
-@pytest.mark.parametrize("wish", ["distance:000000.png:000040:{:.4f}", "distance:0:40:{:.4f}"])
-def test_a_known_distance_makes_metres(request: str, tmp_path: Path, monkeypatch: Patch) -> None:
+@pytest.mark.parametrize("source", ["distance:000000.png:000040:{:.4f}", "distance:0:40:{:.4f}"])
+def test_a_known_distance_makes_metres(source: str, tmp_path: Path, monkeypatch: Patch) -> None:
     use(monkeypatch, FakeSequence(), FakeRunner())
     centers = rigid3.center(path(50))
     length = float(np.linalg.norm(centers[40] - centers[0]))
-    result = run(tmp_path / "out", f"scale.source={request.format(length)}")
+    result = run(tmp_path / "out", f"scale.source={source.format(length)}")
     row = result.report["maps"][0]
     assert (row["unit"], row["scale_source"]) == ("m", "distance")
     assert result.report["ground_truth"][0]["alignment"] == "se3"

@@ -226,18 +226,9 @@ def moved_frames(before: OdometryResult, entries: list[MapResult]) -> OdometryRe
             rigid3.compose(rigid3.compose(poses[mine], rigid3.inverse(was[kept[k]])), now[kept[k]])
             for k in (ahead, after)
         ]
-        poses[mine] = between(moved[0], moved[1], np.clip(weight, 0.0, 1.0))
+        poses[mine] = rigid3.interpolate(moved[0], moved[1], np.clip(weight, 0.0, 1.0))
     poses = poses[before.twin_rows]
     return replace(before, cam_from_world=poses, live_cam_from_world=before.live_cam_from_world, maps=entries)
-
-
-def between(first: Array, second: Array, weight: Array) -> Array:
-    """Poses (N, 7) a share (N,) of the way from the first to the second: centres and rotations apart."""
-    start, end = rigid3.rotation_matrix(first), rigid3.rotation_matrix(second)
-    turn = rigid3.log_so3(end @ start.swapaxes(-1, -2))
-    rotation = rigid3.exp_so3(weight[:, None] * turn) @ start
-    center = (1 - weight[:, None]) * rigid3.center(first) + weight[:, None] * rigid3.center(second)
-    return rigid3.from_matrix(rotation, -np.einsum("nij,nj->ni", rotation, center))
 
 
 def _write(

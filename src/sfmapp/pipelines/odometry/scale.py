@@ -29,7 +29,6 @@ from sfmapp.odometry.inertial.scale import (
     scale_from_path,
 )
 from sfmapp.odometry.result import MapResult, OdometryResult
-from sfmapp.pipelines.odometry.keyframes import KeyframeWatch
 
 STAGE = "scale"
 # Clocks that differ by less are as good as one: exposures alone shift them by so much.
@@ -104,12 +103,12 @@ def resolve_scale_request(scale_request: ScaleRequest | None, is_auto: bool, seq
 
 
 def scale_maps(
-    result: OdometryResult, scale_request: ScaleRequest, watch: KeyframeWatch, imu: Imu | None, events: Events
+    result: OdometryResult, scale_request: ScaleRequest, imu: Imu | None, events: Events
 ) -> list[dict[str, Any]]:
-    """Put each map in metres that the wish can be had for, in place; returns a row for each, with the evidence."""
+    """Put each map in metres that the request can be met for, in place; returns a row for each, with the evidence."""
     rows = []
     for m in range(len(result.maps)):
-        found = _estimate(result, m, scale_request, watch, imu)
+        found = _estimate(result, m, scale_request, imu)
         row: dict[str, Any] = {"map": m, "source": found.source, "evidence": found.evidence}
         if isinstance(found, ScaleEstimate):
             rescale(result, m, found)
@@ -157,11 +156,11 @@ def rescale(result: OdometryResult, map_idx: int, found: ScaleEstimate) -> None:
 
 
 def _estimate(
-    result: OdometryResult, m: int, scale_request: ScaleRequest, watch: KeyframeWatch, imu: Imu | None
+    result: OdometryResult, m: int, scale_request: ScaleRequest, imu: Imu | None
 ) -> ScaleEstimate | ScaleRefusal:
     entry = result.maps[m]
     if scale_request.marker is not None:
-        return scale_from_markers(entry.reconstruction, watch.sightings(entry), scale_request.marker.side)
+        return scale_from_markers(entry.reconstruction, entry.sightings, scale_request.marker.side)
     if scale_request.camera_height is not None:
         return scale_from_camera_height(entry.reconstruction, entry.keyframe_image_idx, scale_request.camera_height)
     if scale_request.distance is not None:

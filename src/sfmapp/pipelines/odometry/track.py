@@ -23,7 +23,6 @@ from sfmapp.images.sequence import Frame, GroundTruth, Imu, Sequence, SequenceKi
 from sfmapp.images.video import VideoSequence
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
-from sfmapp.pipelines.odometry.keyframes import KeyframeWatch
 from sfmapp.pipelines.odometry.live import GrowingTrajectories
 from sfmapp.pipelines.odometry.results import write_odometry
 from sfmapp.pipelines.odometry.scale import ScaleRequest, parse_scale, resolve_scale_request, scale_maps
@@ -64,15 +63,13 @@ class Tracking(Job):
         frames: what was told of each frame.
         threads_cpu: CPU time by thread.
         live: draws what happens; None if nobody looks.
-        keyframes: looks at the images of keyframes.
-        wish: what the unit of length is to come from; None: an arbitrary one will do.
+        scale_request: what the unit of length is to come from; None: an arbitrary one will do.
         sequence: once it is open.
     """
 
     frames: FrameLog
     threads_cpu: ThreadTimes
     live: LiveView | None
-    keyframes: KeyframeWatch
     scale_request: ScaleRequest | None
     sequence: Sequence | None = None
 
@@ -132,11 +129,10 @@ def track_sequence(
         run = Tracking(
             source, workspace, options, events, watch or Stopwatch(), DecisionLog(), threads,
             frames=FrameLog(), threads_cpu=ThreadTimes(), live=live,
-            keyframes=KeyframeWatch(scale_request.detector() if scale_request else None), scale_request=scale_request,
-            sequence=sequence,
+            scale_request=scale_request, sequence=sequence,
         )  # fmt: skip
         growing = stack.enter_context(closing(GrowingTrajectories(workspace.folder, events, run.make_room)))
-        for listener in (growing, event_log, run.log, run.frames, run.keyframes, live):
+        for listener in (growing, event_log, run.log, run.frames, live):
             if listener is not None:
                 events.subscribe(listener)
         return _run(run, self_calibrate)
@@ -162,7 +158,12 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
     watched = Watched(run.sequence, run)
     with run.measured("odometry"):
         result = run_odometry(
-            watched, options.odometry, seed=options.seed, threads=run.threads, events=events.without_cancellation()
+            watched,
+            options.odometry,
+            seed=options.seed,
+            threads=run.threads,
+            events=events.without_cancellation(),
+            markers=None if run.scale_request is None else run.scale_request.detector(),
         )
         run.threads_cpu.sample()
     run.stages["odometry"] = result.report
@@ -171,12 +172,9 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
 
         widen(result, run.stages["self_calibration"])
     with run.measured("scale"):
-        run.keyframes.colour(result)
         if run.scale_request is not None:
             without_cancellation = events.without_cancellation()
-            run.stages["scale"] = scale_maps(
-                result, run.scale_request, run.keyframes, watched.imu, without_cancellation
-            )
+            run.stages["scale"] = scale_maps(result, run.scale_request, watched.imu, without_cancellation)
     result = replace(result, timestamps_s=watched.times_as_given(result))
     if isinstance(run.sequence, FileSequence | VideoSequence):  # frames in memory are all there
         result = result.with_repeated(run.sequence.repeated)
