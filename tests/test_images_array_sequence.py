@@ -92,6 +92,12 @@ def test_the_same_poses_with_and_without_a_folder(tmp_path: Path) -> None:
     assert written.cam_from_world.tobytes() == in_memory.cam_from_world.tobytes()
     keyframes = sfmapp.load(tmp_path / "track")
     assert [image.name for image in keyframes.images] == written.maps[0].reconstruction.image_names
+    assert written.maps[0].reconstruction.point_rgb.tobytes() == in_memory.maps[0].reconstruction.point_rgb.tobytes()
+    options = sfmapp.load_options(settings=["scale.source=distance:0:29:2.5"])
+    metric, _ = sfmapp.track_sequence(sequence, options=options, threads=1, seed=3)
+    first, last = (sfmapp.Rigid3(metric.cam_from_world[k]).center for k in (0, -1))
+    assert np.linalg.norm(last - first) == pytest.approx(2.5)
+    assert metric.maps[0].scale_source == "distance"
     with pytest.raises(sfmapp.UsageError, match="needs a folder"):
         sfmapp.track_sequence(tmp_path)
     with pytest.raises(sfmapp.UsageError, match="come with their camera"):

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.kernels import CANON, LOSS_IDS, POINT, POSE, SCRATCH, linearize
+from sfmapp.adjust.options import Loss
 from sfmapp.adjust.problem import pose_rows
-from sfmapp.adjust.solver import Loss
 from sfmapp.camera.lens import FAMILY, LAST_ON_PLANE, ROW
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction

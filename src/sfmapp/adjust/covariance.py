@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.kernels import CANON, POINT, SCRATCH, linearize, robust_weight
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Problem
-from sfmapp.adjust.solver import AdjustOptions, Engine, make_engine
+from sfmapp.adjust.solver import Engine, make_engine
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import ROW
 from sfmapp.errors import InputError

@@ -17,8 +17,9 @@ from gtsam.symbol_shorthand import C, K, L, V, X
 from numpy.typing import NDArray
 
 from sfmapp.adjust.factors import ExtraFactors, gtsam_pose
-from sfmapp.adjust.problem import Problem, free_values, make_problem
-from sfmapp.adjust.solver import AdjustOptions, AdjustReport, IntrinsicPriors, write_back
+from sfmapp.adjust.options import AdjustOptions, AdjustReport
+from sfmapp.adjust.priors import IntrinsicPriors
+from sfmapp.adjust.problem import Problem, free_values, make_problem, write_back
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import BROWN, RADIAL_FISHEYE
 from sfmapp.camera.models import PARAM_NAMES, canonical_from_params

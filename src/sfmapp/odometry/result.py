@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from sfmapp.contradictions import Contradiction
 from sfmapp.images.sequence import RepeatedFrame
 from sfmapp.odometry.inertial.markers import MarkerSightings
 from sfmapp.odometry.inertial.smoothing import SmoothedTrajectory
+from sfmapp.odometry.report import OdometryReport
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -92,7 +92,7 @@ class OdometryResult:
     maps: list[MapResult]
     covariance: Array | None = None
     smoothed: list[SmoothedTrajectory] = field(default_factory=list)
-    report: dict[str, Any] = field(default_factory=dict)
+    report: OdometryReport | None = None
 
     @property
     def twin_rows(self) -> NDArray[np.int64]:

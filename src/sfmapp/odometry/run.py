@@ -29,6 +29,7 @@ from sfmapp.odometry.recognition import Recognition
 from sfmapp.odometry.records import FrameRecord, gather, leave_keyframe, measure_again
 from sfmapp.odometry.refinement.early_calibration import EarlyCalibration
 from sfmapp.odometry.refinement.final_adjustment import adjust_finally
+from sfmapp.odometry.report import OdometryReport
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.shutter import straighten
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
@@ -440,16 +441,15 @@ class Odometry:
             self.events.decided("adjustment", "the images show a rolling shutter, which is undone", **numbers)
         return numbers
 
-    def _report(self, result: OdometryResult) -> dict[str, Any]:
+    def _report(self, result: OdometryResult) -> OdometryReport:
         tracked = np.isfinite(result.cam_from_world[:, 0])
-        backend = sum(local.backend.cpu_s for local in self.atlas)
-        return {
-            "num_frames": len(self.records), "num_tracked": int(tracked.sum()), "num_maps": len(result.maps),
-            "num_keyframes": [len(m.keyframe_frame_idx) for m in result.maps],
-            "tracking_cpu_s": sum(record.time_s for record in self.records), "backend_cpu_s": backend,
-            **asdict(self.counts), "right_late_frames": self.clock.shift,
-            "pairs": [c.describe() for c in self.clock.contradictions()],
-        }  # fmt: skip
+        return OdometryReport(
+            num_frames=len(self.records), num_tracked=int(tracked.sum()), num_maps=len(result.maps),
+            num_keyframes=[len(m.keyframe_frame_idx) for m in result.maps],
+            tracking_cpu_s=sum(record.time_s for record in self.records),
+            backend_cpu_s=sum(local.backend.cpu_s for local in self.atlas), **asdict(self.counts),
+            right_late_frames=self.clock.shift, pairs=self.clock.contradictions(),
+        )  # fmt: skip
 
 
 def run_odometry(

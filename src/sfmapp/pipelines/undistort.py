@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -25,20 +24,21 @@ from sfmapp.dense.undistort import resample
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.atomic import replaced_file
-from sfmapp.formats.colmap import read_model
+from sfmapp.formats.colmap import MODEL_FILES, read_model
 from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import decode_file, read_file, read_mask_file
 from sfmapp.images.rewrite import encode, encode_mask, without_turn
 from sfmapp.pipelines.dense.source import DenseSource, find_source, model_digest
+from sfmapp.report.model import UndistortedCamera, UndistortNumbers, UndistortReport
+from sfmapp.reporting import NamedReason, from_plain
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.undistortion import Undistortion, has_distortion, plan_undistortion, undistort_reconstruction
+from sfmapp.workspace.job import Job
 from sfmapp.workspace.keys import input_key, stage_key
-from sfmapp.workspace.layout import MODEL_FILES, UNDISTORT
-from sfmapp.workspace.listeners import EventLog
+from sfmapp.workspace.layout import UNDISTORT
 from sfmapp.workspace.manifest import recorded_versions
 from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
-from sfmapp.workspace.workspace import Workspace, open_workspace
 
 STAGE = UNDISTORT
 IMAGES, MASKS = "images", "masks"
@@ -51,31 +51,25 @@ class UndistortResult:
 
     Attributes:
         output: the folder.
-        report: JSON-able: ``num_images``, ``num_copied`` (of them, files that had no distortion), ``num_masks``,
-            ``cameras`` (a row for each pinhole), ``num_points``, ``num_observations``, ``num_dropped`` (observations
-            outside of the pictures, or in photographs that are missing), ``missing`` (name and reason),
-            ``is_up_to_date`` and ``run``.
+        report: of it.
     """
 
     output: Path
-    report: dict[str, Any]
+    report: UndistortReport
 
 
-@dataclass
-class _Job:
+@dataclass(kw_only=True)
+class _Job(Job):
     """An undistortion under way.
 
     Attributes:
-        workspace: the folder.
         photographs: that are there.
         undistortions: one for each.
         lost: (name, reason) of photographs that could not be read.
     """
 
-    workspace: Workspace
-    photographs: Photographs
-    undistortions: list[Undistortion]
-    events: Events
+    photographs: Photographs = field(init=False)
+    undistortions: list[Undistortion] = field(init=False)
     lost: list[tuple[str, str]] = field(default_factory=list)
 
 
@@ -114,32 +108,32 @@ def undistort(
         raise UsageError(f"blank_pixels is {blank_pixels:g}, expected a share from 0 to 1")
     if max_size is not None and max_size < 1:
         raise UsageError(f"max_size is {max_size}, expected 1 pixel or more")
-    options, events, watch = options or Options(), events or Events(), watch or Stopwatch()
-    where = find_source(source, output, images, options, UNDISTORT)
+    where = find_source(source, output, images, options or Options(), UNDISTORT)
     _check_target(where)
     model, keypoints = read_model(where.model, events)
     if not len(model.registered_idx):
         raise NoReconstructionError(f"{where.model}: expected images with a pose, found none")
-    with _opened(where, events) as workspace:
-        photographs = find_photographs(
-            model, where.images, where.options.images,
-            is_upright=where.is_upright, with_copies=True, threads=options.num_workers, events=events,
+    with _Job.opened(UNDISTORT, where.images, where.output, where.options, events=events, watch=watch) as job:
+        _note_source(job, where)
+        job.photographs = find_photographs(
+            model, where.images, job.options.images,
+            is_upright=where.is_upright, with_copies=True, threads=job.threads, events=job.events,
         )  # fmt: skip
-        planned = [plan_undistortion(camera, blank_pixels, max_size) for camera in photographs.cameras]
-        job = _Job(workspace, photographs, planned, events)
+        job.undistortions = [plan_undistortion(camera, blank_pixels, max_size) for camera in job.photographs.cameras]
         key = stage_key(
-            (__name__,), None, [blank_pixels, max_size, where.is_upright],
-            model_digest(where.model), [input_key(record) for record in photographs.records], photographs.missing,
+            (__name__,), None, [blank_pixels, max_size, where.is_upright], model_digest(where.model),
+            [input_key(record) for record in job.photographs.records], job.photographs.missing,
         )  # fmt: skip
-        report = _known_report(job, key)
-        if report is None:
+        known = _known_numbers(job, key)
+        numbers = known
+        if numbers is None:
             _begin(job, key)
-            _write_photographs(job, options.num_workers)
-            report = _write_model(job, model, keypoints)
-            workspace.finish(STAGE, watch.read(), report=report)
-            workspace.save()
-            report = {"is_up_to_date": False, **report}
-        return UndistortResult(workspace.folder, report | {"run": watch.read()})
+            _write_photographs(job)
+            numbers = _write_model(job, model, keypoints)
+            job.workspace.finish(STAGE, job.watch.read(), report=numbers)
+            job.workspace.save()
+        report = UndistortReport(**numbers, is_up_to_date=known is not None, run=job.watch.read())
+        return UndistortResult(job.workspace.folder, report)
 
 
 def _check_target(where: DenseSource) -> None:
@@ -151,21 +145,14 @@ def _check_target(where: DenseSource) -> None:
             raise UsageError(f"{path}: {role} is in {where.output}, where the results go", "choose another folder: -o")
 
 
-@contextmanager
-def _opened(where: DenseSource, events: Events) -> Iterator[Workspace]:
-    with (
-        open_workspace(where.output, UNDISTORT) as workspace,
-        EventLog(workspace.log, events, source=str(where.images), version=sfmapp.__version__) as event_log,
-    ):
-        events.subscribe(event_log)
-        workspace.manifest |= {
-            # what the model belongs to, for the commands that take this workspace; and what that was made of
-            "source": os.path.abspath(where.output / IMAGES),
-            "photographs": os.path.abspath(where.images),
-            "model": os.path.abspath(where.model),
-            "versions": {"sfmapp": sfmapp.__version__, **recorded_versions()},
-        }
-        yield workspace
+def _note_source(job: _Job, where: DenseSource) -> None:
+    job.workspace.manifest |= {
+        # what the model belongs to, for the commands that take this workspace; and what that was made of
+        "source": os.path.abspath(where.output / IMAGES),
+        "photographs": os.path.abspath(where.images),
+        "model": os.path.abspath(where.model),
+        "versions": {"sfmapp": sfmapp.__version__, **recorded_versions()},
+    }
 
 
 def _target(job: _Job, folder: str, name: str) -> Path:
@@ -196,17 +183,20 @@ def _begin(job: _Job, key: str) -> None:
     workspace.begin(STAGE, key, names=names)
 
 
-def _known_report(job: _Job, key: str) -> dict[str, Any] | None:
-    """The report of an earlier run if all that it has written is there."""
+def _known_numbers(job: _Job, key: str) -> UndistortNumbers | None:
+    """What an earlier run has written, if all of it is there."""
     folder = job.workspace.folder
     wanted = [folder / IMAGES / record.name for record in job.photographs.records]
     wanted += [folder / "sparse" / "0" / name for name in MODEL_FILES]
     if not job.workspace.is_current(STAGE, key) or not all(path.is_file() for path in wanted):
         return None
-    return {**job.workspace.manifest["stages"][STAGE]["report"], "is_up_to_date": True}
+    try:
+        return from_plain(UndistortNumbers, job.workspace.manifest["stages"][STAGE]["report"])
+    except ValueError:
+        return None
 
 
-def _write_photographs(job: _Job, threads: int) -> None:
+def _write_photographs(job: _Job) -> None:
     """Write them all. One that cannot be read is noted in ``job.lost``, and costs the others nothing."""
     records, events = job.photographs.records, job.events
     events.started(STAGE, f"{len(records)} photographs", total=len(records))
@@ -228,7 +218,7 @@ def _write_photographs(job: _Job, threads: int) -> None:
         events.advanced(STAGE)
         return reason
 
-    pool = ThreadPoolExecutor(threads)
+    pool = ThreadPoolExecutor(job.threads)
     try:
         job.lost += [found for found in pool.map(write, range(len(records))) if found is not None]
     finally:
@@ -285,7 +275,7 @@ def _lay_out(how: Undistortion, pixels: NDArray[Any]) -> tuple[NDArray[Any], NDA
     return np.array(flat), shown
 
 
-def _write_model(job: _Job, model: Reconstruction, keypoints: list[NDArray[np.float64]]) -> dict[str, Any]:
+def _write_model(job: _Job, model: Reconstruction, keypoints: list[NDArray[np.float64]]) -> UndistortNumbers:
     """Write the model of the photographs that were written, and tell of it."""
     photographs, lost = job.photographs, {name for name, _ in job.lost}
     kept = [i for i, record in enumerate(photographs.records) if record.name not in lost]
@@ -296,16 +286,16 @@ def _write_model(job: _Job, model: Reconstruction, keypoints: list[NDArray[np.fl
         _share(job.workspace.model() / name, job.workspace.folder / "sparse" / name)
     names = [photographs.records[i].name for i in kept]
     masks = [job.workspace.folder / MASKS / f"{name}.png" for name in names]
-    return {
-        "num_images": len(kept),
-        "num_copied": sum(each.is_identity for each in undistortions),
-        "num_masks": sum(path.is_file() for path in masks),
-        "cameras": [{"width": c.width, "height": c.height, "params": c.params.tolist()} for c in flat.cameras],
-        "num_points": int(flat.is_triangulated.sum()),
-        "num_observations": flat.tracks.num_observations,
-        "num_dropped": int(model.obs_is_inlier.sum()) - flat.tracks.num_observations,
-        "missing": [{"name": name, "reason": reason} for name, reason in (*photographs.missing, *job.lost)],
-    }
+    return UndistortNumbers(
+        num_images=len(kept),
+        num_copied=sum(each.is_identity for each in undistortions),
+        num_masks=sum(path.is_file() for path in masks),
+        cameras=[UndistortedCamera(width=c.width, height=c.height, params=c.params.tolist()) for c in flat.cameras],
+        num_points=int(flat.is_triangulated.sum()),
+        num_observations=flat.tracks.num_observations,
+        num_dropped=int(model.obs_is_inlier.sum()) - flat.tracks.num_observations,
+        missing=[NamedReason(name=name, reason=reason) for name, reason in (*photographs.missing, *job.lost)],
+    )
 
 
 def _share(path: Path, other: Path) -> None:

@@ -22,7 +22,8 @@ from scipy.special import chdtri
 
 from sfmapp.adjust.calibration import RAW, CalibrationSystem, reduce_to_calibration
 from sfmapp.adjust.covariance import similarity_basis
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import BROWN, FAMILY, RADIAL_FISHEYE
 from sfmapp.camera.models import PARAM_NAMES, CameraModel, canonical_from_params, kind_of

@@ -9,16 +9,17 @@ of the adjustment: fits of every second frame, and of both ends of the row, must
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import estimate_covariances
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import PARAM_NAMES, Camera
 from sfmapp.camera.models import kind_of, plain_params
 from sfmapp.mapping.structure import residual_scale_px
+from sfmapp.report.model import LensEvidence
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -44,13 +45,13 @@ class LensFit:
     Attributes:
         camera: the fitted one. sigma: standard deviations of its parameters by name, those held left out.
         spread: how many times its own standard deviations the focal lengths of parts differ from the whole.
-        evidence: numbers for the report, JSON-able.
+        evidence: for the report.
     """
 
     camera: Camera
     sigma: dict[str, float]
     spread: float
-    evidence: dict[str, Any]
+    evidence: LensEvidence
 
     @property
     def focal_sigma_relative(self) -> float:
@@ -78,18 +79,18 @@ def fit_lens(model: Reconstruction) -> LensFit:
     bends = [n for n, name in enumerate(names) if kind_of(name) == "distortion"]
     plain = _flat(camera).params
     clear = [abs(fit.whole.params[n] - plain[n]) > _MIN_DISTORTION_SIGMAS * fit.sigma[n] for n in bends]
-    evidence: dict[str, Any] = {"distortion": {names[n]: float(fit.whole.params[n]) for n in bends}}
+    distortion = {names[n]: float(fit.whole.params[n]) for n in bends}
     if bends and not any(clear):
         free = _focal(camera, fit.whole.params)
         fit = _with_parts(model, _flat(camera), False)
         # a distortion too small to be clear may still be there: what it would change is part of the uncertainty
         is_focal = np.array([kind_of(name) == "focal" for name in names])
         fit.sigma[is_focal] = np.hypot(fit.sigma[is_focal], _focal(camera, fit.whole.params) - free)
-    evidence |= {
-        "is_at_rest": fit.whole.is_at_rest, "spread": fit.spread, "has_distortion": any(clear),
-        "parts": [float(_focal(camera, part.params)) for part in fit.parts],
-        "independent_sigma": float(fit.whole.sigma[0]),
-    }  # fmt: skip
+    evidence = LensEvidence(
+        distortion=distortion, is_at_rest=fit.whole.is_at_rest, spread=fit.spread, has_distortion=any(clear),
+        parts=[float(_focal(camera, part.params)) for part in fit.parts],
+        independent_sigma=float(fit.whole.sigma[0]),
+    )  # fmt: skip
     found = replace(camera, params=fit.whole.params)
     sigma = {name: float(value) for name, value in zip(names, fit.sigma, strict=True) if value > 0}
     return LensFit(found, sigma, fit.spread, evidence)

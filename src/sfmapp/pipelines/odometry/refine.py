@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from collections.abc import Sequence as Rows
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-import sfmapp
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
@@ -26,19 +27,27 @@ from sfmapp.mapping.options import MappingOptions
 from sfmapp.odometry.result import MapResult, OdometryResult
 from sfmapp.pipelines.odometry.add_photos import PhotoResult, add_photos
 from sfmapp.pipelines.odometry.results import read_odometry, write_trajectories
-from sfmapp.report.odometry_document import fit_to_ground_truth, ground_truth_row, map_row
+from sfmapp.report.model import (
+    CamerasBeforeAfter,
+    GroundTruthBeforeAfter,
+    GroundTruthReport,
+    MapReport,
+    MapsBeforeAfter,
+    Outcome,
+    RefinedCamera,
+    RefineReport,
+)
+from sfmapp.report.odometry_document import GroundTruthFit, fit_to_ground_truth, ground_truth_row, map_row
 from sfmapp.report.refine_html import REFINE_FORMAT, render_refine_html
+from sfmapp.reporting import NamedReason, document_text
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.sequences.open import open_sequence
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.kernels import kernels_compiling
 from sfmapp.workspace.layout import ODOMETRY, REFINE
-from sfmapp.workspace.listeners import DecisionLog, EventLog
 from sfmapp.workspace.manifest import read_manifest
-from sfmapp.workspace.options import Options, options_from_dict, with_absolute_paths
-from sfmapp.workspace.plain_json import report_text
+from sfmapp.workspace.options import Options, options_from_dict
 from sfmapp.workspace.usage import Stopwatch
-from sfmapp.workspace.workspace import open_workspace
 
 Array = NDArray[np.float64]
 
@@ -57,7 +66,7 @@ class RefineResult(NamedTuple):
     """The refined maps and trajectory, and the report of it as in ``report.json``."""
 
     odometry: OdometryResult
-    report: dict[str, Any]
+    report: RefineReport
 
 
 def refine(
@@ -87,30 +96,22 @@ def refine(
         NoReconstructionError: there is no map in it.
         InterruptedRunError: ``events`` was asked to stop.
     """
-    from threadpoolctl import threadpool_limits
-
-    source, options, events = Path(output), with_absolute_paths(options or Options()), events or Events()
+    source = Path(output)
     manifest = read_manifest(source, ODOMETRY)
     before = read_odometry(source)
     if not before.maps:
         raise NoReconstructionError(f"{source} holds no map to refine", "run sfmapp odometry first")
-    threads = options.num_workers
-    with ExitStack() as stack:
-        workspace = stack.enter_context(open_workspace(Path(refined or source / FOLDER), REFINE))
-        event_log = stack.enter_context(EventLog(workspace.log, events, source=str(source), version=sfmapp.__version__))
-        stack.enter_context(threadpool_limits(1, "blas"))
-        job = Job(str(source), workspace, options, events, watch or Stopwatch(), DecisionLog(), threads)
-        for listener in (event_log, job.log):
-            events.subscribe(listener)
+    target = refined or source / FOLDER
+    with Job.opened(REFINE, source, target, options, events=events, watch=watch) as job:
         job.note_inputs({})
-        stack.enter_context(kernels_compiling(events, job.usage))
-        pool = stack.enter_context(ThreadPoolExecutor(threads))
+        job.until_end.enter_context(kernels_compiling(job.events, job.usage))
+        pool = job.until_end.enter_context(ThreadPoolExecutor(job.threads))
         sequence = _open_sequence(manifest, job, required=photos is not None)
         after, added = _refined(job, before, sequence, photos, free_intrinsics, pool)
         return RefineResult(after, _write(job, before, after, sequence, added))
 
 
-def _open_sequence(manifest: dict[str, Any], job: Job, *, required: bool) -> Sequence | None:
+def _open_sequence(manifest: Mapping[str, Any], job: Job, *, required: bool) -> Sequence | None:
     """The sequence of the run, for its ground truth and its images; None if it is gone and only the ground truth was
     wanted."""
     wanted = options_from_dict({"sequence": manifest["options"]["sequence"]}).sequence
@@ -176,7 +177,7 @@ def adjusted(
         structure.triangulate(model, np.flatnonzero(~model.is_triangulated), mapping, pool, limit_px)
         changed = int((used != model.obs_is_inlier).sum())
         summary = model.summary()
-        text = f"{summary['num_points']} points, {summary['mean_reprojection_error_px']:.3f} px"
+        text = f"{summary.num_points} points, {summary.mean_reprojection_error_px:.3f} px"
         events.decided(STAGE, f"adjusted: {changed} observations changed sides; {text}", **summary)
         events.raise_if_cancelled()
         if changed <= 1e-3 * used.sum():
@@ -233,7 +234,7 @@ def moved_frames(before: OdometryResult, entries: list[MapResult]) -> OdometryRe
 
 def _write(
     job: Job, before: OdometryResult, after: OdometryResult, sequence: Sequence | None, added: PhotoResult | None
-) -> dict[str, Any]:
+) -> RefineReport:
     """Models, trajectories and the report, which is returned."""
     workspace, ground_truth = job.workspace, sequence.ground_truth if sequence is not None else None
     with job.measured("output"):
@@ -245,34 +246,37 @@ def _write(
         else []
         for name, result in (("before", before), ("after", after))
     }
-    report = {
-        "format": REFINE_FORMAT,
-        "outcome": {"exit_code": 0, "message": "", "advice": None},
-        "run": job.facts(),
-        "maps": {
-            name: [map_row(result, m) for m in range(len(result.maps))]
-            for name, result in (("before", before), ("after", after))
-        },
-        "cameras": {
-            name: [
-                {"model": camera.model.name, "params": camera.params.tolist()}
-                for camera in result.maps[0].reconstruction.cameras
-            ]
-            for name, result in (("before", before), ("after", after))
-        },
-        "ground_truth": {
-            name: [{"map": m, **ground_truth_row(fit)} for m, fit in enumerate(found) if fit is not None]
-            for name, found in fits.items()
-        },
-        "orientation": sequence.orientation if sequence is not None else 1,
-        "photographs": added.rows if added is not None else [],
-        "skipped": [{"name": name, "reason": reason} for name, reason in added.skipped] if added is not None else [],
-        "usage": job.usage,
-        "warnings": job.log.warnings,
-        "decisions": job.log.decisions,
-    }
+    report = RefineReport(
+        format=REFINE_FORMAT,
+        outcome=Outcome.of(None),
+        run=job.facts(),
+        maps=MapsBeforeAfter(before=_map_rows(before), after=_map_rows(after)),
+        cameras=CamerasBeforeAfter(before=_cameras(before), after=_cameras(after)),
+        ground_truth=GroundTruthBeforeAfter(**{name: _errors(found) for name, found in fits.items()}),
+        orientation=sequence.orientation if sequence is not None else 1,
+        photographs=added.rows if added is not None else [],
+        skipped=[
+            NamedReason(name=name, reason=reason) for name, reason in (added.skipped if added is not None else ())
+        ],
+        usage=job.usage,
+        warnings=job.log.warnings,
+        decisions=job.log.decisions,
+    )
     workspace.write_text("report.html", render_refine_html(report, after, ground_truth, fits["after"]))
-    workspace.write_text("report.json", report_text(report))
+    workspace.write_text("report.json", document_text(report))
     workspace.manifest["usage"] = job.usage
     workspace.save()
     return report
+
+
+def _map_rows(result: OdometryResult) -> list[MapReport]:
+    return [map_row(result, m) for m in range(len(result.maps))]
+
+
+def _cameras(result: OdometryResult) -> list[RefinedCamera]:
+    cameras = result.maps[0].reconstruction.cameras
+    return [RefinedCamera(model=camera.model.name, params=camera.params.tolist()) for camera in cameras]
+
+
+def _errors(fits: Rows[GroundTruthFit | None]) -> list[GroundTruthReport]:
+    return [ground_truth_row(fit, m) for m, fit in enumerate(fits) if fit is not None]

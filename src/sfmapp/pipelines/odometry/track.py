@@ -7,15 +7,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-import sfmapp
 from sfmapp.errors import InterruptedRunError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.images.frame_reader import FileSequence
@@ -23,19 +20,16 @@ from sfmapp.images.sequence import Frame, GroundTruth, Imu, Sequence, SequenceKi
 from sfmapp.images.video import VideoSequence
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
-from sfmapp.pipelines.odometry.live import GrowingTrajectories
 from sfmapp.pipelines.odometry.results import write_odometry
-from sfmapp.pipelines.odometry.scale import ScaleRequest, parse_scale, resolve_scale_request, scale_maps
-from sfmapp.pipelines.odometry.timing import FrameLog, ThreadTimes
+from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps
+from sfmapp.pipelines.odometry.tracking import Tracking
+from sfmapp.report.model import OdometryRunReport
 from sfmapp.sequences.open import open_sequence
-from sfmapp.viewer.live import LiveView, Screen
-from sfmapp.workspace.job import Job
+from sfmapp.viewer.live import Screen
 from sfmapp.workspace.kernels import compile_odometry_kernels
 from sfmapp.workspace.layout import ODOMETRY
-from sfmapp.workspace.listeners import DecisionLog, EventLog
-from sfmapp.workspace.options import Options, with_absolute_paths
+from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
-from sfmapp.workspace.workspace import open_workspace
 
 if TYPE_CHECKING:
     from sfmapp.scene.rig import Rig
@@ -45,38 +39,13 @@ NO_MAP_ADVICE = (
 )
 # What held for this share of the frames is why there is no map.
 _MOST_FRAMES = 0.5
-GIVEN_UP = "given up, for the disk is full, and the rest matters more"
 
 
 class TrackResult(NamedTuple):
     """What the run found, and the report of it as in ``report.json``."""
 
     odometry: OdometryResult
-    report: dict[str, Any]
-
-
-@dataclass(kw_only=True)
-class Tracking(Job):
-    """State of an odometry run under way.
-
-    Attributes:
-        frames: what was told of each frame.
-        threads_cpu: CPU time by thread.
-        live: draws what happens; None if nobody looks.
-        scale_request: what the unit of length is to come from; None: an arbitrary one will do.
-        sequence: once it is open.
-    """
-
-    frames: FrameLog
-    threads_cpu: ThreadTimes
-    live: LiveView | None
-    scale_request: ScaleRequest | None
-    sequence: Sequence | None = None
-
-    def make_room(self) -> bool:
-        """See :meth:`Job.make_room`; a recording under way is one as well, and its end will be told as such."""
-        is_under_way = self.live is not None and self.live.is_recording and self.live.give_up(GIVEN_UP)
-        return super().make_room() or is_under_way
+    report: OdometryRunReport
 
 
 def track_sequence(
@@ -109,32 +78,15 @@ def track_sequence(
         NoReconstructionError: no map could be made; the report is written.
         InterruptedRunError: ``events`` was asked to stop.
     """
-    from threadpoolctl import threadpool_limits
-
-    options, events = with_absolute_paths(options or Options()), events or Events()
     sequence = None if isinstance(source, str | os.PathLike) else source
-    source = os.fspath(source) if isinstance(source, str | os.PathLike) else source.source
+    name = os.fspath(source) if isinstance(source, str | os.PathLike) else source.source
     if sequence is not None and self_calibrate:
         raise UsageError("frames in memory come with their camera, and cannot be looked at twice to calibrate it")
-    scale_request = parse_scale(options.scale.source) if options.scale.source is not None else None
-    threads = options.num_workers
-    with ExitStack() as stack:
-        workspace = stack.enter_context(open_workspace(Path(output), ODOMETRY))
-        event_log = stack.enter_context(EventLog(workspace.log, events, source=source, version=sfmapp.__version__))
-        # sums must not depend on how many threads the linear algebra would use
-        stack.enter_context(threadpool_limits(1, "blas"))
-        live = LiveView(workspace.recording if record else None, screen) if record or screen else None
-        if live is not None:
-            stack.enter_context(live)
-        run = Tracking(
-            source, workspace, options, events, watch or Stopwatch(), DecisionLog(), threads,
-            frames=FrameLog(), threads_cpu=ThreadTimes(), live=live,
-            scale_request=scale_request, sequence=sequence,
-        )  # fmt: skip
-        growing = stack.enter_context(closing(GrowingTrajectories(workspace.folder, events, run.make_room)))
-        for listener in (growing, event_log, run.log, run.frames, live):
-            if listener is not None:
-                events.subscribe(listener)
+    request = parse_scale(options.scale.source) if options is not None and options.scale.source is not None else None
+    with Tracking.opened(
+        ODOMETRY, name, output, options, events=events, watch=watch, scale_request=request, sequence=sequence
+    ) as run:
+        run.listen_in(record, screen)
         return _run(run, self_calibrate)
 
 
@@ -146,14 +98,16 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         if self_calibrate:
             from sfmapp.pipelines.odometry.self_calibrate import self_calibrated
 
-            options, run.stages["self_calibration"] = self_calibrated(run.source, options, events)
+            options, calibration = self_calibrated(run.source, options, events)
+            run.stages = replace(run.stages, self_calibration=calibration)
         if run.sequence is None:
             run.sequence = open_sequence(run.source, options.sequence, events)
         run.scale_request = resolve_scale_request(run.scale_request, options.scale.source is None, run.sequence)
     if run.live is not None:
         run.live.begin(run.sequence)
     with run.stage("kernels"):
-        run.stages["kernels"] = compile_odometry_kernels(events, inertial=run.sequence.imu is not None)
+        compiled = compile_odometry_kernels(events, inertial=run.sequence.imu is not None)
+        run.stages = replace(run.stages, kernels=compiled)
     run.save_first(lambda: run.workspace.begin(ODOMETRY, ""))
     watched = Watched(run.sequence, run)
     with run.measured("odometry"):
@@ -166,15 +120,16 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
             markers=None if run.scale_request is None else run.scale_request.detector(),
         )
         run.threads_cpu.sample()
-    run.stages["odometry"] = result.report
-    if self_calibrate:
+    run.stages = replace(run.stages, odometry=result.report)
+    if run.stages.self_calibration is not None:
         from sfmapp.pipelines.odometry.self_calibrate import widen
 
-        widen(result, run.stages["self_calibration"])
+        widen(result, run.stages.self_calibration)
     with run.measured("scale"):
         if run.scale_request is not None:
             without_cancellation = events.without_cancellation()
-            run.stages["scale"] = scale_maps(result, run.scale_request, watched.imu, without_cancellation)
+            scaled = scale_maps(result, run.scale_request, watched.imu, without_cancellation)
+            run.stages = replace(run.stages, scale=scaled)
     result = replace(result, timestamps_s=watched.times_as_given(result))
     if isinstance(run.sequence, FileSequence | VideoSequence):  # frames in memory are all there
         result = result.with_repeated(run.sequence.repeated)
@@ -198,12 +153,13 @@ def no_map(run: Tracking, result: OdometryResult) -> NoReconstructionError:
     if num_repeated == seen - 1:
         return NoReconstructionError(f"{run.source}: all {seen} frames show the same picture", NO_MAP_ADVICE)
     text = f"{run.source}: {seen} frames were read, but no map could be begun"
-    for against in result.report.get("pairs", []):
-        return NoReconstructionError(f"{text}: {against['message']}", against["advice"])
-    looked = {name: result.report.get(f"looked_{name}", 0) for name in ("still", "turned")}
-    if looked["still"] >= _MOST_FRAMES * (seen - num_repeated):
+    if (report := result.report) is None:
+        return NoReconstructionError(text, NO_MAP_ADVICE)
+    for against in report.pairs:
+        return NoReconstructionError(f"{text}: {against.message}", against.advice)
+    if report.looked_still >= _MOST_FRAMES * (seen - num_repeated):
         text += ": the camera stands still, the picture hardly moves"
-    elif looked["turned"] >= _MOST_FRAMES * (seen - num_repeated):
+    elif report.looked_turned >= _MOST_FRAMES * (seen - num_repeated):
         text += ": the camera turns on the spot, or everything is too far away for how far it moves"
     return NoReconstructionError(text, NO_MAP_ADVICE)
 
