@@ -234,7 +234,7 @@ def test_a_fit_that_is_good_needs_no_resampling() -> None:
         ("c.xml", "<a><b></a>", "expected XML"),
         ("c.txt", "1 2 3", "expected fx fy cx cy"),
         ("c.txt", "1 PINHOLE 640 480 5", "PINHOLE has 4 parameters"),
-        ("c.txt", "1 THIN_PRISM_FISHEYE 640 480 5", "camera model THIN_PRISM_FISHEYE is not supported"),
+        ("c.txt", "1 THIN_PRISM_FISHEYE 640 480 5", "THIN_PRISM_FISHEYE has 12 parameters, found 1"),
         ("c.txt", "1 FULL_OPENCV 640 480 5 5 320 240", "FULL_OPENCV has 12 parameters, found 4"),
         ("c.yaml", "just text", "'name: value'"),
         ("c.yaml", "", "'name: value'"),

@@ -12,6 +12,7 @@ import pytest
 import sfmapp
 from schemas import check_schema
 from sfmapp.camera.camera import CameraModel
+from sfmapp.camera.lens import BROWN, EQUIRECTANGULAR, RADIAL_FISHEYE
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.formats import ply
 from sfmapp.formats.colmap import read_model, write_model
@@ -125,8 +126,14 @@ def test_bundler_says_where_its_pixels_begin(workspace: Path, tmp_path: Path) ->
 
 @pytest.mark.parametrize("model", list(CameraModel))
 def test_every_camera_model_goes_to_nerfstudio_and_colmap(tmp_path: Path, model: CameraModel) -> None:
-    write_model(tmp_path / "m", scene([synthetic_camera(model)]))
-    for target in ("nerfstudio", "colmap-text"):
+    camera = synthetic_camera(model)
+    write_model(tmp_path / "m", scene([camera]))
+    of_four = (BROWN, RADIAL_FISHEYE, EQUIRECTANGULAR)
+    for target, holds in (("nerfstudio", camera.family in of_four), ("colmap-text", model.is_colmaps)):
+        if not holds:
+            with pytest.raises(UsageError, match=model.name):
+                export_model(tmp_path / "m", target, tmp_path / target)
+            continue
         assert export_model(tmp_path / "m", target, tmp_path / target)["max_px"] < 1e-3
 
 

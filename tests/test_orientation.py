@@ -30,6 +30,7 @@ from sfmapp.geometry.orientation import (
     INVERSE,
     MIRRORED,
     ROTATION_OF,
+    is_sideways,
     upright_pinhole,
     upright_pixels,
     upright_poses,
@@ -116,9 +117,14 @@ def test_a_turned_camera_sees_the_turned_picture(orientation: int, model: Camera
         "p1": 0.02,
         "p2": -0.03,
     }
-    values |= {"k3": 0.01, "k4": -0.004}
-
+    values |= {"k3": 0.01, "k4": -0.004, "k0": -0.02, "k5": 0.002, "k6": 0.001, "k": -0.1, "omega": 0.8, "w": W, "h": H}
+    values |= {"alpha": 0.6, "beta": 1.1, "p0": 0.01, "s0": 0.02, "s1": -0.01, "s2": 0.03, "s3": 0.015, "s4": -0.02}
+    values |= {"sx1": 0.02, "sy1": -0.01, "s": 2.0}
     camera = Camera(model, W, H, np.array([values[name] for name in PARAM_NAMES[model]]))
+    if is_sideways(orientation) and model in (CameraModel.EQUIRECTANGULAR, CameraModel.PINHOLE_SKEW):
+        with pytest.raises(UsageError, match="on their side"):
+            turned_camera(camera, orientation)
+        return
     rays = np.random.default_rng(1).uniform([-0.6, -0.4, 1.0], [0.6, 0.4, 1.0], (50, 3))
     turned_rays = np.column_stack([upright_vectors(orientation, rays[:, :2]), rays[:, 2]])
     expected = upright_xy(orientation, project(camera, rays), W, H)

@@ -89,7 +89,7 @@ def kalibr(folder: Path) -> Path:
 
 def kalibr_section(camera: Camera) -> str:
     fx, fy, cx, cy, *lens = camera.params.tolist()
-    model = "equidistant" if camera.is_fisheye else "radtan"
+    model = "equidistant" if camera.model == CameraModel.OPENCV_FISHEYE else "radtan"
     return (
         f"  camera_model: pinhole\n  distortion_coeffs: {lens}\n  distortion_model: {model}\n"
         f"  intrinsics: [{fx}, {fy}, {cx - 0.5}, {cy - 0.5}]\n  resolution: [{camera.width}, {camera.height}]\n"

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sfmapp.adjust.kernels import CANON, LOSS_IDS, POINT, POSE, SCRATCH, linearize
 from sfmapp.adjust.options import Loss
 from sfmapp.adjust.problem import pose_rows
-from sfmapp.camera.lens import ROW
+from sfmapp.camera.lens import FAMILY, LAST_ON_PLANE, ROW
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.simd.pointers import offset, pointer
@@ -28,7 +28,7 @@ from sfmapp.simd.pointers import offset, pointer
 Array = NDArray[np.float64]
 
 # Derivatives of an observation by the calibration of its camera: the canonical intrinsics, and a turn exp(w) of it.
-RAW = 11
+RAW = FAMILY + 3
 # Share of the diagonal that keeps what nothing determines (the unit of a single camera's map) where it is.
 _DAMPING = 1e-9
 
@@ -65,7 +65,7 @@ def reduce_to_calibration(
 
     Args:
         model: images of one rig, or of single cameras, all registered, frame by frame; camera s is that of sensor s.
-        directions: (C, 11, Q) how canonical intrinsics and turn (radians) of each camera change with each unknown.
+        directions: (C, 19, Q) how canonical intrinsics and turn (radians) of each camera change with each unknown.
         sigma_px: noise of one coordinate. loss, loss_sigmas: as of the adjustment.
         clusters: number of the cluster, from 0 on without gaps, of each of the tracks (T,) that have something to say.
         fields: (O, N) what smooth fields of displacement are at each observation. Their amplitudes in pixels follow
@@ -149,6 +149,7 @@ def _rows(  # type: ignore[no-untyped-def]
             offset(pose, 12 * i), False, offset(pose, 0), offset(lens, ROW * s), xyz[t, 0], xyz[t, 1],
             xyz[t, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[s], True, scratch,
         )  # fmt: skip
+        used = 8 if canonical[s, FAMILY] <= LAST_ON_PLANE else FAMILY  # the numbers in the row that mean something
         frames[n] = i // num_sensors
         for r in range(2):
             row = 2 * n + r
@@ -162,10 +163,10 @@ def _rows(  # type: ignore[no-untyped-def]
                 pose_part[row, k] = weight * total
             for q in range(num):
                 total = 0.0
-                for k in range(8):
+                for k in range(used):
                     total += J[CANON + 2 * k + r] * directions[s, k, q]
                 for k in range(3):
-                    total += J[POSE + 8 * r + k] * directions[s, 8 + k, q]
+                    total += J[POSE + 8 * r + k] * directions[s, FAMILY + k, q]
                 lens_part[row, q] = weight * total
             first = num - 2 * fields.shape[1] * canonical.shape[0] + (2 * s + r) * fields.shape[1]
             for q in range(fields.shape[1]):

@@ -26,5 +26,5 @@ def compile_kernels() -> None:
     camera, tracks = model.cameras[0], model.tracks
     refine_pose(camera.canonical, model.cam_from_world[0], model.point_xyz, tracks.obs_xy[:8])
     no_images = np.zeros(0, np.int32)
-    mark_pairs(np.zeros(1, np.int64), no_images, no_images, no_images, no_images, np.eye(1, dtype=bool))
+    mark_pairs(np.zeros(1, np.int64), no_images, no_images, no_images, no_images, no_images, np.eye(1, dtype=bool))
     find_slot(*number_keys(np.arange(3)), 0)

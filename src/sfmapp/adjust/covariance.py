@@ -397,7 +397,9 @@ def _point_covariances(  # type: ignore[no-untyped-def]
                 xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
                 True, scratch,
             )  # fmt: skip
-            for block in (image_block[i], camera_block[c]):
+            is_wide = free_ptr[c] < free_ptr[c + 1] and free_column[free_ptr[c + 1] - 1] >= 8
+            second = np.int64(camera_block[c]) + 1 if is_wide and camera_block[c] >= 0 else np.int64(-1)
+            for block in (np.int64(image_block[i]), np.int64(camera_block[c]), second):
                 if block >= 0 and mark[block] != p:
                     mark[block] = p
                     touched[count] = block

@@ -132,7 +132,10 @@ class SparseSystem:
         blocks, first = problem.num_blocks, problem.num_pose_blocks
         images = problem.image_idx[problem.pose_images[problem.pose_block >= 0]]
         own = np.flatnonzero(problem.camera_block >= first)
-        self._keys = [X(int(i)) for i in images] + [K(int(problem.camera_idx[c])) for c in own]
+        self._keys = [X(int(i)) for i in images]
+        for c in own:
+            number = int(problem.camera_idx[c])
+            self._keys += [K(number), *([gtsam.symbol("l", number)] if problem.second_block[c] >= 0 else [])]
         self._pairs = list(zip(*(part.tolist() for part in np.divmod(keys, blocks)), range(len(keys)), strict=True))
         self._dims = problem.block_dim.tolist()
         self._ordering: Any = None

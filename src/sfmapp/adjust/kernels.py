@@ -2,7 +2,8 @@
 
 Layout. An unknown block is a row of up to eight numbers: the six of a pose (rotation, then translation, of
 ``x_cam <- exp(w) x_cam + v``), followed by at most two intrinsics where a camera takes part through one image only; or
-the free intrinsics of a camera that several images share. Blocks meet in 8 x 8 tiles. Points are never blocks: they are
+the free intrinsics of a camera that several images share; those beyond the eighth are a second block right behind it.
+Blocks meet in 8 x 8 tiles. Points are never blocks: they are
 eliminated one by one (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 1999, section 6.1) from the factor
 ``L L^T`` of their damped 3 x 3 normal matrix: with Z = W L^-T the reduced system loses Z_a Z_b^T per pair of blocks.
 
@@ -20,7 +21,16 @@ import math
 import numba
 
 from sfmapp.camera import brown, radial_fisheye
-from sfmapp.camera.lens import FAMILY, RADIAL_FISHEYE, ROW, distort
+from sfmapp.camera.lens import (
+    FAMILY,
+    LAST_ON_PLANE,
+    RADIAL_FISHEYE,
+    ROW,
+    across_seam,
+    distort,
+    project,
+    project_jacobian,
+)
 from sfmapp.simd.f64x8 import add2, assign3, spread, store8, subtract3
 from sfmapp.simd.pointers import offset, pointer
 
@@ -28,8 +38,10 @@ from sfmapp.simd.pointers import offset, pointer
 LOSS_IDS: dict[str, int] = {"trivial": 0, "huber": 1, "cauchy": 2}
 
 # Offsets in the scratch row of one observation: two rows each of pose (and merged intrinsics); canonical intrinsics,
-# interleaved; free intrinsics; and point, with the residual in the fourth place.
+# interleaved; free intrinsics, those of the first block and of the second; and point, with the residual in the fourth
+# place.
 POSE, CANON, INTR, POINT, SCRATCH = 0, 16, 48, 80, 96
+_SECOND = INTR + 16
 # What one chunk needs besides, in doubles: the scratch row, the point's normal equations and its eliminator.
 _NORMAL, _SMALL, _ZEROS, _FIXED = 96, 120, 144, 160
 # Smallest depth that counts as in front of the camera, relative to the distance.
@@ -72,6 +84,23 @@ def total_loss(scale2: float, total: float, product: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _linearize_ray(c, px, py, pz, xo, yo, loss, scale2, penalty, J):  # type: ignore[no-untyped-def]
+    """What the lens says in :func:`linearize`, for any family and in every direction: whether it looks there, the
+    squared residual, the weighted residual and the weighted derivatives of u and of v by the point in the camera."""
+    # the row of the lens is laid out so that its derivatives by the parameters come to lie where ours do
+    row = offset(J, CANON - 8)
+    project_jacobian(c, px, py, pz, row)
+    if math.isnan(row[0]):
+        return False, penalty, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    e0, e1 = across_seam(c, row[0] - xo), row[1] - yo
+    s2 = e0 * e0 + e1 * e1
+    w = math.sqrt(robust_weight(loss, scale2, s2))
+    for n in range(2 * FAMILY):
+        J[CANON + n] *= w
+    return True, s2, w * e0, w * e1, w * row[2], w * row[3], w * row[4], w * row[5], w * row[6], w * row[7]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def linearize(  # type: ignore[no-untyped-def]
     pose, mounted, mount, c, x0, x1, x2, xo, yo, loss, scale2, penalty, intrinsics, J
 ):
@@ -86,12 +115,16 @@ def linearize(  # type: ignore[no-untyped-def]
     py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]
     pz = pose[6] * x0 + pose[7] * x1 + pose[8] * x2 + pose[11]
     s2 = penalty
-    if pz > _MIN_COS * (abs(px) + abs(py)):
+    family = c[FAMILY]
+    seen = pz > _MIN_COS * (abs(px) + abs(py))
+    if family > LAST_ON_PLANE or (family == RADIAL_FISHEYE and not seen):
+        seen, s2, e0, e1, g00, g01, g02, g10, g11, g12 = _linearize_ray(c, px, py, pz, xo, yo, loss, scale2, penalty, J)
+    elif seen:
         iz = 1.0 / pz
         u = px * iz
         v = py * iz
         fx, fy = c[0], c[1]
-        if c[FAMILY] == RADIAL_FISHEYE:
+        if family == RADIAL_FISHEYE:
             ud, vd, a, b, d, k0u, k0v, k1u, k1v, k2u, k2v, k3u, k3v = radial_fisheye.jacobian(c, u, v)
         else:
             ud, vd, a, b, d, k0u, k0v, k1u, k1v, k2u, k2v, k3u, k3v = brown.jacobian(c, u, v)
@@ -104,14 +137,24 @@ def linearize(  # type: ignore[no-untyped-def]
         g00, g01, g10, g11 = fx * a * iz, fx * b * iz, fy * b * iz, fy * d * iz
         g02 = -(g00 * u + g01 * v)
         g12 = -(g10 * u + g11 * v)
+        e0 *= w
+        e1 *= w
+        if intrinsics:  # fx, fy, cx, cy, d0..d3, for each the change of u and v
+            J[CANON], J[CANON + 1], J[CANON + 2], J[CANON + 3] = w * ud, 0.0, 0.0, w * vd
+            J[CANON + 4], J[CANON + 5], J[CANON + 6], J[CANON + 7] = w, 0.0, 0.0, w
+            J[CANON + 8], J[CANON + 9] = fx * k0u, fy * k0v
+            J[CANON + 10], J[CANON + 11] = fx * k1u, fy * k1v
+            J[CANON + 12], J[CANON + 13] = fx * k2u, fy * k2v
+            J[CANON + 14], J[CANON + 15] = fx * k3u, fy * k3v
+    if seen:
         p00 = g00 * pose[0] + g01 * pose[3] + g02 * pose[6]
         p01 = g00 * pose[1] + g01 * pose[4] + g02 * pose[7]
         p02 = g00 * pose[2] + g01 * pose[5] + g02 * pose[8]
         p10 = g10 * pose[0] + g11 * pose[3] + g12 * pose[6]
         p11 = g10 * pose[1] + g11 * pose[4] + g12 * pose[7]
         p12 = g10 * pose[2] + g11 * pose[5] + g12 * pose[8]
-        store8(J, POINT, p00, p01, p02, w * e0, 0.0, 0.0, 0.0, 0.0)
-        store8(J, POINT + 8, p10, p11, p12, w * e1, 0.0, 0.0, 0.0, 0.0)
+        store8(J, POINT, p00, p01, p02, e0, 0.0, 0.0, 0.0, 0.0)
+        store8(J, POINT + 8, p10, p11, p12, e1, 0.0, 0.0, 0.0, 0.0)
         if mounted:  # the point and the derivatives as the rig has them
             px, py, pz = px - mount[9], py - mount[10], pz - mount[11]
             px, py, pz = (
@@ -131,13 +174,6 @@ def linearize(  # type: ignore[no-untyped-def]
             )
         store8(J, POSE, py * g02 - pz * g01, pz * g00 - px * g02, px * g01 - py * g00, g00, g01, g02, 0.0, 0.0)
         store8(J, POSE + 8, py * g12 - pz * g11, pz * g10 - px * g12, px * g11 - py * g10, g10, g11, g12, 0.0, 0.0)
-        if intrinsics:  # fx, fy, cx, cy, d0..d3, for each the change of u and v
-            J[CANON], J[CANON + 1], J[CANON + 2], J[CANON + 3] = w * ud, 0.0, 0.0, w * vd
-            J[CANON + 4], J[CANON + 5], J[CANON + 6], J[CANON + 7] = w, 0.0, 0.0, w
-            J[CANON + 8], J[CANON + 9] = fx * k0u, fy * k0v
-            J[CANON + 10], J[CANON + 11] = fx * k1u, fy * k1v
-            J[CANON + 12], J[CANON + 13] = fx * k2u, fy * k2v
-            J[CANON + 14], J[CANON + 15] = fx * k3u, fy * k3v
     else:
         for n in range(SCRATCH):
             J[n] = 0.0
@@ -151,7 +187,13 @@ def squared_residual(pose, c, x0, x1, x2, xo, yo, penalty):  # type: ignore[no-u
     py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]
     pz = pose[6] * x0 + pose[7] * x1 + pose[8] * x2 + pose[11]
     s2 = penalty
-    if pz > _MIN_COS * (abs(px) + abs(py)):
+    seen = pz > _MIN_COS * (abs(px) + abs(py))
+    if c[FAMILY] > LAST_ON_PLANE or (c[FAMILY] == RADIAL_FISHEYE and not seen):
+        ud, vd = project(c, px, py, pz)
+        if not math.isnan(ud):
+            e0, e1 = across_seam(c, ud - xo), vd - yo
+            s2 = e0 * e0 + e1 * e1
+    elif seen:
         iz = 1.0 / pz
         u = px * iz
         v = py * iz
@@ -180,7 +222,7 @@ def scratch_size(first, last, point_ptr, num_blocks, num_free):  # type: ignore[
     longest = 1
     for p in range(first, last):
         longest = max(longest, point_ptr[p + 1] - point_ptr[p])
-    places = min(2 * longest, num_blocks) + 1
+    places = min(3 * longest, num_blocks) + 1
     return _FIXED + 8 * num_free + 24 * places, 2 * num_blocks + places
 
 
@@ -195,6 +237,14 @@ def _place(W, where, mark, blocks, p, block, count):  # type: ignore[no-untyped-
             store8(W, count * 24 + 8 * row, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         return count + 1
     return count
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _split(free_column, first, last):  # type: ignore[no-untyped-def]
+    """Where the derivatives first..last of a camera pass from its block to the second one."""
+    while last > first and free_column[last - 1] >= 8:
+        last -= 1
+    return last
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -254,7 +304,8 @@ def reduce_points(  # type: ignore[no-untyped-def]
         block_dim: (B,) rows in use of each block.
         hash_keys, hash_values: tile of block pair a <= b under key a B + b; empty if that number is the tile's as well.
         tiles: (N * 64,) out: sum of -Z_a Z_b^T. own: (B * 64,) out: J^T J of each block with itself, not eliminated.
-        cross: (I * 64,) out: J_pose^T J_intrinsics of images whose camera has a block of its own.
+        cross: (I * 64,) out: J_pose^T J_intrinsics of images whose camera has a block of its own. Where a camera has a
+            second one ((2 I + C) * 64,): behind it the same of that, and J_first^T J_second of each camera.
         gradient: (2 * B * 8,) out: J^T r before elimination, and what elimination adds to it.
         point_factor: (P, 12) out: L^-1 (l00 l10 l11 l20 l21 l22), gradient, damped diagonal increment; all zero for a
             point that has no depth at all.
@@ -269,7 +320,7 @@ def reduce_points(  # type: ignore[no-untyped-def]
     normal, small, zeros, units = offset(J, _NORMAL), offset(J, _SMALL), offset(J, _ZEROS), offset(J, _FIXED)
     W = offset(units, 8 * free_slot.shape[0])
     for n in range(free_slot.shape[0]):
-        units[n * 8 + free_column[n]] = 1.0
+        units[n * 8 + free_column[n] % 8] = 1.0
     cost, product = 0.0, 1.0
     for p in range(first, last):
         x0, x1, x2 = xyz[p, 0], xyz[p, 1], xyz[p, 2]
@@ -297,7 +348,8 @@ def reduce_points(  # type: ignore[no-untyped-def]
                     count = _place(W, where, mark, blocks, p, block, count)
                     add2(W, where[block] * 24, J, POINT, J, POSE, 3)
             if other >= 0 and other != block:
-                spread(J, INTR, zeros, J, CANON, free_slot, units, free_ptr[c], free_ptr[c + 1])
+                split = _split(free_column, free_ptr[c], free_ptr[c + 1])
+                spread(J, INTR, zeros, J, CANON, free_slot, units, free_ptr[c], split)
                 add2(own, other * 64, J, INTR, J, INTR, block_dim[other])
                 add2(gradient, other * 8, J, POINT + 3, J, INTR, 1)
                 if block >= 0:
@@ -305,6 +357,17 @@ def reduce_points(  # type: ignore[no-untyped-def]
                 if moves:
                     count = _place(W, where, mark, blocks, p, other, count)
                     add2(W, where[other] * 24, J, POINT, J, INTR, 3)
+                if split < free_ptr[c + 1]:
+                    second, images = other + 1, image_block.shape[0]
+                    spread(J, _SECOND, zeros, J, CANON, free_slot, units, split, free_ptr[c + 1])
+                    add2(own, second * 64, J, _SECOND, J, _SECOND, block_dim[second])
+                    add2(gradient, second * 8, J, POINT + 3, J, _SECOND, 1)
+                    add2(cross, (2 * images + c) * 64, J, INTR, J, _SECOND, 8)
+                    if block >= 0:
+                        add2(cross, (images + i) * 64, J, POSE, J, _SECOND, 6)
+                    if moves:
+                        count = _place(W, where, mark, blocks, p, second, count)
+                        add2(W, where[second] * 24, J, POINT, J, _SECOND, 3)
         if not moves or not _factor_point(normal, damping, offset(pointer(point_factor), 12 * p), small):
             continue
         for n in range(count):

@@ -22,8 +22,8 @@ def aligned_zeros(*shape: int) -> Array:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def assemble(  # type: ignore[no-untyped-def]
-    tiles, own, cross, gradient, image_block, image_camera, camera_block, block_dim, hash_keys, hash_values, extra_own,
-    extra_gradient, diagonal,
+    tiles, own, cross, gradient, image_block, image_camera, camera_block, second_block, block_dim, hash_keys,
+    hash_values, extra_own, extra_gradient, diagonal,
 ):  # fmt: skip
     """Sum the chunks, in order, into the first: tiles (K, N * 64) and own, cross, gradient likewise.
 
@@ -49,16 +49,27 @@ def assemble(  # type: ignore[no-untyped-def]
             diagonal[a * 8 + x] = d if d > 0.0 and x < block_dim[a] else 1.0
             if x >= block_dim[a]:
                 tiles[0, tile * 64 + 9 * x] = 1.0
-    for i in range(image_block.shape[0]):
-        a, b = image_block[i], camera_block[image_camera[i]]
+    images = image_block.shape[0]
+    for i in range(images):
+        a, b, second = image_block[i], camera_block[image_camera[i]], second_block[image_camera[i]]
         if a >= 0 and b >= 0 and a != b:
-            tile = a * num_blocks + b
-            if hash_keys.shape[0] > 0:
-                tile = find_slot(hash_keys, hash_values, tile)
-                if tile < 0:
-                    continue
-            for n in range(64):
-                tiles[0, tile * 64 + n] += cross[0, i * 64 + n]
+            _add_tile(tiles, cross, i, a * num_blocks + b, hash_keys, hash_values)
+            if second >= 0:
+                _add_tile(tiles, cross, images + i, a * num_blocks + second, hash_keys, hash_values)
+    for c in range(camera_block.shape[0]):
+        if second_block[c] >= 0:
+            tile = camera_block[c] * num_blocks + second_block[c]
+            _add_tile(tiles, cross, 2 * images + c, tile, hash_keys, hash_values)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_tile(tiles, cross, source, tile, hash_keys, hash_values):  # type: ignore[no-untyped-def]
+    """Add a tile of ``cross`` to that of a pair of blocks, if there is one."""
+    if hash_keys.shape[0] > 0:
+        tile = find_slot(hash_keys, hash_values, tile)
+    if tile >= 0:
+        for n in range(64):
+            tiles[0, tile * 64 + n] += cross[0, source * 64 + n]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -159,24 +170,27 @@ def solve_tiles(tiles, num_blocks, inverse, x):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def mark_pairs(point_ptr, obs_image, image_camera, image_block, camera_block, pairs):  # type: ignore[no-untyped-def]
+def mark_pairs(point_ptr, obs_image, image_camera, image_block, camera_block, second_block, pairs):  # type: ignore[no-untyped-def]
     """Set pairs[a, b], (B, B) bool, for all blocks a <= b that meet in a point."""
     longest = 1
     for p in range(point_ptr.shape[0] - 1):
         longest = max(longest, point_ptr[p + 1] - point_ptr[p])
-    blocks = np.zeros(2 * longest, np.int64)
+    blocks = np.zeros(3 * longest, np.int64)
     for p in range(point_ptr.shape[0] - 1):
         found = 0
         for o in range(point_ptr[p], point_ptr[p + 1]):
             i = obs_image[o]
-            block, other = image_block[i], camera_block[image_camera[i]]
+            block, other, second = image_block[i], camera_block[image_camera[i]], second_block[image_camera[i]]
             if block >= 0:
                 blocks[found] = block
                 found += 1
             # neighbours in a track often share the camera
-            if other >= 0 and other != block and (found == 0 or blocks[found - 1] != other):
+            if other >= 0 and other != block and (found == 0 or blocks[found - 1] not in (other, second)):
                 blocks[found] = other
                 found += 1
+                if second >= 0:
+                    blocks[found] = second
+                    found += 1
         for n in range(found):
             for m in range(n, found):
                 pairs[min(blocks[n], blocks[m]), max(blocks[n], blocks[m])] = True

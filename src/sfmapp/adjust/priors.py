@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Problem
 from sfmapp.camera.camera import PARAM_NAMES, Camera
+from sfmapp.camera.models import kind_of
 
 Array = NDArray[np.float64]
 
@@ -36,9 +37,10 @@ class IntrinsicPriors:
 
     @staticmethod
     def _sigma(name: str, camera: Camera, options: AdjustOptions) -> float | None:
-        if name[0] == "f":
+        kind = kind_of(name)
+        if kind == "focal":
             return camera.focal_sigma
-        return options.principal_point_sigma_px if name[0] == "c" else options.distortion_sigma
+        return options.principal_point_sigma_px if kind == "center" else options.distortion_sigma
 
     def cost(self, canonical: Array) -> float:
         error = canonical[self.camera, self.slot] - self.mean

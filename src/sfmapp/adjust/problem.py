@@ -9,8 +9,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera, canonical_from_params
+from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import ROW
+from sfmapp.camera.models import PARAM_NAMES, canonical_from_params, kind_of
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import RigImages
@@ -26,7 +27,7 @@ class FreeIntrinsics:
     Attributes:
         params: for each local camera, (Q,) positions in ``Camera.params``; empty where the camera is constant.
         ptr: (C + 1,) int64; slot, column: for camera c in ``ptr[c]:ptr[c + 1]`` the canonical slot of each derivative
-            and the column of the block that it belongs to.
+            and the column of the block that it belongs to, from 8 on that of a second block behind it.
     """
 
     params: list[NDArray[np.int64]]
@@ -67,6 +68,12 @@ class Problem:
     free: FreeIntrinsics
 
     @property
+    def second_block(self) -> NDArray[np.int32]:
+        """(C,) the block with what a camera has beyond eight free parameters, -1 where it has no more."""
+        is_wide = np.array([len(params) > 8 for params in self.free.params], bool)
+        return np.where(is_wide & (self.camera_block >= 0), self.camera_block + 1, -1).astype(np.int32)
+
+    @property
     def num_blocks(self) -> int:
         return len(self.block_dim)
 
@@ -98,7 +105,7 @@ def free_params(camera: Camera, focal: bool, distortion: bool, principal_point: 
     if camera.is_fixed:
         return np.zeros(0, np.int64)
     wanted = [
-        focal if name[0] == "f" else principal_point if name[0] == "c" else distortion
+        {"focal": focal, "center": principal_point, "distortion": distortion, "size": False}[kind_of(name)]
         for name in PARAM_NAMES[camera.model]
     ]
     return np.flatnonzero(wanted)
@@ -244,7 +251,7 @@ def _number_blocks(
             dims[only[c]] += len(free)
         else:
             camera_block[c] = len(dims)
-            dims.append(len(free))
+            dims += [min(len(free), 8)] + [len(free) - 8] * (len(free) > 8)
     return pose_block, camera_block, np.array(dims, np.int64)
 
 

@@ -20,7 +20,9 @@ from sfmapp.adjust.factors import ExtraFactors, gtsam_pose
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.priors import IntrinsicPriors
 from sfmapp.adjust.problem import Problem, free_values, make_problem, write_back
-from sfmapp.camera.camera import PARAM_NAMES, Camera, canonical_from_params
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.lens import BROWN, RADIAL_FISHEYE
+from sfmapp.camera.models import PARAM_NAMES, canonical_from_params
 from sfmapp.errors import UsageError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
@@ -97,7 +99,9 @@ class Lens:
     def __init__(self, problem: Problem, index: int, camera: Camera) -> None:
         names = PARAM_NAMES[camera.model]
         canonical = problem.canonical[index]
-        single = names[0] == "f"
+        if camera.family not in (BROWN, RADIAL_FISHEYE):
+            raise UsageError(f"the gtsam backend has no {camera.model.name} cameras", "use adjust.backend=schur")
+        single = names[0] == "f" and camera.family == BROWN
         self.factor: Any
         if single:
             fx, _, cx, cy, k1, k2, _, _ = canonical[:8]
@@ -105,7 +109,7 @@ class Lens:
             self.calibration, self.factor = gtsam.Cal3Bundler(fx, k1, k2, cx, cy), gtsam.GeneralSFMFactor2Cal3Bundler
         else:
             fx, fy, cx, cy, *d = canonical[:8]
-            fisheye = camera.is_fisheye
+            fisheye = camera.family == RADIAL_FISHEYE
             order = _FISHEYE if fisheye else _DS2
             self.calibration = (gtsam.Cal3Fisheye if fisheye else gtsam.Cal3DS2)(fx, fy, 0.0, cx, cy, *d)
             self.factor = gtsam.GeneralSFMFactor2Cal3Fisheye if fisheye else gtsam.GeneralSFMFactor2Cal3DS2

@@ -145,8 +145,9 @@ class Engine:
         self.limits = np.searchsorted(p.point_ptr, shares)
         self.limits[0], self.limits[-1] = 0, len(p.track_idx)
         chunks = self.num_chunks
+        num_cross = images if (p.second_block < 0).all() else 2 * images + len(p.camera_idx)
         self.tiles = aligned_zeros(chunks, self.num_tiles * 64)
-        self.own, self.cross = aligned_zeros(chunks, blocks * 64), aligned_zeros(chunks, images * 64)
+        self.own, self.cross = aligned_zeros(chunks, blocks * 64), aligned_zeros(chunks, num_cross * 64)
         self.gradient = aligned_zeros(chunks, 2 * blocks * 8)
         self.inverse = aligned_zeros(blocks * 64)
         self.diagonal = np.ones(blocks * 8)
@@ -169,7 +170,7 @@ class Engine:
 
         p, blocks = self.problem, self.problem.num_blocks
         met = np.eye(blocks, dtype=bool)
-        mark_pairs(p.point_ptr, p.obs_image, p.image_camera, p.image_block, p.camera_block, met)
+        mark_pairs(p.point_ptr, p.obs_image, p.image_camera, p.image_block, p.camera_block, p.second_block, met)
         if self.extras is not None:
             met.reshape(-1)[self.extras.pairs] = True
         keys = np.flatnonzero(met)
@@ -199,8 +200,8 @@ class Engine:
         if self.extras is not None:
             self.extras.linearize(own, gradient)
         assemble(
-            self.tiles, self.own, self.cross, self.gradient, p.image_block, p.image_camera, p.camera_block, p.block_dim,
-            self.hash_keys, self.hash_values, own, gradient, self.diagonal,
+            self.tiles, self.own, self.cross, self.gradient, p.image_block, p.image_camera, p.camera_block,
+            p.second_block, p.block_dim, self.hash_keys, self.hash_values, own, gradient, self.diagonal,
         )  # fmt: skip
         return cost + self.other_cost(p.poses, p.canonical)
 

@@ -34,6 +34,7 @@ from sfmapp.calibration.opencv_lens import (
 )
 from sfmapp.calibration.slam_settings import orb_slam_fields, vins_fields
 from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, simple_camera
+from sfmapp.camera.models import kind_of
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.text_input import nearest_rotation
 from sfmapp.geometry import rigid3
@@ -90,7 +91,7 @@ def camera_from_text(text: str, size: Size) -> Camera:
         raise UsageError(
             f"camera is {text!r}: {model.name} has {len(PARAM_NAMES[model])} parameters, found {len(params)}", expected
         )
-    focals = params[[name.startswith("f") for name in PARAM_NAMES[model]]]
+    focals = params[[kind_of(name) in ("focal", "size") for name in PARAM_NAMES[model]]]
     if not np.isfinite(params).all() or not (focals > 0).all():
         raise UsageError(f"camera is {text!r}, expected finite numbers and positive focal lengths: {expected}")
     camera = simple_camera(model, *size, 1.0, source="user").with_params(params)

@@ -9,9 +9,9 @@ from typing import Any
 
 from sfmapp.calibration.fields import Fields, is_of_camera
 from sfmapp.camera.camera import Camera
+from sfmapp.camera.names import MODEL_NAMES
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_binary import read_binary_cameras, read_binary_images
-from sfmapp.formats.colmap_model import MODEL_NAMES
 from sfmapp.formats.colmap_text import read_text_images
 from sfmapp.formats.flat_yaml import parse_flat_yaml
 from sfmapp.formats.nerfstudio import read_nerfstudio_cameras
@@ -49,7 +49,7 @@ def read_fields(path: Path) -> Fields:
     rows = [
         line.split() for line in text.replace(",", " ").splitlines() if line.strip() and line.lstrip()[0] not in "#%"
     ]
-    if rows and len(rows[0]) >= 4 and rows[0][1] in MODEL_NAMES.values():
+    if rows and len(rows[0]) >= 4 and rows[0][1] in MODEL_NAMES:
         return {"cameras": _colmap_text_cameras(path, rows)}
     if rows and all(re.fullmatch(r"[-+.\deE]+", field) for row in rows for field in row):
         return _fields_of_numbers(str(path), [field for row in rows for field in row])
@@ -92,9 +92,9 @@ def _colmap_text_cameras(path: Path, rows: list[list[str]]) -> list[Fields]:
 
 def _colmap_binary_cameras(path: Path) -> list[Fields]:
     images = read_binary_images(path.parent) if (path.parent / "images.bin").is_file() else None
-    ids, cameras, notes = read_binary_cameras(path.parent, images)
+    ids, cameras = read_binary_cameras(path.parent)
     if not cameras:
-        raise InputError(f"{path}: expected a camera, found {'; '.join(notes) or 'none'}")
+        raise InputError(f"{path}: expected a camera, found none")
     found = {str(i): {"id": str(i), **_colmap_fields(camera)} for i, camera in zip(ids, cameras, strict=True)}
     if images is not None:
         _add_files(path, found, images.camera_ids.tolist(), images.names)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import PARAM_NAMES, Camera, pixels_to_normalized
+from sfmapp.camera.models import kind_of
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_model import checked_camera
 
@@ -110,31 +111,14 @@ def camera_from_opencv(
     return CalibratedCamera(replace(camera, focal_sigma=SIGMA_CALIBRATED * camera.focal), lens, notes, misfit_px)
 
 
-# COLMAP's models that are not ours in OpenCV's terms: how many focal lengths come first, how many coefficients last, in
-# OpenCV's order, and whether these are of a fisheye lens.
-_OF_COLMAP = {
-    "FULL_OPENCV": (2, 8, False),
-    "FISHEYE": (2, 0, True), "SIMPLE_FISHEYE": (1, 0, True),
-    "RADIAL_FISHEYE": (1, 2, True), "SIMPLE_RADIAL_FISHEYE": (1, 1, True),
-}  # fmt: skip
-
-
 def camera_from_colmap(place: str, model: str, size: Size, params: Sequence[float] | Array) -> CalibratedCamera:
-    """A camera as COLMAP states it (parameters in its order, pixel centres at halves), as one of ours.
+    """A camera as COLMAP states it: parameters in its order, pixel centres at halves.
 
     Raises:
-        InputError: a model that no model of ours can stand for, or not its parameters.
+        InputError: no known model, or not its parameters.
     """
-    if model not in _OF_COLMAP:
-        camera = checked_camera(Path(place), 0, model, *size, params)
-        return CalibratedCamera(replace(camera, focal_sigma=SIGMA_CALIBRATED * camera.focal))
-    num_focals, num_coefficients, fisheye = _OF_COLMAP[model]
-    if len(params) != num_focals + 2 + num_coefficients:
-        expected = num_focals + 2 + num_coefficients
-        raise InputError(f"{place}: {model} has {expected} parameters, found {len(params)}")
-    fx, fy = params[0], params[num_focals - 1]
-    cx, cy = (value - 0.5 for value in params[num_focals : num_focals + 2])
-    return camera_from_opencv(place, size, [fx, fy, cx, cy], params[num_focals + 2 :], fisheye)
+    camera = checked_camera(Path(place), 0, model, *size, params)
+    return CalibratedCamera(replace(camera, focal_sigma=SIGMA_CALIBRATED * camera.focal))
 
 
 def _fitted(
@@ -216,7 +200,7 @@ def scaled_to(place: str, calibrated: CalibratedCamera, size: Size) -> Calibrate
             f"{camera.width}x{camera.height}",
             "calibrate the camera at the size of the images, or give --camera",
         )
-    is_length = [name[0] in "fc" for name in PARAM_NAMES[camera.model]]
+    is_length = [kind_of(name) != "distortion" or name == "s" for name in PARAM_NAMES[camera.model]]
     sigma = camera.focal_sigma and camera.focal_sigma * scale
     params = np.where(is_length, camera.params * scale, camera.params)
     note = f"{place}: calibrated at {camera.width}x{camera.height}, scaled to the images' {size[0]}x{size[1]}"

@@ -6,43 +6,17 @@ Models and the order of their parameters are COLMAP's. Inside kernels a camera i
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from enum import IntEnum
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfmapp.camera.lens import BROWN, FAMILY, RADIAL_FISHEYE, ROW, distort, undistort
+from sfmapp.camera import lens
+from sfmapp.camera.lens import FAMILY, ROW
+from sfmapp.camera.models import PARAM_NAMES, CameraModel, canonical_from_params, family_of, kind_of, plain_params
 
 Array = NDArray[np.float64]
-
-
-class CameraModel(IntEnum):
-    """COLMAP's camera models, with COLMAP's ids."""
-
-    SIMPLE_PINHOLE = 0
-    PINHOLE = 1
-    SIMPLE_RADIAL = 2
-    RADIAL = 3
-    OPENCV = 4
-    OPENCV_FISHEYE = 5
-
-
-PARAM_NAMES: dict[CameraModel, tuple[str, ...]] = {
-    CameraModel.SIMPLE_PINHOLE: ("f", "cx", "cy"),
-    CameraModel.PINHOLE: ("fx", "fy", "cx", "cy"),
-    CameraModel.SIMPLE_RADIAL: ("f", "cx", "cy", "k1"),
-    CameraModel.RADIAL: ("f", "cx", "cy", "k1", "k2"),
-    CameraModel.OPENCV: ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-    CameraModel.OPENCV_FISHEYE: ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
-}
-
-_CANONICAL_SLOT = {
-    "f": (0, 1), "fx": (0,), "fy": (1,), "cx": (2,), "cy": (3,),
-    "k1": (4,), "k2": (5,), "p1": (6,), "p2": (7,), "k3": (6,), "k4": (7,),
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -83,13 +57,8 @@ class Camera:
         """(17,) float64 ``fx, fy, cx, cy``, twelve of distortion and the family: the row that the kernels take."""
         row = np.zeros(ROW)
         row[:FAMILY] = canonical_from_params(self.model) @ self.params
-        row[FAMILY] = RADIAL_FISHEYE if self.is_fisheye else BROWN
+        row[FAMILY] = family_of(self.model)
         return row
-
-    @property
-    def is_fisheye(self) -> bool:
-        """Its coefficients are of the angle from the axis."""
-        return self.model == CameraModel.OPENCV_FISHEYE
 
     @property
     def k_matrix(self) -> Array:
@@ -102,56 +71,73 @@ class Camera:
         return replace(self, params=np.asarray(params, np.float64))
 
     def with_focal(self, focal: float) -> Camera:
-        """The same camera with another mean focal length in pixels; the aspect ratio stays."""
-        is_focal = np.array([name in ("f", "fx", "fy") for name in PARAM_NAMES[self.model]])
+        """The same camera with another mean focal length in pixels; the aspect ratio stays. A panorama has none."""
+        is_focal = np.array([kind_of(name) == "focal" for name in PARAM_NAMES[self.model]])
         return replace(self, params=np.where(is_focal, self.params * focal / self.focal, self.params))
 
+    def with_canonical(self, row: Array) -> Camera:
+        """The same camera with the parameters that its model has among those of a canonical row (17,)."""
+        first = canonical_from_params(self.model).argmax(axis=0)
+        return self.with_params(self.params if self.model == CameraModel.EQUIRECTANGULAR else row[first])
 
-def canonical_from_params(model: CameraModel) -> Array:
-    """(16, P) matrix of zeros and ones that spreads a model's parameters over the canonical sixteen."""
-    names = PARAM_NAMES[model]
-    matrix = np.zeros((FAMILY, len(names)))
-    for column, name in enumerate(names):
-        for row in _CANONICAL_SLOT[name]:
-            matrix[row, column] = 1.0
-    return matrix
+    @property
+    def family(self) -> int:
+        """Number of the family of lenses in :mod:`sfmapp.camera.lens`."""
+        return family_of(self.model)
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether pixels are those of a pinhole with square corners, whatever the model."""
+        is_perspective = self.family in (lens.BROWN, lens.RATIONAL, lens.DIVISION, lens.SKEW)
+        return is_perspective and not self.canonical[4:FAMILY].any()
 
 
 def simple_camera(
     model: CameraModel, width: int, height: int, focal: float, focal_sigma: float | None = None, source: str = "default"
 ) -> Camera:
     """A camera of any model with one focal length in pixels, a centred principal point and no distortion."""
-    values = {"f": focal, "fx": focal, "fy": focal, "cx": width / 2, "cy": height / 2}
-    params = np.array([values.get(name, 0.0) for name in PARAM_NAMES[model]])
-    return Camera(model, width, height, params, focal_sigma, source)
+    return Camera(model, width, height, plain_params(model, width, height, focal), focal_sigma, source)
 
 
 @numba.njit(cache=True, nogil=True)
 def _undistort_all(c: Array, xy: Array, out: Array) -> None:
     for i in range(xy.shape[0]):
-        out[i, 0], out[i, 1] = undistort(c, xy[i, 0], xy[i, 1])
+        out[i, 0], out[i, 1] = lens.undistort(c, xy[i, 0], xy[i, 1])
 
 
 @numba.njit(cache=True, nogil=True)
 def _project_all(c: Array, xyz: Array, out: Array) -> None:
     for i in range(xyz.shape[0]):
-        z = xyz[i, 2]
-        if z > 1e-12:
-            out[i, 0], out[i, 1] = distort(c, xyz[i, 0] / z, xyz[i, 1] / z)
-        else:
-            out[i, 0] = out[i, 1] = math.nan
+        out[i, 0], out[i, 1] = lens.project(c, xyz[i, 0], xyz[i, 1], xyz[i, 2])
+
+
+@numba.njit(cache=True, nogil=True)
+def _unproject_all(c: Array, xy: Array, out: Array) -> None:
+    for i in range(xy.shape[0]):
+        out[i, 0], out[i, 1], out[i, 2] = lens.unproject(c, xy[i, 0], xy[i, 1])
 
 
 def pixels_to_normalized(camera: Camera, xy: ArrayLike) -> Array:
-    """Normalised image points (N, 2) float64, ``(X/Z, Y/Z)``, of pixels (N, 2); NaN where the lens has no inverse."""
+    """Normalised image points (N, 2) float64, ``(X/Z, Y/Z)``, of pixels (N, 2).
+
+    NaN where the lens has no inverse, and more than 88 degrees off its axis: :func:`pixels_to_rays` has no such limit.
+    """
     xy = np.ascontiguousarray(xy, np.float64)
     out = np.empty_like(xy)
     _undistort_all(camera.canonical, xy, out)
     return out
 
 
+def pixels_to_rays(camera: Camera, xy: ArrayLike) -> Array:
+    """Unit rays (N, 3) float64 in the camera's frame of pixels (N, 2); NaN where the lens has no inverse."""
+    xy = np.ascontiguousarray(xy, np.float64)
+    out = np.empty((len(xy), 3))
+    _unproject_all(camera.canonical, xy, out)
+    return out
+
+
 def project(camera: Camera, xyz_cam: ArrayLike) -> Array:
-    """Pixels (N, 2) float64 of points (N, 3) in the camera's frame; NaN behind the camera."""
+    """Pixels (N, 2) float64 of points (N, 3) in the camera's frame; NaN where the lens does not look."""
     xyz = np.ascontiguousarray(xyz_cam, np.float64)
     out = np.empty((len(xyz), 2))
     _project_all(camera.canonical, xyz, out)

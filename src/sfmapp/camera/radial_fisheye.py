@@ -4,7 +4,8 @@ Distortion ``c[4:8]``: k1 to k4. A ray at the angle theta from the axis is image
 
     theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
 
-which is also that of a point of the normalised plane at the radius tan(theta).
+which is also that of a point of the normalised plane at the radius tan(theta). Up to a right angle from the axis there
+are kernels on that plane, for narrow lenses the faster way; those on rays have no such limit.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import math
 import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from sfmapp.camera import equidistant
 
 Array = NDArray[np.float64]
 
@@ -86,3 +89,43 @@ def undistort(c: Array, xd: float, yd: float) -> tuple[float, float]:
         return math.nan, math.nan
     scale = math.tan(theta) / rd
     return xd * scale, yd * scale
+
+
+@numba.njit(cache=True, nogil=True)
+def project(c: Array, x: float, y: float, z: float) -> tuple[float, float]:
+    """Image (x', y') of a ray; NaN straight behind."""
+    a, b = equidistant.project(x, y, z)
+    t2 = a * a + b * b
+    s = 1.0 + t2 * (c[4] + t2 * (c[5] + t2 * (c[6] + t2 * c[7])))
+    return s * a, s * b
+
+
+@numba.njit(cache=True, nogil=True)
+def ray_jacobian(c: Array, x: float, y: float, z: float, J: Array) -> None:
+    """Fill the row J, see :mod:`sfmapp.camera.lens`."""
+    a, b = equidistant.project(x, y, z)
+    axx, axy, ayy, axz, ayz, _ = equidistant.jacobian(x, y, z)
+    t2 = a * a + b * b
+    s = 1.0 + t2 * (c[4] + t2 * (c[5] + t2 * (c[6] + t2 * c[7])))
+    slope = 2.0 * (c[4] + t2 * (2.0 * c[5] + t2 * (3.0 * c[6] + t2 * 4.0 * c[7])))
+    xx, xy, yy = s + a * a * slope, a * b * slope, s + b * b * slope
+    J[0], J[1] = s * a, s * b
+    J[2], J[3], J[4] = xx * axx + xy * axy, xx * axy + xy * ayy, xx * axz + xy * ayz
+    J[5], J[6], J[7] = xy * axx + yy * axy, xy * axy + yy * ayy, xy * axz + yy * ayz
+    power = 1.0
+    for k in range(4):
+        power *= t2
+        J[8 + 2 * k], J[9 + 2 * k] = power * a, power * b
+
+
+@numba.njit(cache=True, nogil=True)
+def unproject(c: Array, xd: float, yd: float) -> tuple[float, float, float]:
+    """Unit ray of an image point; NaN where the polynomial has no inverse."""
+    rd = math.sqrt(xd * xd + yd * yd)
+    if rd < 1e-8:
+        return xd, yd, 1.0
+    theta = angle_of(c, rd, min(rd, 1.5))
+    if not theta < math.pi:
+        return math.nan, math.nan, math.nan
+    scale = math.sin(theta) / rd
+    return xd * scale, yd * scale, math.cos(theta)

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sfmapp.camera.names import MODEL_NAMES
 from sfmapp.cli.common import (
     add_output_flags,
     limit_library_threads,
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from sfmapp.report.model import ReconstructionReport
     from sfmapp.workspace.options import Options
 
-CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 
 EXAMPLES = """\
 examples:
@@ -84,7 +84,7 @@ def _add_option_flags(parser: argparse.ArgumentParser) -> None:
         help="what is known of the camera: a calibration of COLMAP, OpenCV, Kalibr, ROS, ... (several are told apart "
         "by the names of images, or of folders such as cam0), or numbers such as PINHOLE,fx,fy,cx,cy",
     )  # fmt: skip
-    cameras.add_argument("--camera-model", metavar="MODEL", help=", ".join(CAMERA_MODELS))
+    cameras.add_argument("--camera-model", metavar="MODEL", help=", ".join(MODEL_NAMES))
     group.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black pixels are ignored")
     group.add_argument("--min-registered", metavar="N", help="exit with code 5 if fewer images are registered")
     group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, the replay of the run")

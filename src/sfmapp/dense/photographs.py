@@ -122,7 +122,7 @@ def _as_held(record: ImageRecord, camera: Camera, is_upright: bool) -> tuple[Ima
 def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
     """The same camera for an image of another size, in pixels."""
     x, y = width / camera.width, height / camera.height
-    factor = {"f": (x + y) / 2.0, "fx": x, "cx": x, "fy": y, "cy": y}
+    factor = {"f": (x + y) / 2.0, "fx": x, "cx": x, "fy": y, "cy": y, "w": x, "h": y, "s": x}
     params = [v * factor.get(name, 1.0) for name, v in zip(PARAM_NAMES[camera.model], camera.params, strict=True)]
     return replace(camera, width=width, height=height, params=np.array(params))
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.camera.lens import distort
+from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.scene.undistortion import has_distortion
 
 Array = NDArray[np.float64]
@@ -159,12 +160,12 @@ def resample(
 def _reach(camera: Camera) -> float:
     """Radius in the normalised plane up to which the lens is one to one: beyond, its polynomial folds back."""
     radius = np.tan(np.linspace(0.0, 1.53, 4000))
-    row = camera.canonical.copy()
+    # the tangential terms, skew and prism are no reason to fold
+    is_radial = [name[0] not in "ps" for name in PARAM_NAMES[camera.model]]
+    row = camera.with_params(np.where(is_radial, camera.params, 0.0)).canonical
     row[:4] = 1.0, 1.0, 0.0, 0.0
-    if not camera.is_fisheye:
-        row[6:8] = 0.0  # the tangential terms are no reason to fold
     image = np.array([distort(row, r, 0.0)[0] for r in radius])
-    folds = np.flatnonzero(np.diff(image) <= 0.0)
+    folds = np.flatnonzero(~(np.diff(image) > 0.0))
     return float(radius[folds[0]]) if len(folds) else math.inf
 
 

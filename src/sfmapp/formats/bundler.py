@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, CameraModel
+from sfmapp.camera.lens import BROWN
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.text_input import nearest_rotation, plain_numbers, read_limited_text
@@ -64,8 +65,8 @@ def list_path(path: Path) -> Path:
 def _refuse_loss(camera: Camera, idx: int) -> None:
     fx, fy, _, _, _, _, p1, p2 = camera.canonical[:8]
     lost = []
-    if camera.is_fisheye:
-        lost.append("fisheye projection")
+    if camera.family != BROWN and not camera.is_pinhole:
+        lost.append(f"{camera.model.name.replace('_', ' ').lower()} lens")
     elif p1 or p2:
         lost.append(f"tangential distortion p1 = {p1:.3g}, p2 = {p2:.3g}")
     if fx != fy:

@@ -89,7 +89,7 @@ def read_model_poses(folder: str | Path) -> tuple[list[str], NDArray[np.float64]
     order = np.argsort(images.ids)
     names, poses = [images.names[i] for i in order], images.cam_from_world[order]
     try:
-        ids, cameras, _ = (read_binary_cameras if is_binary else read_text_cameras)(folder, images)
+        ids, cameras = (read_binary_cameras if is_binary else read_text_cameras)(folder)
         camera_of = dict(zip(ids.tolist(), cameras, strict=True))
         return names, poses, [camera_of[i] for i in images.camera_ids[order].tolist()]
     except (InputError, KeyError):
@@ -101,7 +101,7 @@ def read_model(folder: str | Path, events: Events | None = None) -> tuple[Recons
 
     Images, cameras and points stand in ascending order of their ids; every track element is an inlier. Images of rigs
     with several cameras are on the reconstruction's ``rig``. Where points or images were taken away, ids that still
-    name them count as none; cameras that no image uses may be of any model; a model without a file of points has none.
+    name them count as none; a model without a file of points has none.
 
     Args:
         folder: of the model.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_model import (
-    FOREIGN_NUM_PARAMS,
-    MODEL_NAMES,
     NO_POINTS_NOTE,
     NO_RIGS_NOTE,
     ColmapModel,
@@ -21,7 +19,6 @@ from sfmapp.formats.colmap_model import (
     PosedImages,
     checked_camera,
     checked_poses,
-    unused_cameras_note,
 )
 from sfmapp.formats.colmap_rigs import Frame, Rig, add_rig, add_sensor, poses_from_frames
 from sfmapp.geometry import rigid3
@@ -55,18 +52,16 @@ def read_binary_images(folder: Path) -> PosedImages:
     return PosedImages(ids, camera_ids, names, poses, xy, point_ids, rigs, frames, notes)
 
 
-def read_binary_cameras(
-    folder: Path, images: PosedImages | None
-) -> tuple[NDArray[np.int64], list[Camera], tuple[str, ...]]:
-    """Ids, cameras, and a note of those that are left out: of a model that is not ours, and that no image uses."""
-    return _read_cameras(_Reader(folder / "cameras.bin"), set(images.camera_ids.tolist()) if images else ())
+def read_binary_cameras(folder: Path) -> tuple[NDArray[np.int64], list[Camera]]:
+    """Ids and cameras."""
+    return _read_cameras(_Reader(folder / "cameras.bin"))
 
 
 def read_binary(folder: Path) -> ColmapModel:
     """Read a binary model, with rigs and frames or without. Raises InputError for anything malformed."""
     images = read_binary_images(folder)
-    camera_ids, cameras, notes = read_binary_cameras(folder, images)
-    notes = (*images.notes, *notes)
+    camera_ids, cameras = read_binary_cameras(folder)
+    notes = images.notes
     if (folder / "points3D.bin").exists():
         points, track_ptr, track = _read_points(_Reader(folder / "points3D.bin"))
     else:
@@ -213,24 +208,17 @@ class _Reader:
             raise InputError(f"{self.path}: expected the end after {self.pos} bytes, found {len(self.data)} bytes")
 
 
-def _read_cameras(
-    reader: _Reader, used_ids: Collection[int]
-) -> tuple[NDArray[np.int64], list[Camera], tuple[str, ...]]:
-    """Ids, cameras, and a note of those that are left out: of a model that is not ours, and not used."""
-    ids, cameras, left_out = [], [], []
-    for _ in range(reader.count("cameras", 24 + min(FOREIGN_NUM_PARAMS.values()) * 8)):
+def _read_cameras(reader: _Reader) -> tuple[NDArray[np.int64], list[Camera]]:
+    """Ids and cameras."""
+    ids, cameras = [], []
+    for _ in range(reader.count("cameras", 24 + min(map(len, PARAM_NAMES.values())) * 8)):
         camera_id, model, width, height = reader.unpack("<IiQQ", "a camera")
-        what = f"the parameters of camera {camera_id}"
-        if model in FOREIGN_NUM_PARAMS and camera_id not in used_ids:
-            reader.array(np.dtype("<f8"), FOREIGN_NUM_PARAMS[model], what)
-            left_out.append(f"{camera_id} ({MODEL_NAMES[model]})")
-            continue
         num_params = len(PARAM_NAMES[CameraModel(model)]) if model in CameraModel._value2member_map_ else 0
-        params = reader.array(np.dtype("<f8"), num_params, what)
+        params = reader.array(np.dtype("<f8"), num_params, f"the parameters of camera {camera_id}")
         ids.append(camera_id)
         cameras.append(checked_camera(reader.path, camera_id, model, width, height, params))
     reader.finish()
-    return np.array(ids, np.int64), cameras, unused_cameras_note(left_out)
+    return np.array(ids, np.int64), cameras
 
 
 def _read_images(

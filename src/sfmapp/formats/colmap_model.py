@@ -10,22 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES, CameraModel, kind_of
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.colmap_rigs import Frame, Rig, mount_images, rig_images
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
 
 Keypoints = list[NDArray[np.float64]]
-
-MODEL_NAMES = {model.value: model.name for model in CameraModel} | {
-    6: "FULL_OPENCV", 7: "FOV", 8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE", 10: "THIN_PRISM_FISHEYE",
-    11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION", 14: "SIMPLE_FISHEYE", 15: "FISHEYE",
-    16: "EUCM", 17: "EQUIRECTANGULAR",
-}  # fmt: skip
-"""Names of COLMAP 4.2's camera models by id, ours and others: the others are refused by name."""
-FOREIGN_NUM_PARAMS = {6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16, 12: 4, 13: 5, 14: 3, 15: 4, 16: 6, 17: 2}
-"""How many parameters the others have, by id: what it takes to read on behind one that no image uses."""
 
 _LARGEST_SIDE_PX = 1_000_000  # a photograph is smaller; a corrupt file says 10^18
 _LARGEST_PARAMETER = 1e9  # so are focal lengths and coefficients; a corrupt file says 10^300
@@ -80,13 +72,6 @@ class PosedImages:
     notes: tuple[str, ...]
 
 
-def unused_cameras_note(left_out: list[str]) -> tuple[str, ...]:
-    """What is said of cameras ("7 (FOV)") that no image uses and whose models are not ours."""
-    if not left_out:
-        return ()
-    return (f"cameras of other models that no image uses are left out: {', '.join(left_out[:5])}",)
-
-
 NO_POINTS_NOTE = "there is no file of points: the model is read without any"
 NO_RIGS_NOTE = "there is a file of frames but none of rigs: the poses are those of the images file"
 
@@ -105,7 +90,7 @@ def checked_camera(
     try:
         known = CameraModel[model] if isinstance(model, str) else CameraModel(model)
     except (KeyError, ValueError):
-        name = model if isinstance(model, str) else MODEL_NAMES.get(model, f"with id {model}")
+        name = model if isinstance(model, str) else f"with id {model}"
         supported = ", ".join(known.name for known in CameraModel)
         raise InputError(
             f"{place}: camera model {name} is not supported, expected one of {supported}",
@@ -119,7 +104,7 @@ def checked_camera(
         raise InputError(f"{place}: {known.name} has {len(names)} parameters, found {len(values)}")
     if (
         not (np.abs(values) < _LARGEST_PARAMETER).all()
-        or not (values[[name.startswith("f") for name in names]] > 0).all()
+        or not (values[[kind_of(name) in ("focal", "size") for name in names]] > 0).all()
     ):
         raise InputError(f"{place}: expected finite parameters and positive focal lengths, found {values.tolist()}")
     return Camera(known, int(width), int(height), values, focal_source="file")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import Camera, CameraModel
+from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_binary import poses_wxyz
 from sfmapp.formats.colmap_model import (
@@ -20,7 +20,6 @@ from sfmapp.formats.colmap_model import (
     checked_camera,
     checked_names,
     checked_poses,
-    unused_cameras_note,
 )
 from sfmapp.formats.colmap_rigs import Frame, Rig, add_rig, add_sensor, poses_from_frames
 from sfmapp.formats.text_input import plain_numbers, read_limited_text
@@ -92,16 +91,16 @@ def read_text_images(folder: Path) -> PosedImages:
     return PosedImages(ids, camera_ids, names, poses, xy, point_ids, rigs, frames, notes)
 
 
-def read_text_cameras(folder: Path, images: PosedImages) -> tuple[NDArray[np.int64], list[Camera], tuple[str, ...]]:
-    """Ids, cameras, and a note of those that are left out: of a model that is not ours, and that no image uses."""
-    return _read_cameras(folder / "cameras.txt", set(images.camera_ids.tolist()))
+def read_text_cameras(folder: Path) -> tuple[NDArray[np.int64], list[Camera]]:
+    """Ids and cameras."""
+    return _read_cameras(folder / "cameras.txt")
 
 
 def read_text(folder: Path) -> ColmapModel:
     """Read a text model, with rigs and frames or without. Raises InputError for anything malformed."""
     images = read_text_images(folder)
-    camera_ids, cameras, notes = read_text_cameras(folder, images)
-    notes = (*images.notes, *notes)
+    camera_ids, cameras = read_text_cameras(folder)
+    notes = images.notes
     table, tracks = np.zeros((0, 8)), list[NDArray[np.int64]]()
     if (folder / "points3D.txt").exists():
         table, tracks = _read_points(folder / "points3D.txt")
@@ -168,19 +167,16 @@ def _no_more(place: str, fields: list[str], what: str) -> None:
         raise InputError(f"{place}: expected the end of the line after {what}, found {' '.join(fields)[:80]!r}")
 
 
-def _read_cameras(path: Path, used_ids: Collection[int]) -> tuple[NDArray[np.int64], list[Camera], tuple[str, ...]]:
-    """Ids, cameras, and a note of those that are left out: of a model that is not ours, and not used."""
-    ids, cameras, left_out = [], [], []
+def _read_cameras(path: Path) -> tuple[NDArray[np.int64], list[Camera]]:
+    """Ids and cameras."""
+    ids, cameras = [], []
     for place, fields in _records(path):
         _need(place, fields, 5, "a camera")
-        if fields[1] not in CameraModel.__members__ and _ints(place, fields[:1], "a camera")[0] not in used_ids:
-            left_out.append(f"{fields[0]} ({fields[1][:40]})")
-            continue
         camera_id, width, height = _ints(place, [fields[0], *fields[2:4]], "a camera")
         params = _floats(place, fields[4:], "the parameters of a camera")
         ids.append(camera_id)
         cameras.append(checked_camera(path, camera_id, fields[1], width, height, params))
-    return np.array(ids, np.int64), cameras, unused_cameras_note(left_out)
+    return np.array(ids, np.int64), cameras
 
 
 def _read_images(

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, CameraModel
-from sfmapp.errors import InputError
+from sfmapp.camera.lens import BROWN, EQUIRECTANGULAR, RADIAL_FISHEYE
+from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.colmap_model import checked_camera
 from sfmapp.formats.ply import write_ply
@@ -29,8 +30,14 @@ from sfmapp.scene.tracks import make_tracks
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 _APPLIED = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # (x, y, z) to (x, z, -y)
-_DISTORTION = {CameraModel.OPENCV: ("k1", "k2", "p1", "p2"), CameraModel.OPENCV_FISHEYE: ("k1", "k2", "k3", "k4")}
+_DISTORTION = {
+    CameraModel.OPENCV: ("k1", "k2", "p1", "p2"), CameraModel.OPENCV_FISHEYE: ("k1", "k2", "k3", "k4"),
+    CameraModel.EQUIRECTANGULAR: (),
+}  # fmt: skip
 _ALIASES = {"PINHOLE": "OPENCV", "SIMPLE_PINHOLE": "OPENCV", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
+_OF_FAMILY = {
+    BROWN: CameraModel.OPENCV, RADIAL_FISHEYE: CameraModel.OPENCV_FISHEYE, EQUIRECTANGULAR: CameraModel.EQUIRECTANGULAR,
+}  # fmt: skip
 POINTS_NAME = "sparse_pc.ply"
 
 
@@ -39,8 +46,11 @@ def write_nerfstudio(path: str | Path, reconstruction: Reconstruction, image_fol
 
     Args:
         path: the JSON file.
-        reconstruction: every camera model can be held; only registered images are written.
+        reconstruction: only registered images are written.
         image_folder: where the images lie, seen from the JSON file.
+
+    Raises:
+        UsageError: a camera is neither perspective with k1, k2, p1, p2, nor fisheye with k1..k4, nor a panorama.
     """
     path = Path(path)
     registered = reconstruction.registered_idx
@@ -67,10 +77,15 @@ def write_nerfstudio(path: str | Path, reconstruction: Reconstruction, image_fol
 
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:
-    model = CameraModel.OPENCV_FISHEYE if camera.is_fisheye else CameraModel.OPENCV
+    model = _OF_FAMILY.get(BROWN if camera.is_pinhole else camera.family)
+    if model is None:
+        raise UsageError(
+            f"nerfstudio's transforms.json cannot hold a {camera.model.name} camera",
+            "write undistorted photographs with sfmapp undistort and export those, or export colmap-bin",
+        )
     fx, fy, cx, cy, *distortion = camera.canonical[:8].tolist()
     size = {"camera_model": model.name, "w": camera.width, "h": camera.height}
-    return size | {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy} | dict(zip(_DISTORTION[model], distortion, strict=True))
+    return size | {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy} | dict(zip(_DISTORTION[model], distortion, strict=False))
 
 
 def read_nerfstudio(path: str | Path) -> Reconstruction:
@@ -198,8 +213,9 @@ def _camera(path: Path, place: str, entries: Mapping[str, Any]) -> Camera:
     # instant-ngp has a flag in place of a name
     name = entries.get("camera_model", "OPENCV_FISHEYE" if entries.get("is_fisheye") is True else "OPENCV")
     name = _ALIASES.get(name, name) if isinstance(name, str) else str(name)
-    if name not in ("OPENCV", "OPENCV_FISHEYE"):
-        raise InputError(f"{place}: expected camera_model OPENCV or OPENCV_FISHEYE, found {name[:40]!r}")
+    if name not in (model.name for model in _DISTORTION):
+        expected = "OPENCV, OPENCV_FISHEYE or EQUIRECTANGULAR"
+        raise InputError(f"{place}: expected camera_model {expected}, found {name[:40]!r}")
 
     def number(key: str, default: float | None = None) -> float:
         if key not in entries and default is not None:
@@ -211,6 +227,8 @@ def _camera(path: Path, place: str, entries: Mapping[str, Any]) -> Camera:
     width, height = number("w"), number("h")
     if width % 1 or height % 1:
         raise InputError(f"{place}: expected a whole number of pixels, found {width} x {height}")
+    if name == CameraModel.EQUIRECTANGULAR.name:
+        return checked_camera(path, entries.get("file_path", ""), name, int(width), int(height), [width, height])
     if "fl_x" not in entries and "camera_angle_x" in entries:  # the form of the synthetic NeRF scenes
         angle = number("camera_angle_x")
         if not 0 < angle < math.pi:

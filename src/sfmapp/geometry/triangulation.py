@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.lens import distort, undistort
+from sfmapp.camera.lens import across_seam, project, undistort, unproject
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -46,14 +46,14 @@ def _midpoint(c1: Array, d1: Array, c2: Array, d2: Array, out: Array) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _squared_error(xyz: Array, rotation: Array, translation: Array, c: Array, u: float, v: float) -> float:
-    """Squared reprojection error in pixels; infinite behind the camera."""
+    """Squared reprojection error in pixels; infinite where the lens does not look."""
     z = rotation[2, 0] * xyz[0] + rotation[2, 1] * xyz[1] + rotation[2, 2] * xyz[2] + translation[2]
-    if not z > 1e-12:
-        return math.inf
     x = rotation[0, 0] * xyz[0] + rotation[0, 1] * xyz[1] + rotation[0, 2] * xyz[2] + translation[0]
     y = rotation[1, 0] * xyz[0] + rotation[1, 1] * xyz[1] + rotation[1, 2] * xyz[2] + translation[1]
-    pu, pv = distort(c, x / z, y / z)
-    du, dv = pu - u, pv - v
+    pu, pv = project(c, x, y, z)
+    if math.isnan(pu):
+        return math.inf
+    du, dv = across_seam(c, pu - u), pv - v
     return du * du + dv * dv
 
 
@@ -149,12 +149,17 @@ def _gather_rays(
             continue
         cam = image_camera_idx[i]
         x, y = undistort(canonical[cam], obs_xy[o, 0], obs_xy[o, 1])
-        if math.isnan(x):
-            continue
-        norm = 1.0 / math.sqrt(x * x + y * y + 1.0)
         r = rotation[i]
-        for a in range(3):
-            rays[k, a] = (r[0, a] * x + r[1, a] * y + r[2, a]) * norm
+        if math.isnan(x):  # too far off the axis for the plane
+            x, y, z = unproject(canonical[cam], obs_xy[o, 0], obs_xy[o, 1])
+            if math.isnan(x):
+                continue
+            for a in range(3):
+                rays[k, a] = r[0, a] * x + r[1, a] * y + r[2, a] * z
+        else:
+            norm = 1.0 / math.sqrt(x * x + y * y + 1.0)
+            for a in range(3):
+                rays[k, a] = (r[0, a] * x + r[1, a] * y + r[2, a]) * norm
         _center(r, translation[i], centers[k])
         obs[k] = o
         k += 1

@@ -11,7 +11,7 @@ from pathlib import PurePosixPath
 from statistics import median, pstdev
 
 from sfmapp.calibration.photographs import GivenCamera, Photograph, read_given_cameras
-from sfmapp.camera.camera import Camera, simple_camera
+from sfmapp.camera.camera import Camera, CameraModel, simple_camera
 from sfmapp.errors import UsageError
 from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.images.exif import ExifFacts, FocalPrior, focal_prior
@@ -138,6 +138,8 @@ def _camera(
         prior = _common_prior(priors)
         camera = simple_camera(model, width, height, prior.focal_px, prior.sigma_px, prior.source)
         reason = prior.reason
+    if model == CameraModel.EQUIRECTANGULAR:  # its size says all
+        return replace(camera, focal_source="user", focal_sigma=None, is_fixed=True), "the size of a panorama"
     return replace(camera, is_fixed=options.fix_intrinsics), reason
 
 

@@ -88,7 +88,7 @@ class ImageOptions:
         if self.focal_px is not None:
             raise UsageError("camera_params and focal_px both give a focal length", "leave one of them out")
         focals = [value for name, value in zip(names, params, strict=True) if name in ("f", "fx", "fy")]
-        if not all(abs(value) < float("inf") for value in params) or min(focals) <= 0.0:
+        if not all(abs(value) < float("inf") for value in params) or min(focals, default=1.0) <= 0.0:
             raise UsageError("camera_params must be finite numbers, focal lengths positive")
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import PARAM_NAMES, Camera, simple_camera
+from sfmapp.camera.models import kind_of
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
@@ -286,7 +287,7 @@ def _given_intrinsics(
 def _values(camera: Camera) -> str:
     """The parameters of a camera in words, pixels to a tenth."""
     return ", ".join(
-        f"{name} {value:.4g}" if name[0] in "kp" else f"{name} {value:.1f}"
+        f"{name} {value:.4g}" if kind_of(name) == "distortion" else f"{name} {value:.1f}"
         for name, value in zip(PARAM_NAMES[camera.model], camera.params, strict=True)
     )
 

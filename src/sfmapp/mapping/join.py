@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import pixels_to_normalized
-from sfmapp.camera.lens import distort
+from sfmapp.camera.lens import across_seam, project
 from sfmapp.geometry import resection, rigid3, similarity
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.mapping.merge import merge, num_linking_points
@@ -464,12 +464,10 @@ def _residual(  # type: ignore[no-untyped-def]
         y = r[0, 1] * d0 + r[1, 1] * d1 + r[2, 1] * d2
         z = r[0, 2] * d0 + r[1, 2] * d1 + r[2, 2] * d2
     depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
-    if not depth > 1e-12:
-        return math.nan, math.nan
-    u = (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]) / depth
-    v = (rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]) / depth
-    u, v = distort(canonical, u, v)
-    return u - xy[0], v - xy[1]
+    right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
+    down = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
+    u, v = project(canonical, right, down, depth)
+    return across_seam(canonical, u - xy[0]), v - xy[1]
 
 
 @numba.njit(cache=True, nogil=True)

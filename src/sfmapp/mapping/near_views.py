@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.lens import distort
+from sfmapp.camera.lens import EQUIRECTANGULAR, FAMILY, project
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3
 from sfmapp.mapping.report import NearPair
@@ -154,11 +154,11 @@ def _count_in_view(  # type: ignore[no-untyped-def]
                 r, s = rotation[j], translation[j]
                 depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + s[2]
                 # beyond 80 degrees a lens model that is good in the picture may fold back into it
-                if not depth > 0.17 * b:
+                if not depth > 0.17 * b and canonical[c, FAMILY] != EQUIRECTANGULAR:
                     continue
-                u = (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + s[0]) / depth
-                v = (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + s[1]) / depth
-                u, v = distort(canonical[c], u, v)
+                right = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + s[0]
+                down = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + s[1]
+                u, v = project(canonical[c], right, down, depth)
                 if 0 <= u < sizes[c, 0] and 0 <= v < sizes[c, 1]:
                     counts[p, side] += 1
                     if side == 1 and mark[t] == p:

@@ -159,6 +159,12 @@ def _export_colmap(
 
         if source.folder is not None and path.exists() and path.resolve() == source.folder.resolve():
             raise UsageError(f"{path} is the model itself", "choose another folder to export to")
+        for camera in source.model.cameras:
+            if not camera.model.is_colmaps:
+                raise UsageError(
+                    f"COLMAP has no {camera.model.name} cameras",
+                    "write undistorted photographs with a PINHOLE model beside them: sfmapp undistort",
+                )
         write(path, source.model, source.keypoints)
         ours = read_model(path)[0]
         copy = read_with_pycolmap(path)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera
-from sfmapp.camera.lens import ROW, distort
+from sfmapp.camera.lens import ROW, across_seam, project
 from sfmapp.geometry import rigid3
 from sfmapp.reporting import Report
 from sfmapp.scene.rig import RigImages
@@ -191,12 +191,9 @@ def reprojection_residuals(
         p = obs_track_idx[o]
         x0, x1, x2 = point_xyz[p, 0], point_xyz[p, 1], point_xyz[p, 2]
         z = rotation[i, 2, 0] * x0 + rotation[i, 2, 1] * x1 + rotation[i, 2, 2] * x2 + translation[i, 2]
-        if not z > 1e-12:
-            out[o, 0] = out[o, 1] = np.nan
-            continue
         x = rotation[i, 0, 0] * x0 + rotation[i, 0, 1] * x1 + rotation[i, 0, 2] * x2 + translation[i, 0]
         y = rotation[i, 1, 0] * x0 + rotation[i, 1, 1] * x1 + rotation[i, 1, 2] * x2 + translation[i, 1]
         k = image_camera_idx[i]
-        u, v = distort(canonical[k], x / z, y / z)
-        out[o, 0] = u - obs_xy[o, 0]
+        u, v = project(canonical[k], x, y, z)
+        out[o, 0] = across_seam(canonical[k], u - obs_xy[o, 0])
         out[o, 1] = v - obs_xy[o, 1]

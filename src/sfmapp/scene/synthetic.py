@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, pixels_to_normalized, project, simple_camera
+from sfmapp.camera.models import kind_of
 from sfmapp.geometry import rigid3
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.reconstruction import Reconstruction
@@ -23,7 +24,11 @@ from sfmapp.scene.tracks import make_tracks
 Array = NDArray[np.float64]
 Layout = Literal["ring", "grid", "forward"]
 
-_DISTORTION = {"k1": -0.08, "k2": 0.02, "p1": 5e-4, "p2": -4e-4, "k3": -0.004, "k4": 0.001}
+_DISTORTION = {
+    "k1": -0.08, "k2": 0.02, "p1": 5e-4, "p2": -4e-4, "k3": -0.004, "k4": 0.001, "k5": 5e-4, "k6": 2e-4, "k0": -0.03,
+    "p0": 3e-4, "s0": 2e-4, "s1": -3e-4, "s2": 2e-4, "s3": 1e-4, "s4": -2e-4, "sx1": 4e-4, "sy1": -3e-4, "k": -0.07,
+    "omega": 0.6, "alpha": 0.55, "beta": 0.05, "s": 2.5,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -176,7 +181,7 @@ def perturb(
     out.move_images(registered, poses[pose_of_image])
     out.point_xyz += point_fraction * size * rng.normal(size=out.point_xyz.shape)
     for c, camera in enumerate(out.cameras):
-        is_focal = np.array([name.startswith("f") for name in PARAM_NAMES[camera.model]])
+        is_focal = np.array([kind_of(name) == "focal" for name in PARAM_NAMES[camera.model]])
         factor = 1.0 + focal_fraction * rng.normal()
         out.cameras[c] = camera.with_params(np.where(is_focal, camera.params * factor, camera.params))
     return out

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from sfmapp.camera.camera import PARAM_NAMES, Camera
-from sfmapp.geometry.orientation import INVERSE, is_sideways, upright_size, upright_vectors, upright_xy
+from sfmapp.errors import UsageError
+from sfmapp.geometry.orientation import INVERSE, MIRRORED, is_sideways, upright_size, upright_vectors, upright_xy
 
 # shares of the picture's sides within which a principal point is in the middle, and beyond which it is nowhere near;
 # 4:3 taken for 3:4 puts it off by an eighth
@@ -15,15 +16,33 @@ _NEAR_CENTER, _FAR_OFF_CENTER = 0.04, 0.08
 
 
 def turned_camera(camera: Camera, orientation: int) -> Camera:
-    """The camera of the same pictures turned, and mirrored, as an EXIF orientation says; exact for every model."""
+    """The camera of the same pictures turned, and mirrored, as an EXIF orientation says; exact for every model.
+
+    Raises:
+        UsageError: a panorama or a skewed pinhole on its side.
+    """
     values = dict(zip(PARAM_NAMES[camera.model], camera.params.tolist(), strict=True))
+    width, height = upright_size(orientation, camera.width, camera.height)
+    if is_sideways(orientation) and ("w" in values or "s" in values):
+        raise UsageError(
+            f"pictures of a {camera.model.name} camera cannot be turned on their side as EXIF's orientation "
+            f"{orientation} says",
+            "turn the photographs themselves, or take the tag out",
+        )
+    if "w" in values:
+        return replace(camera, width=width, height=height)
     center = upright_xy(orientation, [values["cx"], values["cy"]], camera.width, camera.height)
     values["cx"], values["cy"] = center.tolist()
     if is_sideways(orientation) and "fx" in values:
         values["fx"], values["fy"] = values["fy"], values["fx"]
-    if "p1" in values:  # decentring moves x by 2 (v . x) x + r^2 v, v = (p2, p1)
-        values["p2"], values["p1"] = upright_vectors(orientation, [values["p2"], values["p1"]]).tolist()
-    width, height = upright_size(orientation, camera.width, camera.height)
+    # decentring moves x by 2 (v . x) x + r^2 v, v = (p2, p1), of one model (p0, p1); prisms move it along themselves
+    decentring = ("p0", "p1") if "p0" in values else ("p2", "p1")
+    prisms = (("s0", "s2"), ("s1", "s3")) if "s0" in values else (("s1", "s3"), ("s2", "s4"))
+    for x, y in (decentring, *prisms, ("sx1", "sy1")):
+        if x in values:
+            values[x], values[y] = upright_vectors(orientation, [values[x], values[y]]).tolist()
+    if "s" in values and orientation in MIRRORED:  # one of the axes goes the other way
+        values["s"] = -values["s"]
     return replace(camera, width=width, height=height, params=np.array(list(values.values())))
 
 

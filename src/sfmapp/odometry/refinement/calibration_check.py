@@ -24,7 +24,9 @@ from sfmapp.adjust.calibration import RAW, CalibrationSystem, reduce_to_calibrat
 from sfmapp.adjust.covariance import similarity_basis
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.solver import adjust_bundle
-from sfmapp.camera.camera import CameraModel
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.lens import BROWN, FAMILY, RADIAL_FISHEYE
+from sfmapp.camera.models import PARAM_NAMES, CameraModel, canonical_from_params, kind_of
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.geometry.triangulation import triangulate_tracks
@@ -118,7 +120,8 @@ class Unknowns:
             rows.append(("focal_difference", _FOCAL_DIFFERENCE_SIGMA, True))
         for c, camera in enumerate(model.cameras):
             rows.append((f"aspect_{c}", _ASPECT_SIGMA, False))
-            kinds = [_RADIAL_SIGMA] * 4 if camera.is_fisheye else [_RADIAL_SIGMA] * 2 + [_TANGENTIAL_SIGMA] * 2
+            bends = [name for name in PARAM_NAMES[_fullest(camera).model] if kind_of(name) == "distortion"]
+            kinds = [_TANGENTIAL_SIGMA if name[0] in "ps" else _RADIAL_SIGMA for name in bends]
             rows += [(f"distortion_{c}_{k}", sigma, True) for k, sigma in enumerate(kinds)]
         if len(model.cameras) > 1:
             rows += [(f"turn_{axis}", math.radians(_TURN_SIGMA_DEG), True) for axis in "xyz"]
@@ -126,17 +129,18 @@ class Unknowns:
         return Unknowns(list(names), np.array(sigmas), np.array(is_open, bool))
 
     def directions(self, model: Reconstruction) -> Array:
-        """(C, 11, Q) how each unknown changes the canonical intrinsics and the turn of each camera."""
+        """(C, 19, Q) how each unknown changes the canonical intrinsics and the turn of each camera."""
         out, column = np.zeros((len(model.cameras), RAW, len(self.names))), self.names.index
         for c, camera in enumerate(model.cameras):
             fx, fy = camera.canonical[:2]
             out[c, :2, column("focal")] = fx, fy
             out[c, :2, column(f"aspect_{c}")] = fx / 2, -fy / 2
-            out[c, np.arange(4, 8), column(f"distortion_{c}_0") + np.arange(4)] = 1.0
+            slots = _distortion_slots(camera)
+            out[c, slots, column(f"distortion_{c}_0") + np.arange(len(slots))] = 1.0
             if len(model.cameras) > 1:
                 out[c, :2, column("focal_difference")] = np.array([fx, fy]) * (0.5 if c else -0.5)
         if len(model.cameras) > 1:
-            out[1, np.arange(8, 11), column("turn_x") + np.arange(3)] = 1.0
+            out[1, np.arange(16, 19), column("turn_x") + np.arange(3)] = 1.0
         return out
 
     def between(self, given: Reconstruction, found: Reconstruction) -> Array:
@@ -147,7 +151,8 @@ class Unknowns:
         x[column("focal")] = logs.mean()
         for c in range(len(logs)):
             x[column(f"aspect_{c}")] = logs[c, 0] - logs[c, 1]
-            x[column(f"distortion_{c}_0") + np.arange(4)] = canonical[1][c, 4:8] - canonical[0][c, 4:8]
+            slots = _distortion_slots(given.cameras[c])
+            x[column(f"distortion_{c}_0") + np.arange(len(slots))] = canonical[1][c, slots] - canonical[0][c, slots]
         if given.rig is not None and found.rig is not None:
             x[column("focal_difference")] = logs[1].mean() - logs[0].mean()
             turn = rigid3.compose(found.rig.cam_from_rig[1], rigid3.inverse(given.rig.cam_from_rig[1]))
@@ -404,18 +409,29 @@ def _go(look: _Look, step: Array, sigma: float, unknowns: Unknowns) -> _Look | N
     return _look(model, look.x + step, cost, sigma, unknowns)
 
 
+def _fullest(camera: Camera) -> Camera:
+    """The camera with all parameters that its family of lenses has, where the family has a model with them."""
+    model = {BROWN: CameraModel.OPENCV, RADIAL_FISHEYE: CameraModel.OPENCV_FISHEYE}.get(camera.family, camera.model)
+    row, first = camera.canonical, canonical_from_params(model).argmax(axis=0)
+    return replace(camera, model=model, params=row[first])
+
+
+def _distortion_slots(camera: Camera) -> NDArray[np.int64]:
+    """Places in the canonical row of what bends the image."""
+    model = _fullest(camera).model
+    first = canonical_from_params(model).argmax(axis=0)
+    return first[[kind_of(name) == "distortion" for name in PARAM_NAMES[model]]]
+
+
 def _changed(model: Reconstruction, change: Array) -> Reconstruction:
-    """A copy with canonical intrinsics and turns of the cameras changed by (C, 11); the rig's own poses stay."""
+    """A copy with canonical intrinsics and turns of the cameras changed by (C, 19); the rig's own poses stay."""
     out, num_sensors = model.copy(), len(model.cameras)
     out.cameras = [
-        replace(
-            camera, model=CameraModel.OPENCV_FISHEYE if camera.is_fisheye else CameraModel.OPENCV,
-            params=camera.canonical[:8] + by[:8], is_fixed=False,
-        )
+        replace(_fullest(camera).with_canonical(camera.canonical[:FAMILY] + by[:FAMILY]), is_fixed=False)
         for camera, by in zip(model.cameras, change, strict=True)
-    ]  # fmt: skip
+    ]
     if model.rig is not None:
-        turns = rigid3.from_matrix(rigid3.exp_so3(change[:, 8:]), np.zeros((num_sensors, 3)))
+        turns = rigid3.from_matrix(rigid3.exp_so3(change[:, FAMILY:]), np.zeros((num_sensors, 3)))
         frames = model.rig.rig_from_world(model.cam_from_world)
         out.rig = replace(model.rig, cam_from_rig=rigid3.compose(turns, model.rig.cam_from_rig))
         out.cam_from_world = out.rig.cam_from_world(np.arange(len(model.image_names)), frames[model.rig.frame_idx])

@@ -17,6 +17,7 @@ from sfmapp.adjust.covariance import estimate_covariances
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import PARAM_NAMES, Camera
+from sfmapp.camera.models import kind_of, plain_params
 from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.report.model import LensEvidence
 from sfmapp.scene.reconstruction import Reconstruction
@@ -75,14 +76,15 @@ def fit_lens(model: Reconstruction) -> LensFit:
     camera = model.cameras[0]
     fit = _with_parts(model, camera, True)
     names = PARAM_NAMES[camera.model]
-    bends = [n for n, name in enumerate(names) if name[0] in "kp"]
-    clear = [abs(fit.whole.params[n]) > _MIN_DISTORTION_SIGMAS * fit.sigma[n] for n in bends]
+    bends = [n for n, name in enumerate(names) if kind_of(name) == "distortion"]
+    plain = _flat(camera).params
+    clear = [abs(fit.whole.params[n] - plain[n]) > _MIN_DISTORTION_SIGMAS * fit.sigma[n] for n in bends]
     distortion = {names[n]: float(fit.whole.params[n]) for n in bends}
     if bends and not any(clear):
         free = _focal(camera, fit.whole.params)
         fit = _with_parts(model, _flat(camera), False)
         # a distortion too small to be clear may still be there: what it would change is part of the uncertainty
-        is_focal = np.array([name[0] == "f" for name in names])
+        is_focal = np.array([kind_of(name) == "focal" for name in names])
         fit.sigma[is_focal] = np.hypot(fit.sigma[is_focal], _focal(camera, fit.whole.params) - free)
     evidence = LensEvidence(
         distortion=distortion, is_at_rest=fit.whole.is_at_rest, spread=fit.spread, has_distortion=any(clear),
@@ -128,7 +130,7 @@ def _with_parts(model: Reconstruction, camera: Camera, refine_distortion: bool) 
         apart = 1.4826 * np.median(np.abs(change[known]))  # where parts are weak, their own sigmas excuse too much
         spread = float(max(np.sqrt(np.mean((change[known] / own[known]) ** 2)), apart / whole.sigma[0]))
     sigma = np.where(whole.sigma > 0, np.maximum(whole.sigma, 1e-300) * max(1.0, spread), 0.0)
-    is_focal = np.array([name[0] == "f" for name in PARAM_NAMES[camera.model]])
+    is_focal = np.array([kind_of(name) == "focal" for name in PARAM_NAMES[camera.model]])
     sigma[is_focal] = np.hypot(sigma[is_focal], _FLOOR * _focal(camera, whole.params))
     return _Parted(whole, parts, sigma if whole.is_at_rest else sigma * 3.0, spread)
 
@@ -180,8 +182,9 @@ def _prior(camera: Camera) -> Camera:
 
 def _flat(camera: Camera) -> Camera:
     """The same camera without distortion."""
-    bends = np.array([name[0] in "kp" for name in PARAM_NAMES[camera.model]])
-    return replace(camera, params=np.where(bends, 0.0, camera.params))
+    bends = np.array([kind_of(name) == "distortion" for name in PARAM_NAMES[camera.model]])
+    plain = plain_params(camera.model, camera.width, camera.height, camera.focal)
+    return replace(camera, params=np.where(bends, plain, camera.params))
 
 
 def _focal(camera: Camera, params: Array) -> float:
