@@ -383,19 +383,42 @@ def test_pictures_turned_both_ways_do_not_tell_how_a_calibration_was_turned(tmp_
         load(photos, tmp_path / "calib.json")
 
 
-def test_a_lens_of_more_coefficients_is_held_by_the_nearest_or_refused(tmp_path: Path) -> None:
-    photos, path = write_photos(tmp_path / "photos"), tmp_path / "calib.json"
-    k3 = np.array([*LENS, 0.002])
-    path.write_text(json.dumps({"K": MATRIX.tolist(), "dist": k3.tolist(), "width": W, "height": H}))
-    image_set, report, _ = load(photos, path)
-    expected = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), MATRIX, k3)[0].reshape(-1, 2) + 0.5
-    assert np.abs(project(image_set.cameras[0], RAYS) - expected).max() < 0.1
-    assert "the nearest lens with k1, k2, p1, p2 is off by" in report["cameras"][0]["focal_reason"]
-    wide = {"fx": 220.0, "fy": 220.0, "cx": 199.5, "cy": 149.5, "dist": [-0.25, 0.09, 0, 0, -0.016]}
-    path.write_text(json.dumps(wide | {"width": W, "height": H}))
-    with pytest.raises(InputError, match=r"calib.json.*5 coefficients.*off by 0\.\d px") as caught:
-        load(photos, path)
-    assert "CALIB_FIX_K3" in str(caught.value.advice)
+@pytest.mark.parametrize(
+    ("lens", "model"),
+    [
+        ([-0.25, 0.09, 0.001, -0.002, -0.016], CameraModel.FULL_OPENCV),
+        ([0.5, -0.4, 0.0003, -0.0002, 0.1, 0.8, -0.3, 0.05], CameraModel.FULL_OPENCV),
+        ([-0.25, 0.06, 0, 0, 0, 0, 0, 0, 0.002, -0.001, 0.003, 0.001], CameraModel.OPENCV_THIN_PRISM),
+    ],
+)
+@pytest.mark.parametrize("scale", [1, 2])
+def test_lenses_of_more_coefficients_are_held_exactly(
+    tmp_path: Path, lens: list[float], model: CameraModel, scale: int
+) -> None:
+    matrix = np.array([[230.0, 0, 199.0], [0, 231.0, 149.0], [0, 0, 1]])
+    path = tmp_path / "calib.json"
+    path.write_text(json.dumps({"K": matrix.tolist(), "dist": lens, "width": W, "height": H}))
+    image_set, _, _ = load(write_photos(tmp_path / "photos", size=(scale * W, scale * H)), path)
+    expected = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), matrix, np.array(lens))[0].reshape(-1, 2) + 0.5
+    np.testing.assert_allclose(project(image_set.cameras[0], RAYS), scale * expected, atol=1e-9)
+    assert image_set.cameras[0].model == model
+
+
+def test_panoramas_have_cameras_too(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 2000 1000 2000 1000\n")
+    photos = write_photos(tmp_path / "photos", "a.jpg", size=(400, 200), exif=exif_of(focal_35mm=8))
+    image_set, _, log = load(photos, tmp_path / "cameras.txt")
+    assert image_set.cameras[0].params.tolist() == [400.0, 200.0]
+    assert not warnings_of(log)
+
+
+def test_a_tilted_sensor_is_refused(tmp_path: Path) -> None:
+    lens = [-0.25, 0.06, *[0.0] * 10, 0.05, -0.02]
+    fields = {"fx": 230.0, "fy": 231.0, "cx": 199.0, "cy": 149.0, "dist": lens, "width": W, "height": H}
+    (tmp_path / "calib.json").write_text(json.dumps(fields))
+    with pytest.raises(InputError, match=r"calib.json.*tilted") as caught:
+        load(write_photos(tmp_path / "photos"), tmp_path / "calib.json")
+    assert "CALIB_TILTED_MODEL" in str(caught.value.advice)
 
 
 # ----------------------------------------------------------------------------------------------------- contradictions

@@ -241,6 +241,8 @@ def stated_size(place: str, fields: Fields) -> Size | None:
 
 def oddity(camera: Camera) -> str | None:
     """What is odd about a calibration that is unlike that of any camera; None for nothing."""
+    if camera.model == CameraModel.EQUIRECTANGULAR:  # its numbers are the size of the picture
+        return None
     fx, fy, cx, cy = camera.canonical[:4]
     long_side = max(camera.width, camera.height)
     # 0.2 is a fisheye lens of the widest kind, 20 a telescope

@@ -20,7 +20,7 @@ from sfmapp.calibration.fields import (
     stated_size,
 )
 from sfmapp.calibration.files import read_fields
-from sfmapp.calibration.opencv_lens import CalibratedCamera, Size, scaled_to
+from sfmapp.calibration.opencv_lens import CalibratedCamera, Size, exact_camera, scaled_to
 from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
 from sfmapp.geometry.orientation import INVERSE, is_sideways
@@ -33,8 +33,6 @@ CameraAt = Callable[[Size], CalibratedCamera]
 _NUMBERED = re.compile(r"(?:cam|camera|image|images|img)[_-]?(\d+)")
 _OF_A_PAIR = re.compile(r"(?:(?:cam|camera|image|images|img)[_-]?)?(left|right)")
 _NAMES_SHOWN = 4
-# half of what keypoints are located to
-_LARGEST_MISFIT_PX = 0.25
 # a share of a side of the picture: lenses are decentred by some per cent at most, crops by more
 _FAR_OFF_CENTER = 0.15
 
@@ -175,7 +173,7 @@ class GivenCameras:
 
     def _in_pixels_of(self, name: str, group: Sequence[Photograph]) -> GivenCamera:
         first = group[0]
-        found = self.cameras[name](first.size)
+        found = self._at(name, first.size)
         own = (found.camera.width, found.camera.height)
         sideways = sorted({photograph.orientation for photograph in group if is_sideways(photograph.orientation)})
         if _has_shape(own, first.size):
@@ -188,25 +186,23 @@ class GivenCameras:
             found = replace(found, camera=turned, notes=(*found.notes, note))
         else:
             raise self._misshapen(own, first)
-        self._check_fits(found)
         source = ": ".join([PurePath(self.place).name, *([name] if name else [])])
-        notes = [note.removeprefix(f"{self.place}: ").partition(": frames are")[0] for note in found.notes]
-        reason = ", ".join([source, *notes])
+        reason = ", ".join([source, *(note.removeprefix(f"{self.place}: ") for note in found.notes)])
         problem = oddity(found.camera) or self._other_size(name, found.camera)
         return GivenCamera(name, replace(found.camera, focal_source="user"), reason, problem)
 
-    def _check_fits(self, found: CalibratedCamera) -> None:
-        """Refuse a camera that is not the lens of the calibration: photographs are not resampled, as frames are."""
+    def _at(self, name: str, size: Size) -> CalibratedCamera:
+        """A camera with all that its lens has: photographs are not resampled, as frames are."""
+        found = self.cameras[name](size)
         if found.lens is None:
-            return
-        misfit_px = found.misfit_px * found.camera.width / found.lens.size[0]
-        if misfit_px > _LARGEST_MISFIT_PX:
+            return found
+        exact = exact_camera(found.lens)
+        if exact is None:
             raise InputError(
-                f"{self.place}: expected a lens that k1, k2, p1 and p2 can hold, found one with "
-                f"{len(found.lens.coefficients)} coefficients, of which the nearest such lens is off by "
-                f"{misfit_px:.1f} px",
-                "calibrate with k1, k2, p1 and p2 alone (cv2.CALIB_FIX_K3), or undistort the photographs first",
+                f"{self.place}: expected a lens before an upright sensor, found one that is tilted (tau_x, tau_y)",
+                "calibrate without cv2.CALIB_TILTED_MODEL, or undistort the photographs first",
             )
+        return CalibratedCamera(exact)
 
     def _other_size(self, name: str, camera: Camera) -> str | None:
         """What speaks for a calibration with pictures of another size, where it states none."""

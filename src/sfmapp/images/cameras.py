@@ -172,7 +172,7 @@ def _doubts(
     for shot, prior, known in zip(shots, priors, given, strict=True):
         if known is not None and known.problem is not None:
             found.append((shot.name, known.problem))
-        if known is None or prior.source == "default":
+        if known is None or prior.source == "default" or known.camera.model == CameraModel.EQUIRECTANGULAR:
             continue
         focal, sigma = known.camera.focal, math.hypot(prior.sigma_px, known.camera.focal_sigma or 0.0)
         if abs(prior.focal_px - focal) > _CONTRADICTS_SIGMAS * sigma:
