@@ -431,6 +431,7 @@ def test_on_a_full_disk_the_recording_goes_first_and_poses_stay(size_kb: int, co
         assert len(read_tum(disk / "out" / "trajectory_live.tum")[0]) == 50
         assert (disk / "out" / "report.json").is_file() == (code == 0)
         assert ("sfmapp: " in done.stderr) == (code == 3)
-        assert ("recording: given up" in done.stderr) == (code == 0)
+        # whoever notices first, the recorder or the run, words it
+        assert ("no recording: " in done.stderr) == (code == 0)
     finally:
         subprocess.run(["umount", disk], check=True)

@@ -1,4 +1,4 @@
-"""Doubt a result: pycolmap on the same photographs, and the ground truth where there is one, in one table."""
+"""Hold a result against pycolmap on the same photographs and, where there is one, ground truth, in one table."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def validate(
 
     Args:
         output: the workspace of a run.
-        ground truth: COLMAP model, ``cameras.json`` or TUM trajectory; None: no ground truth.
+        ground_truth: COLMAP model, ``cameras.json`` or TUM trajectory; None: no ground truth.
         options: of pycolmap; None: its defaults, but with the camera model, the sharing and the intrinsics that the
             user gave to our run.
         events: progress and cancellation.
