@@ -10,9 +10,9 @@ import pytest
 
 from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.odometry.loops import relocalize as relocalization
 from sfmapp.odometry.loops.closing import apply_closure, fuse_points, join_maps
 from sfmapp.odometry.loops.detection import LoopFinder, LoopOptions
-from sfmapp.odometry.loops.detection import relocalize as relocalization
 from sfmapp.odometry.loops.place_recognition import Candidate, PlaceIndex, PlaceOptions, View
 from sfmapp.odometry.loops.pose_graph import apply_corrections
 from sfmapp.odometry.loops.relocalize import (
