@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.dense.outcome import check, confirmed_share
 from sfmapp.dense.photographs import find_photographs
 from sfmapp.dense.prepare import DensePlan
+from sfmapp.dense.report import SharesReport
 from sfmapp.dense.scene import Patches, Region
 from sfmapp.dense.undistort import make_canvas
 from sfmapp.errors import NoReconstructionError
@@ -64,25 +66,25 @@ def test_where_no_other_view_has_them_in_its_picture_nothing_is_said() -> None:
 
 
 def test_patches_of_chance_are_refused_and_few_good_ones_are_not() -> None:
-    shares = {"textured": 0.8, "covered": 0.12, "points": None}
+    shares = SharesReport(textured=0.8, covered=0.12, points=None)
     with pytest.raises(NoReconstructionError, match="10 % of them agree with more than 3 views: the poses contradict"):
         check(patches_of([3] * 900 + [4] * 100), shares, plan_of(), 3)
     assert check(patches_of([5] * 800), shares, plan_of(), 3) is None
-    warning = check(patches_of([5] * 800), shares | {"covered": 0.05}, plan_of(), 3)
+    warning = check(patches_of([5] * 800), dataclasses.replace(shares, covered=0.05), plan_of(), 3)
     assert warning is not None
     assert "are the poses exact" in warning
 
 
 def test_next_to_nothing_is_refused_with_the_reason() -> None:
     with pytest.raises(NoReconstructionError, match="no texture"):
-        check(patches_of([]), {"textured": 0.001, "covered": 0.0, "points": None}, plan_of(), 3)
+        check(patches_of([]), SharesReport(textured=0.001, covered=0.0, points=None), plan_of(), 3)
     with pytest.raises(NoReconstructionError, match="poses contradict"):
-        check(patches_of([]), {"textured": 0.8, "covered": 0.0, "points": None}, plan_of(), 3)
+        check(patches_of([]), SharesReport(textured=0.8, covered=0.0, points=None), plan_of(), 3)
 
 
 def test_of_a_region_no_more_is_asked_than_that_it_holds_something() -> None:
     plan = plan_of(region=Region(np.zeros(3), np.array([1.0, 2.0, 3.5])))
-    shares = {"textured": 0.8, "covered": 0.0001, "points": None}
+    shares = SharesReport(textured=0.8, covered=0.0001, points=None)
     assert check(patches_of([3] * 10), shares, plan, 3) is None
     with pytest.raises(NoReconstructionError, match=r"region from \(0, 0, 0\) to \(1, 2, 3\.5\)"):
         check(patches_of([]), shares, plan, 3)
