@@ -13,6 +13,7 @@ from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.pipelines.odometry.lens_fit import fit_lens
 from sfmapp.pipelines.odometry.self_calibrate import MAX_FOCAL_SIGMA, SETTLED_SIGMA, widen
+from sfmapp.report.model import CalibrationReport, LensEvidence
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import Layout, make_scene, perturb, synthetic_camera
 
@@ -44,14 +45,24 @@ def test_a_lens_is_found_within_its_sigmas_and_not_called_settled_where_it_is_no
             assert found.camera.params[3] == 0.0
 
 
+def found_camera(is_settled: bool, focal_sigma_relative: float) -> CalibrationReport:
+    fit = LensEvidence(
+        distortion={}, is_at_rest=True, spread=1.0, has_distortion=False, parts=[1.0], independent_sigma=0.1
+    )
+    return CalibrationReport(
+        model="PINHOLE", params={}, sigma={}, focal_sigma_relative=focal_sigma_relative, is_settled=is_settled, fit=fit,
+        frames=[], num_registered=8, num_points=100, mean_reprojection_error_px=0.3, text="",
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize("is_settled", [True, False])
 def test_what_a_lens_leaves_open_is_in_the_sigmas_of_every_map_and_red_if_not_settled(is_settled: bool) -> None:
     def result() -> OdometryResult:
-        return FakeRunner()(FakeSequence(), OdometryOptions(), seed=0, threads=1, events=Events())  # type: ignore[arg-type]
+        return FakeRunner()(FakeSequence(), OdometryOptions(), seed=0, threads=1, events=Events(), markers=None)
 
     plain, wide = result(), result()
     share = 0.1 * SETTLED_SIGMA if is_settled else 0.5 * (SETTLED_SIGMA + MAX_FOCAL_SIGMA)
-    widen(wide, {"is_settled": is_settled, "focal_sigma_relative": share, "fit": {"parts": [1.0]}})
+    widen(wide, found_camera(is_settled, share))
     before, entry = plain.maps[0], wide.maps[0]
     assert [found.subject for found in entry.contradictions] == ([] if is_settled else ["self-calibration"])
     for narrow, wider in ((before.covariance, entry.covariance), (plain.covariance, wide.covariance)):
