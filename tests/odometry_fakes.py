@@ -73,7 +73,14 @@ class FakeRunner:
     finds_nothing: bool = False
 
     def __call__(
-        self, sequence: Sequence, options: OdometryOptions, *, seed: int, threads: int, events: Events, markers: object
+        self,
+        sequence: Sequence,
+        options: OdometryOptions,
+        *,
+        seed: int,
+        threads: int,
+        events: Events,
+        markers: object = None,
     ) -> OdometryResult:
         events.started("odometry", total=sequence.num_frames)
         assert sequence.ground_truth is not None

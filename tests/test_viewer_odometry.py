@@ -102,7 +102,7 @@ def test_a_child_falls_behind_first_without_images_then_without_points(monkeypat
 
         def abandon(self) -> None: ...
 
-    monkeypatch.setattr(live_module, "Outbox", lambda _: Full())
+    monkeypatch.setattr(live_module, "SendQueue", lambda _: Full())
     with LiveView(Path("x.rrd"), None) as view:
         view.begin(FakeSequence())
         for waiting in (0, live_module.MAX_IMAGE_BYTES, live_module.MAX_POINT_BYTES):
