@@ -20,7 +20,8 @@ DOCUMENTS = sorted(
         CHECKOUT / "data" / "README.md",
     ]
 )
-ROOMS = {path.name for path in SOURCE.iterdir() if path.is_dir() and path.name != "__pycache__"}
+# of the checkout, for an installed package also holds the presets and the sample photographs, in `resources`
+ROOMS = {path.name for path in (CHECKOUT / "src" / "sfmapp").glob("*/") if path.name != "__pycache__"}
 TOP = {path.name for path in CHECKOUT.iterdir() if path.is_dir() and not path.name.startswith(".")} | {".ci"}
 # a path, and maybe what is defined in it: `mapping/register.py::choose_images`
 PATH = re.compile(r"`([\w.-]+(?:/[\w.-]+)+/?|[\w-]+/)(?:::(\w+))?`")

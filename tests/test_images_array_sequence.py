@@ -80,8 +80,9 @@ def test_wrong_frames_are_refused_by_name() -> None:
 def test_the_same_poses_with_and_without_a_folder(tmp_path: Path) -> None:
     images = [images[0] for images in room(30).images]
     seen = []
+    events = sfmapp.Events()
     in_memory, report = sfmapp.track_sequence(
-        sfmapp.ArraySequence(iter(images), PINHOLE), on_frame=seen.append, threads=1, seed=3
+        sfmapp.ArraySequence(iter(images), PINHOLE), on_frame=seen.append, events=events, threads=1, seed=3
     )
     assert report is None
     assert len(seen) == 30
@@ -94,7 +95,8 @@ def test_the_same_poses_with_and_without_a_folder(tmp_path: Path) -> None:
     assert [image.name for image in keyframes.images] == written.maps[0].reconstruction.image_names
     assert written.maps[0].reconstruction.point_rgb.tobytes() == in_memory.maps[0].reconstruction.point_rgb.tobytes()
     options = sfmapp.load_options(settings=["scale.source=distance:0:29:2.5"])
-    metric, _ = sfmapp.track_sequence(sequence, options=options, threads=1, seed=3)
+    metric, _ = sfmapp.track_sequence(sequence, options=options, events=events, threads=1, seed=3)
+    assert len(seen) == 30  # who heard of the frames of one call hears nothing of the next
     first, last = (sfmapp.Rigid3(metric.cam_from_world[k]).center for k in (0, -1))
     assert np.linalg.norm(last - first) == pytest.approx(2.5)
     assert metric.maps[0].scale_source == "distance"

@@ -3,9 +3,9 @@
 Layout. An unknown block is a row of up to eight numbers: the six of a pose (rotation, then translation, of
 ``x_cam <- exp(w) x_cam + v``), followed by at most two intrinsics where a camera takes part through one image only; or
 the free intrinsics of a camera that several images share; those beyond the eighth are a second block right behind it.
-Blocks meet in 8 x 8 tiles. Points are never blocks: they are
-eliminated one by one (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 1999, section 6.1) from the factor
-``L L^T`` of their damped 3 x 3 normal matrix: with Z = W L^-T the reduced system loses Z_a Z_b^T per pair of blocks.
+Blocks meet in 8 x 8 tiles. Points are never blocks: they are eliminated one by one (Triggs et al., "Bundle Adjustment:
+A Modern Synthesis", 1999, section 6.1) from the factor ``L L^T`` of their damped 3 x 3 normal matrix: with Z = W L^-T
+the reduced system loses Z_a Z_b^T per pair of blocks.
 
 A pose may be that of a rig which several images share: each has its own row of what the rig's pose and the constant
 mounting of its camera make together, and the derivatives are taken to the rig's frame.

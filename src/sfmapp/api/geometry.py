@@ -13,7 +13,6 @@ from sfmapp.adjust import solver
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.pose import refine_pose
 from sfmapp.api.reconstruction import Reconstruction
-from sfmapp.api.stages import num_threads
 from sfmapp.camera.camera import Camera, pixels_to_normalized, project
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
@@ -26,6 +25,7 @@ from sfmapp.matching.search import Ransac
 from sfmapp.matching.two_view import TwoViewGeometry
 from sfmapp.scene import reconstruction as arrays
 from sfmapp.scene.tracks import make_tracks
+from sfmapp.workspace.options import num_threads
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from sfmapp.api.images import Images, load_images
 from sfmapp.api.reconstruction import Reconstruction
-from sfmapp.api.stages import extract_features, map_images, match_images
+from sfmapp.api.stages import extract_features, map_images, match_images, one_blas_thread
 from sfmapp.errors import UsageError
 from sfmapp.events import Event, Events
 from sfmapp.workspace.options import Options
@@ -161,16 +162,15 @@ def track_sequence(
         >>> sfmapp.track_sequence(frames, on_frame=lambda frame: steer(frame.cam_from_world))
     """
     options, events = _with(options, threads, seed), events or Events()
-    if on_frame is not None:
-        events.subscribe(_each_frame(on_frame))
-    if output is None:
-        return TrackResult(_tracked_in_memory(source, options, events), None)
-    from sfmapp.pipelines.odometry import track
+    with _told_of_frames(events, on_frame):
+        if output is None:
+            return TrackResult(_tracked_in_memory(source, options, events), None)
+        from sfmapp.pipelines.odometry import track
 
-    found, report = track.track_sequence(
-        source, output, options, events=events, record=record, self_calibrate=self_calibrate
-    )
-    return TrackResult(_with_views(found), report)
+        found, report = track.track_sequence(
+            source, output, options, events=events, record=record, self_calibrate=self_calibrate
+        )
+        return TrackResult(_with_views(found), report)
 
 
 def refine(
@@ -448,20 +448,24 @@ def _with(options: Options | None, threads: int | None, seed: int | None = None)
     return options if seed is None else replace(options, seed=seed)
 
 
-def _each_frame(on_frame: Callable[[FrameSnapshot], None]) -> Callable[[Event], None]:
+@contextmanager
+def _told_of_frames(events: Events, on_frame: Callable[[FrameSnapshot], None] | None) -> Iterator[None]:
+    """Let a function hear of each frame until the block ends: the events are the user's, and may see another call."""
     from sfmapp.odometry.snapshot import FrameSnapshot
 
     def listen(event: Event) -> None:
         snapshot = event.data.get("snapshot")
-        if isinstance(snapshot, FrameSnapshot):
+        if on_frame is not None and isinstance(snapshot, FrameSnapshot):
             on_frame(snapshot)
 
-    return listen
+    events.subscribe(listen)
+    try:
+        yield
+    finally:
+        events.unsubscribe(listen)
 
 
 def _tracked_in_memory(source: FilePath | Sequence, options: Options, events: Events) -> OdometryResult:
-    from threadpoolctl import threadpool_limits
-
     from sfmapp.errors import NoReconstructionError
     from sfmapp.odometry.run import run_odometry
     from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps
@@ -470,7 +474,7 @@ def _tracked_in_memory(source: FilePath | Sequence, options: Options, events: Ev
         raise UsageError("a sequence of files needs a folder for its results", "give one as the second argument")
     wanted = options.scale.source
     request = resolve_scale_request(None if wanted is None else parse_scale(wanted), wanted is None, source)
-    with threadpool_limits(1, "blas"):
+    with one_blas_thread():
         found = run_odometry(
             source, options.odometry, seed=options.seed, threads=options.num_workers, events=events,
             markers=None if request is None else request.detector(),

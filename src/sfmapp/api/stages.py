@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
@@ -26,6 +25,7 @@ from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.pairs import PairOptions
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.features import Features
+from sfmapp.workspace.options import num_threads
 
 PairOfImages = tuple[int, int] | tuple[str, str]
 
@@ -80,7 +80,7 @@ def extract_features(
         >>> features = sfmapp.extract_features({"left": left, "right": right})
         >>> features[0].keypoints[:, :2], features[0].descriptors
     """
-    with _one_blas_thread():
+    with one_blas_thread():
         image_set = load_images(images, events=events, threads=threads)
         options, workers = options or FeatureOptions(), num_threads(threads)
         return extract.extract_features(image_set, options, threads=workers, events=events or Events())[0]
@@ -128,7 +128,7 @@ def match_images(
     """
     _check_one_for_each(images, features)
     options, events, workers = options or MatchingOptions(), events or Events(), num_threads(threads)
-    with _one_blas_thread():
+    with one_blas_thread():
         if matches is not None:
             found = _by_position(images, matches)
             return stage.verify_matches(
@@ -178,7 +178,7 @@ def map_images(
         >>> models[0].image("a.jpg").cam_from_world
     """
     _check_one_for_each(images, features)
-    with _one_blas_thread():
+    with one_blas_thread():
         models, _ = incremental.map_images(
             images, features, correspondences, options or MappingOptions(),
             adjust_options=adjust_options or AdjustOptions(), threads=num_threads(threads), events=events or Events(),
@@ -187,13 +187,8 @@ def map_images(
     return [Reconstruction.of(model, keypoints) for model in models]
 
 
-def num_threads(threads: int | None) -> int:
-    """The wish, or the cores that this process may use."""
-    return threads or len(os.sched_getaffinity(0))
-
-
 @contextmanager
-def _one_blas_thread() -> Iterator[None]:
+def one_blas_thread() -> Iterator[None]:
     """Our workers use the cores; sums must not depend on how many the linear algebra beneath them would use."""
     from threadpoolctl import threadpool_limits
 

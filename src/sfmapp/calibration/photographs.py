@@ -24,7 +24,7 @@ from sfmapp.calibration.opencv_lens import CalibratedCamera, Size, exact_camera,
 from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
 from sfmapp.geometry.orientation import INVERSE, is_sideways
-from sfmapp.scene.turned_camera import turned_back, turned_camera
+from sfmapp.scene.turned_camera import fault_of_upright, turned_camera
 
 CameraAt = Callable[[Size], CalibratedCamera]
 """A camera of the size that its calibration states, or of that of the images where it states none."""
@@ -218,13 +218,9 @@ class GivenCameras:
 
     def _check_not_of_upright(self, camera: Camera, photograph: str, sideways: Collection[int]) -> None:
         for orientation in sideways:
-            stored = turned_back(camera, orientation)
-            if stored is not None:
-                raise InputError(
-                    f"{self.place}: expected a camera of {camera.width}x{camera.height} pixels, as {photograph} has "
-                    f"them, found one of {camera.height}x{camera.width}, of pictures turned upright as EXIF says",
-                    f"give --camera {camera.model.name},{','.join(f'{value:.10g}' for value in stored.params)}",
-                )
+            fault = fault_of_upright(camera, orientation, f"as {photograph} has them")
+            if fault is not None:
+                raise InputError(f"{self.place}: {fault[0]}", f"give --camera {camera.model.name},{fault[1]}")
 
     def _misshapen(self, own: Size, photograph: Photograph) -> InputError:
         (width, height), (own_width, own_height) = photograph.size, own

@@ -17,7 +17,7 @@ from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.images.exif import ExifFacts, FocalPrior, focal_prior
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.images.report import CameraPrior
-from sfmapp.scene.turned_camera import turned_back
+from sfmapp.scene.turned_camera import fault_of_upright
 
 # Trust in what a user gives without fixing it: a focal length copied from a data sheet, or a calibration.
 _SIGMA_USER_FOCAL, SIGMA_USER_PARAMS = 0.03, 0.01
@@ -146,13 +146,9 @@ def _camera(
 def _check_not_of_upright(camera: Camera, shots: Sequence[Shot]) -> None:
     """Parameters that were found with pictures that some reader had turned, as OpenCV's does."""
     for shot in shots:
-        stored = turned_back(camera, shot.facts.orientation)
-        if stored is not None:
-            raise UsageError(
-                f"camera_params: expected a camera of {camera.width}x{camera.height} pixels, as {shot.name} has them, "
-                f"found one of {camera.height}x{camera.width}, of pictures turned upright as EXIF says",
-                f"give {','.join(f'{value:.10g}' for value in stored.params)}, the same lens in the pixels of the file",
-            )
+        fault = fault_of_upright(camera, shot.facts.orientation, f"as {shot.name} has them")
+        if fault is not None:
+            raise UsageError(f"camera_params: {fault[0]}", f"give {fault[1]}, the same lens in the pixels of the file")
 
 
 def _common_prior(priors: list[FocalPrior]) -> FocalPrior:

@@ -54,3 +54,16 @@ def turned_back(camera: Camera, orientation: int) -> Camera | None:
     if not is_sideways(orientation) or own < _FAR_OFF_CENTER or turned > _NEAR_CENTER:
         return None
     return turned_camera(replace(camera, width=camera.height, height=camera.width), INVERSE[orientation])
+
+
+def fault_of_upright(camera: Camera, orientation: int, whose: str) -> tuple[str, str] | None:
+    """For a camera that :func:`turned_back` finds to fit the turned pictures: what was expected and found, and its
+    parameters in pixels of the files, as text; None for any other. ``whose`` says whose pixels are wanted."""
+    stored = turned_back(camera, orientation)
+    if stored is None:
+        return None
+    return (
+        f"expected a camera of {camera.width}x{camera.height} pixels, {whose}, found one of "
+        f"{camera.height}x{camera.width}, of pictures turned upright as EXIF says",
+        ",".join(f"{value:.10g}" for value in stored.params),
+    )

@@ -27,7 +27,7 @@ from sfmapp.images.sequence import STAGE, GroundTruth, Imu, Sequence, SequenceOp
 from sfmapp.images.sources import EXTENSIONS, printable
 from sfmapp.images.video import DEFAULT_FPS, VideoSequence, is_stream, read_video_facts
 from sfmapp.scene.rig import Rig
-from sfmapp.scene.turned_camera import turned_back, turned_camera
+from sfmapp.scene.turned_camera import fault_of_upright, turned_camera
 from sfmapp.sequences.euroc import euroc_ground_truth, find_mav, read_euroc_sequence, read_imu
 from sfmapp.sequences.files import (
     Recording,
@@ -204,13 +204,9 @@ def _read_calibration(path: str | Path, sizes: tuple[Size, ...], orientation: in
 
 
 def _check_not_of_upright(what: str, camera: Camera, orientation: int) -> None:
-    stored = turned_back(camera, orientation)
-    if stored is not None:
-        raise InputError(
-            f"{what}: expected a camera of {camera.width}x{camera.height} pixels, as the files store them, found one "
-            f"of {camera.height}x{camera.width}, of pictures turned upright as EXIF says",
-            f"give --camera {camera.model.name},{','.join(f'{value:.10g}' for value in stored.params)}",
-        )
+    fault = fault_of_upright(camera, orientation, "as the files store them")
+    if fault is not None:
+        raise InputError(f"{what}: {fault[0]}", f"give --camera {camera.model.name},{fault[1]}")
 
 
 def _guessed_camera(size: Size, first: Path | None) -> Camera:

@@ -68,7 +68,12 @@ class Options:
     @property
     def num_workers(self) -> int:
         """``threads``, or the cores that this process may use."""
-        return self.threads or len(os.sched_getaffinity(0))
+        return num_threads(self.threads)
+
+
+def num_threads(threads: int | None) -> int:
+    """As many as are asked for, or the cores that this process may use."""
+    return threads or len(os.sched_getaffinity(0))
 
 
 def load_options(presets: Iterable[str] = (), settings: Iterable[str] = ()) -> Options:

@@ -101,13 +101,11 @@ def imu_steps(imu: Imu, start_s: float, stop_s: float) -> Array | None:
 
 
 @numba.njit(cache=True, nogil=True)
-def turn_by(wx: float, wy: float, wz: float, out: Array, slope: Array) -> None:
-    """exp(w) and its right Jacobian, (3, 3), by series: a step of an inertial sensor is a small angle."""
-    n2 = wx * wx + wy * wy + wz * wz
-    a = 1.0 - n2 / 6.0 * (1.0 - n2 / 20.0 * (1.0 - n2 / 42.0))
-    b = 0.5 - n2 / 24.0 * (1.0 - n2 / 30.0 * (1.0 - n2 / 56.0))
-    c = (1.0 - n2 / 20.0 * (1.0 - n2 / 42.0)) / 6.0
-    w = (wx, wy, wz)
+def fill_turn(w: tuple[float, float, float], series: tuple[float, float, float], out: Array, slope: Array) -> None:
+    """exp(w) and its right Jacobian (Sola 2017, equation 183), both (3, 3), of the series sin n / n,
+    (1 - cos n) / n^2 and (n - sin n) / n^3 of n = |w|."""
+    a, b, c = series
+    n2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     for i in range(3):
         for j in range(3):
             square = w[i] * w[j] - (n2 if i == j else 0.0)
@@ -119,6 +117,16 @@ def turn_by(wx: float, wy: float, wz: float, out: Array, slope: Array) -> None:
         out[j, k] -= a * w[i]
         slope[k, j] -= b * w[i]
         slope[j, k] += b * w[i]
+
+
+@numba.njit(cache=True, nogil=True)
+def turn_by(wx: float, wy: float, wz: float, out: Array, slope: Array) -> None:
+    """exp(w) and its right Jacobian, (3, 3), by series: a step of an inertial sensor is a small angle."""
+    n2 = wx * wx + wy * wy + wz * wz
+    a = 1.0 - n2 / 6.0 * (1.0 - n2 / 20.0 * (1.0 - n2 / 42.0))
+    b = 0.5 - n2 / 24.0 * (1.0 - n2 / 30.0 * (1.0 - n2 / 56.0))
+    c = (1.0 - n2 / 20.0 * (1.0 - n2 / 42.0)) / 6.0
+    fill_turn((wx, wy, wz), (a, b, c), out, slope)
 
 
 @numba.njit(cache=True, nogil=True)

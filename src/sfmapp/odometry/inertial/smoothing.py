@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.geometry import rigid3
+from sfmapp.odometry.inertial.gyroscope import fill_turn
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -369,18 +370,7 @@ def _rotation_of(wx: float, wy: float, wz: float, out: Array, slope: Array) -> N
         c = (angle - math.sin(angle)) / (angle2 * angle)
     else:
         a, b, c = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0, 1.0 / 6.0 - angle2 / 120.0
-    w = (wx, wy, wz)
-    for i in range(3):
-        for j in range(3):
-            square = w[i] * w[j] - (angle2 if i == j else 0.0)
-            out[i, j] = (1.0 if i == j else 0.0) + b * square
-            slope[i, j] = (1.0 if i == j else 0.0) + c * square
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        out[k, j] += a * w[i]
-        out[j, k] -= a * w[i]
-        slope[k, j] -= b * w[i]
-        slope[j, k] += b * w[i]
+    fill_turn((wx, wy, wz), (a, b, c), out, slope)
 
 
 @numba.njit(cache=True, nogil=True)
