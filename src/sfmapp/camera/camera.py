@@ -6,6 +6,7 @@ Models and the order of their parameters are COLMAP's. Inside kernels a camera i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numba
@@ -17,6 +18,9 @@ from sfmapp.camera.lens import FAMILY, ROW
 from sfmapp.camera.models import PARAM_NAMES, CameraModel, canonical_from_params, family_of, kind_of, plain_params
 
 Array = NDArray[np.float64]
+
+# Places along each side of a picture where it is asked how far a lens sees.
+_WIDE_STEPS = 17
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,16 @@ class Camera:
         return family_of(self.model)
 
     @property
+    def is_wide(self) -> bool:
+        """Whether the picture shows what lies more than 88 degrees off the axis, where there is no normalised plane."""
+        if self.family in (lens.BROWN, lens.RATIONAL, lens.SKEW):
+            return False
+        steps = np.linspace(0.0, 1.0, _WIDE_STEPS)
+        xy = np.stack(np.meshgrid(steps * self.width, steps * self.height), axis=-1).reshape(-1, 2)
+        # False for NaN, in the corners that a circular picture leaves black
+        return bool((pixels_to_rays(self, xy)[:, 2] <= lens.NARROW).any())
+
+    @property
     def is_pinhole(self) -> bool:
         """Whether pixels are those of a pinhole with square corners, whatever the model."""
         is_perspective = self.family in (lens.BROWN, lens.RATIONAL, lens.DIVISION, lens.SKEW)
@@ -134,6 +148,13 @@ def pixels_to_rays(camera: Camera, xy: ArrayLike) -> Array:
     out = np.empty((len(xy), 3))
     _unproject_all(camera.canonical, xy, out)
     return out
+
+
+def bearings(cameras: Sequence[Camera], pixels: Sequence[ArrayLike]) -> list[Array]:
+    """What poses are estimated from, of pixels (N, 2) each: normalised image points (N, 2), or unit rays (N, 3) of all
+    where one of the cameras is wide. NaN where the lens has no inverse."""
+    find = pixels_to_rays if any(camera.is_wide for camera in cameras) else pixels_to_normalized
+    return [find(camera, xy) for camera, xy in zip(cameras, pixels, strict=True)]
 
 
 def project(camera: Camera, xyz_cam: ArrayLike) -> Array:

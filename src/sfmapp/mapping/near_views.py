@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.lens import EQUIRECTANGULAR, FAMILY, project
+from sfmapp.camera.lens import project
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3
 from sfmapp.mapping.report import NearPair
@@ -64,12 +64,13 @@ def near_views(model: Reconstruction, correspondences: Correspondences) -> NearV
     tried = np.flatnonzero(registered[correspondences.pair_image_idx].all(axis=1))
     images = correspondences.pair_image_idx[tried].astype(np.int64)
     canonical = model.canonical_cameras()
+    is_wide = np.array([c.is_wide for c in model.cameras], bool)
     sizes = np.array([(c.width, c.height) for c in model.cameras], np.float64)
     tracks, counts = model.tracks, np.zeros((len(images), 3), np.int64)
     _count_in_view(
         images, tracks.image_ptr, tracks.image_obs, tracks.obs_track_idx, model.obs_is_inlier, model.point_xyz,
         rigid3.rotation_matrix(model.cam_from_world), np.ascontiguousarray(model.cam_from_world[:, 4:]), model.centers,
-        model.image_camera_idx, canonical, sizes, math.cos(math.radians(MAX_ANGLE_DEG)), MAX_ZOOM,
+        model.image_camera_idx, canonical, is_wide, sizes, math.cos(math.radians(MAX_ANGLE_DEG)), MAX_ZOOM,
         np.full(tracks.num_tracks, -1), counts,
     )  # fmt: skip
     visible = counts[:, :2].min(axis=1)
@@ -128,7 +129,7 @@ def contradiction_of(model: Reconstruction, correspondences: Correspondences) ->
 @numba.njit(cache=True, nogil=True)
 def _count_in_view(  # type: ignore[no-untyped-def]
     images, image_ptr, image_obs, obs_track, is_inlier, xyz, rotation, translation, centers, camera_of, canonical,
-    sizes, min_cos, max_zoom, mark, counts,
+    is_wide, sizes, min_cos, max_zoom, mark, counts,
 ) -> None:  # fmt: skip
     """Fill counts (K, 3): points of the first image in view of the second, of the second in that of the first, both's.
 
@@ -154,7 +155,7 @@ def _count_in_view(  # type: ignore[no-untyped-def]
                 r, s = rotation[j], translation[j]
                 depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + s[2]
                 # beyond 80 degrees a lens model that is good in the picture may fold back into it
-                if not depth > 0.17 * b and canonical[c, FAMILY] != EQUIRECTANGULAR:
+                if not depth > 0.17 * b and not is_wide[c]:
                     continue
                 right = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + s[0]
                 down = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + s[1]
