@@ -18,7 +18,6 @@ from sfmapp.scene.features import Features
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import SyntheticScene, make_scene, synthetic_camera, true_correspondences
 
-
 # A panorama, and lenses that see up to 110 degrees and more from their axis.
 WIDE = {
     "panorama": Camera(CameraModel.EQUIRECTANGULAR, 2000, 1000, np.array([2000.0, 1000.0])),

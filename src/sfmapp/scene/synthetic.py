@@ -399,8 +399,8 @@ def _points_and_visibility(
 
 
 def _sees(camera: Camera, pose: Array, xyz: Array, normals: Array) -> NDArray[np.bool_]:
-    """(N,) bool: in front, or around a wide lens, inside the image, on the front side of the surface, and where the lens
-    is one to one."""
+    """(N,) bool: in front (or anywhere, of a wide lens), inside the image, on the front side of the surface, and where
+    the lens is one to one."""
     xyz_cam = rigid3.apply(pose, xyz)
     depth = np.linalg.norm(xyz_cam, axis=1) if camera.is_wide else xyz_cam[:, 2]
     # 75 degrees off the normal is about where detectors lose a patch
