@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lens_families import LENSES, Lens, behind_percent, poses_of, straightness, surface_distances
+from lens_families import LENSES, Lens, behind_percent, lens_error_px, poses_of, straightness, surface_distances
 from rendered_worlds.all_round import AllRoundRenderer
 from rendered_worlds.rendering import Optics, Renderer
 from rendered_worlds.worlds import gallery_world
@@ -34,7 +34,7 @@ def write_photographs(camera: Camera, poses: np.ndarray, folder: Path) -> list[s
 
 def test_through_a_pinhole_both_renderers_see_the_same() -> None:
     camera = Camera(CameraModel.PINHOLE, 160, 120, np.array([110.0, 111.0, 81.0, 58.0]))
-    pose = poses_of("at a corner", 3)[1]
+    pose = poses_of("at a corner")[3]
     grey, distance = AllRoundRenderer(WORLD, camera).view(pose)
     plain = Renderer(WORLD, camera).view(pose)
     assert np.median(np.abs(grey - plain.grey)) < 1.0
@@ -47,7 +47,7 @@ def test_through_a_pinhole_both_renderers_see_the_same() -> None:
 def test_a_panorama_shows_the_world_all_round() -> None:
     """Where rays of a panorama end, there are surfaces; black is nowhere."""
     camera = Camera(CameraModel.EQUIRECTANGULAR, 128, 64, np.array([128.0, 64.0]))
-    pose = poses_of("round about", 12)[5]
+    pose = poses_of("round about")[5]
     grey, distance = AllRoundRenderer(WORLD, camera).view(pose)
     xy = np.stack(np.meshgrid(np.arange(128) + 0.5, np.arange(64) + 0.5), -1).reshape(-1, 2)
     ends = rigid3.apply(rigid3.inverse(pose), pixels_to_rays(camera, xy) * distance.reshape(-1, 1))
@@ -62,7 +62,7 @@ def test_views_all_round_are_registered_with_points_all_round(name: str, tmp_pat
         if name == "panorama"
         else Camera(CameraModel.OPENCV_FISHEYE, 440, 440, np.array([110.0, 110.5, 221, 218, -0.01, 0.002, 0, 0]))
     )
-    poses = poses_of("round about", 12)[::2]
+    poses = poses_of("round about")[::2]
     names = write_photographs(camera, poses, tmp_path / "images")
     given = camera.with_focal(1.004 * camera.focal)
     text = f"{camera.model.name},{','.join(str(value) for value in given.params)}"
@@ -77,8 +77,8 @@ def test_views_all_round_are_registered_with_points_all_round(name: str, tmp_pat
     assert 20.0 < behind_percent(model) < 60.0
     points = similarity.apply(errors.reference_from_estimate, model.point_xyz[model.is_triangulated])
     assert np.median(surface_distances(WORLD, points)) < 0.02
-    if name != "panorama":
-        assert model.cameras[0].focal == pytest.approx(camera.focal, rel=1e-3)  # it was given 4e-3 off
+    if name != "panorama":  # what lies at a right angle was 0.7 px off
+        assert lens_error_px(model.cameras[0], camera) < 0.3 * lens_error_px(given, camera)
     report = json.loads((out / "report.json").read_text())
     assert report["images"][0]["name"] == "000.png"
 

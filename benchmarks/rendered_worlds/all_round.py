@@ -21,7 +21,7 @@ from sfmapp.geometry import rigid3
 
 Array = NDArray[np.float64]
 
-SAMPLES = 3  # a side of a pixel
+SAMPLES = 2  # a side of a pixel
 FINER = 1.5  # pixels of a face for one of the photograph, a side, where the face is coarsest and the lens is as usual
 MARGIN_PX = 2  # of a face beyond its right angle, for bilinear samples
 # the face's camera from the photograph's: ahead, right, behind, left, below, above
@@ -67,7 +67,8 @@ class AllRoundRenderer:
         return maps
 
     def view(self, cam_from_world: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Grey values (H, W), neither rounded nor clipped, and the distance (H, W) of what is seen, inf of nothing."""
+        """Grey values (H, W), neither rounded nor clipped, and the distance (H, W) of the nearest that is seen, inf of
+        nothing."""
         renderer = Renderer(self.world, self._face_camera)
         rotation, center = rigid3.rotation_matrix(cam_from_world), rigid3.center(cam_from_world)
         grey = np.zeros(self.rays.shape[:2], np.float32)
@@ -87,9 +88,8 @@ class AllRoundRenderer:
             along = (self.rays[on_face] @ face[2]).astype(np.float32)
             distance[on_face] = np.where(here > 0, here / along, np.inf)
         height, width = self.camera.height, self.camera.width
-        middle = SAMPLES // 2
         mean: NDArray[np.float32] = grey.reshape(height, SAMPLES, width, SAMPLES).mean(axis=(1, 3), dtype=np.float32)
-        return mean, distance[middle::SAMPLES, middle::SAMPLES]
+        return mean, distance.reshape(height, SAMPLES, width, SAMPLES).min(axis=(1, 3))
 
     def photograph(self, cam_from_world: ArrayLike, optics: Optics, key: Sequence[int]) -> NDArray[np.uint8]:
         """An (H, W) uint8 image with the sensor's noise, drawn from the integers of ``key``; no vignetting, no blur."""

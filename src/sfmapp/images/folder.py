@@ -272,12 +272,12 @@ def _tell(
     if 0 < len(without) < len(image_set.images):
         events.decided(STAGE, f"{len(without)} of {len(image_set.images)} images have no mask", names=without)
     for entry in entries:
-        events.decided(
-            STAGE,
-            f"camera {entry.camera_idx}: {entry.num_images} images, {entry.width}x{entry.height}, focal "
-            f"length {entry.focal_px:.0f} +- {entry.focal_sigma_px:.0f} px ({entry.focal_reason})",
-            **entry,
-        )
+        # a panorama has no focal length: its size says all
+        known = entry.focal_reason
+        if entry.focal_sigma_px is not None:
+            known = f"focal length {entry.focal_px:.0f} +- {entry.focal_sigma_px:.0f} px ({known})"
+        size = f"{entry.width}x{entry.height}"
+        events.decided(STAGE, f"camera {entry.camera_idx}: {entry.num_images} images, {size}, {known}", **entry)
 
 
 def _tell_orientation(events: Events, records: list[ImageRecord]) -> None:

@@ -62,7 +62,7 @@ def write_results(
     facts = {"pixels": STORED, "orientations": noted_orientations(run.image_set.images)} if run.image_set else {}
     run.save_first(lambda: workspace.begin("mapping", keys.mapping, **facts))
     with run.stage("output"):
-        run.save_first(lambda: workspace.write_models(models, keypoints))
+        run.save_first(lambda: workspace.write_models(models, keypoints, run.events))
     with run.stage("recording"):
         manifest["recording"] = _record(run, models)
     report = _make_report(run, models, failure)
