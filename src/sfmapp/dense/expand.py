@@ -14,6 +14,7 @@ from numba import float32 as f32
 from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
 from sfmapp.dense.patch_kernels import (
     APART,
+    Trial,
     cell_of,
     cell_size,
     holds_window,
@@ -143,31 +144,20 @@ def _insert(store, row, count, p):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def try_cells(  # type: ignore[no-untyped-def]
-    image_arrays,
-    store_arrays,
-    own_arrays,
-    cell_arrays,
-    m,
-    places,
-    candidates,
-    first,
-    last,
-    limits,
-    wave,
-    scratch,
+    image_arrays, store_arrays, own_arrays, cell_arrays, m, places, candidates, part, limits, wave, scratch,
     found_arrays,
-):
-    """Grow patches into cells ``first`` to ``last`` of view m; results at the same positions of what is found.
+):  # fmt: skip
+    """Grow patches into cells ``part[0]`` to ``part[1]`` of view m; results at the same positions of what is found.
 
     With a negative wave the patches are those of a coarser level, and their own waves are passed on.
     """
     images, store, found = image_pointers(image_arrays), store_pointers(store_arrays), store_pointers(found_arrays)
     cells, own = cell_pointers(cell_arrays), store_pointers(own_arrays)
     slot_array, work = np.empty(MOST_SLOTS, np.int64), pointer(scratch)
-    slots, rhos, best = pointer(slot_array), offset(work, RHOS), offset(work, BEST)
+    trial = Trial(offset(work, BEST), pointer(slot_array), offset(work, RHOS), work)
     quads, width = offset(images.quads, images.start[m]), images.width[m]
     contrast = f32(CONTRAST) * images.noise[m] + f32(LEAST_CONTRAST)
-    for i in range(first, last):
+    for i in range(part[0], part[1]):
         found.num_views[i] = 0
         u, v = places[i, 0], places[i, 1]
         deviation = read_reference(quads, width, u, v, contrast, work)
@@ -182,12 +172,12 @@ def try_cells(  # type: ignore[no-untyped-def]
         parent = choose(images, store, m, uf, vf, candidate, work)
         if parent < 0:
             continue
-        n = slots_of(images, store, m, parent, slots, limits.max_refined)
+        n = slots_of(images, store, m, parent, trial.slots, limits.max_refined)
         if n < limits.min_views - 1:
             continue
-        n, sigma = refine(images, m, uf, vf, best, slots, rhos, n, limits, work)
-        if n <= 0 or not judge(images, m, uf, vf, best, slots, rhos, n, sigma, limits, work, found, i):
-            if is_one_short(n, rhos, limits):
+        n, sigma = refine(images, m, uf, vf, trial, n, limits)
+        if n <= 0 or not judge(images, m, uf, vf, trial, n, sigma, limits, found, i):
+            if is_one_short(n, trial.rhos, limits):
                 cells.tried[cell_of(images, m, u, v)] |= SHORT
             if wave < 0 and n > 0 and deviation < f32(CLEAR_DEVIATION) * images.noise[m]:
                 inherit(images, store, m, uf, vf, parent, found, i)

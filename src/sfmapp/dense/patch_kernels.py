@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -166,14 +167,29 @@ def _step(work, shift1, shift2):  # type: ignore[no-untyped-def]
     return solve3(n, work[SUMS + 6], work[SUMS + 7] + pull * shift1, work[SUMS + 8] + pull * shift2)
 
 
+class Trial(NamedTuple):
+    """Pointers to what is known of the patch that is being tried at a pixel.
+
+    Attributes:
+        plane: (3,) float32 w0, wx, wy.
+        slots: (MOST_SLOTS,) int64 neighbours of the view. rhos: float32 their NCC.
+        work: the scratch, which holds the window.
+    """
+
+    plane: Any
+    slots: Any
+    rhos: Any
+    work: Any
+
+
 @numba.njit(cache=True, nogil=True)
-def refine(images, m, u, v, plane, slots, rhos, n, limits, work):  # type: ignore[no-untyped-def]
+def refine(images, m, u, v, trial, n, limits):  # type: ignore[no-untyped-def]
     """Gauss-Newton on the mean NCC over neighbours ``slots[:n]``, which are sifted by what they see at the start.
 
-    ``plane``: (3,) float32 w0, wx, wy, in place. Returns the number of slots left, with their NCC in ``rhos``, and the
-    standard deviation of w0; 0 if that came to nothing, and their number below zero if fewer than
-    ``limits.min_views - 1`` are promising.
+    The plane changes in place. Returns the number of slots left, with their NCC in ``rhos``, and the standard deviation
+    of w0; 0 if that came to nothing, and their number below zero if fewer than ``limits.min_views - 1`` are promising.
     """
+    plane, slots, rhos, work = trial
     s0, s1, s2 = plane[0], plane[1], plane[2]
     step0, step1, step2 = f32(0.0), f32(0.0), f32(0.0)
     first1, first2 = plane[1], plane[2]
@@ -247,11 +263,12 @@ def _sigma(work, mean, num):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def judge(images, m, u, v, plane, slots, rhos, n, sigma, limits, work, found, i):  # type: ignore[no-untyped-def]
+def judge(images, m, u, v, trial, n, sigma, limits, found, i):  # type: ignore[no-untyped-def]
     """Ask the images that took no part, and enter the patch at ``found[i]`` if enough trust it; says whether it was.
 
     ``slots[:n]`` are those that did take part, with their ``rhos``.
     """
+    plane, slots, rhos, work = trial
     found.num_views[i] = 0
     num_asked = n
     for slot in range(images.num_slots):
@@ -274,12 +291,13 @@ def judge(images, m, u, v, plane, slots, rhos, n, sigma, limits, work, found, i)
         slots[k + 1], rhos[k + 1] = slot, rho
     if num_asked < limits.min_views - 1 or not rhos[limits.min_views - 2] >= f32(limits.trusted):
         return False
-    return _enter(images, m, u, v, plane, slots, rhos, num_asked, sigma, limits, found, i)
+    return _enter(images, m, u, v, trial, num_asked, sigma, limits, found, i)
 
 
 @numba.njit(cache=True, nogil=True)
-def _enter(images, m, u, v, plane, slots, rhos, num_asked, sigma, limits, found, i):  # type: ignore[no-untyped-def]
+def _enter(images, m, u, v, trial, num_asked, sigma, limits, found, i):  # type: ignore[no-untyped-def]
     """Check the geometry of a patch that enough images trust, and write it down."""
+    plane, slots, rhos, _ = trial
     k, center = offset(images.k, 4 * m), offset(images.center, 3 * m)
     w0 = np.float64(plane[0])
     z = 1.0 / w0

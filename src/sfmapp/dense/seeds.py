@@ -7,6 +7,7 @@ has a corner as well. Places that correlate there and in a second image are refi
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -23,7 +24,7 @@ from sfmapp.dense.expand import (
     likeness,
     slots_of,
 )
-from sfmapp.dense.patch_kernels import cell_of, holds_window, judge, measure, project, refine
+from sfmapp.dense.patch_kernels import Trial, cell_of, holds_window, judge, measure, project, refine
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
 from sfmapp.simd.pointers import offset, pointer
 
@@ -53,37 +54,37 @@ def corners(gray: NDArray[np.uint8], block_px: int, noise: float) -> NDArray[np.
     return places[blocks.max(axis=1) > floor].astype(np.int32)
 
 
+class CornerSearch(NamedTuple):
+    """Where matches of a corner are looked for.
+
+    Attributes:
+        num_neighbors: in so many of the best neighbours.
+        has_corner: (G,) bool, the cells of all views where a match may lie.
+        depth_range: (V, 2) float64 smallest and largest inverse depth.
+    """
+
+    num_neighbors: int
+    has_corner: NDArray[np.bool_]
+    depth_range: NDArray[np.float64]
+
+
 @numba.njit(cache=True, nogil=True)
 def match_corners(  # type: ignore[no-untyped-def]
-    image_arrays,
-    m,
-    places,
-    store_arrays,
-    cell_arrays,
-    num_searched,
-    has_corner,
-    depth_range,
-    first,
-    last,
-    limits,
-    scratch,
-    found_arrays,
-    spare,
-):
-    """Look for corners ``first`` to ``last`` of view m in its neighbours; patches at the same positions of ``found``.
+    image_arrays, m, places, store_arrays, cell_arrays, search, part, limits, scratch, found_arrays, spare
+):  # fmt: skip
+    """Look for corners ``part[0]`` to ``part[1]`` of view m in its neighbours; patches at the same positions of found.
 
-    ``num_searched``: in so many of them. ``has_corner``: (G,) bool, the cells of all views where a match may lie.
-    ``depth_range``: (V, 2) float64 smallest and largest inverse depth. ``spare``: a position of ``found`` that nobody
-    else uses. What is in a cell already stays; a second layer has to explain the corner better.
+    ``spare``: a position of ``found`` that nobody else uses. What is in a cell already stays; a second layer has to
+    explain the corner better.
     """
     images, found = image_pointers(image_arrays), store_pointers(found_arrays)
     store, cells = store_pointers(store_arrays), cell_pointers(cell_arrays)
     slot_array, work = np.empty(MOST_SLOTS, np.int64), pointer(scratch)
-    slots, rhos, plane = pointer(slot_array), offset(work, RHOS), offset(work, BEST)
+    trial = Trial(offset(work, BEST), pointer(slot_array), offset(work, RHOS), work)
     quads, width = offset(images.quads, images.start[m]), images.width[m]
     likes, depths = np.empty(NUM_KEPT, np.float32), np.empty(NUM_KEPT, np.float32)
     contrast = f32(CONTRAST) * images.noise[m] + f32(LEAST_CONTRAST)
-    for i in range(first, last):
+    for i in range(part[0], part[1]):
         found.num_views[i] = 0
         u, v = places[i, 0], places[i, 1]
         if not holds_window(images, m, u, v):
@@ -98,20 +99,20 @@ def match_corners(  # type: ignore[no-untyped-def]
             continue
         likes[:] = LEAST_SUPPORT
         depths[:] = f32(-1.0)
-        for slot in range(min(images.num_slots, num_searched)):
+        for slot in range(min(images.num_slots, search.num_neighbors)):
             if images.neighbors[m * images.num_slots + slot] < 0:
                 break
-            _search(images, m, slot, f32(u), f32(v), has_corner, depth_range[m], likes, depths, work)
-        _refine_best(images, m, f32(u), f32(v), depths, limits, slots, rhos, plane, work, found_arrays, spare, i)
+            _search(images, m, slot, f32(u), f32(v), search, likes, depths, work)
+        _refine_best(images, m, f32(u), f32(v), depths, limits, trial, found_arrays, spare, i)
         if there >= 0 and not is_second_layer(images, store, there, known, found, i):
             found.num_views[i] = 0
     slot_array[0] = 0
 
 
 @numba.njit(cache=True, nogil=True)
-def _refine_best(images, m, u, v, depths, limits, slots, rhos, plane, work, found_arrays, spare, i):  # type: ignore[no-untyped-def]
+def _refine_best(images, m, u, v, depths, limits, trial, found_arrays, spare, i):  # type: ignore[no-untyped-def]
     """Refine what the search has left of pixel (u, v), and enter the best at position i of ``found``."""
-    found = store_pointers(found_arrays)
+    found, plane, slots = store_pointers(found_arrays), trial.plane, trial.slots
     best = f32(-1.0)
     for j in range(NUM_KEPT):
         if depths[j] <= f32(0.0):
@@ -122,8 +123,8 @@ def _refine_best(images, m, u, v, depths, limits, slots, rhos, plane, work, foun
             if images.neighbors[m * images.num_slots + slot] >= 0 and n < limits.max_refined:
                 slots[n] = slot
                 n += 1
-        n, sigma = refine(images, m, u, v, plane, slots, rhos, n, limits, work)
-        if n > 0 and judge(images, m, u, v, plane, slots, rhos, n, sigma, limits, work, found, spare):
+        n, sigma = refine(images, m, u, v, trial, n, limits)
+        if n > 0 and judge(images, m, u, v, trial, n, sigma, limits, found, spare):
             quality = found.score[spare] * f32(found.num_views[spare])
             if quality > best:
                 best = quality
@@ -132,15 +133,16 @@ def _refine_best(images, m, u, v, depths, limits, slots, rhos, plane, work, foun
 
 
 @numba.njit(cache=True, nogil=True)
-def _search(images, m, slot, u, v, has_corner, depth_range, likes, depths, work):  # type: ignore[no-untyped-def]
+def _search(images, m, slot, u, v, search, likes, depths, work):  # type: ignore[no-untyped-def]
     """Walk the epipolar line of (u, v) in one neighbour, and keep the best places in ``likes`` and ``depths``."""
     pair = m * images.num_slots + slot
     a, b, s = offset(images.a, 9 * pair), offset(images.b, 3 * pair), images.neighbors[pair]
     q0, q1, q2 = a[0] * u + a[1] * v + a[2], a[3] * u + a[4] * v + a[5], a[6] * u + a[7] * v + a[8]
-    low, high = _visible_range(q0, q1, q2, b, depth_range[0], depth_range[1], images.width[s], images.height[s])
+    nearest, farthest = search.depth_range[m, 1], search.depth_range[m, 0]
+    low, high = _visible_range(q0, q1, q2, b, farthest, nearest, images.width[s], images.height[s])
     if not low < high:
         return
-    w, side = low, images.cell_px
+    w, side, has_corner = low, images.cell_px, search.has_corner
     while w < high:
         scale = q2 + b[2] * w
         x, y = (q0 + b[0] * w) / scale, (q1 + b[1] * w) / scale
@@ -200,15 +202,15 @@ def _keep(like, depth, likes, depths):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def try_points(image_arrays, m, places, point_arrays, first, last, limits, scratch, found_arrays):  # type: ignore[no-untyped-def]
-    """Patches at sparse points ``first`` to ``last``, given as a store, in the pixels of view m where they are seen."""
+def try_points(image_arrays, m, places, point_arrays, part, limits, scratch, found_arrays):  # type: ignore[no-untyped-def]
+    """Patches at sparse points ``part[0]`` to ``part[1]``, given as a store, in the pixels of view m that show them."""
     images, found = image_pointers(image_arrays), store_pointers(found_arrays)
     slot_array, work = np.empty(MOST_SLOTS, np.int64), pointer(scratch)
-    slots, rhos, plane = pointer(slot_array), offset(work, RHOS), offset(work, BEST)
+    trial = Trial(offset(work, BEST), pointer(slot_array), offset(work, RHOS), work)
     quads, width = offset(images.quads, images.start[m]), images.width[m]
     points = store_pointers(point_arrays)
     contrast = f32(CONTRAST) * images.noise[m] + f32(LEAST_CONTRAST)
-    for i in range(first, last):
+    for i in range(part[0], part[1]):
         found.num_views[i] = 0
         u, v = places[i, 0], places[i, 1]
         if not holds_window(images, m, u, v):
@@ -217,12 +219,13 @@ def try_points(image_arrays, m, places, point_arrays, first, last, limits, scrat
         if deviation < f32(2.0) * images.noise[m]:
             continue
         _, _, z = project(images, m, offset(points.xyz, 3 * i))
-        n = slots_of(images, points, m, i, slots, limits.max_refined)
+        n = slots_of(images, points, m, i, trial.slots, limits.max_refined)
         if z <= 0.0 or n < limits.min_views - 1:
             continue
+        plane = trial.plane
         plane[0], plane[1], plane[2] = f32(1.0 / z), f32(0.0), f32(0.0)
-        n, sigma = refine(images, m, f32(u), f32(v), plane, slots, rhos, n, limits, work)
-        if n > 0 and judge(images, m, f32(u), f32(v), plane, slots, rhos, n, sigma, limits, work, found, i):
+        n, sigma = refine(images, m, f32(u), f32(v), trial, n, limits)
+        if n > 0 and judge(images, m, f32(u), f32(v), trial, n, sigma, limits, found, i):
             found.wave[i] = 0
     slot_array[0] = 0
 
