@@ -1,6 +1,6 @@
 """Make an environment in .venv and run the demo or the tests in it. Needs nothing but Python 3.11 to 3.13.
 
-python3 get_started.py demo    installs sfmapp, reconstructs the bundled sample, compares it with the truth
+python3 get_started.py demo    installs sfmapp, reconstructs the bundled sample, compares it with the ground truth
 python3 get_started.py test    installs sfmapp and what its tests need, runs them
 """
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from machine import RESULTS, describe_machine
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
@@ -149,10 +150,15 @@ def run_sfmapp(start: Reconstruction, loss: str, scale_px: float, tolerance: flo
     return {"cpu_s": cpu, "wall_s": wall, "iterations": report.num_iterations}, state
 
 
-def compare(name: str, truth: Reconstruction, args: argparse.Namespace) -> list[dict[str, Any]]:
+def compare(name: str, ground_truth: Reconstruction, args: argparse.Namespace) -> list[dict[str, Any]]:
     """Rows of the table for one model: every loss, medians over the repeats, solvers taking turns."""
     start = perturb(
-        truth, rotation_deg=0.1, translation_fraction=0.003, point_fraction=0.003, focal_fraction=0.02, seed=args.seed
+        ground_truth,
+        rotation_deg=0.1,
+        translation_fraction=0.003,
+        point_fraction=0.003,
+        focal_fraction=0.02,
+        seed=args.seed,
     )
     rows = []
     for loss in args.loss:
@@ -165,7 +171,8 @@ def compare(name: str, truth: Reconstruction, args: argparse.Namespace) -> list[
                 samples[solver].append(sample)
                 cost[solver] = neutral_cost(state, loss, args.scale_px)
         row: dict[str, Any] = {
-            "model": name, "images": len(truth.image_names), "observations": truth.tracks.num_observations,
+            "model": name, "images": len(ground_truth.image_names),
+            "observations": ground_truth.tracks.num_observations,
             "loss": loss, "start": neutral_cost(start, loss, args.scale_px),
         }  # fmt: skip
         for solver in samples:
@@ -199,7 +206,7 @@ def main() -> None:
     parser.add_argument("--tolerance", type=float, default=1e-6, help="relative decrease of the cost that stops both")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path, help="write the rows here as well")
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "bundle_adjustment.json")
     args = parser.parse_args()
     print(
         f"{'model':24} {'imgs':>5} {'obs':>8} {'loss':8} | {'Ceres, one thread':>36} | {'sfmapp, one thread':>36} | CPU"
@@ -212,8 +219,7 @@ def main() -> None:
         rows += compare(f"synthetic {args.layout}", scene.observed, args)
     if rows:
         print(f"geometric mean of the ratios: {math.exp(np.mean([math.log(r['ratio']) for r in rows])):.1f}x")
-    if args.json:
-        args.json.write_text(json.dumps(rows, indent=1) + "\n")
+    args.output.write_text(json.dumps(describe_machine() | {"rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ import argparse
 import hashlib
 import json
 import os
-import platform
 import re
 import shutil
 import subprocess
@@ -21,7 +20,6 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dense_inputs import lego_inputs, photographs_model
+from machine import RESULTS, ROOT, describe_machine
 from sfmapp.evaluation.clouds import score_cloud
 from sfmapp.evaluation.measured import run_measured
 from sfmapp.formats.ply_reader import read_ply_geometry
 
-ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))
 PROTOTYPE = ROOT.parent / "shared" / "research" / "prototypes"
 
@@ -57,7 +55,7 @@ class Case:
         images, model: photographs and COLMAP text model of their cameras.
         level, cell_px: resolution and cell.
         has_masks: the alpha of the photographs says where there is something.
-        truth: PLY of the true surface, None for none; distances: where to score, in its units.
+        ground_truth: PLY of the true surface, None for none; distances: where to score, in its units.
         box: low and high corner of what is scored.
         repeat_views: so many views are given a second time, for the memory of larger sets.
         peer_images: photographs for programs that know no alpha; None: the same, "" for no peer.
@@ -69,7 +67,7 @@ class Case:
     level: int
     cell_px: int
     has_masks: bool = False
-    truth: Path | None = None
+    ground_truth: Path | None = None
     distances: tuple[float, ...] = ()
     box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     repeat_views: int = 0
@@ -86,7 +84,7 @@ def find_cases(scenes: Path, work: Path, only: str) -> Iterator[Case]:
         lego = lego_inputs(DATA / "nerf-lego-small", work / "lego")
         for has_masks, name in ((True, "lego with masks"), (False, "lego without masks")):
             yield Case(
-                name, DATA / "nerf-lego-small" / "images", lego.model, 0, 1, has_masks, lego.truth,
+                name, DATA / "nerf-lego-small" / "images", lego.model, 0, 1, has_masks, lego.ground_truth,
                 (0.005 * lego.size, 0.01 * lego.size), peer_images=lego.images_on_white, has_peer=not has_masks,
             )  # fmt: skip
     for scene, levels in (("courtyard", (1, 0)), ("railing", (1,))):
@@ -99,7 +97,7 @@ def find_cases(scenes: Path, work: Path, only: str) -> Iterator[Case]:
             pixel = facts["gsd"] * 2**level
             yield Case(
                 f"{scene} level {level}", folder / "images", folder / "model_points", level, 1,
-                truth=folder / "truth.ply", distances=(pixel, 2 * pixel, 5 * pixel), box=(low, high),
+                ground_truth=folder / "ground_truth.ply", distances=(pixel, 2 * pixel, 5 * pixel), box=(low, high),
             )  # fmt: skip
         if scene == "courtyard":
             yield Case(
@@ -155,24 +153,24 @@ def run_prototype(case: Case, work: Path) -> dict[str, Any]:
 
 
 def scores(case: Case, xyz: NDArray[np.float64]) -> dict[str, Any]:
-    """Accuracy, completeness and F of a cloud; of a truth with labels, completeness by label and width."""
-    if case.truth is None:
+    """Accuracy, completeness and F of a cloud; of a ground truth with labels, completeness by label and width."""
+    if case.ground_truth is None:
         return {}
-    score = score_cloud(xyz, read_ply_geometry(case.truth).xyz, case.distances, box=case.box, threads=2)
+    score = score_cloud(xyz, read_ply_geometry(case.ground_truth).xyz, case.distances, box=case.box, threads=2)
     found: dict[str, Any] = {"score": score.summary()}
-    labels = truth_labels(case.truth)
+    labels = ground_truth_labels(case.ground_truth)
     if labels is not None:
-        is_scored = ~np.isnan(score.truth_distance)
+        is_scored = ~np.isnan(score.ground_truth_distance)
         surfaces = {"rest": labels == 0, "railing": labels > 0}
         surfaces |= {f"bars of {width} px": labels == width for width in np.unique(labels[labels > 0]).tolist()}
         found["completeness_by_surface"] = {
-            name: [float((score.truth_distance[mine & is_scored] <= d).mean()) for d in score.distances]
+            name: [float((score.ground_truth_distance[mine & is_scored] <= d).mean()) for d in score.distances]
             for name, mine in surfaces.items()
         }
     return found
 
 
-def truth_labels(path: Path) -> NDArray[np.uint8] | None:
+def ground_truth_labels(path: Path) -> NDArray[np.uint8] | None:
     """Widths in pixels (0: no bar) as ``make_dense_scene.py`` leaves them in the property green; None without."""
     with path.open("rb") as file:
         head = file.read(4096)
@@ -244,18 +242,12 @@ def markdown(report: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def environment() -> dict[str, Any]:
-    """What the numbers depend on."""
-
-    def git(*words: str) -> str:
-        return subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True).stdout.strip()
-
-    model = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
+def published() -> dict[str, Any]:
+    """The figures of the note as the results hold them."""
+    names = ("cpu_s", "num_points", "f_scores")
     return {
-        "date": datetime.now(UTC).isoformat(timespec="minutes"),
-        "commit": git("rev-parse", "--short", "HEAD")
-        + ("+changes" if git("status", "--porcelain", "--untracked-files=no", "src") else ""),
-        "cpu": model[0].split(":")[1].strip() if model else platform.processor(),
+        case: {program: dict(zip(names, figures, strict=True)) for program, figures in programs.items()}
+        for case, programs in PUBLISHED.items()
     }
 
 
@@ -265,10 +257,10 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, default=ROOT / "out" / "dense", help="folder of the rendered scenes")
     parser.add_argument("--only", default="", help="cases whose names begin with this; others keep their results")
     parser.add_argument("--program", choices=["sfmapp", "prototype"], help="run just one of the two")
-    parser.add_argument("-o", "--output", type=Path, default=ROOT / "benchmarks" / "results" / "dense.json")
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "dense.json")
     args = parser.parse_args()
     runs = json.loads(args.output.read_text())["runs"] if args.output.is_file() else []
-    report: dict[str, Any] = environment() | {"runs": runs}
+    report: dict[str, Any] = describe_machine() | {"published": published(), "runs": runs}
     with tempfile.TemporaryDirectory(prefix="dense-") as name:
         work = Path(name)
         for case in find_cases(args.scenes, work, args.only):

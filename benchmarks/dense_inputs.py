@@ -1,4 +1,4 @@
-"""Models and truths that the dense benchmark needs and the shared data do not hold."""
+"""Models and ground ground truths that the dense benchmark needs and the shared data do not hold."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ LEGO_TOLERANCE = 0.04
 
 @dataclass(frozen=True)
 class Lego:
-    """Attributes: model (text), truth (PLY), images without alpha, size: diagonal of the truth's bounding box."""
+    """Attributes: model (text), ground truth (PLY), images without alpha, size: diagonal of the ground truth's bounding
+    box."""
 
     model: Path
-    truth: Path
+    ground_truth: Path
     images_on_white: Path
     size: float
 
@@ -58,16 +59,18 @@ def photographs_model(images: Path, work: Path) -> Path:
 
 
 def lego_inputs(folder: Path, work: Path) -> Lego:
-    """Truth from the depth of the test views; model of the training views with points of that truth, for the peer."""
+    """Ground truth from the depth of the test views; model of the training views with points of that ground truth, for
+    the peer."""
     import cv2
 
     (work / "images").mkdir(parents=True)
-    truth = np.concatenate(list(_depth_points(folder)))
-    write_ply(work / "truth.ply", truth, np.zeros((len(truth), 3), np.uint8))
+    ground_truth = np.concatenate(list(_depth_points(folder)))
+    write_ply(work / "ground_truth.ply", ground_truth, np.zeros((len(ground_truth), 3), np.uint8))
     cameras = json.loads((folder / "cameras.json").read_text())["cameras"]
-    points = truth[np.random.default_rng(1).permutation(len(truth))[:NUM_POINTS]]
+    points = ground_truth[np.random.default_rng(1).permutation(len(ground_truth))[:NUM_POINTS]]
     seen = np.stack(
-        [_visible(points, truth, *_matrices(camera), (camera["width"], camera["height"])) for camera in cameras], 1
+        [_visible(points, ground_truth, *_matrices(camera), (camera["width"], camera["height"])) for camera in cameras],
+        1,
     )
     points, seen = points[seen.sum(axis=1) >= 3], seen[seen.sum(axis=1) >= 3]
     tracks: list[list[str]] = [[] for _ in points]
@@ -93,8 +96,8 @@ def lego_inputs(folder: Path, work: Path) -> Lego:
     (work / "model").mkdir()
     for name, rows in lines.items():
         (work / "model" / f"{name}.txt").write_text("\n".join([*rows, ""]))
-    size = float(np.linalg.norm(np.ptp(truth, axis=0)))
-    return Lego(work / "model", work / "truth.ply", work / "images", size)
+    size = float(np.linalg.norm(np.ptp(ground_truth, axis=0)))
+    return Lego(work / "model", work / "ground_truth.ply", work / "images", size)
 
 
 def _depth_points(folder: Path) -> Iterator[Array]:
@@ -118,7 +121,9 @@ def _matrices(camera: dict[str, Any]) -> tuple[Array, Array, Array]:
     return np.array(camera["K"]), np.array(camera["R_w2c"]), np.array(camera["t_w2c"]).ravel()
 
 
-def _visible(points: Array, truth: Array, k: Array, r: Array, t: Array, size: tuple[int, int]) -> NDArray[np.bool_]:
+def _visible(
+    points: Array, ground_truth: Array, k: Array, r: Array, t: Array, size: tuple[int, int]
+) -> NDArray[np.bool_]:
     """(N,) bool: in the image and not behind the true points around, splatted four pixels wide."""
     width, height = size
 
@@ -130,7 +135,7 @@ def _visible(points: Array, truth: Array, k: Array, r: Array, t: Array, size: tu
         return np.where(inside, cell, -1), cam[:, 2]
 
     nearest = np.full((width // 4 + 1) * (height // 4 + 1), np.inf)
-    cell, depth = project(truth)
+    cell, depth = project(ground_truth)
     np.minimum.at(nearest, cell[cell >= 0], depth[cell >= 0])
     cell, depth = project(points)
     return np.asarray((cell >= 0) & (depth < nearest[cell] + LEGO_TOLERANCE))

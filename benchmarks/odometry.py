@@ -1,8 +1,9 @@
-"""Whole command against the truth: `sfmapp odometry` on real and rendered sequences, and pycolmap beside it if asked.
+"""Whole command against the ground truth: `sfmapp odometry` on real and rendered sequences, and pycolmap beside it if
+asked.
 
     python benchmarks/odometry.py                     # kitti00-200 forward, in steps of two, backwards; rendered ones
     python benchmarks/odometry.py --rendered 0 --peer # real data alone, and pycolmap on every second frame (minutes)
-    python benchmarks/odometry.py FOLDER ...          # sequences with a truth: KITTI, TUM, EuRoC
+    python benchmarks/odometry.py FOLDER ...          # sequences with a ground truth: KITTI, TUM, EuRoC
 
 The command runs as a process of its own with its default options, without a recording; wall seconds, CPU seconds (user
 and system, children included) and peak resident memory are those of the process, its start and its imports included.
@@ -16,19 +17,18 @@ import argparse
 import hashlib
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
 
+from machine import RESULTS, ROOT, describe_machine
 from sfmapp.errors import SfmError
 from sfmapp.evaluation.measured import ProcessUsage, run_measured
 from sfmapp.evaluation.second_opinion import CameraGroup, SecondOpinionOptions, ask_second_opinion
@@ -38,7 +38,6 @@ from sfmapp.formats.colmap import read_model
 from sfmapp.pipelines.evaluate import evaluate
 from sfmapp.sequences.open import SequenceOptions, open_sequence
 
-ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))
 # one of each kind, as render_sequences.py lays them out
 RENDERED = (("street", ()), ("street", ("--mono",)), ("hall", ()), ("hall", ("--mono",)), ("room", ()))
@@ -84,13 +83,13 @@ def run_sfmapp(case: Case, out: Path, args: argparse.Namespace) -> dict[str, Any
     """One run of the command in a fresh workspace."""
     script = Path(sys.executable).with_name("sfmapp")
     command = [str(script), "odometry", str(case.sequence), "-o", str(out), "--seed", str(args.seed), "-q"]
-    command += ["--no-record", *(["--threads", str(args.threads)] if args.threads else [])]
+    command += ["--no-recording", *(["--threads", str(args.threads)] if args.threads else [])]
     command += [*case.flags, *(flag for setting in args.set for flag in ("--set", setting))]
     usage = run_measured(command, out.with_suffix(".log"))
     if usage.exit_code:
         tail = out.with_suffix(".log").read_text(errors="replace")[-2000:]
         print(f"{case.name}: sfmapp ended with code {usage.exit_code}:\n{tail}", file=sys.stderr)
-    return asdict(usage) | report_numbers(out, usage) | truth_numbers(out, case) | {"digest": digest(out)}
+    return asdict(usage) | report_numbers(out, usage) | ground_truth_numbers(out, case) | {"digest": digest(out)}
 
 
 def report_numbers(out: Path, usage: ProcessUsage) -> dict[str, Any]:
@@ -112,27 +111,27 @@ def report_numbers(out: Path, usage: ProcessUsage) -> dict[str, Any]:
         "cpu_ms_per_frame": timing["cpu_ms_per_frame"],
         "cpu_ms_by_part": timing.get("parts_cpu_ms"),
         "tracking_ms": timing.get("tracking_ms"),
-        "live_ate_m": next((row["ate_m"]["rmse"] for row in report["truth"] if row["poses"] == "live"), None),
+        "live_ate_m": next((row["ate_m"]["rmse"] for row in report["ground_truth"] if row["poses"] == "live"), None),
     }
 
 
-def truth_numbers(out: Path, case: Case) -> dict[str, Any]:
+def ground_truth_numbers(out: Path, case: Case) -> dict[str, Any]:
     """Errors of the largest map by ``sfmapp evaluate``'s own code: with a scale of its own where it has no unit."""
     try:
         result = evaluate(out, case.sequence)
         unit = json.loads((out / "report.json").read_text(encoding="utf-8"))["maps"][0]["unit"]
     except (SfmError, OSError, LookupError) as error:
-        return {"truth": None, "why": str(error)}
+        return {"ground_truth": None, "why": str(error)}
     errors = result.errors["se3" if unit == "m" else "sim3"]
     ate = statistics(errors.absolute.translation_m)
     assert ate is not None
     return {
-        "truth": {
+        "ground_truth": {
             "alignment": "se3" if unit == "m" else "sim3",
             "ate_m": ate,
-            "ate_percent": 100 * ate["rmse"] / result.pairs.truth.path_m,
+            "ate_percent": 100 * ate["rmse"] / result.pairs.ground_truth.path_m,
             "scale": errors.absolute.scale,
-            "path_m": result.pairs.truth.path_m,
+            "path_m": result.pairs.ground_truth.path_m,
             "coverage": result.pairs.coverage,
             "drift_percent": errors.drift.t_rel_percent,
             "drift_deg_per_100m": 100 * errors.drift.r_rel_deg_per_m,
@@ -154,7 +153,7 @@ def run_peer(case: Case, work: Path, args: argparse.Namespace) -> dict[str, Any]
     """pycolmap on every second frame of the first camera: exhaustive matching, starting from the known intrinsics."""
     sequence = open_sequence(case.sequence, SequenceOptions(mono=True), Events())
     frames = [(frame.name, frame.timestamp_s) for frame in sequence.frames()][::2]
-    camera, truth = sequence.rig.cameras[0], sequence.truth
+    camera, ground_truth = sequence.rig.cameras[0], sequence.ground_truth
     names = [name for name, _ in frames]
     options = SecondOpinionOptions(seed=args.seed, num_threads=args.threads, camera_model=camera.model.name)
     group = CameraGroup(tuple(names), tuple(camera.params.tolist()))
@@ -162,23 +161,24 @@ def run_peer(case: Case, work: Path, args: argparse.Namespace) -> dict[str, Any]
     values = {
         "exit_code": 0, "wall_s": opinion.wall_s, "cpu_s": opinion.cpu_s, "peak_memory_mb": opinion.peak_memory_mb,
         "num_frames": len(names), "num_with_pose": opinion.num_registered, "num_in_largest_map": opinion.num_registered,
-        "process_cpu_ms_per_frame": 1e3 * opinion.cpu_s / max(len(names), 1), "truth": None,
+        "process_cpu_ms_per_frame": 1e3 * opinion.cpu_s / max(len(names), 1), "ground_truth": None,
     }  # fmt: skip
-    if opinion.model_folder is None or truth is None:
+    if opinion.model_folder is None or ground_truth is None:
         return values
     model = read_model(opinion.model_folder)[0]
     pose_of = dict(zip(model.image_names, model.cam_from_world, strict=True))
     poses = np.array([pose_of.get(name, np.full(7, np.nan)) for name in names])
     pairs = associate(
         Trajectory.from_cam_from_world(poses, [time for _, time in frames]),
-        Trajectory.from_cam_from_world(truth.cam_from_world, truth.timestamps_s),
+        Trajectory.from_cam_from_world(ground_truth.cam_from_world, ground_truth.timestamps_s),
     )
     error = absolute_error(pairs, "sim3")
     ate = statistics(error.translation_m)
     assert ate is not None
     drift = kitti_drift(pairs, scale=error.scale)
-    path = pairs.truth.path_m
-    values["truth"] = {"alignment": "sim3", "ate_m": ate, "ate_percent": 100 * ate["rmse"] / path, "path_m": path,
+    path = pairs.ground_truth.path_m
+    values["ground_truth"] = {"alignment": "sim3", "ate_m": ate, "ate_percent": 100 * ate["rmse"] / path,
+                       "path_m": path,
                        "scale": error.scale, "coverage": pairs.coverage, "drift_percent": drift.t_rel_percent,
                        "drift_deg_per_100m": 100 * drift.r_rel_deg_per_m, "is_kitti_drift": True}  # fmt: skip
     return values
@@ -233,7 +233,7 @@ RESULT_KEYS = (
     "num_maps",
     "unit",
     "live_ate_m",
-    "truth",
+    "ground_truth",
     "exit_code",
 )
 
@@ -249,10 +249,16 @@ def markdown(report: dict[str, Any]) -> str:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in report["rows"]:
-        truth = row["truth"] or {}
-        ate = f"{truth['ate_m']['rmse']:.3g} ({truth['ate_percent']:.2g} %) {truth['alignment']}" if truth else "-"
-        drift = f"{truth['drift_percent']:.2f}, {truth['drift_deg_per_100m']:.2f}" if truth else "-"
-        if truth and not truth["is_kitti_drift"]:
+        ground_truth = row["ground_truth"] or {}
+        ate = (
+            f"{ground_truth['ate_m']['rmse']:.3g} ({ground_truth['ate_percent']:.2g} %) {ground_truth['alignment']}"
+            if ground_truth
+            else "-"
+        )
+        drift = (
+            f"{ground_truth['drift_percent']:.2f}, {ground_truth['drift_deg_per_100m']:.2f}" if ground_truth else "-"
+        )
+        if ground_truth and not ground_truth["is_kitti_drift"]:
             drift += " *"
         speed = row["num_frames"] / row["wall_s"] if row["num_frames"] and row["wall_s"] else None
         same = {True: "yes", False: "NO", None: "-"}[row["same_bytes"]]
@@ -267,7 +273,7 @@ def markdown(report: dict[str, Any]) -> str:
         )
     loud = max((run["load_before"] for run in report["runs"]), default=0.0)
     lines += ["", f"Highest load average before a run: {loud:.1f}."]
-    if any(row["truth"] and not row["truth"]["is_kitti_drift"] for row in report["rows"]):
+    if any(row["ground_truth"] and not row["ground_truth"]["is_kitti_drift"] for row in report["rows"]):
         lines.append("\\* the path is too short for KITTI's stretches: over 10, 20, ..., 80 % of it.")
     return "\n".join(lines)
 
@@ -278,21 +284,7 @@ def _cell(value: float | None, form: str) -> str:
 
 def environment(args: argparse.Namespace) -> dict[str, Any]:
     """What the numbers depend on."""
-    from importlib.metadata import version
-
-    def git(*words: str) -> str:
-        return subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True).stdout.strip()
-
-    model = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
-    is_dirty = bool(git("status", "--porcelain", "--untracked-files=no", "src", "pipelines"))
-    names = ("sfmapp", "pycolmap", "numpy", "numba", "opencv-contrib-python-headless", "gtsam")
-    return {
-        "date": datetime.now(UTC).isoformat(timespec="minutes"),
-        "commit": git("rev-parse", "--short", "HEAD") + ("+changes" if is_dirty else ""),
-        "versions": {name: version(name) for name in names},
-        "python": platform.python_version(),
-        "cpu": model[0].split(":")[1].strip() if model else platform.processor(),
-        "cores": len(os.sched_getaffinity(0)),
+    return describe_machine() | {
         "seed": args.seed,
         "repeats": args.repeats,
         "threads": args.threads,
@@ -315,12 +307,10 @@ def main() -> None:
     parser.add_argument("--only", action="append", metavar="TEXT", help="only the cases with this in their names")
     parser.add_argument("--peer", action="store_true", help="pycolmap as well, on every second frame: minutes")
     parser.add_argument("--work", type=Path, default=None, help="folder for the workspaces, which are removed again")
-    parser.add_argument(
-        "-o", "--output", type=Path, default=None, help="default: benchmarks/results/odometry-DATE.json"
-    )
+    parser.add_argument("-o", "--output", type=Path, default=None, help="default: benchmarks/results/odometry.json")
     args = parser.parse_args()
     report: dict[str, Any] = environment(args) | {"runs": []}
-    output = args.output or ROOT / "benchmarks" / "results" / f"odometry-{report['date'][:10]}.json"
+    output = args.output or RESULTS / "odometry.json"
     output.parent.mkdir(parents=True, exist_ok=True)
     cases = [case for case in find_cases(args) if not args.only or any(text in case.name for text in args.only)]
     if not cases:
@@ -330,9 +320,10 @@ def main() -> None:
             run_sfmapp(Case("warm", case.sequence, ("--stop", "40")), Path(work) / "out", args)
     for run in measure(cases, args):
         report["runs"].append(run)
-        truth = run["truth"]
+        ground_truth = run["ground_truth"]
         print(f"{run['case']} {run['program']}: {run.get('num_in_largest_map')} of {run['num_frames']} frames, "
-              f"ATE {truth['ate_m']['rmse'] if truth else None}, {run['wall_s']:.1f} s wall, {run['cpu_s']:.1f} s CPU, "
+              f"ATE {ground_truth['ate_m']['rmse'] if ground_truth else None}, "
+              f"{run['wall_s']:.1f} s wall, {run['cpu_s']:.1f} s CPU, "
               f"{run['peak_memory_mb']:.0f} MB", file=sys.stderr)  # fmt: skip
         report["rows"] = summaries(report["runs"])
         output.write_text(json.dumps(report, indent=1) + "\n")

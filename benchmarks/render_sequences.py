@@ -1,4 +1,4 @@
-"""Write rendered sequences with exact truth to disk, laid out as the real data sets are.
+"""Write rendered sequences with exact ground truth to disk, laid out as the real data sets are.
 
     python benchmarks/render_sequences.py street --layout kitti --frames 300 OUT
     python benchmarks/render_sequences.py hall --layout euroc --frames 600 OUT
@@ -142,7 +142,7 @@ def opencv_intrinsics(camera: Camera) -> list[float]:
 
 
 def write_kitti_layout(sequence: RenderedSequence, out: Path, threads: int) -> None:
-    """KITTI odometry: image_0, image_1, calib.txt, times.txt; the truth in poses.txt. Rectified cameras only."""
+    """KITTI odometry: image_0, image_1, calib.txt, times.txt; the ground truth in poses.txt. Rectified cameras only."""
     lines = []
     for i in range(4):  # the colour cameras sit where the grey ones do
         sensor = min(i % 2, len(sequence.rig.cameras) - 1)
@@ -155,7 +155,7 @@ def write_kitti_layout(sequence: RenderedSequence, out: Path, threads: int) -> N
         lines.append(f"P{i}: " + " ".join(f"{v:.12e}" for v in matrix.ravel()) + "\n")
     (out / "calib.txt").write_text("".join(lines))
     (out / "times.txt").write_text("".join(f"{t:.6e}\n" for t in sequence.timestamps_s))
-    write_kitti(out / "poses.txt", sequence.truth)
+    write_kitti(out / "poses.txt", sequence.ground_truth)
     for sensor in range(len(sequence.rig.cameras)):
         (out / f"image_{sensor}").mkdir()
     write_images(sequence, lambda frame, sensor: out / f"image_{sensor}" / f"{frame:06d}.png", threads)
@@ -166,10 +166,10 @@ def write_tum_layout(sequence: RenderedSequence, out: Path, threads: int) -> Non
     names = [f"{TUM_START_S + t:.6f}" for t in sequence.timestamps_s]
     head = "# color images\n# file: 'rendered'\n# timestamp filename\n"
     (out / "rgb.txt").write_text(head + "".join(f"{name} rgb/{name}.png\n" for name in names))
-    truth = rigid3.inverse(sequence.truth)
+    ground_truth = rigid3.inverse(sequence.ground_truth)
     rows = [
         f"{name} " + " ".join(f"{v:.9f}" for v in (*pose[4:], *pose[:4])) + "\n"
-        for name, pose in zip(names, truth, strict=True)
+        for name, pose in zip(names, ground_truth, strict=True)
         if np.isfinite(pose).all()
     ]
     head = "# ground truth trajectory\n# file: 'rendered'\n# timestamp tx ty tz qx qy qz qw\n"
@@ -212,9 +212,9 @@ def write_euroc_layout(sequence: RenderedSequence, out: Path, threads: int) -> N
 def _write_inertia(sequence: RenderedSequence, mav: Path, stamps: NDArray[np.int64]) -> None:
     """imu0 where there is one, and the true states of the body: at its samples, or else at the frames."""
     imu = sequence.imu
-    known = np.isfinite(sequence.truth).all(1)
+    known = np.isfinite(sequence.ground_truth).all(1)
     zeros = np.zeros((int(known.sum()), 6))
-    times, world_from_body = stamps[known], rigid3.inverse(sequence.truth[known])
+    times, world_from_body = stamps[known], rigid3.inverse(sequence.ground_truth[known])
     states = np.column_stack([sequence.motion[known, 3:], zeros])
     if imu is not None:
         times = EUROC_START_NS + np.rint(imu.timestamps_s * 1e9).astype(np.int64)
@@ -235,7 +235,7 @@ def _write_inertia(sequence: RenderedSequence, mav: Path, stamps: NDArray[np.int
     folder = mav / "state_groundtruth_estimate0"
     folder.mkdir()
     (folder / "sensor.yaml").write_text(
-        f"%YAML:1.0\n\nsensor_type: visual-inertial\ncomment: the exact truth\n\n{_transform(rigid3.IDENTITY)}\n"
+        f"%YAML:1.0\n\nsensor_type: visual-inertial\ncomment: the exact ground truth\n\n{_transform(rigid3.IDENTITY)}\n"
     )
     axes = ("p_RS_R_{} [m]", "q_RS_{} []", "v_RS_R_{} [m s^-1]", "b_w_RS_S_{} [rad s^-1]", "b_a_RS_S_{} [m s^-2]")
     names = [

@@ -9,11 +9,14 @@ standard deviations, and the worst error of those that were called settled. A se
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
+from machine import RESULTS, describe_machine
 from rendered_worlds import sequences as rendered
 from rendered_worlds.sequences import RenderedSequence
 from sfmapp.camera.camera import Camera, CameraModel
@@ -31,8 +34,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="folder for the pictures, which are used again")
     parser.add_argument("--sequences", type=int, default=40)
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "self_calibration.json")
     args = parser.parse_args()
-    scores, settled = [], []
+    runs: list[dict[str, Any]] = []
     for number in range(args.sequences):
         place = list(PLACES)[number % len(PLACES)]
         rng = np.random.default_rng([number, 0x5E1F])
@@ -44,17 +48,31 @@ def main() -> None:
         try:
             _, found = self_calibrated(str(folder), load_options(settings=["sequence.fps=10"]), Events())
         except InputError as refusal:
+            runs.append({"sequence": folder.name, "focal_px": focal, "is_refused": True, "reason": str(refusal)})
             print(f"{folder.name}: {focal:.1f} px, refused: {refusal}", flush=True)
             continue
-        sigma = found["focal_sigma_relative"]
         error = next(found["params"][name] for name in ("f", "fx") if name in found["params"]) / focal - 1
-        scores.append(abs(error) / sigma)
-        settled += [abs(error)] if found["is_settled"] else []
-        word = "settled" if found["is_settled"] else "not settled"
-        print(f"{folder.name}: {focal:.1f} px, {100 * error:+.2f} % of {100 * sigma:.2f} %, {word}", flush=True)
-    if scores:
-        print(f"{np.mean(np.array(scores) < 2):.0%} of {len(scores)} within two sigmas")
-        print(f"{len(settled)} settled, at worst {100 * max(settled, default=0.0):.2f} % off")
+        run = {"sequence": folder.name, "focal_px": focal, "is_refused": False, "error_percent": 100 * error}
+        runs.append(run | {"sigma_percent": 100 * found["focal_sigma_relative"], "is_settled": found["is_settled"]})
+        print(described(runs[-1]), flush=True)
+    args.output.write_text(json.dumps(describe_machine() | {"runs": runs}, indent=1) + "\n")
+    print(summary([run for run in runs if not run["is_refused"]]))
+
+
+def described(run: dict[str, Any]) -> str:
+    """A sequence in a line."""
+    error, sigma, word = run["error_percent"], run["sigma_percent"], "settled" if run["is_settled"] else "not settled"
+    return f"{run['sequence']}: {run['focal_px']:.1f} px, {error:+.2f} % of {sigma:.2f} %, {word}"
+
+
+def summary(runs: list[dict[str, Any]]) -> str:
+    """Those that were not refused, in two lines."""
+    within = sum(abs(run["error_percent"]) < 2 * run["sigma_percent"] for run in runs)
+    settled = [abs(run["error_percent"]) for run in runs if run["is_settled"]]
+    return (
+        f"{within} of {len(runs)} within two sigmas\n"
+        f"{len(settled)} settled, at worst {max(settled, default=0.0):.2f} % off"
+    )
 
 
 def lens(focal: float, k1: float, size: tuple[int, int]) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Whole command against whole pipeline: `sfmapp reconstruct` and pycolmap on the same photographs, side by side.
 
     python benchmarks/sparse.py                      # the sets below, three seeds each
-    python benchmarks/sparse.py FOLDER ... --seeds 1 # folders with images/ and cameras.json (or another truth)
+    python benchmarks/sparse.py FOLDER ... --seeds 1 # folders with images/ and cameras.json (or another ground truth)
 
 Each program runs as a process of its own with its default options; wall seconds, CPU seconds (user and system, children
 included) and peak resident memory are those of the process, interpreter start and imports included. The two take turns
@@ -13,29 +13,34 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+from machine import RESULTS, ROOT, describe_machine
 from sfmapp.errors import SfmError
 from sfmapp.evaluation.measured import ProcessUsage, run_measured
 from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.evaluation.second_opinion import SecondOpinionOptions, ask_second_opinion
 from sfmapp.formats.colmap import has_model, read_model
-from sfmapp.formats.truth import read_truth
+from sfmapp.formats.ground_truth import read_ground_truth
 
-ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))
 DEFAULT_SETS = ("fountain-P11", "herz-jesus-P8", "lund-door", "temple-sparse-ring")
-TRUTH_NAMES = ("cameras.json", "truth.json", "trajectory.tum", "groundtruth.txt", "sparse/0", "sparse", "truth")
+GROUND_TRUTH_NAMES = (
+    "cameras.json",
+    "ground_truth.json",
+    "trajectory.tum",
+    "groundtruth.txt",
+    "sparse/0",
+    "sparse",
+    "ground_truth",
+)
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm"}
 PROGRAMS = ("sfmapp", "pycolmap")
 
@@ -46,7 +51,7 @@ class DataSet:
 
     name: str
     images: Path
-    truth: Path | None
+    ground_truth: Path | None
 
     @property
     def image_names(self) -> list[str]:
@@ -63,8 +68,8 @@ def find_sets(folders: list[Path]) -> list[DataSet]:
     for folder in folders:
         if not (folder / "images").is_dir():
             sys.exit(f"{folder}: no folder images/ in it")
-        truth = next((folder / name for name in TRUTH_NAMES if (folder / name).exists()), None)
-        sets.append(DataSet(folder.resolve().name, folder / "images", truth))
+        ground_truth = next((folder / name for name in GROUND_TRUTH_NAMES if (folder / name).exists()), None)
+        sets.append(DataSet(folder.resolve().name, folder / "images", ground_truth))
     return sets
 
 
@@ -104,14 +109,14 @@ def costs(usage: ProcessUsage) -> dict[str, Any]:
 
 
 def results(data: DataSet, model_folder: Path) -> dict[str, Any]:
-    """Counts, and errors against the truth, of a model; both programs are judged by the same code."""
+    """Counts, and errors against the ground truth, of a model; both programs are judged by the same code."""
     model = read_model(model_folder)[0] if has_model(model_folder) else None
     summary: dict[str, Any] = model.summary() if model is not None else {"num_registered": 0}
     values: dict[str, Any] = {"model": summary | {"num_images": len(data.image_names)}}
-    if data.truth is not None:
-        truth = read_truth(data.truth).for_images(data.image_names)
+    if data.ground_truth is not None:
+        ground_truth = read_ground_truth(data.ground_truth).for_images(data.image_names)
         names, poses = (model.image_names, model.cam_from_world) if model is not None else ([], [])
-        values["truth"] = evaluate_poses(names, poses, truth.names, truth.cam_from_world).summary()
+        values["ground_truth"] = evaluate_poses(names, poses, ground_truth.names, ground_truth.cam_from_world).summary()
     return values
 
 
@@ -136,7 +141,8 @@ def measure(data: DataSet, args: argparse.Namespace) -> Iterator[dict[str, Any]]
 
 
 def pick(run: dict[str, Any], path: str) -> float | None:
-    """A number of a run by its path, such as ``truth.auc.1``; keys hold no dot but in ``0.5``, which stands last."""
+    """A number of a run by its path, such as ``ground_truth.auc.1``; keys hold no dot but in ``0.5``, which stands
+    last."""
     value: Any = run
     for key in path.split(".", 2):
         value = value.get(key) if isinstance(value, dict) else None
@@ -161,10 +167,18 @@ def medians(runs: list[dict[str, Any]]) -> dict[str, Any]:
     return table
 
 
-RATIO_PATHS = ("wall_s", "cpu_s", "peak_memory_mb", "truth.center_error.mean", "truth.rotation_error_deg.mean")
+RATIO_PATHS = (
+    "wall_s",
+    "cpu_s",
+    "peak_memory_mb",
+    "ground_truth.center_error.mean",
+    "ground_truth.rotation_error_deg.mean",
+)
 PATHS = (
-    *RATIO_PATHS, "truth.center_error.median", "truth.center_error.max", "truth.rotation_error_deg.max",
-    "truth.auc.0.5", "truth.auc.1", "truth.auc.3", "truth.auc.5", "model.num_images", "model.num_registered",
+    *RATIO_PATHS, "ground_truth.center_error.median", "ground_truth.center_error.max",
+    "ground_truth.rotation_error_deg.max",
+    "ground_truth.auc.0.5", "ground_truth.auc.1", "ground_truth.auc.3", "ground_truth.auc.5", "model.num_images",
+    "model.num_registered",
     "model.num_points", "model.mean_track_length", "model.mean_reprojection_error_px",
 )  # fmt: skip
 
@@ -189,7 +203,7 @@ def markdown(report: dict[str, Any]) -> str:
         lines.append(f"| {data} ({row['sfmapp']['model.num_images'] or row['pycolmap']['model.num_images']:.0f}) | "
                      + " | ".join(cost) + " |")  # fmt: skip
         cells = [_cell(row, path, ".4g") for path in RATIO_PATHS[3:]]
-        cells += [_cell(row, f"truth.auc.{t}", ".3f") for t in ("0.5", "1", "3", "5")]
+        cells += [_cell(row, f"ground_truth.auc.{t}", ".3f") for t in ("0.5", "1", "3", "5")]
         cells += [_cell(row, "model.num_points", ".0f"), _cell(row, "model.mean_track_length", ".2f")]
         cells.append(_cell(row, "model.mean_reprojection_error_px", ".3f"))
         accuracy.append(f"| {data} | " + " | ".join(cells) + " |")
@@ -211,20 +225,7 @@ def _cell(row: dict[str, Any], path: str, form: str) -> str:
 
 def environment(args: argparse.Namespace) -> dict[str, Any]:
     """What the numbers depend on."""
-    from importlib.metadata import version
-
-    def git(*words: str) -> str:
-        return subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True).stdout.strip()
-
-    model = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
-    is_dirty = bool(git("status", "--porcelain", "--untracked-files=no", "src", "pipelines"))
-    return {
-        "date": datetime.now(UTC).isoformat(timespec="minutes"),
-        "commit": git("rev-parse", "--short", "HEAD") + ("+changes" if is_dirty else ""),
-        "versions": {p: version(p) for p in (*PROGRAMS, "numpy", "numba", "opencv-contrib-python-headless", "gtsam")},
-        "python": platform.python_version(),
-        "cpu": model[0].split(":")[1].strip() if model else platform.processor(),
-        "cores": len(os.sched_getaffinity(0)),
+    return describe_machine() | {
         "seeds": args.seeds,
         "threads": args.threads,
         "camera_mode": args.camera_mode,
@@ -243,17 +244,17 @@ def main() -> None:
     parser.add_argument("--only", choices=PROGRAMS, help="run just one of the two")
     parser.add_argument("--set", action="append", default=[], metavar="STAGE.OPTION=VALUE", help="option of sfmapp")
     parser.add_argument("--work", type=Path, default=None, help="folder for the workspaces, which are removed again")
-    parser.add_argument("-o", "--output", type=Path, default=None, help="default: benchmarks/results/sparse-DATE.json")
+    parser.add_argument("-o", "--output", type=Path, default=None, help="default: benchmarks/results/sparse.json")
     args = parser.parse_args()
     args.numba_cache = Path(tempfile.mkdtemp(prefix="numba-", dir=args.work))
     report: dict[str, Any] = environment(args) | {"runs": []}
-    output = args.output or ROOT / "benchmarks" / "results" / f"sparse-{report['date'][:10]}.json"
+    output = args.output or RESULTS / "sparse.json"
     output.parent.mkdir(parents=True, exist_ok=True)
     try:
         for data in find_sets(args.folders):
             for run in measure(data, args):
                 report["runs"].append(run)
-                error = pick(run, "truth.center_error.mean")
+                error = pick(run, "ground_truth.center_error.mean")
                 print(f"{run['set']} {run['program']} seed {run['seed']}{' cold' if run['is_cold'] else ''}: "
                       f"{run['model']['num_registered']} of {run['model']['num_images']}, "
                       f"{run.get('wall_s', 0):.1f} s wall, {run.get('cpu_s', 0):.1f} s CPU, "
@@ -262,6 +263,7 @@ def main() -> None:
                 output.write_text(json.dumps(report, indent=1) + "\n")
     finally:
         shutil.rmtree(args.numba_cache, ignore_errors=True)
+    output.with_suffix(".md").write_text(markdown(report) + "\n")
     print(markdown(report))
 
 

@@ -29,6 +29,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from machine import RESULTS, ROOT, describe_machine
 from render_sequences import LAYOUTS, WRITERS, write_images
 from rendered_worlds import sequences as rendered
 from rendered_worlds.motion import GRAVITY
@@ -42,7 +43,6 @@ from sfmapp.pipelines.odometry.track import track_sequence
 from sfmapp.workspace.options import load_options
 
 Array = NDArray[np.float64]
-ROOT = Path(__file__).resolve().parent.parent
 # as many standard deviations as an honest statement is off by at most
 MAX_SIGMAS = 3.0
 
@@ -236,7 +236,7 @@ def judged(result: OdometryResult, report: dict[str, Any], sequence: Recorded) -
     poses = entry.reconstruction.cam_from_world[entry.keyframe_image_idx]
     pairs = associate(
         Trajectory.from_cam_from_world(poses, result.timestamps_s[frames] - result.timestamps_s[0]),
-        Trajectory.from_cam_from_world(sequence.truth, sequence.timestamps_s - sequence.timestamps_s[0]),
+        Trajectory.from_cam_from_world(sequence.ground_truth, sequence.timestamps_s - sequence.timestamps_s[0]),
     )
     is_metric = entry.scale_source != "none"
     alignment, free = absolute_error(pairs, "se3" if is_metric else "sim3"), absolute_error(pairs, "sim3")
@@ -246,7 +246,7 @@ def judged(result: OdometryResult, report: dict[str, Any], sequence: Recorded) -
     if entry.covariance is not None and np.isfinite(entry.covariance).any():
         diagonal = np.diagonal(entry.covariance[:, 3:, 3:], axis1=1, axis2=2).sum(1)
         variance = float(np.nanmean(diagonal)) + (spread * (entry.scale_sigma or 0.0)) ** 2
-    # lengths of the map in the unit of the truth, so that sigmas can be compared with errors
+    # lengths of the map in the unit of the ground truth, so that sigmas can be compared with errors
     unit = 1.0 if is_metric else free.scale
     error, sigma = float(np.sqrt((alignment.translation_m**2).mean())), float(np.sqrt(variance)) * unit
     sigmas = error / sigma
@@ -259,7 +259,7 @@ def judged(result: OdometryResult, report: dict[str, Any], sequence: Recorded) -
     return {
         "verdict": verdict, "error_m": error, "sigma_m": sigma, "error_sigmas": sigmas, "scale": 1 / free.scale,
         "scale_sigma": entry.scale_sigma, "red": red, "num_frames": int((result.frame_map == 0).sum()),
-        "path_m": pairs.truth.path_m, "is_metric": is_metric,
+        "path_m": pairs.ground_truth.path_m, "is_metric": is_metric,
     }  # fmt: skip
 
 
@@ -289,15 +289,14 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--frames", type=int, default=160)
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "wrong_inputs")
-    parser.add_argument("--json", type=Path, help="write every run here too")
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "wrong_inputs.json", help="every run in numbers")
     args = parser.parse_args()
     rows = []
     print("| fault | seed | verdict | error m of path | in sigmas | scale | red |\n|---|---|---|---|---|---|---|")
     for row in measure(args):
         rows.append(row)
         print(line(row), flush=True)
-    if args.json:
-        args.json.write_text(json.dumps(rows, indent=1) + "\n")
+    args.output.write_text(json.dumps(describe_machine() | {"runs": rows}, indent=1) + "\n")
     wrong = [row for row in rows if row["verdict"] == "SURE AND WRONG"]
     print(f"\n{len(rows)} runs, {len(wrong)} sure and wrong", file=sys.stderr)
 

@@ -13,7 +13,8 @@ a PINHOLE of 1600x1200; the photographs are noisy (3 grey levels) JPEGs. OUT rec
     images/*.jpg       depth/*.npy (H, W) float32, z in metres at the pixels' centres, 0 for the sky
     model/             COLMAP text model, the true cameras and no points
     model_points/      the same with 3000 points of the true surface, each seen by three views and more
-    truth.ply          surface that two views and more see, one point per voxel of a ground pixel; of the railing with
+    ground_truth.ply          surface that two views and more see, one point per voxel of a ground pixel; of the railing
+    with
                        its label (red: 1 railing, 0 rest) and the bar's width in pixels (green)
     scene.json         gsd: metres per pixel at the median depth of the median view; bbox: [low, high]
 
@@ -199,7 +200,7 @@ def distances(scene: mi.Scene, pose: Pose) -> Array:
     return np.array(dr.select(hit.is_valid(), z, 0.0)).reshape(HEIGHT, WIDTH)
 
 
-# ---------------------------------------------------------------- the truth
+# ---------------------------------------------------------------- the ground truth
 def lift(pose: Pose, depth: Array) -> Array:
     """(H, W, 3) world points of a depth map."""
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64) + 0.5
@@ -243,7 +244,7 @@ def surface(world: World, depths: list[Array], labels: list[Array], voxel: float
 
 
 # ---------------------------------------------------------------- files
-def write_truth(path: Path, xyz: Array, label: Array | None) -> None:
+def write_ground_truth(path: Path, xyz: Array, label: Array | None) -> None:
     fields = [(axis, "<f4") for axis in "xyz"] + ([("red", "u1"), ("green", "u1")] if label is not None else [])
     rows = np.empty(len(xyz), fields)
     for i, axis in enumerate("xyz"):
@@ -296,7 +297,7 @@ def name_of(view: int) -> str:
 
 
 def write_geometry(world: World, output: Path) -> None:
-    """Depth maps, models, truth and scene.json."""
+    """Depth maps, models, ground truth and scene.json."""
     (output / "depth").mkdir(exist_ok=True)
     depths, labels = [], []
     for k, pose in enumerate(world.views):
@@ -307,12 +308,12 @@ def write_geometry(world: World, output: Path) -> None:
             labels[-1][(depths[-1] > 0) & (np.abs(distances(bars, pose) - depths[-1]) < 1e-4)] = width
     gsd = float(np.median([np.median(depth[depth > 0]) for depth in depths]) / FOCAL_PX)
     xyz, label, seen = surface(world, depths, labels, gsd)
-    write_truth(output / "truth.ply", xyz, label if world.bars else None)
+    write_ground_truth(output / "ground_truth.ply", xyz, label if world.bars else None)
     chosen = np.flatnonzero(seen.sum(axis=1) >= MIN_VIEWS_POINT)
     chosen = np.random.default_rng(5).choice(chosen, NUM_POINTS, replace=False)
     write_model(output / "model", world.views, np.zeros((0, 3)), seen[:0])
     write_model(output / "model_points", world.views, xyz[chosen], seen[chosen])
-    facts = {"gsd": gsd, "bbox": [world.low.tolist(), world.high.tolist()], "num_truth": len(xyz)}
+    facts = {"gsd": gsd, "bbox": [world.low.tolist(), world.high.tolist()], "num_ground_truth": len(xyz)}
     (output / "scene.json").write_text(json.dumps(facts, indent=1) + "\n")
 
 
@@ -322,7 +323,9 @@ def main() -> None:
     parser.add_argument("output", type=Path)
     parser.add_argument("--spp", type=int, default=4, help="samples per pixel")
     parser.add_argument("--quality", type=int, default=92, help="of the JPEGs")
-    parser.add_argument("--photographs-only", action="store_true", help="depth, models and truth are there already")
+    parser.add_argument(
+        "--photographs-only", action="store_true", help="depth, models and ground truth are there already"
+    )
     args = parser.parse_args()
     start = time.process_time()
     world = {"courtyard": courtyard, "railing": railing}[args.world]()

@@ -1,4 +1,4 @@
-"""A block of aerial photographs that look straight down, with known truth."""
+"""A block of aerial photographs that look straight down, with known ground truth."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.images.sequence import Frame, Sequence, Truth
+from sfmapp.images.sequence import Frame, GroundTruth, Sequence
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
@@ -34,7 +34,7 @@ def path(num: int) -> Array:
 
 @dataclass
 class FakeSequence:
-    """Frames of noise along an arc; the truth is in metres, what the fake runner finds is in a unit of 2 m."""
+    """Frames of noise along an arc; the ground truth is in metres, what the fake runner finds is in a unit of 2 m."""
 
     num_frames: int | None = 50
     kind: str = "folder"
@@ -42,13 +42,13 @@ class FakeSequence:
     rig: Rig = field(default_factory=lambda: Rig.single(simple_camera(CameraModel.PINHOLE, WIDTH, HEIGHT, 120.0)))
     frames_per_second: float | None = FPS
     imu: None = None
-    truth: Truth | None = None
+    ground_truth: GroundTruth | None = None
     orientation: int = 1
     length: int = 50
     pause_s: float = 0.0
 
     def __post_init__(self) -> None:
-        self.truth = Truth(np.arange(self.length) / FPS, path(self.length))
+        self.ground_truth = GroundTruth(np.arange(self.length) / FPS, path(self.length))
 
     def frames(self) -> Iterator[Frame]:
         rng = np.random.default_rng(0)
@@ -60,7 +60,7 @@ class FakeSequence:
 
 @dataclass
 class FakeRunner:
-    """Finds the truth at half its size, but for a centimetre; a keyframe every fifth frame.
+    """Finds the ground truth at half its size, but for a centimetre; a keyframe every fifth frame.
 
     Attributes:
         lost: frames that get no pose.
@@ -75,8 +75,8 @@ class FakeRunner:
         self, sequence: Sequence, options: OdometryOptions, *, seed: int, threads: int, events: Events
     ) -> OdometryResult:
         events.started("odometry", total=sequence.num_frames)
-        assert sequence.truth is not None
-        self.poses = sequence.truth.cam_from_world.copy()
+        assert sequence.ground_truth is not None
+        self.poses = sequence.ground_truth.cam_from_world.copy()
         noise = np.random.default_rng(seed).normal(0, 0.01, (len(self.poses), 3))
         self.poses[:, 4:] = 0.5 * self.poses[:, 4:] + noise
         self.maps: list[KeyframeMap] = []

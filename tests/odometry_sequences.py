@@ -1,4 +1,5 @@
-"""Short rendered sequences with exact truth, as odometry takes them: images of 320 x 240, rendered once per session."""
+"""Short rendered sequences with exact ground truth, as odometry takes them: images of 320 x 240, rendered once per
+session."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from sfmapp.adjust.covariance import similarity_basis
 from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.images.sequence import Frame, Imu, Truth
+from sfmapp.images.sequence import Frame, GroundTruth, Imu
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.result import OdometryResult
@@ -39,7 +40,7 @@ class Played:
     images: list[Images]
     timestamps_s: Array
     rig: Rig
-    truth: Truth
+    ground_truth: GroundTruth
     imu: Imu | None = None
     kind: str = "folder"
     source: str = "rendered"
@@ -57,8 +58,10 @@ class Played:
         """Some frames, at their own times, or (backwards) at those times mirrored."""
         times = self.timestamps_s[idx]
         times = times.max() - times if mirrored else times
-        truth = Truth(times, self.truth.cam_from_world[idx])
-        return replace(self, images=[self.images[i] for i in idx], timestamps_s=times, truth=truth, imu=None)
+        ground_truth = GroundTruth(times, self.ground_truth.cam_from_world[idx])
+        return replace(
+            self, images=[self.images[i] for i in idx], timestamps_s=times, ground_truth=ground_truth, imu=None
+        )
 
 
 # sequences that differ in some frames share the others
@@ -89,7 +92,7 @@ def play(sequence: RenderedSequence) -> Played:
             i.accel_walk,
         )  # fmt: skip
     times = sequence.timestamps_s
-    return Played(images, times, sequence.rig, Truth(times, sequence.truth), imu)
+    return Played(images, times, sequence.rig, GroundTruth(times, sequence.ground_truth), imu)
 
 
 def room_rig(is_stereo: bool) -> Rig:
@@ -127,23 +130,24 @@ def run(sequence: Played, options: OdometryOptions | None = None, seed: int = 0,
     return run_odometry(sequence, options or OdometryOptions(), seed=seed, threads=threads)  # type: ignore[arg-type]
 
 
-def centers_and_truth(result: OdometryResult, sequence: Played, map_idx: int = 0) -> tuple[Array, Array]:
+def centers_and_ground_truth(result: OdometryResult, sequence: Played, map_idx: int = 0) -> tuple[Array, Array]:
     """(N, 3) camera centres of one map and the true ones, of frames that have both."""
-    poses, truth = result.cam_from_world, sequence.truth.cam_from_world[result.frame_idx]
-    both = (result.frame_map == map_idx) & np.isfinite(poses[:, 0]) & np.isfinite(truth[:, 0])
-    return rigid3.center(poses[both]), rigid3.center(truth[both])
+    poses, ground_truth = result.cam_from_world, sequence.ground_truth.cam_from_world[result.frame_idx]
+    both = (result.frame_map == map_idx) & np.isfinite(poses[:, 0]) & np.isfinite(ground_truth[:, 0])
+    return rigid3.center(poses[both]), rigid3.center(ground_truth[both])
 
 
 def absolute_error(result: OdometryResult, sequence: Played, map_idx: int = 0) -> tuple[float, float]:
-    """Rms distance from the truth, in metres, after the best similarity, and the factor that it puts on lengths."""
-    ours, truth = centers_and_truth(result, sequence, map_idx)
-    truth_from_ours = similarity.umeyama(ours, truth)
-    error = similarity.apply(truth_from_ours, ours) - truth
-    return float(np.sqrt((error**2).sum(1).mean())), float(truth_from_ours[7])
+    """Rms distance from the ground truth, in metres, after the best similarity, and the factor that it puts on
+    lengths."""
+    ours, ground_truth = centers_and_ground_truth(result, sequence, map_idx)
+    ground_truth_from_ours = similarity.umeyama(ours, ground_truth)
+    error = similarity.apply(ground_truth_from_ours, ours) - ground_truth
+    return float(np.sqrt((error**2).sum(1).mean())), float(ground_truth_from_ours[7])
 
 
 def path_length(sequence: Played) -> float:
-    centers = rigid3.center(sequence.truth.cam_from_world)
+    centers = rigid3.center(sequence.ground_truth.cam_from_world)
     return float(np.nansum(np.linalg.norm(np.diff(centers, axis=0), axis=1)))
 
 
@@ -168,17 +172,17 @@ def keyframe_map(scene: SyntheticScene, rig: Rig) -> KeyframeMap:
     return keyframes
 
 
-def gauge_errors(ours: Array, truth: Array, num_freedoms: int) -> Array:
-    """(K, 6) errors w, v of poses (K, 7) after moving the truth to the gauge of the covariances.
+def gauge_errors(ours: Array, ground_truth: Array, num_freedoms: int) -> Array:
+    """(K, 6) errors w, v of poses (K, 7) after moving the ground truth to the gauge of the covariances.
 
     Args:
         num_freedoms: 7 where a similarity is open, 6 where lengths are known.
     """
-    start = similarity.align_poses(truth, ours).b_from_a.copy()
+    start = similarity.align_poses(ground_truth, ours).b_from_a.copy()
     if num_freedoms == 6:
-        turned = rigid3.center(truth) @ rigid3.rotation_matrix(start).T
+        turned = rigid3.center(ground_truth) @ rigid3.rotation_matrix(start).T
         start[4:] = [*(rigid3.center(ours).mean(0) - turned.mean(0)), 1.0]
-    moved = similarity.transform_poses(start, truth)
+    moved = similarity.transform_poses(start, ground_truth)
     for _ in range(20):
         basis, constraint = (rows[:num_freedoms] for rows in similarity_basis(moved))
         error = pose_errors(ours, moved)
@@ -195,9 +199,9 @@ def gauge_errors(ours: Array, truth: Array, num_freedoms: int) -> Array:
     return pose_errors(ours, moved)
 
 
-def pose_errors(ours: Array, truth: Array) -> Array:
-    """(K, 6) w and v with ``ours = (exp(w), v) truth``."""
-    delta = rigid3.compose(ours, rigid3.inverse(truth))
+def pose_errors(ours: Array, ground_truth: Array) -> Array:
+    """(K, 6) w and v with ``ours = (exp(w), v) ground_truth``."""
+    delta = rigid3.compose(ours, rigid3.inverse(ground_truth))
     return np.concatenate([rigid3.log_so3(rigid3.rotation_matrix(delta)), delta[:, 4:]], 1)
 
 

@@ -1,6 +1,7 @@
 """Groups of photographs along one facade that overlap weakly: cameras, points and what a matcher would find.
 
-No images: matches are drawn from the truth, thinned between groups, with mismatches that lie near the epipolar lines,
+No images: matches are drawn from the ground truth, thinned between groups, with mismatches that lie near the epipolar
+    lines,
 as those do that pass a verification.
 """
 

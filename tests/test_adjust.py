@@ -176,8 +176,8 @@ def test_noise_free_scene_is_recovered(model, per_image):
     found = start_of(scene)
     report = adjust_bundle(found, TIGHT)
     assert report.final_cost < 1e-8 * report.initial_cost
-    for camera, truth in zip(found.cameras, scene.truth.cameras, strict=True):
-        np.testing.assert_allclose(camera.params, truth.params, atol=1e-3 * truth.focal)
+    for camera, ground_truth in zip(found.cameras, scene.ground_truth.cameras, strict=True):
+        np.testing.assert_allclose(camera.params, ground_truth.params, atol=1e-3 * ground_truth.focal)
 
 
 def test_cost_per_degree_of_freedom_is_the_noise():
@@ -334,7 +334,7 @@ def test_sparse_system_equals_dense_with_any_factors(monkeypatch, per_image):
     from sfmapp.adjust.factors import gtsam_pose
 
     scene = make_scene(12, 8, 300, [synthetic_camera()] * (8 if per_image else 1))
-    where = [gtsam_pose(pose) for pose in scene.truth.cam_from_world]
+    where = [gtsam_pose(pose) for pose in scene.ground_truth.cam_from_world]
     noise = gtsam.noiseModel.Isotropic
     graph = gtsam.NonlinearFactorGraph()
     for i in (0, 3):

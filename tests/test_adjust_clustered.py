@@ -35,7 +35,7 @@ def simulated(seed: int, *, slides: bool) -> tuple[ClusteredCovariances, float, 
         sliding(found, seed)
     adjust_bundle(found, FIXED)
     clustered, independent = clustered_covariances(found, FIXED), estimate_covariances(found, FIXED)
-    errors, _, _ = errors_in_gauge(found, scene.truth, independent)
+    errors, _, _ = errors_in_gauge(found, scene.ground_truth, independent)
     values = [
         float(np.mean([e @ np.linalg.solve(c, e) / 6 for e, c in zip(errors, poses, strict=True)]))
         for poses in (clustered.poses, independent.poses)

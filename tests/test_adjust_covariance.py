@@ -27,7 +27,7 @@ def nees(seeds, *, layout, cameras, sigma_px=None, noise=0.7, options=OPTIONS, n
         adjust_bundle(found, options, **arguments)
         covariances = estimate_covariances(found, options, sigma_px=sigma_px, **arguments)
         assert covariances.is_determined
-        poses, intrinsics, points = errors_in_gauge(found, scene.truth, covariances)
+        poses, intrinsics, points = errors_in_gauge(found, scene.ground_truth, covariances)
         samples[0].extend(normalized(poses, covariances.poses))
         samples[1].extend(normalized(intrinsics, covariances.intrinsics))
         samples[2].extend(normalized(points, covariances.points))
@@ -83,7 +83,7 @@ def test_pose_prior_holds_the_gauge_and_counts_in_its_own_units():
     for i in (0, 3):
         graph.add(
             gtsam.PriorFactorPose3(
-                X(i), gtsam_pose(scene.truth.cam_from_world[i]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
+                X(i), gtsam_pose(scene.ground_truth.cam_from_world[i]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
             )
         )
     found = scene.observed.copy()
@@ -100,7 +100,7 @@ def test_focal_prior_bounds_the_focal():
     scene = make_scene(2, 3, 60, layout="grid")
     from dataclasses import replace
 
-    priors = [replace(scene.truth.cameras[0], focal_sigma=1e-3)]
+    priors = [replace(scene.ground_truth.cameras[0], focal_sigma=1e-3)]
     found = scene.observed.copy()
     adjust_bundle(found, OPTIONS, prior_cameras=priors)
     covariances = estimate_covariances(found, OPTIONS, prior_cameras=priors)

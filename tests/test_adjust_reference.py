@@ -39,7 +39,7 @@ def hold_gauge(scene, images=(0, 1)):
     graph = gtsam.NonlinearFactorGraph()
     noise = gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)
     for i in images:
-        graph.add(gtsam.PriorFactorPose3(X(i), gtsam_pose(scene.truth.cam_from_world[i]), noise))
+        graph.add(gtsam.PriorFactorPose3(X(i), gtsam_pose(scene.ground_truth.cam_from_world[i]), noise))
     return graph
 
 
@@ -72,7 +72,7 @@ def test_same_with_constants_and_factors_on_intrinsics():
     scene = make_scene(4, 6, 200)
     graph = gtsam.NonlinearFactorGraph()
     graph.add(gtsam.PriorFactorVector(K(0), np.array([903.0, -0.07]), gtsam.noiseModel.Isotropic.Sigma(2, 0.2)))
-    where = [gtsam_pose(pose) for pose in scene.truth.cam_from_world]
+    where = [gtsam_pose(pose) for pose in scene.ground_truth.cam_from_world]
     graph.add(
         gtsam.BetweenFactorPose3(X(2), X(4), where[2].between(where[4]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-2))
     )

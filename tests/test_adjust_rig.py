@@ -52,10 +52,10 @@ def assert_on_rig(model):
 
 def test_scene_is_on_its_rig_and_stays_there():
     scene = make_scene(0, 12, 200, rig=three_cameras(), layout="grid")
-    assert scene.truth.rig is not None
-    assert scene.truth.rig.frame_idx.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
-    assert np.abs(scene.truth.residuals_px()).max() < 1e-9
-    for model in (scene.truth, start_of(scene)):
+    assert scene.ground_truth.rig is not None
+    assert scene.ground_truth.rig.frame_idx.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
+    assert np.abs(scene.ground_truth.residuals_px()).max() < 1e-9
+    for model in (scene.ground_truth, start_of(scene)):
         relative = rigid3.compose(model.cam_from_world[1::3], rigid3.inverse(model.cam_from_world[::3]))
         np.testing.assert_allclose(relative, np.tile(model.rig.cam_from_rig[1], (4, 1)), atol=1e-14)
     with pytest.raises(ValueError, match="multiple of 3"):
@@ -86,7 +86,7 @@ def test_same_answer_as_gtsam(loss):
 
     scene = make_scene(1, 12, 250, rig=three_cameras(), layout="grid")
     graph = gtsam.NonlinearFactorGraph()
-    where = gtsam_pose(scene.truth.cam_from_world[3])
+    where = gtsam_pose(scene.ground_truth.cam_from_world[3])
     graph.add(gtsam.PriorFactorPose3(X(3), where, gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
     options = replace(TIGHT, loss=loss, loss_scale_px=0.8)
     start = start_of(scene)
@@ -107,10 +107,10 @@ def test_noise_free_scene_is_recovered_to_scale():
     scene = make_scene(2, 12, 300, rig=synthetic_rig(0.4), sigma_px=0.0, layout="forward")
     found = start_of(scene)
     images = np.arange(12) >= 2
-    found.cam_from_world[:2] = scene.truth.cam_from_world[:2]
+    found.cam_from_world[:2] = scene.ground_truth.cam_from_world[:2]
     report = adjust_bundle(found, TIGHT, variable_images=images)
     assert report.final_cost < 1e-10 * report.initial_cost
-    np.testing.assert_allclose(found.cam_from_world, scene.truth.cam_from_world, atol=1e-5)
+    np.testing.assert_allclose(found.cam_from_world, scene.ground_truth.cam_from_world, atol=1e-5)
 
 
 def test_cost_per_degree_of_freedom_is_the_noise():
@@ -207,14 +207,14 @@ def test_frames_vary_as_a_whole():
 def test_frames_with_one_registered_image():
     scene = make_scene(9, 12, 400, rig=synthetic_rig(0.4), sigma_px=0.0, layout="forward")
     found = start_of(scene)
-    found.cam_from_world[:4] = scene.truth.cam_from_world[:4]
+    found.cam_from_world[:4] = scene.ground_truth.cam_from_world[:4]
     gone = [5, 8]  # a right image, and a left one: the right one then carries its frame
     found.cam_from_world[gone] = np.nan
     found.obs_is_inlier[np.isin(found.tracks.obs_image_idx, gone)] = False
     adjust_bundle(found, TIGHT, variable_images=np.arange(12) >= 4)
     assert np.isnan(found.cam_from_world[gone]).all()
     rest = np.setdiff1d(np.arange(12), gone)
-    np.testing.assert_allclose(found.cam_from_world[rest], scene.truth.cam_from_world[rest], atol=1e-5)
+    np.testing.assert_allclose(found.cam_from_world[rest], scene.ground_truth.cam_from_world[rest], atol=1e-5)
 
 
 def test_factors_are_over_the_rigs_pose():
@@ -223,7 +223,7 @@ def test_factors_are_over_the_rigs_pose():
 
     scene = make_scene(10, 6, 200, rig=synthetic_rig())
     noise = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
-    away = gtsam_pose(scene.truth.cam_from_world[2]).retract(np.full(6, 0.1))
+    away = gtsam_pose(scene.ground_truth.cam_from_world[2]).retract(np.full(6, 0.1))
     graph = gtsam.NonlinearFactorGraph()
     graph.add(gtsam.PriorFactorPose3(X(2), away, noise))
     found = scene.observed.copy()
@@ -255,7 +255,7 @@ def test_nees(held, num_gauge):
         covariances = estimate_covariances(found, KNOWN, sigma_px=0.3, variable_images=images)
         assert covariances.is_determined
         assert covariances.num_gauge == num_gauge
-        error, _, point_error = errors_in_gauge(found, scene.truth, covariances)
+        error, _, point_error = errors_in_gauge(found, scene.ground_truth, covariances)
         poses.extend(normalized(error, covariances.poses))
         points.extend(normalized(point_error, covariances.points))
     assert 0.9 < np.mean(poses) < 1.1

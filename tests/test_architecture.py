@@ -1,4 +1,4 @@
-"""The house rules that a machine can hold: imports run downward, heavy packages stay where they belong."""
+"""The rules that a machine can hold: imports run downward, heavy packages stay where they belong."""
 
 from __future__ import annotations
 
@@ -39,6 +39,7 @@ FLOORS = (
     ("simd",),
     ("contradictions",),
     ("events", "option_checks"),
+    ("packages",),
     ("errors", "children", "kernel_cache"),
 )
 LEVEL = {room: level for level, floor in enumerate(FLOORS) for room in floor}
@@ -104,7 +105,15 @@ def test_library_does_not_print_exit_or_configure_logging(path: Path) -> None:
 
 def test_every_room_has_a_floor() -> None:
     rooms = {path.parent.name for path in SOURCE.glob("*/__init__.py")}
-    assert rooms | {"contradictions", "events", "option_checks", "errors", "children", "kernel_cache"} == set(LEVEL)
+    assert rooms | {
+        "contradictions",
+        "events",
+        "option_checks",
+        "packages",
+        "errors",
+        "children",
+        "kernel_cache",
+    } == set(LEVEL)
 
 
 @pytest.mark.parametrize("job", ["demo", "test"])

@@ -79,6 +79,16 @@ def test_what_cannot_be_parsed_is_usage(args: list[str], tmp_path: Path, monkeyp
 
 
 @pytest.mark.parametrize(
+    "line", ["odometry walk.mp4 -o out --no-record", "dense out --masks m", "reconstruct p -o out --no-rec"]
+)
+def test_a_flag_has_one_spelling(line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(line.split())
+    assert caught.value.code == 2
+    assert "unrecognized arguments: --" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("flags", "words"),
     [
         (
@@ -314,16 +324,16 @@ def test_bars_on_a_terminal_end_with_a_line_per_stage() -> None:
 
 
 @pytest.mark.slow
-def test_the_demo_prints_its_error_against_the_truth(sample: Path, tmp_path: Path) -> None:
+def test_the_demo_prints_its_error_against_the_ground_truth(sample: Path, tmp_path: Path) -> None:
     num_images = len(list((sample / "images").iterdir()))
     done = command("demo", "-o", tmp_path / "demo", "--json", "--min-registered", num_images)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
-    assert result["truth"]["num_common"] == num_images
+    assert result["ground_truth"]["num_common"] == num_images
     # a tenth of a pixel of noise at the sample's distances and 150 points per view and more
-    assert result["truth"]["center_error_share"]["max"] < 2e-3
-    assert result["truth"]["rotation_error_deg"]["max"] < 0.1
+    assert result["ground_truth"]["center_error_share"]["max"] < 2e-3
+    assert result["ground_truth"]["rotation_error_deg"]["max"] < 0.1
     again = command("demo", "-o", tmp_path / "demo")
     assert again.returncode == 0
-    assert "against the truth" in again.stdout
+    assert "against the ground truth" in again.stdout
     assert "nothing to do" in again.stdout

@@ -49,7 +49,7 @@ def test_json_and_flags(wall: Path, capsys: pytest.CaptureFixture[str], tmp_path
         mask[:, :100] = 0
         cv2.imwrite(str(masks / f"view_{m}.png.png"), mask)
     command = ["dense", str(wall), "--images", str(wall / "images"), "-o", str(tmp_path / "out"), *FAST, "--json"]
-    command += ["--masks", str(masks), "--region", "-9", "-9", "3", "9", "9", "5", "--max-memory", "2000"]
+    command += ["--mask-path", str(masks), "--region", "-9", "-9", "3", "9", "9", "5", "--max-memory", "2000"]
     assert main(command) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["num_patches"] > 500
@@ -75,7 +75,7 @@ def test_json_and_flags(wall: Path, capsys: pytest.CaptureFixture[str], tmp_path
         (["dense", "MODEL", "-o", "OUT", "--level", "9"], 2, "dense.level"),
         (["dense", "MODEL", "-o", "OUT", "--level", "1", "--ground-sampling", "0.1"], 2, "both set"),
         (["dense", "MODEL", "-o", "OUT", "--region", "1", "1", "1", "0", "0", "0"], 2, "dense.region"),
-        (["dense", "MODEL", "-o", "OUT", "--masks", "NONE"], 3, "NONE"),
+        (["dense", "MODEL", "-o", "OUT", "--mask-path", "NONE"], 3, "NONE"),
         (["dense", "MODEL", "-o", "EMPTY/../FULL"], 2, "is not empty"),
         (["mesh", "EMPTY"], 3, "not a workspace"),
         (["mesh", "NONE.ply", "-o", "OUT"], 3, "NONE.ply"),

@@ -28,10 +28,10 @@ def loop(count: int = 200, radius: float = 30.0) -> Trajectory:
     return Trajectory(position, rotation, 1.5e9 + np.arange(count) / 10)
 
 
-def worse(truth: Trajectory, scale: float = 1.0, seed: int = 0) -> Trajectory:
+def worse(ground_truth: Trajectory, scale: float = 1.0, seed: int = 0) -> Trajectory:
     """Of another size, and drifting."""
-    drift = np.cumsum(np.random.default_rng(seed).normal(0, 0.02, truth.position.shape), 0)
-    return Trajectory(scale * (truth.position + drift), truth.rotation, truth.timestamps_s)
+    drift = np.cumsum(np.random.default_rng(seed).normal(0, 0.02, ground_truth.position.shape), 0)
+    return Trajectory(scale * (ground_truth.position + drift), ground_truth.rotation, ground_truth.timestamps_s)
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> Path:
@@ -62,8 +62,10 @@ def write_euroc(path: Path, trajectory: Trajectory) -> Path:
 
 @pytest.fixture
 def files(tmp_path: Path) -> tuple[Path, Path]:
-    truth = loop()
-    return write_tum(tmp_path / "trajectory.tum", worse(truth)), write_tum(tmp_path / "groundtruth.txt", truth)
+    ground_truth = loop()
+    return write_tum(tmp_path / "trajectory.tum", worse(ground_truth)), write_tum(
+        tmp_path / "groundtruth.txt", ground_truth
+    )
 
 
 # ------------------------------------------------------------------------------------------------------------- formats
@@ -71,15 +73,15 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
 
 @pytest.mark.parametrize("write", [write_tum, write_kitti, write_euroc])
 def test_formats_are_told_apart_by_what_is_in_them(tmp_path: Path, write: Any) -> None:
-    truth = loop(50)
-    found = read_trajectory(write(tmp_path / "without_an_ending", truth))
+    ground_truth = loop(50)
+    found = read_trajectory(write(tmp_path / "without_an_ending", ground_truth))
     assert found.format == write.__name__.removeprefix("write_")
-    assert found.trajectory.position == pytest.approx(truth.position, abs=1e-8)
-    assert found.trajectory.rotation == pytest.approx(truth.rotation, abs=1e-8)
+    assert found.trajectory.position == pytest.approx(ground_truth.position, abs=1e-8)
+    assert found.trajectory.rotation == pytest.approx(ground_truth.rotation, abs=1e-8)
     if write is write_kitti:
         assert found.trajectory.timestamps_s is None
     else:
-        assert found.trajectory.timestamps_s == pytest.approx(truth.timestamps_s, abs=1e-6)
+        assert found.trajectory.timestamps_s == pytest.approx(ground_truth.timestamps_s, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -138,40 +140,43 @@ def test_windows_lines_a_byte_order_mark_titles_and_tabs(tmp_path: Path) -> None
 
 
 def test_frames_beside_a_kitti_trajectory_name_its_lines(tmp_path: Path) -> None:
-    truth = loop(30)
+    ground_truth = loop(30)
     kept = np.r_[0:10, 15:28]
-    write_kitti(tmp_path / "truth.txt", truth)
-    path = write_kitti(tmp_path / "trajectory.kitti", truth[kept])
+    write_kitti(tmp_path / "ground_truth.txt", ground_truth)
+    path = write_kitti(tmp_path / "trajectory.kitti", ground_truth[kept])
     with pytest.raises(InputError, match="found 23 and 30"):
-        evaluate(path, tmp_path / "truth.txt")
+        evaluate(path, tmp_path / "ground_truth.txt")
     (tmp_path / "trajectory.kitti.frames").write_text("".join(f"{k}\n" for k in kept))
-    result = evaluate(path, tmp_path / "truth.txt")
-    assert result.pairs.truth_idx.tolist() == kept.tolist()
+    result = evaluate(path, tmp_path / "ground_truth.txt")
+    assert result.pairs.ground_truth_idx.tolist() == kept.tolist()
     assert result.pairs.coverage == pytest.approx(23 / 30)
     assert result.errors["se3"].absolute.translation_m.max() < 1e-7
     (tmp_path / "trajectory.kitti.frames").write_text("1\n2\n")
     with pytest.raises(InputError, match="23 ascending numbers"):
-        evaluate(path, tmp_path / "truth.txt")
+        evaluate(path, tmp_path / "ground_truth.txt")
 
 
 def test_times_join_kitti_with_tum(tmp_path: Path) -> None:
-    truth = loop(60)
-    assert truth.timestamps_s is not None
-    ours, theirs = write_tum(tmp_path / "a.tum", truth[20:]), write_kitti(tmp_path / "truth.txt", truth)
+    ground_truth = loop(60)
+    assert ground_truth.timestamps_s is not None
+    ours, theirs = (
+        write_tum(tmp_path / "a.tum", ground_truth[20:]),
+        write_kitti(tmp_path / "ground_truth.txt", ground_truth),
+    )
     with pytest.raises(InputError) as caught:
         evaluate(ours, theirs)
     assert "--times" in str(caught.value.advice)
-    (tmp_path / "times.txt").write_text("\n".join(f"{t:.6f}" for t in truth.timestamps_s))
+    (tmp_path / "times.txt").write_text("\n".join(f"{t:.6f}" for t in ground_truth.timestamps_s))
     result = evaluate(ours, theirs, times=tmp_path / "times.txt")
-    assert result.pairs.truth_idx.tolist() == list(range(20, 60))
+    assert result.pairs.ground_truth_idx.tolist() == list(range(20, 60))
     (tmp_path / "times.txt").write_text("1\n2\n")
     with pytest.raises(InputError, match="a line for each of the 60"):
         evaluate(ours, theirs, times=tmp_path / "times.txt")
 
 
-def test_euroc_truth_is_said_to_be_of_the_imu(tmp_path: Path) -> None:
-    truth = loop(60)
-    result = evaluate(write_tum(tmp_path / "a.tum", truth), write_euroc(tmp_path / "data.csv", truth))
+def test_euroc_ground_truth_is_said_to_be_of_the_imu(tmp_path: Path) -> None:
+    ground_truth = loop(60)
+    result = evaluate(write_tum(tmp_path / "a.tum", ground_truth), write_euroc(tmp_path / "data.csv", ground_truth))
     assert result.errors["se3"].absolute.translation_m.max() < 1e-6
     assert any("IMU" in note for note in result.notes)
 
@@ -246,9 +251,9 @@ def test_options_that_cannot_be_obeyed(
 
 
 def test_a_folder_of_a_run_is_its_trajectory(files: tuple[Path, Path], tmp_path: Path) -> None:
-    truth = loop()
-    write_kitti(tmp_path / "trajectory.kitti", truth)
-    write_kitti(tmp_path / "poses.txt", truth)
+    ground_truth = loop()
+    write_kitti(tmp_path / "trajectory.kitti", ground_truth)
+    write_kitti(tmp_path / "poses.txt", ground_truth)
     assert evaluate(tmp_path, files[1]).estimate.path.name == "trajectory.tum"
     assert evaluate(tmp_path, tmp_path / "poses.txt").estimate.path.name == "trajectory.kitti"
     (tmp_path / "empty").mkdir()
@@ -257,34 +262,34 @@ def test_a_folder_of_a_run_is_its_trajectory(files: tuple[Path, Path], tmp_path:
 
 
 def test_parts_are_not_sold_as_the_whole(tmp_path: Path) -> None:
-    truth = loop()
-    ours = write_tum(tmp_path / "a.tum", worse(truth)[np.r_[0:80, 140:200]])
-    result = evaluate(ours, write_tum(tmp_path / "b.tum", truth))
+    ground_truth = loop()
+    ours = write_tum(tmp_path / "a.tum", worse(ground_truth)[np.r_[0:80, 140:200]])
+    result = evaluate(ours, write_tum(tmp_path / "b.tum", ground_truth))
     assert result.pairs.coverage == pytest.approx(0.7, abs=0.01)
     assert any("covers 69" in note or "covers 70" in note for note in result.notes)
     assert "1 gap" in result.table()
 
 
 def test_a_straight_path_leaves_the_turn_about_it_open(tmp_path: Path) -> None:
-    truth = straight(100, 50.0)
-    result = evaluate(write_tum(tmp_path / "a.tum", worse(truth)), write_tum(tmp_path / "b.tum", truth))
+    ground_truth = straight(100, 50.0)
+    result = evaluate(write_tum(tmp_path / "a.tum", worse(ground_truth)), write_tum(tmp_path / "b.tum", ground_truth))
     assert any("straight" in note for note in result.notes)
-    truth = loop()
-    result = evaluate(write_tum(tmp_path / "a.tum", worse(truth)), write_tum(tmp_path / "b.tum", truth))
+    ground_truth = loop()
+    result = evaluate(write_tum(tmp_path / "a.tum", worse(ground_truth)), write_tum(tmp_path / "b.tum", ground_truth))
     assert not any("straight" in note for note in result.notes)
 
 
-def test_a_sequence_is_its_truth(tmp_path: Path) -> None:
+def test_a_sequence_is_its_ground_truth(tmp_path: Path) -> None:
     from PIL import Image
 
-    truth = loop(30)
+    ground_truth = loop(30)
     for k in range(30):
         (tmp_path / "00" / "image_0").mkdir(parents=True, exist_ok=True)
         Image.fromarray(np.full((8, 8), k, np.uint8)).save(tmp_path / "00" / "image_0" / f"{k:06d}.png")
-    write_kitti(tmp_path / "00" / "poses.txt", truth)
-    assert truth.timestamps_s is not None
+    write_kitti(tmp_path / "00" / "poses.txt", ground_truth)
+    assert ground_truth.timestamps_s is not None
     (tmp_path / "00" / "times.txt").write_text("\n".join(f"{0.1 * k:.6e}" for k in range(30)))
-    played = Trajectory(truth.position, truth.rotation, truth.timestamps_s - 1.5e9)
+    played = Trajectory(ground_truth.position, ground_truth.rotation, ground_truth.timestamps_s - 1.5e9)
     ours = write_tum(tmp_path / "a.tum", worse(played))
     assert len(evaluate(ours, tmp_path / "00").pairs) == 30
     (tmp_path / "00" / "poses.txt").unlink()
@@ -293,33 +298,33 @@ def test_a_sequence_is_its_truth(tmp_path: Path) -> None:
 
 
 def test_a_short_path_tells_why_there_is_no_t_rel(tmp_path: Path) -> None:
-    truth = loop(radius=3.0)
-    result = evaluate(write_tum(tmp_path / "a.tum", worse(truth)), write_tum(tmp_path / "b.tum", truth))
+    ground_truth = loop(radius=3.0)
+    result = evaluate(write_tum(tmp_path / "a.tum", worse(ground_truth)), write_tum(tmp_path / "b.tum", ground_truth))
     assert "drift (%)" in result.table()
     assert "t_rel (%)" not in result.table()
     assert any("no t_rel" in note for note in result.notes)
     found = result.to_dict()["alignments"]["se3"]
     assert found["kitti"] is None
     assert [entry["length_m"] for entry in found["drift_by_length"]] == pytest.approx(
-        [0.1 * k * result.pairs.truth.path_m for k in range(1, 9)]
+        [0.1 * k * result.pairs.ground_truth.path_m for k in range(1, 9)]
     )
 
 
 def test_the_picture_shows_the_alignment_that_tells_most(tmp_path: Path) -> None:
-    truth = loop()
-    theirs = write_tum(tmp_path / "b.tum", truth)
+    ground_truth = loop()
+    theirs = write_tum(tmp_path / "b.tum", ground_truth)
     for scale, expected in ((1.0, "se3"), (0.97, "se3"), (0.1, "sim3")):
-        result = evaluate(write_tum(tmp_path / "a.tum", worse(truth, scale)), theirs)
+        result = evaluate(write_tum(tmp_path / "a.tum", worse(ground_truth, scale)), theirs)
         assert result.telling_alignment == expected
         assert any("without a scale" in note for note in result.notes) == (expected == "sim3")
     assert evaluate(tmp_path / "a.tum", theirs, EvaluateOptions(("none",))).telling_alignment == "none"
 
 
 def test_timestamps_out_of_order_are_sorted_and_said(tmp_path: Path) -> None:
-    truth = loop()
-    theirs = write_tum(tmp_path / "b.tum", truth)
-    plain = evaluate(write_tum(tmp_path / "a.tum", worse(truth)), theirs)
-    mixed = evaluate(write_tum(tmp_path / "a.tum", worse(truth)[np.r_[100:200, 0:100, 99]]), theirs)
+    ground_truth = loop()
+    theirs = write_tum(tmp_path / "b.tum", ground_truth)
+    plain = evaluate(write_tum(tmp_path / "a.tum", worse(ground_truth)), theirs)
+    mixed = evaluate(write_tum(tmp_path / "a.tum", worse(ground_truth)[np.r_[100:200, 0:100, 99]]), theirs)
     assert any("do not ascend" in note for note in mixed.notes)
     assert any("timestamp of the one before" in note for note in mixed.notes)
     before, after = (r.errors["se3"].absolute.translation_m for r in (plain, mixed))
@@ -367,7 +372,7 @@ def straight(count: int, length: float) -> Trajectory:
 
 
 @pytest.mark.parametrize(
-    ("truth", "kept"),
+    ("ground_truth", "kept"),
     [
         (straight(2, 1.0), slice(None)),
         (straight(100, 1e5), slice(None)),
@@ -378,9 +383,9 @@ def straight(count: int, length: float) -> Trajectory:
         (Trajectory(loop().position + np.array([4.5e6, 5e6, 300]), loop().rotation, loop().timestamps_s), slice(None)),
     ],
 )
-def test_pictures_of_odd_trajectories(tmp_path: Path, truth: Trajectory, kept: Any) -> None:
-    theirs = write_tum(tmp_path / "b.tum", truth)
-    draw(evaluate(write_tum(tmp_path / "a.tum", truth[kept]), theirs), tmp_path / "a.png")
+def test_pictures_of_odd_trajectories(tmp_path: Path, ground_truth: Trajectory, kept: Any) -> None:
+    theirs = write_tum(tmp_path / "b.tum", ground_truth)
+    draw(evaluate(write_tum(tmp_path / "a.tum", ground_truth[kept]), theirs), tmp_path / "a.png")
     image = pixels(tmp_path / "a.png")
     assert (image[:, [0, -1]] == 255).all()
 

@@ -37,7 +37,16 @@ def test_help_names_the_commands_and_their_flags(capsys: Capture) -> None:
             main(line)
         assert caught.value.code == 0
     said = capsys.readouterr().out
-    for flag in ("--camera", "--mono", "--self-calibrate", "--truth", "--imu", "--scale", "--view", "--no-record"):
+    for flag in (
+        "--camera",
+        "--mono",
+        "--self-calibrate",
+        "--ground-truth",
+        "--imu",
+        "--scale",
+        "--view",
+        "--no-recording",
+    ):
         assert flag in said
     for flag in ("--start", "--stop", "--step", "--reverse", "--fps", "--seed", "--threads", "--set", "--json"):
         assert flag in said
@@ -70,14 +79,14 @@ def test_wrong_options_say_what_is_right_and_touch_nothing(
 
 
 def test_a_missing_sequence_is_bad_input(tmp_path: Path, capsys: Capture) -> None:
-    line = ["odometry", str(tmp_path / "none"), "-o", str(tmp_path / "out"), "--no-record", "--json"]
+    line = ["odometry", str(tmp_path / "none"), "-o", str(tmp_path / "out"), "--no-recording", "--json"]
     assert main(line) == 3
     assert json.loads(capsys.readouterr().out)["exit_code"] == 3
 
 
 def test_flags_reach_the_options(tmp_path: Path, fake: Patch) -> None:
     flags = "--camera PINHOLE,1,1,1,1 --mono --start 3 --stop 9 --step 2 --reverse --fps 12.5 --seed 5 --threads 1"
-    line = ["odometry", "fake", "-o", str(tmp_path / "out"), "--no-record", "-q", *flags.split()]
+    line = ["odometry", "fake", "-o", str(tmp_path / "out"), "--no-recording", "-q", *flags.split()]
     assert main([*line, "--set", "odometry.max_tracks=321", "--scale", "arbitrary"]) == 0
     options = json.loads((tmp_path / "out" / "run.json").read_text())["options"]
     expected = {
@@ -95,20 +104,20 @@ def test_flags_reach_the_options(tmp_path: Path, fake: Patch) -> None:
 
 def test_a_person_is_told_what_came_of_it(tmp_path: Path, fake: Patch, capsys: Capture) -> None:
     use(fake, FakeRunner(lost=range(20, 25)))
-    assert main(["odometry", "fake", "-o", str(tmp_path / "out"), "--no-record"]) == 0
+    assert main(["odometry", "fake", "-o", str(tmp_path / "out"), "--no-recording"]) == 0
     said = capsys.readouterr().out
     assert "45 of 50 frames have a pose" in said
     assert "unit: arbitrary" in said
     assert "no pose from frame 20 to 24 (0.6 s)" in said
-    assert "against the truth: off by 0.0" in said
+    assert "against the ground truth: off by 0.0" in said
     assert "CPU ms a frame" in said
     assert "sfmapp view" not in said
-    assert main(["odometry", "fake", "-o", str(tmp_path / "out"), "--no-record", "-q"]) == 0
+    assert main(["odometry", "fake", "-o", str(tmp_path / "out"), "--no-recording", "-q"]) == 0
     assert capsys.readouterr().out == ""
 
 
 def test_a_program_gets_one_document_and_events_as_lines(tmp_path: Path, fake: Patch, capsys: Capture) -> None:
-    assert main(["odometry", "fake", "-o", str(tmp_path / "out"), "--no-record", "--json"]) == 0
+    assert main(["odometry", "fake", "-o", str(tmp_path / "out"), "--no-recording", "--json"]) == 0
     said = capsys.readouterr()
     result = json.loads(said.out)
     assert result["exit_code"] == 0
@@ -123,7 +132,7 @@ def test_a_program_gets_one_document_and_events_as_lines(tmp_path: Path, fake: P
 
 def test_no_map_is_4(tmp_path: Path, fake: Patch, capsys: Capture) -> None:
     use(fake, FakeRunner(finds_nothing=True))
-    assert main(["odometry", "fake", "-o", str(tmp_path / "out"), "--no-record"]) == 4
+    assert main(["odometry", "fake", "-o", str(tmp_path / "out"), "--no-recording"]) == 4
     assert "no map could be begun" in capsys.readouterr().err
     assert (tmp_path / "out" / "report.html").is_file()
 

@@ -112,9 +112,9 @@ def test_times_are_as_given(tmp_path: Path, layout: Callable[[Path, list[str]], 
         layout(tmp_path / start, texts)
         sequence = opened(tmp_path / start)
         assert [frame.timestamp_s for frame in sequence.frames()] == seconds(texts, unit), start
-        if sequence.truth is not None:
-            assert sequence.truth.timestamps_s.tolist() == seconds(texts, unit)
-            assert rigid3.center(sequence.truth.cam_from_world)[:, 0] == pytest.approx(range(COUNT))
+        if sequence.ground_truth is not None:
+            assert sequence.ground_truth.timestamps_s.tolist() == seconds(texts, unit)
+            assert rigid3.center(sequence.ground_truth.cam_from_world)[:, 0] == pytest.approx(range(COUNT))
 
 
 @pytest.mark.parametrize(
@@ -130,8 +130,8 @@ def test_whole_numbers_of_euroc_are_nanoseconds(tmp_path: Path, rate: int, unit:
         assert [frame.timestamp_s for frame in sequence.frames()] == expected, start
         assert sequence.imu is not None
         assert sequence.imu.timestamps_s.tolist() == expected
-        assert sequence.truth is not None
-        assert sequence.truth.timestamps_s.tolist() == expected
+        assert sequence.ground_truth is not None
+        assert sequence.ground_truth.timestamps_s.tolist() == expected
         # another unit is read where nanoseconds would be 20 kHz and more, and said
         assert any("are read as" in event.message for event in told) == (unit in ("us", "ms"))
         (tmp_path / start / "mav0/cam0/data.csv").unlink()
@@ -219,10 +219,10 @@ def test_a_given_rate_wins(tmp_path: Path, layout: Callable[[Path, list[str]], N
     assert [frame.timestamp_s for frame in sequence.frames()] == [i / 25 for i in range(COUNT)]
     assert any("times of the sequence are not used: 25 frames a second" in event.message for event in told)
     assert sequence.imu is None
-    if layout in (as_tum, as_euroc):  # the truth comes along: the pose of frame i is still its pose
-        assert sequence.truth is not None
-        np.testing.assert_allclose(sequence.truth.timestamps_s, np.arange(COUNT) / 25, atol=1e-6)
-        assert rigid3.center(sequence.truth.cam_from_world)[:, 0] == pytest.approx(range(COUNT))
+    if layout in (as_tum, as_euroc):  # the ground truth comes along: the pose of frame i is still its pose
+        assert sequence.ground_truth is not None
+        np.testing.assert_allclose(sequence.ground_truth.timestamps_s, np.arange(COUNT) / 25, atol=1e-6)
+        assert rigid3.center(sequence.ground_truth.cam_from_world)[:, 0] == pytest.approx(range(COUNT))
 
 
 def test_times_in_the_names_that_a_list_names_too(tmp_path: Path) -> None:
@@ -242,15 +242,15 @@ def test_nanoseconds_in_tums_form(tmp_path: Path, start: str, form: str) -> None
         "exponent": [f"{ns:.18e}" for ns in stamps],
     }[form]  # fmt: skip
     (tmp_path / "orb.txt").write_text(pose_rows(texts))
-    (tmp_path / "truth.tum").write_text(pose_rows([written(ns, "s") for ns in stamps]))
-    result = evaluate(tmp_path / "orb.txt", tmp_path / "truth.tum")
+    (tmp_path / "ground_truth.tum").write_text(pose_rows([written(ns, "s") for ns in stamps]))
+    result = evaluate(tmp_path / "orb.txt", tmp_path / "ground_truth.tum")
     assert len(result.pairs) == COUNT
     assert result.errors["se3"].absolute.translation_m.max() < 1e-9
     assert any("read as nanoseconds" in note for note in result.notes)
     write_frames(tmp_path / "frames", [f"{written(ns, 's')}.png" for ns in stamps])
-    sequence = opened(tmp_path / "frames", truth=str(tmp_path / "orb.txt"))
-    assert sequence.truth is not None
-    assert sequence.truth.timestamps_s == pytest.approx([ns / 1e9 for ns in stamps], abs=1e-6)
+    sequence = opened(tmp_path / "frames", ground_truth=str(tmp_path / "orb.txt"))
+    assert sequence.ground_truth is not None
+    assert sequence.ground_truth.timestamps_s == pytest.approx([ns / 1e9 for ns in stamps], abs=1e-6)
 
 
 def test_commas_and_seconds_need_titles_that_tell_the_order(tmp_path: Path) -> None:

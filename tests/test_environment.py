@@ -395,23 +395,23 @@ def test_a_killed_odometry_leaves_the_poses_it_had(tmp_path: Path, capsys: Captu
     live = output / "trajectory_live.tum"
     output.mkdir()
     line, env = fake_odometry(output, 0.1)
-    child = subprocess.Popen([*line, "--no-record"], env=env)
+    child = subprocess.Popen([*line, "--no-recording"], env=env)
     assert wait_for(lambda: live.is_file() and len(live.read_bytes().splitlines()) > 8, 60.0)
     child.kill()
     child.wait()
     names, poses = read_tum(live)
     assert len(names) >= 8
-    truth = path(50)[: len(names)]  # of which the fake finds the rotations, and half of the translations
+    ground_truth = path(50)[: len(names)]  # of which the fake finds the rotations, and half of the translations
     np.testing.assert_allclose([float(name) for name in names], np.arange(len(names)) / 10.0)
-    np.testing.assert_allclose(np.abs(np.sum(poses[:, :4] * truth[:, :4], 1)), 1.0, atol=1e-12)
-    np.testing.assert_allclose(poses[:, 4:], 0.5 * truth[:, 4:], atol=0.1)
+    np.testing.assert_allclose(np.abs(np.sum(poses[:, :4] * ground_truth[:, :4], 1)), 1.0, atol=1e-12)
+    np.testing.assert_allclose(poses[:, 4:], 0.5 * ground_truth[:, 4:], atol=0.1)
     # what is left is no result, and is not taken for one
     assert main(["evaluate", str(output), str(live), "--no-plot"]) == 3
     assert "trajectory_live.tum" in capsys.readouterr().err
     with pytest.raises(InputError, match="cut off"):
         read_manifest(output)  # which refine and export begin with
     line, env = fake_odometry(output)
-    assert subprocess.run([*line, "--no-record"], env=env, check=False, timeout=60).returncode == 0
+    assert subprocess.run([*line, "--no-recording"], env=env, check=False, timeout=60).returncode == 0
     assert len(read_tum(live)[0]) == len(read_tum(output / "trajectory.tum")[0]) == 50
     assert main(["evaluate", str(output), str(live), "--no-plot"]) == 0
 

@@ -32,20 +32,20 @@ def aligned(matrix: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return matrix * np.sign((matrix * reference).sum())
 
 
-def rotation_error_deg(pose: np.ndarray, truth: np.ndarray) -> float:
-    return float(rigid3.rotation_angle_deg(rigid3.rotation_matrix(pose) @ rigid3.rotation_matrix(truth).T))
+def rotation_error_deg(pose: np.ndarray, ground_truth: np.ndarray) -> float:
+    return float(rigid3.rotation_angle_deg(rigid3.rotation_matrix(pose) @ rigid3.rotation_matrix(ground_truth).T))
 
 
-def translation_error_deg(pose: np.ndarray, truth: np.ndarray) -> float:
-    return float(np.degrees(np.arccos(np.clip(pose[4:] @ truth[4:], -1, 1))))
+def translation_error_deg(pose: np.ndarray, ground_truth: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(pose[4:] @ ground_truth[4:], -1, 1))))
 
 
 def test_exact_points_give_the_exact_fundamental_matrix() -> None:
     xn1, xn2 = make_points(40, POSE, np.random.default_rng(0))
     xy1, xy2 = to_pixels(K1, xn1), to_pixels(K2, xn2)
-    truth = epipolar.fundamental_from_essential(epipolar.essential_from_pose(POSE), K1, K2)
+    ground_truth = epipolar.fundamental_from_essential(epipolar.essential_from_pose(POSE), K1, K2)
     f = epipolar.fundamental_from_points(xy1, xy2)
-    np.testing.assert_allclose(aligned(f, truth), truth, atol=1e-7)
+    np.testing.assert_allclose(aligned(f, ground_truth), ground_truth, atol=1e-7)
     assert abs(np.linalg.det(f / np.linalg.norm(f))) < 1e-15
     assert epipolar.sampson_errors(f, xy1, xy2).max() < 1e-12
     e = epipolar.essential_from_fundamental(f, K1, K2)
@@ -76,7 +76,7 @@ def test_sampson_error_matches_opencv_and_the_definition() -> None:
 def test_weights_turn_the_algebraic_into_the_sampson_error() -> None:
     """Noise in F falls towards the bound set by Sampson's minimum: reweighting may not make it worse."""
     rng = np.random.default_rng(2)
-    truth = epipolar.fundamental_from_essential(epipolar.essential_from_pose(POSE), K1, K2)
+    ground_truth = epipolar.fundamental_from_essential(epipolar.essential_from_pose(POSE), K1, K2)
     plain, weighted = [], []
     for _ in range(30):
         xn1, xn2 = make_points(60, POSE, rng)
@@ -91,7 +91,7 @@ def test_weights_turn_the_algebraic_into_the_sampson_error() -> None:
     # 60 points bear on 7 numbers: the error at the true points is about sigma sqrt(7 / 60)
     expected = 0.5 * np.sqrt(7 / 60)
     assert 0.6 * expected < np.mean(weighted) < 1.8 * expected
-    assert np.abs(truth).max() > 0
+    assert np.abs(ground_truth).max() > 0
 
 
 @settings(max_examples=40, deadline=None)
@@ -100,8 +100,8 @@ def test_weights_turn_the_algebraic_into_the_sampson_error() -> None:
     st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda t: np.linalg.norm(t) > 0.2),
 )
 def test_an_essential_matrix_has_four_poses_and_depth_finds_the_one(w: list[float], t: list[float]) -> None:
-    truth = np.concatenate([rigid3.quaternion(rigid3.exp_so3(w)), np.array(t) / np.linalg.norm(t)])
-    essential = epipolar.essential_from_pose(truth)
+    ground_truth = np.concatenate([rigid3.quaternion(rigid3.exp_so3(w)), np.array(t) / np.linalg.norm(t)])
+    essential = epipolar.essential_from_pose(ground_truth)
     poses = epipolar.decompose_essential(essential)
     for pose in poses:
         np.testing.assert_allclose(aligned(epipolar.essential_from_pose(pose), essential), essential, atol=1e-9)

@@ -27,10 +27,11 @@ def sparse() -> ModuleType:
 
 
 def run(program: str, seed: int, wall_s: float, error: float | None, is_cold: bool = False) -> dict[str, Any]:
-    truth = {"center_error": None if error is None else {"mean": error}, "auc": {"0.5": 0.25, "1": 0.5}}
+    ground_truth = {"center_error": None if error is None else {"mean": error}, "auc": {"0.5": 0.25, "1": 0.5}}
     return {
         "set": "church", "program": program, "seed": seed, "is_cold": is_cold, "load_before": 0.5, "wall_s": wall_s,
-        "cpu_s": 2 * wall_s, "peak_memory_mb": 100.0, "model": {"num_registered": 5, "num_images": 5}, "truth": truth,
+        "cpu_s": 2 * wall_s, "peak_memory_mb": 100.0, "model": {"num_registered": 5, "num_images": 5},
+        "ground_truth": ground_truth,
     }  # fmt: skip
 
 
@@ -41,16 +42,16 @@ def test_medians_are_over_warm_runs_and_ratios_over_medians(sparse: ModuleType) 
     row = sparse.medians(runs)["church"]
     assert row["sfmapp"]["wall_s"] == 2
     assert row["pycolmap_over_sfmapp"]["wall_s"] == 5
-    assert row["pycolmap_over_sfmapp"]["truth.center_error.mean"] == pytest.approx(0.5)
-    assert row["sfmapp"]["truth.auc.0.5"] == 0.25
+    assert row["pycolmap_over_sfmapp"]["ground_truth.center_error.mean"] == pytest.approx(0.5)
+    assert row["sfmapp"]["ground_truth.auc.0.5"] == 0.25
 
 
 def test_a_run_without_a_result_has_no_median(sparse: ModuleType) -> None:
     """Leaving the failure out would flatter the program that failed."""
     runs = [run("sfmapp", 0, 1, 0.1), run("sfmapp", 1, 1, None), run("pycolmap", 0, 1, 0.1)]
     row = sparse.medians(runs)["church"]
-    assert row["sfmapp"]["truth.center_error.mean"] is None
-    assert "truth.center_error.mean" not in row["pycolmap_over_sfmapp"]
+    assert row["sfmapp"]["ground_truth.center_error.mean"] is None
+    assert "ground_truth.center_error.mean" not in row["pycolmap_over_sfmapp"]
     assert row["sfmapp"]["wall_s"] == 1
 
 
@@ -69,12 +70,16 @@ def test_tables_of_both_and_of_one_alone(sparse: ModuleType) -> None:
     assert columns == {6, 11}
 
 
-def test_folders_with_images_and_truth_are_found(sparse: ModuleType, tmp_path: Path) -> None:
+def test_folders_with_images_and_ground_truth_are_found(sparse: ModuleType, tmp_path: Path) -> None:
     (tmp_path / "set" / "images" / "a").mkdir(parents=True)
     (tmp_path / "set" / "images" / "a" / "1.JPG").touch()
     (tmp_path / "set" / "images" / "notes.txt").touch()
     (tmp_path / "set" / "cameras.json").touch()
     found = sparse.find_sets([tmp_path / "set"])[0]
-    assert (found.name, found.image_names, found.truth) == ("set", ["a/1.JPG"], tmp_path / "set" / "cameras.json")
+    assert (found.name, found.image_names, found.ground_truth) == (
+        "set",
+        ["a/1.JPG"],
+        tmp_path / "set" / "cameras.json",
+    )
     with pytest.raises(SystemExit):
         sparse.find_sets([tmp_path])

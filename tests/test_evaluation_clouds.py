@@ -16,32 +16,32 @@ def lattice(count: int) -> NDArray[np.float64]:
 
 
 def test_a_cloud_at_a_known_height_is_all_wrong_until_it_is_all_right() -> None:
-    truth = lattice(20)
-    score = score_cloud(truth + np.array([0, 0, 0.25]), truth, [0.125, 0.25, 0.5])
+    ground_truth = lattice(20)
+    score = score_cloud(ground_truth + np.array([0, 0, 0.25]), ground_truth, [0.125, 0.25, 0.5])
     assert score.accuracy.tolist() == score.completeness.tolist() == score.f_score.tolist() == [0, 1, 1]
     assert (score.point_distance == 0.25).all()
 
 
 def test_half_of_a_surface_and_as_many_points_in_the_air() -> None:
-    truth = lattice(10)
-    cloud = np.concatenate([truth[:50], truth[:25] + np.array([0, 0, 3.0])])
-    score = score_cloud(cloud, truth, [0.5])
+    ground_truth = lattice(10)
+    cloud = np.concatenate([ground_truth[:50], ground_truth[:25] + np.array([0, 0, 3.0])])
+    score = score_cloud(cloud, ground_truth, [0.5])
     assert score.accuracy == [2 / 3]
     assert score.completeness == [0.5]
     assert score.f_score[0] == pytest.approx(2 * (2 / 3) * 0.5 / (2 / 3 + 0.5), abs=1e-15)
     assert np.isinf(score.point_distance[50:]).all()
     summary = score.summary()
-    assert (summary["num_points"], summary["num_truth"], summary["median_error"]) == (75, 100, 0.0)
+    assert (summary["num_points"], summary["num_ground_truth"], summary["median_error"]) == (75, 100, 0.0)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_all_pairs_agree(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clouds, "_CHUNK_POINTS", 100)
     rng = np.random.default_rng(3)
-    cloud, truth = rng.random((730, 3)), rng.random((410, 3))
-    pairs = np.linalg.norm(cloud[:, None] - truth[None], axis=2)
+    cloud, ground_truth = rng.random((730, 3)), rng.random((410, 3))
+    pairs = np.linalg.norm(cloud[:, None] - ground_truth[None], axis=2)
     limits = [0.03, 0.06, 0.15]
-    score = score_cloud(cloud, truth, limits[::-1], threads=threads)
+    score = score_cloud(cloud, ground_truth, limits[::-1], threads=threads)
     assert score.distances.tolist() == limits
     for k, limit in enumerate(limits):
         precision, recall = (pairs.min(1) <= limit).mean(), (pairs.min(0) <= limit).mean()
@@ -53,19 +53,19 @@ def test_all_pairs_agree(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_points_that_are_not_finite_or_outside_the_box_do_not_count() -> None:
-    truth = lattice(10)
-    cloud = np.concatenate([truth, truth + np.array([0, 0, 50.0]), [[np.nan, 0, 0], [0, np.inf, 0]]])
-    truth = np.concatenate([truth, [[np.nan] * 3]])
-    score = score_cloud(cloud, truth, [0.1], box=([0, 0, -1], [4, 9, 1]))
+    ground_truth = lattice(10)
+    cloud = np.concatenate([ground_truth, ground_truth + np.array([0, 0, 50.0]), [[np.nan, 0, 0], [0, np.inf, 0]]])
+    ground_truth = np.concatenate([ground_truth, [[np.nan] * 3]])
+    score = score_cloud(cloud, ground_truth, [0.1], box=([0, 0, -1], [4, 9, 1]))
     assert score.f_score == [1.0]
-    assert score.summary()["num_points"] == score.summary()["num_truth"] == 50
+    assert score.summary()["num_points"] == score.summary()["num_ground_truth"] == 50
     assert np.isnan(score.point_distance[100:]).all()
-    assert score_cloud(cloud, truth, [0.1]).accuracy == [0.5]
+    assert score_cloud(cloud, ground_truth, [0.1]).accuracy == [0.5]
 
 
 def test_no_points_score_nothing() -> None:
-    for cloud, truth in ((np.zeros((0, 3)), lattice(3)), (lattice(3), np.zeros((0, 3))), ([], [])):
-        score = score_cloud(cloud, truth, [1.0, 2.0])
+    for cloud, ground_truth in ((np.zeros((0, 3)), lattice(3)), (lattice(3), np.zeros((0, 3))), ([], [])):
+        score = score_cloud(cloud, ground_truth, [1.0, 2.0])
         assert score.accuracy.tolist() == score.completeness.tolist() == score.f_score.tolist() == [0, 0]
     assert score_cloud([], [], [1.0]).summary()["median_error"] is None
 

@@ -27,14 +27,14 @@ def odometry() -> ModuleType:
 
 
 def run(case: str, repeat: int, cpu_s: float, digest: str = "a", exit_code: int = 0) -> dict[str, Any]:
-    truth = {"alignment": "sim3", "ate_m": {"rmse": 0.5}, "ate_percent": 0.25, "drift_percent": 1.5,
+    ground_truth = {"alignment": "sim3", "ate_m": {"rmse": 0.5}, "ate_percent": 0.25, "drift_percent": 1.5,
              "drift_deg_per_100m": 0.75, "is_kitti_drift": case == "drive"}  # fmt: skip
     good = {"num_frames": 200, "num_with_pose": 199, "num_in_largest_map": 199, "num_maps": 1, "unit": "",
             "live_ate_m": 0.625, "cpu_ms_per_frame": 5 * cpu_s, "process_cpu_ms_per_frame": 10 * cpu_s}  # fmt: skip
     return {
         "case": case, "program": "sfmapp", "repeat": repeat, "load_before": 1.5, "exit_code": exit_code, "wall_s": 20.0,
         "cpu_s": cpu_s, "peak_memory_mb": 300.0, "digest": digest,
-        **(good | {"truth": truth} if exit_code == 0 else {"num_frames": None, "truth": None}),
+        **(good | {"ground_truth": ground_truth} if exit_code == 0 else {"num_frames": None, "ground_truth": None}),
     }  # fmt: skip
 
 

@@ -85,32 +85,32 @@ def test_auc_of_nothing_is_not_a_number() -> None:
 
 def test_pair_errors_by_hand() -> None:
     """Three cameras in a row; the last is moved so that two directions turn by 45 and by atan(1/2) degrees."""
-    truth = poses_at([[0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    ground_truth = poses_at([[0, 0, 0], [1, 0, 0], [2, 0, 0]])
     estimate = poses_at([[0, 0, 0], [1, 0, 0], [2, 1, 0]])
-    errors = evaluation.pair_errors_deg(estimate, truth)
+    errors = evaluation.pair_errors_deg(estimate, ground_truth)
     np.testing.assert_allclose(errors, [0, np.degrees(np.arctan(0.5)), 45], atol=1e-12)
 
 
 def test_pair_error_is_the_larger_of_rotation_and_direction() -> None:
     """Turning a camera in place by 2 degrees about the baseline changes no direction; about another axis it does."""
-    truth = poses_at([[0, 0, 0], [1, 0, 0]])
+    ground_truth = poses_at([[0, 0, 0], [1, 0, 0]])
     for axis in np.eye(3):
         turned = rigid3.exp_so3(np.radians(2) * np.stack([0 * axis, axis]))
         estimate = poses_at([[0, 0, 0], [1, 0, 0]], turned)
-        assert evaluation.pair_errors_deg(estimate, truth) == pytest.approx([2.0], abs=1e-9)
+        assert evaluation.pair_errors_deg(estimate, ground_truth) == pytest.approx([2.0], abs=1e-9)
 
 
 def test_reversed_baseline_is_a_full_error() -> None:
-    truth, estimate = poses_at([[0, 0, 0], [1, 0, 0]]), poses_at([[0, 0, 0], [-1, 0, 0]])
-    assert evaluation.pair_errors_deg(estimate, truth) == pytest.approx([180.0])
+    ground_truth, estimate = poses_at([[0, 0, 0], [1, 0, 0]]), poses_at([[0, 0, 0], [-1, 0, 0]])
+    assert evaluation.pair_errors_deg(estimate, ground_truth) == pytest.approx([180.0])
 
 
 def test_pairs_without_baseline() -> None:
     """Where the reference stands still only the rotation counts; where only the estimate does, the pair fails."""
-    truth = poses_at([[0, 0, 0], [0, 0, 0], [1, 0, 0]])
+    ground_truth = poses_at([[0, 0, 0], [0, 0, 0], [1, 0, 0]])
     turned = rigid3.exp_so3(np.radians([[0, 0, 0], [0, 0, 3.0], [0, 0, 0]]))
     estimate = poses_at([[0, 0, 0], [0, 0.1, 0], [0, 0, 0]], turned)
-    errors = evaluation.pair_errors_deg(estimate, truth)
+    errors = evaluation.pair_errors_deg(estimate, ground_truth)
     assert errors[0] == pytest.approx(3.0)
     assert np.isinf(errors[1])
     rotation_only = poses_at(np.zeros((3, 3)), turned)
@@ -118,10 +118,10 @@ def test_pairs_without_baseline() -> None:
 
 
 def test_unregistered_images_fail_all_their_pairs() -> None:
-    truth = random_poses(np.random.default_rng(0), 5)
-    estimate = truth.copy()
+    ground_truth = random_poses(np.random.default_rng(0), 5)
+    estimate = ground_truth.copy()
     estimate[2] = np.nan
-    errors = evaluation.pair_errors_deg(estimate, truth)
+    errors = evaluation.pair_errors_deg(estimate, ground_truth)
     i, j = np.triu_indices(5, 1)
     np.testing.assert_array_equal(np.isinf(errors), (i == 2) | (j == 2))
     assert evaluation.auc(errors) == [pytest.approx(0.6)] * 4
@@ -134,11 +134,11 @@ def test_angles_are_exact_from_tiny_to_wide(seed: int, angle: float) -> None:
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
     for degrees in (angle, angle * 1e-6):
-        truth = poses_at(np.zeros((2, 3)), rigid3.exp_so3(rng.normal(size=(2, 3))))
-        estimate = truth.copy()
-        turned = rigid3.exp_so3(np.radians(degrees) * axis) @ rigid3.rotation_matrix(truth[1])
+        ground_truth = poses_at(np.zeros((2, 3)), rigid3.exp_so3(rng.normal(size=(2, 3))))
+        estimate = ground_truth.copy()
+        turned = rigid3.exp_so3(np.radians(degrees) * axis) @ rigid3.rotation_matrix(ground_truth[1])
         estimate[1] = rigid3.from_matrix(turned, np.zeros(3))
-        assert evaluation.pair_errors_deg(estimate, truth)[0] == pytest.approx(degrees, rel=1e-6, abs=1e-12)
+        assert evaluation.pair_errors_deg(estimate, ground_truth)[0] == pytest.approx(degrees, rel=1e-6, abs=1e-12)
 
 
 # ----------------------------------------------------------------------------------------------------------- invariance
@@ -148,9 +148,9 @@ def test_angles_are_exact_from_tiny_to_wide(seed: int, angle: float) -> None:
 @given(seeds, st.integers(3, 12))
 def test_perfect_up_to_a_similarity_is_perfect(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
-    truth = random_poses(rng, count)
-    estimate = similarity.transform_poses(random_similarity(rng), truth)
-    result = evaluation.evaluate_poses(names_of(count), estimate, names_of(count), truth)
+    ground_truth = random_poses(rng, count)
+    estimate = similarity.transform_poses(random_similarity(rng), ground_truth)
+    result = evaluation.evaluate_poses(names_of(count), estimate, names_of(count), ground_truth)
     assert result.center_error.max() < 1e-8
     assert result.rotation_error_deg.max() < 1e-5
     assert evaluation.auc(result.pair_error_deg) == [pytest.approx(1.0, abs=1e-4)] * 4
@@ -160,11 +160,11 @@ def test_perfect_up_to_a_similarity_is_perfect(seed: int, count: int) -> None:
 @given(seeds, st.integers(4, 10), st.booleans())
 def test_all_numbers_are_invariant_under_a_similarity_of_the_estimate(seed: int, count: int, is_robust: bool) -> None:
     rng = np.random.default_rng(seed)
-    truth, names = random_poses(rng, count), names_of(count)
-    estimate = rigid3.compose(poses_at(rng.normal(size=(count, 3)) * 0.02), truth)
+    ground_truth, names = random_poses(rng, count), names_of(count)
+    estimate = rigid3.compose(poses_at(rng.normal(size=(count, 3)) * 0.02), ground_truth)
     moved = similarity.transform_poses(random_similarity(rng), estimate)
-    a = evaluation.evaluate_poses(names, estimate, names, truth, is_robust=is_robust)
-    b = evaluation.evaluate_poses(names, moved, names, truth, is_robust=is_robust)
+    a = evaluation.evaluate_poses(names, estimate, names, ground_truth, is_robust=is_robust)
+    b = evaluation.evaluate_poses(names, moved, names, ground_truth, is_robust=is_robust)
     np.testing.assert_allclose(a.center_error, b.center_error, atol=1e-7)
     np.testing.assert_allclose(a.rotation_error_deg, b.rotation_error_deg, atol=1e-5)
     np.testing.assert_allclose(a.pair_error_deg, b.pair_error_deg, atol=1e-5)
@@ -174,10 +174,10 @@ def test_all_numbers_are_invariant_under_a_similarity_of_the_estimate(seed: int,
 @given(seeds, st.integers(4, 10))
 def test_a_similarity_of_the_reference_scales_the_centre_errors_alone(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
-    truth, names, sim = random_poses(rng, count), names_of(count), random_similarity(rng)
-    estimate = rigid3.compose(poses_at(rng.normal(size=(count, 3)) * 0.02), truth)
-    a = evaluation.evaluate_poses(names, estimate, names, truth)
-    b = evaluation.evaluate_poses(names, estimate, names, similarity.transform_poses(sim, truth))
+    ground_truth, names, sim = random_poses(rng, count), names_of(count), random_similarity(rng)
+    estimate = rigid3.compose(poses_at(rng.normal(size=(count, 3)) * 0.02), ground_truth)
+    a = evaluation.evaluate_poses(names, estimate, names, ground_truth)
+    b = evaluation.evaluate_poses(names, estimate, names, similarity.transform_poses(sim, ground_truth))
     np.testing.assert_allclose(b.center_error, sim[7] * a.center_error, atol=1e-7 * sim[7])
     assert b.scene_size == pytest.approx(sim[7] * a.scene_size)
     np.testing.assert_allclose(a.rotation_error_deg, b.rotation_error_deg, atol=1e-5)
@@ -188,12 +188,12 @@ def test_a_similarity_of_the_reference_scales_the_centre_errors_alone(seed: int,
 @given(seeds, st.integers(3, 10))
 def test_order_and_strangers_do_not_matter(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
-    truth, names = random_poses(rng, count), names_of(count)
-    estimate = rigid3.compose(poses_at(rng.normal(size=(count, 3)) * 0.02), truth)
-    a = evaluation.evaluate_poses(names, estimate, names, truth)
+    ground_truth, names = random_poses(rng, count), names_of(count)
+    estimate = rigid3.compose(poses_at(rng.normal(size=(count, 3)) * 0.02), ground_truth)
+    a = evaluation.evaluate_poses(names, estimate, names, ground_truth)
     order = rng.permutation(count)
     shuffled = [names[i] for i in order] + ["stranger.jpg"]
-    b = evaluation.evaluate_poses(shuffled, np.vstack([estimate[order], random_poses(rng, 1)]), names, truth)
+    b = evaluation.evaluate_poses(shuffled, np.vstack([estimate[order], random_poses(rng, 1)]), names, ground_truth)
     np.testing.assert_allclose(a.center_error, b.center_error, atol=1e-9)
     np.testing.assert_allclose(a.pair_error_deg, b.pair_error_deg, atol=1e-7)
 
@@ -204,10 +204,10 @@ def test_order_and_strangers_do_not_matter(seed: int, count: int) -> None:
 def test_centre_noise_comes_out_as_it_went_in() -> None:
     """rms of 0.01 per axis over 400 cameras: sqrt(3) 0.01, less the seven parameters of the fit."""
     rng = np.random.default_rng(2)
-    truth = random_poses(rng, 400)
-    rotation = rigid3.rotation_matrix(truth)
-    estimate = poses_at(rigid3.center(truth) + rng.normal(size=(400, 3)) * 0.01, rotation)
-    result = evaluation.evaluate_poses(names_of(400), estimate, names_of(400), truth)
+    ground_truth = random_poses(rng, 400)
+    rotation = rigid3.rotation_matrix(ground_truth)
+    estimate = poses_at(rigid3.center(ground_truth) + rng.normal(size=(400, 3)) * 0.01, rotation)
+    result = evaluation.evaluate_poses(names_of(400), estimate, names_of(400), ground_truth)
     rms = result.summary()["center_error"]["rmse"]
     assert 0.95 < rms / (0.01 * np.sqrt(3 * (1 - 7 / 1200))) < 1.05
     assert result.rotation_error_deg.max() < 0.2  # only what the fit itself turns
@@ -215,26 +215,28 @@ def test_centre_noise_comes_out_as_it_went_in() -> None:
 
 def test_rotation_noise_comes_out_as_it_went_in() -> None:
     rng = np.random.default_rng(3)
-    truth = random_poses(rng, 300)
+    ground_truth = random_poses(rng, 300)
     angles = rng.uniform(0.1, 2.0, 300)
     axes = rng.normal(size=(300, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    turned = rigid3.exp_so3(np.radians(angles)[:, None] * axes) @ rigid3.rotation_matrix(truth)
-    result = evaluation.evaluate_poses(names_of(300), poses_at(rigid3.center(truth), turned), names_of(300), truth)
+    turned = rigid3.exp_so3(np.radians(angles)[:, None] * axes) @ rigid3.rotation_matrix(ground_truth)
+    result = evaluation.evaluate_poses(
+        names_of(300), poses_at(rigid3.center(ground_truth), turned), names_of(300), ground_truth
+    )
     np.testing.assert_allclose(result.rotation_error_deg, angles, atol=1e-5)
     assert result.center_error.max() < 1e-9
 
 
 def test_one_wrong_camera_shows_as_one_wrong_camera_in_the_robust_fit() -> None:
     rng = np.random.default_rng(4)
-    truth, names = random_poses(rng, 9), names_of(9)
-    estimate = similarity.transform_poses(random_similarity(rng), truth)
+    ground_truth, names = random_poses(rng, 9), names_of(9)
+    estimate = similarity.transform_poses(random_similarity(rng), ground_truth)
     estimate[3, 4:] += 40 * similarity.IDENTITY[7]
-    robust = evaluation.evaluate_poses(names, estimate, names, truth, is_robust=True)
+    robust = evaluation.evaluate_poses(names, estimate, names, ground_truth, is_robust=True)
     assert np.flatnonzero(robust.center_error > 1e-6).tolist() == [3]
     assert np.flatnonzero(~robust.is_inlier).tolist() == [3]
     assert robust.summary()["num_outliers"] == 1
-    assert np.median(evaluation.evaluate_poses(names, estimate, names, truth).center_error) > 0.01
+    assert np.median(evaluation.evaluate_poses(names, estimate, names, ground_truth).center_error) > 0.01
 
 
 # ------------------------------------------------------------------------------------------- names, gaps, degenerate
@@ -249,13 +251,13 @@ def test_names_match_in_full_then_by_file_then_by_stem() -> None:
     assert evaluation.match_names([], []).tolist() == []
 
 
-def test_missing_images_and_missing_truth() -> None:
+def test_missing_images_and_missing_ground_truth() -> None:
     rng = np.random.default_rng(5)
-    truth, names = random_poses(rng, 6), names_of(6)
-    estimate, truth_with_gap = truth.copy(), truth.copy()
+    ground_truth, names = random_poses(rng, 6), names_of(6)
+    estimate, ground_truth_with_gap = ground_truth.copy(), ground_truth.copy()
     estimate[0] = np.nan
-    truth_with_gap[1] = np.nan
-    result = evaluation.evaluate_poses(names[:-1], estimate[:-1], names, truth_with_gap)
+    ground_truth_with_gap[1] = np.nan
+    result = evaluation.evaluate_poses(names[:-1], estimate[:-1], names, ground_truth_with_gap)
     assert result.names == ("000.jpg", "002.jpg", "003.jpg", "004.jpg", "005.jpg")
     assert result.is_common.tolist() == [False, True, True, True, False]
     assert np.isnan(result.center_error).tolist() == [True, False, False, False, True]
@@ -266,8 +268,8 @@ def test_missing_images_and_missing_truth() -> None:
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_too_little_to_align(count: int) -> None:
-    truth = random_poses(np.random.default_rng(6), 4)
-    result = evaluation.evaluate_poses(names_of(count), truth[:count], names_of(4), truth)
+    ground_truth = random_poses(np.random.default_rng(6), 4)
+    result = evaluation.evaluate_poses(names_of(count), ground_truth[:count], names_of(4), ground_truth)
     summary = result.summary()
     assert result.reference_from_estimate is None
     assert summary["center_error"] is None
@@ -277,17 +279,17 @@ def test_too_little_to_align(count: int) -> None:
 
 def test_pure_rotation_has_an_auc_but_no_centre_error() -> None:
     rng = np.random.default_rng(7)
-    truth = poses_at(np.zeros((5, 3)), rigid3.exp_so3(rng.normal(size=(5, 3))))
-    result = evaluation.evaluate_poses(names_of(5), truth, names_of(5), truth)
+    ground_truth = poses_at(np.zeros((5, 3)), rigid3.exp_so3(rng.normal(size=(5, 3))))
+    result = evaluation.evaluate_poses(names_of(5), ground_truth, names_of(5), ground_truth)
     assert result.summary()["center_error"] is None
     assert result.summary()["auc"]["0.5"] == pytest.approx(1.0, abs=1e-6)
 
 
 def test_two_cameras_have_a_rotation_error() -> None:
     """The twist about the baseline comes from the orientations: turning one camera by 2 degrees leaves 1 on each."""
-    truth = poses_at([[0, 0, 0], [1, 0, 0]])
+    ground_truth = poses_at([[0, 0, 0], [1, 0, 0]])
     turned = rigid3.exp_so3(np.radians([[0, 0, 0], [2.0, 0, 0]]))
-    result = evaluation.evaluate_poses(names_of(2), poses_at([[0, 0, 0], [1, 0, 0]], turned), names_of(2), truth)
+    result = evaluation.evaluate_poses(names_of(2), poses_at([[0, 0, 0], [1, 0, 0]], turned), names_of(2), ground_truth)
     np.testing.assert_allclose(result.rotation_error_deg, [1, 1], atol=1e-9)
     np.testing.assert_allclose(result.center_error, 0, atol=1e-12)
 

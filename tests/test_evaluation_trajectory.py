@@ -50,11 +50,13 @@ def walk(seed: int, count: int = 60) -> Trajectory:
     return Trajectory(position, rotation, np.arange(count) / 10)
 
 
-def shaken(truth: Trajectory, seed: int, sigma: float = 0.1) -> Trajectory:
+def shaken(ground_truth: Trajectory, seed: int, sigma: float = 0.1) -> Trajectory:
     rng = np.random.default_rng([seed, 1])
-    turn = rigid3.exp_so3(rng.normal(0, sigma / 10, (len(truth), 3)))
+    turn = rigid3.exp_so3(rng.normal(0, sigma / 10, (len(ground_truth), 3)))
     return Trajectory(
-        truth.position + rng.normal(0, sigma, truth.position.shape), truth.rotation @ turn, truth.timestamps_s
+        ground_truth.position + rng.normal(0, sigma, ground_truth.position.shape),
+        ground_truth.rotation @ turn,
+        ground_truth.timestamps_s,
     )
 
 
@@ -86,7 +88,7 @@ vectors = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
 )
 def test_association(ours: list[float], theirs: list[float], expected: list[tuple[int, int]]) -> None:
     pairs = associate(straight(ours, ours), straight(theirs, theirs))
-    assert list(zip(pairs.estimate_idx.tolist(), pairs.truth_idx.tolist(), strict=True)) == expected
+    assert list(zip(pairs.estimate_idx.tolist(), pairs.ground_truth_idx.tolist(), strict=True)) == expected
 
 
 def test_the_offset_is_added_to_the_estimate() -> None:
@@ -108,7 +110,7 @@ def test_another_unit_of_time_is_suspected(scale: float) -> None:
 def test_without_timestamps_equal_numbers_are_pairs() -> None:
     ours = straight([0, np.nan, 2, 3])
     pairs = associate(ours, straight([0, 1, 2, 3]))
-    assert pairs.estimate_idx.tolist() == pairs.truth_idx.tolist() == [0, 2, 3]
+    assert pairs.estimate_idx.tolist() == pairs.ground_truth_idx.tolist() == [0, 2, 3]
     assert pairs.coverage == 0.75
     assert pairs.is_gap.tolist() == [False, True, False]
     with pytest.raises(InputError, match="found 4 and 3"):
@@ -117,8 +119,8 @@ def test_without_timestamps_equal_numbers_are_pairs() -> None:
         associate(ours, straight([0, 1], [0, 1]))
 
 
-def test_coverage_is_of_the_time_of_the_truth() -> None:
-    truth = straight(list(range(1001)), [k / 100 for k in range(1001)])  # ten seconds, a hundred a second
+def test_coverage_is_of_the_time_of_the_ground_truth() -> None:
+    ground_truth = straight(list(range(1001)), [k / 100 for k in range(1001)])  # ten seconds, a hundred a second
     times = np.arange(0, 101) / 10
     for kept, expected, gaps in (
         (times, 1.0, 0),
@@ -128,7 +130,7 @@ def test_coverage_is_of_the_time_of_the_truth() -> None:
         (np.delete(times, [50]), 1.0, 0),  # one frame lost is no gap
         (np.delete(times, np.s_[30:70]), 0.6, 1),  # 4.1 s, of which a step counts
     ):
-        pairs = associate(straight([0.0] * len(kept), kept.tolist()), truth)
+        pairs = associate(straight([0.0] * len(kept), kept.tolist()), ground_truth)
         assert pairs.coverage == pytest.approx(expected, abs=1e-9), len(kept)
         assert pairs.is_gap.sum() == gaps
 
@@ -137,16 +139,18 @@ def test_poses_that_are_not_there_are_no_pairs() -> None:
     times = [0.0, 1.0, 2.0, 3.0]
     pairs = associate(straight([0, 1, np.nan, 3], times), straight([np.nan, 1, 2, 3], times))
     assert pairs.estimate_idx.tolist() == [1, 3]
-    assert (pairs.num_estimate, pairs.num_truth) == (3, 3)
+    assert (pairs.num_estimate, pairs.num_ground_truth) == (3, 3)
 
 
 # ------------------------------------------------------------------------------------------------------ absolute error
 
 
 def test_absolute_error_by_hand() -> None:
-    truth = Trajectory(np.array([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]), np.tile(np.eye(3), (4, 1, 1)))
-    ours = Trajectory(truth.position + np.array([0, 0, 5.0]), rigid3.exp_so3(np.tile([0, 0, np.radians(30)], (4, 1))))
-    pairs = associate(ours, truth)
+    ground_truth = Trajectory(np.array([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]), np.tile(np.eye(3), (4, 1, 1)))
+    ours = Trajectory(
+        ground_truth.position + np.array([0, 0, 5.0]), rigid3.exp_so3(np.tile([0, 0, np.radians(30)], (4, 1)))
+    )
+    pairs = associate(ours, ground_truth)
     bare = absolute_error(pairs, "none")
     assert bare.translation_m == pytest.approx([5] * 4)
     assert bare.rotation_deg == pytest.approx([30] * 4)
@@ -180,10 +184,10 @@ def test_statistics_by_hand() -> None:
 
 @given(st.integers(0, 1000), vectors, vectors, st.floats(0.05, 20))
 def test_sim3_does_not_see_a_similarity(seed: int, turn: Array, shift: Array, scale: float) -> None:
-    truth = walk(seed)
-    ours = shaken(truth, seed)
-    before = absolute_error(associate(ours, truth), "sim3")
-    after = absolute_error(associate(moved(ours, turn, shift, scale), truth), "sim3")
+    ground_truth = walk(seed)
+    ours = shaken(ground_truth, seed)
+    before = absolute_error(associate(ours, ground_truth), "sim3")
+    after = absolute_error(associate(moved(ours, turn, shift, scale), ground_truth), "sim3")
     assert after.translation_m == pytest.approx(before.translation_m, abs=1e-9)
     assert after.rotation_deg == pytest.approx(before.rotation_deg, abs=1e-8)
     assert after.scale * scale == pytest.approx(before.scale)
@@ -191,10 +195,10 @@ def test_sim3_does_not_see_a_similarity(seed: int, turn: Array, shift: Array, sc
 
 @given(st.integers(0, 1000), vectors, vectors)
 def test_se3_does_not_see_a_motion_and_is_the_best(seed: int, turn: Array, shift: Array) -> None:
-    truth = walk(seed)
-    ours = shaken(truth, seed)
-    best = absolute_error(associate(ours, truth), "se3")
-    pairs = associate(moved(ours, turn, shift), truth)
+    ground_truth = walk(seed)
+    ours = shaken(ground_truth, seed)
+    best = absolute_error(associate(ours, ground_truth), "se3")
+    pairs = associate(moved(ours, turn, shift), ground_truth)
     after = absolute_error(pairs, "se3")
     assert after.translation_m == pytest.approx(best.translation_m, abs=1e-9)
     assert (best.translation_m**2).sum() <= (absolute_error(pairs, "none").translation_m ** 2).sum() + 1e-9
@@ -203,9 +207,9 @@ def test_se3_does_not_see_a_motion_and_is_the_best(seed: int, turn: Array, shift
 
 
 def test_a_straight_line_is_closed_by_the_orientations() -> None:
-    truth = straight([0, 1, 2, 3, 4])
-    ours = moved(truth, np.array([0.3, -0.7, 1.1]), np.array([1.0, 2, 3]), 0.5)
-    error = absolute_error(associate(ours, truth), "sim3")
+    ground_truth = straight([0, 1, 2, 3, 4])
+    ours = moved(ground_truth, np.array([0.3, -0.7, 1.1]), np.array([1.0, 2, 3]), 0.5)
+    error = absolute_error(associate(ours, ground_truth), "sim3")
     assert error.translation_m == pytest.approx([0] * 5, abs=1e-9)
     assert error.rotation_deg == pytest.approx([0] * 5, abs=1e-6)
 
@@ -220,20 +224,20 @@ def test_one_place_determines_no_alignment() -> None:
 
 
 def test_noise_comes_out_as_it_went_in() -> None:
-    truth = walk(3, 2000)
-    error = absolute_error(associate(shaken(truth, 3, 0.1), truth), "se3")
+    ground_truth = walk(3, 2000)
+    error = absolute_error(associate(shaken(ground_truth, 3, 0.1), ground_truth), "se3")
     # three axes of 0.1 m; sixteen thousand numbers tell the rmse to one percent
     assert np.sqrt((error.translation_m**2).mean()) == pytest.approx(0.1 * np.sqrt(3), rel=0.03)
     assert np.sqrt((error.rotation_deg**2).mean()) == pytest.approx(np.degrees(0.01) * np.sqrt(3), rel=0.05)
 
 
 def test_poses_of_the_house_are_taken_as_they_are() -> None:
-    truth = walk(5)
-    world_from_cam = rigid3.from_matrix(truth.rotation, truth.position)
-    same = Trajectory.from_cam_from_world(rigid3.inverse(world_from_cam), truth.timestamps_s)
-    assert same.position == pytest.approx(truth.position)
-    assert same.rotation == pytest.approx(truth.rotation)
-    assert align(associate(same, truth), "sim3") == pytest.approx(similarity.IDENTITY, abs=1e-9)
+    ground_truth = walk(5)
+    world_from_cam = rigid3.from_matrix(ground_truth.rotation, ground_truth.position)
+    same = Trajectory.from_cam_from_world(rigid3.inverse(world_from_cam), ground_truth.timestamps_s)
+    assert same.position == pytest.approx(ground_truth.position)
+    assert same.rotation == pytest.approx(ground_truth.rotation)
+    assert align(associate(same, ground_truth), "sim3") == pytest.approx(similarity.IDENTITY, abs=1e-9)
 
 
 # ------------------------------------------------------------------------------------------------------ relative error
@@ -295,9 +299,9 @@ def test_a_delta_beyond_the_path() -> None:
 
 @given(st.integers(0, 1000), vectors, vectors, vectors, vectors)
 def test_relative_errors_do_not_see_a_motion(seed: int, turn: Array, shift: Array, other: Array, way: Array) -> None:
-    truth = walk(seed)
-    ours = shaken(truth, seed)
-    before, after = associate(ours, truth), associate(moved(ours, turn, shift), moved(truth, other, way))
+    ground_truth = walk(seed)
+    ours = shaken(ground_truth, seed)
+    before, after = associate(ours, ground_truth), associate(moved(ours, turn, shift), moved(ground_truth, other, way))
     for delta, unit in ((1, "frames"), (0.5, "s"), (5, "m")):
         a, b = (relative_error(pairs, delta, unit) for pairs in (before, after))  # type: ignore[arg-type]
         assert b.first.tolist() == a.first.tolist()
@@ -324,7 +328,7 @@ def test_drift_by_hand() -> None:
     assert turning.r_rel_deg_per_m == pytest.approx((0.01 * (turning.length_m + 1) / turning.length_m).mean())
 
 
-def naive_drift(truth: Trajectory, ours: Trajectory) -> tuple[float, float]:
+def naive_drift(ground_truth: Trajectory, ours: Trajectory) -> tuple[float, float]:
     """The definition, pose by pose with 4 x 4 matrices; percent and degrees a metre."""
 
     def matrix(trajectory: Trajectory, k: int) -> Array:
@@ -333,15 +337,15 @@ def naive_drift(truth: Trajectory, ours: Trajectory) -> tuple[float, float]:
         return pose
 
     way = [0.0]
-    for k in range(1, len(truth)):
-        way.append(way[-1] + float(np.linalg.norm(truth.position[k] - truth.position[k - 1])))
+    for k in range(1, len(ground_truth)):
+        way.append(way[-1] + float(np.linalg.norm(ground_truth.position[k] - ground_truth.position[k - 1])))
     errors = []
-    for first in range(0, len(truth), 10):
+    for first in range(0, len(ground_truth), 10):
         for length in (100, 200, 300, 400, 500, 600, 700, 800):
-            last = next((k for k in range(first, len(truth)) if way[k] > way[first] + length), None)
+            last = next((k for k in range(first, len(ground_truth)) if way[k] > way[first] + length), None)
             if last is None:
                 continue
-            true, found = (np.linalg.inv(matrix(t, first)) @ matrix(t, last) for t in (truth, ours))
+            true, found = (np.linalg.inv(matrix(t, first)) @ matrix(t, last) for t in (ground_truth, ours))
             error = np.linalg.inv(found) @ true
             angle = np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1))
             errors.append((np.linalg.norm(error[:3, 3]) / length, np.degrees(angle) / length))
@@ -350,10 +354,10 @@ def naive_drift(truth: Trajectory, ours: Trajectory) -> tuple[float, float]:
 
 
 def test_drift_is_that_of_the_definition() -> None:
-    truth = walk(7, 700)
-    ours = shaken(truth, 7, 0.3)
-    drift = kitti_drift(associate(ours, truth))
-    assert (drift.t_rel_percent, drift.r_rel_deg_per_m) == pytest.approx(naive_drift(truth, ours), rel=1e-6)
+    ground_truth = walk(7, 700)
+    ours = shaken(ground_truth, 7, 0.3)
+    drift = kitti_drift(associate(ours, ground_truth))
+    assert (drift.t_rel_percent, drift.r_rel_deg_per_m) == pytest.approx(naive_drift(ground_truth, ours), rel=1e-6)
 
 
 def test_a_short_path_has_no_stretch() -> None:
@@ -380,7 +384,7 @@ def write_case(folder: Path) -> tuple[Path, Path]:
     our_rotation = turn @ (rotation @ rigid3.exp_so3(rng.normal(0, 0.01, (400, 3))))[kept]
     times = 1.4e9 + np.arange(400) * 0.05
     our_times = times[kept] + rng.uniform(-0.012, 0.012, 250)  # some are too far from all true ones
-    paths = folder / "estimate.tum", folder / "truth.tum"
+    paths = folder / "estimate.tum", folder / "ground_truth.tum"
     for path, t, p, r in zip(paths, (our_times, times), (ours, position), (our_rotation, rotation), strict=True):
         table = np.concatenate([p, rigid3.quaternion(r)], 1)
         path.write_text(
@@ -444,8 +448,8 @@ def ours_for(name: str, pairs: Pairs) -> list[float]:
 
 
 def read_case(folder: Path) -> Pairs:
-    estimate, truth = (read_trajectory(path).trajectory for path in write_case(folder))
-    return associate(estimate, truth)
+    estimate, ground_truth = (read_trajectory(path).trajectory for path in write_case(folder))
+    return associate(estimate, ground_truth)
 
 
 @pytest.mark.parametrize("name", EVO_CASES)
@@ -467,7 +471,7 @@ def test_equal_to_evo_where_it_is_installed(tmp_path: Path, name: str) -> None:
 def run_evo(program: str, arguments: list[str], folder: Path) -> list[float]:
     """Statistics as evo's program saves them."""
     saved = folder / "evo.zip"
-    files = [str(folder / "truth.tum"), str(folder / "estimate.tum")]
+    files = [str(folder / "ground_truth.tum"), str(folder / "estimate.tum")]
     command = [program, "tum", *files, *arguments, "--save_results", str(saved), "--silent", "--no_warnings"]
     subprocess.run(command, check=True, capture_output=True, env={**os.environ, "HOME": str(folder)})
     with zipfile.ZipFile(saved) as results:

@@ -124,12 +124,12 @@ def test_broken_and_empty_images_warn_by_name(tmp_path: Path) -> None:
 def test_large_images_are_scaled_down_and_keypoints_back(size: tuple[int, int]) -> None:
     """House pixels scale from the corner of the image: a half pixel lost would show as a bias of half the factor."""
     grid = np.stack(np.meshgrid(np.arange(1, 6), np.arange(1, 6)), axis=-1).reshape(-1, 2)
-    truth = grid * (np.array(size) / 6.0)
-    gray = blobs(truth, np.full(len(truth), 9.0), size)
+    ground_truth = grid * (np.array(size) / 6.0)
+    gray = blobs(ground_truth, np.full(len(ground_truth), 9.0), size)
     features, scale, _ = features_from_picture(picture_of(gray), FeatureOptions(max_size_px=400))
     assert scale == pytest.approx(400 / max(size))
-    found = features.keypoints[nearest(features.keypoints[:, :2], truth)]
-    error = found[:, :2] - truth
+    found = features.keypoints[nearest(features.keypoints[:, :2], ground_truth)]
+    error = found[:, :2] - ground_truth
     assert np.abs(error.mean(axis=0)).max() < 0.05
     assert np.abs(error).max() < 0.2
     assert np.abs(found[:, 2] / 9.0 - 1).max() < 0.2

@@ -27,7 +27,7 @@ def sift(gray: np.ndarray, usable: np.ndarray | None = None, **changes: float) -
 
 
 def blobs(xy: np.ndarray, sigma: np.ndarray, size: tuple[int, int], contrast: float = 120.0) -> np.ndarray:
-    """Gaussian blobs at house pixels xy, of either sign, as a uint8 picture; dithered, so that rounding is noise."""
+    """Gaussian blobs at COLMAP's pixels xy, of either sign, as a uint8 picture; dithered, so that rounding is noise."""
     y, x = np.mgrid[: size[1], : size[0]] + 0.5
     picture = np.full(x.shape, 128.0)
     for n, ((cx, cy), s) in enumerate(zip(xy, sigma, strict=True)):
@@ -56,10 +56,10 @@ def test_blobs_are_found_where_they_are(seed: int, octave: int, layer: float) ->
     # at whole powers of two a blob lies in the seam of two octaves, and a hair decides whether either holds it
     sigma = 2.0 ** (octave + layer)
     grid = np.stack(np.meshgrid(np.arange(4), np.arange(3)), axis=-1).reshape(-1, 2) * 64.0 + 48.0
-    truth = grid + np.random.default_rng(seed).uniform(-0.5, 0.5, grid.shape)
-    keypoints, _ = sift(blobs(truth, np.full(len(truth), sigma), (288, 224)))
-    found = keypoints[nearest(keypoints[:, :2], truth)]
-    error = found[:, :2] - truth
+    ground_truth = grid + np.random.default_rng(seed).uniform(-0.5, 0.5, grid.shape)
+    keypoints, _ = sift(blobs(ground_truth, np.full(len(ground_truth), sigma), (288, 224)))
+    found = keypoints[nearest(keypoints[:, :2], ground_truth)]
+    error = found[:, :2] - ground_truth
     assert np.abs(error).max() < 0.03
     assert np.abs(error.mean(axis=0)).max() < 0.01
     # the difference of Gaussians peaks where its own width is that of the blob
@@ -70,9 +70,9 @@ def test_blobs_are_found_where_they_are(seed: int, octave: int, layer: float) ->
 def test_no_bias_towards_the_pixel_grid(shift: float) -> None:
     """The error is no function of the fraction of the pixel: it would bend every camera the same way."""
     grid = np.stack(np.meshgrid(np.arange(9), np.arange(9)), axis=-1).reshape(-1, 2) * 28.0 + 24.0
-    truth = grid + shift
-    keypoints, _ = sift(blobs(truth, np.full(len(truth), 1.1), (272, 272)))
-    error = keypoints[nearest(keypoints[:, :2], truth), :2] - truth
+    ground_truth = grid + shift
+    keypoints, _ = sift(blobs(ground_truth, np.full(len(ground_truth), 1.1), (272, 272)))
+    error = keypoints[nearest(keypoints[:, :2], ground_truth), :2] - ground_truth
     assert np.abs(error.mean(axis=0)).max() < 0.005
 
 
@@ -80,7 +80,7 @@ def test_quarter_turn_turns_keypoints_and_keeps_descriptors() -> None:
     picture = texture((300, 260))
     straight, straight_descriptors = sift(picture)
     turned, turned_descriptors = sift(np.ascontiguousarray(np.rot90(picture, -1)))
-    # clockwise: (x, y) goes to (height - y, x) in house pixels, without any half pixel
+    # clockwise: (x, y) goes to (height - y, x) in COLMAP's pixels, without any half pixel
     expected = np.column_stack([260 - straight[:, 1], straight[:, 0]])
     at = nearest(turned[:, :2], expected)
     angle = np.angle(np.exp(1j * (turned[at, 3] - straight[:, 3] - math.pi / 2)))
@@ -205,7 +205,7 @@ def test_same_places_as_colmap(data_root: Path, name: str) -> None:
 
 
 def true_fundamental(data_root: Path, scene: str, first: int, second: int) -> tuple[list[Path], np.ndarray]:
-    """Files and F (house pixels of the half-size pictures) of two views."""
+    """Files and F (COLMAP's pixels of the half-size pictures) of two views."""
     cameras = [json.loads((data_root / scene / "cameras.json").read_text())["cameras"][i] for i in (first, second)]
     inverse_k, rotation, translation = [], [], []
     for camera in cameras:

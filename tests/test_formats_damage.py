@@ -19,10 +19,10 @@ from sfmapp.errors import InputError
 from sfmapp.formats.bundler import read_bundler, write_bundler
 from sfmapp.formats.colmap import read_model, write_model_text
 from sfmapp.formats.flat_yaml import read_flat_yaml
+from sfmapp.formats.ground_truth import read_ground_truth
 from sfmapp.formats.nerfstudio import read_nerfstudio, write_nerfstudio
 from sfmapp.formats.text_input import read_json_object
 from sfmapp.formats.trajectory import read_tum, write_tum
-from sfmapp.formats.truth import read_truth
 from sfmapp.geometry import rigid3
 from sfmapp.images.folder import describe_images
 from sfmapp.images.image_set import ImageOptions
@@ -55,7 +55,7 @@ def sound_poses(poses: NDArray[np.float64]) -> None:
     np.testing.assert_allclose(np.linalg.norm(poses[:, :4], axis=1), 1.0, atol=1e-9)
 
 
-def truth_of(rec: Reconstruction, path: Path) -> None:
+def ground_truth_of(rec: Reconstruction, path: Path) -> None:
     entries = [
         {"file": name, "K": CAMERA.k_matrix.tolist(), "dist": [0.1, 0, 0, 0], "t_w2c": pose[4:].tolist(),
          "R_w2c": rigid3.rotation_matrix(pose).tolist(), "width": 1001, "height": 750}
@@ -71,7 +71,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "sparse_pc.ply": lambda path: sound_model(read_nerfstudio(path.with_name("transforms.json"))),
     "poses.txt": lambda path: sound_poses(read_kitti(path)),
     "trajectory.tum": lambda path: sound_poses(read_tum(path)[1]),
-    "cameras.json": lambda path: sound_poses(read_truth(path).cam_from_world),
+    "cameras.json": lambda path: sound_poses(read_ground_truth(path).cam_from_world),
     "camera.yaml": read_flat_yaml,
 } | {
     f"model/{name}.txt": lambda path: sound_model(read_model(path.parent)[0])
@@ -87,7 +87,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_nerfstudio(folder / "transforms.json", rec)
     write_kitti(folder / "poses.txt", rec.cam_from_world)
     write_tum(folder / "trajectory.tum", np.arange(4.0), rec.cam_from_world)
-    truth_of(rec, folder / "cameras.json")
+    ground_truth_of(rec, folder / "cameras.json")
     write_model_text(folder / "model", make_scene(0, 4, 8, rig=synthetic_rig()).observed)
     yaml = "%YAML:1.0\n---\nK: !!opencv-matrix\n  rows: 3\n  data: [1., 2.,\n    3.]\na: {b: 1, c: [x, 'y']}\nl:\n"
     (folder / "camera.yaml").write_text(yaml + ' - 1\n - d: 2\n   e: 3\n# c\nf: "q: r"\n')

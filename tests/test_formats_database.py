@@ -38,9 +38,9 @@ def filled(
     path: Path, num_images: int = 5, cameras: list[Camera] | None = None, num_points: int = 200
 ) -> SyntheticScene:
     scene = make_scene(3, num_images, num_points, cameras, sigma_px=0.3)
-    truth = scene.truth
+    ground_truth = scene.ground_truth
     with Database(path) as database:
-        database.set_images(truth.cameras, truth.image_names, truth.image_camera_idx)
+        database.set_images(ground_truth.cameras, ground_truth.image_names, ground_truth.image_camera_idx)
         for image in range(num_images):
             database.write_features(image, features_of(scene, image), f"key{image}")
         database.write_pairs(true_correspondences(scene), "pairs")
@@ -63,8 +63,8 @@ def test_round_trip(tmp_path: Path) -> None:
     for read_only in (False, True):
         with Database(path, read_only=read_only) as database:
             cameras, names, camera_idx = database.read_images()
-            assert names == scene.truth.image_names
-            np.testing.assert_array_equal(camera_idx, scene.truth.image_camera_idx)
+            assert names == scene.ground_truth.image_names
+            np.testing.assert_array_equal(camera_idx, scene.ground_truth.image_camera_idx)
             for ours, expected in zip(cameras, models, strict=True):
                 assert (ours.model, ours.width, ours.height) == (expected.model, expected.width, expected.height)
                 np.testing.assert_array_equal(ours.params, expected.params)
@@ -72,11 +72,11 @@ def test_round_trip(tmp_path: Path) -> None:
             assert database.feature_keys() == {i: f"key{i}" for i in range(7)}
             for image in range(7):
                 assert_equal(database.read_features(image), features_of(scene, image))
-            truth = true_correspondences(scene)
-            assert_equal(database.read_pairs(), truth)
-            assert set(database.pair_keys()) == set(map(tuple, truth.pair_image_idx.tolist()))
-            some = database.read_pairs(truth.pair_image_idx[3:5])
-            np.testing.assert_array_equal(some.matches_of_pair(1), truth.matches_of_pair(4))
+            ground_truth = true_correspondences(scene)
+            assert_equal(database.read_pairs(), ground_truth)
+            assert set(database.pair_keys()) == set(map(tuple, ground_truth.pair_image_idx.tolist()))
+            some = database.read_pairs(ground_truth.pair_image_idx[3:5])
+            np.testing.assert_array_equal(some.matches_of_pair(1), ground_truth.matches_of_pair(4))
             with pytest.raises(InputError, match="found none"):
                 database.read_pairs(np.array([[1, 99]]))
 
@@ -94,31 +94,33 @@ def test_pycolmap_reads_ours(tmp_path: Path) -> None:
         descriptors = database.read_descriptors(image + 1)
         assert descriptors.type == pycolmap.FeatureExtractorType.SIFT
         np.testing.assert_array_equal(descriptors.data, ours.descriptors)
-        assert database.read_image(image + 1).name == scene.truth.image_names[image]
-    truth = true_correspondences(scene)
-    for p, (i, j) in enumerate(truth.pair_image_idx.tolist()):
+        assert database.read_image(image + 1).name == scene.ground_truth.image_names[image]
+    ground_truth = true_correspondences(scene)
+    for p, (i, j) in enumerate(ground_truth.pair_image_idx.tolist()):
         geometry = database.read_two_view_geometry(i + 1, j + 1)
-        np.testing.assert_array_equal(geometry.inlier_matches, truth.matches_of_pair(p))
-        np.testing.assert_array_equal(database.read_matches(i + 1, j + 1), truth.matches_of_pair(p))
-        assert int(geometry.config) == truth.config[p]
+        np.testing.assert_array_equal(geometry.inlier_matches, ground_truth.matches_of_pair(p))
+        np.testing.assert_array_equal(database.read_matches(i + 1, j + 1), ground_truth.matches_of_pair(p))
+        assert int(geometry.config) == ground_truth.config[p]
         assert geometry.H is None
-        if not truth.config[p]:
+        if not ground_truth.config[p]:
             assert geometry.F is geometry.E is geometry.cam2_from_cam1 is None
             continue
-        np.testing.assert_array_equal(geometry.F, truth.fundamental[p])
-        np.testing.assert_array_equal(geometry.E, truth.essential[p])
-        np.testing.assert_array_equal(geometry.cam2_from_cam1.rotation.quat, truth.cam2_from_cam1[p, :4])
-        np.testing.assert_array_equal(geometry.cam2_from_cam1.translation, truth.cam2_from_cam1[p, 4:])
+        np.testing.assert_array_equal(geometry.F, ground_truth.fundamental[p])
+        np.testing.assert_array_equal(geometry.E, ground_truth.essential[p])
+        np.testing.assert_array_equal(geometry.cam2_from_cam1.rotation.quat, ground_truth.cam2_from_cam1[p, :4])
+        np.testing.assert_array_equal(geometry.cam2_from_cam1.translation, ground_truth.cam2_from_cam1[p, 4:])
     database.close()
     with Database(tmp_path / "d.db") as again:
-        assert_equal(again.read_pairs(), truth)
+        assert_equal(again.read_pairs(), ground_truth)
     assert len((tmp_path / "d.db").read_bytes()) == len(before)
 
 
 def test_gps_and_binary_descriptors_reach_pycolmap(tmp_path: Path) -> None:
     scene = make_scene(0, 2, 50)
     with Database(tmp_path / "d.db") as database:
-        database.set_images(scene.truth.cameras, scene.truth.image_names, [0, 0], [None, (48.1, 11.5, 520.0)])
+        database.set_images(
+            scene.ground_truth.cameras, scene.ground_truth.image_names, [0, 0], [None, (48.1, 11.5, 520.0)]
+        )
         database.write_features(0, features_of(scene, 0, orb=True))
         assert_equal(database.read_features(0), features_of(scene, 0, orb=True))
     theirs = pycolmap.Database.open(str(tmp_path / "d.db"))
@@ -139,7 +141,7 @@ def test_pycolmap_maps_from_ours(tmp_path: Path) -> None:
     long_tracks = np.count_nonzero(np.diff(scene.observed.tracks.track_ptr) > 2)  # those of two images it ignores
     assert models[0].num_points3D() > 0.8 * long_tracks
     assert 0.1 < models[0].compute_mean_reprojection_error() < 0.6  # the noise is 0.3 px per axis
-    assert {image.name for image in models[0].images.values()} == set(scene.truth.image_names)
+    assert {image.name for image in models[0].images.values()} == set(scene.ground_truth.image_names)
 
 
 def test_we_read_pycolmaps(tmp_path: Path) -> None:
@@ -192,12 +194,12 @@ def test_affine_keypoints_follow_colmap(tmp_path: Path) -> None:
 def test_changed_image_list_keeps_what_it_can(tmp_path: Path) -> None:
     path = tmp_path / "d.db"
     scene = filled(path)
-    truth, pairs = scene.truth, true_correspondences(scene)
-    names = truth.image_names
+    ground_truth, pairs = scene.ground_truth, true_correspondences(scene)
+    names = ground_truth.image_names
     with Database(path) as database:
         # one image is gone, two are new, one of them in front
         new = ["0_new.jpg", names[0], names[2], names[3], names[4], "z_new.jpg"]
-        database.set_images(truth.cameras, new, [0] * 6)
+        database.set_images(ground_truth.cameras, new, [0] * 6)
         assert database.feature_keys() == {1: "key0", 2: "key2", 3: "key3", 4: "key4"}
         assert_equal(database.read_features(2), features_of(scene, 2))
         back = database.read_pairs()
@@ -205,10 +207,10 @@ def test_changed_image_list_keeps_what_it_can(tmp_path: Path) -> None:
         of_pair = {tuple(pair): p for p, pair in enumerate(pairs.pair_image_idx.tolist())}
         np.testing.assert_array_equal(back.matches_of_pair(4), pairs.matches_of_pair(of_pair[2, 4]))
         # turned round: features stay, pairs go
-        database.set_images(truth.cameras, new[::-1], [0] * 6)
+        database.set_images(ground_truth.cameras, new[::-1], [0] * 6)
         assert database.feature_keys() == {4: "key0", 3: "key2", 2: "key3", 1: "key4"}
         assert database.read_pairs().num_pairs == 0
-        database.set_images(truth.cameras, new[::-1], [0] * 6)
+        database.set_images(ground_truth.cameras, new[::-1], [0] * 6)
         assert len(database.feature_keys()) == 4
     theirs = pycolmap.Database.open(str(path))
     assert theirs.num_images() == theirs.num_frames() == 6
@@ -238,7 +240,7 @@ sys.path.insert(0, {str(Path(__file__).parent)!r})
 from test_formats_database import *
 scene = make_scene(3, 4, 200, sigma_px=0.3)
 database = Database({str(tmp_path / "d.db")!r})
-database.set_images(scene.truth.cameras, scene.truth.image_names, scene.truth.image_camera_idx)
+database.set_images(scene.ground_truth.cameras, scene.ground_truth.image_names, scene.ground_truth.image_camera_idx)
 database.write_features(0, features_of(scene, 0), "k")
 database.write_features(1, features_of(scene, 1), "k")
 database._db.execute("BEGIN IMMEDIATE")
@@ -258,8 +260,8 @@ def test_failed_transaction_changes_nothing(tmp_path: Path) -> None:
     scene = filled(tmp_path / "d.db")
     with Database(tmp_path / "d.db") as database:
         with pytest.raises(InputError, match="UNIQUE"):
-            database.set_images(scene.truth.cameras, ["a", "a"], [0, 0])
-        assert database.read_images()[1] == scene.truth.image_names
+            database.set_images(scene.ground_truth.cameras, ["a", "a"], [0, 0])
+        assert database.read_images()[1] == scene.ground_truth.image_names
         assert len(database.feature_keys()) == 5
 
 

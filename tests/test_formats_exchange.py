@@ -18,11 +18,11 @@ from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.bundler import read_bundler, write_bundler
 from sfmapp.formats.colmap import read_model, write_model, write_model_text
+from sfmapp.formats.ground_truth import read_ground_truth
 from sfmapp.formats.nerfstudio import POINTS_NAME, read_nerfstudio, write_nerfstudio
 from sfmapp.formats.ply import write_ply
 from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.formats.trajectory import read_tum, write_tum
-from sfmapp.formats.truth import read_truth
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene, synthetic_camera
@@ -322,7 +322,7 @@ def test_nerfstudio_refusals(tmp_path: Path, changes: dict[str, Any], match: str
 
 
 def test_nerfstudio_poses_need_neither_points_nor_our_cameras(tmp_path: Path) -> None:
-    """As a truth: panoramas, scenes without sizes, points that are gone or not to be read."""
+    """As a ground truth: panoramas, scenes without sizes, points that are gone or not to be read."""
     path = tmp_path / "transforms.json"
     (tmp_path / "bad.ply").write_bytes(b"no points")
     frames = [
@@ -330,17 +330,17 @@ def test_nerfstudio_poses_need_neither_points_nor_our_cameras(tmp_path: Path) ->
         {"file_path": "/data/b", "transform_matrix": np.eye(4).tolist()},
     ]
     path.write_text(json.dumps(nerf_document(frames=frames, ply_file_path="absent.ply")))
-    truth = read_truth(path)
-    assert truth.names == ("images/a 1.png", "/data/b")
-    assert truth.cameras is not None
-    assert [camera.focal for camera in truth.cameras] == [40, 50]
-    assert truth.for_images(["b.jpg", "a 1.jpg"]).names == ("a 1.jpg", "b.jpg")
+    ground_truth = read_ground_truth(path)
+    assert ground_truth.names == ("images/a 1.png", "/data/b")
+    assert ground_truth.cameras is not None
+    assert [camera.focal for camera in ground_truth.cameras] == [40, 50]
+    assert ground_truth.for_images(["b.jpg", "a 1.jpg"]).names == ("a 1.jpg", "b.jpg")
     for changes in ({"camera_model": "EQUIRECTANGULAR"}, {"w": None}, {"k3": 0.1}, {"ply_file_path": "bad.ply"}):
         path.write_text(json.dumps(nerf_document(frames=frames) | changes))
-        np.testing.assert_array_equal(read_truth(path).cam_from_world, truth.cam_from_world)
+        np.testing.assert_array_equal(read_ground_truth(path).cam_from_world, ground_truth.cam_from_world)
     path.write_text(json.dumps(nerf_document(applied_scale=0)))
     with pytest.raises(InputError, match="applied_scale above 0"):
-        read_truth(path)
+        read_ground_truth(path)
 
 
 def test_nerfstudio_points_in_text_with_gaps_and_a_scale(tmp_path: Path) -> None:
@@ -380,7 +380,7 @@ def test_json_from_outside(tmp_path: Path, text: str) -> None:
     with pytest.raises(InputError):
         read_nerfstudio(tmp_path / "t.json")
     with pytest.raises(InputError):
-        read_truth(tmp_path / "t.json")
+        read_ground_truth(tmp_path / "t.json")
 
 
 @FUZZ
@@ -431,10 +431,11 @@ def test_tum_refusals(tmp_path: Path, line: str) -> None:
         read_tum(tmp_path / "t.txt")
 
 
-# truth ---------------------------------------------------------------------------------------------------------------
+# ground truth
+# ---------------------------------------------------------------------------------------------------------------
 
 
-def json_truth(path: Path, rec: Reconstruction, prefix: str = "images/", **changes: Any) -> Path:
+def json_ground_truth(path: Path, rec: Reconstruction, prefix: str = "images/", **changes: Any) -> Path:
     """cameras.json as the shared data have it."""
     entries = []
     for image in rec.registered_idx:
@@ -450,7 +451,7 @@ def json_truth(path: Path, rec: Reconstruction, prefix: str = "images/", **chang
     return path
 
 
-def test_all_forms_of_truth_agree(tmp_path: Path) -> None:
+def test_all_forms_of_ground_truth_agree(tmp_path: Path) -> None:
     rec = scene([centered_camera()])
     write_model(tmp_path / "sparse" / "0", rec)
     write_nerfstudio(tmp_path / "transforms.json", rec)
@@ -458,48 +459,48 @@ def test_all_forms_of_truth_agree(tmp_path: Path) -> None:
     registered = rec.registered_idx
     paths = [
         tmp_path, tmp_path / "sparse" / "0", tmp_path / "transforms.json", tmp_path / "t.tum",
-        json_truth(tmp_path / "cameras.json", rec),
+        json_ground_truth(tmp_path / "cameras.json", rec),
     ]  # fmt: skip
     for path in paths:
-        truth = read_truth(path)
-        assert len(truth.names) == len(registered)
+        ground_truth = read_ground_truth(path)
+        assert len(ground_truth.names) == len(registered)
         np.testing.assert_allclose(
-            rigid3.rotation_matrix(truth.cam_from_world),
+            rigid3.rotation_matrix(ground_truth.cam_from_world),
             rigid3.rotation_matrix(rec.cam_from_world[registered]),
             atol=1e-9,
         )
-        np.testing.assert_allclose(truth.cam_from_world[:, 4:], rec.cam_from_world[registered, 4:], atol=1e-9)
+        np.testing.assert_allclose(ground_truth.cam_from_world[:, 4:], rec.cam_from_world[registered, 4:], atol=1e-9)
         if path.suffix == ".tum":
-            assert truth.cameras is None
+            assert ground_truth.cameras is None
         else:
-            assert truth.cameras is not None
-            for camera, image in zip(truth.cameras, registered, strict=True):
+            assert ground_truth.cameras is not None
+            for camera, image in zip(ground_truth.cameras, registered, strict=True):
                 ours = rec.cameras[rec.image_camera_idx[image]]
                 np.testing.assert_allclose(camera.canonical, ours.canonical, atol=1e-9)
-            assert truth.for_images(rec.image_names).names == tuple(rec.image_names[i] for i in registered)
+            assert ground_truth.for_images(rec.image_names).names == tuple(rec.image_names[i] for i in registered)
         with pytest.raises(InputError, match="no name fits"):
-            truth.for_images(["p.jpg", "q.jpg"])
+            ground_truth.for_images(["p.jpg", "q.jpg"])
 
 
 @pytest.mark.parametrize("name", ["sparse/0", "sparse", "colmap/sparse/0", "transforms.json", "cameras.json"])
-def test_a_truth_is_found_in_its_folder(tmp_path: Path, name: str) -> None:
+def test_a_ground_truth_is_found_in_its_folder(tmp_path: Path, name: str) -> None:
     rec = scene([centered_camera()])
     if name == "transforms.json":
         write_nerfstudio(tmp_path / name, rec)
     elif name == "cameras.json":
-        json_truth(tmp_path / name, rec)
+        json_ground_truth(tmp_path / name, rec)
     else:
         write_model(tmp_path / name, rec)
     expected = rec.cam_from_world[rec.registered_idx, 4:]
-    np.testing.assert_allclose(read_truth(tmp_path).cam_from_world[:, 4:], expected, atol=1e-9)
+    np.testing.assert_allclose(read_ground_truth(tmp_path).cam_from_world[:, 4:], expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("write", [write_model, write_model_text])
-def test_poses_of_a_colmap_model_are_a_truth_whatever_its_lenses(tmp_path: Path, write: Any) -> None:
+def test_poses_of_a_colmap_model_are_a_ground_truth_whatever_its_lenses(tmp_path: Path, write: Any) -> None:
     """As those of ETH3D: thin prism cameras, and observations that nobody asks for."""
     rec = scene([centered_camera()])
     write(tmp_path, rec)
-    plain = read_truth(tmp_path)
+    plain = read_ground_truth(tmp_path)
     model = pycolmap.Reconstruction(str(tmp_path))
     for camera in model.cameras.values():
         camera.model, camera.params = "THIN_PRISM_FISHEYE", [900.0, 900, 500, 375, *[0.01] * 8]
@@ -507,29 +508,32 @@ def test_poses_of_a_colmap_model_are_a_truth_whatever_its_lenses(tmp_path: Path,
     with pytest.raises(InputError, match="THIN_PRISM_FISHEYE"):
         read_model(tmp_path)
     (next(tmp_path.glob("points3D.*"))).write_bytes(b"no points at all")
-    truth = read_truth(tmp_path)
-    assert truth.cameras is None
-    assert truth.names == plain.names
-    np.testing.assert_allclose(truth.cam_from_world, plain.cam_from_world, atol=1e-14)
+    ground_truth = read_ground_truth(tmp_path)
+    assert ground_truth.cameras is None
+    assert ground_truth.names == plain.names
+    np.testing.assert_allclose(ground_truth.cam_from_world, plain.cam_from_world, atol=1e-14)
 
 
-def test_truth_agrees_with_opencv_on_the_half_pixel(tmp_path: Path) -> None:
+def test_ground_truth_agrees_with_opencv_on_the_half_pixel(tmp_path: Path) -> None:
     """K and dist of cameras.json go to cv2.projectPoints as they are; ours is half a pixel more."""
     rec = scene([synthetic_camera(CameraModel.OPENCV)])
-    truth = read_truth(json_truth(tmp_path / "cameras.json", rec))
+    ground_truth = read_ground_truth(json_ground_truth(tmp_path / "cameras.json", rec))
     entry = json.loads((tmp_path / "cameras.json").read_text())["cameras"][0]
     points = rec.point_xyz[rec.is_triangulated]
     rvec = cv2.Rodrigues(np.array(entry["R_w2c"]))[0]
     theirs = cv2.projectPoints(points, rvec, np.array(entry["t_w2c"]), np.array(entry["K"]), np.array(entry["dist"]))[0]
-    assert truth.cameras is not None
-    ours = project(truth.cameras[0], rigid3.apply(truth.cam_from_world[0], points))
+    assert ground_truth.cameras is not None
+    ours = project(ground_truth.cameras[0], rigid3.apply(ground_truth.cam_from_world[0], points))
     np.testing.assert_allclose(ours - 0.5, theirs[:, 0], atol=1e-6)
 
 
-def test_truth_of_a_trajectory_is_matched_by_number(tmp_path: Path) -> None:
+def test_ground_truth_of_a_trajectory_is_matched_by_number(tmp_path: Path) -> None:
     (tmp_path / "t.tum").write_text("1305031102.1753 0 0 0 0 0 0 1\n1305031102.2 1 0 0 0 0 0 1\n")
     names = ["rgb/1305031102.175300.png", "rgb/x.png"]
-    assert read_truth(tmp_path / "t.tum").for_images(names).names == ("rgb/1305031102.175300.png", "1305031102.2")
+    assert read_ground_truth(tmp_path / "t.tum").for_images(names).names == (
+        "rgb/1305031102.175300.png",
+        "1305031102.2",
+    )
 
 
 @pytest.mark.parametrize(
@@ -549,37 +553,37 @@ def test_truth_of_a_trajectory_is_matched_by_number(tmp_path: Path) -> None:
         ({"width": "wide"}, "finite number"),
     ],
 )
-def test_truth_refusals(tmp_path: Path, changes: dict[str, Any], match: str) -> None:
+def test_ground_truth_refusals(tmp_path: Path, changes: dict[str, Any], match: str) -> None:
     with pytest.raises(InputError, match=match):
-        read_truth(json_truth(tmp_path / "cameras.json", scene([centered_camera()]), **changes))
+        read_ground_truth(json_ground_truth(tmp_path / "cameras.json", scene([centered_camera()]), **changes))
 
 
-def test_truth_from_nowhere(tmp_path: Path) -> None:
+def test_ground_truth_from_nowhere(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="found nothing"):
-        read_truth(tmp_path / "absent.json")
+        read_ground_truth(tmp_path / "absent.json")
     with pytest.raises(InputError, match="COLMAP model"):
-        read_truth(tmp_path)
+        read_ground_truth(tmp_path)
     (tmp_path / "empty.txt").write_text("# nothing\n")
     with pytest.raises(InputError, match="trajectory"):
-        read_truth(tmp_path / "empty.txt")
+        read_ground_truth(tmp_path / "empty.txt")
     (tmp_path / "report.json").write_text('{"registered": 3}')
     with pytest.raises(InputError, match="list of cameras"):
-        read_truth(tmp_path / "report.json")
+        read_ground_truth(tmp_path / "report.json")
 
 
-def test_truth_of_the_shared_data(data_root: Path) -> None:
+def test_ground_truth_of_the_shared_data(data_root: Path) -> None:
     for name, count in (
         ("fountain-P11", 11),
         ("herz-jesus-P8", 8),
         ("temple-sparse-ring", 16),
         ("nerf-lego-small", 50),
     ):
-        truth = read_truth(data_root / name / "cameras.json")
-        assert len(truth.names) == count
+        ground_truth = read_ground_truth(data_root / name / "cameras.json")
+        assert len(ground_truth.names) == count
         images = [path.name for path in (data_root / name / "images").iterdir()]
-        assert sorted(truth.for_images(images).names) == sorted(images)
-    door = read_truth(data_root / "lund-door" / "cameras.json")
-    model = read_truth(data_root / "lund-door" / "colmap_ground_truth").for_images(door.names)
+        assert sorted(ground_truth.for_images(images).names) == sorted(images)
+    door = read_ground_truth(data_root / "lund-door" / "cameras.json")
+    model = read_ground_truth(data_root / "lund-door" / "colmap_ground_truth").for_images(door.names)
     assert model.names == door.names
     np.testing.assert_allclose(model.cam_from_world, door.cam_from_world, atol=1e-12)
     assert door.cameras is not None
@@ -587,5 +591,5 @@ def test_truth_of_the_shared_data(data_root: Path) -> None:
     for a, b in zip(door.cameras, model.cameras, strict=True):
         np.testing.assert_allclose(a.canonical, b.canonical)
         assert (a.width, a.height) == (b.width, b.height)
-    rotation_only = read_truth(data_root / "pano-sponza-rot" / "gt.json")
+    rotation_only = read_ground_truth(data_root / "pano-sponza-rot" / "gt.json")
     np.testing.assert_allclose(rigid3.center(rotation_only.cam_from_world), 0, atol=1e-12)

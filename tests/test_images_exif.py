@@ -121,10 +121,10 @@ def test_35mm_equivalent_keeps_the_diagonal_field_of_view(width: int, height: in
 
 def test_35mm_equivalent_of_cut_frames_lies_within_its_sigma() -> None:
     """A 4:3 sensor of 4000x3000 behind a lens of 28 mm equivalent: the focal length in pixels survives any crop."""
-    truth = focal_prior(ExifFacts(focal_35mm=28.0), 4000, 3000).focal_px
+    ground_truth = focal_prior(ExifFacts(focal_35mm=28.0), 4000, 3000).focal_px
     for width, height in ((4000, 2250), (3000, 3000), (4000, 2000)):
         prior = focal_prior(ExifFacts(focal_35mm=28.0), width, height)
-        assert abs(prior.focal_px - truth) < prior.sigma_px
+        assert abs(prior.focal_px - ground_truth) < prior.sigma_px
         assert prior.sigma_px > 0.08 * prior.focal_px
 
 

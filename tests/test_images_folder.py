@@ -648,7 +648,7 @@ def test_random_bytes_are_skipped(tmp_path: Path, magic: bytes) -> None:
 @pytest.mark.real
 @pytest.mark.skipif(not (DATA / "lund-door").is_dir(), reason=f"no real data in {DATA} (set SFMAPP_DATA)")
 @pytest.mark.parametrize(
-    ("name", "num_images", "source", "truth"),
+    ("name", "num_images", "source", "ground_truth"),
     [
         ("lund-door/images", 12, "exif_35mm", 2435.38),
         ("balbianello", 5, "exif_sensor", 518.69),
@@ -656,10 +656,12 @@ def test_random_bytes_are_skipped(tmp_path: Path, magic: bytes) -> None:
         ("temple-sparse-ring/images", 16, "default", 1520.4),
     ],
 )
-def test_priors_of_real_cameras_hold_the_truth(name: str, num_images: int, source: str, truth: float) -> None:
+def test_priors_of_real_cameras_hold_the_ground_truth(
+    name: str, num_images: int, source: str, ground_truth: float
+) -> None:
     image_set, _, _ = load(DATA / name)
     (camera,) = image_set.cameras
     assert len(image_set.images) == num_images
     assert camera.focal_source == source
     assert camera.focal_sigma is not None
-    assert abs(camera.focal - truth) < 2.0 * camera.focal_sigma
+    assert abs(camera.focal - ground_truth) < 2.0 * camera.focal_sigma

@@ -1,4 +1,4 @@
-"""The incremental loop on synthetic scenes with known truth."""
+"""The incremental loop on synthetic scenes with known ground truth."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from sfmapp.scene.synthetic import SyntheticScene, make_scene, true_corresponden
 def inputs(scene: SyntheticScene, focal_ratio: float | None = 1.2):
     """Image set, features and matches of a scene; cameras know no more than a default focal, or everything (None)."""
     cameras = []
-    for camera in scene.truth.cameras:
+    for camera in scene.ground_truth.cameras:
         guess = simple_camera(camera.model, camera.width, camera.height, (focal_ratio or 1) * camera.width)
         cameras.append(camera if focal_ratio is None else guess)
     records = [
         SimpleNamespace(name=name, camera_idx=int(c))
-        for name, c in zip(scene.truth.image_names, scene.truth.image_camera_idx, strict=True)
+        for name, c in zip(scene.ground_truth.image_names, scene.ground_truth.image_camera_idx, strict=True)
     ]
     features = []
     for i in range(len(records)):
@@ -47,10 +47,10 @@ def reconstruct(scene: SyntheticScene, focal_ratio: float | None = 1.2, threads:
     )  # fmt: skip
 
 
-def center_errors(model: Reconstruction, truth: Reconstruction) -> np.ndarray:
+def center_errors(model: Reconstruction, ground_truth: Reconstruction) -> np.ndarray:
     """Distances of the centres after a similarity fit, as a share of the scene's size."""
     common = model.is_registered
-    a, b = model.centers[common], truth.centers[common]
+    a, b = model.centers[common], ground_truth.centers[common]
     a0, b0 = a - a.mean(0), b - b.mean(0)
     u, s, vt = np.linalg.svd(b0.T @ a0)
     d = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
@@ -64,7 +64,7 @@ def test_every_image_is_registered_and_errors_have_the_size_of_the_noise(layout)
     models, report = reconstruct(scene)
     assert len(models) == 1
     assert models[0].is_registered.all()
-    error = center_errors(models[0], scene.truth)
+    error = center_errors(models[0], scene.ground_truth)
     # half a pixel over a focal of 900 is 5.6e-4; hundreds of points average it, the free intrinsics take some back
     assert 1e-5 < np.median(error) < 3e-3
     rms = models[0].summary()["rms_reprojection_error_px"]
@@ -76,7 +76,7 @@ def test_exact_observations_give_the_exact_scene():
     scene = make_scene(2, 10, 800, sigma_px=0.0)
     models, _ = reconstruct(scene, focal_ratio=None)
     assert models[0].is_registered.all()
-    assert center_errors(models[0], scene.truth).max() < 1e-5
+    assert center_errors(models[0], scene.ground_truth).max() < 1e-5
     assert models[0].summary()["rms_reprojection_error_px"] < 1e-4
 
 
@@ -85,7 +85,7 @@ def test_wrong_observations_are_left_out():
     scene = make_scene(3, 12, 1200, sigma_px=0.5, outlier_ratio=0.2)
     models, _ = reconstruct(scene)
     assert models[0].is_registered.all()
-    assert np.median(center_errors(models[0], scene.truth)) < 4e-3
+    assert np.median(center_errors(models[0], scene.ground_truth)) < 4e-3
 
 
 def test_gtsam_as_the_backend_comes_to_the_same():
@@ -111,7 +111,7 @@ def test_uncertainty_has_the_size_of_the_error():
         uncertainty = report["models"][0]["uncertainty"]
         assert uncertainty["noise_px"] == pytest.approx(0.5, rel=0.15)
         sigma = uncertainty["cameras"][0]["sigma"]["f"]
-        ratios.append((models[0].cameras[0].focal - scene.truth.cameras[0].focal) / sigma)
+        ratios.append((models[0].cameras[0].focal - scene.ground_truth.cameras[0].focal) / sigma)
     assert 0.2 < np.sqrt(np.mean(np.square(ratios))) < 2.0  # a chi of 6 degrees of freedom over root 6
 
 

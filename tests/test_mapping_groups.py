@@ -12,7 +12,7 @@ from sfmapp.adjust.solver import AdjustOptions
 from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.mapping import mend, structure
+from sfmapp.mapping import repair, structure
 from sfmapp.mapping.incremental import map_images
 from sfmapp.mapping.join import find_joint
 from sfmapp.mapping.mapper import Mapper
@@ -39,14 +39,14 @@ def mapped(place: Place, found=None, threads: int = 1):
     return models, report, said
 
 
-def rms_error(model: Reconstruction, truth: Reconstruction, chosen: np.ndarray) -> float:
+def rms_error(model: Reconstruction, ground_truth: Reconstruction, chosen: np.ndarray) -> float:
     """Of the centres of chosen images, aligned on these."""
-    a, b = model.centers[chosen], truth.centers[chosen]
+    a, b = model.centers[chosen], ground_truth.centers[chosen]
     return float(np.sqrt(((similarity.apply(similarity.umeyama(a, b), a) - b) ** 2).sum(1).mean()))
 
 
 def halves(place: Place, pool: ThreadPoolExecutor, world: np.ndarray = WORLD) -> list[Reconstruction]:
-    """The observed truth of the first group, and of the others in a world of their own."""
+    """The observed ground truth of the first group, and of the others in a world of their own."""
     out = []
     for side in (place.group == 0, place.group > 0):
         model = place.scene.observed.copy()
@@ -68,9 +68,9 @@ def test_points_that_two_models_see_tell_how_they_lie_to_each_other(seed):
     assert joint.reason == ""
     assert joint.num_agreeing > 0.7 * joint.num_links > 70
     error = similarity.compose(joint.target_from_source, WORLD)
-    truth = place.scene.truth.centers[place.group == 1]
+    ground_truth = place.scene.ground_truth.centers[place.group == 1]
     # ten metres away and half a pixel over a focal length of a thousand: 5 mm for one point, hundreds average it
-    assert 1e-6 < np.linalg.norm(similarity.apply(error, truth) - truth, axis=1).max() < 0.05
+    assert 1e-6 < np.linalg.norm(similarity.apply(error, ground_truth) - ground_truth, axis=1).max() < 0.05
     assert error[7] == pytest.approx(1.0, abs=5e-3)
 
 
@@ -107,11 +107,13 @@ def test_groups_that_overlap_weakly_become_one_model_and_none_is_the_worse_for_i
     assert report["models"][0]["contradictions"] == []
     everything = np.ones(10, bool)
     # the places are 20 m wide
-    assert rms_error(models[0], place.scene.truth, everything) < 0.05
+    assert rms_error(models[0], place.scene.ground_truth, everything) < 0.05
     for g in range(2):
         own = place.group == g
         alone, _, _ = mapped(place, place.of_images(own))
-        assert rms_error(models[0], place.scene.truth, own) < 2 * rms_error(alone[0], place.scene.truth, own)
+        assert rms_error(models[0], place.scene.ground_truth, own) < 2 * rms_error(
+            alone[0], place.scene.ground_truth, own
+        )
 
 
 def test_same_bytes_on_any_number_of_threads_though_focal_lengths_are_searched():
@@ -135,8 +137,8 @@ def test_the_uncertainty_of_a_new_position_has_the_size_of_its_error():
         model.point_xyz[hidden] = np.nan
         found = register_image(model, 0, MappingOptions(), max_error_px=4.0, search_focal=True)
         assert found.cam_from_world is not None
-        seen = scene.truth.point_xyz[np.setdiff1d(model.tracks.obs_track_idx[obs], hidden)]
-        center = scene.truth.centers[0]
+        seen = scene.ground_truth.point_xyz[np.setdiff1d(model.tracks.obs_track_idx[obs], hidden)]
+        center = scene.ground_truth.centers[0]
         distance = np.median(np.linalg.norm(seen - center, axis=1))
         errors.append(np.linalg.norm(rigid3.center(found.cam_from_world) - center) / distance)
         sigmas.append(found.position_sigma)
@@ -161,24 +163,24 @@ def test_a_part_that_hangs_loosely_on_a_model_is_found_and_joined_again():
         right = place.scene.observed.copy()
 
         def mapper_of(model: Reconstruction) -> Mapper:
-            cameras = list(place.scene.truth.cameras)
+            cameras = list(place.scene.ground_truth.cameras)
             return Mapper(model, found, options, AdjustOptions(), Events(), pool, cameras, np.zeros(10, bool), {})
 
         mapper_of(right).adjust_globally()
-        assert mend.loose_parts(right, options.min_pose_inliers) == []
+        assert repair.loose_parts(right, options.min_pose_inliers) == []
         # the second group a metre away and a tenth smaller: its points hold for it alone
         wrong = right.copy()
         second = place.group == 1
         shift = similarity.from_parts(rigid3.exp_so3([0.0, 0.05, 0.0]), [1.0, 0.0, 0.5], 0.9)
         wrong.cam_from_world[second] = similarity.transform_poses(shift, wrong.cam_from_world[second])
         structure.triangulate(wrong, np.arange(wrong.tracks.num_tracks), options, pool)
-        parts = mend.loose_parts(wrong, options.min_pose_inliers)
+        parts = repair.loose_parts(wrong, options.min_pose_inliers)
         assert len(parts) == 1
         assert parts[0].tolist() in (second.tolist(), (~second).tolist())
-        better = mend.mended(wrong, found, mapper_of, options, Events())
+        better = repair.repaired(wrong, found, mapper_of, options, Events())
     everything = np.ones(10, bool)
-    assert rms_error(wrong, place.scene.truth, everything) > 0.2
-    assert rms_error(better, place.scene.truth, everything) < 0.03
+    assert rms_error(wrong, place.scene.ground_truth, everything) > 0.2
+    assert rms_error(better, place.scene.ground_truth, everything) < 0.03
 
 
 def test_an_image_that_its_own_pairs_contradict_is_taken_back():
@@ -206,7 +208,10 @@ def test_many_matches_under_a_small_angle_start_before_few_under_a_wide_one():
     # the pair of the widest angle keeps 60 matches, the others with less than half its angle keep all
     found = thinned(found, lambda p, m: (np.arange(len(m)) < 60) if p == far else angles[p] < 0.5 * angles[far])
     model = Reconstruction.empty(
-        list(scene.truth.cameras), scene.truth.image_names, scene.truth.image_camera_idx, scene.observed.tracks
+        list(scene.ground_truth.cameras),
+        scene.ground_truth.image_names,
+        scene.ground_truth.image_camera_idx,
+        scene.observed.tracks,
     )
     with ThreadPoolExecutor(1) as pool:
         mapper = Mapper(

@@ -45,7 +45,7 @@ def worst_error_in_sigmas(result: SimpleNamespace, scene: SyntheticScene) -> flo
     distances = np.linalg.norm(centers - centers.mean(0), axis=1)
     to_size = np.sqrt((distances**2).mean()) / distances.max()
     sigmas = [entry["center_sigma_share"] for entry in result.row["uncertainty"]["images"].values()]
-    return float((center_errors(result.model, scene.truth) * to_size / np.sqrt(3) / sigmas).max())
+    return float((center_errors(result.model, scene.ground_truth) * to_size / np.sqrt(3) / sigmas).max())
 
 
 # ------------------------------------------------------------------------------------------------- wrong focal lengths
@@ -138,7 +138,7 @@ def test_photographs_that_were_cut_each_otherwise_are_red(offset):
     rng = np.random.default_rng(7)
     centers = TRUE.params[1:3] + rng.uniform(-offset, offset, (12, 2))
     scene = make_scene(7, 12, 1500, [TRUE.with_params([900.0, *center, 0.0]) for center in centers], layout="grid")
-    for model in (scene.truth, scene.observed):  # all that is known is that the files have one size
+    for model in (scene.ground_truth, scene.observed):  # all that is known is that the files have one size
         model.cameras, model.image_camera_idx = [TRUE], np.zeros(12, np.int32)
     result = map_with(scene, simple_camera(CameraModel.SIMPLE_RADIAL, 1000, 750, 1200.0, 600.0))
     found = [row["subject"] for row in result.row["contradictions"]]

@@ -73,8 +73,8 @@ def test_an_image_in_a_wrong_place_is_named_and_widens_every_sigma():
     assert contradiction.evidence["num_matches"] == agreement.num_matches[enough].sum()
     assert contradiction.rotation_sigma_deg == pytest.approx(150.0, abs=1.0)
     # 3 sigmas along each axis hold what the image is off by, in shares of the spread of the centres
-    off = np.linalg.norm(wrong.centers[6] - scene.truth.centers[6])
-    spread = np.sqrt(((scene.truth.centers - scene.truth.centers.mean(0)) ** 2).sum(1).mean())
+    off = np.linalg.norm(wrong.centers[6] - scene.ground_truth.centers[6])
+    spread = np.sqrt(((scene.ground_truth.centers - scene.ground_truth.centers.mean(0)) ** 2).sum(1).mean())
     assert off < 3 * contradiction.position_sigma_share * spread
 
 
@@ -173,13 +173,13 @@ def test_background_tells_sides_that_look_alike_apart(seed):
     assert len(models) == 1
     assert models[0].is_registered.all()
     assert report["models"][0]["contradictions"] == []
-    assert center_errors(models[0], scene.truth).max() < 3e-3  # a fold is 1 and more
+    assert center_errors(models[0], scene.ground_truth).max() < 3e-3  # a fold is 1 and more
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_fold_that_nothing_can_resolve_is_red(seed):
     scene, models, report = map_look_alike(seed, 24, 1500, background=0.0)
-    assert center_errors(models[0], scene.truth).max() > 0.5  # folded
+    assert center_errors(models[0], scene.ground_truth).max() > 0.5  # folded
     assert report["models"][0]["contradictions"][0]["subject"] == "verified pairs"
     # centres are off by up to the diameter of the ring: three stated sigmas are more
     assert report["models"][0]["uncertainty"]["median_center_sigma_share"] > 1 / 3
@@ -209,7 +209,7 @@ def photographs(tmp_path, num: int, *, has_background: bool) -> tuple[np.ndarray
 @pytest.mark.parametrize("has_background", [True, False])
 def test_rendered_photographs_round_a_thing_with_two_like_sides(tmp_path, has_background):
     num = 32 if has_background else 20
-    truth, image_set = photographs(tmp_path, num, has_background=has_background)
+    ground_truth, image_set = photographs(tmp_path, num, has_background=has_background)
     events = Events()
     features, _ = extract_features(image_set, FeatureOptions(), threads=1, events=events)
     pairs = np.stack(np.triu_indices(num, 1), 1).astype(np.int32)
@@ -218,7 +218,7 @@ def test_rendered_photographs_round_a_thing_with_two_like_sides(tmp_path, has_ba
         image_set, features, found, MappingOptions(), adjust_options=AdjustOptions(), threads=1, events=events
     )
     reference = models[0].copy()
-    reference.cam_from_world[:] = truth
+    reference.cam_from_world[:] = ground_truth
     error = center_errors(models[0], reference)
     red = report["models"][0]["contradictions"]
     if has_background:

@@ -15,10 +15,10 @@ from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene
 
 
-def part(truth: Reconstruction, images: range, b_from_a: np.ndarray | None = None) -> Reconstruction:
+def part(ground_truth: Reconstruction, images: range, b_from_a: np.ndarray | None = None) -> Reconstruction:
     """The model of some images, with the points that two of them see, carried into another world."""
-    model = truth.copy()
-    model.cam_from_world[[i for i in range(len(truth.image_names)) if i not in images]] = np.nan
+    model = ground_truth.copy()
+    model.cam_from_world[[i for i in range(len(ground_truth.image_names)) if i not in images]] = np.nan
     seen = model.is_registered[model.tracks.obs_image_idx]
     count = np.bincount(model.tracks.obs_track_idx[seen], minlength=model.tracks.num_tracks)
     model.point_xyz[count < 2] = np.nan
@@ -33,17 +33,17 @@ WORLD = np.append(rigid3.from_matrix(rigid3.exp_so3(np.array([0.4, -1.1, 0.3])),
 
 
 def test_a_shared_image_and_common_points_give_the_similarity():
-    truth = make_scene(0, 10, 600, sigma_px=0.0).truth
-    target, source = part(truth, range(6)), part(truth, range(5, 10), WORLD)
+    ground_truth = make_scene(0, 10, 600, sigma_px=0.0).ground_truth
+    target, source = part(ground_truth, range(6)), part(ground_truth, range(5, 10), WORLD)
     found = find_merge(target, source)
     assert found is not None
     target_from_source, votes = found
     assert target_from_source[7] == pytest.approx(1 / 2.5, rel=1e-9)
     assert votes >= 8
     union = merge(target, source, target_from_source)
-    np.testing.assert_allclose(union.centers, truth.centers, atol=1e-9)
+    np.testing.assert_allclose(union.centers, ground_truth.centers, atol=1e-9)
     known = union.is_triangulated
-    np.testing.assert_allclose(union.point_xyz[known], truth.point_xyz[known], atol=1e-9)
+    np.testing.assert_allclose(union.point_xyz[known], ground_truth.point_xyz[known], atol=1e-9)
     assert known.sum() == (target.is_triangulated | source.is_triangulated).sum()
     assert np.linalg.norm(union.residuals_px()[union.obs_is_inlier], axis=1).max() < 1e-6
     with ThreadPoolExecutor(1) as pool:
@@ -53,17 +53,17 @@ def test_a_shared_image_and_common_points_give_the_similarity():
 
 
 def test_models_without_a_shared_image_or_common_points_stay_apart():
-    truth = make_scene(1, 10, 600, sigma_px=0.0).truth
-    assert find_merge(part(truth, range(5)), part(truth, range(5, 10))) is None
-    apart = part(truth, range(5, 10))
-    target = part(truth, range(6))
+    ground_truth = make_scene(1, 10, 600, sigma_px=0.0).ground_truth
+    assert find_merge(part(ground_truth, range(5)), part(ground_truth, range(5, 10))) is None
+    apart = part(ground_truth, range(5, 10))
+    target = part(ground_truth, range(6))
     apart.point_xyz[target.is_triangulated] = np.nan
     assert find_merge(target, apart) is None
 
 
 def test_points_that_disagree_on_the_scale_do_not_vote():
-    truth = make_scene(2, 10, 600, sigma_px=0.0).truth
-    target, source = part(truth, range(6)), part(truth, range(5, 10), WORLD)
+    ground_truth = make_scene(2, 10, 600, sigma_px=0.0).ground_truth
+    target, source = part(ground_truth, range(6)), part(ground_truth, range(5, 10), WORLD)
     rng = np.random.default_rng(0)
     center = source.centers[5]
     source.point_xyz[:] = center + (source.point_xyz - center) * rng.uniform(0.2, 5.0, (len(source.point_xyz), 1))

@@ -31,7 +31,7 @@ def with_poster(seed: int, is_still: bool):
     spot = rng.uniform(0, [400, 330], (NUM_FLAT, 2))
     image_set = SimpleNamespace(images=[], cameras=(replace(CAMERA.with_focal(1200.0)),), skipped=())
     features, visible = [], []
-    for i, name in enumerate(scene.truth.image_names):
+    for i, name in enumerate(scene.ground_truth.image_names):
         corner = np.array([300.0, 400.0]) if is_still else rng.uniform(0, [600, 420])
         xy = scene.keypoints(i)
         visible.append(~((xy > corner) & (xy < corner + np.array([400, 330]))).all(1))
@@ -67,7 +67,7 @@ def test_the_scene_is_mapped_as_if_nothing_were_in_front_of_it(seed, is_still):
     )
     assert more == []
     assert model.is_registered.all()
-    assert center_errors(model, scene.truth).max() < 0.02
+    assert center_errors(model, scene.ground_truth).max() < 0.02
     used = np.bincount(model.tracks.obs_image_idx[model.obs_is_inlier], minlength=9)
     on_poster = (
         model.tracks.obs_feature_idx >= np.array([len(f) for f in features])[model.tracks.obs_image_idx] - NUM_FLAT

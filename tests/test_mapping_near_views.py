@@ -36,7 +36,7 @@ def split(model: Reconstruction, is_other: np.ndarray) -> Reconstruction:
 
 
 def test_near_views_of_a_right_model_share_what_both_see(scene):
-    model, pairs = scene.truth, true_correspondences(scene, min_matches=1)
+    model, pairs = scene.ground_truth, true_correspondences(scene, min_matches=1)
     found = near_views.near_views(model, pairs)
     assert len(found.num_visible) > 5
     assert not found.is_missing.any()
@@ -48,7 +48,7 @@ def test_near_views_of_a_right_model_share_what_both_see(scene):
 
 
 def test_the_points_in_view_are_those_that_project_into_the_picture(scene):
-    model, pairs = scene.truth, true_correspondences(scene, min_matches=1)
+    model, pairs = scene.ground_truth, true_correspondences(scene, min_matches=1)
     found = near_views.near_views(model, pairs)
     for (i, j), visible in list(zip(found.image_idx, found.num_visible, strict=True))[:5]:
         counts = []
@@ -72,7 +72,7 @@ def test_images_side_by_side_without_a_match_are_missing(scene):
     all_pairs = true_correspondences(scene, min_matches=1)
     between = other[all_pairs.pair_image_idx[:, 0]] != other[all_pairs.pair_image_idx[:, 1]]
     pairs = all_pairs.without(np.flatnonzero(between))
-    model = split(scene.truth, other)
+    model = split(scene.ground_truth, other)
     found = near_views.near_views(model, pairs)
     is_between = other[found.image_idx[:, 0]] != other[found.image_idx[:, 1]]
     assert is_between.sum() >= near_views.MIN_PAIRS
@@ -95,4 +95,4 @@ def test_pairs_that_nobody_tried_to_match_say_nothing(scene):
             np.isin(np.arange(pairs.num_pairs), inside)[:, None], pairs.pair_image_idx, pairs.pair_image_idx[inside[:1]]
         ),
     )
-    assert not near_views.near_views(split(scene.truth, other), tried).is_missing.any()
+    assert not near_views.near_views(split(scene.ground_truth, other), tried).is_missing.any()

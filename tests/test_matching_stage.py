@@ -82,10 +82,10 @@ def test_matches_and_poses_are_right(coarse_features: int) -> None:
         assert len(matches) > 0.9 * common
         assert (shown[i][matches[:, 0]] == shown[j][matches[:, 1]]).mean() > 0.995
         assert len(np.unique(matches[:, 0])) == len(np.unique(matches[:, 1])) == len(matches)
-        truth = rigid3.compose(poses[j], rigid3.inverse(poses[i]))
+        ground_truth = rigid3.compose(poses[j], rigid3.inverse(poses[i]))
         pose = found.cam2_from_cam1[p]
-        assert rigid3.rotation_angle_deg(rigid3.rotation_matrix(pose) @ rigid3.rotation_matrix(truth).T) < 0.15
-        assert pose[4:] @ truth[4:] / np.linalg.norm(truth[4:]) > np.cos(np.radians(1.0))
+        assert rigid3.rotation_angle_deg(rigid3.rotation_matrix(pose) @ rigid3.rotation_matrix(ground_truth).T) < 0.15
+        assert pose[4:] @ ground_truth[4:] / np.linalg.norm(ground_truth[4:]) > np.cos(np.radians(1.0))
     json.dumps(report)
 
 
@@ -255,9 +255,9 @@ def test_photographs_match_and_guidance_agrees_with_the_full_product(data_root: 
     import cv2
 
     folder = data_root / "fountain-P11"
-    truth = json.loads((folder / "cameras.json").read_text())["cameras"][:3]
+    ground_truth = json.loads((folder / "cameras.json").read_text())["cameras"][:3]
     features, projections = [], []
-    for camera in truth:
+    for camera in ground_truth:
         keypoints, descriptors = cv2.SIFT_create(0, 3, 0.02).detectAndCompute(
             cv2.imread(str(folder / camera["file"]), 0), None
         )

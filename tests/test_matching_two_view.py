@@ -39,16 +39,18 @@ def views(
     xy, xy2 = xy[is_right] + rng.normal(0, noise_px, (is_right.sum(), 2)), xy2[is_right]
     xy2 = xy2 + rng.normal(0, noise_px, xy2.shape)
     wrong = rng.uniform([0, 0], [1000, 800], (2, num_wrong, 2))
-    truth = np.arange(len(xy) + num_wrong) < len(xy)
-    return np.concatenate([xy, wrong[0]]), np.concatenate([xy2, wrong[1]]), truth
+    ground_truth = np.arange(len(xy) + num_wrong) < len(xy)
+    return np.concatenate([xy, wrong[0]]), np.concatenate([xy2, wrong[1]]), ground_truth
 
 
-def rotation_error_deg(g: TwoViewGeometry, truth: np.ndarray = SIDEWAYS) -> float:
-    return float(rigid3.rotation_angle_deg(rigid3.rotation_matrix(g.cam2_from_cam1) @ rigid3.rotation_matrix(truth).T))
+def rotation_error_deg(g: TwoViewGeometry, ground_truth: np.ndarray = SIDEWAYS) -> float:
+    return float(
+        rigid3.rotation_angle_deg(rigid3.rotation_matrix(g.cam2_from_cam1) @ rigid3.rotation_matrix(ground_truth).T)
+    )
 
 
-def translation_error_deg(g: TwoViewGeometry, truth: np.ndarray = SIDEWAYS) -> float:
-    return float(np.degrees(np.arccos(np.clip(g.cam2_from_cam1[4:] @ truth[4:], -1, 1))))
+def translation_error_deg(g: TwoViewGeometry, ground_truth: np.ndarray = SIDEWAYS) -> float:
+    return float(np.degrees(np.arccos(np.clip(g.cam2_from_cam1[4:] @ ground_truth[4:], -1, 1))))
 
 
 def with_focal(factor: float) -> Camera:
@@ -56,44 +58,46 @@ def with_focal(factor: float) -> Camera:
 
 
 def test_a_scene_with_known_focals_is_calibrated() -> None:
-    xy1, xy2, truth = views(SIDEWAYS, np.random.default_rng(0))
+    xy1, xy2, ground_truth = views(SIDEWAYS, np.random.default_rng(0))
     g = verify_pair(xy1, xy2, KNOWN, KNOWN, OPTIONS, RANSAC)
     assert g.config == TwoViewConfig.CALIBRATED
-    assert g.is_inlier[truth].mean() > 0.97
-    assert g.is_inlier[~truth].mean() < 0.08
+    assert g.is_inlier[ground_truth].mean() > 0.97
+    assert g.is_inlier[~ground_truth].mean() < 0.08
     # half a pixel over a focal of 900, by some 200 points, is 0.002 degrees times the trade with the translation
     assert rotation_error_deg(g) < 0.3
     assert translation_error_deg(g) < 1.5
-    depths, angles = epipolar.ray_depths(SIDEWAYS, (xy1[truth] - [500, 400]) / 900, (xy2[truth] - [500, 400]) / 900)
+    depths, angles = epipolar.ray_depths(
+        SIDEWAYS, (xy1[ground_truth] - [500, 400]) / 900, (xy2[ground_truth] - [500, 400]) / 900
+    )
     assert g.median_angle_deg == pytest.approx(np.degrees(np.median(angles)), rel=0.1)
     assert (depths > 0).all()
     assert epipolar.sampson_errors(g.fundamental, xy1, xy2)[g.is_inlier].max() < 16
-    assert min(g.num_inliers_f, g.num_inliers_e) > 0.97 * truth.sum()
+    assert min(g.num_inliers_f, g.num_inliers_e) > 0.97 * ground_truth.sum()
 
 
 def test_a_scene_with_unknown_focal_is_uncalibrated_but_has_a_pose() -> None:
-    xy1, xy2, truth = views(SIDEWAYS, np.random.default_rng(1))
+    xy1, xy2, ground_truth = views(SIDEWAYS, np.random.default_rng(1))
     g = verify_pair(xy1, xy2, UNKNOWN, UNKNOWN, OPTIONS, RANSAC)
     assert g.config == TwoViewConfig.UNCALIBRATED
-    assert g.is_inlier[truth].mean() > 0.97
+    assert g.is_inlier[ground_truth].mean() > 0.97
     assert rotation_error_deg(g) < 8.0  # with a focal that is a third too long
 
 
 @pytest.mark.parametrize("factor", [0.75, 1.3])
 def test_a_wrong_focal_from_exif_loses_no_matches(factor: float) -> None:
-    xy1, xy2, truth = views(SIDEWAYS, np.random.default_rng(2), noise_px=0.3)
+    xy1, xy2, ground_truth = views(SIDEWAYS, np.random.default_rng(2), noise_px=0.3)
     g = verify_pair(xy1, xy2, with_focal(factor), with_focal(factor), OPTIONS, RANSAC)
     assert g.config in (TwoViewConfig.CALIBRATED, TwoViewConfig.UNCALIBRATED)
-    assert g.is_inlier[truth].mean() > 0.97
+    assert g.is_inlier[ground_truth].mean() > 0.97
     assert rotation_error_deg(g) < 10.0
 
 
 @pytest.mark.parametrize("camera", [KNOWN, UNKNOWN], ids=["known focal", "unknown focal"])
 def test_a_plane_is_planar(camera: Camera) -> None:
-    xy1, xy2, truth = views(SIDEWAYS, np.random.default_rng(3), plane=True)
+    xy1, xy2, ground_truth = views(SIDEWAYS, np.random.default_rng(3), plane=True)
     g = verify_pair(xy1, xy2, camera, camera, OPTIONS, RANSAC)
     assert g.config == TwoViewConfig.PLANAR
-    assert g.is_inlier[truth].mean() > 0.97
+    assert g.is_inlier[ground_truth].mean() > 0.97
     if camera is KNOWN:  # a plane allows two motions; ours may be the other
         assert np.isfinite(g.cam2_from_cam1).all()
 
@@ -103,10 +107,10 @@ def test_a_plane_is_planar(camera: Camera) -> None:
 )
 def test_a_rotation_is_panoramic(camera: Camera) -> None:
     turn = np.concatenate([rigid3.quaternion(rigid3.exp_so3([0.05, -0.3, 0.1])), np.zeros(3)])
-    xy1, xy2, truth = views(turn, np.random.default_rng(4))
+    xy1, xy2, ground_truth = views(turn, np.random.default_rng(4))
     g = verify_pair(xy1, xy2, camera, camera, OPTIONS, RANSAC)
     assert g.config == TwoViewConfig.PANORAMIC
-    assert g.is_inlier[truth].mean() > 0.97
+    assert g.is_inlier[ground_truth].mean() > 0.97
     assert g.median_angle_deg == 0.0
     np.testing.assert_array_equal(g.cam2_from_cam1[4:], 0.0)
     if camera is KNOWN:
@@ -137,11 +141,11 @@ def test_the_scene_is_found_behind_a_poster_that_most_matches_lie_on(
     camera: Camera, shift: tuple[float, float]
 ) -> None:
     rng = np.random.default_rng(11)
-    xy1, xy2, truth = views(SIDEWAYS, rng, num_wrong=60)
-    flat1, flat2 = poster(rng, 2 * int(truth.sum()), shift)
+    xy1, xy2, ground_truth = views(SIDEWAYS, rng, num_wrong=60)
+    flat1, flat2 = poster(rng, 2 * int(ground_truth.sum()), shift)
     g = verify_pair(np.concatenate([xy1, flat1]), np.concatenate([xy2, flat2]), camera, camera, OPTIONS, RANSAC)
     assert g.config in (TwoViewConfig.CALIBRATED, TwoViewConfig.UNCALIBRATED)
-    assert g.is_inlier[: len(xy1)][truth].mean() > 0.95
+    assert g.is_inlier[: len(xy1)][ground_truth].mean() > 0.95
     assert g.is_inlier[len(xy1) :].mean() < 0.05
     assert g.num_moving_alone > 0.9 * len(flat1)
     assert rotation_error_deg(g) < (0.3 if camera is KNOWN else 8.0)
@@ -224,13 +228,13 @@ def test_it_finds_what_colmap_finds(num_wrong: int) -> None:
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=[900, 500, 400, 0])
     camera.has_prior_focal_length = True
     for plane in (False, True):
-        xy1, xy2, truth = views(SIDEWAYS, np.random.default_rng(8), num_wrong=num_wrong, plane=plane)
+        xy1, xy2, ground_truth = views(SIDEWAYS, np.random.default_rng(8), num_wrong=num_wrong, plane=plane)
         index = np.stack([np.arange(len(xy1))] * 2, 1).astype(np.uint32)
         theirs = pycolmap.estimate_calibrated_two_view_geometry(camera, xy1, camera, xy2, index)
         ours = verify_pair(xy1, xy2, KNOWN, KNOWN, OPTIONS, RANSAC)
         assert kinds[theirs.config] == ours.config
         mask = np.zeros(len(xy1), bool)
         mask[theirs.inlier_matches[:, 0]] = True
-        assert ours.is_inlier[truth].sum() >= 0.97 * mask[truth].sum()
+        assert ours.is_inlier[ground_truth].sum() >= 0.97 * mask[ground_truth].sum()
         # chance inliers: no more than COLMAP lets in, give or take a few
-        assert ours.is_inlier[~truth].sum() <= mask[~truth].sum() + 0.03 * num_wrong + 2
+        assert ours.is_inlier[~ground_truth].sum() <= mask[~ground_truth].sum() + 0.03 * num_wrong + 2

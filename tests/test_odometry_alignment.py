@@ -342,13 +342,13 @@ def test_real_stereo_pairs_are_matched(data_root: Path) -> None:
     if not folder.is_dir():
         pytest.skip(f"no {folder}")
     left, right = (cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) for name in ("im2.png", "im6.png"))
-    truth = cv2.imread(str(folder / "disp2.png"), cv2.IMREAD_UNCHANGED) / 4.0
+    ground_truth = cv2.imread(str(folder / "disp2.png"), cv2.IMREAD_UNCHANGED) / 4.0
     first = build_pyramid(left)
     xy = find_corners(first, np.empty((0, 2)), 600, min_distance_px=6)
     steps = np.arange(0.0, 64.0, 2.0)
     segments = np.stack([xy[:, None, 0] - steps, np.repeat(xy[:, 1:], len(steps), 1)], -1)
     found = search_along_epipolar(first, xy, build_pyramid(right), segments, np.full(len(xy), len(steps)))
-    disparity = truth[xy[:, 1].astype(int), xy[:, 0].astype(int)]
+    disparity = ground_truth[xy[:, 1].astype(int), xy[:, 0].astype(int)]
     known = (disparity > 0) & (xy[:, 0] - disparity > 10)
     assert found.is_found[known].mean() > 0.75
     error = np.abs(xy[:, 0] - found.xy[:, 0] - disparity)[known & found.is_found]

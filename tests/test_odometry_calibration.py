@@ -17,7 +17,7 @@ from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.refinement import calibration_check
 from sfmapp.odometry.refinement.calibration_check import Unknowns, _changed
-from sfmapp.odometry.refinement.finish import Conclusion, conclude
+from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment, adjust_finally
 from sfmapp.scene.rig import Rig
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ def path(num: int, bend: float) -> Array:
 
 
 def drive(
-    truth: Rig, given: Rig, *, bend: float = 0.0, num: int = 16, seed: int = 0, field_px: float = 0.0
+    ground_truth: Rig, given: Rig, *, bend: float = 0.0, num: int = 16, seed: int = 0, field_px: float = 0.0
 ) -> tuple[KeyframeMap, Array]:
     """A map of what a true rig saw, held with the given one, and the true poses.
 
@@ -67,16 +67,16 @@ def drive(
     keyframes = KeyframeMap(given)
     keyframes.new_points(len(xyz))
     for k, pose in enumerate(poses):
-        xy = np.empty((len(xyz), len(truth.cameras), 2))
-        for s, camera in enumerate(truth.cameras):
-            in_camera = rigid3.apply(rigid3.compose(truth.cam_from_rig[s], pose), xyz)
+        xy = np.empty((len(xyz), len(ground_truth.cameras), 2))
+        for s, camera in enumerate(ground_truth.cameras):
+            in_camera = rigid3.apply(rigid3.compose(ground_truth.cam_from_rig[s], pose), xyz)
             xy[:, s] = project(camera, in_camera)
             u, v = ((xy[:, s] - [600, 200]) / [600, 200]).T
             xy[:, s] += field_px * np.column_stack([u * v, u**2 - v**2])
         xy += rng.normal(0, NOISE_PX, xy.shape)
         good = ((xy > 0) & (xy < (1200, 400))).all((1, 2)) & (rigid3.apply(pose, xyz)[:, 2] > 2) & (np.abs(at - k) < 9)
         seen = np.flatnonzero(good)
-        flags = np.ones((len(seen), len(truth.cameras)), bool)
+        flags = np.ones((len(seen), len(ground_truth.cameras)), bool)
         keyframes.append(Keyframe(k, 0.1 * k, f"{k:06d}.png", pose.copy(), seen, xy[seen], flags))
     keyframes.point_xyz[: len(xyz)] = xyz
     few = keyframes.num_observations(np.arange(len(xyz))) < 4
@@ -92,16 +92,16 @@ def errors(keyframes: KeyframeMap, poses: Array) -> tuple[float, float]:
 
 
 def concluded(
-    truth: Rig, given: Rig, refine: bool = True, **drive_options: float
-) -> tuple[Conclusion, float, float, Rig]:
-    keyframes, poses = drive(truth, given, **drive_options)  # type: ignore[arg-type]
-    conclusion = conclude(keyframes, replace(OPTIONS, refine_camera=refine), Events())
-    return conclusion, *errors(keyframes, poses), keyframes.rig
+    ground_truth: Rig, given: Rig, refine: bool = True, **drive_options: float
+) -> tuple[FinalAdjustment, float, float, Rig]:
+    keyframes, poses = drive(ground_truth, given, **drive_options)  # type: ignore[arg-type]
+    final = adjust_finally(keyframes, replace(OPTIONS, refine_camera=refine), Events())
+    return final, *errors(keyframes, poses), keyframes.rig
 
 
 def test_the_reduced_cost_is_that_of_adjusting_again() -> None:
-    truth = rig_of(lens(), lens())
-    keyframes, _ = drive(truth, truth, bend=0.02, num=8)
+    ground_truth = rig_of(lens(), lens())
+    keyframes, _ = drive(ground_truth, ground_truth, bend=0.02, num=8)
     model, _ = keyframes.reconstruction(np.arange(8))
     variable = np.arange(16) > 1
     options = AdjustOptions(refine_focal=False, refine_distortion=False, relative_cost_tolerance=1e-12)
@@ -122,14 +122,14 @@ def test_the_reduced_cost_is_that_of_adjusting_again() -> None:
 
 
 def test_a_straight_drive_leaves_the_focal_length_to_its_prior_and_says_so() -> None:
-    truth, given = rig_of(lens(1.01), lens(1.01)), rig_of(lens(), lens())
-    straight, scale, _, rig = concluded(truth, given)
+    ground_truth, given = rig_of(lens(1.01), lens(1.01)), rig_of(lens(), lens())
+    straight, scale, _, rig = concluded(ground_truth, given)
     sigma = straight.report["camera"]["sigma"]["focal"]
     assert sigma > 0.007
     assert rig.cameras == given.cameras
     assert straight.scale_sigma is not None
     assert 0.5 < (1 - scale) / straight.scale_sigma < 2  # off by what it says
-    bent, scale, _, rig = concluded(truth, given, bend=0.06)
+    bent, scale, _, rig = concluded(ground_truth, given, bend=0.06)
     assert bent.report["camera"]["sigma"]["focal"] < sigma / 2
     assert rig.cameras[0].focal == pytest.approx(1.01 * FOCAL, rel=3e-3)
     assert bent.scale_sigma is not None
@@ -154,11 +154,11 @@ def test_refining_a_straight_drive_makes_nothing_worse(name: str) -> None:
     assert on.report["camera"]["is_refined"] is (name != "right")
     assert abs(scale_on - 1) < 1.1 * abs(scale_off - 1) + 1e-3
     assert shape_on < 1.1 * shape_off + 2e-3
-    for conclusion, scale in ((off, scale_off), (on, scale_on)):
-        assert conclusion.scale_sigma is not None
-        assert 0.002 <= conclusion.scale_sigma < 0.06
-        assert abs(scale - 1) < 3 * conclusion.scale_sigma
-        assert conclusion.contradictions == []
+    for final, scale in ((off, scale_off), (on, scale_on)):
+        assert final.scale_sigma is not None
+        assert 0.002 <= final.scale_sigma < 0.06
+        assert abs(scale - 1) < 3 * final.scale_sigma
+        assert final.contradictions == []
     for camera in rig.cameras:
         assert camera.canonical[0] / camera.canonical[1] == pytest.approx(1, abs=2e-3)
 
@@ -167,23 +167,23 @@ def test_refining_a_straight_drive_makes_nothing_worse(name: str) -> None:
 @pytest.mark.parametrize("num_sensors", [1, 2])
 def test_a_focal_length_that_is_far_off_is_found_where_the_drive_bends(factor: float, num_sensors: int) -> None:
     right, wrong = lens(), lens(factor)
-    truth, given = (rig_of(c, c if num_sensors == 2 else None) for c in (right, wrong))
-    conclusion, scale, _, rig = concluded(truth, given, bend=0.03, seed=3)
-    if not conclusion.contradictions:
+    ground_truth, given = (rig_of(c, c if num_sensors == 2 else None) for c in (right, wrong))
+    final, scale, _, rig = concluded(ground_truth, given, bend=0.03, seed=3)
+    if not final.contradictions:
         assert rig.cameras[0].focal == pytest.approx(FOCAL, rel=0.01)
     else:
-        assert conclusion.contradictions[0].subject == "given calibration"
+        assert final.contradictions[0].subject == "given calibration"
     if num_sensors == 2:
-        assert conclusion.scale_sigma is not None
-        sigma = np.hypot(conclusion.scale_sigma, sum(c.scale_sigma for c in conclusion.contradictions))
+        assert final.scale_sigma is not None
+        sigma = np.hypot(final.scale_sigma, sum(c.scale_sigma for c in final.contradictions))
         assert abs(scale - 1) < 3 * sigma
 
 
 def test_a_contradiction_stands_where_refining_is_not_allowed() -> None:
-    truth, given = rig_of(lens()), rig_of(lens(1.1))
-    conclusion, _, shape, rig = concluded(truth, given, refine=False, bend=0.06)
+    ground_truth, given = rig_of(lens()), rig_of(lens(1.1))
+    final, _, shape, rig = concluded(ground_truth, given, refine=False, bend=0.06)
     assert rig.cameras == given.cameras
-    (found,) = conclusion.contradictions
+    (found,) = final.contradictions
     assert found.subject == "given calibration"
     spread = np.sqrt(((rigid3.center(path(16, 0.06)) - rigid3.center(path(16, 0.06)).mean(0)) ** 2).sum(1).mean())
     assert shape < 3 * np.sqrt(3) * found.position_sigma_share * spread
@@ -195,19 +195,19 @@ def test_a_contradiction_stands_where_refining_is_not_allowed() -> None:
 def test_a_map_that_was_made_with_a_refined_camera_is_not_torn_by_the_given_one(
     stretch: float, is_stereo: bool
 ) -> None:
-    truth = rig_of(lens(), lens()) if is_stereo else rig_of(lens())
+    ground_truth = rig_of(lens(), lens()) if is_stereo else rig_of(lens())
     given = rig_of(lens(stretch), lens(stretch)) if is_stereo else rig_of(lens(stretch))
     refined_before = rig_of(lens(1.01), lens(1.01)) if is_stereo else rig_of(lens(1.01))
-    keyframes, poses = drive(truth, refined_before, bend=0.03)
-    conclusion = conclude(keyframes, OPTIONS, Events(), given)
-    report = conclusion.report["camera"]
+    keyframes, poses = drive(ground_truth, refined_before, bend=0.03)
+    final = adjust_finally(keyframes, OPTIONS, Events(), given)
+    report = final.report["camera"]
     assert report["is_refined"]
     assert np.allclose(report["given"][0], given.cameras[0].params)
     assert keyframes.rig.cameras[0].focal == pytest.approx(FOCAL, rel=5e-3)
     scale, error = errors(keyframes, poses)
     assert error < 0.05
     if is_stereo:
-        assert scale == pytest.approx(1.0, abs=3 * conclusion.scale_sigma)
+        assert scale == pytest.approx(1.0, abs=3 * final.scale_sigma)
 
 
 def test_what_a_camera_differs_by_is_what_it_was_changed_by() -> None:
@@ -223,9 +223,9 @@ def test_where_nothing_makes_a_wrong_calibration_better_the_map_is_red_and_open(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(calibration_check, "_go", lambda *_: None)
-    conclusion, *_ = concluded(rig_of(lens()), rig_of(lens(0.7)), bend=0.03)
-    assert not conclusion.report["camera"]["is_refined"]
-    [contradiction] = conclusion.contradictions
+    final, *_ = concluded(rig_of(lens()), rig_of(lens(0.7)), bend=0.03)
+    assert not final.report["camera"]["is_refined"]
+    [contradiction] = final.contradictions
     assert contradiction.subject == "given calibration"
     assert contradiction.position_sigma_share >= 1.0
     assert contradiction.rotation_sigma_deg >= 180.0

@@ -33,21 +33,21 @@ def seen(num_mapped: int, noise_px: float, seed: int) -> tuple[ActiveTracks, np.
 
 @pytest.mark.parametrize("seed", range(5))
 def test_few_points_carry_the_scale(seed: int) -> None:
-    tracks, xyz, truth = seen(8, 0.2, seed)
+    tracks, xyz, ground_truth = seen(8, 0.2, seed)
     pose = chain_pose(CAMERA, tracks, References.of(np.array([3]), REFERENCE), xyz)
     assert pose is not None
     # 0.2 px over a baseline of 0.4 at a depth of 5 leaves about 1 % of depth, so of scale
-    error = np.linalg.norm(rigid3.center(pose) - rigid3.center(truth)) / 0.41
+    error = np.linalg.norm(rigid3.center(pose) - rigid3.center(ground_truth)) / 0.41
     assert 1e-5 < error < 0.05
-    turn = rigid3.rotation_angle_deg(rigid3.rotation_matrix(pose) @ rigid3.rotation_matrix(truth).T)
+    turn = rigid3.rotation_angle_deg(rigid3.rotation_matrix(pose) @ rigid3.rotation_matrix(ground_truth).T)
     assert turn < 0.2
 
 
 def test_exact_tracks_give_the_exact_pose() -> None:
-    tracks, xyz, truth = seen(6, 0.0, 0)
+    tracks, xyz, ground_truth = seen(6, 0.0, 0)
     pose = chain_pose(CAMERA, tracks, References.of(np.array([3]), REFERENCE), xyz)
     assert pose is not None
-    np.testing.assert_allclose(pose, truth, atol=1e-5)
+    np.testing.assert_allclose(pose, ground_truth, atol=1e-5)
 
 
 def test_without_points_or_with_contradicting_ones_there_is_no_scale() -> None:

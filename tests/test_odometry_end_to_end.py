@@ -33,7 +33,7 @@ CAMERA = Camera(CameraModel.PINHOLE, 320, 240, np.array([262.5, 262.5, 160.0, 12
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Frames of a room, the truth, and photographs of it that are none of the frames."""
+    """Frames of a room, the ground truth, and photographs of it that are none of the frames."""
     from PIL import Image
 
     folder = tmp_path_factory.mktemp("room")
@@ -43,7 +43,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for k in range(NUM_FRAMES):
         kind = "photos" if is_photo(k) else "frames"
         Image.fromarray(sequence.image(k)).save(folder / kind / f"{k / FPS:.6f}.png")
-    write_tum(folder / "truth.txt", sequence.timestamps_s, sequence.truth)
+    write_tum(folder / "ground_truth.txt", sequence.timestamps_s, sequence.ground_truth)
     return folder
 
 
@@ -53,7 +53,9 @@ def is_photo(number: int) -> bool:
 
 def options_of(room: Path, *settings: str) -> Options:
     camera = "PINHOLE,262.5,262.5,160,120"
-    return load_options(settings=[f"sequence.camera={camera}", f"sequence.truth={room / 'truth.txt'}", *settings])
+    return load_options(
+        settings=[f"sequence.camera={camera}", f"sequence.ground_truth={room / 'ground_truth.txt'}", *settings]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -64,19 +66,21 @@ def tracked(room: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
 
 
 def errors_m(names: list[str], poses: NDArray[np.float64], room: Path) -> NDArray[np.float64]:
-    """Distance of each image's centre from the truth of its moment, after a similarity over all of them."""
-    times, truth = read_tum(room / "truth.txt")
+    """Distance of each image's centre from the ground truth of its moment, after a similarity over all of them."""
+    times, ground_truth = read_tum(room / "ground_truth.txt")
     moments = np.array([float(Path(name).stem) for name in names])
     near = np.abs(np.array([float(t) for t in times])[None] - moments[:, None]).argmin(1)
-    fit = similarity.align_poses(poses, truth[near]).b_from_a
-    return np.asarray(np.linalg.norm(similarity.apply(fit, rigid3.center(poses)) - rigid3.center(truth[near]), axis=1))
+    fit = similarity.align_poses(poses, ground_truth[near]).b_from_a
+    return np.asarray(
+        np.linalg.norm(similarity.apply(fit, rigid3.center(poses)) - rigid3.center(ground_truth[near]), axis=1)
+    )
 
 
 def test_a_rendered_room_is_tracked(room: Path, tracked: tuple[Path, TrackResult]) -> None:
     report = tracked[1].report
     assert report["frames"]["num_with_pose"] >= report["frames"]["num_frames"] - 2
     assert len(report["maps"]) == 1
-    (final, *_) = report["truth"]
+    (final, *_) = report["ground_truth"]
     # a percent of the path: ten times what it takes, a tenth of what a drifting or mirrored path would have
     assert final["ate_m"]["rmse"] < 0.01 * final["true_path_m"]
     assert 0.01 < report["maps"][0]["mean_reprojection_error_px"] < 0.5
@@ -169,7 +173,7 @@ def test_frames_that_repeat_the_one_before_have_its_pose(room: Path, tmp_path: P
                 shutil.copy(path, tmp_path / "frames" / name)
     output = tmp_path / "out"
     told: list[Event] = []
-    options = options_of(room, "odometry.smooth=true", "sequence.truth=" + str(room / "truth.txt"))
+    options = options_of(room, "odometry.smooth=true", "sequence.ground_truth=" + str(room / "ground_truth.txt"))
     result, report = track_sequence(tmp_path / "frames", output, options, record=False, events=Events(told.append))
     row = {Path(name).name: k for k, name in enumerate(result.frame_names)}
     assert len(row) == 35
@@ -210,7 +214,7 @@ def test_a_refined_map_is_no_worse_and_the_frames_move_with_it(
     before = {path: path.read_bytes() for path in tracked[0].rglob("*") if path.is_file()}
     result, report = refine(tracked[0], tmp_path / "refined", options_of(room))
     assert {path: path.read_bytes() for path in tracked[0].rglob("*") if path.is_file()} == before
-    errors = [report["truth"][when][0]["ate_m"]["rmse"] for when in ("before", "after")]
+    errors = [report["ground_truth"][when][0]["ate_m"]["rmse"] for when in ("before", "after")]
     assert errors[1] < 1.2 * errors[0]
     maps = [report["maps"][when][0] for when in ("before", "after")]
     assert maps[1]["num_points"] > 0.9 * maps[0]["num_points"]
@@ -279,13 +283,13 @@ def test_only_odometry_can_be_refined(room: Path, tracked: tuple[Path, TrackResu
 
 @pytest.mark.slow
 def test_the_first_seconds_tell_the_focal_length(room: Path, tmp_path: Path) -> None:
-    options = load_options(settings=[f"sequence.truth={room / 'truth.txt'}"])
+    options = load_options(settings=[f"sequence.ground_truth={room / 'ground_truth.txt'}"])
     result = track_sequence(room / "frames", tmp_path / "out", options, record=False, self_calibrate=True)
     found = result.report["stages"]["self_calibration"]
     # two seconds of a small picture do not tell it better than to some percent
     assert found["params"]["f"] == pytest.approx(262.5, rel=0.05)
     assert found["focal_sigma_relative"] < 0.03
-    assert result.report["truth"][0]["ate_m"]["rmse"] < 0.02 * result.report["truth"][0]["true_path_m"]
+    assert result.report["ground_truth"][0]["ate_m"]["rmse"] < 0.02 * result.report["ground_truth"][0]["true_path_m"]
     assert "calibrated with the first minute" in (tmp_path / "out" / "report.html").read_text()
 
 

@@ -14,7 +14,7 @@ from sfmapp.errors import InterruptedRunError
 from sfmapp.events import Events
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
-from sfmapp.odometry.refinement.finish import _left_open, conclude
+from sfmapp.odometry.refinement.final_adjustment import _left_open, adjust_finally
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.synthetic import make_scene, synthetic_rig
 
@@ -31,7 +31,7 @@ def small_map(seed: int, rig: Rig, *, num_keyframes: int = 8, num_points: int = 
         seed, num_sensors * num_keyframes, num_points, sigma_px=sigma_px, layout="forward",
         outlier_ratio=outlier_ratio, **arguments,
     )  # fmt: skip
-    return played.keyframe_map(scene, rig), scene.truth.cam_from_world[::num_sensors]
+    return played.keyframe_map(scene, rig), scene.ground_truth.cam_from_world[::num_sensors]
 
 
 @pytest.mark.parametrize(("num_sensors", "num_freedoms"), [(1, 7), (2, 6)])
@@ -39,20 +39,20 @@ def test_normalised_errors_are_one_under_independent_noise(num_sensors: int, num
     rig = Rig.single(CAMERA) if num_sensors == 1 else synthetic_rig()
     options, values = replace(OPTIONS, refine_camera=False), []
     for seed in range(40):
-        keyframes, truth = small_map(seed, rig)
-        conclusion = conclude(keyframes, options, Events())
-        assert conclusion.covariance is not None
+        keyframes, ground_truth = small_map(seed, rig)
+        final = adjust_finally(keyframes, options, Events())
+        assert final.covariance is not None
         ours = np.array([k.rig_from_world for k in keyframes.keyframes])
-        errors = played.gauge_errors(ours, truth, num_freedoms)
-        values.append(played.normalized_errors(errors, conclusion.covariance).mean())
+        errors = played.gauge_errors(ours, ground_truth, num_freedoms)
+        values.append(played.normalized_errors(errors, final.covariance).mean())
     assert 0.8 < np.mean(values) < 1.25
-    assert conclusion.gauge == "centroid, mean rotation" + (" and spread" if num_sensors == 1 else "")
+    assert final.gauge == "centroid, mean rotation" + (" and spread" if num_sensors == 1 else "")
 
 
 def test_noise_and_covariance_have_the_size_of_what_was_drawn() -> None:
     small, large = (small_map(0, Rig.single(CAMERA), sigma_px=sigma)[0] for sigma in (0.2, 0.6))
     options = replace(OPTIONS, refine_camera=False)
-    one, other = conclude(small, options, Events()), conclude(large, options, Events())
+    one, other = adjust_finally(small, options, Events()), adjust_finally(large, options, Events())
     assert 0.15 < one.report["sigma_px"] < 0.22
     assert 0.45 < other.report["sigma_px"] < 0.66
     assert one.covariance is not None
@@ -63,11 +63,11 @@ def test_noise_and_covariance_have_the_size_of_what_was_drawn() -> None:
 
 def test_a_keyframe_without_points_has_no_covariance_and_the_others_keep_theirs() -> None:
     keyframes, _ = small_map(1, Rig.single(CAMERA), num_keyframes=8)
-    whole = conclude(small_map(1, Rig.single(CAMERA), num_keyframes=8)[0], OPTIONS, Events()).covariance
+    whole = adjust_finally(small_map(1, Rig.single(CAMERA), num_keyframes=8)[0], OPTIONS, Events()).covariance
     blind = keyframes.keyframes[4]
     blind.is_inlier[:] = False
     blind.xy[:] = 1e6  # nowhere near: the last word must not take them back
-    found = conclude(keyframes, OPTIONS, Events()).covariance
+    found = adjust_finally(keyframes, OPTIONS, Events()).covariance
     assert whole is not None
     assert found is not None
     assert np.isnan(found[4]).all()
@@ -84,7 +84,7 @@ def test_a_wrong_focal_length_is_found_and_corrected(num_sensors: int, sigma_px:
     keyframes, _ = small_map(3, rig, num_keyframes=14, num_points=600, sigma_px=sigma_px)
     wrong = tuple(replace(c, params=c.params * [1.02, 1.02, 1, 1]) for c in rig.cameras)
     keyframes.rig = Rig(wrong, rig.cam_from_rig)
-    report = conclude(keyframes, OPTIONS, Events()).report["camera"]
+    report = adjust_finally(keyframes, OPTIONS, Events()).report["camera"]
     assert report["is_refined"]
     # a rig may turn as well: so few keyframes leave more to the prior, which sits at the wrong focal length
     limit = 0.004 if num_sensors == 1 else 0.006
@@ -97,16 +97,16 @@ def test_a_wrong_focal_length_is_found_and_corrected(num_sensors: int, sigma_px:
 def test_a_right_calibration_is_left_alone(seed: int) -> None:
     rig = Rig.single(CAMERA) if seed % 2 else synthetic_rig()
     keyframes, _ = small_map(seed, rig, num_keyframes=10, num_points=400, outlier_ratio=0.02)
-    report = conclude(keyframes, OPTIONS, Events()).report["camera"]
+    report = adjust_finally(keyframes, OPTIONS, Events()).report["camera"]
     assert not report["is_refined"]
     assert keyframes.rig.cameras == rig.cameras
     assert report["surprise"] < report["max_surprise"] / 3  # far from the bound
 
 
 def test_outliers_are_told_from_points() -> None:
-    keyframes, truth = small_map(5, Rig.single(CAMERA), num_points=300, outlier_ratio=0.05)
+    keyframes, ground_truth = small_map(5, Rig.single(CAMERA), num_points=300, outlier_ratio=0.05)
     clean, _ = small_map(5, Rig.single(CAMERA), num_points=300)
-    conclude(keyframes, OPTIONS, Events())
+    adjust_finally(keyframes, OPTIONS, Events())
     wrong, marked = 0, 0
     for ours, right in zip(keyframes.keyframes, clean.keyframes, strict=True):
         is_outlier = np.abs(ours.xy - right.xy).max((1, 2)) > 20
@@ -115,14 +115,14 @@ def test_outliers_are_told_from_points() -> None:
     assert wrong > 30
     assert marked > 0.95 * wrong
     ours = np.array([k.rig_from_world for k in keyframes.keyframes])
-    errors = played.gauge_errors(ours, truth, 7)
+    errors = played.gauge_errors(ours, ground_truth, 7)
     assert np.degrees(np.linalg.norm(errors[:, :3], axis=1)).max() < 0.2
 
 
 def test_the_first_keyframe_stays_and_the_rest_is_at_a_minimum() -> None:
     keyframes, _ = small_map(6, synthetic_rig())
     first = keyframes.keyframes[0].rig_from_world.copy()
-    report = conclude(keyframes, replace(OPTIONS, refine_camera=False, covariance=False), Events()).report
+    report = adjust_finally(keyframes, replace(OPTIONS, refine_camera=False, covariance=False), Events()).report
     np.testing.assert_array_equal(keyframes.keyframes[0].rig_from_world, first)
     model, _ = keyframes.reconstruction(np.arange(8))
     again = adjust_bundle(
@@ -140,7 +140,7 @@ def test_a_stopped_run_is_interrupted() -> None:
     events = Events()
     events.cancel()
     with pytest.raises(InterruptedRunError):
-        conclude(keyframes, OPTIONS, events)
+        adjust_finally(keyframes, OPTIONS, events)
 
 
 def test_a_refined_calibration_widens_what_it_moved() -> None:
@@ -149,7 +149,7 @@ def test_a_refined_calibration_widens_what_it_moved() -> None:
     right, _ = small_map(3, rig, num_keyframes=14, num_points=600, sigma_px=0.1)
     wrong, _ = small_map(3, rig, num_keyframes=14, num_points=600, sigma_px=0.1)
     wrong.rig = Rig((replace(CAMERA, params=CAMERA.params * [1.02, 1.02, 1, 1]),), rig.cam_from_rig)
-    found = [conclude(keyframes, OPTIONS, Events()) for keyframes in (right, wrong)]
+    found = [adjust_finally(keyframes, OPTIONS, Events()) for keyframes in (right, wrong)]
     assert [c.report["camera"]["is_refined"] for c in found] == [False, True]
     sigmas = [np.sqrt(np.einsum("kii->ki", c.covariance)).mean() for c in found if c.covariance is not None]
     assert 2.0 < sigmas[1] / sigmas[0] < 200.0

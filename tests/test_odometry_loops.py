@@ -13,7 +13,7 @@ from sfmapp.geometry import rigid3, similarity
 from sfmapp.odometry.loops.closing import apply_closure, fuse_points, join_maps
 from sfmapp.odometry.loops.detection import LoopFinder, LoopOptions
 from sfmapp.odometry.loops.detection import relocalize as relocalization
-from sfmapp.odometry.loops.places import Candidate, PlaceOptions, Places, View
+from sfmapp.odometry.loops.place_recognition import Candidate, PlaceIndex, PlaceOptions, View
 from sfmapp.odometry.loops.pose_graph import apply_corrections
 from sfmapp.odometry.loops.relocalize import (
     RelocalizeOptions,
@@ -110,7 +110,7 @@ class Walker:
         self.keyframes.keyframes.append(keyframe)
         return keyframe
 
-    def add_to(self, places: Places, keyframe: Keyframe) -> View:
+    def add_to(self, places: PlaceIndex, keyframe: Keyframe) -> View:
         image = self.images[keyframe.frame_idx]
         return places.add(self.map_idx, keyframe.frame_idx, image, keyframe.xy[:, 0], keyframe.point_id)
 
@@ -133,15 +133,15 @@ def wall() -> Wall:
 
 
 @pytest.fixture(scope="module")
-def _walked(wall: Wall) -> tuple[Walker, Places]:
-    walker, places = Walker(wall), Places()
+def _walked(wall: Wall) -> tuple[Walker, PlaceIndex]:
+    walker, places = Walker(wall), PlaceIndex()
     for n, pose in enumerate(round_trip()[:30]):
         walker.add_to(places, walker.step(n, pose))
     return walker, places
 
 
 @pytest.fixture
-def walked(_walked: tuple[Walker, Places]) -> tuple[KeyframeMap, Places]:
+def walked(_walked: tuple[Walker, PlaceIndex]) -> tuple[KeyframeMap, PlaceIndex]:
     walker, places = copy.deepcopy((_walked[0].keyframes, _walked[1]))
     return walker, places
 
@@ -180,7 +180,7 @@ def test_twist_is_the_roll_between_cameras() -> None:
         assert np.cos(twist(tilted, base) - angle) > np.cos(0.05)
 
 
-def test_places_find_the_revisit(walked: tuple[KeyframeMap, Places], wall: Wall) -> None:
+def test_places_find_the_revisit(walked: tuple[KeyframeMap, PlaceIndex], wall: Wall) -> None:
     keyframes, places = walked
     for n in (2, 9, 17, 25):
         pose = keyframes.keyframes[n].rig_from_world.copy()
@@ -195,7 +195,7 @@ def test_places_are_small_and_the_same_twice(wall: Wall) -> None:
     rng = np.random.default_rng(0)
     tables = []
     for _ in range(2):
-        places = Places(PlaceOptions(learn_after=4))
+        places = PlaceIndex(PlaceOptions(learn_after=4))
         rng = np.random.default_rng(0)
         for n in range(20):
             image = rng.integers(0, 255, (60, 80), np.uint8)
@@ -209,7 +209,7 @@ def test_places_are_small_and_the_same_twice(wall: Wall) -> None:
     assert tables[0] == tables[1]
 
 
-def test_places_follow_what_happens_to_keyframes_and_points(walked: tuple[KeyframeMap, Places]) -> None:
+def test_places_follow_what_happens_to_keyframes_and_points(walked: tuple[KeyframeMap, PlaceIndex]) -> None:
     _, places = walked
     before = places[5]
     a, b = int(before.point_id[3]), int(before.point_id[10])
@@ -234,7 +234,7 @@ def test_places_follow_what_happens_to_keyframes_and_points(walked: tuple[Keyfra
 # ------------------------------------------------------------------------------------------------------ relocalisation
 
 
-def test_a_lost_image_is_found_again(walked: tuple[KeyframeMap, Places], wall: Wall) -> None:
+def test_a_lost_image_is_found_again(walked: tuple[KeyframeMap, PlaceIndex], wall: Wall) -> None:
     keyframes, places = walked
     for x, y, distance, roll in [(7.3, 4.4, 3.0, 0), (10.2, 3.7, 3.6, 8), (15.2, 5.9, 2.5, -6), (13.0, 8.0, 2.6, 0)]:
         pose = pose_at(x, y, distance, roll, 4.0)
@@ -251,13 +251,15 @@ def test_a_lost_image_is_found_again(walked: tuple[KeyframeMap, Places], wall: W
         assert np.median(np.linalg.norm(seen - corners(image)[located.corner_idx], axis=1)) < 1.5
 
 
-def test_a_turned_image_is_found_at_the_roll_it_is_tried_with(walked: tuple[KeyframeMap, Places], wall: Wall) -> None:
+def test_a_turned_image_is_found_at_the_roll_it_is_tried_with(
+    walked: tuple[KeyframeMap, PlaceIndex], wall: Wall
+) -> None:
     keyframes, places = walked
     image = wall.photograph(pose_at(8.0, 4.1, 3.0, 28.0), 999)
     assert relocalize({0: keyframes}, places, View(image, corners(image)), OPTIONS, np.radians(25)) is not None
 
 
-def test_an_unknown_place_is_not_found(walked: tuple[KeyframeMap, Places]) -> None:
+def test_an_unknown_place_is_not_found(walked: tuple[KeyframeMap, PlaceIndex]) -> None:
     keyframes, places = walked
     other = Wall(texture(77))
     for n in range(6):
@@ -265,7 +267,7 @@ def test_an_unknown_place_is_not_found(walked: tuple[KeyframeMap, Places]) -> No
         assert relocalize({0: keyframes}, places, View(image, corners(image)), OPTIONS) is None
 
 
-def test_the_same_poster_elsewhere_is_refused(walked: tuple[KeyframeMap, Places], wall: Wall) -> None:
+def test_the_same_poster_elsewhere_is_refused(walked: tuple[KeyframeMap, PlaceIndex], wall: Wall) -> None:
     """A third of the image is exactly what was there, all else is not: many matches agree, and the rest contradicts."""
     keyframes, places = walked
     here = pose_at(8.2, 4.0)
@@ -285,7 +287,7 @@ def test_the_same_poster_elsewhere_is_refused(walked: tuple[KeyframeMap, Places]
 
 
 def test_six_wrong_matches_in_ten(
-    walked: tuple[KeyframeMap, Places], wall: Wall, monkeypatch: pytest.MonkeyPatch
+    walked: tuple[KeyframeMap, PlaceIndex], wall: Wall, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     keyframes, places = walked
     right = relocalization.match_points
@@ -338,27 +340,27 @@ def drift(num: int, sigma: float, seed: int, poses: list[Array]) -> Array:
     return np.array(out)
 
 
-def rms_error(keyframes: KeyframeMap, truth: list[Array]) -> float:
+def rms_error(keyframes: KeyframeMap, ground_truth: list[Array]) -> float:
     poses = np.array([k.rig_from_world for k in keyframes.keyframes])
-    b_from_a = similarity.align_poses(poses, np.array(truth)).b_from_a
-    error = similarity.apply(b_from_a, rigid3.center(poses)) - rigid3.center(np.array(truth))
+    b_from_a = similarity.align_poses(poses, np.array(ground_truth)).b_from_a
+    error = similarity.apply(b_from_a, rigid3.center(poses)) - rigid3.center(np.array(ground_truth))
     return float(np.sqrt((error**2).sum(1).mean()))
 
 
 def walk_with_drift(wall: Wall, sigma: float, seed: int) -> tuple[Walker, list[Array], list[Array]]:
     """All keyframes of the round trip in a map that has drifted, their true poses, and the similarity of the end."""
-    walker, truth = Walker(wall), round_trip()
-    for n, pose in enumerate(truth):
+    walker, ground_truth = Walker(wall), round_trip()
+    for n, pose in enumerate(ground_truth):
         walker.step(n, pose)
-    moves = drift(len(truth), sigma, seed, truth)
+    moves = drift(len(ground_truth), sigma, seed, ground_truth)
     apply_corrections(walker.keyframes, moves)
-    return walker, truth, list(moves)
+    return walker, ground_truth, list(moves)
 
 
 def test_a_loop_is_closed(wall: Wall) -> None:
-    walker, truth, moves = walk_with_drift(wall, 0.01, 4)
+    walker, ground_truth, moves = walk_with_drift(wall, 0.01, 4)
     keyframes, everything = walker.keyframes, walker.keyframes.keyframes
-    places, finder, closure = Places(), LoopFinder(), None
+    places, finder, closure = PlaceIndex(), LoopFinder(), None
     keyframes.keyframes = []
     for n, keyframe in enumerate(everything):
         keyframes.keyframes.append(keyframe)
@@ -370,7 +372,10 @@ def test_a_loop_is_closed(wall: Wall) -> None:
     views = closure.views
     assert len(views) == LoopOptions().min_views
     assert all(v.old_idx < 20 and v.new_idx >= 40 for v in views)
-    assert np.linalg.norm(rigid3.center(truth[views[0].new_idx]) - rigid3.center(truth[views[0].old_idx])) < 1.5
+    assert (
+        np.linalg.norm(rigid3.center(ground_truth[views[0].new_idx]) - rigid3.center(ground_truth[views[0].old_idx]))
+        < 1.5
+    )
     # the similarity is that of the drift between both sides
     true = similarity.compose(moves[views[-1].old_idx], similarity.inverse(moves[views[-1].new_idx]))
     center = rigid3.center(keyframes.keyframes[-1].rig_from_world)
@@ -385,9 +390,9 @@ def test_a_loop_is_closed(wall: Wall) -> None:
     assert len(pairs) > 60
     assert len(np.unique(pairs[:, 0])) == len(np.unique(pairs[:, 1])) == len(pairs)
     assert np.median(np.linalg.norm(spots[pairs[:, 0]] - spots[pairs[:, 1]], axis=1)) < 0.03
-    before = rms_error(keyframes, truth[:last])
+    before = rms_error(keyframes, ground_truth[:last])
     closed = apply_closure(keyframes, places, closure)
-    after = rms_error(keyframes, truth[:last])
+    after = rms_error(keyframes, ground_truth[:last])
     # a walk pinned at its end keeps the middle's error: some of it goes, not all
     assert 0.15 * before < after < 0.75 * before
     assert closed.corrections.shape == (last, 8)
@@ -412,7 +417,7 @@ def wall_spots(walker: Walker, moves: list[Array]) -> Array:
 
 def walk_along(image: Array, options: LoopOptions) -> bool:
     """Whether a loop is found on the way along a wall, on to new places all the time."""
-    walker, places, finder, found = Walker(Wall(image)), Places(), LoopFinder(options), False
+    walker, places, finder, found = Walker(Wall(image)), PlaceIndex(), LoopFinder(options), False
     for n in range(30):
         keyframe = walker.step(n, pose_at(3 + 0.6 * n, 5.5 + 0.02 * n))
         found |= finder.find({0: walker.keyframes}, 0, places, n, walker.add_to(places, keyframe)) is not None
@@ -441,7 +446,7 @@ def test_a_correction_that_nobody_could_have_lost_is_refused(wall: Wall) -> None
     # the way back is torn from the way there by more than half of its length
     tear = similarity.from_parts(np.eye(3), [40.0, 0.0, 0.0], 1.0)
     apply_corrections(keyframes, np.array([similarity.IDENTITY if n < 49 else tear for n in range(len(everything))]))
-    places, finder = Places(), LoopFinder()
+    places, finder = PlaceIndex(), LoopFinder()
     keyframes.keyframes = []
     for n, keyframe in enumerate(everything):
         keyframes.keyframes.append(keyframe)
@@ -449,10 +454,10 @@ def test_a_correction_that_nobody_could_have_lost_is_refused(wall: Wall) -> None
 
 
 def test_two_halves_become_one(wall: Wall) -> None:
-    places, finder = Places(), LoopFinder()
+    places, finder = PlaceIndex(), LoopFinder()
     first, second = Walker(wall, 0), Walker(wall, 1)
-    truth = round_trip()
-    for n, pose in enumerate(truth[:28]):
+    ground_truth = round_trip()
+    for n, pose in enumerate(ground_truth[:28]):
         first.add_to(places, first.step(n, pose))
     there = similarity.from_parts(rigid3.exp_so3([0.3, -0.5, 0.2]), [5.0, -3.0, 1.0], 1.8)
     back = [pose_at(12 - 0.6 * k, 4.15, 3.1) for k in range(12)]
@@ -477,7 +482,7 @@ def test_two_halves_become_one(wall: Wall) -> None:
     assert (joined.kept_map, joined.absorbed_map) == (0, 1)
     frames = [k.frame_idx for k in joined.keyframes.keyframes]
     assert frames == [*range(28), *range(100, 100 + count)]
-    assert rms_error(joined.keyframes, truth[:28] + back[:count]) < 0.02
+    assert rms_error(joined.keyframes, ground_truth[:28] + back[:count]) < 0.02
     assert joined.id_offset == first.keyframes.num_points
     assert joined.keyframes.num_points == first.keyframes.num_points + second.keyframes.num_points
     assert all(places[f].map_idx == 0 for f in frames)

@@ -13,7 +13,7 @@ from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.frontend.alignment import align_patches
 from sfmapp.odometry.frontend.pyramid import build_pyramid
-from sfmapp.odometry.initialize import Beginning, TwoViews, pose_between
+from sfmapp.odometry.initialize import MapInitializer, TwoViews, pose_between
 from sfmapp.odometry.map.backend import LAG, Backend, choose_window, classify, make_job, take_over
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
@@ -29,7 +29,7 @@ MONO = Rig.single(CAMERA)
 
 def mono_map(seed: int = 0, num_keyframes: int = 12, sigma_px: float = 0.3) -> tuple[KeyframeMap, Array]:
     scene = make_scene(seed, num_keyframes, 250, CAMERA, sigma_px=sigma_px, layout="forward")
-    return played.keyframe_map(scene, MONO), scene.truth.cam_from_world
+    return played.keyframe_map(scene, MONO), scene.ground_truth.cam_from_world
 
 
 # ------------------------------------------------------------------ the map
@@ -123,25 +123,25 @@ def test_tracking_waits_for_a_late_adjustment() -> None:
     assert backend.num_jobs == 1
 
 
-def center_errors(keyframes: KeyframeMap, truth: Array) -> Array:
+def center_errors(keyframes: KeyframeMap, ground_truth: Array) -> Array:
     centers = rigid3.center(np.array([k.rig_from_world for k in keyframes.keyframes]))
-    return np.linalg.norm(centers - rigid3.center(truth), axis=1)
+    return np.linalg.norm(centers - rigid3.center(ground_truth), axis=1)
 
 
 def test_the_window_brings_poses_back() -> None:
-    keyframes, truth = mono_map(sigma_px=0.2)
+    keyframes, ground_truth = mono_map(sigma_px=0.2)
     rng = np.random.default_rng(0)
     for keyframe in keyframes.keyframes[8:]:
         keyframe.rig_from_world = rigid3.compose(
             rigid3.from_matrix(rigid3.exp_so3(rng.normal(0, 0.01, 3)), rng.normal(0, 0.05, 3)), keyframe.rig_from_world
         )
-    before = center_errors(keyframes, truth)[8:].max()
+    before = center_errors(keyframes, ground_truth)[8:].max()
     with ThreadPoolExecutor(1) as executor:
         backend = Backend(executor)
         for frame in range(3):
             backend.begin(make_job(keyframes, *choose_window(keyframes, OPTIONS)), frame)
             backend.finish(keyframes)
-    assert 1e-4 < center_errors(keyframes, truth)[8:].max() < 0.4 * before
+    assert 1e-4 < center_errors(keyframes, ground_truth)[8:].max() < 0.4 * before
 
 
 def test_points_with_support_elsewhere_are_kept() -> None:
@@ -208,13 +208,13 @@ class Plane:
         return np.clip(128 + 40 * value / np.sqrt(40) + noise, 0, 255).astype(np.uint8)
 
 
-def begin(slope: float, poses: Array) -> tuple[TwoViews | None, Beginning]:
-    plane, beginning = Plane(1, slope), Beginning(played.PINHOLE, OPTIONS, 0)
+def begin(slope: float, poses: Array) -> tuple[TwoViews | None, MapInitializer]:
+    plane, initializer = Plane(1, slope), MapInitializer(played.PINHOLE, OPTIONS, 0)
     for n, pose in enumerate(poses):
-        views = beginning.add(build_pyramid(plane.photograph(pose, n)))
+        views = initializer.add(build_pyramid(plane.photograph(pose, n)))
         if views is not None:
-            return views, beginning
-    return None, beginning
+            return views, initializer
+    return None, initializer
 
 
 def poses_along(direction: Array, turn: Array, num: int) -> Array:
@@ -226,16 +226,16 @@ def poses_along(direction: Array, turn: Array, num: int) -> Array:
 @pytest.mark.parametrize("slope", [0.0, 0.8], ids=["one plane", "two planes"])
 def test_two_views_of_known_pose(slope: float) -> None:
     poses = poses_along(np.array([0.04, 0.01, 0.0]), np.array([0.0, 0.004, 0.002]), 25)
-    views, beginning = begin(slope, poses)
+    views, initializer = begin(slope, poses)
     if views is None:  # a plane that cannot be told from its mirror image is no map: waiting is honest
         assert slope == 0.0
-        assert beginning.reason
+        assert initializer.reason
         return
-    truth = poses[len(beginning.seen) - 1]
+    ground_truth = poses[len(initializer.seen) - 1]
     found = views.last_from_first
-    turn = rigid3.rotation_matrix(found) @ rigid3.rotation_matrix(truth).T
+    turn = rigid3.rotation_matrix(found) @ rigid3.rotation_matrix(ground_truth).T
     assert np.degrees(np.linalg.norm(rigid3.log_so3(turn))) < 0.35
-    a, b = rigid3.center(found), rigid3.center(truth)
+    a, b = rigid3.center(found), rigid3.center(ground_truth)
     assert np.degrees(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b))) < 4.0
     # depths, in the unit in which their median is one
     assert np.median(views.xyz[:, 2]) == pytest.approx(1.0, abs=1e-9)
@@ -244,27 +244,27 @@ def test_two_views_of_known_pose(slope: float) -> None:
     x, z = unit * views.xyz[:, 0], unit * views.xyz[:, 2]
     off = np.abs(z / (4 + slope * np.abs(x)) - 1)
     assert 1e-4 < np.median(off) < 0.06
-    np.testing.assert_allclose(project(played.PINHOLE, views.xyz), beginning.corners[views.track], atol=1e-6)
+    np.testing.assert_allclose(project(played.PINHOLE, views.xyz), initializer.corners[views.track], atol=1e-6)
     assert views.num_inliers >= 40
     assert views.median_angle_deg > 0.8
 
 
 def test_a_rotation_makes_no_two_views() -> None:
-    views, beginning = begin(0.8, poses_along(np.zeros(3), np.array([0.002, 0.008, 0.0]), 25))
+    views, initializer = begin(0.8, poses_along(np.zeros(3), np.array([0.002, 0.008, 0.0]), 25))
     assert views is None
-    assert TwoViewConfig.PANORAMIC.name in beginning.reason or "corners" in beginning.reason
+    assert TwoViewConfig.PANORAMIC.name in initializer.reason or "corners" in initializer.reason
 
 
 def test_no_motion_makes_no_two_views() -> None:
-    views, beginning = begin(0.8, poses_along(np.zeros(3), np.zeros(3), 6))
+    views, initializer = begin(0.8, poses_along(np.zeros(3), np.zeros(3), 6))
     assert views is None
-    assert "motion" in beginning.reason
+    assert "motion" in initializer.reason
 
 
 def test_black_and_plain_images_make_no_two_views() -> None:
-    beginning = Beginning(played.PINHOLE, OPTIONS, 0)
+    initializer = MapInitializer(played.PINHOLE, OPTIONS, 0)
     for value in (0, 0, 128, 255, 255):
-        assert beginning.add(build_pyramid(np.full((240, 320), value, np.uint8))) is None
+        assert initializer.add(build_pyramid(np.full((240, 320), value, np.uint8))) is None
 
 
 def test_poses_between_are_on_the_way() -> None:

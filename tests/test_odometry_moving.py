@@ -38,9 +38,9 @@ def test_a_board_that_sways_before_the_camera_is_told() -> None:
     assert FIRST - 1 <= found.evidence["first_frame"] <= FIRST + 8
     assert found.evidence["last_frame"] <= LAST + 4
     centers = rigid3.center(result.cam_from_world[entry.keyframe_frame_idx])
-    truth = rigid3.center(walk.truth.cam_from_world[result.frame_idx[entry.keyframe_frame_idx]])
-    unit = similarity.umeyama(centers, truth)
-    error = np.linalg.norm(similarity.apply(unit, centers) - truth, axis=1)
+    ground_truth = rigid3.center(walk.ground_truth.cam_from_world[result.frame_idx[entry.keyframe_frame_idx]])
+    unit = similarity.umeyama(centers, ground_truth)
+    error = np.linalg.norm(similarity.apply(unit, centers) - ground_truth, axis=1)
     assert entry.covariance is not None
     sigma = float(unit[7]) * np.sqrt(np.trace(entry.covariance[:, 3:, 3:], axis1=1, axis2=2))
     assert np.median(error) < 3 * np.median(sigma)

@@ -22,7 +22,7 @@ from sfmapp.images.sequence import Imu, SequenceOptions
 from sfmapp.odometry.inertial.visual_inertial import contradicted
 from sfmapp.odometry.inertial.visual_inertial import faults as inertial_faults
 from sfmapp.odometry.records import _covariance_gap
-from sfmapp.odometry.refinement.finish import MAX_COVARIANCE_KEYFRAMES, Conclusion
+from sfmapp.odometry.refinement.final_adjustment import MAX_COVARIANCE_KEYFRAMES, FinalAdjustment
 from sfmapp.odometry.result import FrameState
 from sfmapp.pipelines.odometry import track as pipeline
 from sfmapp.pipelines.odometry.scale import parse_scale
@@ -30,7 +30,7 @@ from sfmapp.pipelines.odometry.timing import ThreadTimes
 from sfmapp.pipelines.odometry.track import TrackResult, track_sequence
 from sfmapp.pipelines.sparse.reconstruct import reconstruct
 from sfmapp.pipelines.validate import validate
-from sfmapp.report.odometry_document import FrameFacts, make_checks
+from sfmapp.report.odometry_document import FrameTable, make_checks
 from sfmapp.report.plots import Curve, plot_svg, ticks
 from sfmapp.scene.rig import Rig
 from sfmapp.workspace.options import Options, load_options, options_from_dict
@@ -118,7 +118,7 @@ def test_keyframes_have_covariances(finished: tuple[Path, TrackResult]) -> None:
 def test_missing_covariances_are_said_and_not_green(finished: tuple[Path, TrackResult]) -> None:
     """None at all is red, some amber; all, or none asked for, is no row."""
     report = finished[1].report
-    facts = FrameFacts(np.full(1, np.nan), np.full(1, np.nan), np.full(1, np.nan), np.full(1, -1))
+    facts = FrameTable(np.full(1, np.nan), np.full(1, np.nan), np.full(1, np.nan), np.full(1, -1))
     for gap, sigma, light in (("", {"median": 1.0}, None), ("2 of 9", {"median": 1.0}, "amber"), ("open", None, "red")):
         maps = [report["maps"][0] | {"covariance_gap": gap, "position_sigma": sigma}]
         rows = [row for row in make_checks(report["frames"], maps, {}, facts) if "uncertainty" in row["name"]]
@@ -137,7 +137,7 @@ def test_missing_covariances_are_said_and_not_green(finished: tuple[Path, TrackR
     ],
 )
 def test_why_there_is_no_covariance(covariance: np.ndarray | None, num: int, said: str) -> None:
-    gap = _covariance_gap(Conclusion(covariance, "", {}), num)
+    gap = _covariance_gap(FinalAdjustment(covariance, "", {}), num)
     assert said in gap
     assert bool(gap) == bool(said)
 
@@ -162,9 +162,9 @@ def test_a_stereo_map_holds_both_cameras(tmp_path: Path, monkeypatch: Patch) -> 
     assert result.report["sequence"]["stereo"]
 
 
-def test_the_report_compares_with_the_truth(finished: tuple[Path, TrackResult]) -> None:
+def test_the_report_compares_with_the_ground_truth(finished: tuple[Path, TrackResult]) -> None:
     report = json.loads((finished[0] / "report.json").read_text())
-    final, live = report["truth"]
+    final, live = report["ground_truth"]
     assert (final["poses"], final["alignment"], final["num_pairs"], live["poses"]) == ("final", "sim3", 45, "live")
     assert 0.01 < final["ate_m"]["rmse"] < 0.06
     assert final["scale"] == pytest.approx(2, rel=0.01)
@@ -207,7 +207,12 @@ def test_the_page_is_whole_and_says_what_counts(finished: tuple[Path, TrackResul
     page = Page()
     page.feed((finished[0] / "report.html").read_text())
     assert page.open == []
-    for words in ("45 of 50 frames with a pose", "Gaps: frames without a pose", "From above", "Against the truth"):
+    for words in (
+        "45 of 50 frames with a pose",
+        "Gaps: frames without a pose",
+        "From above",
+        "Against the ground truth",
+    ):
         assert words in page.text
     assert "arbitrary" in page.text
 
@@ -311,16 +316,16 @@ def test_workspaces_of_other_commands_are_refused(
 
 
 @pytest.mark.parametrize("wish", ["distance:000000.png:000040:{:.4f}", "distance:0:40:{:.4f}"])
-def test_a_known_distance_makes_metres(wish: str, tmp_path: Path, monkeypatch: Patch) -> None:
+def test_a_known_distance_makes_metres(request: str, tmp_path: Path, monkeypatch: Patch) -> None:
     use(monkeypatch, FakeSequence(), FakeRunner())
     centers = rigid3.center(path(50))
     length = float(np.linalg.norm(centers[40] - centers[0]))
-    result = run(tmp_path / "out", f"scale.source={wish.format(length)}")
+    result = run(tmp_path / "out", f"scale.source={request.format(length)}")
     row = result.report["maps"][0]
     assert (row["unit"], row["scale_source"]) == ("m", "distance")
-    assert result.report["truth"][0]["alignment"] == "se3"
+    assert result.report["ground_truth"][0]["alignment"] == "se3"
     # the centres of the two frames are a centimetre off in a unit of two metres
-    assert result.report["truth"][0]["ate_m"]["rmse"] < 0.06
+    assert result.report["ground_truth"][0]["ate_m"]["rmse"] < 0.06
     assert row["path_length"] == pytest.approx(24, rel=0.05)
     assert result.report["stages"]["scale"][0]["metres_per_unit"] == pytest.approx(2, rel=0.01)
     # covariances are in metres as well
@@ -381,9 +386,9 @@ def test_paths_in_the_options_hold_in_any_folder(tmp_path: Path, monkeypatch: Pa
     (tmp_path / "calib.json").write_text("{}")
     monkeypatch.chdir(tmp_path)
     use(monkeypatch, FakeSequence(), FakeRunner())
-    run(tmp_path / "out", "sequence.truth=truth.txt", "sequence.camera=calib.json")
+    run(tmp_path / "out", "sequence.ground_truth=ground_truth.txt", "sequence.camera=calib.json")
     options = json.loads((tmp_path / "out" / "run.json").read_text())["options"]["sequence"]
-    assert options["truth"] == str(tmp_path / "truth.txt")
+    assert options["ground_truth"] == str(tmp_path / "ground_truth.txt")
     assert options["camera"] == str(tmp_path / "calib.json")
     run(tmp_path / "out", "sequence.camera=PINHOLE,1,1,1,1")
     options = json.loads((tmp_path / "out" / "run.json").read_text())["options"]["sequence"]

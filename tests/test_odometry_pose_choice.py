@@ -59,7 +59,7 @@ def test_a_plane_seen_over_a_short_way_shows_several_motions_of_which_one_is_rig
         assert (np.diff(costs) >= 0).all()
         if len(poses) == 1 and is_way_known(CAMERA, poses[0], xy1, xy2, costs[0]):
             told.append(off_deg(poses[0], true))
-    # the start was the truth each time: the other motions were looked for
+    # the start was the ground truth each time: the other motions were looked for
     assert sum(number > 1 for number in numbers) >= 8
     assert np.median(among) < 10.0
     assert all(off < 20.0 for off in told)

@@ -82,8 +82,8 @@ def walk(num: int, noise: Array, seed: int) -> tuple[Array, Array, Array, Array]
     angle = np.linspace(0.0, 2.0 * np.pi, num)
     centers = np.stack([20 * np.cos(angle), 20 * np.sin(angle), np.zeros(num)], 1)
     turn = rigid3.exp_so3(np.outer(-angle, [0.0, 0.0, 1.0]))
-    truth = rigid3.from_matrix(turn, -np.einsum("nij,nj->ni", turn, centers))
-    nodes = [np.append(rigid3.inverse(pose), 1.0) for pose in truth]
+    ground_truth = rigid3.from_matrix(turn, -np.einsum("nij,nj->ni", turn, centers))
+    nodes = [np.append(rigid3.inverse(pose), 1.0) for pose in ground_truth]
     drifted = [nodes[0]]
     for k in range(1, num):
         e = noise * rng.normal(size=7)
@@ -93,7 +93,7 @@ def walk(num: int, noise: Array, seed: int) -> tuple[Array, Array, Array, Array]
     poses = np.array([rigid3.inverse(node[:7]) for node in drifted])
     scale = np.array([node[7] for node in drifted])
     last = similarity.compose(drifted[0], similarity.compose(similarity.inverse(nodes[0]), nodes[-1]))
-    return truth, poses, scale, similarity.compose(last, similarity.inverse(drifted[-1]))
+    return ground_truth, poses, scale, similarity.compose(last, similarity.inverse(drifted[-1]))
 
 
 def chain(num: int, depth: Array | float = 5.0, baseline: float = 1.0) -> GraphEdges:
@@ -101,8 +101,8 @@ def chain(num: int, depth: Array | float = 5.0, baseline: float = 1.0) -> GraphE
     return GraphEdges(pair, np.full(num - 1, 100), np.broadcast_to(depth, num - 1) * 1.0, np.full(num - 1, baseline))
 
 
-def rms(poses: Array, truth: Array) -> float:
-    return float(np.sqrt(((rigid3.center(poses) - rigid3.center(truth)) ** 2).sum(1).mean()))
+def rms(poses: Array, ground_truth: Array) -> float:
+    return float(np.sqrt(((rigid3.center(poses) - rigid3.center(ground_truth)) ** 2).sum(1).mean()))
 
 
 def test_translation_drift_becomes_a_bridge() -> None:
@@ -110,13 +110,13 @@ def test_translation_drift_becomes_a_bridge() -> None:
     before, after = 0.0, 0.0
     noise = np.array([0.0, 0.0, 0.0, 0.02, 0.02, 0.02, 0.0])
     for seed in range(60):
-        truth, poses, _, loop = walk(60, noise, seed)
+        ground_truth, poses, _, loop = walk(60, noise, seed)
         corrections = optimize_pose_graph(poses, chain(60), [LoopEdge(0, 59, loop, 100_000)], True)
         assert np.all(corrections[:, 7] == 1.0)
         moved = np.array([similarity.transform_poses(c, p) for c, p in zip(corrections, poses, strict=True)])
-        assert np.linalg.norm(rigid3.center(moved[-1]) - rigid3.center(truth[-1])) < 0.01
-        before += rms(poses, truth) ** 2
-        after += rms(moved, truth) ** 2
+        assert np.linalg.norm(rigid3.center(moved[-1]) - rigid3.center(ground_truth[-1])) < 0.01
+        before += rms(poses, ground_truth) ** 2
+        after += rms(moved, ground_truth) ** 2
     assert 0.25 < after / before < 0.42
 
 
@@ -143,11 +143,11 @@ def test_seven_kinds_of_drift_at_once() -> None:
     noise = np.array([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01, 0.01])
     before, after, log_scale = [], [], []
     for seed in range(12):
-        truth, poses, scale, loop = walk(80, noise, seed)
+        ground_truth, poses, scale, loop = walk(80, noise, seed)
         corrections = optimize_pose_graph(poses, chain(80, 5.0 * scale[1:]), [LoopEdge(0, 79, loop, 500)], False)
         moved = np.array([similarity.transform_poses(c, p) for c, p in zip(corrections, poses, strict=True)])
-        before.append(rms(poses, truth))
-        after.append(rms(moved, truth))
+        before.append(rms(poses, ground_truth))
+        after.append(rms(moved, ground_truth))
         log_scale.append(abs(np.log(corrections[-1, 7] * scale[-1])))
     assert max(log_scale) < 0.02
     # a bridge: more than half of the error goes, and a third of it must stay in the middle

@@ -11,7 +11,7 @@ from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
-from sfmapp.odometry.refinement.finish import conclude
+from sfmapp.odometry.refinement.final_adjustment import adjust_finally
 from sfmapp.scene.rig import Rig
 
 Array = NDArray[np.float64]
@@ -38,19 +38,19 @@ def seen_by(rig: Rig, rig_from_world: Array, xyz: Array, rng: np.random.Generato
 @pytest.mark.parametrize("is_turned", [True, False])
 def test_the_end_of_a_drive_finds_the_turn_and_with_it_the_scale(is_turned: bool) -> None:
     rng = np.random.default_rng(1)
-    truth = rig_turned_by(TURN if is_turned else np.zeros(3))
+    ground_truth = rig_turned_by(TURN if is_turned else np.zeros(3))
     poses, xyz = [], rng.uniform([-25, -5, 3], [25, 5, 120], (3000, 3))
     keyframes = KeyframeMap(rig_turned_by(np.zeros(3)))
     keyframes.new_points(len(xyz))
     for k in range(25):
         turn = rigid3.exp_so3(np.array([0.0, 0.02 * k, 0.0]))
         poses.append(rigid3.from_matrix(turn, -turn @ np.array([0.01 * k * k, 0.0, 1.5 * k])))
-        xy = seen_by(truth, poses[-1], xyz, rng)
+        xy = seen_by(ground_truth, poses[-1], xyz, rng)
         seen = np.flatnonzero(np.isfinite(xy[:, 0, 0]) & (rigid3.apply(poses[-1], xyz)[:, 2] > 2))
         keyframes.append(Keyframe(k, 0.1 * k, str(k), poses[-1].copy(), seen, xy[seen], np.ones((len(seen), 2), bool)))
     keyframes.point_xyz[: len(xyz)] = xyz
     keyframes.point_xyz[keyframes.num_observations(np.arange(keyframes.num_points)) < 6] = np.nan
-    report = conclude(keyframes, OdometryOptions(covariance=False), Events()).report
+    report = adjust_finally(keyframes, OdometryOptions(covariance=False), Events()).report
     assert report["camera"]["is_refined"] is is_turned
     found = rigid3.center(np.array([k.rig_from_world for k in keyframes.keyframes]))
     scale = similarity.umeyama(found, rigid3.center(np.array(poses)))[7]
@@ -62,6 +62,6 @@ def test_the_end_of_a_drive_finds_the_turn_and_with_it_the_scale(is_turned: bool
 def conclude_with_given_rig(keyframes: KeyframeMap, poses: list[Array]) -> float:
     """The scale that the same observations get when the calibration is believed."""
     keyframes.rig = rig_turned_by(np.zeros(3))
-    conclude(keyframes, OdometryOptions(covariance=False, refine_camera=False), Events())
+    adjust_finally(keyframes, OdometryOptions(covariance=False, refine_camera=False), Events())
     found = rigid3.center(np.array([k.rig_from_world for k in keyframes.keyframes]))
     return float(similarity.umeyama(found, rigid3.center(np.array(poses)))[7])

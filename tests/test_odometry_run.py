@@ -1,4 +1,5 @@
-"""Odometry on short rendered sequences with exact truth, and on real ones: what is found, and what is not made up."""
+"""Odometry on short rendered sequences with exact ground truth, and on real ones: what is found, and what is not made
+up."""
 
 from __future__ import annotations
 
@@ -38,13 +39,13 @@ def digest(result: OdometryResult) -> tuple[bytes, ...]:
 
 
 def assert_no_jump(result: OdometryResult, sequence: Played, bound_m: float) -> None:
-    """Every pose of every map is where the truth says: nothing is made up, nothing joined wrongly."""
+    """Every pose of every map is where the ground truth says: nothing is made up, nothing joined wrongly."""
     for m in range(len(result.maps)):
-        ours, truth = played.centers_and_truth(result, sequence, m)
+        ours, ground_truth = played.centers_and_ground_truth(result, sequence, m)
         if len(ours) < 4:
             continue
-        unit = similarity.umeyama(ours, truth)
-        assert np.linalg.norm(similarity.apply(unit, ours) - truth, axis=1).max() < bound_m
+        unit = similarity.umeyama(ours, ground_truth)
+        assert np.linalg.norm(similarity.apply(unit, ours) - ground_truth, axis=1).max() < bound_m
 
 
 # ------------------------------------------------------------------ plain walks
@@ -107,7 +108,7 @@ def test_covariances_have_the_size_of_the_errors(is_stereo: bool) -> None:
         assert found.covariance is not None
         ours = found.reconstruction.cam_from_world[found.keyframe_image_idx]
         errors = played.gauge_errors(
-            ours, sequence.truth.cam_from_world[found.keyframe_frame_idx], 6 if is_stereo else 7
+            ours, sequence.ground_truth.cam_from_world[found.keyframe_frame_idx], 6 if is_stereo else 7
         )
         values += list(played.normalized_errors(errors, found.covariance))
     assert 0.1 < np.median(values) < 9.0
@@ -330,13 +331,15 @@ def test_kitti_is_followed_to_the_end(data_root: Path) -> None:
     errors = []
     for how in (SequenceOptions(), SequenceOptions(step=2), SequenceOptions(reverse=True)):
         sequence = open_sequence(folder, how, Events())
-        assert sequence.truth is not None
+        assert sequence.ground_truth is not None
         result = run_odometry(sequence, OdometryOptions())
         assert (result.frame_map == 0).sum() >= len(result.frame_names) - 1
-        truth = sequence.truth.cam_from_world
+        ground_truth = sequence.ground_truth.cam_from_world
         good = result.frame_map == 0
         ours = rigid3.center(result.cam_from_world[good])
-        there = rigid3.center(truth[np.searchsorted(sequence.truth.timestamps_s, result.timestamps_s[good] - 1e-6)])
+        there = rigid3.center(
+            ground_truth[np.searchsorted(sequence.ground_truth.timestamps_s, result.timestamps_s[good] - 1e-6)]
+        )
         off = similarity.apply(similarity.umeyama(ours, there), ours) - there
         errors.append(float(np.sqrt((off**2).sum(1).mean())))
     # ORB-SLAM3: 0.717 m
@@ -353,8 +356,8 @@ def test_a_real_rotation_never_makes_a_map(data_root: Path) -> None:
     folder = data_root / "pano-sponza-rot"
     if not folder.is_dir():
         pytest.skip(f"{folder} is not there")
-    truth = json.loads((folder / "gt.json").read_text())
-    k = np.array(truth["K"]) if "K" in truth else np.array(truth["intrinsics"])
+    ground_truth = json.loads((folder / "gt.json").read_text())
+    k = np.array(ground_truth["K"]) if "K" in ground_truth else np.array(ground_truth["intrinsics"])
     camera = f"PINHOLE,{k[0][0]},{k[1][1]},{k[0][2] + 0.5},{k[1][2] + 0.5}"
     sequence = open_sequence(folder / "images", SequenceOptions(camera=camera), Events())
     result = run_odometry(sequence, OdometryOptions())

@@ -1,4 +1,4 @@
-"""The unit of length of a map from markers, distances and the height of the camera, against synthetic truth."""
+"""The unit of length of a map from markers, distances and the height of the camera, against synthetic ground truth."""
 
 from __future__ import annotations
 

@@ -59,9 +59,9 @@ def make_map(readout: float, noise_px: float = 0.15) -> tuple[KeyframeMap, list[
 def error(keyframes: KeyframeMap) -> float:
     """ATE of the keyframes after a similarity, in metres."""
     centers = rigid3.center(np.array([k.rig_from_world for k in keyframes.keyframes]))
-    truth = rigid3.center(np.array([pose_at(k.frame_idx) for k in keyframes.keyframes]))
-    aligned = similarity.apply(similarity.umeyama(centers, truth), centers)
-    return float(np.sqrt(((aligned - truth) ** 2).sum(1).mean()))
+    ground_truth = rigid3.center(np.array([pose_at(k.frame_idx) for k in keyframes.keyframes]))
+    aligned = similarity.apply(similarity.umeyama(centers, ground_truth), centers)
+    return float(np.sqrt(((aligned - ground_truth) ** 2).sum(1).mean()))
 
 
 @pytest.mark.parametrize("readout", [0.6, -0.3])

@@ -18,9 +18,9 @@ def simulate(
     rng = np.random.default_rng([seed, 11])
     steps = 8
     p, v, w, rotation = np.zeros(3), rng.normal(size=3), 0.3 * rng.normal(size=3), np.eye(3)
-    truth, h = np.empty((num, 7)), dt / steps
+    ground_truth, h = np.empty((num, 7)), dt / steps
     for f in range(num):
-        truth[f] = rigid3.inverse(rigid3.from_matrix(rotation, p))
+        ground_truth[f] = rigid3.inverse(rigid3.from_matrix(rotation, p))
         for _ in range(steps):
             p, rotation = p + v * h, rotation @ rigid3.exp_so3(w * h)
             v = v + Q_POSITION * np.sqrt(h) * rng.normal(size=3)
@@ -28,8 +28,8 @@ def simulate(
     size = np.r_[np.full(3, np.radians(sigma_deg)), np.full(3, sigma)]
     mix = np.eye(6) + 0.2 * rng.normal(size=(num, 6, 6))
     root = np.exp(0.3 * rng.normal(size=num))[:, None, None] * size[:, None] * mix
-    measured = perturbed(truth, np.einsum("nij,nj->ni", root, rng.normal(size=(num, 6))))
-    return dt * np.arange(num), truth, measured, root @ root.swapaxes(1, 2)
+    measured = perturbed(ground_truth, np.einsum("nij,nj->ni", root, rng.normal(size=(num, 6))))
+    return dt * np.arange(num), ground_truth, measured, root @ root.swapaxes(1, 2)
 
 
 def perturbed(poses: np.ndarray, tangent: np.ndarray) -> np.ndarray:
@@ -37,14 +37,14 @@ def perturbed(poses: np.ndarray, tangent: np.ndarray) -> np.ndarray:
     return rigid3.compose(rigid3.from_matrix(rigid3.exp_so3(tangent[:, :3]), tangent[:, 3:]), poses)
 
 
-def tangent(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def tangent(poses: np.ndarray, ground_truth: np.ndarray) -> np.ndarray:
     """(N, 6) errors of poses, the inverse of ``perturbed``."""
-    change = rigid3.compose(poses, rigid3.inverse(truth))
+    change = rigid3.compose(poses, rigid3.inverse(ground_truth))
     return np.column_stack([rigid3.log_so3(rigid3.rotation_matrix(change)), change[:, 4:]])
 
 
-def nees(poses: np.ndarray, covariance: np.ndarray, truth: np.ndarray) -> float:
-    error = tangent(poses, truth)
+def nees(poses: np.ndarray, covariance: np.ndarray, ground_truth: np.ndarray) -> float:
+    error = tangent(poses, ground_truth)
     return float((error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(1).mean() / 6)
 
 
@@ -52,12 +52,12 @@ def nees(poses: np.ndarray, covariance: np.ndarray, truth: np.ndarray) -> float:
 def test_consistent_and_better_than_the_measurements(is_causal: bool) -> None:
     scores, innovations, gains = [], [], []
     for seed in range(12):
-        times, truth, measured, covariance = simulate(seed)
+        times, ground_truth, measured, covariance = simulate(seed)
         options = SmoothingOptions(Q_POSITION, Q_ROTATION, is_causal=is_causal)
         found = smooth_trajectory(times, measured, covariance, options)
-        scores.append(nees(found.cam_from_world, found.covariance, truth))
+        scores.append(nees(found.cam_from_world, found.covariance, ground_truth))
         innovations.append(np.nanmean(found.nis[5:]) / 6)
-        raw, smooth = tangent(measured, truth), tangent(found.cam_from_world, truth)
+        raw, smooth = tangent(measured, ground_truth), tangent(found.cam_from_world, ground_truth)
         gains.append(np.sqrt((smooth**2).mean(0) / (raw**2).mean(0)))
         assert not found.is_predicted.any()
         assert found.is_rejected.sum() <= 1
@@ -90,7 +90,7 @@ def test_densities_do_not_depend_on_the_unit_of_length() -> None:
 def test_gaps_are_bridged_with_growing_covariance() -> None:
     scores = []
     for seed in range(20):
-        times, truth, measured, covariance = simulate(seed, 200)
+        times, ground_truth, measured, covariance = simulate(seed, 200)
         gap = slice(100, 120)
         measured[gap] = np.nan
         for is_causal in (False, True):
@@ -103,7 +103,7 @@ def test_gaps_are_bridged_with_growing_covariance() -> None:
             assert np.isnan(found.nis[gap]).all()
             if is_causal:
                 assert sigma[119] > 3 * sigma[99]
-            scores.append(nees(found.cam_from_world[gap], found.covariance[gap], truth[gap]))
+            scores.append(nees(found.cam_from_world[gap], found.covariance[gap], ground_truth[gap]))
     # a gap is one draw of the motion, so 20 draws of some 6 numbers each: 0.75 to 1.3 at two sigma
     assert 0.7 < np.mean(scores[::2]) < 1.35
     assert 0.7 < np.mean(scores[1::2]) < 1.35
@@ -130,13 +130,13 @@ def test_long_gaps_and_ends_stay_open() -> None:
 
 def test_wrong_poses_are_rejected_and_jumps_are_followed() -> None:
     rng = np.random.default_rng(8)
-    times, truth, measured, covariance = simulate(5, 300)
+    times, ground_truth, measured, covariance = simulate(5, 300)
     wrong = np.array([40, 41, 90, 150, 200])
     measured[wrong] = perturbed(measured[wrong], rng.choice([-1, 1], (5, 6)) * [0.3, 0.3, 0.3, 1, 1, 1])
     found = smooth_trajectory(times, measured, covariance)
     assert found.is_rejected.nonzero()[0].tolist() == wrong.tolist()
     assert found.is_predicted[wrong].all()
-    error = np.abs(tangent(found.cam_from_world, truth))
+    error = np.abs(tangent(found.cam_from_world, ground_truth))
     assert error[wrong, :3].max() < np.radians(0.5)
     assert error[wrong, 3:].max() < 0.05
     # the world itself moves by ten metres: three frames are doubted, the rest is followed
@@ -145,9 +145,9 @@ def test_wrong_poses_are_rejected_and_jumps_are_followed() -> None:
     jumped[250:] = rigid3.compose(measured[250:], moved)
     found = smooth_trajectory(times, jumped, covariance)
     assert found.is_rejected[250:].nonzero()[0].tolist() == [0, 1, 2]
-    after = np.abs(tangent(found.cam_from_world[254:], rigid3.compose(truth[254:], moved)))
+    after = np.abs(tangent(found.cam_from_world[254:], rigid3.compose(ground_truth[254:], moved)))
     assert after[:, 3:].max() < 0.05
-    before = np.abs(tangent(found.cam_from_world[210:250], truth[210:250]))
+    before = np.abs(tangent(found.cam_from_world[210:250], ground_truth[210:250]))
     assert before[:, 3:].max() < 0.05
 
 
@@ -155,10 +155,10 @@ def test_half_turns_do_not_confuse_it() -> None:
     """A camera that spins at two turns a second, measured at 30 Hz."""
     times = np.arange(120) / 30
     rotation = rigid3.exp_so3(np.outer(times, [0.0, 4 * np.pi, 0.0]))
-    truth = rigid3.inverse(rigid3.from_matrix(rotation, np.outer(times, [1.0, 0.0, 0.0])))
+    ground_truth = rigid3.inverse(rigid3.from_matrix(rotation, np.outer(times, [1.0, 0.0, 0.0])))
     covariance = np.tile(np.diag([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2]) ** 2, (120, 1, 1))
-    found = smooth_trajectory(times, truth, covariance)
-    assert np.abs(tangent(found.cam_from_world, truth)).max() < 2e-3
+    found = smooth_trajectory(times, ground_truth, covariance)
+    assert np.abs(tangent(found.cam_from_world, ground_truth)).max() < 2e-3
     assert np.allclose(found.turn_rate[10:-10], [0.0, 4 * np.pi, 0.0], atol=0.05)
     assert np.allclose(found.velocity[10:-10], [1.0, 0.0, 0.0], atol=0.05)
 

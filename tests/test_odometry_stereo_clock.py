@@ -14,7 +14,7 @@ from sfmapp.geometry import rigid3, similarity
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.odometry.run import run_odometry
-from sfmapp.odometry.stereo_clock import Look, estimate_lateness
+from sfmapp.odometry.stereo_clock import Look, estimate_time_offset
 
 FRAMES = 60
 
@@ -33,8 +33,8 @@ def run(sequence: Played) -> OdometryResult:
 def scale_of(result: OdometryResult, sequence: Played) -> float:
     """Estimated over true length."""
     known = np.isfinite(result.cam_from_world[:, 0])
-    truth = rigid3.center(sequence.truth.cam_from_world[result.frame_idx[known]])
-    return 1 / float(similarity.umeyama(rigid3.center(result.cam_from_world[known]), truth)[7])
+    ground_truth = rigid3.center(sequence.ground_truth.cam_from_world[result.frame_idx[known]])
+    return 1 / float(similarity.umeyama(rigid3.center(result.cam_from_world[known]), ground_truth)[7])
 
 
 @pytest.mark.parametrize("late", [2, -1])
@@ -88,7 +88,7 @@ def test_lateness_is_told_from_a_turn_of_the_rig(late: float) -> None:
         off = -late * motion - columns[:, :3] @ turn + rng.normal(0, 0.1, 200)
         off[:20] += rng.uniform(-20, 20, 20)  # mismatches
         looks.append(Look(frame, 0.1, off, motion, columns, np.ones(200), 200, 200))
-    found = estimate_lateness(looks)
+    found = estimate_time_offset(looks)
     assert found.is_known
     assert found.frames == pytest.approx(late, abs=0.02)
     np.testing.assert_allclose(found.of_looks, late, atol=0.05)

@@ -24,7 +24,7 @@ from sfmapp.errors import InputError, UsageError
 from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.events import Event, Events
 from sfmapp.formats.colmap import read_model
-from sfmapp.formats.truth import read_truth
+from sfmapp.formats.ground_truth import read_ground_truth
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.orientation import (
     INVERSE,
@@ -221,13 +221,13 @@ def test_models_and_exports_fit_the_files_as_pycolmap_reads_them(
     document = json.loads((tmp_path / "nerfstudio/transforms.json").read_text())
     assert (document["w"], document["h"]) == size
     # the sample's true cameras, of the upright pictures: rolled with them, in a world that is mirrored as they are
-    truth = read_truth(sample / "cameras.json")
+    ground_truth = read_ground_truth(sample / "cameras.json")
     mirror = np.diag([-1.0, 1.0, 1.0]) if orientation in MIRRORED else np.eye(3)
-    rotation = mirror @ rigid3.rotation_matrix(truth.cam_from_world) @ mirror
-    poses = rigid3.from_matrix(rotation, truth.cam_from_world[:, 4:] @ mirror)
+    rotation = mirror @ rigid3.rotation_matrix(ground_truth.cam_from_world) @ mirror
+    poses = rigid3.from_matrix(rotation, ground_truth.cam_from_world[:, 4:] @ mirror)
     poses = upright_poses(poses, [INVERSE[ROTATION_OF[orientation]]] * len(poses))
     errors = evaluate_poses(
-        model.image_names, model.cam_from_world, [Path(n).stem + ".png" for n in truth.names], poses
+        model.image_names, model.cam_from_world, [Path(n).stem + ".png" for n in ground_truth.names], poses
     )
     assert np.nanmax(errors.rotation_error_deg) < 0.2
 
@@ -284,14 +284,14 @@ def test_a_mirrored_file_joins_no_model_of_others(photos: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize("orientation", range(2, 9))
 @pytest.mark.parametrize("is_upright", [True, False])
-def test_validate_compares_with_a_truth_in_one_frame(
+def test_validate_compares_with_a_ground_truth_in_one_frame(
     tmp_path: Path, orientation: int, is_upright: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from sfmapp.formats.colmap import write_model
     from sfmapp.scene.synthetic import make_scene as make_cameras
     from sfmapp.workspace.layout import FORMAT
 
-    model = make_cameras(num_images=6, num_points=60, seed=1).truth
+    model = make_cameras(num_images=6, num_points=60, seed=1).ground_truth
     for name in model.image_names:
         path = tmp_path / "photos" / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -305,10 +305,10 @@ def test_validate_compares_with_a_truth_in_one_frame(
     if orientation in MIRRORED:  # the true world, of which the files show a mirror image
         mirror = np.diag([-1.0, 1.0, 1.0])
         upright = rigid3.from_matrix(mirror @ rigid3.rotation_matrix(upright) @ mirror, upright[:, 4:] @ mirror)
-    write_model(tmp_path / "truth", replace(model, cam_from_world=upright) if is_upright else model)
+    write_model(tmp_path / "ground_truth", replace(model, cam_from_world=upright) if is_upright else model)
     monkeypatch.setattr(validation, "_ask", lambda *_: None)
-    result = validation.validate(tmp_path / "out", tmp_path / "truth")
-    assert result.ours["truth"]["rotation_error_deg"]["max"] < 1e-4
+    result = validation.validate(tmp_path / "out", tmp_path / "ground_truth")
+    assert result.ours["ground_truth"]["rotation_error_deg"]["max"] < 1e-4
     assert any("turned back" in note for note in result.notes) == is_upright
 
 
@@ -399,7 +399,7 @@ def test_a_replay_counts_in_upright_pixels(orientation: int) -> None:
     from sfmapp.scene.features import Features
     from sfmapp.scene.synthetic import make_scene as make_cameras
 
-    model = make_cameras(num_images=3, num_points=40, seed=1).truth
+    model = make_cameras(num_images=3, num_points=40, seed=1).ground_truth
     camera = model.cameras[0]
     records = tuple(
         ImageRecord(name, Path(name), camera.width, camera.height, orientation) for name in model.image_names
@@ -450,7 +450,7 @@ def test_live_frames_are_upright(orientation: int) -> None:
     drawing._recording = logged  # type: ignore[assignment]
     camera = Camera(CameraModel.PINHOLE, W, H, np.array([40.0, 40.0, W / 2, H / 2]))
     drawing.draw({
-        "kind": "begin", "title": "", "camera": camera, "truth_times": None, "truth_cam_from_world": None,
+        "kind": "begin", "title": "", "camera": camera, "ground_truth_times": None, "ground_truth_cam_from_world": None,
         "is_metric": False, "orientation": orientation,
     })  # fmt: skip
     stored = cv2.resize(np.random.default_rng(0).integers(0, 255, (4, 6), np.uint8), (W, H))

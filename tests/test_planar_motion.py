@@ -1,4 +1,4 @@
-"""The two-point algorithm for planar motion against truth, physics and the five-point algorithm."""
+"""The two-point algorithm for planar motion against ground truth, physics and the five-point algorithm."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def planar_pair(
     return pose, xn1[keep] + noise[0], xn2 + noise[1]
 
 
-def errors_deg(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+def errors_deg(found: np.ndarray, ground_truth: np.ndarray) -> tuple[float, float]:
     """Angles between the rotations and between the directions of translation."""
-    rotation = rigid3.rotation_angle_deg(rigid3.rotation_matrix(found).T @ rigid3.rotation_matrix(truth))
-    cosine = found[4:] @ truth[4:] / np.linalg.norm(found[4:]) / np.linalg.norm(truth[4:])
+    rotation = rigid3.rotation_angle_deg(rigid3.rotation_matrix(found).T @ rigid3.rotation_matrix(ground_truth))
+    cosine = found[4:] @ ground_truth[4:] / np.linalg.norm(found[4:]) / np.linalg.norm(ground_truth[4:])
     return float(rotation), float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 

@@ -1,4 +1,4 @@
-"""Rendered sequences: the image shows what the geometry says, and the truth beside it is the truth."""
+"""Rendered sequences: the image shows what the geometry says, and the ground truth beside it is the ground truth."""
 
 from __future__ import annotations
 
@@ -412,8 +412,8 @@ def test_edits_change_what_they_say(places: dict[str, RenderedSequence]) -> None
     before, after = (rigid3.rotation_matrix(turned.cam_from_world[k]) for k in (4, 10))
     assert rigid3.rotation_angle_deg(before.T @ after) == pytest.approx(90)
     elsewhere = rendered.splice(room, places["hall"], 7, 5)
-    assert np.isnan(elsewhere.truth[7:12]).all()
-    assert np.array_equal(elsewhere.truth[12:], room.truth[7:])
+    assert np.isnan(elsewhere.ground_truth[7:12]).all()
+    assert np.array_equal(elsewhere.ground_truth[12:], room.ground_truth[7:])
     assert np.array_equal(elsewhere.image(13), room.image(8))
     assert not np.array_equal(elsewhere.image(8), room.image(8))
     twice = rendered.repeat(room, 2 * len(room))
@@ -458,10 +458,12 @@ def test_what_is_written_is_read_as_the_real_data_are(name: str, kind: str, tmp_
             assert np.array_equal(image, sequence.image(k, sensor))
     times = np.array([frame.timestamp_s for frame in frames])
     np.testing.assert_allclose(times - times[0], sequence.timestamps_s, atol=1e-6)
-    assert read.truth is not None
-    at = np.array([np.argmin(np.abs(read.truth.timestamps_s - t)) for t in times])
-    relative = rigid3.compose(sequence.truth, rigid3.inverse(sequence.truth[0]))
-    found = rigid3.compose(read.truth.cam_from_world[at], rigid3.inverse(read.truth.cam_from_world[at[0]]))
+    assert read.ground_truth is not None
+    at = np.array([np.argmin(np.abs(read.ground_truth.timestamps_s - t)) for t in times])
+    relative = rigid3.compose(sequence.ground_truth, rigid3.inverse(sequence.ground_truth[0]))
+    found = rigid3.compose(
+        read.ground_truth.cam_from_world[at], rigid3.inverse(read.ground_truth.cam_from_world[at[0]])
+    )
     np.testing.assert_allclose(found, relative, atol=1e-6)
     if sequence.imu is not None:
         assert read.imu is not None

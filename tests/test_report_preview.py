@@ -12,7 +12,7 @@ from sfmapp.report.preview import (
     BACKGROUND,
     CLAY,
     LAMP,
-    Eye,
+    VirtualCamera,
     picture_of_mesh,
     picture_of_patches,
     see_mesh,
@@ -25,14 +25,14 @@ Array = NDArray[np.float64]
 
 # looks from somewhere to somewhere, not along an axis
 POSE = rigid3.from_matrix(rigid3.exp_so3(np.array([0.3, -0.4, 0.2])), np.array([0.5, -0.2, 1.0]))
-EYE = Eye(np.array([150.0, 140.0, 80.0, 60.0]), POSE, 160, 120)
+EYE = VirtualCamera(np.array([150.0, 140.0, 80.0, 60.0]), POSE, 160, 120)
 
 
 def world(cam: Array) -> Array:
     return rigid3.apply(rigid3.inverse(POSE), cam)
 
 
-def rays(eye: Eye) -> Array:
+def rays(eye: VirtualCamera) -> Array:
     """(H, W, 3) directions in the camera's axes, z = 1, through the centres of the pixels."""
     y, x = np.indices((eye.height, eye.width)) + 0.5
     fx, fy, cx, cy = eye.k
@@ -51,7 +51,7 @@ def plane(normal: Array, distance: float, spacing: float) -> tuple[Array, NDArra
     return world(cam), np.tile(facing, (len(cam), 1)).astype(np.float32)
 
 
-def depth_of_plane(normal: Array, distance: float, eye: Eye) -> Array:
+def depth_of_plane(normal: Array, distance: float, eye: VirtualCamera) -> Array:
     return distance / (rays(eye) @ (normal / np.linalg.norm(normal)))
 
 
@@ -100,7 +100,7 @@ def test_the_nearer_of_two_crossing_planes_is_seen_whatever_comes_first() -> Non
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 60.0])
 def test_the_area_of_a_disc_shrinks_with_the_cosine(tilt_deg: float) -> None:
-    eye = Eye(np.array([400.0, 400.0, 80.5, 60.5]), rigid3.IDENTITY, 160, 120)
+    eye = VirtualCamera(np.array([400.0, 400.0, 80.5, 60.5]), rigid3.IDENTITY, 160, 120)
     tilt = np.radians(tilt_deg)
     normal = np.array([[np.sin(tilt), 0.0, -np.cos(tilt)]], np.float32)
     seen = see_patches(np.array([[0.0, 0.0, 100.0]]), normal, np.array([10.0], np.float32), eye)
@@ -110,7 +110,7 @@ def test_the_area_of_a_disc_shrinks_with_the_cosine(tilt_deg: float) -> None:
 
 
 def test_a_disc_smaller_than_a_pixel_is_a_pixel_and_none_is_seen_behind_the_eye() -> None:
-    eye = Eye(EYE.k, rigid3.IDENTITY, EYE.width, EYE.height)
+    eye = VirtualCamera(EYE.k, rigid3.IDENTITY, EYE.width, EYE.height)
     xyz = np.array([[0.5, 0.25, 5.0], [0.5, 0.25, -5.0], [100.0, 0.0, 5.0]])
     seen = see_patches(xyz, np.tile(np.float32([0, 0, -1]), (3, 1)), np.full(3, 1e-4, np.float32), eye)
     # 150 0.5 / 5 + 80 = 95, 140 0.25 / 5 + 60 = 67
@@ -138,7 +138,7 @@ def test_a_mesh_of_a_plane_has_its_depth_without_a_seam() -> None:
 
 
 def test_a_sphere_is_as_near_and_as_bright_as_a_sphere() -> None:
-    eye = Eye(np.array([300.0, 300.0, 80.0, 60.0]), np.array([0, 0, 0, 1.0, 0.2, -0.1, 8.0]), 160, 120)
+    eye = VirtualCamera(np.array([300.0, 300.0, 80.0, 60.0]), np.array([0, 0, 0, 1.0, 0.2, -0.1, 8.0]), 160, 120)
     xyz, faces = sphere(60, 1.5)
     assert ((xyz[faces[:, 0]] * face_vectors(xyz, faces)).sum(axis=1) > 0).all()
     seen = see_mesh(xyz, faces, eye)

@@ -104,8 +104,8 @@ def make_kitti(root: Path, folders: Several[str] = ("image_0", "image_1"), count
     return sequence, rigid3.compose(poses, rigid3.inverse(poses[:1]))
 
 
-def test_kitti_stereo_has_rig_times_and_truth(tmp_path: Path, told: Told) -> None:
-    folder, truth = make_kitti(tmp_path)
+def test_kitti_stereo_has_rig_times_and_ground_truth(tmp_path: Path, told: Told) -> None:
+    folder, ground_truth = make_kitti(tmp_path)
     sequence = open_sequence(folder, SequenceOptions(), told.events)
     frames = list(sequence.frames())
     assert (sequence.kind, sequence.num_frames, len(frames)) == ("kitti", 6, 6)
@@ -120,22 +120,24 @@ def test_kitti_stereo_has_rig_times_and_truth(tmp_path: Path, told: Told) -> Non
     np.testing.assert_allclose(sequence.rig.cam_from_rig[1], [0, 0, 0, 1, -0.54, 0, 0])
     left, right = (project(camera, rigid3.apply(pose, [[0.3, 0.1, 5.0]])) for pose in sequence.rig.cam_from_rig)
     np.testing.assert_allclose(left - right, [[50 * 0.54 / 5, 0]])
-    assert sequence.truth is not None
-    np.testing.assert_allclose(sequence.truth.timestamps_s, [frame.timestamp_s for frame in frames])
-    assert_same_poses(sequence.truth.cam_from_world, truth)
+    assert sequence.ground_truth is not None
+    np.testing.assert_allclose(sequence.ground_truth.timestamps_s, [frame.timestamp_s for frame in frames])
+    assert_same_poses(sequence.ground_truth.cam_from_world, ground_truth)
     assert not told.of("warned")
 
 
 def test_kitti_colour_pair_stands_beside_camera_0(tmp_path: Path, told: Told) -> None:
-    folder, truth = make_kitti(tmp_path, ("image_2", "image_3"))
+    folder, ground_truth = make_kitti(tmp_path, ("image_2", "image_3"))
     sequence = open_sequence(folder, SequenceOptions(), told.events)
     np.testing.assert_allclose(sequence.rig.cam_from_rig[1, 4:], [-0.54, 0, 0], atol=1e-12)
     # P2 = K [I | t]: where camera 2 sees a point of the world, P2 has it
     matrix = np.array([float(v) for v in P_COLOR[0].split()]).reshape(3, 4)
     point = np.array([0.2, -0.1, 4.0])
     seen = matrix @ np.append(point, 1.0)
-    assert sequence.truth is not None
-    in_camera_2 = rigid3.apply(rigid3.compose(sequence.truth.cam_from_world, rigid3.inverse(truth)), point)
+    assert sequence.ground_truth is not None
+    in_camera_2 = rigid3.apply(
+        rigid3.compose(sequence.ground_truth.cam_from_world, rigid3.inverse(ground_truth)), point
+    )
     pixels = project(sequence.rig.cameras[0], in_camera_2)
     np.testing.assert_allclose(pixels, np.tile(seen[:2] / seen[2] + 0.5, (6, 1)), atol=1e-5)
 
@@ -149,11 +151,11 @@ def test_kitti_grey_is_taken_before_colour_and_mono_takes_one(tmp_path: Path, to
     np.testing.assert_array_equal(frame.images[0], noise(0))
     right = open_sequence(folder / "image_1", SequenceOptions(), told.events)
     np.testing.assert_array_equal(next(iter(right.frames())).images[0], noise(1000))
-    assert right.truth is not None
+    assert right.ground_truth is not None
     # the right camera's own poses
-    assert sequence.truth is not None
-    expected = rigid3.compose([0, 0, 0, 1, -0.54, 0, 0], sequence.truth.cam_from_world)
-    assert_same_poses(right.truth.cam_from_world, expected)
+    assert sequence.ground_truth is not None
+    expected = rigid3.compose([0, 0, 0, 1, -0.54, 0, 0], sequence.ground_truth.cam_from_world)
+    assert_same_poses(right.ground_truth.cam_from_world, expected)
 
 
 def test_kitti_frames_without_a_partner_are_left_out(tmp_path: Path, told: Told) -> None:
@@ -177,12 +179,12 @@ def test_calib_json_with_poses_beside(tmp_path: Path, told: Told) -> None:
     sequence = open_sequence(str(tmp_path), SequenceOptions(), told.events)
     np.testing.assert_allclose(sequence.rig.cameras[0].params, [50, 51, 31.5, 23.5])
     assert sequence.frames_per_second == pytest.approx(9.5)
-    assert sequence.truth is not None
-    assert len(sequence.truth.timestamps_s) == 5
+    assert sequence.ground_truth is not None
+    assert len(sequence.ground_truth.timestamps_s) == 5
     assert open_sequence(tmp_path / "calib.json", SequenceOptions(), told.events).num_frames == 5
 
 
-def test_every_second_file_taken_out_keeps_time_and_truth(tmp_path: Path, told: Told) -> None:
+def test_every_second_file_taken_out_keeps_time_and_ground_truth(tmp_path: Path, told: Told) -> None:
     write_images(tmp_path / "image_0", numbered(9))
     (tmp_path / "calib.json").write_text(json.dumps({"fx": 50.0, "fy": 50.0, "cx": 31.5, "cy": 23.5}))
     write_kitti(tmp_path / "poses.txt", some_poses(9))
@@ -190,20 +192,20 @@ def test_every_second_file_taken_out_keeps_time_and_truth(tmp_path: Path, told: 
     for i in range(1, 9, 2):
         (tmp_path / "image_0" / f"{i:06d}.png").unlink()
     half = open_sequence(tmp_path, SequenceOptions(), told.events)
-    assert whole.truth is not None
-    assert half.truth is not None
-    np.testing.assert_allclose(half.truth.timestamps_s, [0, 0.2, 0.4, 0.6, 0.8])
-    assert_same_poses(half.truth.cam_from_world, whole.truth.cam_from_world[::2])
+    assert whole.ground_truth is not None
+    assert half.ground_truth is not None
+    np.testing.assert_allclose(half.ground_truth.timestamps_s, [0, 0.2, 0.4, 0.6, 0.8])
+    assert_same_poses(half.ground_truth.cam_from_world, whole.ground_truth.cam_from_world[::2])
 
 
-def test_truth_that_does_not_fit_is_left_aside(tmp_path: Path, told: Told) -> None:
+def test_ground_truth_that_does_not_fit_is_left_aside(tmp_path: Path, told: Told) -> None:
     write_images(tmp_path / "image_0", numbered(5))
     write_kitti(tmp_path / "poses.txt", some_poses(3))
     sequence = open_sequence(tmp_path, SequenceOptions(camera=PINHOLE), told.events)
-    assert sequence.truth is None
+    assert sequence.ground_truth is None
     assert any("poses.txt: expected a pose for each of 5 frames, found 3" in text for text in told.of("warned"))
     with pytest.raises(InputError, match="found 3"):
-        open_sequence(tmp_path, SequenceOptions(camera=PINHOLE, truth=str(tmp_path / "poses.txt")), told.events)
+        open_sequence(tmp_path, SequenceOptions(camera=PINHOLE, ground_truth=str(tmp_path / "poses.txt")), told.events)
 
 
 @given(st.integers(1, 30), st.integers(0, 2**31), st.booleans())
@@ -258,14 +260,14 @@ def make_tum(folder: Path, count: int = 5) -> tuple[list[str], np.ndarray]:
     return stamps, poses
 
 
-def test_tum_reads_list_and_truth(tmp_path: Path, told: Told) -> None:
+def test_tum_reads_list_and_ground_truth(tmp_path: Path, told: Told) -> None:
     stamps, poses = make_tum(tmp_path)
     sequence = open_sequence(tmp_path, SequenceOptions(camera=PINHOLE), told.events)
     frames = list(sequence.frames())
     assert sequence.kind == "tum"
     assert [frame.timestamp_s for frame in frames] == [float(stamp) for stamp in stamps]
-    assert sequence.truth is not None
-    assert_same_poses(sequence.truth.cam_from_world, poses)
+    assert sequence.ground_truth is not None
+    assert_same_poses(sequence.ground_truth.cam_from_world, poses)
     for inside in ("rgb", "rgb.txt"):
         assert open_sequence(tmp_path / inside, SequenceOptions(camera=PINHOLE), told.events).num_frames == 5
 
@@ -385,18 +387,18 @@ def make_euroc(root: Path) -> np.ndarray:
         "gyroscope_random_walk: 1.9393e-05\naccelerometer_noise_density: 2.0000e-3\naccelerometer_random_walk: 3.0e-3\n"
     )
     (imu / "sensor.yaml").write_text(sensor_yaml(rigid3.IDENTITY, noise_text))
-    truth = root / "mav0" / "state_groundtruth_estimate0"
-    truth.mkdir()
+    ground_truth = root / "mav0" / "state_groundtruth_estimate0"
+    ground_truth.mkdir()
     poses = some_poses(6)
     rows = "".join(
         f"{stamp},{','.join(map(repr, [*p[4:], p[3], *p[:3]]))},0,0,0,0,0,0,0,0,0\n"
         for stamp, p in zip(NANOSECONDS, poses.tolist(), strict=True)
     )
-    (truth / "data.csv").write_text("#timestamp, p_RS_R_x [m], ...\n" + rows)
+    (ground_truth / "data.csv").write_text("#timestamp, p_RS_R_x [m], ...\n" + rows)
     return poses
 
 
-def test_euroc_stereo_imu_and_truth(tmp_path: Path, told: Told) -> None:
+def test_euroc_stereo_imu_and_ground_truth(tmp_path: Path, told: Told) -> None:
     world_from_body = make_euroc(tmp_path)
     sequence = open_sequence(tmp_path, SequenceOptions(), told.events)
     frames = list(sequence.frames())
@@ -411,13 +413,13 @@ def test_euroc_stereo_imu_and_truth(tmp_path: Path, told: Told) -> None:
     in_body = np.array([0.3, 2.0, -1.0])
     in_cams = [rigid3.apply(rigid3.inverse(pose), in_body) for pose in (T_BS0, T_BS1)]
     np.testing.assert_allclose(rigid3.apply(sequence.rig.cam_from_rig[1], in_cams[0]), in_cams[1], atol=1e-9)
-    assert sequence.truth is not None
+    assert sequence.ground_truth is not None
     assert sequence.imu is not None
     in_world = rigid3.apply(world_from_body, in_body)
     np.testing.assert_allclose(
-        rigid3.apply(sequence.truth.cam_from_world, in_world), np.tile(in_cams[0], (6, 1)), atol=1e-9
+        rigid3.apply(sequence.ground_truth.cam_from_world, in_world), np.tile(in_cams[0], (6, 1)), atol=1e-9
     )
-    np.testing.assert_allclose(sequence.truth.timestamps_s, [frame.timestamp_s for frame in frames], atol=1e-6)
+    np.testing.assert_allclose(sequence.ground_truth.timestamps_s, [frame.timestamp_s for frame in frames], atol=1e-6)
     np.testing.assert_allclose(rigid3.apply(sequence.imu.imu_from_cam, in_cams[0]), in_body, atol=1e-9)
     np.testing.assert_allclose(sequence.imu.accel[0], [9.7, 0.5, -0.25])
     assert (sequence.imu.gyro_noise, sequence.imu.gyro_walk) == (1.6968e-4, 1.9393e-5)
@@ -444,16 +446,16 @@ def test_euroc_tolerates_missing_partners_and_lists(tmp_path: Path, told: Told) 
     assert open_sequence(tmp_path, SequenceOptions(), told.events).num_frames == 5
 
 
-def test_euroc_vicon_truth_is_of_a_marker(tmp_path: Path, told: Told) -> None:
+def test_euroc_vicon_ground_truth_is_of_a_marker(tmp_path: Path, told: Told) -> None:
     poses = make_euroc(tmp_path)
     mav = tmp_path / "mav0"
     (mav / "state_groundtruth_estimate0").rename(mav / "vicon0")
     body_from_marker = rigid3.from_matrix(rigid3.exp_so3([0.0, 0.2, 0.0]), [0.0, 0.1, 0.2])
     (mav / "vicon0" / "sensor.yaml").write_text(sensor_yaml(body_from_marker, ""))
     sequence = open_sequence(tmp_path, SequenceOptions(), told.events)
-    assert sequence.truth is not None
+    assert sequence.ground_truth is not None
     world_from_cam = rigid3.compose(rigid3.compose(poses, rigid3.inverse(body_from_marker)), T_BS0)
-    assert_same_poses(sequence.truth.cam_from_world, rigid3.inverse(world_from_cam))
+    assert_same_poses(sequence.ground_truth.cam_from_world, rigid3.inverse(world_from_cam))
 
 
 @pytest.mark.parametrize(
@@ -479,22 +481,22 @@ def test_euroc_files_that_are_broken(tmp_path: Path, told: Told, name: str, text
         open_sequence(tmp_path, SequenceOptions(), told.events)
 
 
-def test_imu_and_truth_from_elsewhere(tmp_path: Path, told: Told) -> None:
+def test_imu_and_ground_truth_from_elsewhere(tmp_path: Path, told: Told) -> None:
     make_euroc(tmp_path / "euroc")
     mav = tmp_path / "euroc" / "mav0"
     write_images(tmp_path / "photos", [f"{stamp}.png" for stamp in NANOSECONDS])
     options = SequenceOptions(
         camera=str(mav / "cam0/sensor.yaml"), imu=str(mav / "imu0"),
-        truth=str(mav / "state_groundtruth_estimate0/data.csv"),
+        ground_truth=str(mav / "state_groundtruth_estimate0/data.csv"),
     )  # fmt: skip
     here = open_sequence(tmp_path / "photos", options, told.events)
     there = open_sequence(tmp_path / "euroc", SequenceOptions(), told.events)
     assert here.imu is not None
     assert there.imu is not None
-    assert here.truth is not None
-    assert there.truth is not None
+    assert here.ground_truth is not None
+    assert there.ground_truth is not None
     np.testing.assert_allclose(here.imu.imu_from_cam, there.imu.imu_from_cam)
-    np.testing.assert_allclose(here.truth.cam_from_world, there.truth.cam_from_world)
+    np.testing.assert_allclose(here.ground_truth.cam_from_world, there.ground_truth.cam_from_world)
     with pytest.raises(InputError, match="where the IMU sits"):
         open_sequence(tmp_path / "photos", SequenceOptions(camera=PINHOLE, imu=str(mav / "imu0")), told.events)
 
@@ -661,15 +663,17 @@ def test_start_stop_step_and_reverse(tmp_path: Path, told: Told) -> None:
     assert_frames_ascend(backwards, back)
     assert [frame.name for frame in backwards] == [frame.name for frame in frames[::-1]]
     assert [frame.idx for frame in backwards] == list(range(6))
-    assert forth.truth is not None
-    assert back.truth is not None
+    assert forth.ground_truth is not None
+    assert back.ground_truth is not None
     # the pose that belongs to a picture still does
-    by_name = dict(zip([frame.name for frame in frames], forth.truth.cam_from_world, strict=True))
+    by_name = dict(zip([frame.name for frame in frames], forth.ground_truth.cam_from_world, strict=True))
     at = (
-        np.interp([frame.timestamp_s for frame in backwards], back.truth.timestamps_s, np.arange(6)).round().astype(int)
+        np.interp([frame.timestamp_s for frame in backwards], back.ground_truth.timestamps_s, np.arange(6))
+        .round()
+        .astype(int)
     )
     expected = np.array([by_name[frame.name] for frame in backwards])
-    assert_same_poses(back.truth.cam_from_world[at], expected)
+    assert_same_poses(back.ground_truth.cam_from_world[at], expected)
     assert forth.imu is not None
     assert back.imu is not None
     np.testing.assert_allclose(back.imu.gyro, -forth.imu.gyro[::-1])
@@ -869,8 +873,8 @@ def test_real_kitti(data_root: Path, told: Told) -> None:
     sequence = open_sequence(folder, SequenceOptions(), told.events)
     assert (sequence.kind, sequence.num_frames) == ("kitti", 200)
     np.testing.assert_allclose(sequence.rig.cameras[0].params, [718.856, 718.856, 607.6928, 185.7157])
-    assert sequence.truth is not None
-    centers = rigid3.center(sequence.truth.cam_from_world)
+    assert sequence.ground_truth is not None
+    centers = rigid3.center(sequence.ground_truth.cam_from_world)
     assert np.linalg.norm(np.diff(centers, axis=0), axis=1).sum() == pytest.approx(145, abs=3)
     frames = list(sequence.frames())
     assert len(frames) == 200

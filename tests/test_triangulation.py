@@ -32,12 +32,12 @@ def blank(model: Reconstruction) -> Reconstruction:
 
 @pytest.mark.parametrize("layout", ["ring", "grid", "forward"])
 def test_exact_observations_give_exact_points(layout):
-    truth = make_scene(0, 8, 300, layout=layout).truth
-    model = blank(truth)
+    ground_truth = make_scene(0, 8, 300, layout=layout).ground_truth
+    model = blank(ground_truth)
     num = run(triangulation.triangulate_tracks, model, max_error_px=1e-3, min_angle_deg=0.5)
     done = model.is_triangulated
     assert num == done.sum() > 0.9 * len(done)
-    np.testing.assert_allclose(model.point_xyz[done], truth.point_xyz[done], atol=1e-6)
+    np.testing.assert_allclose(model.point_xyz[done], ground_truth.point_xyz[done], atol=1e-6)
     assert model.obs_is_inlier[done[model.tracks.obs_track_idx]].all()
 
 
@@ -57,7 +57,7 @@ def test_outliers_are_left_out_and_noise_is_averaged():
 
 def test_small_angles_and_single_observations_are_refused():
     scene = make_scene(2, 6, 200)
-    model = blank(scene.truth)
+    model = blank(scene.ground_truth)
     assert run(triangulation.triangulate_tracks, model, min_angle_deg=179.0) == 0
     assert not model.is_triangulated.any()
     model.cam_from_world[1:] = np.nan

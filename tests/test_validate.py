@@ -1,4 +1,4 @@
-"""The comparison with pycolmap and the truth: numbers, table, notes and failures, on a scene that both know."""
+"""The comparison with pycolmap and the ground truth: numbers, table, notes and failures, on a scene that both know."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NUM_IMAGES = 6
 
 @pytest.fixture
 def scene() -> Reconstruction:
-    return make_scene(num_images=NUM_IMAGES, num_points=60, seed=1).truth
+    return make_scene(num_images=NUM_IMAGES, num_points=60, seed=1).ground_truth
 
 
 def with_poses(scene: Reconstruction, cam_from_world: np.ndarray) -> Reconstruction:
@@ -53,7 +53,7 @@ def workspace(tmp_path: Path, scene: Reconstruction) -> Path:
 
 
 @pytest.fixture
-def truth_file(tmp_path: Path, scene: Reconstruction) -> Path:
+def ground_truth_file(tmp_path: Path, scene: Reconstruction) -> Path:
     rotation = rigid3.rotation_matrix(scene.cam_from_world)
     cameras = [
         {
@@ -89,14 +89,14 @@ def opinion_on(model: Reconstruction | None, asked: list[dict[str, Any]]) -> Ans
 
 
 def test_the_same_model_in_another_world_agrees(
-    workspace: Path, truth_file: Path, scene: Reconstruction, monkeypatch: pytest.MonkeyPatch
+    workspace: Path, ground_truth_file: Path, scene: Reconstruction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sim = similarity.from_parts(rigid3.exp_so3([0.3, -0.2, 1.0]), [5.0, 6, 7], 3.0)
     other = with_poses(scene, similarity.transform_poses(sim, scene.cam_from_world))
     other.point_xyz = similarity.apply(sim, scene.point_xyz)
     asked: list[dict[str, Any]] = []
     monkeypatch.setattr(pipeline, "ask_second_opinion", opinion_on(other, asked))
-    result = pipeline.validate(workspace, truth_file)
+    result = pipeline.validate(workspace, ground_truth_file)
     assert asked[0]["names"] == scene.image_names
     assert asked[0]["root"] == workspace.parent / "photos"
     assert asked[0]["camera_groups"] is None
@@ -109,8 +109,8 @@ def test_the_same_model_in_another_world_agrees(
         assert side["registered"] == side["images"] == NUM_IMAGES
         assert side["points"] == scene.summary()["num_points"]
         assert side["reprojection_error_px"] < 1e-9
-        assert side["truth"]["center_error"]["max"] < 1e-9
-        assert side["truth"]["auc"]["0.5"] == pytest.approx(1.0, abs=1e-4)
+        assert side["ground_truth"]["center_error"]["max"] < 1e-9
+        assert side["ground_truth"]["auc"]["0.5"] == pytest.approx(1.0, abs=1e-4)
     table = result.table()
     assert max(map(len, table.splitlines())) <= 100
     for words in ("registered images", "6 of 6", "2.0 s", "10.0 s   5.00 x less", "4.50 x less", "2.00 x more",
@@ -120,7 +120,7 @@ def test_the_same_model_in_another_world_agrees(
 
 
 def test_known_differences_come_out(
-    workspace: Path, truth_file: Path, scene: Reconstruction, monkeypatch: pytest.MonkeyPatch
+    workspace: Path, ground_truth_file: Path, scene: Reconstruction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """pycolmap lost an image and turned another by one degree in place."""
     poses = scene.cam_from_world.copy()
@@ -130,7 +130,7 @@ def test_known_differences_come_out(
     other = with_poses(scene, poses)
     other.obs_is_inlier[other.tracks.obs_image_idx == 0] = False
     monkeypatch.setattr(pipeline, "ask_second_opinion", opinion_on(other, []))
-    result = pipeline.validate(workspace, truth_file)
+    result = pipeline.validate(workspace, ground_truth_file)
     assert result.agreement is not None
     assert result.pycolmap is not None
     assert result.agreement["num_common"] == NUM_IMAGES - 1
@@ -138,25 +138,25 @@ def test_known_differences_come_out(
     assert result.agreement["rotation_error_deg"]["median"] < 1e-5
     assert result.pycolmap["registered"] == NUM_IMAGES - 1
     # of 15 pairs 5 lost an image and 4 hold the turned one
-    assert result.pycolmap["truth"]["auc"]["0.5"] == pytest.approx(6 / 15, abs=1e-4)
-    assert result.pycolmap["truth"]["auc"]["5"] == pytest.approx((6 + 4 * 0.8) / 15, abs=1e-4)
+    assert result.pycolmap["ground_truth"]["auc"]["0.5"] == pytest.approx(6 / 15, abs=1e-4)
+    assert result.pycolmap["ground_truth"]["auc"]["5"] == pytest.approx((6 + 4 * 0.8) / 15, abs=1e-4)
     assert "5 of 6" in result.table()
 
 
-def test_truth_beyond_the_photographs_is_left_out(
-    workspace: Path, truth_file: Path, scene: Reconstruction, monkeypatch: pytest.MonkeyPatch
+def test_ground_truth_beyond_the_photographs_is_left_out(
+    workspace: Path, ground_truth_file: Path, scene: Reconstruction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A trajectory of a thousand frames is no failure of the six that were given."""
     monkeypatch.setattr(pipeline, "ask_second_opinion", opinion_on(scene, []))
-    document = json.loads(truth_file.read_text())
+    document = json.loads(ground_truth_file.read_text())
     document["cameras"] += [document["cameras"][0] | {"file": f"images/stranger{k}.jpg"} for k in range(3)]
     del document["cameras"][1]
-    truth_file.write_text(json.dumps(document))
-    result = pipeline.validate(workspace, truth_file)
-    assert result.ours["truth"]["num_reference_images"] == NUM_IMAGES - 1
-    assert result.ours["truth"]["auc"]["5"] == pytest.approx(1.0, abs=1e-4)
-    assert "3 entries of the truth have no photograph" in result.table()
-    assert "1 photographs are not in the truth" in result.table()
+    ground_truth_file.write_text(json.dumps(document))
+    result = pipeline.validate(workspace, ground_truth_file)
+    assert result.ours["ground_truth"]["num_reference_images"] == NUM_IMAGES - 1
+    assert result.ours["ground_truth"]["auc"]["5"] == pytest.approx(1.0, abs=1e-4)
+    assert "3 entries of the ground truth have no photograph" in result.table()
+    assert "1 photographs are not in the ground truth" in result.table()
 
 
 def test_no_model_of_pycolmap_and_no_opinion_at_all(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,14 +229,14 @@ def test_refusals(workspace: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError):
         pipeline.validate(tmp_path / "nowhere")
     with pytest.raises(InputError):
-        pipeline.validate(workspace, tmp_path / "no-truth.json")
+        pipeline.validate(workspace, tmp_path / "no-ground_truth.json")
     for path in (workspace / "sparse" / "0").iterdir():
         path.unlink()
     with pytest.raises(NoReconstructionError):
         pipeline.validate(workspace)
 
 
-def test_table_without_truth_or_opinion_has_no_gaps(workspace: Path) -> None:
+def test_table_without_ground_truth_or_opinion_has_no_gaps(workspace: Path) -> None:
     ours = {"registered": 3, "images": 3, "points": 5, "track_length": None, "reprojection_error_px": None,
             "wall_s": 1.0, "cpu_s": None, "peak_memory_mb": 10.0}  # fmt: skip
     empty = pipeline.Validation(ours, None, None, None, [])

@@ -176,14 +176,14 @@ def test_replay_survives_the_way_to_the_other_process(
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (0.6, 0, -0.8)])
 def test_up_is_found_from_level_cameras_however_they_are_held(up: tuple[float, float, float]) -> None:
-    truth = np.array(up, np.float64)
-    poses = ring(truth)
+    ground_truth = np.array(up, np.float64)
+    poses = ring(ground_truth)
     quarter = rigid3.from_matrix(rigid3.exp_so3([0, 0, np.pi / 2]), np.zeros(3))
     poses[0] = rigid3.compose(quarter, poses[0])  # one portrait among them
-    assert up_direction(poses) @ truth > np.cos(np.radians(25))
-    assert up_direction(ring(truth)) @ truth > np.cos(np.radians(0.1))
-    lying = rigid3.compose(np.tile(quarter, (NUM_IMAGES, 1)), ring(truth))
-    assert up_direction(lying) @ truth > np.cos(np.radians(0.1))
+    assert up_direction(poses) @ ground_truth > np.cos(np.radians(25))
+    assert up_direction(ring(ground_truth)) @ ground_truth > np.cos(np.radians(0.1))
+    lying = rigid3.compose(np.tile(quarter, (NUM_IMAGES, 1)), ring(ground_truth))
+    assert up_direction(lying) @ ground_truth > np.cos(np.radians(0.1))
 
 
 def test_up_of_cameras_side_by_side_is_the_top_of_the_images() -> None:

@@ -20,7 +20,7 @@ from sfmapp.geometry import rigid3, similarity
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.viewer import live as live_module
-from sfmapp.viewer.live import LiveView, Outbox, read_message, thinned_stride, write_message
+from sfmapp.viewer.live import LiveView, SendQueue, read_message, thinned_stride, write_message
 from sfmapp.viewer.live_scene import POINT_BLOCK, LiveMap, frustum_lines, unbroken
 from sfmapp.viewer.view import open_live_viewer, server_command, window_command
 
@@ -74,7 +74,7 @@ def test_long_recordings_show_fewer_images() -> None:
 
 
 def test_a_child_that_does_not_read_is_not_waited_for() -> None:
-    outbox = Outbox([sys.executable, "-c", "import time; time.sleep(60)"])
+    outbox = SendQueue([sys.executable, "-c", "import time; time.sleep(60)"])
     start = time.monotonic()
     image = np.zeros(1 << 20, np.uint8)
     for _ in range(400):
@@ -85,7 +85,7 @@ def test_a_child_that_does_not_read_is_not_waited_for() -> None:
 
 
 def test_a_child_that_dies_says_why() -> None:
-    outbox = Outbox([sys.executable, "-c", "raise SystemExit('no room left')"])
+    outbox = SendQueue([sys.executable, "-c", "raise SystemExit('no room left')"])
     outbox.put({"kind": "x"})
     assert outbox.close(20) == "exit code 1: no room left"
 
@@ -194,20 +194,24 @@ def test_lines_break_at_gaps() -> None:
     assert [len(line) for line in lines] == [2, 2, 2]
 
 
-def test_the_truth_is_laid_on_the_path_so_far() -> None:
+def test_the_ground_truth_is_laid_on_the_path_so_far() -> None:
     from sfmapp.evaluation.trajectory import Trajectory
 
     poses = path(40)
     scene = LiveMap(rigid3.IDENTITY)
-    truth_from_map = similarity.from_parts(rigid3.exp_so3(np.array([0.1, -0.4, 0.2])), np.array([3.0, 1, 2]), 2.5)
-    truth = Trajectory.from_cam_from_world(similarity.transform_poses(truth_from_map, poses), np.arange(40) / 10)
+    ground_truth_from_map = similarity.from_parts(
+        rigid3.exp_so3(np.array([0.1, -0.4, 0.2])), np.array([3.0, 1, 2]), 2.5
+    )
+    ground_truth = Trajectory.from_cam_from_world(
+        similarity.transform_poses(ground_truth_from_map, poses), np.arange(40) / 10
+    )
     for k in range(30):
         scene.add_frame(k, k / 10, poses[k])
-    found = scene.against(truth, "sim3")
+    found = scene.against(ground_truth, "sim3")
     assert found is not None
-    assert np.allclose(similarity.apply(found[0], truth.position[:30]), rigid3.center(poses[:30]), atol=1e-6)
+    assert np.allclose(similarity.apply(found[0], ground_truth.position[:30]), rigid3.center(poses[:30]), atol=1e-6)
     assert found[1] < 1e-6
-    assert LiveMap(rigid3.IDENTITY).against(truth, "sim3") is None
+    assert LiveMap(rigid3.IDENTITY).against(ground_truth, "sim3") is None
 
 
 def test_a_frustum_ends_at_the_corners_of_the_image() -> None:
@@ -262,7 +266,7 @@ def test_a_recording_holds_frames_map_and_plots(tmp_path: Path) -> None:
     assert rows["/log"] >= 9
     for name in ("live/map0/points/0", "live/map0/keyframes/0", "live/map0/path/0", "live/map1/path/0", "live/camera"):
         assert rows[f"/world/scene/{name}"] > 0, rows
-    for name in ("map0/points", "map0/path", "map0/keyframes", "map0/truth", "map1/path"):
+    for name in ("map0/points", "map0/path", "map0/keyframes", "map0/ground_truth", "map1/path"):
         assert rows[f"/world/scene/final/{name}"] == 1
 
 
@@ -270,8 +274,8 @@ def test_a_run_that_fails_leaves_neither_child_nor_file(tmp_path: Path) -> None:
     recording = tmp_path / "recording.rrd"
     view = LiveView(recording, None)
     view.begin(FakeSequence())
-    assert view._outbox is not None
-    child = view._outbox._child
+    assert view._send_queue is not None
+    child = view._send_queue._child
     waited = time.monotonic()
     while not list(tmp_path.iterdir()) and time.monotonic() - waited < 20:
         time.sleep(0.05)  # until the child has begun its file

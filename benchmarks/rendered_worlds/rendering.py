@@ -1,4 +1,4 @@
-"""A small ray caster: worlds of textured rectangles seen through any lens, with exact truth.
+"""A small ray caster: worlds of textured rectangles seen through any lens, with exact ground truth.
 
 What a pixel shows follows from the rectangle's homography alone. With the rectangle's corner p and edges a, b in the
 camera's frame, the ray d = (x, y, 1) meets the point p + u a + v b at depth z where ``[a b p] (u/z, v/z, 1/z) = d``:

@@ -1,4 +1,5 @@
-"""Rendered sequences with exact truth: a hand-held walk through a room, a drone in a hall, a drive round a block.
+"""Rendered sequences with exact ground truth: a hand-held walk through a room, a drone in a hall, a drive round a
+block.
 
 A sequence is plain arrays with one row for each frame, and the worlds that they are seen in; images are rendered when
 they are asked for, the same bytes every time. Edits (a blackout, a camera that stands still, a fast pan, frames from
@@ -79,7 +80,7 @@ class RenderedSequence:
         return [[Renderer(world, camera) for camera in self.rig.cameras] for world in self.worlds]
 
     @property
-    def truth(self) -> Array:
+    def ground_truth(self) -> Array:
         """(N, 7) cam_from_world of the rig's first camera, NaN for frames of another place."""
         return np.where((self.place == 0)[:, None], self.cam_from_world, np.nan)
 

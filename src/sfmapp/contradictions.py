@@ -1,6 +1,6 @@
 """Evidence in hand that a result does not agree with: said in words, in numbers, and in every sigma that hangs on it.
 
-The rule of the house: a contradiction is resolved, or it is red in the report, named in the terminal, and widens the
+The rule: a contradiction is resolved, or it is red in the report, named in the terminal, and widens the
 stated uncertainty. Stages find contradictions; reports and the command line only show them.
 """
 

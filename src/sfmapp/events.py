@@ -99,7 +99,7 @@ class Events:
         """A stop was asked for."""
         return self._cancelled.is_set()
 
-    def deaf(self) -> Events:
+    def without_cancellation(self) -> Events:
         """The same line to the same listeners without the wish to stop: for a stage that ends by itself, whole, when
         what it works on ends early."""
         other = copy.copy(self)

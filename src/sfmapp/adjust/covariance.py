@@ -3,9 +3,10 @@
 The information is that of the adjustment at its minimum, undamped: reprojections divided by the variance of the noise,
 priors and gtsam factors as they are. What the observations cannot tell, in a free network the seven degrees of a
 similarity (six where a rig with a baseline measures lengths), is taken out by inner constraints (Triggs et al. 1999,
-section 9): among all equivalent reconstructions the errors are those of the one whose poses lie nearest to the truth,
-in the sum of ``|v|^2 + s^2 |w|^2`` over the poses, where w and v are rotation and translation errors and s is the rms
-distance of the centres from their mean. Compare with a known truth by :func:`errors_in_gauge`. For covariances relative
+section 9): among all equivalent reconstructions the errors are those of the one whose poses lie nearest to the ground
+ground truth, in the sum of ``|v|^2 + s^2 |w|^2`` over the poses, where w and v are rotation and translation errors and
+s is the rms distance of the centres from their mean. Compare with a known ground truth by :func:`errors_in_gauge`. For
+covariances relative
 to one image or frame hold that constant: with a baseline nothing is then left open, without one the scale.
 """
 
@@ -261,20 +262,20 @@ def pose_covariances(
 
 
 def errors_in_gauge(
-    estimate: Reconstruction, truth: Reconstruction, covariances: Covariances
+    estimate: Reconstruction, ground_truth: Reconstruction, covariances: Covariances
 ) -> tuple[Array, list[Array], Array]:
     """Errors of an estimate in the tangents and the gauge of its covariances.
 
-    Where the gauge was free (``num_gauge`` 7 or 6) the truth is moved by the similarity, or rigid motion, that this
-    module's gauge asks for; otherwise both must be in the same frame.
+    Where the gauge was free (``num_gauge`` 7 or 6) the ground truth is moved by the similarity, or rigid motion, that
+    this module's gauge asks for; otherwise both must be in the same frame.
 
     Returns:
         poses (n, 6), intrinsics m times (Q,), and points (p, 3).
     """
     images = covariances.image_idx
-    wanted = _moved_to_gauge(estimate, truth, images, covariances.num_gauge)
+    wanted = _moved_to_gauge(estimate, ground_truth, images, covariances.num_gauge)
     intrinsics = [
-        (estimate.cameras[c].params - truth.cameras[c].params)[free]
+        (estimate.cameras[c].params - ground_truth.cameras[c].params)[free]
         for c, free in zip(covariances.camera_idx, covariances.free_params, strict=True)
     ]
     points = estimate.point_xyz[covariances.track_idx] - wanted.point_xyz[covariances.track_idx]
@@ -282,18 +283,18 @@ def errors_in_gauge(
 
 
 def pose_errors_in_gauge(
-    estimate: Reconstruction, truth: Reconstruction, image_idx: NDArray[np.int64], num_gauge: int
+    estimate: Reconstruction, ground_truth: Reconstruction, image_idx: NDArray[np.int64], num_gauge: int
 ) -> Array:
     """(n, 6) errors of the poses of images (n,) alone, as of :func:`errors_in_gauge`."""
-    wanted = _moved_to_gauge(estimate, truth, image_idx, num_gauge)
+    wanted = _moved_to_gauge(estimate, ground_truth, image_idx, num_gauge)
     return _pose_errors(estimate.cam_from_world[image_idx], wanted.cam_from_world[image_idx])
 
 
 def _moved_to_gauge(
-    estimate: Reconstruction, truth: Reconstruction, images: NDArray[np.int64], freedoms: int
+    estimate: Reconstruction, ground_truth: Reconstruction, images: NDArray[np.int64], freedoms: int
 ) -> Reconstruction:
-    """The truth, moved to where this module's gauge compares it with the estimate."""
-    wanted = truth.copy()
+    """The ground truth, moved to where this module's gauge compares it with the estimate."""
+    wanted = ground_truth.copy()
     reached = estimate.distinct_poses(images)[0]
     for _ in range(20 if freedoms >= 6 else 0):
         poses = wanted.distinct_poses(images)[0]
@@ -306,9 +307,9 @@ def _moved_to_gauge(
     return wanted
 
 
-def _pose_errors(estimate: Array, truth: Array) -> Array:
-    """(n, 6) w and v with ``estimate = (exp(w), v) truth``, poses (n, 7)."""
-    delta = rigid3.compose(estimate, rigid3.inverse(truth))
+def _pose_errors(estimate: Array, ground_truth: Array) -> Array:
+    """(n, 6) w and v with ``estimate = (exp(w), v) ground_truth``, poses (n, 7)."""
+    delta = rigid3.compose(estimate, rigid3.inverse(ground_truth))
     return np.concatenate([rigid3.log_so3(rigid3.rotation_matrix(delta)), delta[:, 4:]], 1)
 
 

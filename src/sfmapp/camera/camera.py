@@ -1,7 +1,7 @@
 """Cameras: models, parameters, projection and its inverse.
 
 Models and the order of their parameters are COLMAP's. Inside kernels a camera is the canonical row of
-:mod:`sfmapp.camera.lens`. Pixels follow the house rule: the centre of the top-left pixel is (0.5, 0.5).
+:mod:`sfmapp.camera.lens`. Pixels follow COLMAP's convention: the centre of the top-left pixel is (0.5, 0.5).
 """
 
 from __future__ import annotations

@@ -88,7 +88,7 @@ def _add_dense_flags(parser: argparse.ArgumentParser) -> None:
     group = _add_option_flags(parser)
     group.add_argument("--level", metavar="N", help="halve the photographs N times; default: 1600 px or less a side")
     group.add_argument("--ground-sampling", metavar="D", help="instead: what a pixel measures, in units of the world")
-    group.add_argument("--masks", metavar="DIR", help="folder of masks named IMAGE.png; black is ignored")
+    group.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black is ignored")
     group.add_argument(
         "--region", metavar=("X", "Y", "Z", "X", "Y", "Z"), nargs=6,
         help="lower and upper corner of the box to reconstruct",
@@ -115,7 +115,7 @@ def _dense(args: argparse.Namespace) -> int:
     flags = {
         "dense.level": args.level,
         "dense.ground_sampling": args.ground_sampling,
-        "images.mask_path": args.masks,
+        "images.mask_path": args.mask_path,
         "dense.region": None if args.region is None else ",".join(args.region),
         "dense.max_memory_mb": args.max_memory,
     }

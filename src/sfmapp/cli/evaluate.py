@@ -1,4 +1,4 @@
-"""``sfmapp evaluate``: a trajectory against the truth."""
+"""``sfmapp evaluate``: a trajectory against the ground truth."""
 
 from __future__ import annotations
 
@@ -25,14 +25,17 @@ formats, told apart by what is in the files:
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command of this family to the parser."""
     parser = commands.add_parser(
-        "evaluate", help="hold a trajectory against the truth: ATE, RPE, KITTI's drift, and a picture",
+        "evaluate", help="hold a trajectory against the ground truth: ATE, RPE, KITTI's drift, and a picture",
         description="Print the absolute error (ATE), the relative error (RPE) and KITTI's t_rel and r_rel of a "
-        "trajectory, and draw it against the truth.",
+        "trajectory, and draw it against the ground truth.",
         epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("trajectory", metavar="TRAJ", type=Path, help="the estimate, or the folder of an odometry run")
     parser.add_argument(
-        "truth", metavar="TRUTH", type=Path, help="the true poses: a file, or the folder of a sequence that has them"
+        "ground_truth",
+        metavar="GROUND_TRUTH",
+        type=Path,
+        help="the true poses: a file, or the folder of a sequence that has them",
     )
     pairs = parser.add_argument_group("pairs of poses")
     pairs.add_argument("--max-diff", metavar="SECONDS", type=float, default=0.01,
@@ -48,8 +51,8 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
                         "repeated; default: a frame, a second, and about a tenth of the path")  # fmt: skip
     errors.add_argument("--all-pairs", action="store_true",
                         help="RPE over motions from every pose, not from where the one before has ended")  # fmt: skip
-    errors.add_argument("--pairs-from", choices=("truth", "estimate"), default="truth",
-                        help="whose path measures the metres of --delta; default: truth")  # fmt: skip
+    errors.add_argument("--pairs-from", choices=("ground_truth", "estimate"), default="ground_truth",
+                        help="whose path measures the metres of --delta; default: ground truth")  # fmt: skip
     drawing = parser.add_argument_group("picture").add_mutually_exclusive_group()
     drawing.add_argument("--plot", metavar="PNG", type=Path, help="where to draw it; default: TRAJ.png")
     drawing.add_argument("--no-plot", action="store_true", help="no picture")
@@ -68,7 +71,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         is_overlapping=args.all_pairs,
         is_by_estimate=args.pairs_from == "estimate",
     )
-    result = evaluate(args.trajectory, args.truth, options, times=args.times)
+    result = evaluate(args.trajectory, args.ground_truth, options, times=args.times)
     try:  # before the table, which may go to a pipe that closes early
         picture = None if args.no_plot else _draw(result, args.plot)
     finally:

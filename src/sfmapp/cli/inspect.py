@@ -22,16 +22,20 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=_view)
 
     parser = commands.add_parser(
-        "validate", help="compare with pycolmap on the same photographs, and with the truth",
-        description="Run pycolmap on the same photographs and print both results side by side; with --truth-cloud, "
-        "score the dense cloud and the mesh instead.",
+        "validate", help="compare with pycolmap on the same photographs, and with the ground truth",
+        description="Run pycolmap on the same photographs and print both results side by side; with "
+        "--ground-truth-cloud, score the dense cloud and the mesh instead.",
     )  # fmt: skip
-    parser.add_argument("output", metavar="OUT", type=Path, help="folder of a run; with --truth-cloud also a PLY")
-    parser.add_argument("--truth", metavar="FILE", type=Path, help="COLMAP model, cameras.json or TUM trajectory")
     parser.add_argument(
-        "--truth-cloud", metavar="PLY", type=Path,
-        help="true cloud or mesh: accuracy, completeness and F-score at 1, 2 and 5 times a distance; with --truth the "
-        "result is first aligned by its cameras",
+        "output", metavar="OUT", type=Path, help="folder of a run; with --ground-truth-cloud also a PLY"
+    )
+    parser.add_argument(
+        "--ground-truth", metavar="FILE", type=Path, help="COLMAP model, cameras.json or TUM trajectory"
+    )
+    parser.add_argument(
+        "--ground-truth-cloud", metavar="PLY", type=Path,
+        help="true cloud or mesh: accuracy, completeness and F-score at 1, 2 and 5 times a distance; with "
+        "--ground-truth the result is first aligned by its cameras",
     )  # fmt: skip
     parser.add_argument(
         "--distance",
@@ -75,16 +79,20 @@ def _validate(args: argparse.Namespace) -> int:
     from sfmapp.pipelines.validate import Validation, validate
     from sfmapp.pipelines.validate_cloud import CloudValidation, validate_cloud
 
-    if args.distance is not None and args.truth_cloud is None:
-        raise UsageError("--distance is of no use without --truth-cloud")
+    if args.distance is not None and args.ground_truth_cloud is None:
+        raise UsageError("--distance is of no use without --ground-truth-cloud")
     with listening(args) as events:
         result: Validation | CloudValidation
-        if args.truth_cloud is not None:
+        if args.ground_truth_cloud is not None:
             result = validate_cloud(
-                args.output, args.truth_cloud, truth_poses=args.truth, distance=args.distance, events=events
+                args.output,
+                args.ground_truth_cloud,
+                ground_truth_poses=args.ground_truth,
+                distance=args.distance,
+                events=events,
             )
         else:
-            result = validate(args.output, args.truth, events=events)
+            result = validate(args.output, args.ground_truth, events=events)
     if args.json:
         print_json({"exit_code": 0, **result.to_dict()})
     else:

@@ -14,6 +14,7 @@ from sfmapp.cli.signals import signals_interrupt
 from sfmapp.cli.streams import standard_streams
 from sfmapp.errors import InputError, InterruptedRunError, SfmError, refusal
 from sfmapp.kernel_cache import ADVICE, is_without_cache
+from sfmapp.packages import missing_package
 
 EXIT_CODES = """\
 exit codes: 0 done, 1 a bug, 2 usage, 3 bad input, or no room for what is to be written or held in memory,
@@ -54,7 +55,9 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _known(error: Exception) -> SfmError | None:
-    """What is no bug: a refusal of the system, or kernels that find no place."""
+    """What is no bug: a refusal of the system, a package that is not installed, or kernels that find no place."""
+    if isinstance(error, ModuleNotFoundError):
+        return missing_package(error)
     if isinstance(error, OSError):
         return refusal(error)
     if isinstance(error, RuntimeError) and str(error).startswith("Symlink loop"):  # of pathlib, before Python 3.13
@@ -77,6 +80,8 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for family in (reconstruct, dense, odometry, evaluate, inspect, convert, undistort):
         family.add_commands(commands)
+    for command in commands.choices.values():
+        command.allow_abbrev = False  # half a flag would mean another one as soon as there are more
     return parser
 
 

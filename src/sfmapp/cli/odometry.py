@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 EXAMPLES = """\
 examples:
   sfmapp odometry walk.mp4 -o out/ --camera PINHOLE,525,525,320,240 --view
-  sfmapp odometry dataset/sequences/00 -o out/ --truth poses/00.txt
+  sfmapp odometry dataset/sequences/00 -o out/ --ground-truth poses/00.txt
   sfmapp odometry MH_01_easy -o out/ --mono --scale imu
   sfmapp odometry frames/ -o out/ --camera calib.json --scale marker:DICT_4X4_50:0.16
 
 Frames come from a folder of images, a video or stream, or a sequence of KITTI, TUM or EuRoC, whose cameras, times,
-truth and IMU are found by themselves. With two cameras lengths are metres; with one their unit is arbitrary unless
---scale tells it. OUT/report.html tells how good it is, where there are gaps, and why."""
+ground truth and IMU are found by themselves. With two cameras lengths are metres; with one their unit is arbitrary
+unless --scale tells it. OUT/report.html tells how good it is, where there are gaps, and why."""
 
 SCALE = (
     "where metres come from: marker:DICT:METRES (side of an ArUco or AprilTag marker), distance:A:B:METRES (between "
@@ -52,7 +52,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     _add_sequence_flags(parser)
     group = parser.add_argument_group("looking at it")
     group.add_argument("--view", action="store_true", help="watch in rerun while it runs")
-    group.add_argument("--no-record", action="store_true", help="do not write recording.rrd, which replays the run")
+    group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, which replays the run")
     _add_option_flags(parser)
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_odometry, parser=parser)
@@ -75,7 +75,7 @@ def _add_sequence_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--camera", metavar="MODEL,...|FILE", help="intrinsics, such as PINHOLE,fx,fy,cx,cy, or a file")
     group.add_argument("--self-calibrate", action="store_true", help="find them from the first minute")
     group.add_argument("--mono", action="store_true", help="use the first camera alone")
-    group.add_argument("--truth", metavar="FILE", help="true trajectory of TUM, KITTI or EuRoC, to compare with")
+    group.add_argument("--ground-truth", metavar="FILE", help="true trajectory of TUM, KITTI or EuRoC, to compare with")
     group.add_argument("--imu", metavar="FILE", help="inertial measurements in EuRoC's form")
     group.add_argument("--scale", metavar="SOURCE", help=SCALE)
     group.add_argument("--start", metavar="N", help="first frame to play")
@@ -98,7 +98,7 @@ def _options(args: argparse.Namespace) -> Options:
     limit_library_threads()
     from sfmapp.workspace.options import load_options
 
-    named = ("camera", "truth", "imu", "start", "stop", "step", "fps")
+    named = ("camera", "ground_truth", "imu", "start", "stop", "step", "fps")
     flags: dict[str, Any] = {"seed": args.seed, "threads": args.threads, "scale.source": args.scale}
     flags |= {f"sequence.{name}": getattr(args, name) for name in named}
     flags |= {f"sequence.{name}": True for name in ("mono", "reverse") if getattr(args, name)}
@@ -120,7 +120,7 @@ def _odometry(args: argparse.Namespace) -> int:
     try:
         with listening(args) as events:
             result = track_sequence(
-                args.sequence, args.output, options, events=events, record=not args.no_record,
+                args.sequence, args.output, options, events=events, record=not args.no_recording,
                 screen=viewer.screen if viewer else None, self_calibrate=args.self_calibrate, watch=watch,
             )  # fmt: skip
     except BaseException:
@@ -154,7 +154,7 @@ def _refine(args: argparse.Namespace) -> int:
         )  # fmt: skip
     report = result.report
     if args.json:
-        named = ("maps", "truth", "photographs", "run")
+        named = ("maps", "ground_truth", "photographs", "run")
         print_json({"exit_code": 0, "output": str(output), **{name: report[name] for name in named}})
     elif not args.quiet:
         _print_refined(output, report)
@@ -167,9 +167,9 @@ def _print_refined(output: Path, report: dict[str, Any]) -> None:
             f"map {after['idx']}: {before['num_points']} to {after['num_points']} points, reprojection error"
             f" {before['mean_reprojection_error_px']:.3f} to {after['mean_reprojection_error_px']:.3f} px"
         )
-    for before, after in zip(report["truth"]["before"], report["truth"]["after"], strict=False):
+    for before, after in zip(report["ground_truth"]["before"], report["ground_truth"]["after"], strict=False):
         errors = [row["ate_m"]["rmse"] for row in (before, after)]
-        print(f"  against the truth: {errors[0]:.4f} to {errors[1]:.4f} m rmse ({before['alignment'].upper()})")
+        print(f"  against the ground truth: {errors[0]:.4f} to {errors[1]:.4f} m rmse ({before['alignment'].upper()})")
     photos, run = report["photographs"], report["run"]
     if photos:
         print(f"{sum(row['is_registered'] for row in photos)} of {len(photos)} photographs registered")
@@ -196,7 +196,7 @@ def summary(output: Path, report: dict[str, Any]) -> dict[str, Any]:
     paths = {name: str(output / path) for name, path in (
         ("trajectory", "trajectory.tum"), ("model", "sparse/0"), ("report", "report.json"),
     )}  # fmt: skip
-    named = ("frames", "maps", "truth", "timing", "run")
+    named = ("frames", "maps", "ground_truth", "timing", "run")
     return {"output": str(output), **paths, **{name: report[name] for name in named}}
 
 
@@ -216,11 +216,11 @@ def _print_summary(args: argparse.Namespace, report: dict[str, Any]) -> None:
     if len(report["maps"]) > 1:
         sizes = ", ".join(str(other["num_frames"]) for other in report["maps"])
         print(f"  it falls into {len(report['maps'])} maps of {sizes} frames, each with a world of its own")
-    for row in report["truth"]:
+    for row in report["ground_truth"]:
         if row["poses"] == "final":
             ate, which = row["ate_m"], f", map {row['map']}" if row["map"] else ""
             print(
-                f"  against the truth{which}: off by {ate['rmse']:.3f} m rmse,"
+                f"  against the ground truth{which}: off by {ate['rmse']:.3f} m rmse,"
                 f" {ate['max']:.3f} m at worst, over {row['true_path_m']:.1f} m ({row['alignment'].upper()})"
             )
     print_contradictions(row for found in report["maps"] for row in found["contradictions"])
@@ -228,5 +228,5 @@ def _print_summary(args: argparse.Namespace, report: dict[str, Any]) -> None:
         f"{took(run)}; {timing['cpu_ms_per_frame']:.1f} CPU ms a frame,"
         f" {timing['frames_per_second']:.1f} frames a second"
     )
-    looks = "" if args.no_record else f"; look at it: sfmapp view {output}"
+    looks = "" if args.no_recording else f"; look at it: sfmapp view {output}"
     print(f"trajectory {output / 'trajectory.tum'}, report {output / 'report.html'}{looks}")

@@ -51,8 +51,9 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=_reconstruct, parser=parser)
 
     parser = commands.add_parser(
-        "demo", help="reconstruct the bundled sample and compare it with the truth",
-        description="Reconstruct the bundled sample, a rendered courtyard, and print the pose error against the truth.",
+        "demo", help="reconstruct the bundled sample and compare it with the ground truth",
+        description="Reconstruct the bundled sample, a rendered courtyard, and print the pose error against the "
+        "ground truth.",
     )  # fmt: skip
     parser.add_argument("-o", "--output", metavar="OUT", type=Path, default=Path("demo"), help="default: demo")
     _add_option_flags(parser)
@@ -136,21 +137,21 @@ def _go_on(args: argparse.Namespace, options: Options) -> dict[str, Any]:
 
 def _demo(args: argparse.Namespace) -> int:
     options = _options(args)
-    from sfmapp.pipelines.demo import compare_with_truth
+    from sfmapp.pipelines.demo import compare_with_ground_truth
     from sfmapp.workspace.resources import sample_folder
 
     sample = sample_folder()
     report = _run(args, str(sample / "images"), options)
-    errors = compare_with_truth(args.output, sample)
+    errors = compare_with_ground_truth(args.output, sample)
     if args.json:
-        print_json({"exit_code": 0, **_result(args.output, report), "truth": errors})
+        print_json({"exit_code": 0, **_result(args.output, report), "ground_truth": errors})
         return 0
     if not args.quiet:
         _print_summary(args.output, report)
     center, rotation = errors["center_error"], errors["rotation_error_deg"]
     whose = f"{errors['num_common']} of {errors['num_reference_images']} images, {errors['scene_size']:.1f} m apart"
     print(
-        f"against the truth: camera centres off by {1000 * center['mean']:.2f} mm on average,"
+        f"against the ground truth: camera centres off by {1000 * center['mean']:.2f} mm on average,"
         f" {1000 * center['max']:.2f} mm at worst; rotations by {rotation['mean']:.4f} and {rotation['max']:.4f}"
         f" degrees ({whose})"
     )

@@ -166,7 +166,7 @@ def try_cells(  # type: ignore[no-untyped-def]
         if deviation < f32(LEAST_DEVIATION) * images.noise[m]:
             continue
         there = cells.patch[LAYERS * cell_of(images, m, u, v)] if wave >= 0 else np.int32(-1)
-        known = likeness(images, store, m, uf, vf, there, work) if there >= 0 else f32(-1.0)
+        known = zncc_with_patch(images, store, m, uf, vf, there, work) if there >= 0 else f32(-1.0)
         if known > CONTENT:
             continue
         parent = choose(images, store, m, uf, vf, candidate, work)
@@ -299,7 +299,7 @@ def choose(images, store, m, u, v, row, work):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def likeness(images, store, m, u, v, p, work):  # type: ignore[no-untyped-def]
+def zncc_with_patch(images, store, m, u, v, p, work):  # type: ignore[no-untyped-def]
     """Mean NCC of a patch, seen from view m at (u, v), with the first images that trust it."""
     wu, wv, w = plane_in_view(images, m, offset(store.xyz, 3 * p), offset(store.normal, 3 * p))
     w0 = f32(wu * u + wv * v + w)

@@ -13,7 +13,7 @@ import numpy as np
 from numba import float32 as f32
 
 from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
-from sfmapp.dense.expand import BETTER, CONTRAST, LEAST_CONTRAST, LEAST_DEVIATION, likeness
+from sfmapp.dense.expand import BETTER, CONTRAST, LEAST_CONTRAST, LEAST_DEVIATION, zncc_with_patch
 from sfmapp.dense.patch_kernels import holds_window, project
 from sfmapp.dense.window import read_reference
 from sfmapp.simd.pointers import offset, pointer
@@ -41,8 +41,8 @@ def weigh_layers(image_arrays, store_arrays, cell_arrays, m, cell_idx, first, la
                 continue
             if read_reference(quads, width, u, v, contrast, work) < f32(LEAST_DEVIATION) * images.noise[m]:
                 continue
-            own = likeness(images, store, m, f32(u), f32(v), p, work)
-            other = likeness(images, store, m, f32(u), f32(v), q, work)
+            own = zncc_with_patch(images, store, m, f32(u), f32(v), p, work)
+            other = zncc_with_patch(images, store, m, f32(u), f32(v), q, work)
             if own > f32(-1.0) and other - own > worst:
                 loser[i], worst = p, other - own
 

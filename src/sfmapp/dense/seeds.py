@@ -21,8 +21,8 @@ from sfmapp.dense.expand import (
     CONTRAST,
     LEAST_CONTRAST,
     is_second_layer,
-    likeness,
     slots_of,
+    zncc_with_patch,
 )
 from sfmapp.dense.patch_kernels import Trial, cell_of, holds_window, judge, measure, project, refine
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
@@ -94,7 +94,7 @@ def match_corners(  # type: ignore[no-untyped-def]
             continue
         cell = cell_of(images, m, u, v)
         there = cells.patch[LAYERS * cell] if cell >= 0 else np.int32(-1)
-        known = likeness(images, store, m, f32(u), f32(v), there, work) if there >= 0 else f32(-1.0)
+        known = zncc_with_patch(images, store, m, f32(u), f32(v), there, work) if there >= 0 else f32(-1.0)
         if known > CONTENT:
             continue
         likes[:] = LEAST_SUPPORT

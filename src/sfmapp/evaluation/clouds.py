@@ -39,7 +39,7 @@ class CloudScore:
         accuracy, completeness, f_score: (T,) shares, 0 to 1.
         point_distance: (N,) of each reconstructed point to the nearest true one, inf beyond the last of ``distances``,
             NaN for points that were not scored (not finite, or outside the box).
-        truth_distance: (M,) likewise of each true point to the nearest reconstructed one.
+        ground_truth_distance: (M,) likewise of each true point to the nearest reconstructed one.
     """
 
     distances: Array
@@ -47,17 +47,17 @@ class CloudScore:
     completeness: Array
     f_score: Array
     point_distance: Array
-    truth_distance: Array
+    ground_truth_distance: Array
 
     def summary(self) -> dict[str, Any]:
         """JSON-able numbers."""
-        point, truth = ~np.isnan(self.point_distance), ~np.isnan(self.truth_distance)
+        point, ground_truth = ~np.isnan(self.point_distance), ~np.isnan(self.ground_truth_distance)
         within = self.point_distance[np.isfinite(self.point_distance)]
         return {
             "num_points": int(point.sum()),
             "num_points_left_out": int((~point).sum()),
-            "num_truth": int(truth.sum()),
-            "num_truth_left_out": int((~truth).sum()),
+            "num_ground_truth": int(ground_truth.sum()),
+            "num_ground_truth_left_out": int((~ground_truth).sum()),
             "median_error": float(np.median(within)) if len(within) else None,
             "scores": [
                 {"distance": float(d), "accuracy": float(a), "completeness": float(c), "f_score": float(f)}
@@ -68,36 +68,38 @@ class CloudScore:
 
 def score_cloud(
     xyz: ArrayLike,
-    truth: ArrayLike,
+    ground_truth: ArrayLike,
     distances: Sequence[float],
     *,
     box: tuple[ArrayLike, ArrayLike] | None = None,
     threads: int = 1,
 ) -> CloudScore:
-    """Score a reconstructed cloud against the truth.
+    """Score a reconstructed cloud against the ground truth.
 
     Points that are not finite, and those outside the box, are left out on both sides. Without reconstructed points, or
     without true ones, all shares are 0. The result does not depend on the number of threads.
 
     Args:
         xyz: (N, 3) reconstructed points.
-        truth: (M, 3) true points, same frame and unit.
+        ground_truth: (M, 3) true points, same frame and unit.
         distances: T thresholds > 0; a point at exactly that distance counts as within it.
         box: low and high corners (3,) of what is scored; None: everything.
         threads: of the search for nearest neighbours.
     """
-    points, true_points = _as_points(xyz), _as_points(truth)
+    points, true_points = _as_points(xyz), _as_points(ground_truth)
     limits = np.sort(np.asarray(distances, np.float64).ravel())
     if not len(limits) or not (np.isfinite(limits) & (limits > 0)).all():
         raise ValueError(f"expected distances above 0, found {limits}")
     is_scored, is_true = _is_scored(points, box), _is_scored(true_points, box)
-    point_distance, truth_distance = np.full(len(points), np.nan), np.full(len(true_points), np.nan)
+    point_distance, ground_truth_distance = np.full(len(points), np.nan), np.full(len(true_points), np.nan)
     point_distance[is_scored] = nearest_distance(points[is_scored], true_points[is_true], limits[-1], threads=threads)
-    truth_distance[is_true] = nearest_distance(true_points[is_true], points[is_scored], limits[-1], threads=threads)
-    accuracy, completeness = _shares(point_distance[is_scored], limits), _shares(truth_distance[is_true], limits)
+    ground_truth_distance[is_true] = nearest_distance(
+        true_points[is_true], points[is_scored], limits[-1], threads=threads
+    )
+    accuracy, completeness = _shares(point_distance[is_scored], limits), _shares(ground_truth_distance[is_true], limits)
     both = accuracy + completeness
     f_score = np.divide(2 * accuracy * completeness, both, out=np.zeros_like(both), where=both > 0)
-    return CloudScore(limits, accuracy, completeness, f_score, point_distance, truth_distance)
+    return CloudScore(limits, accuracy, completeness, f_score, point_distance, ground_truth_distance)
 
 
 def nearest_distance(xyz: Array, others: Array, limit: float, *, threads: int = 1) -> Array:

@@ -158,25 +158,30 @@ def pair_errors_deg(cam_from_world: ArrayLike, reference_cam_from_world: ArrayLi
     poses, reference = _as_poses(cam_from_world), _as_poses(reference_cam_from_world)
     if len(poses) != len(reference):
         raise ValueError(f"{len(poses)} estimated poses, {len(reference)} reference poses")
-    rotation, truth_rotation = rigid3.rotation_matrix(poses), rigid3.rotation_matrix(reference)
-    center, truth_center = rigid3.center(poses), rigid3.center(reference)
+    rotation, ground_truth_rotation = rigid3.rotation_matrix(poses), rigid3.rotation_matrix(reference)
+    center, ground_truth_center = rigid3.center(poses), rigid3.center(reference)
     no_baseline = _NO_BASELINE * scene_size(reference)
     registered = _has_pose(poses)
     estimate_size = scene_size(poses[registered])
     rows = [np.zeros(0)]
     for i in range(len(poses) - 1):  # row by row: N^2 matrices at once would be gigabytes for thousands of images
         j = slice(i + 1, None)
-        relative, truth_relative = rotation[j] @ rotation[i].T, truth_rotation[j] @ truth_rotation[i].T
+        relative, ground_truth_relative = (
+            rotation[j] @ rotation[i].T,
+            ground_truth_rotation[j] @ ground_truth_rotation[i].T,
+        )
         # j_from_i translation = R_j (c_i - c_j)
         step = np.einsum("nij,nj->ni", rotation[j], center[i] - center[j])
-        truth_step = np.einsum("nij,nj->ni", truth_rotation[j], truth_center[i] - truth_center[j])
-        direction = np.degrees(
-            np.arctan2(np.linalg.norm(np.cross(step, truth_step), axis=1), np.sum(step * truth_step, 1))
+        ground_truth_step = np.einsum(
+            "nij,nj->ni", ground_truth_rotation[j], ground_truth_center[i] - ground_truth_center[j]
         )
-        has_truth = np.linalg.norm(truth_step, axis=1) > no_baseline
+        direction = np.degrees(
+            np.arctan2(np.linalg.norm(np.cross(step, ground_truth_step), axis=1), np.sum(step * ground_truth_step, 1))
+        )
+        has_ground_truth = np.linalg.norm(ground_truth_step, axis=1) > no_baseline
         has_step = np.linalg.norm(step, axis=1) > _NO_BASELINE * estimate_size
-        direction = np.where(has_truth, np.where(has_step, direction, np.inf), 0.0)
-        error = np.maximum(_angle_between_deg(relative, truth_relative), direction)
+        direction = np.where(has_ground_truth, np.where(has_step, direction, np.inf), 0.0)
+        error = np.maximum(_angle_between_deg(relative, ground_truth_relative), direction)
         rows.append(np.where(registered[i] & registered[j], error, np.inf))
     return np.concatenate(rows)
 

@@ -19,6 +19,7 @@ from typing import Any, Literal
 from sfmapp.errors import InputError, SfmError
 from sfmapp.evaluation.measured import high_water_mark_mb, run_measured
 from sfmapp.events import Events
+from sfmapp.packages import require
 
 STAGE = "second_opinion"
 
@@ -120,7 +121,7 @@ def ask_second_opinion(
         events: progress and cancellation.
 
     Raises:
-        InputError: the image folder is missing.
+        InputError: the image folder is missing, or pycolmap is not installed.
         SfmError: pycolmap failed or crashed; the message holds the end of its log.
     """
     options, events = options or SecondOpinionOptions(), events or Events()
@@ -138,6 +139,7 @@ def ask_second_opinion(
     request_text = json.dumps(request, indent=1)
     if fingerprint and answer_path.is_file() and request_path.is_file() and request_path.read_text() == request_text:
         return SecondOpinion(**json.loads(answer_path.read_text()))
+    require("pycolmap")
     output.mkdir(parents=True, exist_ok=True)
     _remove_old(output)
     request_path.write_text(request_text)

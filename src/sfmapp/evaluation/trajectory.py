@@ -5,15 +5,15 @@ Definitions, with their sources:
 - *association*: each pose of the trajectory that has fewer of them is paired with the nearest in time of the other
   (Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012).
 - *absolute error* (ATE): after an alignment over all pairs, the distance of positions and the angle of
-  ``R_truth^T R_estimate``. The alignment is Umeyama's closed form (PAMI 1991) over the positions; ``se3`` keeps the
-  scale at one (Zhang and Scaramuzza, "A tutorial on quantitative trajectory evaluation", IROS 2018).
+  ``R_ground_truth^T R_estimate``. The alignment is Umeyama's closed form (PAMI 1991) over the positions; ``se3`` keeps
+  the scale at one (Zhang and Scaramuzza, "A tutorial on quantitative trajectory evaluation", IROS 2018).
 - *relative error* (RPE): length and angle of ``(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`` for true poses Q and estimated ones P a
   given number of frames, seconds or metres apart (Sturm et al.). No alignment is involved, but a scale may be.
 - *drift* (t_rel, r_rel): the relative error over stretches of 100, 200, ..., 800 m of the true path that begin at every
   tenth frame, divided by their length, mean over all stretches (Geiger et al., "Are we ready for autonomous driving?",
   CVPR 2012, and the development kit of the odometry benchmark).
 
-Positions are those of the body (camera) in the world. Lengths are in the unit of the truth, taken to be metres.
+Positions are those of the body (camera) in the world. Lengths are in the unit of the ground truth, taken to be metres.
 """
 
 from __future__ import annotations
@@ -102,22 +102,22 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Pairs:
-    """An estimate and the truth at the same P moments, in the order of time.
+    """An estimate and the ground truth at the same P moments, in the order of time.
 
     Attributes:
-        estimate, truth: P poses each.
-        estimate_idx, truth_idx: (P,) their positions in the whole trajectories.
-        num_estimate, num_truth: poses of the whole trajectories, gaps left out.
-        coverage: share, 0 to 1, of the truth's duration over which there is an estimate (see :func:`associate`).
+        estimate, ground_truth: P poses each.
+        estimate_idx, ground_truth_idx: (P,) their positions in the whole trajectories.
+        num_estimate, num_ground_truth: poses of the whole trajectories, gaps left out.
+        coverage: share, 0 to 1, of the ground truth's duration over which there is an estimate (see :func:`associate`).
         is_gap: (P,) bool: much time (or a number) has passed since the pose before.
     """
 
     estimate: Trajectory
-    truth: Trajectory
+    ground_truth: Trajectory
     estimate_idx: Indices
-    truth_idx: Indices
+    ground_truth_idx: Indices
     num_estimate: int
-    num_truth: int
+    num_ground_truth: int
     coverage: float
     is_gap: NDArray[np.bool_]
 
@@ -126,9 +126,9 @@ class Pairs:
 
     @property
     def clock(self) -> Array:
-        """(P,) seconds of the truth, or numbers of frames where there are no timestamps."""
-        times = self.truth.timestamps_s
-        return times if times is not None else self.truth_idx.astype(np.float64)
+        """(P,) seconds of the ground truth, or numbers of frames where there are no timestamps."""
+        times = self.ground_truth.timestamps_s
+        return times if times is not None else self.ground_truth_idx.astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -136,19 +136,19 @@ class AbsoluteError:
     """Errors at P moments after an alignment.
 
     Attributes:
-        truth_from_estimate: (8,) similarity that was applied.
+        ground_truth_from_estimate: (8,) similarity that was applied.
         translation_m: (P,). rotation_deg: (P,) degrees, 0 to 180.
-        aligned: the estimate in the world of the truth.
+        aligned: the estimate in the world of the ground truth.
     """
 
-    truth_from_estimate: Array
+    ground_truth_from_estimate: Array
     translation_m: Array
     rotation_deg: Array
     aligned: Trajectory
 
     @property
     def scale(self) -> float:
-        return float(self.truth_from_estimate[7])
+        return float(self.ground_truth_from_estimate[7])
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ def statistics(values: ArrayLike) -> dict[str, float] | None:
 
 
 def associate(
-    estimate: Trajectory, truth: Trajectory, *, max_difference_s: float = MAX_DIFFERENCE_S, offset_s: float = 0.0
+    estimate: Trajectory, ground_truth: Trajectory, *, max_difference_s: float = MAX_DIFFERENCE_S, offset_s: float = 0.0
 ) -> Pairs:
     """Poses of the same moments.
 
@@ -226,19 +226,19 @@ def associate(
     may serve twice. Both are put in the order of time first. Without timestamps in either, equal numbers are pairs.
 
     Coverage counts the time between neighbouring paired poses, unless it is a gap (2.5 median steps and more), which
-    counts as one step, and half a step at each end; divided by the duration of the truth. Without timestamps it is the
-    share of the true poses that have an estimate.
+    counts as one step, and half a step at each end; divided by the duration of the ground truth. Without timestamps it
+    is the share of the true poses that have an estimate.
 
     Raises:
         InputError: no pair, or only one of the two has timestamps, or neither has and their lengths differ.
     """
-    with_pose = np.flatnonzero(estimate.has_pose), np.flatnonzero(truth.has_pose)
-    if estimate.timestamps_s is None or truth.timestamps_s is None:
-        idx = _same_numbers(estimate, truth)
+    with_pose = np.flatnonzero(estimate.has_pose), np.flatnonzero(ground_truth.has_pose)
+    if estimate.timestamps_s is None or ground_truth.timestamps_s is None:
+        idx = _same_numbers(estimate, ground_truth)
         coverage = len(idx) / max(len(with_pose[1]), 1)
         is_gap = np.diff(idx, prepend=idx[:1]) > 1
-        return Pairs(estimate[idx], truth[idx], idx, idx, len(with_pose[0]), len(with_pose[1]), coverage, is_gap)
-    times = estimate.timestamps_s + offset_s, truth.timestamps_s
+        return Pairs(estimate[idx], ground_truth[idx], idx, idx, len(with_pose[0]), len(with_pose[1]), coverage, is_gap)
+    times = estimate.timestamps_s + offset_s, ground_truth.timestamps_s
     ours, theirs = (idx[np.argsort(t[idx], kind="stable")] for idx, t in zip(with_pose, times, strict=True))
     t_ours, t_theirs = times[0][ours], times[1][theirs]
     if len(theirs) < len(ours):
@@ -258,20 +258,21 @@ def associate(
     )
     duration = float(np.ptp(t_theirs))
     coverage = min(float(covered) / duration, 1.0) if duration > 0 else 1.0
-    return Pairs(estimate[a], truth[b], a, b, len(ours), len(theirs), coverage, is_gap)
+    return Pairs(estimate[a], ground_truth[b], a, b, len(ours), len(theirs), coverage, is_gap)
 
 
-def _same_numbers(estimate: Trajectory, truth: Trajectory) -> Indices:
-    if (estimate.timestamps_s is None) != (truth.timestamps_s is None):
-        which = "estimate" if estimate.timestamps_s is None else "truth"
+def _same_numbers(estimate: Trajectory, ground_truth: Trajectory) -> Indices:
+    if (estimate.timestamps_s is None) != (ground_truth.timestamps_s is None):
+        which = "estimate" if estimate.timestamps_s is None else "ground_truth"
         raise InputError(f"the {which} has no timestamps, the other has", "give them, one a line: --times FILE")
-    if len(estimate) != len(truth):
+    if len(estimate) != len(ground_truth):
         raise InputError(
-            f"expected as many poses in the estimate as in the truth, for without timestamps line i belongs to line i; "
-            f"found {len(estimate)} and {len(truth)}",
-            "use trajectories with timestamps (TUM), or give those of the truth with --times FILE",
+            "expected as many poses in the estimate as in the ground truth, for without timestamps line i belongs to "
+            "line i; "
+            f"found {len(estimate)} and {len(ground_truth)}",
+            "use trajectories with timestamps (TUM), or give those of the ground truth with --times FILE",
         )
-    idx = np.flatnonzero(estimate.has_pose & truth.has_pose)
+    idx = np.flatnonzero(estimate.has_pose & ground_truth.has_pose)
     if not len(idx):
         raise InputError("no line has a pose in both trajectories")
     return idx
@@ -295,7 +296,8 @@ def _no_pair(ours: Array, theirs: Array, max_difference_s: float) -> InputError:
     if len(ours) and len(theirs) and (ours[0] > 1e3 * abs(theirs[-1]) or theirs[0] > 1e3 * abs(ours[-1])):
         advice = "one of them seems to count in another unit or from another start; " + advice
     return InputError(
-        f"no pose of the estimate ({span[0]}) is within {max_difference_s:g} s of one of the truth ({span[1]})", advice
+        f"no pose of the estimate ({span[0]}) is within {max_difference_s:g} s of one of the ground truth ({span[1]})",
+        advice,
     )
 
 
@@ -303,10 +305,10 @@ def _no_pair(ours: Array, theirs: Array, max_difference_s: float) -> InputError:
 
 
 def align(pairs: Pairs, how: Alignment) -> Array:
-    """``truth_from_estimate`` (8,) over all pairs.
+    """``ground_truth_from_estimate`` (8,) over all pairs.
 
     Positions on a straight line leave the rotation about it open; there the orientations close it. With ``origin`` the
-    first pose of the estimate is laid on that of the truth.
+    first pose of the estimate is laid on that of the ground truth.
 
     Raises:
         InputError: fewer than two pairs, or the positions are all in one place.
@@ -316,17 +318,17 @@ def align(pairs: Pairs, how: Alignment) -> Array:
 
 def _alignment(pairs: Pairs, how: Alignment) -> tuple[Array, Array, float]:
     """Rotation (3, 3), translation (3,) and scale of :func:`align`."""
-    x_a, x_b = pairs.estimate.position, pairs.truth.position
+    x_a, x_b = pairs.estimate.position, pairs.ground_truth.position
     if how == "none":
         return np.eye(3), np.zeros(3), 1.0
     if how == "origin":
-        rotation = pairs.truth.rotation[0] @ pairs.estimate.rotation[0].T
+        rotation = pairs.ground_truth.rotation[0] @ pairs.estimate.rotation[0].T
         return rotation, x_b[0] - rotation @ x_a[0], 1.0
     try:
         try:
             fit = similarity.umeyama(x_a, x_b)
         except ValueError:
-            fit = similarity.align_poses(_cam_from_world(pairs.estimate), _cam_from_world(pairs.truth)).b_from_a
+            fit = similarity.align_poses(_cam_from_world(pairs.estimate), _cam_from_world(pairs.ground_truth)).b_from_a
     except ValueError as error:
         raise InputError(f"{len(pairs)} pairs do not determine an alignment: {error}", "--align origin") from None
     rotation = rigid3.rotation_matrix(fit)
@@ -338,7 +340,7 @@ def _alignment(pairs: Pairs, how: Alignment) -> tuple[Array, Array, float]:
 def is_straight(pairs: Pairs) -> bool:
     """The positions lie on a line within the errors of an alignment, so the turn about it is not theirs to tell."""
     try:
-        fit = similarity.align_poses(_cam_from_world(pairs.estimate), _cam_from_world(pairs.truth))
+        fit = similarity.align_poses(_cam_from_world(pairs.estimate), _cam_from_world(pairs.ground_truth))
     except ValueError:
         return True
     return fit.is_twist_from_orientations
@@ -352,7 +354,7 @@ def _cam_from_world(trajectory: Trajectory) -> Array:
 
 
 def absolute_error(pairs: Pairs, how: Alignment = "se3") -> AbsoluteError:
-    """Distance and angle between the aligned estimate and the truth at each pair.
+    """Distance and angle between the aligned estimate and the ground truth at each pair.
 
     Raises:
         InputError: the alignment is not determined (see :func:`align`).
@@ -365,8 +367,8 @@ def absolute_error(pairs: Pairs, how: Alignment = "se3") -> AbsoluteError:
     )
     return AbsoluteError(
         similarity.from_parts(rotation, translation, scale),
-        np.linalg.norm(aligned.position - pairs.truth.position, axis=1),
-        _angle_deg(pairs.truth.rotation.swapaxes(-1, -2) @ aligned.rotation),
+        np.linalg.norm(aligned.position - pairs.ground_truth.position, axis=1),
+        _angle_deg(pairs.ground_truth.rotation.swapaxes(-1, -2) @ aligned.rotation),
         aligned,
     )
 
@@ -388,7 +390,7 @@ def relative_error(
         is_overlapping: a motion begins at every pose; else where the one before has ended. In metres and in seconds the
             pose nearest to the asked distance ends a motion, and those off by more than a tenth do not count; but
             motions in metres that do not overlap end at the first pose that is at least as far.
-        is_by_estimate: metres are measured along the estimate, not along the truth.
+        is_by_estimate: metres are measured along the estimate, not along the ground truth.
 
     Raises:
         UsageError: ``delta`` is not positive, or not whole in frames, or in seconds where there are none.
@@ -397,18 +399,18 @@ def relative_error(
     if not (np.isfinite(delta) and delta > 0) or (unit == "frames" and delta % 1):
         raise UsageError(f"expected a positive {'whole ' if unit == 'frames' else ''}delta, found {delta:g} {unit}")
     if unit == "s":
-        if pairs.truth.timestamps_s is None:
+        if pairs.ground_truth.timestamps_s is None:
             raise UsageError("a delta in seconds needs timestamps", "--times FILE, or a delta in frames (1f)")
-        first, last = _apart_in_time(pairs.truth.timestamps_s, delta, is_overlapping)
+        first, last = _apart_in_time(pairs.ground_truth.timestamps_s, delta, is_overlapping)
     elif unit == "m":
-        way = pairs.estimate.distance_m * scale if is_by_estimate else pairs.truth.distance_m
+        way = pairs.estimate.distance_m * scale if is_by_estimate else pairs.ground_truth.distance_m
         first, last = _apart_along(way, delta, is_overlapping)
     else:
         first = np.arange(0, max(len(pairs) - int(delta), 0), 1 if is_overlapping else int(delta), dtype=np.int64)
         last = first + int(delta)
     if not len(first):
         raise InputError(
-            f"no two of {len(pairs)} poses over {pairs.truth.path_m:.3g} m are {delta:g} {unit} apart",
+            f"no two of {len(pairs)} poses over {pairs.ground_truth.path_m:.3g} m are {delta:g} {unit} apart",
             "give a smaller delta",
         )
     return RelativeError(delta, unit, first, last, *_motion_errors(pairs, first, last, scale))
@@ -432,7 +434,7 @@ def kitti_drift(
         lengths_m: of the stretches; those of the benchmark are 100, 200, ..., 800.
         step: pairs between the beginnings.
     """
-    way = pairs.truth.distance_m
+    way = pairs.ground_truth.distance_m
     begin = np.repeat(np.arange(0, len(pairs), step, dtype=np.int64), len(lengths_m))
     length = np.tile(np.asarray(lengths_m, np.float64), len(begin) // max(len(lengths_m), 1))
     end = np.searchsorted(way, way[begin] + length, side="right")
@@ -444,7 +446,7 @@ def kitti_drift(
 
 def path_shares_m(pairs: Pairs) -> tuple[float, ...]:
     """Lengths for :func:`kitti_drift` where the path is shorter than 100 m: 10, 20, ..., 80 % of it."""
-    return tuple(share * pairs.truth.path_m for share in PATH_SHARES)
+    return tuple(share * pairs.ground_truth.path_m for share in PATH_SHARES)
 
 
 def _motion_errors(pairs: Pairs, first: Indices, last: Indices, scale: float) -> tuple[Array, Array]:
@@ -455,7 +457,7 @@ def _motion_errors(pairs: Pairs, first: Indices, last: Indices, scale: float) ->
         step = factor * (trajectory.position[last] - trajectory.position[first])
         return back @ trajectory.rotation[last], np.einsum("nij,nj->ni", back, step)
 
-    (rotation, step), (true_rotation, true_step) = motion(pairs.estimate, scale), motion(pairs.truth, 1.0)
+    (rotation, step), (true_rotation, true_step) = motion(pairs.estimate, scale), motion(pairs.ground_truth, 1.0)
     # a rotation before it does not change the length of a vector, but matrices of few digits are no exact rotations
     back = true_rotation.swapaxes(-1, -2)
     return np.linalg.norm(np.einsum("nij,nj->ni", back, step - true_step), axis=1), _angle_deg(back @ rotation)

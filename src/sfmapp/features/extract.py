@@ -175,7 +175,7 @@ def features_from_picture(
     else:
         keypoints, descriptors = extract_orb(gray, usable, max_num_features=options.max_num_features)
     if scale < 1.0:
-        # house pixels have their origin at the corner of the image, so scaling is a plain product
+        # COLMAP's pixels have their origin at the corner of the image, so scaling is a plain product
         factor = np.array([width / gray.shape[1], height / gray.shape[0]], np.float32)
         keypoints[:, :2] *= factor
         keypoints[:, 2] *= factor.mean()

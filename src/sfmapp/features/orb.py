@@ -17,11 +17,11 @@ def extract_orb(
 
     Args:
         gray: (H, W) uint8.
-        usable: (H, W) bool, False where nothing may be detected; None for everywhere.
+        usable: (H, W) bool, False where nothing may be detected; None foreverywhere.
         max_num_features: the strongest so many are kept.
 
     Returns:
-        (N, 4) float32 x, y in house pixels, scale in pixels, orientation in radians, largest scale first;
+        (N, 4) float32 x, y in COLMAP's pixels, scale in pixels, orientation in radians, largest scale first;
         (N, 32) uint8 of packed bits.
     """
     import cv2

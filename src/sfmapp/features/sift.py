@@ -39,7 +39,7 @@ FloatImage = NDArray[np.float32]
 
 
 class Scratch:
-    """Memory for the scale space of one image at a time: taking 150 MB a megapixel and a half anew for every image
+    """Memory for the scale space of one image at a time: taking 150 MB a megapixel and a half anew forevery image
     costs as much time as its descriptors.
 
     Levels 1 to 3 of the first octave come first, as they are needed to the end. Its other three take as much memory as
@@ -76,7 +76,7 @@ class _Octave:
     step: float
 
     def xy(self) -> NDArray[np.float64]:
-        """(N, 2) house pixels. The corner of the first pixel is the origin at every resolution up to the doubled
+        """(N, 2) COLMAP's pixels. The corner of the first pixel is the origin at every resolution up to the doubled
         one; from there on every second pixel is dropped, which keeps the centre of the first."""
         return self.found[:, :2] * self.step + 0.5 / _UPSAMPLING
 
@@ -95,7 +95,7 @@ def extract_sift(
 
     Args:
         gray: (H, W) uint8.
-        usable: (H, W) bool, False where nothing may be detected; None for everywhere.
+        usable: (H, W) bool, False where nothing may be detected; None foreverywhere.
         max_num_features: the strongest so many are kept, with some regard to their spread over the image.
         max_num_orientations: descriptors at one place, at most; seconds only where the budget has room.
         contrast_threshold: least difference of Gaussians, for grey levels in [0, 1]; lowered for flat images.
@@ -103,7 +103,7 @@ def extract_sift(
         scratch: memory that the next image in this thread can use again; None: taken anew.
 
     Returns:
-        (N, 4) float32 x, y in house pixels, scale in pixels, orientation in radians from x towards y (which points
+        (N, 4) float32 x, y in COLMAP's pixels, scale in pixels, orientation in radians from x towards y (which points
         down), largest scale first; (N, 128) uint8 descriptors as COLMAP stores them; the contrast threshold in use.
     """
     threshold = _threshold(gray, contrast_threshold)

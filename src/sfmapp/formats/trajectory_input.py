@@ -6,7 +6,8 @@ KITTI 12 columns: the rows of world_from_cam (3, 4); line i is frame i      Geig
 EuRoC 8 columns or more, commas: ``timestamp_ns, px, py, pz, qw, qx, qy, qz`` Burri et al., IJRR 2016
 ===== ===================================================================== =========================================
 
-All hold world_from_body: of the camera in TUM's and KITTI's truth, of the IMU in EuRoC's. Times may be in another unit
+All hold world_from_body: of the camera in TUM's and KITTI's ground truth, of the IMU in EuRoC's. Times may be in
+    another unit
 (ORB-SLAM3 writes nanoseconds into TUM's form): see :mod:`sfmapp.formats.clocks`. KITTI's rows may be whole 4 x 4
 matrices.
 """
@@ -44,7 +45,7 @@ class TrajectoryFile:
     """What a file holds.
 
     Attributes:
-        path, format: where it is from, and what it turned out to be; a kind of sequence if it is one's truth.
+        path, format: where it is from, and what it turned out to be; a kind of sequence if it is one's ground truth.
         trajectory: its poses in the order of the file; a line with "nan" in it is a gap.
         is_numbered: ``PATH.frames`` beside a KITTI trajectory names the frame of each line (see
             :func:`sfmapp.sequences.kitti.write_kitti`): the others are gaps, and the last ones may be missing.

@@ -194,7 +194,7 @@ def _read_file(path: Path, max_bytes: int) -> bytes:
     status = os.stat(path)
     if stat.S_ISDIR(status.st_mode):
         raise UnusableImage("a folder, not a file")
-    if not stat.S_ISREG(status.st_mode):  # opening a pipe would wait for ever
+    if not stat.S_ISREG(status.st_mode):  # opening a pipe would wait forever
         raise UnusableImage("not a regular file")
     with open(path, "rb") as file:
         data = file.read(max_bytes + 1)

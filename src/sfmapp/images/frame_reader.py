@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sfmapp.events import Events
 from sfmapp.images.headers import Header, UnusableImage, read_header
 from sfmapp.images.pixels import decode_bytes
-from sfmapp.images.sequence import STAGE, Frame, Imu, RepeatedFrame, SequenceKind, Truth
+from sfmapp.images.sequence import STAGE, Frame, GroundTruth, Imu, RepeatedFrame, SequenceKind
 from sfmapp.scene.rig import Rig
 
 Pixels = NDArray[np.uint8]
@@ -64,7 +64,7 @@ def read_ahead(read_next: Callable[[], Frame | Skipped | None]) -> Iterator[Fram
         pool.shutdown(cancel_futures=True)
 
 
-class ProblemTeller:
+class ProblemReporter:
     """Warns of frames that are left out: once however often the sequence is played.
 
     Attributes:
@@ -121,7 +121,7 @@ def read_regular_file(path: Path) -> bytes:
     """The bytes of a file. Raises UnusableImage if it is none, too large, or cannot be read."""
     try:
         status = os.stat(path)
-        if not stat.S_ISREG(status.st_mode):  # opening a pipe would wait for ever
+        if not stat.S_ISREG(status.st_mode):  # opening a pipe would wait forever
             raise UnusableImage("not a regular file")
         if status.st_size > _LARGEST_FILE_BYTES:
             raise UnusableImage(f"larger than {_LARGEST_FILE_BYTES} bytes")
@@ -250,7 +250,7 @@ class FileSequence:
     sampling: tuple[NDArray[np.float32] | None, ...]
     frames_per_second: float | None
     imu: Imu | None
-    truth: Truth | None
+    ground_truth: GroundTruth | None
     events: Events
     elapsed_s: NDArray[np.float64] | None = None
     orientation: int = 1
@@ -258,7 +258,7 @@ class FileSequence:
 
     def __post_init__(self) -> None:
         self.num_frames = len(self.names)
-        self._teller = ProblemTeller(self.events)
+        self._teller = ProblemReporter(self.events)
 
     @property
     def repeated(self) -> list[RepeatedFrame]:

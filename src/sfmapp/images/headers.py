@@ -75,7 +75,7 @@ _MARKS = {
 def picture_format(path: Path) -> str | None:
     """The format of a file that is a picture by its first bytes, whatever it is called; None for any other file."""
     try:
-        if not stat.S_ISREG(os.stat(path).st_mode):  # opening a pipe would wait for ever
+        if not stat.S_ISREG(os.stat(path).st_mode):  # opening a pipe would wait forever
             return None
         with path.open("rb") as file:
             data = file.read(16)

@@ -32,11 +32,11 @@ class SequenceOptions:
         start, stop: first frame and the one behind the last, as positions in the sequence; None: to its end.
         step: play every step-th frame.
         reverse: play backwards. Time still ascends: a frame of time t comes at first + last - t, so that the intervals
-            stay what they are; the truth is mirrored with it, and the IMU, whose rates of rotation change sign.
+            stay what they are; the ground truth is mirrored with it, and the IMU, whose rates of rotation change sign.
         fps: frames a second, in place of the times that the sequence holds; None: its times, and where it holds none
             10 for KITTI, 30 else, with a note.
         imu: path of IMU measurements in EuRoC's form, ``sensor.yaml`` beside it. None: what the sequence holds.
-        truth: path of a trajectory of TUM, KITTI or EuRoC. None: what the sequence holds.
+        ground_truth: path of a trajectory of TUM, KITTI or EuRoC. None: what the sequence holds.
     """
 
     camera: str | None = None
@@ -47,7 +47,7 @@ class SequenceOptions:
     reverse: bool = False
     fps: float | None = None
     imu: str | None = None
-    truth: str | None = None
+    ground_truth: str | None = None
 
     def __post_init__(self) -> None:
         check_options("sequence", self, {"start": Range(0), "step": Range(1), "fps": Range(1e-3, 1e5)})
@@ -122,7 +122,7 @@ class Imu:
 
 
 @dataclass(frozen=True)
-class Truth:
+class GroundTruth:
     """Where the rig's first camera truly was: (N,) ascending seconds, and cam_from_world (N, 7) in metres."""
 
     timestamps_s: Array
@@ -139,7 +139,7 @@ class Sequence(Protocol):
         num_frames: how many there are, unreadable ones included (of a video: what its header says); None where only
             reading tells.
         frames_per_second: nominal rate; None where unknown.
-        imu, truth: None where there is none.
+        imu, ground_truth: None where there is none.
         orientation: EXIF orientation 1 to 8 of the frames, for whoever shows them to people.
     """
 
@@ -149,7 +149,7 @@ class Sequence(Protocol):
     num_frames: int | None
     frames_per_second: float | None
     imu: Imu | None
-    truth: Truth | None
+    ground_truth: GroundTruth | None
     orientation: int
 
     def frames(self) -> Iterator[Frame]:

@@ -27,13 +27,13 @@ from sfmapp.images.containers import (
 )
 from sfmapp.images.frame_reader import (
     LARGEST_FRAME_PX,
-    ProblemTeller,
+    ProblemReporter,
     Skipped,
     read_ahead,
     resampled,
     skipped_twin,
 )
-from sfmapp.images.sequence import Frame, Imu, RepeatedFrame, SequenceKind, SequenceOptions, Truth
+from sfmapp.images.sequence import Frame, GroundTruth, Imu, RepeatedFrame, SequenceKind, SequenceOptions
 from sfmapp.scene.rig import Rig
 
 Pixels = NDArray[np.uint8]
@@ -143,7 +143,7 @@ class VideoSequence:
     events: Events
     sampling: tuple[NDArray[np.float32] | None, ...] = (None,)
     imu: Imu | None = None
-    truth: Truth | None = None
+    ground_truth: GroundTruth | None = None
     kind: SequenceKind = "video"
     orientation: int = 1
     num_frames: int | None = field(init=False)
@@ -157,7 +157,7 @@ class VideoSequence:
         self.num_frames = len(played[:: self.options.step]) if total is not None else None
         fps = self.options.fps or self.facts.fps
         self.frames_per_second = fps / self.options.step if fps else None
-        self._teller = ProblemTeller(self.events)
+        self._teller = ProblemReporter(self.events)
 
     @property
     def repeated(self) -> list[RepeatedFrame]:

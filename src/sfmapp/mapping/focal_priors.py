@@ -38,9 +38,9 @@ REFUTED_SIGMAS, DOUBTFUL_SIGMAS, GOOD_PART = 5.0, 2.0, 0.9
 SAME_SUPPORT, MORE_SUPPORT = 0.98, 1.05
 # Residuals below so many robust standard deviations agree with a model.
 AGREE_SIGMAS = 3.0
-# Focal lengths miss the truth by more than independent errors of keypoints explain: by 0 to 7 times that on the shared
-# sets, by up to 10 on rendered flat blocks with a lens that the model does not hold. What a lens with more terms makes
-# of them comes on top. The photographs determine a focal length if their sigma by this reckoning is half of the
+# Focal lengths miss the ground truth by more than independent errors of keypoints explain: by 0 to 7 times that on the
+# shared sets, by up to 10 on rendered flat blocks with a lens that the model does not hold. What a lens with more terms
+# makes of them comes on top. The photographs determine a focal length if their sigma by this reckoning is half of the
 # prior's: the prior then has a fifth of the say.
 FOCAL_INFLATION, DETERMINED_SHARE = 5.0, 0.5
 # Below this relative sigma from independent errors no lens term was seen to move a focal length by a per cent, and the

@@ -23,19 +23,19 @@ from sfmapp.contradictions import Contradiction
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.images.folder import ImageSet
-from sfmapp.mapping import join, mend, near_views, structure, verified_pairs
+from sfmapp.mapping import join, near_views, repair, structure, verified_pairs
 from sfmapp.mapping.focal import estimate_focal_ratio
 from sfmapp.mapping.focal_priors import MapFrom, Mapped, settle_focal_lengths
 from sfmapp.mapping.intrinsics_check import check_intrinsics, widened_uncertainty
 from sfmapp.mapping.join import find_joint, holds_together, in_common_cameras, unite
 from sfmapp.mapping.look_alikes import tell_apart
 from sfmapp.mapping.mapper import STAGE, Mapper
-from sfmapp.mapping.mend import mended
 from sfmapp.mapping.merge import find_merge, merge, num_linking_points
 from sfmapp.mapping.moving_planes import without_moving_planes
 from sfmapp.mapping.one_place import OnePlace, find_one_place
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images
+from sfmapp.mapping.repair import repaired
 from sfmapp.mapping.tracks import build_tracks, track_colors
 from sfmapp.mapping.verified_pairs import contradictions_of
 from sfmapp.scene.correspondences import Correspondences
@@ -154,7 +154,7 @@ class _Task:
         models, initial_reports = _grow_models(empty, mapper_of, options, events)
         models, apart = _merge_models(_without_parts(models), mapper_of, correspondences, options, events)
         models = _with_left_over(models, mapper_of, correspondences, events)
-        models = [mended(model, correspondences, mapper_of, options, events) for model in models]
+        models = [repaired(model, correspondences, mapper_of, options, events) for model in models]
         return Mapped(cameras, models, initial_reports, focal_report, attempts, mapper_of, apart)
 
 
@@ -440,5 +440,5 @@ def compile_kernels() -> None:
     verified_pairs.compile_kernels()
     join.compile_kernels()
     near_views.compile_kernels()
-    mend.compile_kernels()
+    repair.compile_kernels()
     solver.compile_kernels()

@@ -481,7 +481,7 @@ class Mapper:
         return int(self.reconstruction.is_registered.sum()), int(self.reconstruction.is_triangulated.sum())
 
     def _candidates(self) -> NDArray[np.int64]:
-        """Images that may be registered, without those taken back twice: they would come for ever."""
+        """Images that may be registered, without those taken back twice: they would come forever."""
         hopeless = [i for i, times in self.times_dropped.items() if times >= 2]
         return np.setdiff1d(np.flatnonzero(~self.reconstruction.is_registered & ~self.locked), hopeless)
 

@@ -376,7 +376,7 @@ def _is_useful(correspondences: Correspondences) -> Bools:
 
 
 def _obs_of_features(tracks: Tracks, correspondences: Correspondences) -> tuple[Ints, Ints]:
-    """(I + 1,) where the keypoints of each image begin, and for every keypoint its observation or -1."""
+    """(I + 1,) where the keypoints of each image begin, and forevery keypoint its observation or -1."""
     sizes = np.zeros(tracks.num_images, np.int64)
     _num_features(tracks.obs_image_idx, tracks.obs_feature_idx, sizes)
     for side in range(2):

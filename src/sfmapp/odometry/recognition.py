@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from sfmapp.odometry.frontend.corners import find_corners
 from sfmapp.odometry.loops.closing import apply_closure, join_maps
 from sfmapp.odometry.loops.detection import LoopClosure, LoopFinder
-from sfmapp.odometry.loops.places import Places
-from sfmapp.odometry.loops.places import View as PlaceView
+from sfmapp.odometry.loops.place_recognition import PlaceIndex
+from sfmapp.odometry.loops.place_recognition import View as PlaceView
 from sfmapp.odometry.loops.relocalize import RelocalizeOptions, relocalize
 from sfmapp.odometry.map.local_map import LocalMap, View
 from sfmapp.odometry.records import FrameRecord
@@ -39,7 +39,7 @@ class Recognition:
     """All places of all maps."""
 
     def __init__(self, seed: int) -> None:
-        self._places, self._finder = Places(seed=seed), LoopFinder()
+        self._places, self._finder = PlaceIndex(seed=seed), LoopFinder()
         self._num_searches = 0
         # keyframe of the current map up to which no loop is looked for
         self._resting_until = 0

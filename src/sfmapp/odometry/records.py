@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sfmapp.contradictions import widened, widened_scale_sigma
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
-from sfmapp.odometry.refinement.finish import MAX_COVARIANCE_KEYFRAMES, Conclusion
+from sfmapp.odometry.refinement.final_adjustment import MAX_COVARIANCE_KEYFRAMES, FinalAdjustment
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.odometry.tracker import measure_pose
 
@@ -94,7 +94,7 @@ def measure_again(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: i
 
 
 def gather(
-    records: list[FrameRecord], maps: dict[int, KeyframeMap], conclusions: dict[int, Conclusion]
+    records: list[FrameRecord], maps: dict[int, KeyframeMap], conclusions: dict[int, FinalAdjustment]
 ) -> OdometryResult:
     """The result of a run, the map with the most frames first."""
     poses = np.full((len(records), 7), np.nan)
@@ -132,28 +132,28 @@ def _covariance(record: FrameRecord, found: MapResult | None) -> Array:
     return adjoint @ of_keyframe @ adjoint.T + record.covariance
 
 
-def _map_result(keyframes: KeyframeMap, conclusion: Conclusion) -> MapResult:
+def _map_result(keyframes: KeyframeMap, final: FinalAdjustment) -> MapResult:
     num, num_sensors = len(keyframes.keyframes), len(keyframes.rig.cameras)
     model, _ = keyframes.reconstruction(np.arange(num))
-    covariance, found = conclusion.covariance, conclusion.contradictions
+    covariance, found = final.covariance, final.contradictions
     if covariance is not None:
         poses = np.array([k.rig_from_world for k in keyframes.keyframes])
         covariance = widened(covariance, rigid3.spread(poses), found)
     return MapResult(
         model, np.array([k.frame_idx for k in keyframes.keyframes], np.int64),
-        np.arange(num, dtype=np.int64) * num_sensors, covariance, conclusion.gauge,
-        "stereo" if num_sensors > 1 else "none", widened_scale_sigma(conclusion.scale_sigma, found), found,
-        _covariance_gap(conclusion, num), conclusion.noise_covariance,
+        np.arange(num, dtype=np.int64) * num_sensors, covariance, final.gauge,
+        "stereo" if num_sensors > 1 else "none", widened_scale_sigma(final.scale_sigma, found), found,
+        _covariance_gap(final, num), final.noise_covariance,
     )  # fmt: skip
 
 
-def _covariance_gap(conclusion: Conclusion, num_keyframes: int) -> str:
+def _covariance_gap(final: FinalAdjustment, num_keyframes: int) -> str:
     """Why keyframes have no covariance; empty where all have one, or none was asked for."""
-    covariance = conclusion.covariance
+    covariance = final.covariance
     if covariance is None:
         if num_keyframes < 2:
             return "a single keyframe has nothing that it could be uncertain against"
-        if num_keyframes > MAX_COVARIANCE_KEYFRAMES or conclusion.report.get("is_piecewise"):
+        if num_keyframes > MAX_COVARIANCE_KEYFRAMES or final.report.get("is_piecewise"):
             return f"{num_keyframes} keyframes are too many for covariances, {MAX_COVARIANCE_KEYFRAMES} the most"
         return ""
     num_known = int(np.isfinite(covariance).all((1, 2)).sum())

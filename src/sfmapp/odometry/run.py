@@ -16,7 +16,7 @@ from sfmapp.odometry.frontend.active_tracks import ActiveTracks
 from sfmapp.odometry.frontend.pyramid import Pyramid, build_pyramid
 from sfmapp.odometry.inertial.gyroscope import GyroTrust, imu_rotation
 from sfmapp.odometry.inertial.smoothing import smooth_trajectory
-from sfmapp.odometry.initialize import Beginning, TwoViews, pose_between
+from sfmapp.odometry.initialize import MapInitializer, TwoViews, pose_between
 from sfmapp.odometry.loops.sweep import is_too_large
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.map.local_map import LocalMap, View
@@ -24,7 +24,7 @@ from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.recognition import Recognition
 from sfmapp.odometry.records import FrameRecord, gather, leave_keyframe, measure_again
 from sfmapp.odometry.refinement.early_calibration import is_time_to_ask, refine_early
-from sfmapp.odometry.refinement.finish import conclude
+from sfmapp.odometry.refinement.final_adjustment import adjust_finally
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.shutter import straighten
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
@@ -54,7 +54,7 @@ class Odometry:
         self.local: LocalMap | None = None
         self.num_begun = 0  # numbers of maps that were taken into others are not given again: live poses are in worlds
         self.recognition = Recognition(seed)
-        self.beginning = Beginning(self.rig.cameras[0], options, seed)
+        self.initializer = MapInitializer(self.rig.cameras[0], options, seed)
         self.waiting: list[tuple[FrameRecord, View]] = []
         self.tracks, self.is_mapped = ActiveTracks.none(), np.zeros(0, bool)
         self.pose, self.step = rigid3.IDENTITY, rigid3.IDENTITY
@@ -106,10 +106,10 @@ class Odometry:
             if is_open and self.clock.is_usable:
                 self._begin_stereo(record, view)
             return
-        views = self.beginning.add(view.pyramids[0])
-        self.counts["looked_still"] += self.beginning.is_still
-        self.counts["looked_turned"] += self.beginning.is_turn
-        if len(self.beginning.seen) == 1:
+        views = self.initializer.add(view.pyramids[0])
+        self.counts["looked_still"] += self.initializer.is_still
+        self.counts["looked_turned"] += self.initializer.is_turn
+        if len(self.initializer.seen) == 1:
             self.waiting.clear()  # a new first view: what was before it has no pose
         self.waiting.append((record, view))
         if views is not None and is_open:
@@ -129,9 +129,9 @@ class Odometry:
 
     def _begin_from_two_views(self, views: TwoViews) -> None:
         """Make a map of two views, and give poses to the frames between them."""
-        local, seen = self._new_map(), self.beginning.seen
+        local, seen = self._new_map(), self.initializer.seen
         (first_record, first), (last_record, last) = self.waiting[0], self.waiting[-1]
-        corners = local.begin(first, self.beginning.corners)
+        corners = local.begin(first, self.initializer.corners)
         local.keyframes.point_xyz[corners.point_id[views.track]] = views.xyz
         tracks = corners.moved(seen[-1]).subset(np.isfinite(seen[-1][:, 0]))
         tracks = local.add_keyframe(last, views.last_from_first, tracks, len(self.records))
@@ -154,7 +154,7 @@ class Odometry:
             num_inliers=views.num_inliers, num_tracks=views.num_tracks, num_mapped=self.num_mapped_at_keyframe,
         )  # fmt: skip
         self.waiting.clear()
-        self.beginning = Beginning(self.rig.cameras[0], self.options, self.seed)
+        self.initializer = MapInitializer(self.rig.cameras[0], self.options, self.seed)
 
     def _new_map(self) -> LocalMap:
         number = self.num_begun
@@ -269,7 +269,7 @@ class Odometry:
         self.lost_since = record.timestamp_s
         self.counts["losses"] += 1
         self.step = rigid3.IDENTITY
-        self.beginning = Beginning(self.rig.cameras[0], self.options, self.seed)
+        self.initializer = MapInitializer(self.rig.cameras[0], self.options, self.seed)
         self.waiting.clear()
 
     def _recover(self, record: FrameRecord, view: View) -> bool:
@@ -365,7 +365,7 @@ class Odometry:
             maps[number] = local.keyframes
             self.events.started("adjustment", f"adjusting {local.newest + 1} keyframes together")
             straightened = self._straighten(local)
-            conclusions[number] = conclude(local.keyframes, self.options, self.events, self.given_rig)
+            conclusions[number] = adjust_finally(local.keyframes, self.options, self.events, self.given_rig)
             conclusions[number].report["shutter"] = straightened
             conclusions[number].contradictions.extend(self.clock.contradictions(local.keyframes))
             conclusions[number].contradictions.extend(local.witnesses.contradictions(local.keyframes))

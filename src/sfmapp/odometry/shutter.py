@@ -21,7 +21,7 @@ from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.map.backend import Job, make_job, take_over
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.records import FrameRecord, measure_again
-from sfmapp.odometry.refinement.finish import MIN_EVIDENCE, MIN_SIGMA_PX
+from sfmapp.odometry.refinement.final_adjustment import MIN_EVIDENCE, MIN_SIGMA_PX
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]

@@ -110,7 +110,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Lateness:
+class TimeOffset:
     """How late the right camera is, in frames: of all looks together, and of each (NaN where it does not tell)."""
 
     frames: float
@@ -187,13 +187,13 @@ def _lines(far: Array, baseline: Array) -> Array:
     return np.asarray(line / np.linalg.norm(line[:, :2], axis=1)[:, None], np.float64)
 
 
-def estimate_lateness(looks: list[Look]) -> Lateness:
+def estimate_time_offset(looks: list[Look]) -> TimeOffset:
     """Fit the lateness of the right camera to all looks, with one turn of it, robustly."""
     told = np.full(len(looks), np.nan)
     usable = [n for n, seen in enumerate(looks) if len(seen.off_px) >= _MIN_MATCHES]
     usable = [n for n in usable if np.median(np.abs(looks[n].motion_px)) > _MIN_MOTION_PX]
     if not usable:
-        return Lateness(float("nan"), told)
+        return TimeOffset(float("nan"), told)
     step = float(np.median([looks[n].step_s for n in usable]))
     motion = [looks[n].motion_px * step / looks[n].step_s for n in usable]
     off = np.concatenate([looks[n].off_px for n in usable])
@@ -202,7 +202,7 @@ def estimate_lateness(looks: list[Look]) -> Lateness:
     late, turn = min(fits, key=lambda fit: float(np.median(np.abs(off + columns @ np.append(fit[0], fit[1])))))
     for n, of_motion in zip(usable, motion, strict=True):
         told[n] = _fit_one(looks[n].off_px + looks[n].columns @ turn, of_motion, late)
-    return Lateness(late, told)
+    return TimeOffset(late, told)
 
 
 def _fit(off: Array, columns: Array, start: float) -> tuple[float, Array]:
@@ -252,7 +252,7 @@ class StereoClock:
             room = min(room, max(8, _MAX_HELD_BYTES // sum(image.nbytes for image in frame.images)))
             if len(held) % _HELD_STEP == 0:
                 self._looks += self._look_back(held, len(held) - 1, 0)
-                if estimate_lateness(self._looks).is_known:
+                if estimate_time_offset(self._looks).is_known:
                     break
             if len(held) >= room:
                 break
@@ -262,7 +262,7 @@ class StereoClock:
             events.warned("odometry", f"the right camera is {when}: its images are paired anew", shift=self.shift)
         against = _mounting(self._looks)
         if 2 * sum(not seen.is_right for seen in self._looks) > len(self._looks):
-            against = against or ([] if estimate_lateness(self._looks).is_known else _strangers(self._looks))
+            against = against or ([] if estimate_time_offset(self._looks).is_known else _strangers(self._looks))
         self.is_usable = not against
         for found in against:
             events.warned("odometry", found.message)
@@ -280,13 +280,13 @@ class StereoClock:
 
     def _settle(self, held: list[Frame]) -> None:
         """Find the whole frames that the cameras are apart, from the frames that are held."""
-        shift, late, partners = 0, estimate_lateness(self._looks).frames, _partner_share(self._looks)
+        shift, late, partners = 0, estimate_time_offset(self._looks).frames, _partner_share(self._looks)
         for _ in range(_MAX_ROUNDS):
             if not abs(late) > _MIN_SHIFT:
                 break
             shift += int(np.sign(late)) * max(1, int(np.rint(abs(late))))
             looks = [s for n in range(1, len(held), _HELD_STEP) for s in self._look_back(held, n, shift)]
-            left, share = estimate_lateness(looks).frames, _partner_share(looks)
+            left, share = estimate_time_offset(looks).frames, _partner_share(looks)
             if share > partners and abs(left) < _MAX_LEFT:
                 self.shift, self._looks, partners = shift, looks, share
             late = left
@@ -410,7 +410,7 @@ def _strangers(looks: list[Look]) -> list[Contradiction]:
 
 def _lateness(looks: list[Look], rig: Rig, keyframes: KeyframeMap | None) -> list[Contradiction]:
     """Cameras that do not look at the same moment, all the time or for a while."""
-    late = estimate_lateness(looks)
+    late = estimate_time_offset(looks)
     told = np.flatnonzero(np.isfinite(late.of_looks))
     if len(told) < _IN_A_ROW:
         return []

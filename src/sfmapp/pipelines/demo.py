@@ -7,11 +7,13 @@ from typing import Any
 
 from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.formats.colmap import read_model
-from sfmapp.formats.truth import read_truth
+from sfmapp.formats.ground_truth import read_ground_truth
 
 
-def compare_with_truth(output: Path, sample: Path) -> dict[str, Any]:
+def compare_with_ground_truth(output: Path, sample: Path) -> dict[str, Any]:
     """Errors of ``output/sparse/0`` in metres and degrees; see :meth:`PoseErrors.summary`."""
     model, _ = read_model(output / "sparse" / "0")
-    truth = read_truth(sample / "cameras.json")
-    return evaluate_poses(model.image_names, model.cam_from_world, truth.names, truth.cam_from_world).summary()
+    ground_truth = read_ground_truth(sample / "cameras.json")
+    return evaluate_poses(
+        model.image_names, model.cam_from_world, ground_truth.names, ground_truth.cam_from_world
+    ).summary()

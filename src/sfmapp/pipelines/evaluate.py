@@ -1,4 +1,4 @@
-"""Hold a trajectory against the truth: the errors of the literature in one table, and a picture."""
+"""Hold a trajectory against the ground truth: the errors of the literature in one table, and a picture."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ from sfmapp.formats.trajectory_input import TrajectoryFile, read_trajectory
 
 Array = NDArray[np.float64]
 
-# with less of the truth covered the table says that its errors are not comparable; KITTI's devkit takes whole runs only
+# with less of the ground truth covered the table says that its errors are not comparable; KITTI's devkit takes whole
+# runs only
 _COMPARABLE_COVERAGE = 0.99
 # a unit of length that is off by more than this is none: visual odometry with a scale has a few percent at most
 _METRIC_SCALE = 0.1
@@ -63,7 +64,7 @@ class EvaluateOptions:
     is_overlapping: bool = False
     """A relative motion begins at every pose, not where the one before has ended."""
     is_by_estimate: bool = False
-    """Deltas in metres are measured along the estimate, not along the truth."""
+    """Deltas in metres are measured along the estimate, not along the ground truth."""
 
 
 @dataclass(frozen=True)
@@ -84,17 +85,17 @@ class Errors:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """An estimate against the truth.
+    """An estimate against the ground truth.
 
     Attributes:
-        estimate, truth: what was read.
+        estimate, ground_truth: what was read.
         pairs: the poses that were compared.
         errors: by alignment, in the order that was asked for.
         notes: what a reader of the numbers has to know.
     """
 
     estimate: TrajectoryFile
-    truth: TrajectoryFile
+    ground_truth: TrajectoryFile
     pairs: Pairs
     errors: dict[Alignment, Errors]
     notes: list[str] = field(default_factory=list)
@@ -107,17 +108,21 @@ class Evaluation:
         return next(iter(self.errors))
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able: metres (the truth's unit), degrees, seconds."""
-        pairs, times = self.pairs, self.pairs.truth.timestamps_s
+        """JSON-able: metres (the ground truth's unit), degrees, seconds."""
+        pairs, times = self.pairs, self.pairs.ground_truth.timestamps_s
         return {
             "estimate": {"path": os.fspath(self.estimate.path), "format": self.estimate.format,
                          "num_poses": pairs.num_estimate},
-            "truth": {"path": os.fspath(self.truth.path), "format": self.truth.format, "num_poses": pairs.num_truth},
+            "ground_truth": {
+                "path": os.fspath(self.ground_truth.path),
+                "format": self.ground_truth.format,
+                "num_poses": pairs.num_ground_truth,
+            },
             "num_pairs": len(pairs),
             "num_gaps": int(pairs.is_gap.sum()),
             "coverage": pairs.coverage,
             "duration_s": None if times is None else float(np.ptp(times)),
-            "path_m": pairs.truth.path_m,
+            "path_m": pairs.ground_truth.path_m,
             "alignments": {how: _errors_dict(errors) for how, errors in self.errors.items()},
             "notes": self.notes,
         }  # fmt: skip
@@ -129,7 +134,7 @@ class Evaluation:
 
 def evaluate(
     estimate: str | os.PathLike[str],
-    truth: str | os.PathLike[str],
+    ground_truth: str | os.PathLike[str],
     options: EvaluateOptions | None = None,
     *,
     times: str | os.PathLike[str] | None = None,
@@ -138,8 +143,8 @@ def evaluate(
 
     Args:
         estimate: TUM, KITTI or EuRoC text (see :mod:`sfmapp.formats.trajectory_input`), or the folder of an odometry
-            run, of which ``trajectory.tum`` is taken (``trajectory.kitti`` if the truth has no timestamps).
-        truth: a file of the same formats, not necessarily the same one, or the folder of a sequence (see
+            run, of which ``trajectory.tum`` is taken (``trajectory.kitti`` if the ground truth has no timestamps).
+        ground_truth: a file of the same formats, not necessarily the same one, or the folder of a sequence (see
             :func:`sfmapp.sequences.open.open_sequence`): then it is of the first camera on the clock of the frames,
             and played as the run was if ``estimate`` is the folder of one.
         times: file with the seconds of the lines of KITTI trajectories.
@@ -153,7 +158,9 @@ def evaluate(
         raise UsageError("expected a maximum difference of at least 0 s and a finite offset")
     seconds = None if times is None else Path(times)
     true_file = (
-        read_trajectory(Path(truth), seconds) if not Path(truth).is_dir() else _of_sequence(Path(truth), Path(estimate))
+        read_trajectory(Path(ground_truth), seconds)
+        if not Path(ground_truth).is_dir()
+        else _of_sequence(Path(ground_truth), Path(estimate))
     )
     ours_path = _trajectory_of(Path(estimate), true_file.trajectory)
     our_file = read_trajectory(ours_path, seconds, like=true_file.trajectory.timestamps_s)
@@ -161,7 +168,7 @@ def evaluate(
     pairs = associate(ours, theirs, max_difference_s=options.max_difference_s, offset_s=options.offset_s)
     if len(pairs) < 2:
         raise InputError(f"{our_file.path} and {true_file.path} have one pose in common, which tells nothing")
-    for file, path in ((our_file, pairs.estimate), (true_file, pairs.truth)):
+    for file, path in ((our_file, pairs.estimate), (true_file, pairs.ground_truth)):
         if not path.path_m < _LONGEST_PATH_M:
             raise InputError(f"{file.path}: expected positions in metres, found a path of {path.path_m:.3g} m")
     deltas = options.deltas or _deltas(pairs)
@@ -172,7 +179,7 @@ def evaluate(
 
 
 def draw(result: Evaluation, path: str | os.PathLike[str]) -> None:
-    """Draw the estimate against the truth as a PNG, after the alignment that tells most.
+    """Draw the estimate against the ground truth as a PNG, after the alignment that tells most.
 
     Raises:
         InputError: the file cannot be written.
@@ -182,17 +189,18 @@ def draw(result: Evaluation, path: str | os.PathLike[str]) -> None:
     how = result.telling_alignment
     errors, pairs = result.errors[how], result.pairs
     rmse = float(np.sqrt((errors.absolute.translation_m**2).mean()))
-    title = f"{result.estimate.path.name} against {result.truth.path.name}"
+    title = f"{result.estimate.path.name} against {result.ground_truth.path.name}"
     facts = [
-        f"ATE rmse {rmse:.3g} m" + (f", {100 * rmse / pairs.truth.path_m:.2g} % of path" if pairs.truth.path_m else ""),
+        f"ATE rmse {rmse:.3g} m"
+        + (f", {100 * rmse / pairs.ground_truth.path_m:.2g} % of path" if pairs.ground_truth.path_m else ""),
         _ALIGNMENT_NAMES[how] + (f" {errors.absolute.scale:.4g}" if how == "sim3" else ""),
         f"{len(pairs)} poses",
         f"coverage {100 * pairs.coverage:.1f} %",
-        f"{_metres(pairs.truth.path_m)} of path",
+        f"{_metres(pairs.ground_truth.path_m)} of path",
     ]
     if len(errors.drift.first):
         facts.append(f"{'drift' if errors.is_by_share else 't_rel'} {errors.drift.t_rel_percent:.3g} %")
-    write_trajectory_plot(Path(path), pairs, errors.absolute, result.truth.trajectory, title, facts)
+    write_trajectory_plot(Path(path), pairs, errors.absolute, result.ground_truth.trajectory, title, facts)
 
 
 _ALIGNMENT_NAMES = {
@@ -215,7 +223,7 @@ def parse_delta(text: str) -> tuple[float, DeltaUnit]:
     return float(found[1]), _UNITS[found[2]]
 
 
-def _trajectory_of(path: Path, truth: Trajectory) -> Path:
+def _trajectory_of(path: Path, ground_truth: Trajectory) -> Path:
     if not path.is_dir():
         return path
     from sfmapp.workspace.layout import MANIFEST
@@ -226,11 +234,11 @@ def _trajectory_of(path: Path, truth: Trajectory) -> Path:
     tum, kitti = path / "trajectory.tum", path / "trajectory.kitti"
     if not tum.is_file():
         raise InputError(f"{path}: expected a trajectory, found a folder without trajectory.tum")
-    return kitti if truth.timestamps_s is None and kitti.is_file() else tum
+    return kitti if ground_truth.timestamps_s is None and kitti.is_file() else tum
 
 
 def _of_sequence(folder: Path, estimate: Path) -> TrajectoryFile:
-    """The truth of a sequence, played backwards or in steps as the run was."""
+    """The ground truth of a sequence, played backwards or in steps as the run was."""
     from sfmapp.events import Events
     from sfmapp.images.sequence import SequenceOptions
     from sfmapp.sequences.open import open_sequence
@@ -242,38 +250,38 @@ def _of_sequence(folder: Path, estimate: Path) -> TrajectoryFile:
     if (estimate / MANIFEST).is_file():
         options = options_from_dict(read_manifest(estimate).get("options", {})).sequence
     sequence = open_sequence(folder, options, Events(), require_camera=False)
-    if sequence.truth is None:
+    if sequence.ground_truth is None:
         raise InputError(
             f"{folder}: expected true poses beside the frames, found none", "name the file that holds them"
         )
-    truth = sequence.truth
+    ground_truth = sequence.ground_truth
     return TrajectoryFile(
-        folder, sequence.kind, Trajectory.from_cam_from_world(truth.cam_from_world, truth.timestamps_s)
+        folder, sequence.kind, Trajectory.from_cam_from_world(ground_truth.cam_from_world, ground_truth.timestamps_s)
     )
 
 
-def _same_length(estimate: TrajectoryFile, truth: TrajectoryFile) -> tuple[Trajectory, Trajectory]:
+def _same_length(estimate: TrajectoryFile, ground_truth: TrajectoryFile) -> tuple[Trajectory, Trajectory]:
     """Both without timestamps: frames that a numbered file does not reach are gaps at its end."""
-    if estimate.trajectory.timestamps_s is not None or truth.trajectory.timestamps_s is not None:
-        return estimate.trajectory, truth.trajectory
-    length = max(len(estimate.trajectory), len(truth.trajectory))
+    if estimate.trajectory.timestamps_s is not None or ground_truth.trajectory.timestamps_s is not None:
+        return estimate.trajectory, ground_truth.trajectory
+    length = max(len(estimate.trajectory), len(ground_truth.trajectory))
 
     def padded(file: TrajectoryFile) -> Trajectory:
         missing = length - len(file.trajectory) if file.is_numbered else 0
         position = np.concatenate([file.trajectory.position, np.full((missing, 3), np.nan)])
         return Trajectory(position, np.concatenate([file.trajectory.rotation, np.full((missing, 3, 3), np.nan)]))
 
-    return padded(estimate), padded(truth)
+    return padded(estimate), padded(ground_truth)
 
 
 def _deltas(pairs: Pairs) -> tuple[tuple[float, DeltaUnit], ...]:
     """A frame; a second, if poses come faster and there are two of them; metres, a power of ten near path / 10."""
     deltas: list[tuple[float, DeltaUnit]] = [(1.0, "frames")]
-    times = pairs.truth.timestamps_s
+    times = pairs.ground_truth.timestamps_s
     if times is not None and np.median(np.diff(times)) <= 0.5 and np.ptp(times) >= 2:
         deltas.append((1.0, "s"))
-    if pairs.truth.path_m > 0:
-        deltas.append((min(10.0 ** round(math.log10(pairs.truth.path_m / 10)), 100.0), "m"))
+    if pairs.ground_truth.path_m > 0:
+        deltas.append((min(10.0 ** round(math.log10(pairs.ground_truth.path_m / 10)), 100.0), "m"))
     return tuple(deltas)
 
 
@@ -293,7 +301,7 @@ def _errors(
         except InputError:  # nobody asked for this delta: gaps can leave no two poses a second apart
             if options.deltas is not None:
                 raise
-    is_short = pairs.truth.path_m <= KITTI_LENGTHS_M[0]
+    is_short = pairs.ground_truth.path_m <= KITTI_LENGTHS_M[0]
     if is_short:
         drift = kitti_drift(pairs, scale=absolute.scale, lengths_m=path_shares_m(pairs), step=1)
     else:
@@ -305,13 +313,14 @@ def _notes(result: Evaluation, options: EvaluateOptions) -> list[str]:
     pairs, notes = result.pairs, []
     if pairs.coverage < _COMPARABLE_COVERAGE:
         notes.append(
-            f"the estimate covers {100 * pairs.coverage:.1f} % of the truth: these errors say nothing about the rest, "
+            f"the estimate covers {100 * pairs.coverage:.1f} % of the ground truth: these errors say nothing about the "
+            "rest, "
             "and are not comparable with those of a run that covers more"
         )
     left = pairs.num_estimate - len(np.unique(pairs.estimate_idx))
-    if left and pairs.num_truth > pairs.num_estimate:
+    if left and pairs.num_ground_truth > pairs.num_estimate:
         notes.append(f"{left} poses of the estimate have no true one within {options.max_difference_s:g} s")
-    for name, file in (("estimate", result.estimate), ("truth", result.truth)):
+    for name, file in (("estimate", result.estimate), ("ground_truth", result.ground_truth)):
         notes += [file.note] if file.note else []
         times = file.trajectory.timestamps_s
         steps = np.diff(times) if times is not None else np.ones(0)
@@ -319,9 +328,14 @@ def _notes(result: Evaluation, options: EvaluateOptions) -> list[str]:
             notes.append(f"the timestamps of the {name} do not ascend ({(steps < 0).sum()} steps back): sorted by time")
         if (steps == 0).any():
             notes.append(f"{(steps == 0).sum()} poses of the {name} have the timestamp of the one before")
-    if result.truth.format == "euroc" and result.estimate.format != "euroc" and not result.truth.path.is_dir():
+    if (
+        result.ground_truth.format == "euroc"
+        and result.estimate.format != "euroc"
+        and not result.ground_truth.path.is_dir()
+    ):
         notes.append(
-            "EuRoC's truth is of the IMU, whose axes are not the camera's: against it the rotations, RPE and drift of "
+            "EuRoC's ground truth is of the IMU, whose axes are not the camera's: against it the rotations, RPE and "
+            "drift of "
             "a camera's trajectory say nothing, and the ATE holds the lever between the two; give the folder of the "
             "sequence instead"
         )
@@ -344,7 +358,8 @@ def _drift_note(result: Evaluation) -> str:
     if errors.is_by_share:
         return (
             f"no t_rel and r_rel: KITTI's stretches are 100 to 800 m long, this path is "
-            f"{_metres(result.pairs.truth.path_m)}; the drift is over stretches of 10, 20, ..., 80 % of it instead"
+            f"{_metres(result.pairs.ground_truth.path_m)}; the drift is over stretches of "
+            "10, 20, ..., 80 % of it instead"
         )
     longest = errors.drift.length_m.max(initial=0)
     if not longest:
@@ -373,7 +388,7 @@ def _errors_dict(errors: Errors) -> dict[str, Any]:
         kitti = {"t_rel_percent": drift.t_rel_percent, "r_rel_deg_per_m": drift.r_rel_deg_per_m,
                  "r_rel_deg_per_100m": 100 * drift.r_rel_deg_per_m, "num": len(drift.first)}  # fmt: skip
     return {
-        "truth_from_estimate": errors.absolute.truth_from_estimate.tolist(),
+        "ground_truth_from_estimate": errors.absolute.ground_truth_from_estimate.tolist(),
         "scale": errors.absolute.scale,
         "ate": {"translation_m": statistics(errors.absolute.translation_m),
                 "rotation_deg": statistics(errors.absolute.rotation_deg)},
@@ -392,14 +407,15 @@ def _errors_dict(errors: Errors) -> dict[str, Any]:
 
 def _table_lines(result: Evaluation) -> list[str]:
     pairs = result.pairs
-    times = pairs.truth.timestamps_s
+    times = pairs.ground_truth.timestamps_s
     duration = "" if times is None else f" in {np.ptp(times):.4g} s"
     num_gaps = int(pairs.is_gap.sum())
     lines = [
         f"{result.estimate.path} ({_FORMAT_NAMES.get(result.estimate.format, result.estimate.format)})",
-        f"against {result.truth.path} ({_FORMAT_NAMES.get(result.truth.format, result.truth.format)})",
-        f"{len(pairs)} pairs of {pairs.num_estimate} estimated and {pairs.num_truth} true poses, "
-        f"{_metres(pairs.truth.path_m)}{duration}, coverage {100 * pairs.coverage:.1f} %, "
+        f"against {result.ground_truth.path} "
+        f"({_FORMAT_NAMES.get(result.ground_truth.format, result.ground_truth.format)})",
+        f"{len(pairs)} pairs of {pairs.num_estimate} estimated and {pairs.num_ground_truth} true poses, "
+        f"{_metres(pairs.ground_truth.path_m)}{duration}, coverage {100 * pairs.coverage:.1f} %, "
         f"{num_gaps or 'no'} gap{'' if num_gaps == 1 else 's'}",
         "",
     ]

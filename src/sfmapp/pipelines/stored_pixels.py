@@ -21,12 +21,13 @@ from sfmapp.geometry.orientation import INVERSE, MIRRORED, ROTATION_OF, upright_
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from sfmapp.formats.truth import Truth
+    from sfmapp.formats.ground_truth import GroundTruth
     from sfmapp.scene.reconstruction import Reconstruction
 
 # what the mapping notes of its model in the manifest; earlier versions noted nothing
 STORED = "stored"
-# where the truth is of pictures that were turned, turning it back leaves this share of the rotation errors at most
+# where the ground truth is of pictures that were turned, turning it back leaves this share of the rotation errors at
+# most
 _TURNED_SHARE = 0.2
 
 
@@ -62,38 +63,41 @@ def check_pixels(folder: Path, manifest: Mapping[str, Any]) -> None:
         )
 
 
-def truth_in_stored_pixels(
-    truth: Truth, model: Reconstruction, orientations: Mapping[str, int], notes: list[str]
-) -> Truth:
+def ground_truth_in_stored_pixels(
+    ground_truth: GroundTruth, model: Reconstruction, orientations: Mapping[str, int], notes: list[str]
+) -> GroundTruth:
     """The same cameras with axes along those of the files, if they evidently are those of pictures turned upright.
 
     Args:
-        truth: with the names of the photographs.
+        ground_truth: with the names of the photographs.
         model: whose errors tell.
         orientations: EXIF's, by name of the photograph.
-        notes: told if the truth was turned.
+        notes: told if the ground truth was turned.
     """
-    held = [orientations.get(name, 1) for name in truth.names]
+    held = [orientations.get(name, 1) for name in ground_truth.names]
     if not held or all(orientation == 1 for orientation in held):
-        return truth
-    poses, is_mirrored = truth.cam_from_world, all(orientation in MIRRORED for orientation in held)
+        return ground_truth
+    poses, is_mirrored = ground_truth.cam_from_world, all(orientation in MIRRORED for orientation in held)
     if is_mirrored:  # and so is the world that their model is of
         mirror = np.diag([-1.0, 1.0, 1.0])
         poses = rigid3.from_matrix(mirror @ rigid3.rotation_matrix(poses) @ mirror, poses[:, 4:] @ mirror)
     poses = upright_poses(poses, [INVERSE[ROTATION_OF[orientation]] for orientation in held])
-    as_given, as_stored = (_rotation_error(model, truth, known) for known in (truth.cam_from_world, poses))
+    as_given, as_stored = (
+        _rotation_error(model, ground_truth, known) for known in (ground_truth.cam_from_world, poses)
+    )
     if not as_stored < _TURNED_SHARE * as_given:
-        return truth
+        return ground_truth
     notes.append(
-        "the truth is of pictures turned upright as EXIF says: its cameras were turned back to the pixels of the files"
+        "the ground truth is of pictures turned upright as EXIF says: its cameras were turned back to the "
+        "pixels of the files"
         + (", and mirrored as these are" if is_mirrored else "")
         + f" (median rotation error {as_stored:.3g} degrees, as given {as_given:.3g})"
     )
-    return replace(truth, cam_from_world=poses)
+    return replace(ground_truth, cam_from_world=poses)
 
 
-def _rotation_error(model: Reconstruction, truth: Truth, poses: NDArray[np.float64]) -> float:
+def _rotation_error(model: Reconstruction, ground_truth: GroundTruth, poses: NDArray[np.float64]) -> float:
     """Median in degrees; NaN without two common images."""
-    errors = evaluate_poses(model.image_names, model.cam_from_world, truth.names, poses).rotation_error_deg
+    errors = evaluate_poses(model.image_names, model.cam_from_world, ground_truth.names, poses).rotation_error_deg
     known = errors[np.isfinite(errors)]
     return float(np.median(known)) if len(known) else np.nan

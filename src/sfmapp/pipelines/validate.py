@@ -1,4 +1,4 @@
-"""Doubt a result: pycolmap on the same photographs, and the truth where there is one, in one table."""
+"""Doubt a result: pycolmap on the same photographs, and the ground truth where there is one, in one table."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from sfmapp.evaluation.poses import AUC_THRESHOLDS_DEG, PoseErrors, compare_reco
 from sfmapp.evaluation.second_opinion import CameraGroup, SecondOpinion, SecondOpinionOptions, ask_second_opinion
 from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model
-from sfmapp.formats.truth import Truth, read_truth
+from sfmapp.formats.ground_truth import GroundTruth, read_ground_truth
 from sfmapp.images.folder import load_images
-from sfmapp.pipelines.stored_pixels import check_pixels, truth_in_stored_pixels
+from sfmapp.pipelines.stored_pixels import check_pixels, ground_truth_in_stored_pixels
 from sfmapp.workspace.layout import RECONSTRUCT
 from sfmapp.workspace.manifest import read_manifest
 from sfmapp.workspace.options import options_from_dict
@@ -38,16 +38,17 @@ class Validation:
     Attributes:
         ours, pycolmap: ``registered``, ``images``, ``points``, ``track_length``, ``reprojection_error_px`` (mean over
             the observations, by the same code for both), ``wall_s``, ``cpu_s``, ``peak_memory_mb`` (None: not recorded)
-            and, with a truth, ``truth`` as :meth:`PoseErrors.summary` gives it. ``pycolmap`` is None if it failed.
+            and, with a ground truth, ``ground_truth`` as :meth:`PoseErrors.summary` gives it. ``pycolmap`` is None if
+            it failed.
         agreement: of the poses after a robust similarity fit, pycolmap being the reference; None without two models.
-        truth: name of the truth, None without.
+        ground truth: name of the ground truth, None without.
         notes: what a reader of the table has to know.
     """
 
     ours: dict[str, Any]
     pycolmap: dict[str, Any] | None
     agreement: dict[str, Any] | None
-    truth: str | None
+    ground_truth: str | None
     notes: list[str] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
@@ -61,25 +62,25 @@ class Validation:
 
 def validate(
     output: str | os.PathLike[str],
-    truth: str | os.PathLike[str] | None = None,
+    ground_truth: str | os.PathLike[str] | None = None,
     *,
     options: SecondOpinionOptions | None = None,
     events: Events | None = None,
 ) -> Validation:
-    """Compare the largest model of a workspace with pycolmap's on the same photographs, and both with a truth.
+    """Compare the largest model of a workspace with pycolmap's on the same photographs, and both with a ground truth.
 
     pycolmap's result is kept in ``OUT/validation/pycolmap`` and used again while photographs and options are the same.
     ``OUT/validation/report.json`` holds the comparison.
 
     Args:
         output: the workspace of a run.
-        truth: COLMAP model, ``cameras.json`` or TUM trajectory; None: no truth.
+        ground truth: COLMAP model, ``cameras.json`` or TUM trajectory; None: no ground truth.
         options: of pycolmap; None: its defaults, but with the camera model, the sharing and the intrinsics that the
             user gave to our run.
         events: progress and cancellation.
 
     Raises:
-        InputError: no workspace, no truth, or the photographs are gone.
+        InputError: no workspace, no ground truth, or the photographs are gone.
         NoReconstructionError: the workspace holds no model.
         InterruptedRunError: ``events`` was asked to stop.
     """
@@ -89,14 +90,14 @@ def validate(
     model_folder = folder / "sparse" / "0"
     if not has_model(model_folder):
         raise NoReconstructionError(f"{folder} holds no model to validate", "run sfmapp reconstruct first")
-    known_truth = read_truth(Path(truth)) if truth is not None else None
+    known_ground_truth = read_ground_truth(Path(ground_truth)) if ground_truth is not None else None
     model = read_model(model_folder)[0]
     image_set, image_options = _photographs(manifest, events)
     notes = _changed_photographs(manifest, image_set)
-    if known_truth is not None:
-        known_truth = _truth_of_photographs(known_truth, image_set, notes)
+    if known_ground_truth is not None:
+        known_ground_truth = _ground_truth_of_photographs(known_ground_truth, image_set, notes)
         orientations = {image.name: image.orientation for image in image_set.images}
-        known_truth = truth_in_stored_pixels(known_truth, model, orientations, notes)
+        known_ground_truth = ground_truth_in_stored_pixels(known_ground_truth, model, orientations, notes)
     ours = _numbers(model, len(image_set.images)) | _own_usage(folder, notes)
     opinion = _ask(image_set, image_options, folder / FOLDER / "pycolmap", options, events, notes)
     theirs, agreement = None, None
@@ -106,14 +107,14 @@ def validate(
         theirs |= {"phases": opinion.phases, "version": opinion.version, "options": opinion.options}
         if other is not None:
             agreement = compare_reconstructions(model, other).summary()
-        if known_truth is not None:
-            theirs["truth"] = _against(other, known_truth).summary()
-    if known_truth is not None:
-        ours["truth"] = _against(model, known_truth).summary()
+        if known_ground_truth is not None:
+            theirs["ground_truth"] = _against(other, known_ground_truth).summary()
+    if known_ground_truth is not None:
+        ours["ground_truth"] = _against(model, known_ground_truth).summary()
         notes.append(
-            "centre and rotation errors after a least-squares similarity fit to the truth; the AUC needs no fit"
+            "centre and rotation errors after a least-squares similarity fit to the ground truth; the AUC needs no fit"
         )
-    result = Validation(ours, theirs, agreement, None if truth is None else os.fspath(truth), notes)
+    result = Validation(ours, theirs, agreement, None if ground_truth is None else os.fspath(ground_truth), notes)
     _write_json(folder / FOLDER / "report.json", result.to_dict())
     return result
 
@@ -223,23 +224,27 @@ def _own_usage(folder: Path, notes: list[str]) -> dict[str, float | None]:
     return {key: run.get(key) for key in _USAGE_KEYS}
 
 
-def _against(model: Reconstruction | None, truth: Truth) -> PoseErrors:
+def _against(model: Reconstruction | None, ground_truth: GroundTruth) -> PoseErrors:
     if model is None:
-        return evaluate_poses([], [], truth.names, truth.cam_from_world)
-    return evaluate_poses(model.image_names, model.cam_from_world, truth.names, truth.cam_from_world)
+        return evaluate_poses([], [], ground_truth.names, ground_truth.cam_from_world)
+    return evaluate_poses(model.image_names, model.cam_from_world, ground_truth.names, ground_truth.cam_from_world)
 
 
-def _truth_of_photographs(truth: Truth, image_set: ImageSet, notes: list[str]) -> Truth:
+def _ground_truth_of_photographs(ground_truth: GroundTruth, image_set: ImageSet, notes: list[str]) -> GroundTruth:
     """The entries that have a photograph, under its name: a trajectory may hold many more than were ever given."""
     names = [image.name for image in image_set.images]
-    truth = truth.for_images(names)
+    ground_truth = ground_truth.for_images(names)
     ours = set(names)
-    kept = [k for k, name in enumerate(truth.names) if name in ours]
-    if len(kept) < len(truth.names):
-        notes.append(f"{len(truth.names) - len(kept)} entries of the truth have no photograph and are left out")
+    kept = [k for k, name in enumerate(ground_truth.names) if name in ours]
+    if len(kept) < len(ground_truth.names):
+        notes.append(
+            f"{len(ground_truth.names) - len(kept)} entries of the ground truth have no photograph and are left out"
+        )
     if len(kept) < len(names):
-        notes.append(f"{len(names) - len(kept)} photographs are not in the truth and are left out of its errors")
-    return replace(truth, names=tuple(truth.names[k] for k in kept), cam_from_world=truth.cam_from_world[kept])
+        notes.append(f"{len(names) - len(kept)} photographs are not in the ground truth and are left out of its errors")
+    return replace(
+        ground_truth, names=tuple(ground_truth.names[k] for k in kept), cam_from_world=ground_truth.cam_from_world[kept]
+    )
 
 
 def _write_json(path: Path, value: dict[str, Any]) -> None:
@@ -274,8 +279,12 @@ def table_lines(result: Validation) -> list[str]:
     lines = _columns(rows)
     if result.agreement is not None:
         lines += ["", *_agreement_lines(result.agreement)]
-    if result.truth is not None:
-        lines += ["", f"against {result.truth}", *_columns(_truth_rows(ours["truth"], (theirs or {}).get("truth")))]
+    if result.ground_truth is not None:
+        lines += [
+            "",
+            f"against {result.ground_truth}",
+            *_columns(_ground_truth_rows(ours["ground_truth"], (theirs or {}).get("ground_truth"))),
+        ]
     lines.append("")
     for note in result.notes:
         first, *more = note.splitlines()  # what pycolmap said before it fell over keeps its lines
@@ -297,7 +306,7 @@ def _agreement_lines(agreement: dict[str, Any]) -> list[str]:
     ]
 
 
-def _truth_rows(ours: dict[str, Any], theirs: dict[str, Any] | None) -> list[tuple[str, str, str, str]]:
+def _ground_truth_rows(ours: dict[str, Any], theirs: dict[str, Any] | None) -> list[tuple[str, str, str, str]]:
     def pick(summary: dict[str, Any] | None, group: str, key: str, form: str, scale: float = 1.0) -> str:
         values = summary and summary[group]
         return _number(values[key] * scale, form) if values else "-"

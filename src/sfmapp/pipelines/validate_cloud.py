@@ -17,10 +17,10 @@ from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.events import Events
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.colmap import has_model, read_model
+from sfmapp.formats.ground_truth import read_ground_truth
 from sfmapp.formats.ply_reader import PlyGeometry, read_ply_geometry
-from sfmapp.formats.truth import read_truth
 from sfmapp.geometry import similarity
-from sfmapp.pipelines.stored_pixels import orientations_of, truth_in_stored_pixels
+from sfmapp.pipelines.stored_pixels import ground_truth_in_stored_pixels, orientations_of
 
 FOLDER = "validation"
 CLOUD, MESH, PATCHES = Path("dense") / "fused.ply", Path("mesh") / "mesh.ply", Path("dense") / "patches.npz"
@@ -35,14 +35,14 @@ class CloudValidation:
     """Scores of what a result holds.
 
     Attributes:
-        truth: name of the true cloud.
-        distance: the distance D in units of the truth.
+        ground_truth: name of the true cloud.
+        distance: the distance D in units of the ground truth.
         scores: by file, as :meth:`CloudScore.summary` gives them, at 1, 2 and 5 D.
         recording: the coloured clouds, None if rerun failed.
         notes: what a reader of the table has to know.
     """
 
-    truth: str
+    ground_truth: str
     distance: float
     scores: dict[str, dict[str, Any]]
     recording: str | None
@@ -55,9 +55,9 @@ class CloudValidation:
     def table(self) -> str:
         """The scores as plain text; no newline at its end."""
         head = f"{'':<28}" + "".join(f"{f'{factor:g} x D':>12}" for factor in DISTANCE_FACTORS)
-        lines = [f"against {self.truth}, D = {self.distance:.6g}", head]
+        lines = [f"against {self.ground_truth}, D = {self.distance:.6g}", head]
         for name, summary in self.scores.items():
-            lines.append(f"{name}: {summary['num_points']} points, {summary['num_truth']} true points")
+            lines.append(f"{name}: {summary['num_points']} points, {summary['num_ground_truth']} true points")
             for title, key in (("accuracy", "accuracy"), ("completeness", "completeness"), ("F-score", "f_score")):
                 values = "".join(f"{100 * score[key]:>10.2f} %" for score in summary["scores"])
                 lines.append(f"  {title:<26}{values}")
@@ -69,9 +69,9 @@ class CloudValidation:
 
 def validate_cloud(
     output: str | os.PathLike[str],
-    truth_cloud: str | os.PathLike[str],
+    ground_truth_cloud: str | os.PathLike[str],
     *,
-    truth_poses: str | os.PathLike[str] | None = None,
+    ground_truth_poses: str | os.PathLike[str] | None = None,
     distance: float | None = None,
     threads: int | None = None,
     events: Events | None = None,
@@ -82,41 +82,41 @@ def validate_cloud(
 
     Args:
         output: a workspace with ``dense/fused.ply`` or ``mesh/mesh.ply``, or a PLY file.
-        truth_cloud: a PLY: cloud or mesh. A mesh becomes points, spread evenly.
-        truth_poses: true cameras, as :func:`validate` takes them. The similarity that carries the cameras of the
+        ground_truth_cloud: a PLY: cloud or mesh. A mesh becomes points, spread evenly.
+        ground_truth_poses: true cameras, as :func:`validate` takes them. The similarity that carries the cameras of the
             workspace into them carries its cloud too; None: both clouds are in one frame.
-        distance: the distance D in units of the truth; None: the median size of a pixel at the patches.
+        distance: the distance D in units of the ground truth; None: the median size of a pixel at the patches.
         threads: of the search; None: as many as there are processors.
         events: progress and cancellation.
 
     Raises:
-        InputError: a file is missing or not what it should be, or the truth holds no points.
+        InputError: a file is missing or not what it should be, or the ground truth holds no points.
         UsageError: the distance is not given and not known, or not above 0.
     """
     events, folder = events or Events(), Path(output)
     files = _files(folder)
-    events.started("validate", f"reading {truth_cloud}", total=1 + len(files))
+    events.started("validate", f"reading {ground_truth_cloud}", total=1 + len(files))
     threads = threads or os.cpu_count() or 1
     notes: list[str] = []
-    sim = similarity.IDENTITY if truth_poses is None else _alignment(folder, Path(truth_poses), notes)
+    sim = similarity.IDENTITY if ground_truth_poses is None else _alignment(folder, Path(ground_truth_poses), notes)
     limit = _distance(folder, distance, float(sim[7]))
-    truth = _points(read_ply_geometry(Path(truth_cloud)), limit, os.fspath(truth_cloud), notes)
-    if not np.isfinite(truth).all(axis=1).any():
-        raise InputError(f"{truth_cloud}: expected true points, found none that is finite")
+    ground_truth = _points(read_ply_geometry(Path(ground_truth_cloud)), limit, os.fspath(ground_truth_cloud), notes)
+    if not np.isfinite(ground_truth).all(axis=1).any():
+        raise InputError(f"{ground_truth_cloud}: expected true points, found none that is finite")
     events.advanced("validate")
     found: dict[str, tuple[NDArray[np.float64], CloudScore]] = {}
     for name, path in files.items():
         geometry = read_ply_geometry(path)
         moved = PlyGeometry(similarity.apply(sim, geometry.xyz), geometry.triangles)
         xyz = _points(moved, limit, name, notes)
-        score = score_cloud(xyz, truth, [limit * factor for factor in DISTANCE_FACTORS], threads=threads)
+        score = score_cloud(xyz, ground_truth, [limit * factor for factor in DISTANCE_FACTORS], threads=threads)
         found[name] = xyz, score
         events.advanced("validate", message=name)
     place = (folder if folder.is_dir() else folder.parent) / FOLDER
     place.mkdir(parents=True, exist_ok=True)
-    recording = _record(place / "cloud_error.rrd", found, truth, events)
+    recording = _record(place / "cloud_error.rrd", found, ground_truth, events)
     scores = {name: score.summary() for name, (_, score) in found.items()}
-    result = CloudValidation(os.fspath(truth_cloud), limit, scores, recording, notes)
+    result = CloudValidation(os.fspath(ground_truth_cloud), limit, scores, recording, notes)
     with replaced_file(place / "cloud.json") as beside:
         beside.write_text(json.dumps(result.to_dict(), indent=1) + "\n", encoding="utf-8")
     events.finished("validate", f"scored {', '.join(found)}", **result.to_dict())
@@ -154,18 +154,18 @@ def _distance(folder: Path, distance: float | None, scale: float) -> float:
     return float(np.median(sizes)) * scale
 
 
-def _alignment(folder: Path, truth_poses: Path, notes: list[str]) -> NDArray[np.float64]:
-    """``truth_from_ours`` (8,) of the cameras in the workspace."""
+def _alignment(folder: Path, ground_truth_poses: Path, notes: list[str]) -> NDArray[np.float64]:
+    """``ground_truth_from_ours`` (8,) of the cameras in the workspace."""
     model_folder = folder / "sparse" / "0"
     if not has_model(model_folder):
-        raise InputError(f"{model_folder}: expected a model, to align it with {truth_poses}, found none")
+        raise InputError(f"{model_folder}: expected a model, to align it with {ground_truth_poses}, found none")
     model = read_model(model_folder)[0]
-    truth = read_truth(truth_poses).for_images(model.image_names)
+    ground_truth = read_ground_truth(ground_truth_poses).for_images(model.image_names)
     # where all centres are on a line, the axes of the cameras tell how the scene is turned about it
-    truth = truth_in_stored_pixels(truth, model, orientations_of(folder), notes)
-    errors = evaluate_poses(model.image_names, model.cam_from_world, truth.names, truth.cam_from_world)
+    ground_truth = ground_truth_in_stored_pixels(ground_truth, model, orientations_of(folder), notes)
+    errors = evaluate_poses(model.image_names, model.cam_from_world, ground_truth.names, ground_truth.cam_from_world)
     if errors.reference_from_estimate is None:
-        raise InputError(f"{truth_poses}: expected two true cameras of photographs of the model, found fewer")
+        raise InputError(f"{ground_truth_poses}: expected two true cameras of photographs of the model, found fewer")
     residual = np.nanmedian(errors.center_error)
     notes.append(
         f"moved by a similarity fitted to {int(errors.is_common.sum())} cameras, median residual {residual:.4g}"
@@ -186,7 +186,10 @@ def _points(geometry: PlyGeometry, distance: float, name: str, notes: list[str])
 
 
 def _record(
-    path: Path, found: dict[str, tuple[NDArray[np.float64], CloudScore]], truth: NDArray[np.float64], events: Events
+    path: Path,
+    found: dict[str, tuple[NDArray[np.float64], CloudScore]],
+    ground_truth: NDArray[np.float64],
+    events: Events,
 ) -> str | None:
     """Write the recording; a failure is a warning, as the scores are worth having without it."""
     try:
@@ -196,7 +199,7 @@ def _record(
         for name, (xyz, score) in found.items():
             stem, limits = Path(name).stem, score.distances
             clouds[f"{stem}/accuracy"] = ErrorCloud(xyz, score.point_distance)
-            clouds[f"{stem}/completeness"] = ErrorCloud(truth, score.truth_distance)
+            clouds[f"{stem}/completeness"] = ErrorCloud(ground_truth, score.ground_truth_distance)
         write_error_rrd(path, clouds, limits, f"Errors of {', '.join(found)}")
     except Exception as error:  # rerun raises what it likes
         events.warned("validate", f"{path} was not written: {error}")

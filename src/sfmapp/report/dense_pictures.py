@@ -11,7 +11,7 @@ from sfmapp.dense.scene import DenseScene, DenseView, Patches
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.orientation import MIRRORED, upright_pinhole, upright_pixels, upright_poses, upright_size
 from sfmapp.geometry.upright import up_direction
-from sfmapp.report.preview import Eye, picture_of_mesh, picture_of_patches
+from sfmapp.report.preview import VirtualCamera, picture_of_mesh, picture_of_patches
 from sfmapp.scene.mesh import Mesh
 
 Array = NDArray[np.float64]
@@ -61,7 +61,7 @@ def dense_pictures(scene: DenseScene, patches: Patches, mesh: Mesh | None, *, ce
 
 
 def _pictures(
-    patches: Patches, radius: NDArray[np.float32], mesh: Mesh | None, eye: Eye, *, is_mirrored: bool = False
+    patches: Patches, radius: NDArray[np.float32], mesh: Mesh | None, eye: VirtualCamera, *, is_mirrored: bool = False
 ) -> list[Picture]:
     colored, clay = picture_of_patches(patches.xyz, patches.normal, patches.rgb, radius, eye)
     shown = [("patches", colored), ("patches in the light of a lamp", clay)]
@@ -75,20 +75,20 @@ def _chosen_views(scene: DenseScene, patches: Patches) -> list[int]:
     counts = np.bincount(patches.view_idx, minlength=len(scene.views))
     first = int(counts.argmax())
     forward = rigid3.rotation_matrix(scene.cam_from_world)[:, 2]
-    likeness = np.where(2 * counts >= counts[first], forward @ forward[first], np.inf)
-    second = int(likeness.argmin())
+    alignment = np.where(2 * counts >= counts[first], forward @ forward[first], np.inf)
+    second = int(alignment.argmin())
     return [first] if second == first else [first, second]
 
 
-def _eye_of(view: DenseView) -> Eye:
+def _eye_of(view: DenseView) -> VirtualCamera:
     """The view's own eye, its head upright."""
     scale = LONGER_SIDE_PX / max(view.width, view.height)
     k = upright_pinhole(view.orientation, view.k, view.width, view.height) * scale
     width, height = upright_size(view.orientation, round(view.width * scale), round(view.height * scale))
-    return Eye(k, upright_poses(view.cam_from_world[None], [view.orientation])[0], width, height)
+    return VirtualCamera(k, upright_poses(view.cam_from_world[None], [view.orientation])[0], width, height)
 
 
-def turned_eye(scene: DenseScene, patches: Patches, v: int) -> Eye:
+def turned_eye(scene: DenseScene, patches: Patches, v: int) -> VirtualCamera:
     """The eye of view v, turned around what it sees to the side and up, at a distance from which all of that shows."""
     eye = _eye_of(scene.views[v])
     body = _middle_points(patches.xyz)
@@ -105,7 +105,7 @@ def turned_eye(scene: DenseScene, patches: Patches, v: int) -> Eye:
     axes = np.stack([right, np.cross(-back, right), -back])
     center = target + _distance((body - target) @ axes.T, eye) * back
     pose = rigid3.from_matrix(axes, -axes @ center)
-    return Eye(eye.k, np.asarray(pose), eye.width, eye.height)
+    return VirtualCamera(eye.k, np.asarray(pose), eye.width, eye.height)
 
 
 def _raised(direction: Array, up: Array) -> Array:
@@ -127,7 +127,7 @@ def _middle_points(xyz: Array) -> Array:
     return np.asarray(sample[kept] if kept.any() else sample)
 
 
-def _distance(offset: Array, eye: Eye) -> float:
+def _distance(offset: Array, eye: VirtualCamera) -> float:
     """How far from the origin along -z an eye has to stand to see points (N, 3) around it, given in its axes."""
     fx, fy, cx, cy = eye.k
     half = np.array([min(cx, eye.width - cx) / fx, min(cy, eye.height - cy) / fy])

@@ -1,4 +1,4 @@
-"""What came of a sequence, as JSON-able rows: frames and gaps, maps, the error against the truth, and checks."""
+"""What came of a sequence, as JSON-able rows: frames and gaps, maps, the error against the ground truth, and checks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sfmapp.evaluation.trajectory import (
     statistics,
 )
 from sfmapp.geometry import rigid3
-from sfmapp.images.sequence import Truth
+from sfmapp.images.sequence import GroundTruth
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.report.document import check, check_contradictions
 
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class FrameFacts:
+class FrameTable:
     """What was seen of each frame while it was tracked, over frames (F); NaN where nothing was told.
 
     Attributes:
@@ -50,8 +50,8 @@ class FrameFacts:
 
 
 @dataclass(frozen=True)
-class Against:
-    """One map's trajectory against the truth."""
+class GroundTruthFit:
+    """One map's trajectory against the ground truth."""
 
     pairs: Pairs
     error: AbsoluteError
@@ -148,45 +148,47 @@ def _uncertainty(entry: MapResult) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def against_truth(result: OdometryResult, truth: Truth, map_idx: int) -> Against | None:
-    """A map's poses after an alignment to the truth: with a scale of its own where that is unknown.
+def fit_to_ground_truth(result: OdometryResult, ground_truth: GroundTruth, map_idx: int) -> GroundTruthFit | None:
+    """A map's poses after an alignment to the ground truth: with a scale of its own where that is unknown.
 
     None if the two have too little in common.
     """
     is_metric = unit_of(result.maps[map_idx]) != ""
     return _against(
-        result, np.where((result.frame_map == map_idx)[:, None], result.cam_from_world, np.nan), truth, is_metric
+        result, np.where((result.frame_map == map_idx)[:, None], result.cam_from_world, np.nan), ground_truth, is_metric
     )
 
 
-def live_against_truth(result: OdometryResult, truth: Truth, facts: FrameFacts) -> Against | None:
+def fit_live_to_ground_truth(
+    result: OdometryResult, ground_truth: GroundTruth, facts: FrameTable
+) -> GroundTruthFit | None:
     """The same of the live poses of the longest live map. Metres from anywhere but a rig are known only in the end."""
     maps = facts.live_maps()
     if not maps:
         return None
     is_metric = any(entry.scale_source == "stereo" for entry in result.maps)
     poses = np.where((facts.live_map == maps[0])[:, None], result.live_cam_from_world, np.nan)
-    return _against(result, poses, truth, is_metric)
+    return _against(result, poses, ground_truth, is_metric)
 
 
-def _against(result: OdometryResult, poses: Array, truth: Truth, is_metric: bool) -> Against | None:
+def _against(result: OdometryResult, poses: Array, ground_truth: GroundTruth, is_metric: bool) -> GroundTruthFit | None:
     alignment: Alignment = "se3" if is_metric else "sim3"
-    times = truth.timestamps_s
-    # nearer than half a frame: a truth that is sampled more sparsely than the frames still names its own
+    times = ground_truth.timestamps_s
+    # nearer than half a frame: a ground truth that is sampled more sparsely than the frames still names its own
     step = float(np.median(np.diff(result.timestamps_s))) if len(result.timestamps_s) > 1 else 0.02
     try:
         pairs = associate(
             Trajectory.from_cam_from_world(poses, result.timestamps_s),
-            Trajectory.from_cam_from_world(truth.cam_from_world, times),
+            Trajectory.from_cam_from_world(ground_truth.cam_from_world, times),
             max_difference_s=step / 2,
         )
-        return Against(pairs, absolute_error(pairs, alignment), alignment)
+        return GroundTruthFit(pairs, absolute_error(pairs, alignment), alignment)
     except InputError:
         return None
 
 
-def errors_of_frames(result: OdometryResult, against: Sequence[Against | None]) -> Array:
-    """(F,) distance of each frame's final position from the truth, NaN where it is not known."""
+def errors_of_frames(result: OdometryResult, against: Sequence[GroundTruthFit | None]) -> Array:
+    """(F,) distance of each frame's final position from the ground truth, NaN where it is not known."""
     errors = np.full(len(result.frame_idx), np.nan)
     for fit in against:
         if fit is not None:
@@ -194,20 +196,20 @@ def errors_of_frames(result: OdometryResult, against: Sequence[Against | None]) 
     return errors
 
 
-def truth_row(against: Against) -> dict[str, Any]:
+def ground_truth_row(against: GroundTruthFit) -> dict[str, Any]:
     """The error in numbers: metres and degrees."""
     return {
         "alignment": against.alignment,
         "num_pairs": len(against.pairs),
         "scale": against.error.scale,
-        "true_path_m": against.pairs.truth.path_m,
+        "true_path_m": against.pairs.ground_truth.path_m,
         "ate_m": statistics(against.error.translation_m),
         "rotation_deg": statistics(against.error.rotation_deg),
     }
 
 
 def make_checks(
-    frames: Mapping[str, Any], maps: Sequence[Mapping[str, Any]], timing: Mapping[str, Any], facts: FrameFacts
+    frames: Mapping[str, Any], maps: Sequence[Mapping[str, Any]], timing: Mapping[str, Any], facts: FrameTable
 ) -> list[dict[str, str]]:
     """Traffic lights over a run, each with its thresholds in words."""
     share = 100 * frames["num_in_largest_map"] / max(1, frames["num_frames"])

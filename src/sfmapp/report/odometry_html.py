@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.images.sequence import Truth
+from sfmapp.images.sequence import GroundTruth
 from sfmapp.odometry.result import OdometryResult
-from sfmapp.report.odometry_document import Against, FrameFacts, errors_of_frames, unit_of
+from sfmapp.report.odometry_document import FrameTable, GroundTruthFit, errors_of_frames, unit_of
 from sfmapp.report.page import check_table, failure_box, log_table, render_page, table, usage_table
-from sfmapp.report.path_view import PATH_COLOR, TRUTH_COLOR, PathScene, legend, path_view_svg
+from sfmapp.report.path_view import GROUND_TRUTH_COLOR, PATH_COLOR, PathScene, legend, path_view_svg
 from sfmapp.report.plots import Curve, plot_svg
 
 MAX_VIEWS = 4
@@ -22,16 +22,17 @@ _ORANGE, _GREY = "#e07b00", "#999"
 
 
 def render_odometry_html(
-    report: Mapping[str, Any], result: OdometryResult | None, facts: FrameFacts | None, truth: Truth | None,
-    against: Sequence[Against | None],
+    report: Mapping[str, Any], result: OdometryResult | None, facts: FrameTable | None,
+    ground_truth: GroundTruth | None,
+    against: Sequence[GroundTruthFit | None],
 ) -> str:  # fmt: skip
-    """The page of a report; ``against``: each map against the truth, empty without one."""
+    """The page of a report; ``against``: each map against the ground truth, empty without one."""
     body = [_headline(report), failure_box(report["outcome"]), check_table(report["checks"])]
     if result is not None and facts is not None and len(result.frame_idx):
-        body.append(trajectory_views(result, truth, against, report["sequence"]["orientation"]))
+        body.append(trajectory_views(result, ground_truth, against, report["sequence"]["orientation"]))
         body.append("<h2>Frame by frame</h2>" + _plots(result, facts, against))
         body.append(_gaps(report["frames"]["gaps"]))
-    body.append(_maps(report["maps"]) + _truth(report.get("truth")))
+    body.append(_maps(report["maps"]) + _ground_truth(report.get("ground_truth")))
     body.append(_loops(report["decisions"]) + _sequence(report["sequence"], report["stages"]))
     body.append(_timing(report.get("timing")) + usage_table(report["usage"], report["run"]))
     body.append(log_table("Warnings", report["warnings"]) + log_table("Decisions", report["decisions"]))
@@ -57,17 +58,20 @@ def _headline(report: Mapping[str, Any]) -> str:
 
 
 def trajectory_views(
-    result: OdometryResult, truth: Truth | None, against: Sequence[Against | None], orientation: int
+    result: OdometryResult, ground_truth: GroundTruth | None, against: Sequence[GroundTruthFit | None], orientation: int
 ) -> str:
-    """Each map from above; those that the truth joins share its frame but not one picture. ``orientation``: EXIF's."""
+    """Each map from above; those that the ground truth joins share its frame but not one picture. ``orientation``:
+    EXIF's."""
     parts = []
     for map_idx in range(min(len(result.maps), MAX_VIEWS)):
         fit = against[map_idx] if against else None
         unit = unit_of(result.maps[map_idx])
-        svg = path_view_svg(_scene(result, map_idx, truth, fit, "m" if fit else unit), orientation)
+        svg = path_view_svg(_scene(result, map_idx, ground_truth, fit, "m" if fit else unit), orientation)
         entries = [(PATH_COLOR, "trajectory, keyframes as dots")]
         if fit:
-            entries.append((TRUTH_COLOR, f"truth; the trajectory is laid on it ({fit.alignment.upper()})"))
+            entries.append(
+                (GROUND_TRUTH_COLOR, f"ground truth; the trajectory is laid on it ({fit.alignment.upper()})")
+            )
         title = "From above" + (f", map {map_idx}" if len(result.maps) > 1 else "")
         parts.append(f"<h2>{title}</h2>{svg}{legend(entries)}")
     if len(result.maps) > MAX_VIEWS:
@@ -76,7 +80,7 @@ def trajectory_views(
 
 
 def _scene(
-    result: OdometryResult, map_idx: int, truth: Truth | None, fit: Against | None, unit: str
+    result: OdometryResult, map_idx: int, ground_truth: GroundTruth | None, fit: GroundTruthFit | None, unit: str
 ) -> PathScene:  # fmt: skip
     entry = result.maps[map_idx]
     model = entry.reconstruction
@@ -86,16 +90,19 @@ def _scene(
     keyframes = model.cam_from_world[entry.keyframe_image_idx]
     points = model.point_xyz[model.is_triangulated]
     centers = np.zeros((0, 3))
-    if fit is not None and truth is not None:
-        to_truth = fit.error.truth_from_estimate
-        poses, keyframes = similarity.transform_poses(to_truth, poses), similarity.transform_poses(to_truth, keyframes)
-        points = similarity.apply(to_truth, points)
-        during = slice(int(fit.pairs.truth_idx[0]), int(fit.pairs.truth_idx[-1]) + 1)
-        centers = rigid3.center(truth.cam_from_world[during])
+    if fit is not None and ground_truth is not None:
+        to_ground_truth = fit.error.ground_truth_from_estimate
+        poses, keyframes = (
+            similarity.transform_poses(to_ground_truth, poses),
+            similarity.transform_poses(to_ground_truth, keyframes),
+        )
+        points = similarity.apply(to_ground_truth, points)
+        during = slice(int(fit.pairs.ground_truth_idx[0]), int(fit.pairs.ground_truth_idx[-1]) + 1)
+        centers = rigid3.center(ground_truth.cam_from_world[during])
     return PathScene(poses, keyframes, points, centers, unit)
 
 
-def _plots(result: OdometryResult, facts: FrameFacts, against: Sequence[Against | None]) -> str:
+def _plots(result: OdometryResult, facts: FrameTable, against: Sequence[GroundTruthFit | None]) -> str:
     x = result.frame_idx.astype(np.float64)
     has_pose = np.isfinite(result.cam_from_world[:, 0])
     edges = np.diff(np.concatenate([[0], (~has_pose).astype(np.int8), [0]]))
@@ -115,8 +122,8 @@ def _plots(result: OdometryResult, facts: FrameFacts, against: Sequence[Against 
     if any(against):
         error = errors_of_frames(result, against)
         parts += [
-            "<h3>Distance from the truth, m</h3>",
-            plot_svg(x, [Curve("final", error, TRUTH_COLOR)], gaps, "frame"),
+            "<h3>Distance from the ground truth, m</h3>",
+            plot_svg(x, [Curve("final", error, GROUND_TRUTH_COLOR)], gaps, "frame"),
         ]
     return "".join(parts)
 
@@ -175,7 +182,7 @@ def scale_text(row: Mapping[str, Any]) -> str:
     return f"{text}, \N{PLUS-MINUS SIGN}{100 * sigma:.2g} %" if sigma else text
 
 
-def _truth(rows: Sequence[Mapping[str, Any]] | None) -> str:
+def _ground_truth(rows: Sequence[Mapping[str, Any]] | None) -> str:
     if not rows:
         return ""
     head = [
@@ -194,7 +201,7 @@ def _truth(rows: Sequence[Mapping[str, Any]] | None) -> str:
                 ("", f"{row['rotation_deg']['rmse']:.3f}"), ("", f"{row['scale']:.4g}"),
             ]
         )  # fmt: skip
-    return "<h2>Against the truth</h2>" + table(head, cells)
+    return "<h2>Against the ground truth</h2>" + table(head, cells)
 
 
 def _loops(decisions: Iterable[Mapping[str, Any]]) -> str:

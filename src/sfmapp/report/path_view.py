@@ -1,4 +1,4 @@
-"""A trajectory seen from above, as a small SVG: the path with its gaps, keyframes, points, and the truth."""
+"""A trajectory seen from above, as a small SVG: the path with its gaps, keyframes, points, and the ground truth."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sfmapp.report.top_view import HEIGHT, MAX_POINTS, WIDTH, fit_page, ground_a
 
 Array = NDArray[np.float64]
 
-PATH_COLOR, TRUTH_COLOR = "#2f7fe0", "#2a9d4a"
+PATH_COLOR, GROUND_TRUTH_COLOR = "#2f7fe0", "#2a9d4a"
 _MAX_VERTICES = 3000
 
 
@@ -28,14 +28,14 @@ class PathScene:
         cam_from_world: (F, 7) poses of all frames, NaN in gaps.
         keyframe_cam_from_world: (K, 7).
         point_xyz: (P, 3).
-        truth_centers: (T, 3) true positions in the same world; empty without truth.
+        ground_truth_centers: (T, 3) true positions in the same world; empty without ground truth.
         unit: of length, ``m`` or empty where it is arbitrary.
     """
 
     cam_from_world: Array
     keyframe_cam_from_world: Array
     point_xyz: Array
-    truth_centers: Array
+    ground_truth_centers: Array
     unit: str
 
 
@@ -50,16 +50,16 @@ def path_view_svg(scene: PathScene, orientation: int = 1) -> str:
     poses = scene.cam_from_world[with_pose]
     axes = ground_axes(rigid3.rotation_matrix(upright_poses(poses, np.full(len(poses), orientation))))
     path = rigid3.center(scene.cam_from_world) @ axes.T
-    truth = scene.truth_centers @ axes.T
+    ground_truth = scene.ground_truth_centers @ axes.T
     # the points may lie far beyond the path: they are the background, and get half its size on each side at most
-    shown = np.concatenate([path[with_pose], truth])
+    shown = np.concatenate([path[with_pose], ground_truth])
     points = scene.point_xyz[:: max(1, len(scene.point_xyz) // MAX_POINTS)] @ axes.T
     middle, half = (shown.max(0) + shown.min(0)) / 2, np.ptp(shown, axis=0).max() or 1.0
     points = points[(np.abs(points - middle) < half).all(1)]
     scale, offset = fit_page(points, shown)
     parts = [_dots((points * scale + offset).round(1))]
-    if len(truth):
-        parts.append(_strip(truth * scale + offset, TRUTH_COLOR, 5, 'stroke-opacity=".55"'))
+    if len(ground_truth):
+        parts.append(_strip(ground_truth * scale + offset, GROUND_TRUTH_COLOR, 5, 'stroke-opacity=".55"'))
     parts.append(_strip(path * scale + offset, PATH_COLOR, 2))
     for center in (rigid3.center(scene.keyframe_cam_from_world) @ axes.T) * scale + offset:
         parts.append(f'<circle cx="{center[0]:.1f}" cy="{center[1]:.1f}" r="2.6" fill="{PATH_COLOR}"/>')

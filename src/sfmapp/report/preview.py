@@ -24,7 +24,7 @@ MAX_RADIUS_PX = 64.0
 
 
 @dataclass(frozen=True)
-class Eye:
+class VirtualCamera:
     """A camera without distortion that looks at a result.
 
     Attributes:
@@ -38,9 +38,9 @@ class Eye:
     width: int
     height: int
 
-    def larger(self, factor: int) -> Eye:
+    def larger(self, factor: int) -> VirtualCamera:
         """The same with so many times the pixels each way."""
-        return Eye(self.k * factor, self.cam_from_world, self.width * factor, self.height * factor)
+        return VirtualCamera(self.k * factor, self.cam_from_world, self.width * factor, self.height * factor)
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Seen:
     weight: NDArray[np.float32]
 
 
-def see_patches(xyz: Array, normal: NDArray[np.float32], radius: NDArray[np.float32], eye: Eye) -> Seen:
+def see_patches(xyz: Array, normal: NDArray[np.float32], radius: NDArray[np.float32], eye: VirtualCamera) -> Seen:
     """Patches (N) as discs in their planes, the foremost in each pixel.
 
     Args:
@@ -75,7 +75,7 @@ def see_patches(xyz: Array, normal: NDArray[np.float32], radius: NDArray[np.floa
     return Seen(idx, depth, np.zeros((eye.height, eye.width, 0), np.float32))
 
 
-def see_mesh(xyz: Array, faces: NDArray[np.int32], eye: Eye) -> Seen:
+def see_mesh(xyz: Array, faces: NDArray[np.int32], eye: VirtualCamera) -> Seen:
     """Triangles (F, 3) of vertices (N, 3), world, from either side, the foremost in each pixel.
 
     A pixel sees the triangle that its centre is in. Triangles that reach behind the eye are left out.
@@ -88,7 +88,7 @@ def see_mesh(xyz: Array, faces: NDArray[np.int32], eye: Eye) -> Seen:
     return Seen(idx, depth, weight)
 
 
-def shaded(normal: NDArray[np.floating], eye: Eye, rgb: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+def shaded(normal: NDArray[np.floating], eye: VirtualCamera, rgb: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
     """Colours (..., 3) of surfaces in the light of the lamp (Lambert), of clay or of their own colour.
 
     Args:
@@ -104,14 +104,16 @@ def shaded(normal: NDArray[np.floating], eye: Eye, rgb: NDArray[np.uint8] | None
 
 
 def picture_of_patches(
-    xyz: Array, normal: NDArray[np.float32], rgb: NDArray[np.uint8], radius: NDArray[np.float32], eye: Eye
+    xyz: Array, normal: NDArray[np.float32], rgb: NDArray[np.uint8], radius: NDArray[np.float32], eye: VirtualCamera
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Two pictures (H, W, 3) RGB of patches (N): in their colours, and as clay in the light of a lamp."""
     seen = see_patches(xyz, normal, radius, eye.larger(2))
     return _picture(seen, rgb), _picture(seen, shaded(normal.astype(np.float64), eye))
 
 
-def picture_of_mesh(xyz: Array, faces: NDArray[np.int32], normal: NDArray[np.float32], eye: Eye) -> NDArray[np.uint8]:
+def picture_of_mesh(
+    xyz: Array, faces: NDArray[np.int32], normal: NDArray[np.float32], eye: VirtualCamera
+) -> NDArray[np.uint8]:
     """(H, W, 3) RGB of a mesh as clay in the light of a lamp, with normals (N, 3) of its vertices."""
     seen = see_mesh(xyz, faces, eye.larger(2))
     rows = seen.idx >= 0

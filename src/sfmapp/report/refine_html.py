@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from sfmapp.images.sequence import Truth
+from sfmapp.images.sequence import GroundTruth
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.report.document import check_contradictions
-from sfmapp.report.odometry_document import Against
+from sfmapp.report.odometry_document import GroundTruthFit
 from sfmapp.report.odometry_html import trajectory_views
 from sfmapp.report.page import check_table, failure_box, log_table, render_page, table, usage_table
 
@@ -22,15 +22,18 @@ _ROWS = (
 
 
 def render_refine_html(
-    report: Mapping[str, Any], result: OdometryResult, truth: Truth | None, against: Sequence[Against | None]
+    report: Mapping[str, Any],
+    result: OdometryResult,
+    ground_truth: GroundTruth | None,
+    against: Sequence[GroundTruthFit | None],
 ) -> str:
-    """The page of a report; ``result`` is the refined one, ``against`` each of its maps against the truth."""
+    """The page of a report; ``result`` is the refined one, ``against`` each of its maps against the ground truth."""
     run = report["run"]
     facts = "; ".join([run["source"], f"sfmapp {run['versions']['sfmapp']}", run["started"]])
     body = [f'<p class="dim">{escape(facts)}</p>']
     found = check_contradictions(row for entry in report["maps"]["after"] for row in entry["contradictions"])
     body += [failure_box(report["outcome"]), check_table(found), "<h2>Before and after</h2>" + _comparison(report)]
-    body.append(trajectory_views(result, truth, against, report["orientation"]))
+    body.append(trajectory_views(result, ground_truth, against, report["orientation"]))
     body.append(_photographs(report["photographs"], report["skipped"]))
     body.append(usage_table(report["usage"], run))
     body.append(log_table("Warnings", report["warnings"]) + log_table("Decisions", report["decisions"]))
@@ -43,9 +46,11 @@ def _comparison(report: Mapping[str, Any]) -> str:
         for key, label, form in _ROWS:
             cells = [("", f"{entry[key]:{form}}") for entry in (before, after)]
             rows.append([("", before["idx"]), ("t", label), *cells])
-    for before, after in zip(report["truth"]["before"], report["truth"]["after"], strict=False):
+    for before, after in zip(report["ground_truth"]["before"], report["ground_truth"]["after"], strict=False):
         cells = [("", f"{entry['ate_m']['rmse']:.4f}") for entry in (before, after)]
-        rows.append([("", before["map"]), ("t", f"off the truth, rmse m ({before['alignment'].upper()})"), *cells])
+        rows.append(
+            [("", before["map"]), ("t", f"off the ground truth, rmse m ({before['alignment'].upper()})"), *cells]
+        )
     for k, (before, after) in enumerate(zip(report["cameras"]["before"], report["cameras"]["after"], strict=False)):
         cells = [("w", " ".join([entry["model"], *(f"{v:.6g}" for v in entry["params"])])) for entry in (before, after)]
         rows.append([("", ""), ("t", f"camera {k}"), *cells])

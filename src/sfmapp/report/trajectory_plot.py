@@ -1,4 +1,5 @@
-"""A trajectory against the truth as a picture: from above with its error in colours, and its errors over time."""
+"""A trajectory against the ground truth as a picture: from above with its error in colours, and its errors over
+time."""
 
 from __future__ import annotations
 
@@ -22,8 +23,8 @@ _INK: Color = (32, 36, 42)
 _DIM: Color = (104, 112, 122)
 _GRID: Color = (232, 234, 237)
 _FRAME: Color = (190, 195, 201)
-_TRUTH: Color = (190, 197, 206)
-_TRUTH_DARK: Color = (128, 137, 148)
+_GROUND_TRUTH: Color = (190, 197, 206)
+_GROUND_TRUTH_DARK: Color = (128, 137, 148)
 _GAP: Color = (252, 228, 226)
 _LINE: Color = (62, 30, 160)
 _START: Color = (28, 146, 92)
@@ -56,7 +57,7 @@ class _Panel:
 
 @dataclass(frozen=True)
 class _View:
-    """Two axes of the truth's world on a panel, to the same scale."""
+    """Two axes of the ground truth's world on a panel, to the same scale."""
 
     panel: _Panel
     axes: tuple[int, int]
@@ -70,24 +71,24 @@ class _View:
 
 
 def write_trajectory_plot(
-    path: Path, pairs: Pairs, error: AbsoluteError, truth: Trajectory, title: str, facts: Sequence[str]
+    path: Path, pairs: Pairs, error: AbsoluteError, ground_truth: Trajectory, title: str, facts: Sequence[str]
 ) -> None:
-    """Draw the aligned estimate over the truth, and what it is off by, as a PNG.
+    """Draw the aligned estimate over the ground truth, and what it is off by, as a PNG.
 
-    The view is along the axis of the truth's world in which it extends least. Below or beside it: distance and angle to
-    the truth, and the coordinate along the view.
+    The view is along the axis of the ground truth's world in which it extends least. Below or beside it: distance and
+    angle to the ground truth, and the coordinate along the view.
 
     Args:
         path: where to write.
         pairs, error: of :mod:`sfmapp.evaluation.trajectory`.
-        truth: all of it, the part without an estimate included.
+        ground_truth: all of it, the part without an estimate included.
         title, facts: the head line, and what stands below it.
 
     Raises:
         InputError: the file cannot be written.
     """
     page = Drawing(WIDTH, HEIGHT)
-    whole = truth[truth.has_pose]
+    whole = ground_truth[ground_truth.has_pose]
     shown = np.concatenate([whole.position, error.aligned.position])
     axes, across = _plane(whole.position)
     extent = np.maximum(np.ptp(shown[:, axes], axis=0), 1e-9)
@@ -95,7 +96,7 @@ def write_trajectory_plot(
     _head(page, title, facts)
     view = _fit(map_panel, shown, axes)
     _draw_view(page, view, whole, pairs, error)
-    _draw_strips(page, strips, truth, pairs, error, across)
+    _draw_strips(page, strips, ground_truth, pairs, error, across)
     page.write_png(path)
 
 
@@ -142,18 +143,18 @@ def _fit(panel: _Panel, shown: Array, axes: tuple[int, int]) -> _View:
     return _View(panel, axes, (low + high) / 2 - np.array([panel.width, panel.height]) / zoom / 2, zoom)
 
 
-def _draw_view(page: Drawing, view: _View, truth: Trajectory, pairs: Pairs, error: AbsoluteError) -> None:
+def _draw_view(page: Drawing, view: _View, ground_truth: Trajectory, pairs: Pairs, error: AbsoluteError) -> None:
     panel = view.panel
     _view_grid(page, view)
-    stride = -(-len(truth) // _MAX_CORNERS)
-    page.line(view.to_page(truth.position[::stride]), _TRUTH, 9)
+    stride = -(-len(ground_truth) // _MAX_CORNERS)
+    page.line(view.to_page(ground_truth.position[::stride]), _GROUND_TRUTH, 9)
     stride = -(-len(pairs) // _MAX_CORNERS)
     xy, errors = view.to_page(error.aligned.position[::stride]), error.translation_m[::stride]
     worst = max(float(error.translation_m.max()), _ROUNDING)
     # a gap that falls between two shown corners is one between them
     is_gap = np.maximum.reduceat(pairs.is_gap[1:], np.arange(0, len(pairs) - 1, stride))[: len(xy) - 1]
     for k in np.flatnonzero(is_gap):
-        page.dashes(xy[k : k + 2], _TRUTH_DARK, 2)
+        page.dashes(xy[k : k + 2], _GROUND_TRUTH_DARK, 2)
     tone = np.where(is_gap, np.nan, (errors[1:] + errors[:-1]) / 2 / worst)
     for start, end in _runs(~is_gap):
         page.colored_line(xy[start : end + 1], colormap(tone[start:end]), 4.5)
@@ -162,7 +163,7 @@ def _draw_view(page: Drawing, view: _View, truth: Trajectory, pairs: Pairs, erro
     page.disc(xy[-1], 8, _END, (255, 255, 255))
     page.disc(xy[0], 8, _START, (255, 255, 255))
     _legend(page, panel, has_gaps=bool(is_gap.any()))
-    _scale_bar(page, view, np.concatenate([xy, view.to_page(truth.position)]))
+    _scale_bar(page, view, np.concatenate([xy, view.to_page(ground_truth.position)]))
     _color_bar(page, panel, worst)
 
 
@@ -236,13 +237,13 @@ def _legend(page: Drawing, panel: _Panel, *, has_gaps: bool) -> None:
         page.text(text, x + sample + 12, y + 7, 20, _INK)
         x += sample + 12 + page.text_width(text, 20) + 40
 
-    page.line(np.array([[x, y], [x + 44, y]]), _TRUTH, 9)
-    entry("truth", 44)
+    page.line(np.array([[x, y], [x + 44, y]]), _GROUND_TRUTH, 9)
+    entry("ground_truth", 44)
     tones = np.linspace(0, 1, 45)
     page.colored_line(np.stack([x + np.arange(45.0), np.full(45, y)], 1), colormap(tones[1:]), 4.5)
     entry("estimate", 44)
     if has_gaps:
-        page.dashes(np.array([[x, y], [x + 44, y]]), _TRUTH_DARK, 2)
+        page.dashes(np.array([[x, y], [x + 44, y]]), _GROUND_TRUTH_DARK, 2)
         entry("gap", 44)
     page.disc(np.array([x + 8, y]), 8, _START, (255, 255, 255))
     entry("start", 16)
@@ -318,11 +319,15 @@ class _Strip:
 
 
 def _draw_strips(
-    page: Drawing, panels: Sequence[_Panel], truth: Trajectory, pairs: Pairs, error: AbsoluteError, across: int
+    page: Drawing, panels: Sequence[_Panel], ground_truth: Trajectory, pairs: Pairs, error: AbsoluteError, across: int
 ) -> None:
-    has_time = pairs.truth.timestamps_s is not None
-    moments = truth.timestamps_s if truth.timestamps_s is not None else np.arange(len(truth), dtype=np.float64)
-    true_time = moments[truth.has_pose]
+    has_time = pairs.ground_truth.timestamps_s is not None
+    moments = (
+        ground_truth.timestamps_s
+        if ground_truth.timestamps_s is not None
+        else np.arange(len(ground_truth), dtype=np.float64)
+    )
+    true_time = moments[ground_truth.has_pose]
     start = float(true_time.min()) if has_time else 0.0
     time, true_time = pairs.clock - start, true_time - start
     span = float(true_time.min()), float(true_time.max())
@@ -336,17 +341,17 @@ def _draw_strips(
         rmse = float(np.sqrt((values**2).mean()))
         page.dashes(strip.points(np.array(span), np.full(2, rmse)), _DIM, 1.5)
         page.text(f"rmse {rmse:.3g}", panel.right, panel.top - 14, 20, _DIM, anchor="end")
-    true, ours = truth.position[truth.has_pose, across], error.aligned.position[:, across]
+    true, ours = ground_truth.position[ground_truth.has_pose, across], error.aligned.position[:, across]
     low, high = float(min(true.min(), ours.min())), float(max(true.max(), ours.max()))
     margin = 0.08 * (high - low) or 1.0
     strip = _Strip(panels[2], *span, low - margin, high + margin, gaps)
     _strip_grid(page, strip, f"{'xyz'[across]}, m, across the view", label)
-    page.line(strip.points(true_time, true), _TRUTH, 6)
+    page.line(strip.points(true_time, true), _GROUND_TRUTH, 6)
     page.line(strip.points(time, ours, pairs.is_gap), _LINE, 2)
 
 
 def _gaps(time: Array, is_gap: NDArray[np.bool_], span: tuple[float, float]) -> list[tuple[float, float]]:
-    """From where to where there is no estimate, the ends of the truth included."""
+    """From where to where there is no estimate, the ends of the ground truth included."""
     gaps = [(float(time[k - 1]), float(time[k])) for k in np.flatnonzero(is_gap)]
     step = 2.5 * float(np.median(np.diff(time)))
     return gaps + [(a, b) for a, b in ((span[0], float(time[0])), (float(time[-1]), span[1])) if b - a > step]

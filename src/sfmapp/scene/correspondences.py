@@ -33,7 +33,7 @@ class Correspondences:
         matches: (M, 2) int32, positions of the keypoints in images i and j; inliers only.
         config: (P,) int8 of TwoViewConfig; UNDEFINED where verification failed.
         fundamental, essential, homography: (P, 3, 3) float64, mapping image i to j (x_j^T F x_i = 0, x_j ~ H x_i) in
-            house pixels for F and H and normalised coordinates for E; NaN where not estimated.
+            COLMAP's pixels for F and H and normalised coordinates for E; NaN where not estimated.
         cam2_from_cam1: (P, 7) float64 pose j_from_i with unit translation, NaN where not estimated.
         median_angle_deg: (P,) float64, median triangulation angle of the inliers; NaN where there is no pose.
         num_putative, num_inliers_f, num_inliers_e, num_inliers_h: (P,) int32 matches before verification, and how many

@@ -1,4 +1,4 @@
-"""Synthetic scenes with known truth and noise knobs: for tests, benchmarks and trying things out.
+"""Synthetic scenes with known ground truth and noise knobs: for tests, benchmarks and trying things out.
 
 Everything is drawn from a seed. Visibility is physical enough to give tracks of real shape: a point has a normal and is
 seen from the front side only, inside the image, and detected with some probability.
@@ -31,13 +31,13 @@ class SyntheticScene:
     """A scene and what was observed of it.
 
     Attributes:
-        truth: every image registered, every point triangulated, exact observations.
+        ground_truth: every image registered, every point triangulated, exact observations.
         observed: the same poses and points beside noisy observations, all of them marked as inliers; start from
             ``perturb(scene.observed, ...)`` or from ``Reconstruction.empty`` with its cameras and tracks.
         obs_is_outlier: (O,) bool, which observations were replaced by a random pixel.
     """
 
-    truth: Reconstruction
+    ground_truth: Reconstruction
     observed: Reconstruction
     obs_is_outlier: NDArray[np.bool_]
 
@@ -111,7 +111,7 @@ def make_scene(
         poses = mounted.cam_from_world(np.arange(num_images), frames[mounted.frame_idx])
     xyz, visible = _points_and_visibility(layout, num_points, poses, camera_list, image_camera_idx, detection, rng)
     scene = _observe(seed, camera_list, image_camera_idx, poses, xyz, visible, sigma_px, outlier_ratio, rng)
-    scene.truth.rig = scene.observed.rig = mounted
+    scene.ground_truth.rig = scene.observed.rig = mounted
     return scene
 
 
@@ -183,12 +183,12 @@ def perturb(
 
 
 def true_correspondences(scene: SyntheticScene, min_matches: int = 15) -> Correspondences:
-    """What a perfect matcher would find: for every pair of images the shared tracks (outliers left out), with the true
+    """What a perfect matcher would find: forevery pair of images the shared tracks (outliers left out), with the true
     two-view geometry. Pairs with fewer than ``min_matches`` stay in as failures.
 
     Feature positions are those of ``scene.observed.tracks.obs_feature_idx``.
     """
-    tracks, truth = scene.observed.tracks, scene.truth
+    tracks, ground_truth = scene.observed.tracks, scene.ground_truth
     feature = np.full((tracks.num_images, tracks.num_tracks), -1, np.int32)
     good = ~scene.obs_is_outlier
     feature[tracks.obs_image_idx[good], tracks.obs_track_idx[good]] = tracks.obs_feature_idx[good]
@@ -200,7 +200,7 @@ def true_correspondences(scene: SyntheticScene, min_matches: int = 15) -> Corres
     config = np.zeros(num, np.int8)
     matches: list[NDArray[np.int32]] = []
     putative = np.zeros(num, np.int32)
-    centers = truth.centers
+    centers = ground_truth.centers
     for p, (i, j) in enumerate(pairs):
         shared = np.flatnonzero((feature[i] >= 0) & (feature[j] >= 0))
         putative[p] = len(shared)
@@ -209,14 +209,14 @@ def true_correspondences(scene: SyntheticScene, min_matches: int = 15) -> Corres
             continue
         matches.append(np.stack([feature[i, shared], feature[j, shared]], 1))
         config[p] = TwoViewConfig.CALIBRATED
-        pose = rigid3.compose(truth.cam_from_world[j], rigid3.inverse(truth.cam_from_world[i]))
+        pose = rigid3.compose(ground_truth.cam_from_world[j], rigid3.inverse(ground_truth.cam_from_world[i]))
         pose[4:] /= np.linalg.norm(pose[4:])
         relative[p] = pose
         essential = rigid3.skew(pose[4:]) @ rigid3.rotation_matrix(pose)
-        k_i, k_j = (truth.cameras[truth.image_camera_idx[a]].k_matrix for a in (i, j))
+        k_i, k_j = (ground_truth.cameras[ground_truth.image_camera_idx[a]].k_matrix for a in (i, j))
         matrices["essential"][p] = essential
         matrices["fundamental"][p] = np.linalg.inv(k_j).T @ essential @ np.linalg.inv(k_i)
-        rays = [_unit(truth.point_xyz[shared] - centers[a]) for a in (i, j)]
+        rays = [_unit(ground_truth.point_xyz[shared] - centers[a]) for a in (i, j)]
         angle[p] = np.degrees(np.median(np.arccos(np.clip((rays[0] * rays[1]).sum(1), -1, 1))))
     counts = np.array([len(m) for m in matches], np.int64)
     found = counts.astype(np.int32)
@@ -271,7 +271,7 @@ def _alike_correspondences(
     rng: np.random.Generator,
 ) -> Correspondences:  # fmt: skip
     """Verified matches between points that look alike: of each pair those of the turn that most agree with."""
-    tracks, poses, sides = scene.observed.tracks, scene.truth.cam_from_world, len(turns)
+    tracks, poses, sides = scene.observed.tracks, scene.ground_truth.cam_from_world, len(turns)
     # what each image sees of what looks the same: the observation if it is one, else none
     obs_of = np.full((tracks.num_images, looks_like.max() + 1), -1)
     count = np.zeros(obs_of.shape, np.int64)

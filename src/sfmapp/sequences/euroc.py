@@ -1,4 +1,4 @@
-"""The layout of EuRoC MAV (Burri et al., IJRR 2016): ``mav0`` with cameras, IMU and truth, times in nanoseconds.
+"""The layout of EuRoC MAV (Burri et al., IJRR 2016): ``mav0`` with cameras, IMU and ground truth, times in nanoseconds.
 
 ``T_BS`` of a sensor takes points of its own frame to that of the body.
 """
@@ -20,7 +20,7 @@ from sfmapp.formats.clocks import Times, parse_time, read_column
 from sfmapp.formats.flat_yaml import read_flat_yaml
 from sfmapp.formats.trajectory_input import TrajectoryFile, read_trajectory
 from sfmapp.geometry import rigid3
-from sfmapp.images.sequence import STAGE, Imu, Truth
+from sfmapp.images.sequence import STAGE, GroundTruth, Imu
 from sfmapp.scene.rig import Rig
 from sfmapp.sequences.files import (
     Recording,
@@ -38,7 +38,7 @@ from sfmapp.sequences.files import (
 Array = NDArray[np.float64]
 
 # Poses of the body, best first. What a laser tracker alone saw (leica0) is positions without rotations.
-_TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
+_GROUND_TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 # Noise of a common MEMS IMU (EuRoC's ADIS16448), for files that do not state it: rad/s/sqrt(Hz), m/s^2/sqrt(Hz),
 # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz).
 _NOISE = {
@@ -58,7 +58,7 @@ def find_mav(folder: Path) -> Path | None:
 
 
 def read_euroc_sequence(mav: Path, events: Events, only: str | None = None) -> Recording:
-    """A ``mav0`` folder: ``cam0`` and, where it is there, ``cam1``, paired by time; IMU and truth.
+    """A ``mav0`` folder: ``cam0`` and, where it is there, ``cam1``, paired by time; IMU and ground truth.
 
     Args:
         only: the one camera to use, such as ``cam1``; None: both.
@@ -85,22 +85,22 @@ def read_euroc_sequence(mav: Path, events: Events, only: str | None = None) -> R
     times = read_column(str(mav / cameras[0]), [parse_time(stamp) for stamp in stamps], "ns")
     calibration = _read_rig(mav, cameras, sizes)
     body_from_cam = calibration.body_from_cam if calibration else None
-    imu, truth, notes = None, None, list[str]()
+    imu, ground_truth, notes = None, None, list[str]()
     if (mav / "imu0" / "data.csv").is_file():
         if body_from_cam is None:
             events.warned(STAGE, f"{mav / 'imu0'} is not used: no calibration says where it sits (T_BS)")
         else:
             imu, note = read_imu(mav / "imu0" / "data.csv", body_from_cam, times)
             notes.append(note)
-    for name in _TRUTH_FOLDERS:
+    for name in _GROUND_TRUTH_FOLDERS:
         if (mav / name / "data.csv").is_file():
             file = read_trajectory(mav / name / "data.csv", like=times.seconds, is_euroc=True)
-            truth = euroc_truth(file, body_from_cam)
+            ground_truth = euroc_ground_truth(file, body_from_cam)
             notes.append(file.note)
             break
     names = frame_names(mav, first)
     told = tuple(note for note in notes if note)
-    return Recording("euroc", mav, names, times, frames, sizes, calibration, imu, truth, notes=told)
+    return Recording("euroc", mav, names, times, frames, sizes, calibration, imu, ground_truth, notes=told)
 
 
 def _read_frames(camera: Path, events: Events) -> dict[str, Path]:
@@ -194,7 +194,7 @@ def read_imu(path: Path, body_from_cam: Array, frames: Times | None = None) -> t
     return imu, times.note
 
 
-def euroc_truth(file: TrajectoryFile, body_from_cam: Array | None) -> Truth:
+def euroc_ground_truth(file: TrajectoryFile, body_from_cam: Array | None) -> GroundTruth:
     """Poses of the body of a trajectory as poses of the camera.
 
     Args:
@@ -213,4 +213,4 @@ def euroc_truth(file: TrajectoryFile, body_from_cam: Array | None) -> Truth:
         world_from_cam = rigid3.compose(world_from_cam, rigid3.inverse(read_pose(f"{sensor}: T_BS", fields["T_BS"])))
     if body_from_cam is not None:
         world_from_cam = rigid3.compose(world_from_cam, body_from_cam)
-    return in_order(Truth(times[has_pose], rigid3.inverse(world_from_cam[has_pose])))
+    return in_order(GroundTruth(times[has_pose], rigid3.inverse(world_from_cam[has_pose])))

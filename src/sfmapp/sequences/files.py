@@ -23,7 +23,7 @@ from sfmapp.formats.clocks import Times, are_dates, parse_time, read_column, tim
 from sfmapp.formats.text_input import read_limited_text
 from sfmapp.images.frame_reader import LARGEST_FRAME_PX, read_regular_file, some
 from sfmapp.images.headers import UnusableImage, read_header
-from sfmapp.images.sequence import STAGE, Imu, SequenceKind, Truth
+from sfmapp.images.sequence import STAGE, GroundTruth, Imu, SequenceKind
 from sfmapp.images.sources import is_picture, natural_key, printable
 
 Array = NDArray[np.float64]
@@ -47,10 +47,10 @@ class Recording:
         paths: for each frame one file, or two of a pair; one as well where a pair lacks the second.
         sizes: (width, height) of the images of each camera.
         calibration: None if there is none.
-        imu, truth: None where there is none, or where the files that may hold the truth are ``truth_paths``; poses are
-            of the first camera.
-        truth_paths: where a trajectory of the body may lie; the first that is there counts.
-        notes: how times of the IMU and the truth were read, where that is not what the format says.
+        imu, ground_truth: None where there is none, or where the files that may hold the ground truth are
+            ``ground_truth_paths``; poses are of the first camera.
+        ground_truth_paths: where a trajectory of the body may lie; the first that is there counts.
+        notes: how times of the IMU and the ground truth were read, where that is not what the format says.
     """
 
     kind: SequenceKind
@@ -61,8 +61,8 @@ class Recording:
     sizes: tuple[Size, ...]
     calibration: Calibration | None
     imu: Imu | None = None
-    truth: Truth | None = None
-    truth_paths: tuple[Path, ...] = ()
+    ground_truth: GroundTruth | None = None
+    ground_truth_paths: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -264,10 +264,10 @@ def times_of_rows(path: Path, paths: Sequence[Path]) -> Times:
     return times.at(rows)
 
 
-def in_order(truth: Truth) -> Truth:
+def in_order(ground_truth: GroundTruth) -> GroundTruth:
     """The same poses, ascending in time, one for each time."""
-    times, first = np.unique(truth.timestamps_s, return_index=True)
-    return Truth(times, truth.cam_from_world[first])
+    times, first = np.unique(ground_truth.timestamps_s, return_index=True)
+    return GroundTruth(times, ground_truth.cam_from_world[first])
 
 
 def warn_of_missing(events: Events, what: str, names: list[str]) -> None:

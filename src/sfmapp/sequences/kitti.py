@@ -131,10 +131,10 @@ def read_kitti_sequence(folder: Path, events: Events, only: str | None = None) -
         calibration = kitti_calibration(folder / "calib.txt", sizes, int(names[0][-1]))
     times = times_of_rows(folder / "times.txt", left) if (folder / "times.txt").is_file() else None
     resolved = folder.resolve()
-    truth_paths = (folder / "poses.txt", resolved.parent.parent / "poses" / f"{resolved.name}.txt")
+    ground_truth_paths = (folder / "poses.txt", resolved.parent.parent / "poses" / f"{resolved.name}.txt")
     names_of_frames = frame_names(folder, left)
     return Recording(
-        "kitti", folder, names_of_frames, times, frames, sizes, calibration, truth_paths=truth_paths
+        "kitti", folder, names_of_frames, times, frames, sizes, calibration, ground_truth_paths=ground_truth_paths
     )  # fmt: skip
 
 

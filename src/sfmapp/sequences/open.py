@@ -23,12 +23,12 @@ from sfmapp.geometry.orientation import INVERSE, is_sideways, upright_size
 from sfmapp.images.exif import ExifFacts, focal_prior, read_exif
 from sfmapp.images.frame_reader import FileSequence, read_regular_file, some
 from sfmapp.images.headers import UnusableImage, read_header
-from sfmapp.images.sequence import STAGE, Imu, Sequence, SequenceOptions, Truth
+from sfmapp.images.sequence import STAGE, GroundTruth, Imu, Sequence, SequenceOptions
 from sfmapp.images.sources import EXTENSIONS, printable
 from sfmapp.images.video import DEFAULT_FPS, VideoSequence, is_stream, read_video_facts
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.turned_camera import turned_back, turned_camera
-from sfmapp.sequences.euroc import euroc_truth, find_mav, read_euroc_sequence, read_imu
+from sfmapp.sequences.euroc import euroc_ground_truth, find_mav, read_euroc_sequence, read_imu
 from sfmapp.sequences.files import (
     Recording,
     Size,
@@ -46,7 +46,7 @@ from sfmapp.sequences.plain import (
     read_listed_sequence,
     read_pair_sequence,
 )
-from sfmapp.sequences.tum import is_tum, read_tum_sequence, tum_truth
+from sfmapp.sequences.tum import is_tum, read_tum_sequence, tum_ground_truth
 
 __all__ = ["MissingCameraError", "SequenceOptions", "open_sequence"]
 
@@ -289,8 +289,10 @@ def _sequence(
     clock = _clock(recording, first, options, calibration, events)
     times, elapsed = clock.frames_s, clock.elapsed_s
     body_from_cam = calibration.body_from_cam if calibration else None
-    truth = clock.moved(_truth(recording, options.truth, clock.own_s, first, body_from_cam, events))
-    _warn_of_foreign_truth(truth, times, events)
+    ground_truth = clock.moved(
+        _ground_truth(recording, options.ground_truth, clock.own_s, first, body_from_cam, events)
+    )
+    _warn_of_foreign_ground_truth(ground_truth, times, events)
     imu = _imu(recording, options, clock, body_from_cam, events)
     kept = ascending(times)
     if len(kept) < len(times):
@@ -302,7 +304,7 @@ def _sequence(
     if not len(played):
         raise InputError(f"{source}: expected frames from {options.start} to {options.stop}, found {len(kept)} in all")
     if options.reverse:
-        played, times, elapsed, truth, imu = _mirrored(played, times, elapsed, truth, imu)
+        played, times, elapsed, ground_truth, imu = _mirrored(played, times, elapsed, ground_truth, imu)
     fps = 1 / float(np.median(np.diff(times[played]))) if len(played) > 1 else clock.frames_per_second
     sequence = FileSequence(
         recording.kind,
@@ -314,7 +316,7 @@ def _sequence(
         _sampling(rig, calibration),
         fps,
         imu,
-        truth,
+        ground_truth,
         events,
         None if elapsed is None else elapsed[played],
         orientation,
@@ -329,7 +331,8 @@ class _Clock:
 
     Attributes:
         frames_s: (N,) seconds that they are played with.
-        own_s: (N,) what the sequence says, which truth and IMU go by; the same array unless a rate was given instead.
+        own_s: (N,) what the sequence says, which ground truth and IMU go by; the same array unless a rate was given
+            instead.
         frames_per_second: the rate that they were made from; None where they were not.
         own: the sequence's times where they are played as they are; None otherwise.
     """
@@ -344,20 +347,24 @@ class _Clock:
         """(N,) see :class:`~sfmapp.images.sequence.Frame`."""
         return None if self.own is None else self.own.elapsed_s
 
-    def moved(self, truth: Truth | None) -> Truth | None:
+    def moved(self, ground_truth: GroundTruth | None) -> GroundTruth | None:
         """Poses at times of the sequence's own clock at those that are played; all others as they are."""
         order = ascending(self.own_s)
-        if truth is None or self.own_s is self.frames_s or not len(truth.timestamps_s) or len(order) < 2:
-            return truth
-        if _share_time(truth, self.frames_s) or not _share_time(truth, self.own_s):
-            return truth
+        if ground_truth is None or self.own_s is self.frames_s or not len(ground_truth.timestamps_s) or len(order) < 2:
+            return ground_truth
+        if _share_time(ground_truth, self.frames_s) or not _share_time(ground_truth, self.own_s):
+            return ground_truth
         own, played = self.own_s[order], self.frames_s[order]
-        inside = (truth.timestamps_s >= own[0]) & (truth.timestamps_s <= own[-1])
-        return Truth(np.interp(truth.timestamps_s[inside], own, played), truth.cam_from_world[inside])
+        inside = (ground_truth.timestamps_s >= own[0]) & (ground_truth.timestamps_s <= own[-1])
+        return GroundTruth(
+            np.interp(ground_truth.timestamps_s[inside], own, played), ground_truth.cam_from_world[inside]
+        )
 
 
-def _share_time(truth: Truth, times: Array) -> bool:
-    return bool(len(times) and times.min() <= truth.timestamps_s[-1] and truth.timestamps_s[0] <= times.max())
+def _share_time(ground_truth: GroundTruth, times: Array) -> bool:
+    return bool(
+        len(times) and times.min() <= ground_truth.timestamps_s[-1] and ground_truth.timestamps_s[0] <= times.max()
+    )
 
 
 def _clock(
@@ -398,37 +405,39 @@ def _imu(
     return recording.imu
 
 
-def _truth(
+def _ground_truth(
     recording: Recording,
     given: str | None,
     times: Array,
     first: list[Path],
     body_from_cam: Array | None,
     events: Events,
-) -> Truth | None:
+) -> GroundTruth | None:
     """The user's trajectory, or the one that lies beside the frames: of that one, nothing wrong stops the run."""
-    truth = recording.truth
-    beside = next((path for path in recording.truth_paths if path.is_file()), None)
+    ground_truth = recording.ground_truth
+    beside = next((path for path in recording.ground_truth_paths if path.is_file()), None)
     if given is not None:
-        truth = _read_truth(Path(given), times, first, body_from_cam, events)
+        ground_truth = _read_ground_truth(Path(given), times, first, body_from_cam, events)
     elif beside is not None:
         try:
-            truth = _read_truth(beside, times, first, body_from_cam, events)
+            ground_truth = _read_ground_truth(beside, times, first, body_from_cam, events)
         except InputError as error:
-            events.warned(STAGE, f"the truth is not used: {error}")
-    return truth if truth is not None and len(truth.timestamps_s) else None
+            events.warned(STAGE, f"the ground truth is not used: {error}")
+    return ground_truth if ground_truth is not None and len(ground_truth.timestamps_s) else None
 
 
-def _warn_of_foreign_truth(truth: Truth | None, times: Array, events: Events) -> None:
-    if truth is not None and len(truth.timestamps_s) and not _share_time(truth, times):
-        span = f"{truth.timestamps_s[0]:.3f} to {truth.timestamps_s[-1]:.3f} s"
-        text = f"the truth is of {span}, the frames of {times.min():.3f} to {times.max():.3f} s: they share no time"
+def _warn_of_foreign_ground_truth(ground_truth: GroundTruth | None, times: Array, events: Events) -> None:
+    if ground_truth is not None and len(ground_truth.timestamps_s) and not _share_time(ground_truth, times):
+        span = f"{ground_truth.timestamps_s[0]:.3f} to {ground_truth.timestamps_s[-1]:.3f} s"
+        text = (
+            f"the ground truth is of {span}, the frames of {times.min():.3f} to {times.max():.3f} s: they share no time"
+        )
         events.warned(STAGE, text)
 
 
-def _read_truth(
+def _read_ground_truth(
     path: Path, times: Array | None, first: list[Path], body_from_cam: Array | None, events: Events
-) -> Truth:
+) -> GroundTruth:
     """A trajectory of the first camera (TUM) or of the body (EuRoC; KITTI, whose body is its camera 0).
 
     ``times`` are those of the frames; None of a video, which are not known before it is read.
@@ -437,9 +446,9 @@ def _read_truth(
     if file.note:
         events.decided(STAGE, file.note)
     if file.format == "euroc":
-        return euroc_truth(file, body_from_cam)
+        return euroc_ground_truth(file, body_from_cam)
     if file.format == "tum":
-        return tum_truth(file)
+        return tum_ground_truth(file)
     poses = read_kitti(path)
     if times is None:
         raise InputError(
@@ -453,7 +462,7 @@ def _read_truth(
     if body_from_cam is not None:
         poses = rigid3.compose(rigid3.inverse(body_from_cam), poses)
     order = [i for i in ascending(times) if np.isfinite(poses[i]).all()]
-    return Truth(times[order], poses[order])
+    return GroundTruth(times[order], poses[order])
 
 
 def _given_imu(given: str, body_from_cam: Array | None, times: Times | None, events: Events) -> Imu:
@@ -470,13 +479,13 @@ def _given_imu(given: str, body_from_cam: Array | None, times: Times | None, eve
 
 
 def _mirrored(
-    played: NDArray[np.int64], times: Array, elapsed: Array | None, truth: Truth | None, imu: Imu | None
-) -> tuple[NDArray[np.int64], Array, Array | None, Truth | None, Imu | None]:
+    played: NDArray[np.int64], times: Array, elapsed: Array | None, ground_truth: GroundTruth | None, imu: Imu | None
+) -> tuple[NDArray[np.int64], Array, Array | None, GroundTruth | None, Imu | None]:
     """Everything backwards in time, on a clock that still ascends: t becomes first + last - t."""
     total = float(times[played[0]] + times[played[-1]])
     total_elapsed = 0.0 if elapsed is None else float(elapsed[played[0]] + elapsed[played[-1]])
-    if truth is not None:
-        truth = Truth(total - truth.timestamps_s[::-1], truth.cam_from_world[::-1].copy())
+    if ground_truth is not None:
+        ground_truth = GroundTruth(total - ground_truth.timestamps_s[::-1], ground_truth.cam_from_world[::-1].copy())
     if imu is not None:
         # a rotation runs the other way round; an acceleration, the second derivative, is what it was
         back = total - imu.timestamps_s[::-1]
@@ -484,7 +493,7 @@ def _mirrored(
         imu = replace(
             imu, timestamps_s=back, gyro=-imu.gyro[::-1], accel=imu.accel[::-1].copy(), elapsed_s=back_elapsed
         )
-    return played[::-1], total - times, None if elapsed is None else total_elapsed - elapsed, truth, imu
+    return played[::-1], total - times, None if elapsed is None else total_elapsed - elapsed, ground_truth, imu
 
 
 def _open_video(source: str, options: SequenceOptions, events: Events, require_camera: bool) -> VideoSequence:
@@ -495,10 +504,10 @@ def _open_video(source: str, options: SequenceOptions, events: Events, require_c
     rig = _rig(source, calibration, (size,), None, events, require_camera)
     body_from_cam = calibration.body_from_cam if calibration else None
     imu = _given_imu(options.imu, body_from_cam, None, events) if options.imu is not None else None
-    truth = None
-    if options.truth is not None:
-        truth = _read_truth(Path(options.truth), None, [], body_from_cam, events)
-    sequence = VideoSequence(source, rig, facts, options, events, _sampling(rig, calibration), imu, truth)
+    ground_truth = None
+    if options.ground_truth is not None:
+        ground_truth = _read_ground_truth(Path(options.ground_truth), None, [], body_from_cam, events)
+    sequence = VideoSequence(source, rig, facts, options, events, _sampling(rig, calibration), imu, ground_truth)
     _tell(sequence, events)
     return sequence
 
@@ -515,7 +524,7 @@ def _tell(sequence: Sequence, events: Events) -> None:
         f"{camera.model.name}, f {camera.focal:.1f} px",
     ]
     parts += ["IMU"] if sequence.imu is not None else []
-    parts += ["truth"] if sequence.truth is not None else []
+    parts += ["ground_truth"] if sequence.ground_truth is not None else []
     if sequence.orientation != 1:
         text = "the frames have an EXIF orientation: they are used as they are stored, which a calibration has to fit"
         events.decided(STAGE, text, orientation=sequence.orientation)
@@ -528,5 +537,5 @@ def _tell(sequence: Sequence, events: Events) -> None:
         num_cameras=len(sequence.rig.cameras),
         baseline_m=baseline if sequence.rig.is_stereo else None,
         has_imu=sequence.imu is not None,
-        has_truth=sequence.truth is not None,
+        has_ground_truth=sequence.ground_truth is not None,
     )

@@ -26,7 +26,7 @@ _PAIRS = (
     ("camera_0", "camera_1"), ("image_00", "image_01"), ("cam_left", "cam_right"),
 )  # fmt: skip
 _TIMES = ("times.txt", "timestamps.txt", "timestamp.txt", "data.csv", "times.csv", "timestamps.csv", "rgb.txt")
-_TRUTHS = ("groundtruth.txt", "groundtruth.tum", "groundtruth.csv", "poses.txt")
+_GROUND_TRUTHS = ("groundtruth.txt", "groundtruth.tum", "groundtruth.csv", "poses.txt")
 _CALIBRATION_STEMS = (
     "calib", "calibration", "camera", "intrinsics", "camera_info", "camchain", "stereo", "sensor", "ost",
 )  # fmt: skip
@@ -79,7 +79,9 @@ def read_pair_sequence(root: Path, left: Path, right: Path, events: Events) -> R
     first = [frame[0] for frame in frames]
     sizes = (common_size(first, str(left)), common_size([frame[1] for frame in frames], str(right)))
     times = _times(first, left, left.parent, root)
-    return Recording("folder", root, frame_names(root, first), times, frames, sizes, None, truth_paths=_truths(root))
+    return Recording(
+        "folder", root, frame_names(root, first), times, frames, sizes, None, ground_truth_paths=_ground_truths(root)
+    )
 
 
 def read_folder_sequence(root: Path, folder: Path) -> Recording:
@@ -101,11 +103,13 @@ def _of_files(root: Path, files: list[Path], what: str, folders: tuple[Path, ...
     size = common_size(files, what)
     frames: list[tuple[Path, ...]] = [(path,) for path in files]
     times = _times(files, *folders)
-    return Recording("folder", root, frame_names(root, files), times, frames, (size,), None, truth_paths=_truths(root))
+    return Recording(
+        "folder", root, frame_names(root, files), times, frames, (size,), None, ground_truth_paths=_ground_truths(root)
+    )
 
 
-def _truths(root: Path) -> tuple[Path, ...]:
-    return tuple(root / name for name in _TRUTHS)
+def _ground_truths(root: Path) -> tuple[Path, ...]:
+    return tuple(root / name for name in _GROUND_TRUTHS)
 
 
 def _times(files: list[Path], *folders: Path) -> Times | None:

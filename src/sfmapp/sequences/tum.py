@@ -15,7 +15,7 @@ from sfmapp.events import Events
 from sfmapp.formats.clocks import Times, parse_time, read_column
 from sfmapp.formats.trajectory_input import TrajectoryFile
 from sfmapp.geometry import rigid3
-from sfmapp.images.sequence import Truth
+from sfmapp.images.sequence import GroundTruth
 from sfmapp.images.sources import EXTENSIONS
 from sfmapp.scene.rig import Rig
 from sfmapp.sequences.files import (
@@ -63,8 +63,8 @@ def read_tum_sequence(folder: Path, events: Events) -> Recording:
     size = common_size(paths, str(folder / "rgb"))
     frames: list[tuple[Path, ...]] = [(path,) for path in paths]
     calibration = _published_calibration(folder, size)
-    names, truth_paths = frame_names(folder, paths), (folder / "groundtruth.txt",)
-    return Recording("tum", folder, names, times, frames, (size,), calibration, truth_paths=truth_paths)
+    names, ground_truth_paths = frame_names(folder, paths), (folder / "groundtruth.txt",)
+    return Recording("tum", folder, names, times, frames, (size,), calibration, ground_truth_paths=ground_truth_paths)
 
 
 def _read_list(folder: Path, events: Events) -> tuple[Times, list[Path]]:
@@ -88,11 +88,11 @@ def _read_list(folder: Path, events: Events) -> tuple[Times, list[Path]]:
     return read_column(str(list_path), times, "s"), paths
 
 
-def tum_truth(file: TrajectoryFile) -> Truth:
+def tum_ground_truth(file: TrajectoryFile) -> GroundTruth:
     """Poses of a trajectory as those of the camera."""
     times, has_pose = file.trajectory.timestamps_s, file.trajectory.has_pose
     assert times is not None
-    return in_order(Truth(times[has_pose], rigid3.inverse(file.trajectory.world_from_body[has_pose])))
+    return in_order(GroundTruth(times[has_pose], rigid3.inverse(file.trajectory.world_from_body[has_pose])))
 
 
 def _published_calibration(folder: Path, size: Size) -> Calibration | None:

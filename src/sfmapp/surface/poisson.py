@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sfmapp.errors import NoReconstructionError
 from sfmapp.evaluation.measured import ProcessUsage
 from sfmapp.events import Events
+from sfmapp.packages import require
 from sfmapp.surface.child import run_child
 from sfmapp.surface.trim import pieces, rim
 
@@ -62,7 +63,9 @@ def poisson(
     Raises:
         NoReconstructionError: fewer than 50 points, or the child ended without a surface (the message says how).
         InterruptedRunError: ``events`` was asked to stop.
+        MissingPackageError: open3d is not installed.
     """
+    require("open3d", "libusb_package")
     if len(xyz) < FEWEST_POINTS:
         raise NoReconstructionError(
             f"Poisson reconstruction: expected at least {FEWEST_POINTS} oriented points, found {len(xyz)}"

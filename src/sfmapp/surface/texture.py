@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sfmapp.dense.scene import DenseScene
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
+from sfmapp.packages import require
 from sfmapp.scene.mesh import Mesh, face_areas, flat_areas
 from sfmapp.surface.child import run_child
 from sfmapp.surface.options import SurfaceOptions
@@ -71,7 +72,9 @@ def texture_mesh(
     Raises:
         NoReconstructionError: a child process ended without a result.
         InterruptedRunError: ``events`` was asked to stop.
+        MissingPackageError: xatlas or open3d is not installed.
     """
+    require("xatlas", "open3d", "libusb_package")
     events = events or Events()
     start = time.monotonic()
     events.started(STAGE, "texture", total=4)

@@ -2,7 +2,7 @@
 
 Entities::
 
-    world/NAME/accuracy       reconstructed points by their distance to the truth
+    world/NAME/accuracy       reconstructed points by their distance to the ground truth
     world/NAME/completeness   true points by their distance to the reconstruction
     legend                    the colours in words
 """

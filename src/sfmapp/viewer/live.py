@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from sfmapp.events import Event
 from sfmapp.odometry.result import FrameState
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
+from sfmapp.packages import MissingPackageError, require
 from sfmapp.viewer.listener import MAX_MESSAGES
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ class Screen:
 
 
 def thinned_stride(frame_number: int, num_frames: int | None) -> int:
-    """Every how manieth frame is shown with its image, so that a recording of any length stays modest.
+    """Every n-th frame is shown with its image, so that a recording of any length stays modest.
 
     Of a sequence of unknown length the first thousand, then every second of as many more, then every fourth.
     """
@@ -67,7 +68,7 @@ class LiveView:
 
     def __init__(self, recording: Path | None, screen: Screen | None) -> None:
         self._recording, self._screen = recording, screen
-        self._outbox: Outbox | None = None
+        self._send_queue: SendQueue | None = None
         self._num_frames: int | None = None
         self._count = self._num_messages = 0
         self._with_next_frame: list[dict[str, Any]] = []
@@ -79,23 +80,28 @@ class LiveView:
 
     def begin(self, sequence: sequences.Sequence) -> None:
         """Start the child, which first learns what will be played."""
+        try:
+            require("rerun")
+        except MissingPackageError as missing:
+            self._problem = f"{missing}: {missing.advice}"
+            return
         camera = sequence.rig.cameras[0]
         self._num_frames = sequence.num_frames
-        truth = sequence.truth
+        ground_truth = sequence.ground_truth
         command = [
             sys.executable, "-P", "-m", "sfmapp.viewer.live_process",
             str(self._recording.absolute()) if self._recording else "", self._screen.url if self._screen else "",
         ]  # fmt: skip
-        self._outbox = Outbox(command)
+        self._send_queue = SendQueue(command)
         self._send(
             "begin", title=os.path.basename(os.path.abspath(sequence.source)) or sequence.source, camera=camera,
-            truth_times=None if truth is None else truth.timestamps_s,
-            truth_cam_from_world=None if truth is None else truth.cam_from_world,
+            ground_truth_times=None if ground_truth is None else ground_truth.timestamps_s,
+            ground_truth_cam_from_world=None if ground_truth is None else ground_truth.cam_from_world,
             is_metric=sequence.rig.is_stereo, orientation=sequence.orientation,
         )  # fmt: skip
 
     def __call__(self, event: Event) -> None:
-        if self._outbox is None:
+        if self._send_queue is None:
             return
         snapshot = event.data.get("snapshot")
         if isinstance(snapshot, FrameSnapshot):
@@ -108,28 +114,28 @@ class LiveView:
             text = f"{event.stage}: {event.message}"
             self._with_next_frame.append({"kind": "log", "level": _LEVELS[event.kind], "text": text})
 
-    def end(self, result: OdometryResult, truth_from_map: Sequence[Array | None], errors_m: Array) -> str:
+    def end(self, result: OdometryResult, ground_truth_from_map: Sequence[Array | None], errors_m: Array) -> str:
         """Show the final result and close; returns what went wrong, empty for nothing.
 
         Args:
-            truth_from_map: (8,) similarity of each map, None for one that has too little in common with the truth;
-                empty without truth.
-            errors_m: (F,) distance of each frame from the truth, NaN where it is not known.
+            ground_truth_from_map: (8,) similarity of each map, None for one that has too little in common with the
+                ground truth; empty without ground truth.
+            errors_m: (F,) distance of each frame from the ground truth, NaN where it is not known.
         """
-        if self._outbox is None:
+        if self._send_queue is None:
             return self._problem
         self._send_decisions()
         self._send(
             "end", frame_idx=result.frame_idx, timestamps_s=result.timestamps_s, frame_map=result.frame_map,
-            cam_from_world=result.cam_from_world, truth_from_map=list(truth_from_map), errors=errors_m,
+            cam_from_world=result.cam_from_world, ground_truth_from_map=list(ground_truth_from_map), errors=errors_m,
             maps=_final_maps(result),
         )  # fmt: skip
-        outbox, self._outbox = self._outbox, None
+        outbox, self._send_queue = self._send_queue, None
         return outbox.close(END_TIMEOUT_S)
 
     def give_up(self, problem: str) -> bool:
         """End the child and take away what it has recorded so far; whether there was one."""
-        if self._outbox is None:
+        if self._send_queue is None:
             return False
         self._problem = problem
         self._stop()
@@ -144,19 +150,19 @@ class LiveView:
         self._stop()
 
     def _stop(self) -> None:
-        if self._outbox is not None:
-            self._outbox.abandon()
-            self._outbox = None
+        if self._send_queue is not None:
+            self._send_queue.abandon()
+            self._send_queue = None
         if self._recording is not None:  # of a child that was ended, now or for want of time
             for unfinished in self._recording.parent.glob(f".{self._recording.name}.*.part"):
                 unfinished.unlink(missing_ok=True)
 
     def _send_frame(self, seen: FrameSnapshot) -> None:
-        assert self._outbox is not None
+        assert self._send_queue is not None
         stride = thinned_stride(self._count, self._num_frames)
         is_shown = self._count % stride == 0
         self._count += 1
-        waiting = self._outbox.num_bytes
+        waiting = self._send_queue.num_bytes
         image = seen.image if is_shown and waiting < MAX_IMAGE_BYTES else None
         # what was tracked before a loss is not tracked any more
         is_lost = seen.state == FrameState.LOST
@@ -171,14 +177,14 @@ class LiveView:
         self._send_decisions()
 
     def _send_decisions(self) -> None:
-        assert self._outbox is not None
+        assert self._send_queue is not None
         for message in self._with_next_frame:
-            self._outbox.put(message)
+            self._send_queue.put(message)
         self._with_next_frame.clear()
 
     def _send(self, kind: str, **content: Any) -> None:
-        assert self._outbox is not None
-        self._outbox.put({"kind": kind, **content})
+        assert self._send_queue is not None
+        self._send_queue.put({"kind": kind, **content})
 
 
 def _map_message(seen: MapSnapshot) -> dict[str, Any]:
@@ -212,7 +218,7 @@ def _final_maps(result: OdometryResult) -> list[dict[str, Any]]:
 # ------------------------------------------------------------------------------------------------------------- the pipe
 
 
-class Outbox:
+class SendQueue:
     """Messages on their way to a child's standard input: dicts of plain values and arrays."""
 
     def __init__(self, command: Sequence[str]) -> None:

@@ -5,7 +5,7 @@ Entities (everything on the timelines ``frame`` and ``time``)::
     world/scene                     turned so that up is up
     world/scene/live/map0/points, keyframes, path   blocks of the map and of the trajectory, as they are known
     world/scene/live/camera         where the camera is now
-    world/scene/live/truth          the true path so far, laid on the trajectory
+    world/scene/live/ground_truth          the true path so far, laid on the trajectory
     world/scene/final/map0/...      the result
     image, image/mapped, image/tracked   the frame, points that the pose was measured with, and the other tracks
     plots/points, time, error       numbers by frame
@@ -55,7 +55,7 @@ class LiveDrawing:
         sinks = [*([rr.FileSink(os.fspath(path))] if path else []), *([rr.GrpcSink(url)] if url else [])]
         self._recording.set_sinks(*sinks)
         self._maps: dict[int, LiveMap] = {}
-        self._truth: Trajectory | None = None
+        self._ground_truth: Trajectory | None = None
         self._alignment: Alignment = "sim3"
         self._count = self._drawn_at = 0
         self._is_lost = False
@@ -84,13 +84,13 @@ class LiveDrawing:
         recording, self._camera = self._recording, message["camera"]
         self._orientation = message["orientation"]
         self._rotation = turn_to_z(up_direction(upright_poses(rigid3.IDENTITY[None], [self._orientation])))
-        self._has_truth = message["truth_times"] is not None
-        if self._has_truth:
-            poses = message["truth_cam_from_world"]
-            self._truth = Trajectory.from_cam_from_world(poses, message["truth_times"])
+        self._has_ground_truth = message["ground_truth_times"] is not None
+        if self._has_ground_truth:
+            poses = message["ground_truth_cam_from_world"]
+            self._ground_truth = Trajectory.from_cam_from_world(poses, message["ground_truth_times"])
             self._alignment = "se3" if message["is_metric"] else "sim3"
         recording.send_recording_name(printable(message["title"]))
-        recording.send_blueprint(blueprint(None, self._has_truth), make_active=True, make_default=True)
+        recording.send_blueprint(blueprint(None, self._has_ground_truth), make_active=True, make_default=True)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         # cameras are taken to start level until more of them are known
         recording.log("world/scene", rr.Transform3D(mat3x3=self._rotation), static=True)
@@ -139,8 +139,8 @@ class LiveDrawing:
         if message["is_complete"] or self._count - self._drawn_at >= DRAW_EVERY:
             self._drawn_at = self._count
             self._draw_map(ours, map_idx)
-            if self._truth is not None:
-                self._draw_truth(ours, map_idx)
+            if self._ground_truth is not None:
+                self._draw_ground_truth(ours, map_idx)
 
     def _join(self, ours: LiveMap, map_idx: int) -> None:
         """Maps whose keyframes are in this one now are drawn no more."""
@@ -177,7 +177,7 @@ class LiveDrawing:
             self._shown_extent = extent
             heading = rigid3.rotation_matrix(rigid3.compose(ours.placement, rigid3.inverse(poses[-1])))[:, 2]
             eye = frame_view(body, eye_direction(self._rotation @ heading))
-            self._recording.send_blueprint(blueprint(eye, self._has_truth), make_active=True, make_default=True)
+            self._recording.send_blueprint(blueprint(eye, self._has_ground_truth), make_active=True, make_default=True)
 
     def _log(self, message: Mapping[str, Any]) -> None:
         self._recording.log("log", rr.TextLog(message["text"], level=message["level"]))
@@ -208,7 +208,7 @@ class LiveDrawing:
         recording.log("world/scene", rr.Transform3D(mat3x3=rotation), static=True)
         direction = eye_direction((headings @ rotation.T).mean(0))
         eye = frame_view(np.concatenate(bodies) @ rotation.T, direction)
-        recording.send_blueprint(blueprint(eye, self._has_truth), make_active=True, make_default=True)
+        recording.send_blueprint(blueprint(eye, self._has_ground_truth), make_active=True, make_default=True)
 
     def _lay_live_on_final(self, message: Mapping[str, Any]) -> None:
         """Scale, and what was corrected in the end, also hold for what was drawn before: nothing jumps when played."""
@@ -281,22 +281,24 @@ class LiveDrawing:
         strips = rr.LineStrips3D(lines, colors=_ORANGE, radii=rr.Radius.ui_points(1.4))
         self._recording.log(f"{_LIVE}/camera", strips)
 
-    def _draw_truth(self, ours: LiveMap, map_idx: int) -> None:
+    def _draw_ground_truth(self, ours: LiveMap, map_idx: int) -> None:
         """The true path until now, laid on the trajectory as it is now."""
-        assert self._truth is not None
-        fit = ours.against(self._truth, self._alignment)
+        assert self._ground_truth is not None
+        fit = ours.against(self._ground_truth, self._alignment)
         if fit is None:
             return
-        map_from_truth, error = fit
+        map_from_ground_truth, error = fit
         self._recording.log("plots/error/live", rr.Scalars(error))
-        times = self._truth.timestamps_s
+        times = self._ground_truth.timestamps_s
         assert times is not None
         until = int(np.searchsorted(times, ours.last_time_s, side="right"))
         since = int(np.searchsorted(times, ours.first_time_s))
-        xyz = similarity.apply(map_from_truth, self._truth.position[since:until][:: max(1, (until - since) // 2000)])
+        xyz = similarity.apply(
+            map_from_ground_truth, self._ground_truth.position[since:until][:: max(1, (until - since) // 2000)]
+        )
         if len(xyz) > 1:
             strips = rr.LineStrips3D([xyz], colors=_GREEN, radii=rr.Radius.ui_points(1.0))
-            self._recording.log(f"{_LIVE}/map{map_idx}/truth", strips)
+            self._recording.log(f"{_LIVE}/map{map_idx}/ground_truth", strips)
 
     def _draw_final(self, message: Mapping[str, Any]) -> tuple[list[Array], Array]:
         """All maps of the result in one scene; returns what a view has to hold, and where the cameras look."""
@@ -322,32 +324,33 @@ class LiveDrawing:
             recording.log(f"{root}/keyframes", rr.LineStrips3D(frusta, colors=_BLUE, radii=rr.Radius.ui_points(0.7)))
             path = unbroken(rigid3.center(poses), np.arange(len(poses)))
             recording.log(f"{root}/path", rr.LineStrips3D(path, colors=_ORANGE, radii=rr.Radius.ui_points(1.6)))
-            fits = message["truth_from_map"]
-            if self._truth is not None and m < len(fits) and (fit := fits[m]) is not None:
-                self._draw_final_truth(root, similarity.compose(place, similarity.inverse(fit)), message, known)
+            fits = message["ground_truth_from_map"]
+            if self._ground_truth is not None and m < len(fits) and (fit := fits[m]) is not None:
+                self._draw_final_ground_truth(root, similarity.compose(place, similarity.inverse(fit)), message, known)
             bodies.append(body_of(rigid3.center(poses[known]), xyz))
             headings.append(rigid3.rotation_matrix(poses[known])[:, 2])
         return bodies, np.concatenate(headings)
 
-    def _draw_final_truth(
-        self, root: str, scene_from_truth: Array, message: Mapping[str, Any], known: NDArray[np.bool_]
+    def _draw_final_ground_truth(
+        self, root: str, scene_from_ground_truth: Array, message: Mapping[str, Any], known: NDArray[np.bool_]
     ) -> None:
-        assert self._truth is not None
-        assert self._truth.timestamps_s is not None
+        assert self._ground_truth is not None
+        assert self._ground_truth.timestamps_s is not None
         first, last = message["timestamps_s"][known][[0, -1]]
-        during = (self._truth.timestamps_s >= first) & (self._truth.timestamps_s <= last)
-        xyz = similarity.apply(scene_from_truth, self._truth.position[during])
+        during = (self._ground_truth.timestamps_s >= first) & (self._ground_truth.timestamps_s <= last)
+        xyz = similarity.apply(scene_from_ground_truth, self._ground_truth.position[during])
         strips = rr.LineStrips3D([xyz], colors=_GREEN, radii=rr.Radius.ui_points(1.0))
-        self._recording.log(f"{root}/truth", strips)
+        self._recording.log(f"{root}/ground_truth", strips)
 
 
 def placement(message: Mapping[str, Any], m: int, bodies: Sequence[Array]) -> Array | None:
-    """``scene_from_map`` (8,): where the truth says, or beside the maps before it; the first stays where it is."""
+    """``scene_from_map`` (8,): where the ground truth says, or beside the maps before it; the first stays where it
+    is."""
     if m == 0:
         return similarity.IDENTITY
     if not (message["frame_map"] == m).any() or not len(message["maps"][m]["keyframe_cam_from_world"]):
         return None
-    fits = message["truth_from_map"]
+    fits = message["ground_truth_from_map"]
     if fits and fits[0] is not None and fits[m] is not None:
         return similarity.compose(similarity.inverse(fits[0]), fits[m])
     before = np.concatenate(bodies)
@@ -378,7 +381,7 @@ def final_frustum(keyframes: Array, xyz: Array) -> float:
     return float(np.clip(FRUSTUM_SHARE * 3 * nearest, 0.004 * size, max(0.6 * apart, 0.004 * size))) or 0.1
 
 
-def blueprint(eye: tuple[Array, Array] | None, has_truth: bool) -> rrb.Blueprint:
+def blueprint(eye: tuple[Array, Array] | None, has_ground_truth: bool) -> rrb.Blueprint:
     """The layout, looking at the map from an eye at a target."""
     controls = None
     if eye is not None:
@@ -386,7 +389,7 @@ def blueprint(eye: tuple[Array, Array] | None, has_truth: bool) -> rrb.Blueprint
     world = rrb.Spatial3DView(origin="world", name="Map and trajectory", eye_controls=controls, line_grid=False)
     image = rrb.Spatial2DView(origin="image", name="Frame: green points are in the map, orange ones are not yet")
     shown = [("points", "Points"), ("time", "CPU time of tracking (ms)")]
-    shown += [("error", "Distance from the truth (m)")] if has_truth else []
+    shown += [("error", "Distance from the ground truth (m)")] if has_ground_truth else []
     plots = [rrb.TimeSeriesView(origin=f"plots/{name}", name=label) for name, label in shown]
     columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
     log = rrb.TextLogView(origin="log", name="Decisions", columns=columns)

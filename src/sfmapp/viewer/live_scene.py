@@ -209,20 +209,21 @@ class LiveMap:
         stop = min(len(self._frame_number), (block + 1) * FRAME_BLOCK)
         return unbroken(rigid3.center(self.frame_poses(first, stop)), self.frame_numbers[first:stop])
 
-    def against(self, truth: Trajectory, alignment: Alignment) -> tuple[Array, float] | None:
-        """``map_from_truth`` (8,) over the path so far, and the newest frame's distance from the truth; None so far."""
+    def against(self, ground_truth: Trajectory, alignment: Alignment) -> tuple[Array, float] | None:
+        """``map_from_ground_truth`` (8,) over the path so far, and the newest frame's distance from the ground truth;
+        None so far."""
         times = np.array(self._time)
         if len(times) < 3:
             return None
         ours = Trajectory.from_cam_from_world(self.frame_poses(), times)
         try:
-            pairs = associate(ours, truth, max_difference_s=float(np.median(np.diff(times))) / 2)
+            pairs = associate(ours, ground_truth, max_difference_s=float(np.median(np.diff(times))) / 2)
             error = absolute_error(pairs, alignment)
         except InputError:
             return None
         if not error.scale > 0:
             return None
-        return similarity.inverse(error.truth_from_estimate), float(error.translation_m[-1])
+        return similarity.inverse(error.ground_truth_from_estimate), float(error.translation_m[-1])
 
 
 def unbroken(xyz: Array, number: Ints) -> list[Array]:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.children import with_parent
+from sfmapp.packages import MissingPackageError, require
 from sfmapp.viewer.listener import Message, RecordingListener, Step
 from sfmapp.viewer.replay import make_replay
 
@@ -75,6 +76,10 @@ def write_recording(
 
 def draw_in_child(kind: Kind, folder: Path, path: Path, threads: int, timeout_s: float) -> str:
     """Draw what lies in folder into the file path; returns what went wrong, empty for nothing."""
+    try:
+        require("rerun")
+    except MissingPackageError as missing:
+        return f"{missing}: {missing.advice}"
     arguments = [kind, str(folder.absolute()), str(path.absolute()), str(threads)]
     command = with_parent([sys.executable, "-P", "-m", "sfmapp.viewer.record_process", *arguments])
     try:

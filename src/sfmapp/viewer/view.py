@@ -18,6 +18,7 @@ from urllib.parse import quote
 
 from sfmapp.children import with_parent
 from sfmapp.errors import InputError, SfmError
+from sfmapp.packages import require
 
 if TYPE_CHECKING:
     from sfmapp.viewer.live import Screen
@@ -48,11 +49,12 @@ def view(
         tell: given a line on how to reach it.
 
     Raises:
-        InputError: the file does not exist.
+        InputError: the file does not exist, or rerun is not installed.
         SfmError: the viewer failed.
     """
     if not recording.is_file():
         raise InputError(f"{recording} does not exist")
+    require("rerun")
     if serve is None:
         serve = not has_screen()
         if not serve and _open_window(recording):
@@ -90,7 +92,7 @@ class LiveViewer:
                 self.close()
 
     def leave(self) -> None:
-        """After a run that failed: a window stays with what was shown, a server would run for ever."""
+        """After a run that failed: a window stays with what was shown, a server would run forever."""
         if self._is_server:
             self.close()
 
@@ -108,6 +110,7 @@ def open_live_viewer(*, tell: Callable[[str], None], serve: bool | None = None) 
         tell: given a line on how to reach it.
         serve: for a browser in any case (True) or never (False).
     """
+    require("rerun")
     from sfmapp.viewer.live import Screen  # loads kernels, which a look at a recording needs none of
 
     serve = not has_screen() if serve is None else serve

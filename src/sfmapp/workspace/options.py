@@ -98,7 +98,7 @@ def with_absolute_paths(options: Options) -> Options:
     if masks is not None:
         images = dataclasses.replace(options.images, mask_path=os.path.abspath(masks))
         options = dataclasses.replace(options, images=images)
-    given = {name: path for name in ("camera", "imu", "truth") if (path := getattr(sequence, name)) is not None}
+    given = {name: path for name in ("camera", "imu", "ground_truth") if (path := getattr(sequence, name)) is not None}
     # a camera may be a file or numbers
     found = {name: os.path.abspath(path) for name, path in given.items() if name != "camera" or os.path.exists(path)}
     return dataclasses.replace(options, sequence=dataclasses.replace(sequence, **found)) if found else options

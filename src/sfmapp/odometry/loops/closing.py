@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sfmapp.geometry import similarity
 from sfmapp.odometry.loops.detection import LoopClosure
-from sfmapp.odometry.loops.places import Ids, Places
+from sfmapp.odometry.loops.place_recognition import Ids, PlaceIndex
 from sfmapp.odometry.loops.pose_graph import LoopEdge, apply_corrections, essential_edges, optimize_pose_graph
 from sfmapp.odometry.map.backend import make_job, run_job, take_over
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
@@ -54,7 +54,7 @@ class Joined:
     renamed: Ids
 
 
-def apply_closure(keyframes: KeyframeMap, places: Places, closure: LoopClosure) -> Closed:
+def apply_closure(keyframes: KeyframeMap, places: PlaceIndex, closure: LoopClosure) -> Closed:
     """Close a loop of a map, in place: a pose graph bends it, the points seen on both sides become one, and the
     keyframes at the seam are adjusted.
 
@@ -79,7 +79,7 @@ def apply_closure(keyframes: KeyframeMap, places: Places, closure: LoopClosure) 
     return Closed(corrections, renamed)
 
 
-def join_maps(maps: dict[int, KeyframeMap], places: Places, closure: LoopClosure) -> Joined:
+def join_maps(maps: dict[int, KeyframeMap], places: PlaceIndex, closure: LoopClosure) -> Joined:
     """Bring the smaller of two maps into the larger. ``maps`` is not changed; ``places`` is.
 
     Raises:

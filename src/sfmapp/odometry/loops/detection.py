@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.odometry.loops.places import Ids, Places, View
+from sfmapp.odometry.loops.place_recognition import Ids, PlaceIndex, View
 from sfmapp.odometry.loops.pose_graph import keyframe_depths
 from sfmapp.odometry.loops.relocalize import (
     LocalPoints,
@@ -126,7 +126,7 @@ class LoopFinder:
         self._suspicion = None
 
     def find(
-        self, maps: Mapping[int, KeyframeMap], map_idx: int, places: Places, frame_idx: int, view: View
+        self, maps: Mapping[int, KeyframeMap], map_idx: int, places: PlaceIndex, frame_idx: int, view: View
     ) -> LoopClosure | None:
         """Look whether a new keyframe closes a loop of its map, or shows a place of another map.
 
@@ -167,7 +167,7 @@ class LoopFinder:
         return None
 
     def _confirm(
-        self, maps: Mapping[int, KeyframeMap], map_idx: int, places: Places, new_idx: int, view: View
+        self, maps: Mapping[int, KeyframeMap], map_idx: int, places: PlaceIndex, new_idx: int, view: View
     ) -> LoopClosure | None:
         """Look for the keyframe where a suspected loop says that it is."""
         suspicion = self._suspicion
@@ -197,7 +197,7 @@ class LoopFinder:
         return None
 
     def _seen_near(
-        self, old_map: KeyframeMap, places: Places, view: View, new_idx: int, old_idx: int, pose: Array
+        self, old_map: KeyframeMap, places: PlaceIndex, view: View, new_idx: int, old_idx: int, pose: Array
     ) -> LoopView | None:
         options, camera = self.options.relocalize, old_map.rig.cameras[0]
         local = local_points(old_map, places, old_map.keyframes[old_idx].frame_idx, options.num_neighbors)
@@ -207,7 +207,7 @@ class LoopFinder:
         return self._view(old_map, places, view, new_idx, old_idx, located)
 
     def _view(
-        self, old_map: KeyframeMap, places: Places, view: View, new_idx: int, old_idx: int, located: Located
+        self, old_map: KeyframeMap, places: PlaceIndex, view: View, new_idx: int, old_idx: int, located: Located
     ) -> LoopView:
         frame_idx = old_map.keyframes[old_idx].frame_idx
         local = local_points(old_map, places, frame_idx, self.options.relocalize.num_neighbors)
@@ -255,7 +255,7 @@ class LoopFinder:
         )  # fmt: skip
 
 
-def _nearest_place(keyframes: KeyframeMap, places: Places, pose: Array, last: int | None) -> int | None:
+def _nearest_place(keyframes: KeyframeMap, places: PlaceIndex, pose: Array, last: int | None) -> int | None:
     """The keyframe before a last one that is a place and looks from nearest in nearly the same direction: distance over
     its depth, plus radians between the axes."""
     known = np.array([n for n, k in enumerate(keyframes.keyframes[:last]) if k.frame_idx in places], np.int64)

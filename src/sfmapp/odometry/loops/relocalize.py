@@ -25,7 +25,7 @@ from sfmapp.geometry import rigid3
 from sfmapp.geometry.resection import estimate_pose
 from sfmapp.matching.descriptors import mutual_neighbors
 from sfmapp.matching.products import Best, largest_products
-from sfmapp.odometry.loops.places import QUERY_SCALES, SIGMA_PX, Bytes, Candidate, Ids, Places, View
+from sfmapp.odometry.loops.place_recognition import QUERY_SCALES, SIGMA_PX, Bytes, Candidate, Ids, PlaceIndex, View
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 
 Array = NDArray[np.float64]
@@ -112,7 +112,7 @@ class Relocalization:
 
 
 def relocalize(
-    maps: Mapping[int, KeyframeMap], places: Places, view: View, options: RelocalizeOptions, roll: float = 0.0
+    maps: Mapping[int, KeyframeMap], places: PlaceIndex, view: View, options: RelocalizeOptions, roll: float = 0.0
 ) -> Relocalization | None:
     """Find an image in any of the maps.
 
@@ -129,7 +129,12 @@ def relocalize(
 
 
 def locate(
-    keyframes: KeyframeMap, places: Places, view: View, candidate: Candidate, options: RelocalizeOptions, roll: float
+    keyframes: KeyframeMap,
+    places: PlaceIndex,
+    view: View,
+    candidate: Candidate,
+    options: RelocalizeOptions,
+    roll: float,
 ) -> Located | None:
     """The pose of an image at a place, or None where too few points agree to have one."""
     camera = keyframes.rig.cameras[0]
@@ -187,7 +192,7 @@ def is_convincing(found: Located, view: View, options: RelocalizeOptions) -> boo
     )
 
 
-def local_points(keyframes: KeyframeMap, places: Places, frame_idx: int, num_neighbors: int) -> LocalPoints:
+def local_points(keyframes: KeyframeMap, places: PlaceIndex, frame_idx: int, num_neighbors: int) -> LocalPoints:
     """The triangulated points of a keyframe and of those that share most points with it, each as it looked in the
     first of these that has it."""
     around = [position_of(keyframes, frame_idx)]
@@ -347,9 +352,9 @@ def _nearest_within(  # type: ignore[no-untyped-def]
 
 def compile_kernels() -> None:
     """Run every kernel of places and relocalisation once, so that numba compiles or loads them now."""
-    from sfmapp.odometry.loops import places
+    from sfmapp.odometry.loops import place_recognition
 
-    places.compile_kernels()
+    place_recognition.compile_kernels()
     ids = np.zeros(1, np.int64)
     row = np.zeros((1, 128), np.uint8)
     _nearest_within(np.zeros((1, 2)), ids, row, np.zeros((1, 2)), row[None], 1.0, ids.copy(), ids.copy())

@@ -8,7 +8,7 @@ from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.map.backend import classify, make_job, take_over
 from sfmapp.odometry.map.local_map import LocalMap
 from sfmapp.odometry.refinement.calibration_check import adjust_poses, question_calibration
-from sfmapp.odometry.refinement.finish import MIN_SIGMA_PX, rig_of
+from sfmapp.odometry.refinement.final_adjustment import MIN_SIGMA_PX, rig_of
 
 # Keyframes at which a map is questioned until its calibration has been refined: early ones for the live poses, later
 # ones for motions that tell little. A first look at a calibration that is right costs one adjustment.

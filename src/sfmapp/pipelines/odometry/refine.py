@@ -26,7 +26,7 @@ from sfmapp.mapping.options import MappingOptions
 from sfmapp.odometry.result import MapResult, OdometryResult
 from sfmapp.pipelines.odometry.add_photos import PhotoResult, add_photos
 from sfmapp.pipelines.odometry.results import read_odometry, write_trajectories
-from sfmapp.report.odometry_document import against_truth, map_row, truth_row
+from sfmapp.report.odometry_document import fit_to_ground_truth, ground_truth_row, map_row
 from sfmapp.report.refine_html import REFINE_FORMAT, render_refine_html
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.sequences.open import open_sequence
@@ -111,14 +111,15 @@ def refine(
 
 
 def _open_sequence(manifest: dict[str, Any], job: Job, *, required: bool) -> Sequence | None:
-    """The sequence of the run, for its truth and its images; None if it is gone and only the truth was wanted."""
-    wish = options_from_dict({"sequence": manifest["options"]["sequence"]}).sequence
+    """The sequence of the run, for its ground truth and its images; None if it is gone and only the ground truth was
+    wanted."""
+    wanted = options_from_dict({"sequence": manifest["options"]["sequence"]}).sequence
     try:
-        return open_sequence(manifest["source"], wish, job.events, require_camera=False)
+        return open_sequence(manifest["source"], wanted, job.events, require_camera=False)
     except InputError as error:
         if required:
             raise
-        job.events.warned(STAGE, f"the sequence is not there any more, nor is its truth: {error}")
+        job.events.warned(STAGE, f"the sequence is not there any more, nor is its ground truth: {error}")
         return None
 
 
@@ -146,7 +147,7 @@ def _refined(
                 threads=job.threads, pool=pool, events=job.events,
             )  # fmt: skip
             maps[0] = map_with_photos
-    entries = [laid_back(entry, model) for entry, model in zip(before.maps, maps, strict=True)]
+    entries = [in_previous_gauge(entry, model) for entry, model in zip(before.maps, maps, strict=True)]
     return moved_frames(before, entries), added
 
 
@@ -183,7 +184,7 @@ def adjusted(
     return model
 
 
-def laid_back(entry: MapResult, model: Reconstruction) -> MapResult:
+def in_previous_gauge(entry: MapResult, model: Reconstruction) -> MapResult:
     """The refined map where the old one lay: an adjustment leaves place and, with one camera, size open.
 
     Metres that came from outside stay what they were on average; a rig knows its own.
@@ -243,12 +244,14 @@ def _write(
     job: Job, before: OdometryResult, after: OdometryResult, sequence: Sequence | None, added: PhotoResult | None
 ) -> dict[str, Any]:
     """Models, trajectories and the report, which is returned."""
-    workspace, truth = job.workspace, sequence.truth if sequence is not None else None
+    workspace, ground_truth = job.workspace, sequence.ground_truth if sequence is not None else None
     with job.measured("output"):
         workspace.write_models([entry.reconstruction for entry in after.maps])
         write_trajectories(workspace, after)
     fits = {
-        name: [against_truth(result, truth, m) for m in range(len(result.maps))] if truth is not None else []
+        name: [fit_to_ground_truth(result, ground_truth, m) for m in range(len(result.maps))]
+        if ground_truth is not None
+        else []
         for name, result in (("before", before), ("after", after))
     }
     report = {
@@ -266,8 +269,8 @@ def _write(
             ]
             for name, result in (("before", before), ("after", after))
         },
-        "truth": {
-            name: [{"map": m, **truth_row(fit)} for m, fit in enumerate(found) if fit is not None]
+        "ground_truth": {
+            name: [{"map": m, **ground_truth_row(fit)} for m, fit in enumerate(found) if fit is not None]
             for name, found in fits.items()
         },
         "orientation": sequence.orientation if sequence is not None else 1,
@@ -277,7 +280,7 @@ def _write(
         "warnings": job.log.warnings,
         "decisions": job.log.decisions,
     }
-    workspace.write_text("report.html", render_refine_html(report, after, truth, fits["after"]))
+    workspace.write_text("report.html", render_refine_html(report, after, ground_truth, fits["after"]))
     workspace.write_text("report.json", report_text(report))
     workspace.manifest["usage"] = job.usage
     workspace.save()

@@ -21,15 +21,15 @@ from sfmapp.pipelines.odometry.live import numbered
 from sfmapp.pipelines.odometry.timing import frame_statistics
 from sfmapp.report.odometry_document import (
     FORMAT,
-    Against,
-    FrameFacts,
-    against_truth,
+    FrameTable,
+    GroundTruthFit,
     errors_of_frames,
+    fit_live_to_ground_truth,
+    fit_to_ground_truth,
     frame_summary,
-    live_against_truth,
+    ground_truth_row,
     make_checks,
     map_row,
-    truth_row,
 )
 from sfmapp.report.odometry_html import render_odometry_html
 from sfmapp.workspace.layout import ODOMETRY
@@ -53,7 +53,7 @@ COVARIANCE_COLUMNS = (
 def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstructionError | None) -> dict[str, Any]:
     """Write everything, the report last; returns it."""
     assert run.sequence is not None
-    workspace, truth = run.workspace, run.sequence.truth
+    workspace, ground_truth = run.workspace, run.sequence.ground_truth
     facts = run.frames.facts(result)
     with run.measured("output"):
         # what matters most comes first, should the disk be full
@@ -62,11 +62,15 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
         run.save_first(lambda: workspace.write_models([entry.reconstruction for entry in result.maps]))
         run.save_first(lambda: workspace.write_text("covariance.csv", _covariance_csv(result)))
         run.save_first(lambda: workspace.write_text("frame_covariance.csv", _frame_covariance_csv(result)))
-    against = [against_truth(result, truth, m) for m in range(len(result.maps))] if truth is not None else []
+    against = (
+        [fit_to_ground_truth(result, ground_truth, m) for m in range(len(result.maps))]
+        if ground_truth is not None
+        else []
+    )
     with run.measured("recording"):
         _finish_recording(run, result, against)
     report = make_report(run, result, facts, against, failure)
-    page = render_odometry_html(report, result, facts, truth, against)
+    page = render_odometry_html(report, result, facts, ground_truth, against)
     run.save_first(lambda: workspace.write_text("report.html", page))
     report["run"] |= run.watch.read()  # the last measurement that can still be written down
     run.save_first(lambda: workspace.write_text("report.json", report_text(report)))
@@ -76,7 +80,7 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
     return report
 
 
-def write_trajectories(workspace: Workspace, result: OdometryResult, facts: FrameFacts | None = None) -> None:
+def write_trajectories(workspace: Workspace, result: OdometryResult, facts: FrameTable | None = None) -> None:
     """A file of final poses for each map, and one of live poses; the largest map also as KITTI has it, and smoothed.
 
     Maps have worlds of their own, so they cannot share a file. What an earlier run left is taken away.
@@ -149,7 +153,7 @@ def read_odometry(folder: Path) -> OdometryResult:
     return OdometryResult(indices, names, times, poses, np.full_like(poses, np.nan), frame_map, states, maps)
 
 
-def _frames_csv(result: OdometryResult, facts: FrameFacts) -> str:
+def _frames_csv(result: OdometryResult, facts: FrameTable) -> str:
     rows = []
     for k, name in enumerate(result.frame_names):
         counts = ["" if np.isnan(v) else int(v) for v in (facts.num_tracked[k], facts.num_mapped[k])]
@@ -195,7 +199,7 @@ def _csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     return text.getvalue()
 
 
-def _finish_recording(run: Tracking, result: OdometryResult, against: Sequence[Against | None]) -> None:
+def _finish_recording(run: Tracking, result: OdometryResult, against: Sequence[GroundTruthFit | None]) -> None:
     """Let the recording show the end; a failure is a warning. A recording of other results is taken away."""
     manifest = run.workspace.manifest
     if run.live is None or not run.live.is_recording:
@@ -203,17 +207,17 @@ def _finish_recording(run: Tracking, result: OdometryResult, against: Sequence[A
         manifest["recording"] = "not wanted"
     if run.live is None:
         return
-    fits = [None if fit is None else fit.error.truth_from_estimate for fit in against]
+    fits = [None if fit is None else fit.error.ground_truth_from_estimate for fit in against]
     problem = run.live.end(result, fits, errors_of_frames(result, against))
     if run.live.is_recording:
         manifest["recording"] = "failed" if problem else "written"
     if problem:
         run.workspace.recording.unlink(missing_ok=True)
-        run.events.deaf().warned("recording", f"no recording: {problem}")
+        run.events.without_cancellation().warned("recording", f"no recording: {problem}")
 
 
 def make_report(
-    run: Tracking, result: OdometryResult, facts: FrameFacts, against: Sequence[Against | None],
+    run: Tracking, result: OdometryResult, facts: FrameTable, against: Sequence[GroundTruthFit | None],
     failure: NoReconstructionError | None,
 ) -> dict[str, Any]:  # fmt: skip
     """The report as in ``report.json``."""
@@ -230,7 +234,7 @@ def make_report(
         "sequence": describe_sequence(run.sequence, result),
         "frames": frames,
         "maps": maps,
-        "truth": _truth_rows(run, result, facts, against),
+        "ground_truth": _ground_truth_rows(run, result, facts, against),
         "timing": timing,
         "checks": make_checks(frames, maps, timing, facts) if maps else [],
         "usage": run.usage,
@@ -249,14 +253,17 @@ def _outcome(run: Tracking, failure: NoReconstructionError | None) -> dict[str, 
     return {"exit_code": 0, "message": "", "advice": None}
 
 
-def _truth_rows(
-    run: Tracking, result: OdometryResult, facts: FrameFacts, against: Sequence[Against | None]
+def _ground_truth_rows(
+    run: Tracking, result: OdometryResult, facts: FrameTable, against: Sequence[GroundTruthFit | None]
 ) -> list[dict[str, Any]]:
     """The error of each map, and of the live poses of the longest live map."""
     assert run.sequence is not None
-    rows = [{"map": m, "poses": "final", **truth_row(fit)} for m, fit in enumerate(against) if fit is not None]
-    if run.sequence.truth is not None and (live := live_against_truth(result, run.sequence.truth, facts)) is not None:
-        rows.insert(1, {"map": 0, "poses": "live", **truth_row(live)})
+    rows = [{"map": m, "poses": "final", **ground_truth_row(fit)} for m, fit in enumerate(against) if fit is not None]
+    if (
+        run.sequence.ground_truth is not None
+        and (live := fit_live_to_ground_truth(result, run.sequence.ground_truth, facts)) is not None
+    ):
+        rows.insert(1, {"map": 0, "poses": "live", **ground_truth_row(live)})
     return rows
 
 
@@ -275,7 +282,7 @@ def describe_sequence(sequence: sequences.Sequence, result: OdometryResult) -> M
         "frames_per_second": sequence.frames_per_second,
         "stereo": sequence.rig.is_stereo,
         "imu": sequence.imu is not None,
-        "truth": sequence.truth is not None,
+        "ground_truth": sequence.ground_truth is not None,
         "orientation": sequence.orientation,
         "cameras": cameras,
     }

@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class ScaleWish:
+class ScaleRequest:
     """What a scale is to come from; one of the four is set.
 
     Attributes:
@@ -57,7 +57,7 @@ class ScaleWish:
         return None if self.marker is None else MarkerDetector(self.marker.dictionary)
 
 
-def parse_scale(text: str) -> ScaleWish | None:
+def parse_scale(text: str) -> ScaleRequest | None:
     """``marker:DICT:METRES``, ``distance:A:B:METRES``, ``distance:path:METRES``, ``camera_height:METRES``, ``imu``, or
     ``arbitrary``, which is None.
 
@@ -67,13 +67,13 @@ def parse_scale(text: str) -> ScaleWish | None:
     kind, _, rest = text.strip().partition(":")
     match kind:
         case "marker":
-            return ScaleWish(text, marker=parse_marker(rest))
+            return ScaleRequest(text, marker=parse_marker(rest))
         case "distance":
-            return ScaleWish(text, distance=parse_distance(rest.replace(":", ",")))
+            return ScaleRequest(text, distance=parse_distance(rest.replace(":", ",")))
         case "camera_height":
-            return ScaleWish(text, camera_height=parse_length(rest))
+            return ScaleRequest(text, camera_height=parse_length(rest))
         case "imu" if not rest:
-            return ScaleWish(text, imu=True)
+            return ScaleRequest(text, imu=True)
         case "arbitrary" if not rest:
             return None
     raise UsageError(
@@ -82,7 +82,7 @@ def parse_scale(text: str) -> ScaleWish | None:
     )
 
 
-def settled_wish(wish: ScaleWish | None, is_auto: bool, sequence: Sequence) -> ScaleWish | None:
+def resolve_scale_request(scale_request: ScaleRequest | None, is_auto: bool, sequence: Sequence) -> ScaleRequest | None:
     """What the scale will come from; what the sequence cannot give is refused before an hour is spent on it.
 
     Args:
@@ -91,23 +91,25 @@ def settled_wish(wish: ScaleWish | None, is_auto: bool, sequence: Sequence) -> S
     Raises:
         UsageError: a stereo sequence, which is in metres already, or no IMU.
     """
-    if wish is None:
+    if scale_request is None:
         has_imu = is_auto and sequence.imu is not None and not sequence.rig.is_stereo
-        return ScaleWish("imu", imu=True) if has_imu else None
+        return ScaleRequest("imu", imu=True) if has_imu else None
     if sequence.rig.is_stereo:
-        raise UsageError(f"--scale {wish.text}: the sequence is stereo and in metres", "leave it out, or add --mono")
-    if wish.imu and sequence.imu is None:
+        raise UsageError(
+            f"--scale {scale_request.text}: the sequence is stereo and in metres", "leave it out, or add --mono"
+        )
+    if scale_request.imu and sequence.imu is None:
         raise UsageError("--scale imu: the sequence has no inertial measurements", "name them: --imu FILE")
-    return wish
+    return scale_request
 
 
 def scale_maps(
-    result: OdometryResult, wish: ScaleWish, watch: KeyframeWatch, imu: Imu | None, events: Events
+    result: OdometryResult, scale_request: ScaleRequest, watch: KeyframeWatch, imu: Imu | None, events: Events
 ) -> list[dict[str, Any]]:
     """Put each map in metres that the wish can be had for, in place; returns a row for each, with the evidence."""
     rows = []
     for m in range(len(result.maps)):
-        found = _estimate(result, m, wish, watch, imu)
+        found = _estimate(result, m, scale_request, watch, imu)
         row: dict[str, Any] = {"map": m, "source": found.source, "evidence": found.evidence}
         if isinstance(found, ScaleEstimate):
             rescale(result, m, found)
@@ -155,25 +157,25 @@ def rescale(result: OdometryResult, map_idx: int, found: ScaleEstimate) -> None:
 
 
 def _estimate(
-    result: OdometryResult, m: int, wish: ScaleWish, watch: KeyframeWatch, imu: Imu | None
+    result: OdometryResult, m: int, scale_request: ScaleRequest, watch: KeyframeWatch, imu: Imu | None
 ) -> ScaleEstimate | ScaleRefusal:
     entry = result.maps[m]
-    if wish.marker is not None:
-        return scale_from_markers(entry.reconstruction, watch.sightings(entry), wish.marker.side)
-    if wish.camera_height is not None:
-        return scale_from_camera_height(entry.reconstruction, entry.keyframe_image_idx, wish.camera_height)
-    if wish.distance is not None:
-        return _from_distance(result, m, wish.distance)
+    if scale_request.marker is not None:
+        return scale_from_markers(entry.reconstruction, watch.sightings(entry), scale_request.marker.side)
+    if scale_request.camera_height is not None:
+        return scale_from_camera_height(entry.reconstruction, entry.keyframe_image_idx, scale_request.camera_height)
+    if scale_request.distance is not None:
+        return _from_distance(result, m, scale_request.distance)
     assert imu is not None
     return _from_imu(result, m, imu)
 
 
-def _from_distance(result: OdometryResult, m: int, wish: KnownDistance) -> ScaleEstimate | ScaleRefusal:
+def _from_distance(result: OdometryResult, m: int, scale_request: KnownDistance) -> ScaleEstimate | ScaleRefusal:
     entry = result.maps[m]
-    if wish.frames is None:
-        return scale_from_path(entry.reconstruction.cam_from_world[entry.keyframe_image_idx], wish.length)
-    positions = [_frame_named(result, name) for name in wish.frames]
-    for name, k in zip(wish.frames, positions, strict=True):
+    if scale_request.frames is None:
+        return scale_from_path(entry.reconstruction.cam_from_world[entry.keyframe_image_idx], scale_request.length)
+    positions = [_frame_named(result, name) for name in scale_request.frames]
+    for name, k in zip(scale_request.frames, positions, strict=True):
         if k is None:
             shown = ", ".join(result.frame_names[:2])
             reason = f"there is no frame {name!r}; they are named such as {shown}, or by number"
@@ -183,7 +185,7 @@ def _from_distance(result: OdometryResult, m: int, wish: KnownDistance) -> Scale
     a, b = (k for k in positions if k is not None)
     poses = result.cam_from_world
     return scale_from_distance(
-        poses[a], poses[b], wish.length, _covariance_near(result, entry, a), _covariance_near(result, entry, b)
+        poses[a], poses[b], scale_request.length, _covariance_near(result, entry, a), _covariance_near(result, entry, b)
     )
 
 

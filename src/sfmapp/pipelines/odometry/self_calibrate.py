@@ -53,8 +53,8 @@ def self_calibrated(source: str, options: Options, events: Events) -> tuple[Opti
         InputError: the frames do not tell the intrinsics: too few, too little parallax, or a reconstruction that leaves
             the focal length open.
     """
-    wish = replace(options.sequence, camera=None, mono=True)
-    sequence = open_sequence(source, wish, events, require_camera=False)
+    wanted = replace(options.sequence, camera=None, mono=True)
+    sequence = open_sequence(source, wanted, events, require_camera=False)
     events.started(STAGE, "calibrating with the first minute")
     frames = choose_frames(sequence)
     if len(frames) < MIN_FRAMES:
@@ -69,7 +69,7 @@ def self_calibrated(source: str, options: Options, events: Events) -> tuple[Opti
     events.finished(STAGE, found["text"])
     if not found["is_settled"]:
         events.warned(STAGE, f"the calibration is not settled: {found['text']}")
-    return replace(options, sequence=replace(wish, camera=text)), found
+    return replace(options, sequence=replace(wanted, camera=text)), found
 
 
 def choose_frames(sequence: Sequence) -> list[Frame]:
@@ -164,9 +164,9 @@ def _reconstruct(source: str, frames: list[Frame], options: Options, events: Eve
             cv2.imwrite(str(folder / f"{number:03d}.png"), frame.images[0])
         for model in models:
             images = replace(options.images, camera_model=model, camera_sharing="all", mask_path=None)
-            wish = replace(options, images=images, min_registered=None)
+            wanted = replace(options, images=images, min_registered=None)
             try:
-                runs.append(reconstruct(folder, Path(name) / "out", wish, events=events, record=False))
+                runs.append(reconstruct(folder, Path(name) / "out", wanted, events=events, record=False))
             except NoReconstructionError as failure:
                 raise InputError(
                     f"{source}: no calibration from its first minute: {failure}",

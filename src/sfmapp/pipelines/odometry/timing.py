@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sfmapp.events import Event
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.snapshot import FrameSnapshot
-from sfmapp.report.odometry_document import FrameFacts
+from sfmapp.report.odometry_document import FrameTable
 
 # the threads of a run by the beginning of their names, and what the report calls them
 READING, BACK_END, DRAWING = "frames", "adjust", "recording"
@@ -40,13 +40,13 @@ class FrameLog:
         """CPU seconds of tracking in all."""
         return sum(row[2] for row in self._rows.values())
 
-    def facts(self, result: OdometryResult) -> FrameFacts:
+    def facts(self, result: OdometryResult) -> FrameTable:
         """Of the frames (F,) of a result. What repeats another was not tracked, and has the live map of that one."""
         nothing = (np.nan, np.nan, np.nan, -1)
         seen = result.frame_idx[result.twin_rows]
         table = np.array([self._rows.get(int(idx), nothing) for idx in seen], np.float64).reshape(-1, 4)
         table[result.frame_state == FrameState.REPEATED, :3] = np.nan
-        return FrameFacts(table[:, 0], table[:, 1], 1e3 * table[:, 2], table[:, 3].astype(np.int64))
+        return FrameTable(table[:, 0], table[:, 1], 1e3 * table[:, 2], table[:, 3].astype(np.int64))
 
 
 class ThreadTimes:

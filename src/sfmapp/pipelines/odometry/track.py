@@ -19,14 +19,14 @@ import sfmapp
 from sfmapp.errors import InterruptedRunError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.images.frame_reader import FileSequence
-from sfmapp.images.sequence import Frame, Imu, Sequence, SequenceKind, Truth
+from sfmapp.images.sequence import Frame, GroundTruth, Imu, Sequence, SequenceKind
 from sfmapp.images.video import VideoSequence
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
 from sfmapp.pipelines.odometry.keyframes import KeyframeWatch
 from sfmapp.pipelines.odometry.live import GrowingTrajectories
 from sfmapp.pipelines.odometry.results import write_odometry
-from sfmapp.pipelines.odometry.scale import ScaleWish, parse_scale, scale_maps, settled_wish
+from sfmapp.pipelines.odometry.scale import ScaleRequest, parse_scale, resolve_scale_request, scale_maps
 from sfmapp.pipelines.odometry.timing import FrameLog, ThreadTimes
 from sfmapp.sequences.open import open_sequence
 from sfmapp.viewer.live import LiveView, Screen
@@ -73,7 +73,7 @@ class Tracking(Job):
     threads_cpu: ThreadTimes
     live: LiveView | None
     keyframes: KeyframeWatch
-    wish: ScaleWish | None
+    scale_request: ScaleRequest | None
     sequence: Sequence | None = None
 
     def make_room(self) -> bool:
@@ -114,7 +114,7 @@ def track_sequence(
     from threadpoolctl import threadpool_limits
 
     source, options, events = os.fspath(source), with_absolute_paths(options or Options()), events or Events()
-    wish = parse_scale(options.scale.source) if options.scale.source is not None else None
+    scale_request = parse_scale(options.scale.source) if options.scale.source is not None else None
     threads = options.num_workers
     with ExitStack() as stack:
         workspace = stack.enter_context(open_workspace(Path(output), ODOMETRY))
@@ -127,7 +127,7 @@ def track_sequence(
         run = Tracking(
             source, workspace, options, events, watch or Stopwatch(), DecisionLog(), threads,
             frames=FrameLog(), threads_cpu=ThreadTimes(), live=live,
-            keyframes=KeyframeWatch(wish.detector() if wish else None), wish=wish,
+            keyframes=KeyframeWatch(scale_request.detector() if scale_request else None), scale_request=scale_request,
         )  # fmt: skip
         growing = stack.enter_context(closing(GrowingTrajectories(workspace.folder, events, run.make_room)))
         for listener in (growing, event_log, run.log, run.frames, run.keyframes, live):
@@ -146,7 +146,7 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
 
             options, run.stages["self_calibration"] = self_calibrated(run.source, options, events)
         run.sequence = open_sequence(run.source, options.sequence, events)
-        run.wish = settled_wish(run.wish, options.scale.source is None, run.sequence)
+        run.scale_request = resolve_scale_request(run.scale_request, options.scale.source is None, run.sequence)
     if run.live is not None:
         run.live.begin(run.sequence)
     with run.stage("kernels"):
@@ -154,7 +154,9 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
     run.save_first(lambda: run.workspace.begin(ODOMETRY, ""))
     watched = Watched(run.sequence, run)
     with run.measured("odometry"):
-        result = run_odometry(watched, options.odometry, seed=options.seed, threads=run.threads, events=events.deaf())
+        result = run_odometry(
+            watched, options.odometry, seed=options.seed, threads=run.threads, events=events.without_cancellation()
+        )
         run.threads_cpu.sample()
     run.stages["odometry"] = result.report
     if self_calibrate:
@@ -163,9 +165,11 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         widen(result, run.stages["self_calibration"])
     with run.measured("scale"):
         run.keyframes.colour(result)
-        if run.wish is not None:
-            deaf = events.deaf()
-            run.stages["scale"] = scale_maps(result, run.wish, run.keyframes, watched.imu, deaf)
+        if run.scale_request is not None:
+            without_cancellation = events.without_cancellation()
+            run.stages["scale"] = scale_maps(
+                result, run.scale_request, run.keyframes, watched.imu, without_cancellation
+            )
     result = replace(result, timestamps_s=watched.times_as_given(result))
     if isinstance(run.sequence, FileSequence | VideoSequence):  # frames in memory are all there
         result = result.with_repeated(run.sequence.repeated)
@@ -212,11 +216,11 @@ class Watched:
     num_frames: int | None
     frames_per_second: float | None
     imu: Imu | None
-    truth: Truth | None
+    ground_truth: GroundTruth | None
     orientation: int
 
     def __init__(self, sequence: Sequence, run: Tracking) -> None:
-        for name in ("kind", "source", "rig", "num_frames", "frames_per_second", "imu", "truth", "orientation"):
+        for name in ("kind", "source", "rig", "num_frames", "frames_per_second", "imu", "ground_truth", "orientation"):
             setattr(self, name, getattr(sequence, name))
         self._sequence, self._run = sequence, run
         self._given_s: dict[int, float] = {}

@@ -92,7 +92,7 @@ def reconstruct(
     if options.min_registered is not None and found < options.min_registered:
         raise TooFewImagesError(
             f"{found} images are registered, {options.min_registered} were asked for",
-            f"{output}/report.html tells for every image why",
+            f"{output}/report.html tells forevery image why",
         )
     return RunResult(model, report)
 

@@ -27,14 +27,14 @@ _INSIDE = ("", "sparse/0", "sparse", "colmap/sparse/0", "transforms.json", "came
 
 
 @dataclass(frozen=True)
-class Truth:
+class GroundTruth:
     """Reference cameras.
 
     Attributes:
         path: the file or folder that they come from.
         names: N names of images, as the file has them; of a trajectory, the timestamps.
         cam_from_world: (N, 7) float64, quaternion x y z w and translation, in the file's own world.
-        cameras: N intrinsics in the house's pixel rule; None where the file holds none, or others than ours.
+        cameras: N intrinsics in COLMAP's pixel convention; None where the file holds none, or others than ours.
     """
 
     path: Path
@@ -42,7 +42,7 @@ class Truth:
     cam_from_world: NDArray[np.float64]
     cameras: tuple[Camera, ...] | None
 
-    def for_images(self, image_names: Sequence[str]) -> Truth:
+    def for_images(self, image_names: Sequence[str]) -> GroundTruth:
         """The same with the names of our images, where they are found; other entries keep theirs.
 
         Names are matched in full, then by file name, then without the suffix, then as numbers (timestamps).
@@ -73,7 +73,7 @@ def _number(text: str) -> float:
         return math.nan
 
 
-def read_truth(path: str | Path) -> Truth:
+def read_ground_truth(path: str | Path) -> GroundTruth:
     """Read reference cameras: a COLMAP model, ``cameras.json``, ``transforms.json``, a folder with one of them, or a
     trajectory.
 
@@ -89,25 +89,27 @@ def read_truth(path: str | Path) -> Truth:
         inside = [path / name for name in _INSIDE if has_model(path / name) or (path / name).is_file()]
         path = next(iter(inside), path)
     if path.is_dir():
-        return _truth(path, *read_model_poses(path))
+        return _ground_truth(path, *read_model_poses(path))
     if not path.exists():
         raise InputError(f"{path}: expected a COLMAP model, cameras.json or TUM trajectory, found nothing")
     if path.suffix.lower() != ".json":
         names, poses = read_tum(path)
         if not names:
             raise InputError(f"{path}: expected lines of 8 numbers (TUM trajectory), found none")
-        return Truth(path, tuple(names), poses, None)
+        return GroundTruth(path, tuple(names), poses, None)
     document = read_json_object(path)
     if "frames" in document:
-        return _truth(path, *read_nerfstudio_poses(path))
+        return _ground_truth(path, *read_nerfstudio_poses(path))
     return _from_cameras_json(path, document)
 
 
-def _truth(path: Path, names: list[str], poses: NDArray[np.float64], cameras: list[Camera] | None) -> Truth:
-    return Truth(path, tuple(names), poses, None if cameras is None else tuple(cameras))
+def _ground_truth(
+    path: Path, names: list[str], poses: NDArray[np.float64], cameras: list[Camera] | None
+) -> GroundTruth:
+    return GroundTruth(path, tuple(names), poses, None if cameras is None else tuple(cameras))
 
 
-def _from_cameras_json(path: Path, document: dict[str, Any]) -> Truth:
+def _from_cameras_json(path: Path, document: dict[str, Any]) -> GroundTruth:
     entries = document.get("cameras")
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path}: expected a list of cameras (or of frames), found {', '.join(list(document)[:6])}")
@@ -129,7 +131,7 @@ def _from_cameras_json(path: Path, document: dict[str, Any]) -> Truth:
     if len(set(names)) < len(names):
         raise InputError(f"{path}: expected every file once, found one twice")
     known = tuple(cameras) if len(cameras) == len(names) else None
-    return Truth(path, tuple(names), np.array(poses).reshape(-1, 7), known)
+    return GroundTruth(path, tuple(names), np.array(poses).reshape(-1, 7), known)
 
 
 def _json_camera(path: Path, place: str, entry: dict[str, Any]) -> Camera:

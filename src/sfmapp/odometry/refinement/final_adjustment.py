@@ -42,7 +42,7 @@ MIN_SIGMA_PX = 0.02
 
 
 @dataclass(frozen=True)
-class Conclusion:
+class FinalAdjustment:
     """What the end of a map has brought.
 
     Attributes:
@@ -62,7 +62,9 @@ class Conclusion:
     noise_covariance: Array | None = None
 
 
-def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events, given: Rig | None = None) -> Conclusion:
+def adjust_finally(
+    keyframes: KeyframeMap, options: OdometryOptions, events: Events, given: Rig | None = None
+) -> FinalAdjustment:
     """Adjust all keyframes and points of a map, in place, and the cameras where the images contradict them.
 
     Args:
@@ -71,7 +73,7 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events, g
         given: the rig as it was given, which is questioned once more, by all there is; None for that of the keyframes.
     """
     if is_too_large(keyframes):
-        return _conclude_large(keyframes, options, events)
+        return _adjust_large_map(keyframes, options, events)
     everything = np.arange(len(keyframes.keyframes))
     job = make_job(keyframes, everything, everything > 0)
     model, report = job.model, dict[str, Any]()
@@ -102,7 +104,7 @@ def conclude(keyframes: KeyframeMap, options: OdometryOptions, events: Events, g
             covariance += answer.pose_covariance
         if answer.is_refined:
             contradictions += _left_open(covariance, rigid3.spread(model.cam_from_world), events)
-    return Conclusion(covariance, gauge, report, contradictions, answer.scale_sigma, noise)
+    return FinalAdjustment(covariance, gauge, report, contradictions, answer.scale_sigma, noise)
 
 
 def _left_open(covariance: Array, size: float, events: Events) -> list[Contradiction]:
@@ -120,7 +122,7 @@ def _left_open(covariance: Array, size: float, events: Events) -> list[Contradic
     return [Contradiction("given calibration", message, "calibrate the camera, or move more and turn", evidence)]
 
 
-def _conclude_large(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -> Conclusion:
+def _adjust_large_map(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -> FinalAdjustment:
     """The same piece by piece, without covariances; the cameras are questioned on the newest keyframes alone."""
     report: dict[str, Any] = {"is_piecewise": True}
     num = len(keyframes.keyframes)
@@ -135,7 +137,7 @@ def _conclude_large(keyframes: KeyframeMap, options: OdometryOptions, events: Ev
         if answer.model.rig is not None:
             _rescale(keyframes, rigid3.spread(answer.model.cam_from_world) / rigid3.spread(job.model.cam_from_world))
     sweep(keyframes, options, events)
-    return Conclusion(None, "", report, answer.contradictions, answer.scale_sigma)
+    return FinalAdjustment(None, "", report, answer.contradictions, answer.scale_sigma)
 
 
 def _question(

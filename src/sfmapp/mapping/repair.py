@@ -27,7 +27,7 @@ MIN_HELD = 0.5
 MAX_IMAGES = 5000
 
 
-def mended(
+def repaired(
     model: Reconstruction,
     correspondences: Correspondences,
     mapper_of: Callable[[Reconstruction], Mapper],

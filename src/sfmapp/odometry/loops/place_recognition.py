@@ -59,7 +59,7 @@ class View:
     """An image and its corners, described at whatever scale and roll is asked for.
 
     Attributes:
-        shape: (height, width). xy: (N, 2) float64 corners in house pixels.
+        shape: (height, width). xy: (N, 2) float64 corners in COLMAP's pixels.
         point_id: (N,) which points they are, -1 where unknown.
     """
 
@@ -128,7 +128,7 @@ class Candidate:
     similarity: float
 
 
-class Places:
+class PlaceIndex:
     """All keyframes of all maps, by frame number: that of a keyframe stays the same when others are dropped or joined.
 
     What is found depends on the order of the calls alone. One thread at a time.
@@ -202,7 +202,7 @@ class Places:
         return self._best(vector, np.ones(len(self._places), bool), self._usual(), True)
 
     def rename_points(self, map_idx: int, old_id: Ids, new_id: Ids) -> None:
-        """Points of a map that are others in truth. Of two that become the same in one place the first stays."""
+        """Points of a map that are others in ground truth. Of two that become the same in one place the first stays."""
         if not len(old_id):
             return
         order = np.argsort(old_id, kind="stable")

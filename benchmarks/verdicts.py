@@ -1,0 +1,271 @@
+"""Every claim of the project as a row with a verdict, from the committed results: ahead, level or behind.
+
+    python benchmarks/verdicts.py                    # writes results/baseline.json and results/verdicts.md
+    python benchmarks/verdicts.py --compare FOLDER   # what other results, measured anew, change in the baseline
+
+Nothing is measured here. Level are costs and errors within a tenth, which is about what a shared machine changes in a
+measurement, scores within one percentage point, and counts that are equal. No row is left out because it is lost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+RESULTS = Path(__file__).resolve().parent / "results"
+# below these, differences are noise: of costs and errors as a share, of scores in percentage points
+SHARE, POINTS = 0.1, 1.0
+SPARSE = (
+    ("model.num_registered", "registered images", "count", "more"),
+    ("wall_s", "wall time", "s", "less"),
+    ("cpu_s", "CPU time", "s", "less"),
+    ("peak_memory_mb", "peak memory", "MB", "less"),
+    ("ground_truth.center_error.mean", "mean error of camera centres", "unit of the ground truth", "less"),
+    ("ground_truth.rotation_error_deg.mean", "mean rotation error", "deg", "less"),
+    ("ground_truth.auc.1", "AUC@1", "%", "more"),
+    ("ground_truth.auc.5", "AUC@5", "%", "more"),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A figure of ours, beside that of a peer where there is one.
+
+    Attributes:
+        benchmark: whose results it comes from, ``results/BENCHMARK.json``.
+        case: data set or problem.
+        quantity, unit, better: what is compared, and which way.
+        sfmapp, peer_value: the figures; peer: the other program, empty where none was measured.
+        is_published: the peer's figure is from its authors or our research note, measured on another machine.
+        date, commit: of our figure.
+    """
+
+    benchmark: str
+    case: str
+    quantity: str
+    unit: str
+    better: Literal["less", "more"]
+    sfmapp: float
+    peer: str
+    peer_value: float | None
+    is_published: bool
+    date: str
+    commit: str
+
+    @property
+    def verdict(self) -> str:
+        """``ahead``, ``level`` or ``behind`` of the peer; ``alone`` without one."""
+        if self.peer_value is None:
+            return "alone"
+        if is_level(self.sfmapp, self.peer_value, self.unit):
+            return "level"
+        return "ahead" if (self.sfmapp < self.peer_value) == (self.better == "less") else "behind"
+
+
+def is_level(a: float, b: float, unit: str) -> bool:
+    """Whether two figures of a unit differ by no more than noise."""
+    margin = {"%": POINTS, "count": 0.0}.get(unit, SHARE * max(abs(a), abs(b)))
+    return abs(a - b) <= margin
+
+
+def read(folder: Path, benchmark: str) -> dict[str, Any]:
+    """The committed results of a benchmark."""
+    report: dict[str, Any] = json.loads((folder / f"{benchmark}.json").read_text(encoding="utf-8"))
+    return report
+
+
+def rows_of(folder: Path) -> list[Row]:
+    """All rows, benchmark by benchmark, of those whose results are there."""
+    makers = {
+        "sparse": sparse_rows,
+        "bundle_adjustment": adjustment_rows,
+        "dense": dense_rows,
+        "odometry": odometry_rows,
+    }
+    return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
+
+
+def sparse_rows(folder: Path) -> Iterator[Row]:
+    """``sfmapp reconstruct`` against pycolmap."""
+    report = read(folder, "sparse")
+    for case, programs in report["medians"].items():
+        for path, quantity, unit, better in SPARSE:
+            ours, theirs = (programs[program].get(path) for program in ("sfmapp", "pycolmap"))
+            if unit == "%":
+                ours, theirs = (None if value is None else 100 * value for value in (ours, theirs))
+            if ours is not None:
+                yield Row(
+                    "sparse", case, quantity, unit, better, ours, "pycolmap", theirs, False, report["date"][:10],
+                    report["commit"],
+                )  # type: ignore[arg-type]  # fmt: skip
+
+
+def adjustment_rows(folder: Path) -> Iterator[Row]:
+    """Bundle adjustment against Ceres."""
+    report = read(folder, "bundle_adjustment")
+    for row in report["rows"]:
+        yield Row(
+            "bundle_adjustment", f"{row['model']}, {row['loss']} loss", "CPU time", "s", "less", row["sfmapp"]["cpu_s"],
+            "Ceres", row["ceres"]["cpu_s"], False, report["date"][:10], report["commit"],
+        )  # fmt: skip
+
+
+def dense_rows(folder: Path) -> Iterator[Row]:
+    """``sfmapp dense`` against the prototype, and against published figures of PMVS2 and OpenMVS."""
+    report = read(folder, "dense")
+    ours = {run["case"]: run for run in report["runs"] if run["program"] == "sfmapp" and run["threads"] == 1}
+    peers = [
+        (run["case"], run["program"], *_dense_figures(run), False) for run in report["runs"] if run not in ours.values()
+    ]
+    for case, programs in report["published"].items():
+        for program, figures in programs.items():
+            peers.append((case, program, figures["cpu_s"], figures["f_scores"], True))
+    for case, program, cpu_s, f_scores, is_published in peers:
+        run = ours.get(case)
+        if run is None or program == "sfmapp":
+            continue
+        about = ("dense", case), (program,), (is_published, run["date"][:10], run["commit"])
+        my_cpu_s, mine = _dense_figures(run)
+        if cpu_s is not None:
+            yield Row(*about[0], "CPU time", "s", "less", my_cpu_s, *about[1], cpu_s, *about[2])
+        for place, (my_f, f) in enumerate(zip(mine or (), f_scores or (), strict=False)):
+            yield Row(*about[0], f"F-score, distance {place + 1}", "%", "more", my_f, *about[1], f, *about[2])
+
+
+def _dense_figures(run: dict[str, Any]) -> tuple[float, list[float] | None]:
+    """CPU seconds, and F-scores in per cent at growing distances."""
+    score = run.get("score")
+    return run["cpu_s"], None if score is None else [100 * row["f_score"] for row in score["scores"]]
+
+
+def odometry_rows(folder: Path) -> Iterator[Row]:
+    """``sfmapp odometry``: no peer has been run on the same frames on this machine."""
+    report = read(folder, "odometry")
+    for row in report["rows"]:
+        figures = (
+            ("frames in the largest map", "%", "more", 100 * row["num_in_largest_map"] / row["num_frames"]),
+            ("ATE, rmse", "m", "less", row["ground_truth"]["ate_m"]["rmse"]),
+            ("CPU time a frame", "ms", "less", row["cpu_ms_per_frame"]),
+        )
+        for quantity, unit, better, value in figures:
+            yield Row(
+                "odometry", row["case"], quantity, unit, better, value, "", None, False, report["date"][:10],
+                report["commit"],
+            )  # type: ignore[arg-type]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Promise:
+    """Something that sfmapp says of itself, and how often it held."""
+
+    benchmark: str
+    text: str
+    held: int
+    tried: int
+    date: str
+
+
+def promises(folder: Path) -> Iterator[Promise]:
+    """What is promised, with the runs that break it."""
+    wrong = read(folder, "wrong_inputs")
+    runs = wrong["runs"]
+    silent = sum(run["verdict"] == "SURE AND WRONG" for run in runs)
+    narrow = sum(run["verdict"] == "said, but too sure" for run in runs)
+    about = "wrong_inputs", len(runs), wrong["date"][:10]
+    yield Promise(about[0], "a result that is wrong is red", about[1] - silent, *about[1:])
+    yield Promise(about[0], "an error is within three stated sigmas", about[1] - silent - narrow, *about[1:])
+    first = wrong["first_runs"]
+    silent, narrow, num_runs = first["num_sure_and_wrong"], first["num_too_sure"], first["num_runs"]
+    yield Promise(about[0], "the same on seeds never seen before: red", num_runs - silent, num_runs, about[2])
+    yield Promise(about[0], "the same: within three sigmas", num_runs - silent - narrow, num_runs, about[2])
+    report = read(folder, "self_calibration")
+    found = [run for run in report["runs"] if not run["is_refused"]]
+    within = sum(abs(run["error_percent"]) <= 2 * run["sigma_percent"] for run in found)
+    text = "a self-calibrated focal length is within two stated sigmas"
+    yield Promise("self_calibration", text, within, len(found), report["date"][:10])
+    report = read(folder, "odometry")
+    same = [row["same_bytes"] for row in report["rows"]]
+    yield Promise("odometry", "two runs write the same bytes", sum(same), len(same), report["date"][:10])
+    report = read(folder, "dense")
+    digests = {run["digest"] for run in report["runs"] if run["case"] == "fountain" and "digest" in run}
+    text = "one and two threads make the same patches"
+    yield Promise("dense", text, int(len(digests) == 1), 1, report["date"][:10])
+
+
+def markdown(folder: Path) -> str:
+    """Both tables."""
+    rows = rows_of(folder)
+    compared = [row for row in rows if row.peer_value is not None]
+    counts = ", ".join(f"{sum(r.verdict == v for r in compared)} {v}" for v in ("ahead", "level", "behind"))
+    lines = [
+        "# Verdicts",
+        "",
+        "Made by `python benchmarks/verdicts.py` from the results beside it; nothing here is written by hand.",
+        f"{len(compared)} figures beside a peer's: {counts}. Level: costs and errors within a tenth,",
+        "scores within one percentage point, counts that are equal. Alone: nobody else was measured on the same data.",
+        "Figures marked * are published ones, measured by others on other machines.",
+        "",
+    ]
+    for benchmark in dict.fromkeys(row.benchmark for row in rows):
+        mine = [row for row in rows if row.benchmark == benchmark]
+        dates = ", ".join(sorted({row.date for row in mine}))
+        lines += [
+            f"## {benchmark.replace('_', ' ')}",
+            "",
+            f"Measured {dates}; `results/{benchmark}.json`.",
+            "",
+            "| case | figure | sfmapp | peer | | verdict |",
+            "|---|---|---|---|---|---|",
+        ]
+        for row in mine:
+            peer = "" if row.peer_value is None else f"{row.peer_value:.4g}{'*' if row.is_published else ''}"
+            figure = row.quantity if row.unit == "count" else f"{row.quantity}, {row.unit}"
+            verdict = f"**{row.verdict}**" if row.verdict == "behind" else row.verdict
+            lines.append(f"| {row.case} | {figure} | {row.sfmapp:.4g} | {peer} | {row.peer} | {verdict} |")
+        lines.append("")
+    lines += ["## Promises", "", "| promise | kept | of | measured | verdict |", "|---|---|---|---|---|"]
+    for p in promises(folder):
+        verdict = "kept" if p.held == p.tried else f"**broken {p.tried - p.held} times**"
+        lines.append(f"| {p.text} (`results/{p.benchmark}.json`) | {p.held} | {p.tried} | {p.date} | {verdict} |")
+    return "\n".join(lines) + "\n"
+
+
+def baseline(folder: Path) -> str:
+    """All rows as JSON, one a line."""
+    rows = [json.dumps(asdict(row) | {"verdict": row.verdict}) for row in rows_of(folder)]
+    return "[\n" + ",\n".join(rows) + "\n]\n"
+
+
+def changes(folder: Path) -> Iterator[str]:
+    """What results measured anew change in the committed baseline, beyond noise."""
+    old = {
+        (r["benchmark"], r["case"], r["quantity"], r["peer"]): r
+        for r in json.loads((RESULTS / "baseline.json").read_text())
+    }
+    for row in rows_of(folder):
+        before = old.get((row.benchmark, row.case, row.quantity, row.peer))
+        if before is None:
+            yield f"new: {row.benchmark}, {row.case}, {row.quantity}: {row.sfmapp:.4g}"
+        elif not is_level(row.sfmapp, before["sfmapp"], row.unit):
+            better = "better" if (row.sfmapp < before["sfmapp"]) == (row.better == "less") else "WORSE"
+            yield f"{better}: {row.benchmark}, {row.case}, {row.quantity}: {before['sfmapp']:.4g} to {row.sfmapp:.4g}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--compare", type=Path, metavar="FOLDER", help="other results under the same names")
+    args = parser.parse_args()
+    if args.compare is not None:
+        print("\n".join(changes(args.compare)) or "no figure differs by more than noise")
+        return
+    (RESULTS / "baseline.json").write_text(baseline(RESULTS), encoding="utf-8")
+    (RESULTS / "verdicts.md").write_text(markdown(RESULTS), encoding="utf-8")
+    print(markdown(RESULTS), end="")
+
+
+if __name__ == "__main__":
+    main()
