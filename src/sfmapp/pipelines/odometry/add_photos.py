@@ -54,8 +54,8 @@ class PhotoResult:
 
 
 def add_photos(
-    model: Reconstruction, odometry: OdometryResult, sequence: Sequence, photos: str, options: Options,
-    mapping: MappingOptions, *, threads: int, pool: Executor, events: Events,
+    model: Reconstruction, odometry: OdometryResult, sequence: Sequence, photos: str, options: Options, *,
+    threads: int, pool: Executor, events: Events,
 ) -> tuple[Reconstruction, PhotoResult]:  # fmt: skip
     """The largest map of an odometry run with photographs registered in it.
 
@@ -68,7 +68,7 @@ def add_photos(
         odometry: whose largest map it is.
         sequence: whose frames the keyframes are.
         photos: a folder, a glob or a list.
-        mapping: what is accepted.
+        options: of images, features, pairs, matching, mapping and adjustment.
 
     Raises:
         InputError: there is no usable photograph, or the frames of the sequence are gone.
