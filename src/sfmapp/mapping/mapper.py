@@ -41,12 +41,14 @@ MIN_NOISE_PX = 0.02
 MAX_UNCERTAINTY_IMAGES = 200
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Mapper:
     """Grows one model. Every method is a step of the method and changes ``reconstruction`` in place.
 
-    ``locked`` (I,) bool are images that this model must not register. ``waits``: weak images whose strongest pairs are
-    with images outside of the model are left to another one, which may grow from there.
+    ``prior_cameras`` are what the cameras of the model, in their order, were before anything was seen with them.
+    ``locked`` (I,) bool are images that this model must not register. ``attempts``: the last one for each image.
+    ``waits``: weak images whose strongest pairs are with images outside of the model are left to another one, which
+    may grow from there.
     """
 
     reconstruction: Reconstruction
@@ -57,7 +59,7 @@ class Mapper:
     pool: Executor
     prior_cameras: list[Camera]
     locked: NDArray[np.bool_]
-    attempts: dict[int, Registration]
+    attempts: dict[int, Registration] = field(default_factory=dict)
     failed_with: dict[int, int] = field(default_factory=dict)
     times_dropped: dict[int, int] = field(default_factory=dict)
     size_at_global: tuple[int, int] = (0, 0)
