@@ -147,7 +147,7 @@ def write_kitti_layout(sequence: RenderedSequence, out: Path, threads: int) -> N
     for i in range(4):  # the colour cameras sit where the grey ones do
         sensor = min(i % 2, len(sequence.rig.cameras) - 1)
         camera, pose = sequence.rig.cameras[sensor], sequence.rig.cam_from_rig[sensor]
-        if camera.canonical[4:].any() or np.abs(pose[:3]).max() > 0:
+        if camera.canonical[4:8].any() or np.abs(pose[:3]).max() > 0:
             raise SystemExit("the layout of KITTI holds rectified cameras only")
         fx, fy, cx, cy = opencv_intrinsics(camera)
         matrix = np.array([[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0]])
@@ -177,8 +177,8 @@ def write_tum_layout(sequence: RenderedSequence, out: Path, threads: int) -> Non
     camera = sequence.rig.cameras[0]
     calib = dict(zip(("fx", "fy", "cx", "cy"), opencv_intrinsics(camera), strict=True))
     calib |= {"width": camera.width, "height": camera.height}
-    if camera.canonical[4:].any():
-        calib |= dict(zip(("k1", "k2", "p1", "p2"), camera.canonical[4:].tolist(), strict=True))
+    if camera.canonical[4:8].any():
+        calib |= dict(zip(("k1", "k2", "p1", "p2"), camera.canonical[4:8].tolist(), strict=True))
     (out / "calib.json").write_text(json.dumps(calib, indent=1) + "\n")
     (out / "rgb").mkdir()
     write_images(sequence, lambda frame, _: out / "rgb" / f"{names[frame]}.png", threads)
@@ -203,7 +203,7 @@ def write_euroc_layout(sequence: RenderedSequence, out: Path, threads: int) -> N
             f"rate_hz: {rate:.6g}\n"
             f"resolution: [{camera.width}, {camera.height}]\ncamera_model: pinhole\n"
             f"intrinsics: {opencv_intrinsics(camera)} #fu, fv, cu, cv\ndistortion_model: radial-tangential\n"
-            f"distortion_coefficients: {camera.canonical[4:].tolist()}\n"
+            f"distortion_coefficients: {camera.canonical[4:8].tolist()}\n"
         )
     _write_inertia(sequence, mav, stamps)
     write_images(sequence, lambda frame, sensor: mav / f"cam{sensor}" / "data" / f"{stamps[frame]}.png", threads)

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from sfmapp.adjust import kernels, solver
 from sfmapp.adjust.problem import pose_rows
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
-from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, distort, project
+from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, project
+from sfmapp.camera.lens import ROW, distort
 from sfmapp.errors import InterruptedRunError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
@@ -52,11 +53,11 @@ def squares(model):
 
 
 @numba.njit
-def observe(pose, mounted, mount, canonical, fisheye, x, y, z, u, v, loss, scale2, scratch):
+def observe(pose, mounted, mount, canonical, x, y, z, u, v, loss, scale2, scratch):
     """Linearise, and check the squared residual by the kernel that computes nothing else."""
     p, m, c, J = pointer(pose), pointer(mount), pointer(canonical), pointer(scratch)
-    s = kernels.linearize(p, mounted, m, c, fisheye, x, y, z, u, v, loss, scale2, 0.0, True, J)
-    if abs(s - kernels.squared_residual(p, c, fisheye, x, y, z, u, v, 0.0)) > 1e-9 * s:
+    s = kernels.linearize(p, mounted, m, c, x, y, z, u, v, loss, scale2, 0.0, True, J)
+    if abs(s - kernels.squared_residual(p, c, x, y, z, u, v, 0.0)) > 1e-9 * s:
         return np.nan
     return s
 
@@ -78,27 +79,27 @@ def test_jacobians_equal_central_differences(model, rotation, point, translation
     if mounting is not None:
         mount = rigid3.from_matrix(rigid3.exp_so3(np.array(mounting[:3])), np.array(mounting[3:]))
     world = turn.T @ (rigid3.apply(rigid3.inverse(mount), in_cam) - t)
-    spread = np.eye(8)
+    spread = np.eye(ROW, 8)
 
     def pixel(delta):
         moved = rigid3.exp_so3(delta[:3]) @ (turn @ (world + delta[6:9]) + t) + delta[3:6]
         moved = rigid3.apply(mount, moved)
-        return np.array(distort(camera.is_fisheye, camera.canonical + spread @ delta[9:], *(moved[:2] / moved[2])))
+        return np.array(distort(camera.canonical + spread @ delta[9:], *(moved[:2] / moved[2])))
 
     pose, mounts = np.zeros((1, 12)), pose_rows(mount[None])
     of_image = np.array([0 if mounting is not None else -1], np.int32)
     kernels.fill_rows(rigid3.from_matrix(turn, t)[None], np.zeros(1, np.int32), of_image, mounts, pose)
     scratch = np.zeros(kernels.SCRATCH)
     observed = pixel(np.zeros(17)) - [3.0, -4.0]
-    args = (pose[0], mounting is not None, mounts[0], camera.canonical, camera.is_fisheye, *world, *observed)
+    args = (pose[0], mounting is not None, mounts[0], camera.canonical, *world, *observed)
     s = observe(*args, 0, 1.0, scratch)
     assert s == pytest.approx(25.0, rel=1e-9)
     rows = scratch.reshape(-1, 2, 8)
-    ours = np.hstack([rows[0][:, :6], rows[3][:, :3], scratch[16:32].reshape(8, 2).T])
+    ours = np.hstack([rows[0][:, :6], rows[5][:, :3], scratch[16:32].reshape(8, 2).T])
     steps = np.array([1e-6] * 9 + [1e-3] * 4 + [1e-6] * 4)
     numeric = np.stack([(pixel(h) - pixel(-h)) / (2 * h.max()) for h in np.diag(steps)], 1)
     np.testing.assert_allclose(ours, numeric, atol=2e-5 * np.abs(numeric).max())
-    np.testing.assert_allclose(rows[3][:, 3], [3.0, -4.0], atol=1e-9)
+    np.testing.assert_allclose(rows[5][:, 3], [3.0, -4.0], atol=1e-9)
     # a robust weight scales residual and Jacobians by the root of rho'
     weighted = np.zeros(kernels.SCRATCH)
     observe(*args, 2, 4.0, weighted)

@@ -38,7 +38,7 @@ def test_noise_free_pose_is_recovered(model, refine_focal):
     if refine_focal:
         canonical[:2] += 20.0
     found = refine_pose(
-        canonical, camera.is_fisheye, start, xyz, xy, refine_focal=refine_focal, relative_cost_tolerance=1e-14,
+        canonical, start, xyz, xy, refine_focal=refine_focal, relative_cost_tolerance=1e-14,
         max_iterations=100,
     )  # fmt: skip
     assert np.abs(tangent(found.cam_from_world, ground_truth)).max() < 1e-6
@@ -53,7 +53,7 @@ def test_covariance_is_honest():
         ground_truth, xyz, xy = view(scene, 1)
         camera = scene.ground_truth.cameras[0]
         found = refine_pose(
-            camera.canonical, False, ground_truth, xyz, xy, loss="trivial", inlier_px=10.0, refine_focal=True,
+            camera.canonical, ground_truth, xyz, xy, loss="trivial", inlier_px=10.0, refine_focal=True,
             relative_cost_tolerance=1e-12,
         )  # fmt: skip
         error = np.append(tangent(found.cam_from_world, ground_truth), found.canonical[0] - camera.focal)
@@ -66,7 +66,7 @@ def test_outliers_are_found_and_do_not_pull():
     scene = make_scene(3, 5, 600, outlier_ratio=0.3, sigma_px=0.5)
     ground_truth, xyz, xy = view(scene)
     start = perturb(scene.ground_truth, rotation_deg=0.5, translation_fraction=0.01).cam_from_world[2]
-    found = refine_pose(scene.ground_truth.cameras[0].canonical, False, start, xyz, xy)
+    found = refine_pose(scene.ground_truth.cameras[0].canonical, start, xyz, xy)
     tracks = scene.observed.tracks
     outlier = scene.obs_is_outlier[tracks.observations_of_image(2)]
     assert (found.is_inlier == ~outlier).mean() > 0.99
@@ -77,13 +77,13 @@ def test_focal_prior_holds_and_degenerate_input_survives():
     scene = make_scene(4, 5, 300)
     ground_truth, xyz, xy = view(scene)
     canonical = scene.ground_truth.cameras[0].canonical
-    free = refine_pose(canonical, False, ground_truth, xyz, xy, refine_focal=True)
-    held = refine_pose(canonical, False, ground_truth, xyz, xy, refine_focal=True, focal_sigma_px=1e-3)
+    free = refine_pose(canonical, ground_truth, xyz, xy, refine_focal=True)
+    held = refine_pose(canonical, ground_truth, xyz, xy, refine_focal=True, focal_sigma_px=1e-3)
     assert abs(held.canonical[0] - canonical[0]) < 0.05 * abs(free.canonical[0] - canonical[0])
-    empty = refine_pose(canonical, False, ground_truth, np.zeros((0, 3)), np.zeros((0, 2)))
+    empty = refine_pose(canonical, ground_truth, np.zeros((0, 3)), np.zeros((0, 2)))
     np.testing.assert_allclose(empty.cam_from_world, ground_truth, atol=1e-15)
     assert np.isinf(empty.covariance).all()
-    behind = refine_pose(canonical, False, ground_truth, -xyz * 100, xy)
+    behind = refine_pose(canonical, ground_truth, -xyz * 100, xy)
     assert np.isfinite(behind.cam_from_world).all()
-    one = refine_pose(canonical, False, ground_truth, xyz[:1], xy[:1])
+    one = refine_pose(canonical, ground_truth, xyz[:1], xy[:1])
     assert np.isfinite(one.cam_from_world).all()

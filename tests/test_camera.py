@@ -45,9 +45,9 @@ def test_projection_equals_opencv_half_a_pixel_away(model):
     k = camera.k_matrix.copy()
     k[:2, 2] -= 0.5  # OpenCV's pixel centres are at integers
     if model == CameraModel.OPENCV:
-        expected = cv2.projectPoints(xyz, np.zeros(3), np.zeros(3), k, camera.canonical[4:])[0][:, 0]
+        expected = cv2.projectPoints(xyz, np.zeros(3), np.zeros(3), k, camera.canonical[4:8])[0][:, 0]
     else:
-        expected = cv2.fisheye.projectPoints(xyz[:, None], np.zeros(3), np.zeros(3), k, camera.canonical[4:])[0][:, 0]
+        expected = cv2.fisheye.projectPoints(xyz[:, None], np.zeros(3), np.zeros(3), k, camera.canonical[4:8])[0][:, 0]
     np.testing.assert_allclose(project(camera, xyz), expected + 0.5, atol=1e-9)
 
 

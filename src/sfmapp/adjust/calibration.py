@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from sfmapp.adjust.kernels import CANON, LOSS_IDS, POINT, POSE, SCRATCH, linearize
 from sfmapp.adjust.problem import pose_rows
 from sfmapp.adjust.solver import Loss
+from sfmapp.camera.lens import ROW
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.simd.pointers import offset, pointer
@@ -74,7 +75,7 @@ def reduce_to_calibration(
     num_sensors = 1 if model.rig is None else len(model.rig.cam_from_rig)
     num_frames = len(model.image_names) // num_sensors
     mounts = rigid3.IDENTITY[None] if model.rig is None else model.rig.cam_from_rig
-    canonical, fisheye = model.canonical_cameras()
+    canonical = model.canonical_cameras()
     penalty = np.array([float(c.width**2 + c.height**2) for c in model.cameras])
     basis = np.zeros((tracks.num_observations, 0)) if fields is None else np.ascontiguousarray(fields)
     num = directions.shape[2] + 2 * len(model.cameras) * basis.shape[1]
@@ -82,7 +83,7 @@ def reduce_to_calibration(
     padded[:, :, : directions.shape[2]] = directions
     arguments = (
         tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy, model.obs_is_inlier, model.point_xyz,
-        pose_rows(model.cam_from_world), num_sensors, _adjoints(mounts), np.ascontiguousarray(canonical), fisheye,
+        pose_rows(model.cam_from_world), num_sensors, _adjoints(mounts), np.ascontiguousarray(canonical),
         penalty, padded, basis, LOSS_IDS[loss], (loss_sigmas * sigma_px) ** 2, 1.0 / sigma_px,
         int(np.diff(tracks.track_ptr).max(initial=1)),
     )  # fmt: skip
@@ -127,7 +128,7 @@ def _stretch(model: Reconstruction, num_sensors: int) -> Array:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _rows(  # type: ignore[no-untyped-def]
-    t, track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, fisheye, penalty,
+    t, track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, penalty,
     directions, fields, loss, scale2, weight, J, frames, pose_part, lens_part, point_part, residual,
 ):  # fmt: skip
     """Fill the rows of a track's inliers; returns their number, 0 if there are too few for a point.
@@ -145,7 +146,7 @@ def _rows(  # type: ignore[no-untyped-def]
         i = obs_image[o]
         s = i % num_sensors
         linearize(
-            offset(pose, 12 * i), False, offset(pose, 0), offset(lens, 8 * s), fisheye[s], xyz[t, 0], xyz[t, 1],
+            offset(pose, 12 * i), False, offset(pose, 0), offset(lens, ROW * s), xyz[t, 0], xyz[t, 1],
             xyz[t, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[s], True, scratch,
         )  # fmt: skip
         frames[n] = i // num_sensors
@@ -214,7 +215,7 @@ def _project(point_part, rows, columns):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _reduce(  # type: ignore[no-untyped-def]
-    track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, fisheye, penalty, directions,
+    track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, penalty, directions,
     fields, loss, scale2, weight, longest, system, cross, said,
 ):  # fmt: skip
     """Add the tracks, points eliminated, to the upper half of a system over poses (F * 6), and to cross (F * 6, Q).
@@ -227,7 +228,7 @@ def _reduce(  # type: ignore[no-untyped-def]
     place, W = np.zeros(longest, np.int64), np.zeros((3, 6 * longest))
     for t in range(track_ptr.shape[0] - 1):
         n = _rows(
-            t, track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, fisheye, penalty,
+            t, track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, penalty,
             directions, fields, loss, scale2, weight, J, frames, pose_part, lens_part, point_part, residual,
         )  # fmt: skip
         said[t] = n > 0
@@ -259,7 +260,7 @@ def _reduce(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _by_cluster(  # type: ignore[no-untyped-def]
-    track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, fisheye, penalty, directions,
+    track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, penalty, directions,
     fields, loss, scale2, weight, longest, response, cluster, gradient, information,
 ):  # fmt: skip
     """Gradient (C, Q) and information (C, Q, Q) of clusters of tracks, the poses following with response (F * 6, Q)."""
@@ -272,7 +273,7 @@ def _by_cluster(  # type: ignore[no-untyped-def]
         if c < 0:
             continue
         n = _rows(
-            t, track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, fisheye, penalty,
+            t, track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, penalty,
             directions, fields, loss, scale2, weight, J, frames, pose_part, lens_part, point_part, residual,
         )  # fmt: skip
         for r in range(2 * n):

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import constrained_inverse, gauge_of, pose_covariances, reduced_matrix
-from sfmapp.adjust.kernels import SCRATCH, linearize
+from sfmapp.adjust.kernels import POINT, SCRATCH, linearize
 from sfmapp.adjust.solver import AdjustOptions, Engine, make_engine
+from sfmapp.camera.lens import ROW
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.simd.pointers import offset, pointer
@@ -93,7 +94,7 @@ def _scatter(engine: Engine, num: int) -> tuple[Array, Array, float, float]:
     clustered, independent, sums = np.zeros((num, num)), np.zeros((num, num)), np.zeros(2)
     _add_tracks(
         p.point_ptr, p.obs_image, p.obs_xy, p.xyz, engine.rows, p.image_mount, p.mounts, p.image_camera, p.image_block,
-        p.canonical, p.fisheye, p.penalty, engine.loss, engine.scale2, engine.factor, np.zeros(SCRATCH), clustered,
+        p.canonical, p.penalty, engine.loss, engine.scale2, engine.factor, np.zeros(SCRATCH), clustered,
         independent, sums,
     )  # fmt: skip
     return clustered, independent, float(sums[0]), float(sums[1])
@@ -101,7 +102,7 @@ def _scatter(engine: Engine, num: int) -> tuple[Array, Array, float, float]:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_tracks(  # type: ignore[no-untyped-def]
-    point_ptr, obs_image, obs_xy, xyz, poses, image_mount, mounts, image_camera, image_block, canonical, fisheye,
+    point_ptr, obs_image, obs_xy, xyz, poses, image_mount, mounts, image_camera, image_block, canonical,
     penalty, loss, scale2, factor, J, clustered, independent, sums,
 ):  # fmt: skip
     """See :func:`_scatter`. The point is eliminated with ``V^-1 = L^-T L^-1`` from the factor."""
@@ -121,11 +122,11 @@ def _add_tracks(  # type: ignore[no-untyped-def]
             i = obs_image[o]
             c = image_camera[i]
             s = linearize(
-                offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, 8 * c),
-                fisheye[c], xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
+                offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, ROW * c),
+                xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
                 False, scratch,
             )  # fmt: skip
-            squared = J[51] * J[51] + J[59] * J[59]
+            squared = J[POINT + 3] * J[POINT + 3] + J[POINT + 11] * J[POINT + 11]
             weight = squared / s if s > 0.0 else 1.0
             squares += squared
             sums[0] += weight
@@ -138,14 +139,14 @@ def _add_tracks(  # type: ignore[no-untyped-def]
                 count += 1
                 U[k], Z[k], g[k] = 0.0, 0.0, 0.0
             for m in range(3):
-                b[m] += J[48 + m] * J[51] + J[56 + m] * J[59]
+                b[m] += J[POINT + m] * J[POINT + 3] + J[POINT + 8 + m] * J[POINT + 11]
             for r in range(6):
-                g[k, r] += J[r] * J[51] + J[8 + r] * J[59]
+                g[k, r] += J[r] * J[POINT + 3] + J[8 + r] * J[POINT + 11]
                 for m in range(6):
                     U[k, r, m] += J[r] * J[m] + J[8 + r] * J[8 + m]
                 for m in range(3):
                     for n in range(m + 1):  # Z = W L^-T
-                        Z[k, r, m] += (J[r] * J[48 + n] + J[8 + r] * J[56 + n]) * L[m, n]
+                        Z[k, r, m] += (J[r] * J[POINT + n] + J[8 + r] * J[POINT + 8 + n]) * L[m, n]
         for m in range(3):
             y[m] = L[m, 0] * b[0] + L[m, 1] * b[1] + L[m, 2] * b[2]
         noise = squares / (2 * (end - begin) - 3)

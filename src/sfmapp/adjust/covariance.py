@@ -20,10 +20,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.kernels import SCRATCH, linearize, robust_weight
+from sfmapp.adjust.kernels import CANON, POINT, SCRATCH, linearize, robust_weight
 from sfmapp.adjust.problem import Problem
 from sfmapp.adjust.solver import AdjustOptions, Engine, make_engine
 from sfmapp.camera.camera import Camera
+from sfmapp.camera.lens import ROW
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.simd.pointers import offset, pointer
@@ -111,7 +112,7 @@ def _variance(engine: Engine, num_unknowns: int) -> float:
     p = engine.problem
     total = _weighted_squares(
         p.point_ptr, p.obs_image, p.obs_xy, p.xyz, engine.rows, p.image_mount, p.mounts, p.image_camera, p.canonical,
-        p.fisheye, p.penalty, engine.loss, engine.scale2, np.zeros(SCRATCH),
+        p.penalty, engine.loss, engine.scale2, np.zeros(SCRATCH),
     )  # fmt: skip
     is_free = (p.pose_block >= 0).all() and not p.is_constant.any() and engine.extras is None
     free_gauge = 0 if not is_free else 6 if p.has_baseline else 7
@@ -215,7 +216,7 @@ def _collect(
     if determined:
         _point_covariances(
             p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, engine.rows, p.image_mount, p.mounts,
-            p.image_camera, p.image_block, p.canonical, p.fisheye, p.penalty, p.camera_block, p.free.ptr, p.free.slot,
+            p.image_camera, p.image_block, p.canonical, p.penalty, p.camera_block, p.free.ptr, p.free.slot,
             p.free.column, p.block_dim, engine.loss, engine.scale2, engine.factor, covariance, variance,
             np.zeros(SCRATCH), points,
         )  # fmt: skip
@@ -327,7 +328,7 @@ def _apply_similarity(model: Reconstruction, poses: Array, move: Array) -> None:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _weighted_squares(  # type: ignore[no-untyped-def]
-    point_ptr, obs_image, obs_xy, xyz, poses, image_mount, mounts, image_camera, canonical, fisheye, penalty, loss,
+    point_ptr, obs_image, obs_xy, xyz, poses, image_mount, mounts, image_camera, canonical, penalty, loss,
     scale2, J,
 ):  # fmt: skip
     """Sum of rho'(s) s over all observations."""
@@ -338,8 +339,8 @@ def _weighted_squares(  # type: ignore[no-untyped-def]
             i = obs_image[o]
             c = image_camera[i]
             s = linearize(
-                offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, 8 * c),
-                fisheye[c], xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
+                offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, ROW * c),
+                xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
                 False, scratch,
             )  # fmt: skip
             total += robust_weight(loss, scale2, s) * s
@@ -349,7 +350,7 @@ def _weighted_squares(  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _point_covariances(  # type: ignore[no-untyped-def]
     point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_mount, mounts, image_camera, image_block, canonical,
-    fisheye, penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, factor, covariance,
+    penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, factor, covariance,
     variance, J, out,
 ):  # fmt: skip
     """``V^-1 (variance V + W^T C W) V^-1`` of each point, with V^-1 = L^-T L^-1 from the factor; C in full blocks."""
@@ -371,8 +372,8 @@ def _point_covariances(  # type: ignore[no-untyped-def]
             i = obs_image[o]
             c = image_camera[i]
             linearize(
-                offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, 8 * c),
-                fisheye[c], xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
+                offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, ROW * c),
+                xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
                 True, scratch,
             )  # fmt: skip
             for block in (image_block[i], camera_block[c]):
@@ -384,11 +385,11 @@ def _point_covariances(  # type: ignore[no-untyped-def]
             for j in range(3):
                 if image_block[i] >= 0:
                     for k in range(6):
-                        W[image_block[i] * 8 + k, j] += J[k] * J[48 + j] + J[8 + k] * J[56 + j]
+                        W[image_block[i] * 8 + k, j] += J[k] * J[POINT + j] + J[8 + k] * J[POINT + 8 + j]
                 if camera_block[c] >= 0:
                     for n in range(free_ptr[c], free_ptr[c + 1]):
-                        k, slot = camera_block[c] * 8 + free_column[n], 16 + 2 * free_slot[n]
-                        W[k, j] += J[slot] * J[48 + j] + J[slot + 1] * J[56 + j]
+                        k, slot = camera_block[c] * 8 + free_column[n], CANON + 2 * free_slot[n]
+                        W[k, j] += J[slot] * J[POINT + j] + J[slot + 1] * J[POINT + 8 + j]
         M[:] = 0.0
         for a in range(count):
             for r in range(touched[a] * 8, touched[a] * 8 + block_dim[touched[a]]):

@@ -19,6 +19,8 @@ import math
 
 import numba
 
+from sfmapp.camera import brown, radial_fisheye
+from sfmapp.camera.lens import FAMILY, RADIAL_FISHEYE, ROW, distort
 from sfmapp.simd.f64x8 import add2, assign3, spread, store8, subtract3
 from sfmapp.simd.pointers import offset, pointer
 
@@ -27,9 +29,9 @@ LOSS_IDS: dict[str, int] = {"trivial": 0, "huber": 1, "cauchy": 2}
 
 # Offsets in the scratch row of one observation: two rows each of pose (and merged intrinsics); canonical intrinsics,
 # interleaved; free intrinsics; and point, with the residual in the fourth place.
-POSE, CANON, INTR, POINT, SCRATCH = 0, 16, 32, 48, 64
+POSE, CANON, INTR, POINT, SCRATCH = 0, 16, 48, 80, 96
 # What one chunk needs besides, in doubles: the scratch row, the point's normal equations and its eliminator.
-_NORMAL, _SMALL, _ZEROS, _FIXED = 64, 88, 112, 128
+_NORMAL, _SMALL, _ZEROS, _FIXED = 96, 120, 144, 160
 # Smallest depth that counts as in front of the camera, relative to the distance.
 _MIN_COS = 1e-6
 
@@ -71,14 +73,14 @@ def total_loss(scale2: float, total: float, product: float) -> float:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def linearize(  # type: ignore[no-untyped-def]
-    pose, mounted, mount, c, fisheye, x0, x1, x2, xo, yo, loss, scale2, penalty, intrinsics, J
+    pose, mounted, mount, c, x0, x1, x2, xo, yo, loss, scale2, penalty, intrinsics, J
 ):
     """Weighted Jacobians and residual of one observation into the scratch row J; returns the squared residual.
 
     pose, mount, c and J are pointers: to 12 numbers, R row by row and t, of cam_from_world and, if ``mounted``, of
-    cam_from_rig, the derivatives then being those by the rig's pose; to 8 canonical intrinsics, whose derivatives are
-    wanted if ``intrinsics``; and to the scratch row. Behind the camera the Jacobians are zero and the squared residual
-    is ``penalty``, so that a point gains nothing by slipping there.
+    cam_from_rig, the derivatives then being those by the rig's pose; to the camera's canonical row, whose
+    derivatives are wanted if ``intrinsics``; and to the scratch row. Behind the camera the Jacobians are zero and the
+    squared residual is ``penalty``, so that a point gains nothing by slipping there.
     """
     px = pose[0] * x0 + pose[1] * x1 + pose[2] * x2 + pose[9]
     py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]
@@ -88,41 +90,11 @@ def linearize(  # type: ignore[no-untyped-def]
         iz = 1.0 / pz
         u = px * iz
         v = py * iz
-        r2 = u * u + v * v
         fx, fy = c[0], c[1]
-        d0, d1, d2, d3 = c[4], c[5], c[6], c[7]
-        if fisheye:
-            r = math.sqrt(r2)
-            if r < 1e-8:
-                s, slope, q = 1.0, 2.0 * (d0 - 1.0 / 3.0), 0.0
-                t2 = r2
-            else:
-                theta = math.atan(r)
-                t2 = theta * theta
-                q = theta * t2 / r
-                s = theta * (1.0 + t2 * (d0 + t2 * (d1 + t2 * (d2 + t2 * d3)))) / r
-                rate = 1.0 + t2 * (3.0 * d0 + t2 * (5.0 * d1 + t2 * (7.0 * d2 + t2 * 9.0 * d3)))
-                slope = (rate / (1.0 + r2) - s) / r2
-            ud, vd = s * u, s * v
-            a = s + u * u * slope
-            b = u * v * slope
-            d = s + v * v * slope
-            k0u, k0v = q * u, q * v
-            k1u, k1v = t2 * k0u, t2 * k0v
-            k2u, k2v = t2 * k1u, t2 * k1v
-            k3u, k3v = t2 * k2u, t2 * k2v
+        if c[FAMILY] == RADIAL_FISHEYE:
+            ud, vd, a, b, d, k0u, k0v, k1u, k1v, k2u, k2v, k3u, k3v = radial_fisheye.jacobian(c, u, v)
         else:
-            radial = 1.0 + r2 * (d0 + r2 * d1)
-            slope = 2.0 * (d0 + 2.0 * r2 * d1)
-            k0u, k0v = r2 * u, r2 * v
-            k1u, k1v = r2 * k0u, r2 * k0v
-            k2u, k2v = 2.0 * u * v, r2 + 2.0 * v * v
-            k3u, k3v = r2 + 2.0 * u * u, k2u
-            ud = u * radial + d2 * k2u + d3 * k3u
-            vd = v * radial + d2 * k2v + d3 * k3v
-            a = radial + u * u * slope + 2.0 * d2 * v + 6.0 * d3 * u
-            b = u * v * slope + 2.0 * d2 * u + 2.0 * d3 * v
-            d = radial + v * v * slope + 2.0 * d3 * u + 6.0 * d2 * v
+            ud, vd, a, b, d, k0u, k0v, k1u, k1v, k2u, k2v, k3u, k3v = brown.jacobian(c, u, v)
         e0 = fx * ud + c[2] - xo
         e1 = fy * vd + c[3] - yo
         s2 = e0 * e0 + e1 * e1
@@ -173,7 +145,7 @@ def linearize(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def squared_residual(pose, c, fisheye, x0, x1, x2, xo, yo, penalty):  # type: ignore[no-untyped-def]
+def squared_residual(pose, c, x0, x1, x2, xo, yo, penalty):  # type: ignore[no-untyped-def]
     """The squared residual of one observation, ``penalty`` behind the camera; arguments as in :func:`linearize`."""
     px = pose[0] * x0 + pose[1] * x1 + pose[2] * x2 + pose[9]
     py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]
@@ -183,22 +155,9 @@ def squared_residual(pose, c, fisheye, x0, x1, x2, xo, yo, penalty):  # type: ig
         iz = 1.0 / pz
         u = px * iz
         v = py * iz
-        r2 = u * u + v * v
-        d0, d1, d2, d3 = c[4], c[5], c[6], c[7]
-        if fisheye:
-            r = math.sqrt(r2)
-            s = 1.0
-            if r >= 1e-8:
-                theta = math.atan(r)
-                t2 = theta * theta
-                s = theta * (1.0 + t2 * (d0 + t2 * (d1 + t2 * (d2 + t2 * d3)))) / r
-            ud, vd = s * u, s * v
-        else:
-            radial = 1.0 + r2 * (d0 + r2 * d1)
-            ud = u * radial + 2.0 * d2 * u * v + d3 * (r2 + 2.0 * u * u)
-            vd = v * radial + d2 * (r2 + 2.0 * v * v) + 2.0 * d3 * u * v
-        e0 = c[0] * ud + c[2] - xo
-        e1 = c[1] * vd + c[3] - yo
+        ud, vd = distort(c, u, v)
+        e0 = ud - xo
+        e1 = vd - yo
         s2 = e0 * e0 + e1 * e1
     return s2
 
@@ -279,7 +238,7 @@ def _factor_point(normal, damping, factor, small):  # type: ignore[no-untyped-de
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def reduce_points(  # type: ignore[no-untyped-def]
     first, last, point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_mount, mounts, image_camera, image_block,
-    intrinsics, fisheye, penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, damping,
+    intrinsics, penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, damping,
     hash_keys, hash_values, tiles, own, cross, gradient, point_factor, scratch, integers,
 ):  # fmt: skip
     """Linearise points first..last and eliminate them; returns the cost of their observations.
@@ -289,7 +248,7 @@ def reduce_points(  # type: ignore[no-untyped-def]
         is_constant: (P,) points that do not move.
         poses: (I, 12); image_camera: (I,); image_block: (I,) block of its pose, -1 where that is constant.
         image_mount: (I,) row in mounts (M, 12), cam_from_rig; -1 where the image's pose is that of its block.
-        intrinsics: (C, 8) canonical; penalty: (C,) squared residual of what is behind.
+        intrinsics: (C, 17) canonical rows; penalty: (C,) squared residual of what is behind.
         camera_block: (C,) block that holds the free intrinsics, -1 where constant; free_ptr, free_slot, free_column:
             for camera c, canonical slot and column in the block.
         block_dim: (B,) rows in use of each block.
@@ -323,8 +282,8 @@ def reduce_points(  # type: ignore[no-untyped-def]
             c = image_camera[i]
             block, other = image_block[i], camera_block[c]
             s2 = linearize(
-                offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, 8 * c),
-                fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c], other >= 0, J,
+                offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]),
+                offset(lens, ROW * c), x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c], other >= 0, J,
             )  # fmt: skip
             cost, product = add_loss(loss, scale2, s2, cost, product)
             if moves:
@@ -366,7 +325,7 @@ def reduce_points(  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def substitute_points(  # type: ignore[no-untyped-def]
     first, last, point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_mount, mounts, image_camera, image_block,
-    intrinsics, fisheye, penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, point_factor,
+    intrinsics, penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, point_factor,
     step, new_poses, new_intrinsics, new_xyz, sums, scratch,
 ):  # fmt: skip
     """Steps of points first..last after those of the blocks, and the cost of the state that results.
@@ -392,8 +351,9 @@ def substitute_points(  # type: ignore[no-untyped-def]
                 if block < 0 and other < 0:
                     continue
                 linearize(
-                    offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, 8 * c),
-                    fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c], other >= 0, J,
+                    offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]),
+                    offset(lens, ROW * c), x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
+                    other >= 0, J,
                 )  # fmt: skip
                 e0 = e1 = 0.0
                 if block >= 0:
@@ -427,7 +387,7 @@ def substitute_points(  # type: ignore[no-untyped-def]
             i = obs_image[o]
             c = image_camera[i]
             s2 = squared_residual(
-                offset(new_pose, 12 * i), offset(new_lens, 8 * c), fisheye[c], x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1],
+                offset(new_pose, 12 * i), offset(new_lens, ROW * c), x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1],
                 penalty[c],
             )  # fmt: skip
             cost, product = add_loss(loss, scale2, s2, cost, product)
@@ -467,7 +427,7 @@ def retract(  # type: ignore[no-untyped-def]
     poses, pose_block, image_pose, image_mount, mounts, canonical, camera_block, free_ptr, free_slot, free_column, step,
     new_poses, new_rows, new_canonical,
 ):  # fmt: skip
-    """Apply a step of the blocks: ``x_cam <- exp(w) x_cam + v`` on poses (Q, 7), sums on canonical rows (C, 8).
+    """Apply a step of the blocks: ``x_cam <- exp(w) x_cam + v`` on poses (Q, 7), sums on canonical rows (C, 17).
 
     Constant poses and cameras keep their bits. Also fills new_rows (I, 12) by :func:`fill_rows`.
     """

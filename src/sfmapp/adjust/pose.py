@@ -9,7 +9,8 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfmapp.adjust.kernels import LOSS_IDS, POINT, SCRATCH, add_loss, fill_rows, linearize, retract, total_loss
+from sfmapp.adjust.kernels import CANON, LOSS_IDS, POINT, SCRATCH, add_loss, fill_rows, linearize, retract, total_loss
+from sfmapp.camera.lens import ROW
 from sfmapp.simd.f64x8 import add2
 from sfmapp.simd.pointers import pointer
 
@@ -22,7 +23,7 @@ class RefinedPose:
 
     Attributes:
         cam_from_world: (7,) quaternion x y z w and translation.
-        canonical: (8,) intrinsics; changed in the focal lengths alone, and only if they were free.
+        canonical: (17,) intrinsics; changed in the focal lengths alone, and only if they were free.
         covariance: (6, 6), or (7, 7) with the focal length in pixels last, over rotation (radians) and translation of
             ``x_cam <- exp(w) x_cam + v``, scaled by the inliers' residuals; infinite where the points do not hold it.
         is_inlier: (N,) bool: in front of the camera with a residual below the threshold.
@@ -40,7 +41,6 @@ class RefinedPose:
 
 def refine_pose(
     canonical: ArrayLike,
-    fisheye: bool,
     cam_from_world: ArrayLike,
     xyz: ArrayLike,
     xy: ArrayLike,
@@ -56,7 +56,7 @@ def refine_pose(
     """Minimise the robust reprojection error of known points over one pose, from a start such as PnP gives.
 
     Args:
-        canonical: (8,) intrinsics. fisheye: their kind.
+        canonical: (17,) intrinsics, see ``Camera.canonical``.
         cam_from_world: (7,) start.
         xyz: (N, 3) world. xy: (N, 2) pixels.
         loss, scale_px: as in ``AdjustOptions``.
@@ -71,7 +71,7 @@ def refine_pose(
     weight = 0.0 if focal_sigma_px is None else 1.0 / focal_sigma_px**2
     size = 7 if refine_focal else 6
     cost, iterations = _refine(
-        row, fisheye, state, points, pixels, LOSS_IDS[loss], scale_px**2, size, weight, max_iterations,
+        row, state, points, pixels, LOSS_IDS[loss], scale_px**2, size, weight, max_iterations,
         relative_cost_tolerance, information, residuals2,
     )  # fmt: skip
     is_inlier = residuals2 <= inlier_px**2
@@ -88,7 +88,7 @@ def refine_pose(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _normal_equations(  # type: ignore[no-untyped-def]
-    canonical, fisheye, rows, xyz, xy, loss, scale2, size, penalty, J, information, gradient, residuals2
+    canonical, rows, xyz, xy, loss, scale2, size, penalty, J, information, gradient, residuals2
 ):
     """Fill information (64,), gradient (8,) and the squared residuals (N,), infinite behind; returns the cost."""
     information[:] = 0.0
@@ -96,7 +96,7 @@ def _normal_equations(  # type: ignore[no-untyped-def]
     total, product = 0.0, 1.0
     for n in range(xyz.shape[0]):
         s2 = linearize(
-            pointer(rows), False, pointer(rows), pointer(canonical), fisheye, xyz[n, 0], xyz[n, 1], xyz[n, 2],
+            pointer(rows), False, pointer(rows), pointer(canonical), xyz[n, 0], xyz[n, 1], xyz[n, 2],
             xy[n, 0], xy[n, 1], loss, scale2, -1.0, size > 6, pointer(J),
         )  # fmt: skip
         residuals2[n] = s2
@@ -105,8 +105,8 @@ def _normal_equations(  # type: ignore[no-untyped-def]
             s2 = penalty
         total, product = add_loss(loss, scale2, s2, total, product)
         J[7] = J[15] = 0.0
-        J[6] = J[16] + J[18] if size > 6 else 0.0
-        J[14] = J[17] + J[19] if size > 6 else 0.0
+        J[6] = J[CANON] + J[CANON + 2] if size > 6 else 0.0
+        J[14] = J[CANON + 1] + J[CANON + 3] if size > 6 else 0.0
         add2(information, 0, J, 0, J, 0, 8)
         add2(gradient, 0, J, POINT + 3, J, 0, 1)
     return total_loss(scale2, total, product)
@@ -144,7 +144,7 @@ def _damped_step(information, gradient, damping, size, step):  # type: ignore[no
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _refine(  # type: ignore[no-untyped-def]
-    c, fisheye, state, xyz, xy, loss, scale2, size, prior_weight, max_iterations, tolerance, information, residuals2
+    c, state, xyz, xy, loss, scale2, size, prior_weight, max_iterations, tolerance, information, residuals2
 ):
     J = np.zeros(SCRATCH)
     block, camera_block = np.zeros(1, np.int32), np.full(1, 0 if size > 6 else -1, np.int32)
@@ -153,14 +153,14 @@ def _refine(  # type: ignore[no-untyped-def]
     free_slot, free_column = np.array([0, 1]), np.array([6, 6])
     poses, new_poses = state.reshape(1, 7), np.empty((1, 7))
     rows, new_rows = np.empty((1, 12)), np.empty((1, 12))
-    canonical, new_canonical = c.reshape(1, 8), np.empty((1, 8))
+    canonical, new_canonical = c.reshape(1, ROW), np.empty((1, ROW))
     step = np.zeros(8)
     fill_rows(poses, block, none, no_mounts, rows)
     focal = c[0]
     penalty = 8.0 * focal * focal  # gtsam's choice for points behind the camera
     H, g, new_H, new_g = np.zeros(64), np.zeros(8), np.zeros(64), np.zeros(8)
     new_residuals2 = np.empty(xyz.shape[0])
-    cost = _normal_equations(canonical, fisheye, rows, xyz, xy, loss, scale2, size, penalty, J, H, g, residuals2)
+    cost = _normal_equations(canonical, rows, xyz, xy, loss, scale2, size, penalty, J, H, g, residuals2)
     H[54] += prior_weight
     damping, growth, iterations = 1e-4, 2.0, 0
     while iterations < max_iterations and damping < 1e12:
@@ -175,7 +175,6 @@ def _refine(  # type: ignore[no-untyped-def]
         )  # fmt: skip
         new_cost = _normal_equations(
             new_canonical,
-            fisheye,
             new_rows,
             xyz,
             xy,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import PARAM_NAMES, Camera, canonical_from_params
+from sfmapp.camera.lens import ROW
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import RigImages
@@ -62,7 +63,6 @@ class Problem:
     image_block: NDArray[np.int32]
     camera_block: NDArray[np.int32]
     block_dim: NDArray[np.int64]
-    fisheye: Mask
     penalty: Array
     free: FreeIntrinsics
 
@@ -170,7 +170,7 @@ def make_problem(
         image_pose=image_pose,
         image_mount=image_mount,
         mounts=mounts,
-        canonical=np.array([camera.canonical for camera in cameras]).reshape(-1, 8),
+        canonical=np.array([camera.canonical for camera in cameras]).reshape(-1, ROW),
         xyz=reconstruction.point_xyz[selected[kept]],
         is_constant=is_constant[kept],
         point_ptr=point_ptr,
@@ -181,7 +181,6 @@ def make_problem(
         image_block=pose_block[image_pose],
         camera_block=camera_block,
         block_dim=block_dim,
-        fisheye=np.array([camera.is_fisheye for camera in cameras], bool),
         # a point behind the camera misses by the image's diagonal
         penalty=np.array([float(camera.width**2 + camera.height**2) for camera in cameras]),
         free=_free_columns(cameras, params, camera_block, int(pose_varies.sum())),

@@ -99,11 +99,11 @@ class Lens:
         single = names[0] == "f"
         self.factor: Any
         if single:
-            fx, _, cx, cy, k1, k2, _, _ = canonical
+            fx, _, cx, cy, k1, k2, _, _ = canonical[:8]
             order: tuple[str | None, ...] = _BUNDLER
             self.calibration, self.factor = gtsam.Cal3Bundler(fx, k1, k2, cx, cy), gtsam.GeneralSFMFactor2Cal3Bundler
         else:
-            fx, fy, cx, cy, *d = canonical
+            fx, fy, cx, cy, *d = canonical[:8]
             fisheye = camera.is_fisheye
             order = _FISHEYE if fisheye else _DS2
             self.calibration = (gtsam.Cal3Fisheye if fisheye else gtsam.Cal3DS2)(fx, fy, 0.0, cx, cy, *d)

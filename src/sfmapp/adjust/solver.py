@@ -210,7 +210,7 @@ def compile_kernels() -> None:
     estimate_covariances(model, fixed)
     clustered_covariances(make_scene(0, 3, 40).observed, fixed)
     camera, tracks = model.cameras[0], model.tracks
-    refine_pose(camera.canonical, camera.is_fisheye, model.cam_from_world[0], model.point_xyz, tracks.obs_xy[:8])
+    refine_pose(camera.canonical, model.cam_from_world[0], model.point_xyz, tracks.obs_xy[:8])
     no_images = np.zeros(0, np.int32)
     mark_pairs(np.zeros(1, np.int64), no_images, no_images, no_images, no_images, np.eye(1, dtype=bool))
     find_slot(*number_keys(np.arange(3)), 0)
@@ -325,7 +325,7 @@ class Engine:
         def chunk(k: int) -> float:
             cost: float = kernels.reduce_points(
                 self.limits[k], self.limits[k + 1], p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, self.rows,
-                p.image_mount, p.mounts, p.image_camera, p.image_block, p.canonical, p.fisheye, p.penalty,
+                p.image_mount, p.mounts, p.image_camera, p.image_block, p.canonical, p.penalty,
                 p.camera_block, p.free.ptr, p.free.slot, p.free.column, p.block_dim, self.loss, self.scale2, damping,
                 self.hash_keys, self.hash_values, self.tiles[k], self.own[k], self.cross[k], self.gradient[k],
                 self.factor, *self.scratch[k],
@@ -381,7 +381,7 @@ class Engine:
         def chunk(k: int) -> None:
             kernels.substitute_points(
                 self.limits[k], self.limits[k + 1], p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, self.rows,
-                p.image_mount, p.mounts, p.image_camera, p.image_block, p.canonical, p.fisheye, p.penalty,
+                p.image_mount, p.mounts, p.image_camera, p.image_block, p.canonical, p.penalty,
                 p.camera_block, p.free.ptr, p.free.slot, p.free.column, p.block_dim, self.loss, self.scale2,
                 self.factor, step, self.new_rows, self.new_canonical, self.new_xyz, self.sums[k], self.scratch[k][0],
             )  # fmt: skip

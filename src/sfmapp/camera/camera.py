@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfmapp.camera.lens import distort, undistort
+from sfmapp.camera.lens import BROWN, FAMILY, RADIAL_FISHEYE, ROW, distort, undistort
 
 Array = NDArray[np.float64]
 
@@ -80,8 +80,11 @@ class Camera:
 
     @property
     def canonical(self) -> Array:
-        """(8,) float64 ``fx, fy, cx, cy, d0..d3``: the form that the kernels take."""
-        return canonical_from_params(self.model) @ self.params
+        """(17,) float64 ``fx, fy, cx, cy``, twelve of distortion and the family: the row that the kernels take."""
+        row = np.zeros(ROW)
+        row[:FAMILY] = canonical_from_params(self.model) @ self.params
+        row[FAMILY] = RADIAL_FISHEYE if self.is_fisheye else BROWN
+        return row
 
     @property
     def is_fisheye(self) -> bool:
@@ -104,9 +107,9 @@ class Camera:
 
 
 def canonical_from_params(model: CameraModel) -> Array:
-    """(8, P) matrix of zeros and ones that spreads a model's parameters over the canonical eight."""
+    """(16, P) matrix of zeros and ones that spreads a model's parameters over the canonical sixteen."""
     names = PARAM_NAMES[model]
-    matrix = np.zeros((8, len(names)))
+    matrix = np.zeros((FAMILY, len(names)))
     for column, name in enumerate(names):
         for row in _CANONICAL_SLOT[name]:
             matrix[row, column] = 1.0
@@ -123,17 +126,17 @@ def simple_camera(
 
 
 @numba.njit(cache=True, nogil=True)
-def _undistort_all(fisheye: bool, c: Array, xy: Array, out: Array) -> None:
+def _undistort_all(c: Array, xy: Array, out: Array) -> None:
     for i in range(xy.shape[0]):
-        out[i, 0], out[i, 1] = undistort(fisheye, c, xy[i, 0], xy[i, 1])
+        out[i, 0], out[i, 1] = undistort(c, xy[i, 0], xy[i, 1])
 
 
 @numba.njit(cache=True, nogil=True)
-def _project_all(fisheye: bool, c: Array, xyz: Array, out: Array) -> None:
+def _project_all(c: Array, xyz: Array, out: Array) -> None:
     for i in range(xyz.shape[0]):
         z = xyz[i, 2]
         if z > 1e-12:
-            out[i, 0], out[i, 1] = distort(fisheye, c, xyz[i, 0] / z, xyz[i, 1] / z)
+            out[i, 0], out[i, 1] = distort(c, xyz[i, 0] / z, xyz[i, 1] / z)
         else:
             out[i, 0] = out[i, 1] = math.nan
 
@@ -142,7 +145,7 @@ def pixels_to_normalized(camera: Camera, xy: ArrayLike) -> Array:
     """Normalised image points (N, 2) float64, ``(X/Z, Y/Z)``, of pixels (N, 2); NaN where the lens has no inverse."""
     xy = np.ascontiguousarray(xy, np.float64)
     out = np.empty_like(xy)
-    _undistort_all(camera.is_fisheye, camera.canonical, xy, out)
+    _undistort_all(camera.canonical, xy, out)
     return out
 
 
@@ -150,5 +153,5 @@ def project(camera: Camera, xyz_cam: ArrayLike) -> Array:
     """Pixels (N, 2) float64 of points (N, 3) in the camera's frame; NaN behind the camera."""
     xyz = np.ascontiguousarray(xyz_cam, np.float64)
     out = np.empty((len(xyz), 2))
-    _project_all(camera.is_fisheye, camera.canonical, xyz, out)
+    _project_all(camera.canonical, xyz, out)
     return out

@@ -152,7 +152,7 @@ def resample(
     layers = np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None])
     white = np.full(layers.shape[2], 255.0) if layers.dtype == np.uint8 else layers.max(axis=(0, 1)).astype(np.float64)
     flat, shown = np.empty((size[1], size[0], layers.shape[2]), layers.dtype), np.empty(size[::-1], np.uint8)
-    _resample(layers, camera.is_fisheye, camera.canonical, _reach(camera), k, white, flat, shown)
+    _resample(layers, camera.canonical, _reach(camera), k, white, flat, shown)
     return flat.reshape(size[1], size[0], *pixels.shape[2:]), shown
 
 
@@ -162,8 +162,8 @@ def _reach(camera: Camera) -> float:
     row = camera.canonical.copy()
     row[:4] = 1.0, 1.0, 0.0, 0.0
     if not camera.is_fisheye:
-        row[6:] = 0.0  # the tangential terms are no reason to fold
-    image = np.array([distort(camera.is_fisheye, row, r, 0.0)[0] for r in radius])
+        row[6:8] = 0.0  # the tangential terms are no reason to fold
+    image = np.array([distort(row, r, 0.0)[0] for r in radius])
     folds = np.flatnonzero(np.diff(image) <= 0.0)
     return float(radius[folds[0]]) if len(folds) else math.inf
 
@@ -184,7 +184,7 @@ def _cubic_weights(t):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _resample(pixels, fisheye, row, reach, k, white, out, shown):  # type: ignore[no-untyped-def]
+def _resample(pixels, row, reach, k, white, out, shown):  # type: ignore[no-untyped-def]
     """Fill out (h, w, C) of the plane of k from a photograph (H, W, C); shown (h, w): 255 where it shows any of it.
 
     The border of the photograph is carried on, so that pixels at the edge have company of their kind.
@@ -194,7 +194,7 @@ def _resample(pixels, fisheye, row, reach, k, white, out, shown):  # type: ignor
         y = (v + 0.5 - k[3]) / k[1]
         for u in range(out.shape[1]):
             x = (u + 0.5 - k[2]) / k[0]
-            px, py = distort(fisheye, row, x, y)
+            px, py = distort(row, x, y)
             is_shown = x * x + y * y < reach * reach and 0.0 <= px <= width and 0.0 <= py <= height
             shown[v, u] = 255 if is_shown else 0
             px, py = min(max(px, 0.0), float(width)) - 0.5, min(max(py, 0.0), float(height)) - 0.5

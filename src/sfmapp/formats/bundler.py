@@ -62,7 +62,7 @@ def list_path(path: Path) -> Path:
 
 
 def _refuse_loss(camera: Camera, idx: int) -> None:
-    fx, fy, _, _, _, _, p1, p2 = camera.canonical
+    fx, fy, _, _, _, _, p1, p2 = camera.canonical[:8]
     lost = []
     if camera.is_fisheye:
         lost.append("fisheye projection")

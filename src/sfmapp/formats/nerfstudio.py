@@ -68,7 +68,7 @@ def write_nerfstudio(path: str | Path, reconstruction: Reconstruction, image_fol
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:
     model = CameraModel.OPENCV_FISHEYE if camera.is_fisheye else CameraModel.OPENCV
-    fx, fy, cx, cy, *distortion = camera.canonical.tolist()
+    fx, fy, cx, cy, *distortion = camera.canonical[:8].tolist()
     size = {"camera_model": model.name, "w": camera.width, "h": camera.height}
     return size | {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy} | dict(zip(_DISTORTION[model], distortion, strict=True))
 

@@ -45,16 +45,14 @@ def _midpoint(c1: Array, d1: Array, c2: Array, d2: Array, out: Array) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def _squared_error(
-    xyz: Array, rotation: Array, translation: Array, fisheye: bool, c: Array, u: float, v: float
-) -> float:
+def _squared_error(xyz: Array, rotation: Array, translation: Array, c: Array, u: float, v: float) -> float:
     """Squared reprojection error in pixels; infinite behind the camera."""
     z = rotation[2, 0] * xyz[0] + rotation[2, 1] * xyz[1] + rotation[2, 2] * xyz[2] + translation[2]
     if not z > 1e-12:
         return math.inf
     x = rotation[0, 0] * xyz[0] + rotation[0, 1] * xyz[1] + rotation[0, 2] * xyz[2] + translation[0]
     y = rotation[1, 0] * xyz[0] + rotation[1, 1] * xyz[1] + rotation[1, 2] * xyz[2] + translation[1]
-    pu, pv = distort(fisheye, c, x / z, y / z)
+    pu, pv = distort(c, x / z, y / z)
     du, dv = pu - u, pv - v
     return du * du + dv * dv
 
@@ -139,7 +137,6 @@ def _gather_rays(
     translation: Array,
     image_camera_idx: Int32s,
     canonical: Array,
-    fisheye: Bools,
     obs: Ints,
     centers: Array,
     rays: Array,
@@ -151,7 +148,7 @@ def _gather_rays(
         if math.isnan(translation[i, 0]):
             continue
         cam = image_camera_idx[i]
-        x, y = undistort(fisheye[cam], canonical[cam], obs_xy[o, 0], obs_xy[o, 1])
+        x, y = undistort(canonical[cam], obs_xy[o, 0], obs_xy[o, 1])
         if math.isnan(x):
             continue
         norm = 1.0 / math.sqrt(x * x + y * y + 1.0)
@@ -175,7 +172,6 @@ def _mark_inliers(
     translation: Array,
     image_camera_idx: Int32s,
     canonical: Array,
-    fisheye: Bools,
     limit: float,
     used: Bools,
 ) -> tuple[int, float]:
@@ -186,9 +182,7 @@ def _mark_inliers(
         o = obs[m]
         i = obs_image_idx[o]
         cam = image_camera_idx[i]
-        error = _squared_error(
-            xyz, rotation[i], translation[i], fisheye[cam], canonical[cam], obs_xy[o, 0], obs_xy[o, 1]
-        )
+        error = _squared_error(xyz, rotation[i], translation[i], canonical[cam], obs_xy[o, 0], obs_xy[o, 1])
         used[m] = error <= limit
         inliers += used[m]
         cost += min(error, limit)
@@ -205,7 +199,6 @@ def triangulate_tracks(
     translation: Array,
     image_camera_idx: Int32s,
     canonical: Array,
-    fisheye: Bools,
     max_error_px: float,
     min_angle_rad: float,
     point_xyz: Array,
@@ -217,7 +210,7 @@ def triangulate_tracks(
         tracks: (K,) int64, the tracks to try.
         track_ptr, obs_image_idx, obs_xy: as in Tracks.
         rotation, translation: (I, 3, 3), (I, 3) cam_from_world, NaN where unregistered.
-        image_camera_idx, canonical, fisheye: intrinsics as in Reconstruction.
+        image_camera_idx, canonical: intrinsics as in Reconstruction.
         max_error_px: largest reprojection error of an inlier.
         min_angle_rad: smallest angle between two rays of an accepted point.
         point_xyz, obs_is_inlier: written for the given tracks only; NaN and False where triangulation fails.
@@ -233,7 +226,7 @@ def triangulate_tracks(
         obs_is_inlier[track_ptr[t] : track_ptr[t + 1]] = False
         point_xyz[t, :] = math.nan
         k = _gather_rays(
-            t, track_ptr, obs_image_idx, obs_xy, rotation, translation, image_camera_idx, canonical, fisheye,
+            t, track_ptr, obs_image_idx, obs_xy, rotation, translation, image_camera_idx, canonical,
             obs, centers, rays,
         )  # fmt: skip
         # an odd stride through the pairs of a long track meets all of its observations
@@ -245,7 +238,7 @@ def triangulate_tracks(
                 if index % stride != 0 or _midpoint(centers[i], rays[i], centers[j], rays[j], xyz) > max_cosine:
                     continue
                 inliers, cost = _mark_inliers(
-                    xyz, obs, k, obs_image_idx, obs_xy, rotation, translation, image_camera_idx, canonical, fisheye,
+                    xyz, obs, k, obs_image_idx, obs_xy, rotation, translation, image_camera_idx, canonical,
                     limit, used,
                 )  # fmt: skip
                 if inliers > best_count or (inliers == best_count > 1 and cost < best_cost):
@@ -255,7 +248,7 @@ def triangulate_tracks(
         if best_count < 2 or (k > 2 and not _refine(best_xyz, centers, rays, best_used, k)):
             continue
         inliers, _ = _mark_inliers(
-            best_xyz, obs, k, obs_image_idx, obs_xy, rotation, translation, image_camera_idx, canonical, fisheye,
+            best_xyz, obs, k, obs_image_idx, obs_xy, rotation, translation, image_camera_idx, canonical,
             limit, best_used,
         )  # fmt: skip
         if inliers < 2 or _min_cosine(best_xyz, centers, best_used, k, max_cosine) > max_cosine:
@@ -277,7 +270,6 @@ def classify_observations(
     translation: Array,
     image_camera_idx: Int32s,
     canonical: Array,
-    fisheye: Bools,
     max_error_px: float,
     min_angle_rad: float,
     point_xyz: Array,
@@ -305,7 +297,7 @@ def classify_observations(
             error = math.inf
             if not math.isnan(translation[i, 0]):
                 error = _squared_error(
-                    point_xyz[t], rotation[i], translation[i], fisheye[cam], canonical[cam], obs_xy[o, 0], obs_xy[o, 1]
+                    point_xyz[t], rotation[i], translation[i], canonical[cam], obs_xy[o, 0], obs_xy[o, 1]
                 )
             used[k] = error <= limit
             obs_is_inlier[o] = used[k]

@@ -74,7 +74,7 @@ class _Checks:
         group_ptr: (G + 1,) checks of each group. group_link: (G,) its link. group_is_forward: (G,) bool: points of the
             source in images of the target.
         xyz: (C, 3) points in the world of their model. xy: (C, 2) pixels.
-        image_idx: (C,) the images; rotation: (C, 3, 3), translation: (C, 3), canonical: (C, 8), fisheye: (C,) theirs.
+        image_idx: (C,) the images; rotation: (C, 3, 3), translation: (C, 3), canonical: (C, 17) theirs.
         num_links: L.
         point_target, point_source: (B, 3) points of the links that are triangulated on both sides, in either world.
     """
@@ -88,7 +88,6 @@ class _Checks:
     rotation: Array
     translation: Array
     canonical: Array
-    fisheye: Bools
     num_links: int
     point_target: Array
     point_source: Array
@@ -251,8 +250,7 @@ def _checks(target: Reconstruction, source: Reconstruction, correspondences: Cor
         np.repeat([True, False], [len(link) for link in group_link]), np.concatenate([xyz for _, xyz, _, _ in parts]),
         np.concatenate([viewer.tracks.obs_xy[obs] for _, _, viewer, obs in parts]),
         np.concatenate(image).astype(np.int64), rigid3.rotation_matrix(pose), np.ascontiguousarray(pose[:, 4:]),
-        np.concatenate([row[0][c] for row, c in zip(rows, camera, strict=True)]),
-        np.concatenate([row[1][c] for row, c in zip(rows, camera, strict=True)]), len(track_target),
+        np.concatenate([row[c] for row, c in zip(rows, camera, strict=True)]), len(track_target),
         target.point_xyz[track_target[both]], source.point_xyz[track_source[both]],
     )  # fmt: skip
 
@@ -390,7 +388,7 @@ def _scores(sims: Array, checks: _Checks, tolerance_px: float) -> tuple[Array, I
     _score_all(
         rigid3.rotation_matrix(sims), np.ascontiguousarray(sims[:, 4:7]), np.ascontiguousarray(sims[:, 7]),
         checks.group_ptr, checks.group_link, checks.group_is_forward, checks.xyz, checks.xy, checks.rotation,
-        checks.translation, checks.canonical, checks.fisheye, tolerance_px**2, np.empty(checks.num_links), cost,
+        checks.translation, checks.canonical, tolerance_px**2, np.empty(checks.num_links), cost,
         agreeing,
     )  # fmt: skip
     return cost, agreeing
@@ -446,14 +444,14 @@ def _residuals(sim: Array, checks: _Checks) -> Array:
     out = np.empty_like(checks.xy)
     _residuals_of(
         rigid3.rotation_matrix(sim), sim[4:7].copy(), float(sim[7]), checks.is_forward, checks.xyz, checks.xy,
-        checks.rotation, checks.translation, checks.canonical, checks.fisheye, out,
+        checks.rotation, checks.translation, checks.canonical, out,
     )  # fmt: skip
     return out
 
 
 @numba.njit(cache=True, nogil=True)
 def _residual(  # type: ignore[no-untyped-def]
-    r, t, s, forward, xyz, xy, rotation, translation, canonical, fisheye
+    r, t, s, forward, xyz, xy, rotation, translation, canonical
 ) -> tuple[float, float]:
     """Projected minus observed pixel of a point that the similarity (r, t, s), or its inverse, carries over."""
     if forward:
@@ -470,23 +468,23 @@ def _residual(  # type: ignore[no-untyped-def]
         return math.nan, math.nan
     u = (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]) / depth
     v = (rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]) / depth
-    u, v = distort(fisheye, canonical, u, v)
+    u, v = distort(canonical, u, v)
     return u - xy[0], v - xy[1]
 
 
 @numba.njit(cache=True, nogil=True)
 def _residuals_of(  # type: ignore[no-untyped-def]
-    r, t, s, is_forward, xyz, xy, rotation, translation, canonical, fisheye, out
+    r, t, s, is_forward, xyz, xy, rotation, translation, canonical, out
 ) -> None:
     for c in range(len(xyz)):
         out[c, 0], out[c, 1] = _residual(
-            r, t, s, is_forward[c], xyz[c], xy[c], rotation[c], translation[c], canonical[c], fisheye[c]
+            r, t, s, is_forward[c], xyz[c], xy[c], rotation[c], translation[c], canonical[c]
         )
 
 
 @numba.njit(cache=True, nogil=True)
 def _score_all(  # type: ignore[no-untyped-def]
-    rs, ts, scales, group_ptr, group_link, group_is_forward, xyz, xy, rotation, translation, canonical, fisheye,
+    rs, ts, scales, group_ptr, group_link, group_is_forward, xyz, xy, rotation, translation, canonical,
     tolerance2, link_cost, cost, agreeing,
 ) -> None:  # fmt: skip
     """Fill cost (H,) and agreeing (H,). A link costs the mean over its images, in the direction where that is less: a
@@ -499,7 +497,7 @@ def _score_all(  # type: ignore[no-untyped-def]
             for c in range(group_ptr[g], group_ptr[g + 1]):
                 du, dv = _residual(
                     rs[h], ts[h], scales[h], group_is_forward[g], xyz[c], xy[c], rotation[c], translation[c],
-                    canonical[c], fisheye[c],
+                    canonical[c],
                 )  # fmt: skip
                 error = (du * du + dv * dv) / tolerance2
                 total += error if error < 1.0 else 1.0

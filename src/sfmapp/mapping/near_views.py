@@ -63,13 +63,13 @@ def near_views(model: Reconstruction, correspondences: Correspondences) -> NearV
     registered = model.is_registered
     tried = np.flatnonzero(registered[correspondences.pair_image_idx].all(axis=1))
     images = correspondences.pair_image_idx[tried].astype(np.int64)
-    canonical, fisheye = model.canonical_cameras()
+    canonical = model.canonical_cameras()
     sizes = np.array([(c.width, c.height) for c in model.cameras], np.float64)
     tracks, counts = model.tracks, np.zeros((len(images), 3), np.int64)
     _count_in_view(
         images, tracks.image_ptr, tracks.image_obs, tracks.obs_track_idx, model.obs_is_inlier, model.point_xyz,
         rigid3.rotation_matrix(model.cam_from_world), np.ascontiguousarray(model.cam_from_world[:, 4:]), model.centers,
-        model.image_camera_idx, canonical, fisheye, sizes, math.cos(math.radians(MAX_ANGLE_DEG)), MAX_ZOOM,
+        model.image_camera_idx, canonical, sizes, math.cos(math.radians(MAX_ANGLE_DEG)), MAX_ZOOM,
         np.full(tracks.num_tracks, -1), counts,
     )  # fmt: skip
     visible = counts[:, :2].min(axis=1)
@@ -128,7 +128,7 @@ def contradiction_of(model: Reconstruction, correspondences: Correspondences) ->
 @numba.njit(cache=True, nogil=True)
 def _count_in_view(  # type: ignore[no-untyped-def]
     images, image_ptr, image_obs, obs_track, is_inlier, xyz, rotation, translation, centers, camera_of, canonical,
-    fisheye, sizes, min_cos, max_zoom, mark, counts,
+    sizes, min_cos, max_zoom, mark, counts,
 ) -> None:  # fmt: skip
     """Fill counts (K, 3): points of the first image in view of the second, of the second in that of the first, both's.
 
@@ -158,7 +158,7 @@ def _count_in_view(  # type: ignore[no-untyped-def]
                     continue
                 u = (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + s[0]) / depth
                 v = (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + s[1]) / depth
-                u, v = distort(fisheye[c], canonical[c], u, v)
+                u, v = distort(canonical[c], u, v)
                 if 0 <= u < sizes[c, 0] and 0 <= v < sizes[c, 1]:
                     counts[p, side] += 1
                     if side == 1 and mark[t] == p:

@@ -139,7 +139,7 @@ def register_image(
         reason = f"{num_inliers} of {len(obs)} points agree with one pose, at least {needed} are needed"
         return Registration(image_idx, len(obs), num_inliers, None, reason=reason)
     refined = refine_pose(
-        camera.with_focal(camera.focal * found.focal_scale).canonical, camera.is_fisheye, found.cam_from_world, xyz,
+        camera.with_focal(camera.focal * found.focal_scale).canonical, found.cam_from_world, xyz,
         tracks.obs_xy[obs], scale_px=0.5 * max_error_px, inlier_px=max_error_px, refine_focal=search_focal,
     )  # fmt: skip
     focal_px = float(refined.canonical[:2].mean()) if search_focal else None

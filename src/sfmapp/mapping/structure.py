@@ -77,12 +77,12 @@ def _over_chunks(
     pool: Executor,
     max_error_px: float | None = None,
 ) -> int:
-    canonical, fisheye = reconstruction.canonical_cameras()
+    canonical = reconstruction.canonical_cameras()
     t = reconstruction.tracks
     arguments = (
         t.track_ptr, t.obs_image_idx, t.obs_xy, rigid3.rotation_matrix(reconstruction.cam_from_world),
         np.ascontiguousarray(reconstruction.cam_from_world[:, 4:]), reconstruction.image_camera_idx, canonical,
-        fisheye, max_error_px or options.max_reprojection_error_px, math.radians(options.min_triangulation_angle_deg),
+        max_error_px or options.max_reprojection_error_px, math.radians(options.min_triangulation_angle_deg),
         reconstruction.point_xyz, reconstruction.obs_is_inlier,
     )  # fmt: skip
     chunks = [tracks[i : i + CHUNK] for i in range(0, len(tracks), CHUNK)]

@@ -109,7 +109,7 @@ def pair_agreement(reconstruction: Reconstruction, correspondences: Corresponden
     counts = np.zeros((len(pair_idx), 3), np.int64)
     image_idx = images[pair_idx]
     if len(pair_idx):
-        canonical, fisheye = reconstruction.canonical_cameras()
+        canonical = reconstruction.canonical_cameras()
         camera_of = reconstruction.image_camera_idx
         poses = reconstruction.cam_from_world
         relative = rigid3.compose(poses[image_idx[:, 1]], rigid3.inverse(poses[image_idx[:, 0]]))
@@ -120,7 +120,7 @@ def pair_agreement(reconstruction: Reconstruction, correspondences: Corresponden
         first, obs_of_feature = _obs_of_features(tracks, correspondences)
         rays = np.empty((tracks.num_observations, 2))
         _undistort_observations(
-            tracks.obs_xy, camera_of[tracks.obs_image_idx], canonical, fisheye, registered[tracks.obs_image_idx], rays
+            tracks.obs_xy, camera_of[tracks.obs_image_idx], canonical, registered[tracks.obs_image_idx], rays
         )
         _count_matches(
             pair_idx, image_idx, correspondences.pair_ptr, correspondences.matches, first, obs_of_feature, rays,
@@ -440,14 +440,14 @@ def _roots_before(when: int, parent: Ints, joined_as: Ints) -> Ints:
 
 @numba.njit(cache=True, nogil=True)
 def _undistort_observations(
-    xy: Array, camera_idx: NDArray[np.int32], canonical: Array, fisheye: Bools, wanted: Bools, out: Array
+    xy: Array, camera_idx: NDArray[np.int32], canonical: Array, wanted: Bools, out: Array
 ) -> None:
     """Fill out (O, 2) with normalised image points; NaN where they are not wanted."""
     for o in range(len(xy)):
         out[o, 0] = out[o, 1] = math.nan
         if wanted[o]:
             k = camera_idx[o]
-            out[o, 0], out[o, 1] = undistort(fisheye[k], canonical[k], xy[o, 0], xy[o, 1])
+            out[o, 0], out[o, 1] = undistort(canonical[k], xy[o, 0], xy[o, 1])
 
 
 @numba.njit(cache=True, nogil=True)

@@ -214,7 +214,7 @@ class MapInitializer:
         """(N,) pixels by which points are off in the n-th view, its pose fitted to them; NaN behind the camera."""
         camera = self.camera
         start = pose_between(rigid3.IDENTITY, last_from_first, n / (len(self.seen) - 1))
-        pose = refine_pose(camera.canonical, camera.is_fisheye, start, xyz, xy).cam_from_world
+        pose = refine_pose(camera.canonical, start, xyz, xy).cam_from_world
         return np.asarray(np.linalg.norm(project(camera, rigid3.apply(pose, xyz)) - xy, axis=1), np.float64)
 
     def _witnesses(self, track: NDArray[np.int64]) -> list[int]:

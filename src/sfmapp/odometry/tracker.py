@@ -137,13 +137,13 @@ def measure_pose(camera: Camera, start: Array, xyz: Array, xy: Array) -> tuple[A
     """
     if len(xyz) < MIN_INLIERS:
         return None
-    canonical, fisheye = camera.canonical, camera.is_fisheye
-    best = refine_pose(canonical, fisheye, start, xyz, xy, inlier_px=_OUTLIER_RANGE_PX[1])
+    canonical = camera.canonical
+    best = refine_pose(canonical, start, xyz, xy, inlier_px=_OUTLIER_RANGE_PX[1])
     if best.is_inlier.sum() < 0.6 * len(xyz):
         normalized = pixels_to_normalized(camera, xy)
         sampled = estimate_pose(xyz, normalized, 3.0 / camera.focal, max_iterations=1000)
         if sampled is not None and sampled.num_inliers >= MIN_INLIERS:
-            other = refine_pose(canonical, fisheye, sampled.cam_from_world, xyz, xy, inlier_px=_OUTLIER_RANGE_PX[1])
+            other = refine_pose(canonical, sampled.cam_from_world, xyz, xy, inlier_px=_OUTLIER_RANGE_PX[1])
             if other.is_inlier.sum() > best.is_inlier.sum():
                 best = other
     error = np.linalg.norm(project(camera, rigid3.apply(best.cam_from_world, xyz)) - xy, axis=1)

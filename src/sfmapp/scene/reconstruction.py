@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera
-from sfmapp.camera.lens import distort
+from sfmapp.camera.lens import ROW, distort
 from sfmapp.geometry import rigid3
 from sfmapp.scene.rig import RigImages
 from sfmapp.scene.tracks import Tracks
@@ -95,12 +95,9 @@ class Reconstruction:
         """(I, 3) camera centres in the world, NaN where unregistered."""
         return rigid3.center(self.cam_from_world)
 
-    def canonical_cameras(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """(C, 8) canonical intrinsics and (C,) fisheye flags for the kernels."""
-        return (
-            np.array([camera.canonical for camera in self.cameras]).reshape(-1, 8),
-            np.array([camera.is_fisheye for camera in self.cameras], bool),
-        )
+    def canonical_cameras(self) -> NDArray[np.float64]:
+        """(C, 17) canonical intrinsics for the kernels, see ``Camera.canonical``."""
+        return np.array([camera.canonical for camera in self.cameras]).reshape(-1, ROW)
 
     def distinct_poses(self, image_idx: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Poses (Q, 7) that registered images (N,) do not share, in the order of their first image, and (N,) whose is
@@ -135,11 +132,11 @@ class Reconstruction:
 
     def residuals_px(self) -> NDArray[np.float64]:
         """(O, 2) projected minus observed pixel; NaN where the image or the point is missing, or behind the camera."""
-        canonical, fisheye = self.canonical_cameras()
+        canonical = self.canonical_cameras()
         out = np.empty((self.tracks.num_observations, 2))
         reprojection_residuals(
             rigid3.rotation_matrix(self.cam_from_world), self.cam_from_world[:, 4:].copy(), self.image_camera_idx,
-            canonical, fisheye, self.point_xyz, self.tracks.obs_image_idx, self.tracks.obs_track_idx,
+            canonical, self.point_xyz, self.tracks.obs_image_idx, self.tracks.obs_track_idx,
             self.tracks.obs_xy, out,
         )  # fmt: skip
         return out
@@ -168,7 +165,6 @@ def reprojection_residuals(
     translation: NDArray[np.float64],
     image_camera_idx: NDArray[np.int32],
     canonical: NDArray[np.float64],
-    fisheye: NDArray[np.bool_],
     point_xyz: NDArray[np.float64],
     obs_image_idx: NDArray[np.int32],
     obs_track_idx: NDArray[np.int32],
@@ -187,6 +183,6 @@ def reprojection_residuals(
         x = rotation[i, 0, 0] * x0 + rotation[i, 0, 1] * x1 + rotation[i, 0, 2] * x2 + translation[i, 0]
         y = rotation[i, 1, 0] * x0 + rotation[i, 1, 1] * x1 + rotation[i, 1, 2] * x2 + translation[i, 1]
         k = image_camera_idx[i]
-        u, v = distort(fisheye[k], canonical[k], x / z, y / z)
+        u, v = distort(canonical[k], x / z, y / z)
         out[o, 0] = u - obs_xy[o, 0]
         out[o, 1] = v - obs_xy[o, 1]

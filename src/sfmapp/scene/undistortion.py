@@ -45,7 +45,7 @@ class Undistortion:
 
 def has_distortion(camera: Camera) -> bool:
     """Whether the camera is more than a pinhole."""
-    return camera.is_fisheye or bool(camera.canonical[4:].any())
+    return camera.is_fisheye or bool(camera.canonical[4:16].any())
 
 
 def plan_undistortion(camera: Camera, blank_pixels: float = 0.0, max_size: int | None = None) -> Undistortion:

@@ -170,7 +170,7 @@ def locate_near(
         if len(point) < 6:
             return None
         refined = refine_pose(
-            camera.canonical, camera.is_fisheye, pose, local.xyz[point], view.xy[corner], scale_px=0.5 * limit,
+            camera.canonical, pose, local.xyz[point], view.xy[corner], scale_px=0.5 * limit,
             inlier_px=limit,
         )  # fmt: skip
         pose = refined.cam_from_world

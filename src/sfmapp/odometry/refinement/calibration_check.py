@@ -146,7 +146,7 @@ class Unknowns:
         x[column("focal")] = logs.mean()
         for c in range(len(logs)):
             x[column(f"aspect_{c}")] = logs[c, 0] - logs[c, 1]
-            x[column(f"distortion_{c}_0") + np.arange(4)] = canonical[1][c, 4:] - canonical[0][c, 4:]
+            x[column(f"distortion_{c}_0") + np.arange(4)] = canonical[1][c, 4:8] - canonical[0][c, 4:8]
         if given.rig is not None and found.rig is not None:
             x[column("focal_difference")] = logs[1].mean() - logs[0].mean()
             turn = rigid3.compose(found.rig.cam_from_rig[1], rigid3.inverse(given.rig.cam_from_rig[1]))
@@ -409,7 +409,7 @@ def _changed(model: Reconstruction, change: Array) -> Reconstruction:
     out.cameras = [
         replace(
             camera, model=CameraModel.OPENCV_FISHEYE if camera.is_fisheye else CameraModel.OPENCV,
-            params=camera.canonical + by[:8], is_fixed=False,
+            params=camera.canonical[:8] + by[:8], is_fixed=False,
         )
         for camera, by in zip(model.cameras, change, strict=True)
     ]  # fmt: skip
@@ -436,11 +436,11 @@ def _start_afresh(look: _Look, sigma: float, unknowns: Unknowns) -> _Look:
     and settle once more."""
     model = look.model.copy()
     tracks = model.tracks
-    canonical, fisheye = model.canonical_cameras()
+    canonical = model.canonical_cameras()
     lost = np.flatnonzero(~model.is_triangulated)
     triangulate_tracks(
         lost, tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy, rigid3.rotation_matrix(model.cam_from_world),
-        model.cam_from_world[:, 4:].copy(), model.image_camera_idx, canonical, fisheye, _TRIANGULATION_PX,
+        model.cam_from_world[:, 4:].copy(), model.image_camera_idx, canonical, _TRIANGULATION_PX,
         math.radians(_TRIANGULATION_DEG), model.point_xyz, model.obs_is_inlier,
     )  # fmt: skip
     classify(model, np.zeros(tracks.num_tracks, np.int64))
