@@ -26,7 +26,7 @@ from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.camera.camera import CameraModel
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.geometry.triangulation import triangulate_tracks
+from sfmapp.geometry.triangulation import Observed, triangulate_tracks
 from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.map.backend import classify
 from sfmapp.scene.reconstruction import Reconstruction
@@ -436,11 +436,9 @@ def _start_afresh(look: _Look, sigma: float, unknowns: Unknowns) -> _Look:
     and settle once more."""
     model = look.model.copy()
     tracks = model.tracks
-    canonical = model.canonical_cameras()
     lost = np.flatnonzero(~model.is_triangulated)
     triangulate_tracks(
-        lost, tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy, rigid3.rotation_matrix(model.cam_from_world),
-        model.cam_from_world[:, 4:].copy(), model.image_camera_idx, canonical, _TRIANGULATION_PX,
+        lost, Observed(tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy), model.views(), _TRIANGULATION_PX,
         math.radians(_TRIANGULATION_DEG), model.point_xyz, model.obs_is_inlier,
     )  # fmt: skip
     classify(model, np.zeros(tracks.num_tracks, np.int64))
