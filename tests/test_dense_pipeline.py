@@ -113,8 +113,9 @@ def test_the_same_again_does_nothing(wall: Path, tmp_path: Path) -> None:
     again = dense(copy / "sparse" / "0", out, FAST, images=copy / "images", record=False)
     assert again.report["is_up_to_date"]
     assert (out / "dense" / "patches.npz").stat().st_mtime_ns == before
-    # threads are no reason to begin anew, another photograph is
-    assert dense(out, options=replace(FAST, threads=2), record=False).report["is_up_to_date"]
+    # neither threads nor memory are a reason to begin anew, another photograph is
+    other = replace(FAST, threads=2, dense=replace(FAST.dense, max_memory_mb=8000))
+    assert dense(out, options=other, record=False).report["is_up_to_date"]
     image = cv2.imread(str(copy / "images" / "view_4.png"))
     cv2.imwrite(str(copy / "images" / "view_4.png"), np.maximum(image, 2))
     changed = dense(copy / "sparse" / "0", out, FAST, images=copy / "images", record=False)

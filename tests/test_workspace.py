@@ -14,8 +14,11 @@ import numpy as np
 import pytest
 
 from sfmapp.camera.camera import CameraModel, simple_camera
+from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import InputError, UsageError
+from sfmapp.features.extract import FeatureOptions
 from sfmapp.images.image_set import ImageRecord, ImageSet
+from sfmapp.matching.options import MatchingOptions
 from sfmapp.pipelines.sparse.keys import stage_keys
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
@@ -147,15 +150,22 @@ def test_files_appear_whole(tmp_path: Path) -> None:
 
 
 def test_keys_depend_on_options_inputs_and_source() -> None:
-    base = stage_key(["matching"], {"a": 1}, "input")
-    assert base == stage_key(["matching"], {"a": 1}, "input")
+    base = stage_key(["sfmapp.matching.stage"], MatchingOptions(), "input")
+    assert base == stage_key(["sfmapp.matching.stage"], MatchingOptions(), "input")
     others = [
-        stage_key(["matching"], {"a": 2}, "input"),
-        stage_key(["matching"], {"a": 1}, "other"),
-        stage_key(["features"], {"a": 1}, "input"),
-        stage_key(["matching"], {"a": 1}),
+        stage_key(["sfmapp.matching.stage"], MatchingOptions(max_ratio=0.7), "input"),
+        stage_key(["sfmapp.matching.stage"], MatchingOptions(), "other"),
+        stage_key(["sfmapp.features.extract"], MatchingOptions(), "input"),
+        stage_key(["sfmapp.matching.stage"], MatchingOptions()),
+        stage_key(["sfmapp.matching.stage"], None, "input"),
     ]
-    assert len({base, *others}) == 5
+    assert len({base, *others}) == 6
+
+
+def test_what_a_stage_may_take_is_in_no_key() -> None:
+    for options, budget in ((FeatureOptions(), "memory_mb"), (DenseOptions(), "max_memory_mb")):
+        more = dataclasses.replace(options, **{budget: 8000})  # type: ignore[arg-type]
+        assert stage_key(["sfmapp.events"], options) == stage_key(["sfmapp.events"], more)
 
 
 def two_images() -> ImageSet:
@@ -167,6 +177,7 @@ def two_images() -> ImageSet:
     ("stage", "option", "value", "touched"),
     [
         ("features", "max_num_features", 99, {"features", "pairs", "matching", "mapping"}),
+        ("features", "memory_mb", 99, set()),
         ("pairs", "num_neighbors", 99, {"pairs", "mapping"}),
         ("matching", "max_ratio", 0.7, {"matching", "mapping"}),
         ("mapping", "min_pose_inliers", 99, {"mapping"}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 import numbers
@@ -40,8 +41,16 @@ def positive(most: float = math.inf) -> Range:
     return Range(0.0, most, is_open=True)
 
 
+RESOURCE: Mapping[str, Any] = {"is_resource": True}
+"""Metadata of an option that says what a run may take, such as memory: results do not depend on it, nor do keys."""
+
 SHARE = Range(0.0, 1.0)
 """A share of a whole, 0 and 1 among them."""
+
+
+def is_resource(field: dataclasses.Field[Any]) -> bool:
+    """Whether an option says what a run may take, and not what comes of it."""
+    return bool(field.metadata.get("is_resource"))
 
 
 def check_options(stage: str, options: DataclassInstance, ranges: Mapping[str, Range]) -> None:

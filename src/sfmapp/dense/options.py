@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from sfmapp.errors import UsageError
-from sfmapp.option_checks import Range, check_options, positive
+from sfmapp.option_checks import RESOURCE, Range, check_options, positive
 
 _RANGES = {
     "level": Range(0, 6),
@@ -40,7 +40,7 @@ class DenseOptions:
     min_views: int = 3
     max_neighbors: int = 8
     region: tuple[float, ...] | None = None
-    max_memory_mb: int = 3000
+    max_memory_mb: int = field(default=3000, metadata=RESOURCE)
 
     def __post_init__(self) -> None:
         check_options("dense", self, _RANGES)

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -16,7 +16,7 @@ from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.features.orb import extract_orb
 from sfmapp.features.sift import Scratch, compile_kernels, extract_sift
-from sfmapp.option_checks import Range, check_options, positive
+from sfmapp.option_checks import RESOURCE, Range, check_options, positive
 from sfmapp.scene.features import DescriptorMetric, Features
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class FeatureOptions:
     """SIFT: largest ratio of principal curvatures; larger keeps more keypoints along edges."""
     max_num_orientations: int = 2
     """SIFT: descriptors at one place, at most; more than one only where the budget has room."""
-    memory_mb: int | None = None
+    memory_mb: int | None = field(default=None, metadata=RESOURCE)
     """Memory that all workers together may take; None for half of what is free at the start."""
 
     def __post_init__(self) -> None:

@@ -128,7 +128,7 @@ def undistort(
         planned = [plan_undistortion(camera, blank_pixels, max_size) for camera in photographs.cameras]
         job = _Job(workspace, photographs, planned, events)
         key = stage_key(
-            ("dense", "images", "scene", "geometry", "formats"), [blank_pixels, max_size, where.is_upright],
+            (__name__,), None, [blank_pixels, max_size, where.is_upright],
             model_digest(where.model), [input_key(record) for record in photographs.records], photographs.missing,
         )  # fmt: skip
         report = _known_report(job, key)

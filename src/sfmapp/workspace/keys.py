@@ -2,33 +2,39 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Sequence
-from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sfmapp.option_checks import is_resource
+from sfmapp.workspace.code import source_digest
+from sfmapp.workspace.options import options_to_dict
 from sfmapp.workspace.plain_json import canonical_json
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
     from sfmapp.images.image_set import ImageRecord
 
-_PACKAGE = Path(__file__).resolve().parent.parent
 
+def stage_key(entries: Sequence[str], options: DataclassInstance | None, *inputs: Any) -> str:
+    """Key of a stage: a hash of what its results follow from.
 
-def stage_key(packages: Sequence[str], options: Any, *inputs: Any) -> str:
-    """Key of a stage: a hash of the source of the packages that it runs, its plain options and its plain inputs."""
-    text = canonical_json([[source_digest(package) for package in packages], options, list(inputs)])
+    Args:
+        entries: names of the modules that the stage begins in; what they import counts as well.
+        options: of the stage; those that say what it may take, and not what comes of it, have no part in the key.
+        inputs: plain values.
+    """
+    text = canonical_json([source_digest(*entries), _of_results(options), list(inputs)])
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
-@cache
-def source_digest(package: str) -> str:
-    """Hash of the source files of one of our packages: the version of a stage that nobody has to remember to raise."""
-    digest = hashlib.blake2b(digest_size=16)
-    for path in sorted((_PACKAGE / package).glob("*.py")):
-        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()
+def _of_results(options: DataclassInstance | None) -> dict[str, Any]:
+    if options is None:
+        return {}
+    plain = options_to_dict(options)
+    return {field.name: plain[field.name] for field in dataclasses.fields(options) if not is_resource(field)}
 
 
 def input_key(record: ImageRecord) -> str:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from sfmapp.pipelines.dense import results as dense_results
 from sfmapp.pipelines.dense.results import STAGE
 from sfmapp.pipelines.dense.source import DenseJob, dense_job, find_source, model_digest, plan_source
 from sfmapp.workspace.kernels import compile_dense_kernels
+from sfmapp.workspace.keys import input_key, stage_key
 from sfmapp.workspace.options import Options, with_absolute_paths
 from sfmapp.workspace.usage import Stopwatch
 
@@ -82,7 +84,8 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
     try:
         with job.stage("views"):
             plan, report["views"] = plan_source(job)
-        key = dense_results.dense_key(job, plan)
+        clusters = make_clusters(plan, job.options.dense.cell_px, job.options.dense.max_memory_mb)
+        key = _key(job, plan, clusters)
         files = (dense_results.FUSED, dense_results.PATCHES)
         if (earlier := dense_results.earlier_report(job, STAGE, key, files)) is not None:
             patches, _ = read_patches(job.workspace.folder / dense_results.PATCHES)
@@ -93,7 +96,7 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
         job.workspace.begin(STAGE, key, model=model_digest(job.known.model))
         with job.measured("kernels"):
             compile_dense_kernels(job.events)
-        patches = _densify(job, plan, report, is_resumed)
+        patches = _densify(job, plan, clusters, report, is_resumed)
         dense_results.write_cloud(job, plan, patches)
         if warning := outcome.check(patches, report["shares"], plan, job.options.dense.min_views):
             job.events.warned(STAGE, warning)
@@ -110,10 +113,19 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
     return DenseResult(patches, plan.names, report, job.workspace.folder)
 
 
-def _densify(job: DenseJob, plan: DensePlan, report: dict[str, Any], is_resumed: bool) -> Patches:
+def _key(job: DenseJob, plan: DensePlan, clusters: Sequence[Cluster]) -> str:
+    """Of the patches: model, photographs and masks, options, our code; and the clusters, which is all that follows
+    from how much memory there may be."""
+    inputs = [[record.name, record.turn, input_key(record)] for record in plan.records]
+    cores = [cluster.core.tolist() for cluster in clusters]
+    return stage_key((__name__,), job.options.dense, model_digest(job.known.model), inputs, cores)
+
+
+def _densify(
+    job: DenseJob, plan: DensePlan, clusters: list[Cluster], report: dict[str, Any], is_resumed: bool
+) -> Patches:
     """Patches of all clusters, within the region; what came of it goes into the report."""
     options = job.options.dense
-    clusters = make_clusters(plan, options.cell_px, options.max_memory_mb)
     if len(clusters) > 1:
         sizes = [len(cluster.core) for cluster in clusters]
         job.events.decided(

@@ -26,7 +26,7 @@ from sfmapp.surface.mesh import make_mesh
 from sfmapp.surface.texture import texture_mesh
 from sfmapp.workspace.keys import stage_key
 from sfmapp.workspace.manifest import read_manifest
-from sfmapp.workspace.options import Options, options_from_dict, options_to_dict, with_absolute_paths
+from sfmapp.workspace.options import Options, options_from_dict, with_absolute_paths
 from sfmapp.workspace.usage import Stopwatch
 
 STAGE = "mesh"
@@ -81,7 +81,7 @@ def mesh_workspace(
 def _run(job: DenseJob, record: bool) -> MeshResult:
     folder = job.workspace.folder
     digest = dense_results.file_digest(folder / dense_results.PATCHES)
-    key = stage_key(("surface",), options_to_dict(job.options.surface), digest)
+    key = stage_key((__name__,), job.options.surface, digest)
     if (earlier := dense_results.earlier_report(job, STAGE, key, (MESH_PLY, MESH_GLB))) is not None:
         return MeshResult(None, earlier)
     patches, names = read_patches(folder / dense_results.PATCHES)

@@ -17,15 +17,13 @@ from sfmapp.dense.prepare import DensePlan, coarser_plan, load_scene
 from sfmapp.dense.scene import DenseScene, Patches
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.formats.colmap import read_model
-from sfmapp.pipelines.dense.source import DenseJob, model_digest
+from sfmapp.pipelines.dense.source import DenseJob
 from sfmapp.report.dense_document import dense_document
 from sfmapp.report.dense_html import render_dense_html
 from sfmapp.report.dense_pictures import PictureRow, dense_pictures
 from sfmapp.report.html import render_html
 from sfmapp.scene.mesh import Mesh
-from sfmapp.workspace.keys import input_key, stage_key
 from sfmapp.workspace.layout import DENSE
-from sfmapp.workspace.options import options_to_dict
 from sfmapp.workspace.plain_json import report_text
 
 STAGE = "dense"
@@ -36,13 +34,6 @@ RECORDING = "dense/recording.rrd"
 PICTURE_PX = 640
 # whose messages in the report of a workspace are ours to replace
 _OWN_STAGES = frozenset((STAGE, "views", "maps", "mesh", "texture", "recording"))
-
-
-def dense_key(job: DenseJob, plan: DensePlan) -> str:
-    """Of the patches: model, photographs and masks, options, our code."""
-    inputs = [[record.name, record.turn, input_key(record)] for record in plan.records]
-    packages = ("dense", "images", "geometry", "scene")
-    return stage_key(packages, options_to_dict(job.options.dense), model_digest(job.known.model), inputs)
 
 
 def earlier_report(job: DenseJob, stage: str, key: str, files: Sequence[str]) -> dict[str, Any] | None:

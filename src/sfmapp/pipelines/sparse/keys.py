@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sfmapp.workspace.keys import input_key, stage_key
 from sfmapp.workspace.options import Options, options_to_dict
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet
+
+
+# where the stages begin; :mod:`sfmapp.workspace.code` finds what they import
+FEATURES, PAIRS, MATCHING = ("sfmapp.features.extract",), ("sfmapp.matching.pairs",), ("sfmapp.matching.stage",)
+MAPPING = ("sfmapp.mapping.incremental", "sfmapp.formats.colmap")
 
 
 @dataclass(frozen=True)
@@ -34,16 +39,14 @@ class StageKeys:
 
 def stage_keys(options: Options, image_set: ImageSet) -> StageKeys:
     """Keys of all stages for these photographs and options."""
-    plain = options_to_dict(options)
     inputs = {record.name: input_key(record) for record in image_set.images}
-    features = stage_key(("features", "images"), plain["features"])
+    features = stage_key(FEATURES, options.features)
     images = [features, list(inputs.items()), options.seed]
     lenses = [[camera.model.name, camera.width, camera.height, camera.params.tolist()] for camera in image_set.cameras]
     priors = [[camera.focal_sigma, camera.focal_source, camera.is_fixed] for camera in image_set.cameras]
     whose = [record.camera_idx for record in image_set.images]
     places = [[record.timestamp, record.gps] for record in image_set.images]
-    pairs = stage_key(("matching",), plain["pairs"], images, places)
-    matching = stage_key(("matching", "geometry", "camera", "simd", "scene"), plain["matching"], images, lenses, whose)
-    mapped: tuple[Any, ...] = (plain["adjust"], pairs, matching, priors)
-    mapping = stage_key(("mapping", "adjust", "geometry", "camera", "simd", "scene"), plain["mapping"], *mapped)
+    pairs = stage_key(PAIRS, options.pairs, images, places)
+    matching = stage_key(MATCHING, options.matching, images, lenses, whose)
+    mapping = stage_key(MAPPING, options.mapping, options_to_dict(options.adjust), pairs, matching, priors)
     return StageKeys(inputs, features, pairs, matching, mapping)
