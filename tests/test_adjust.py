@@ -53,11 +53,11 @@ def squares(model):
 
 
 @numba.njit
-def observe(pose, mounted, mount, canonical, x, y, z, u, v, loss, scale2, scratch):
+def observe(pose, mounted, mount, canonical, point, pixel, loss, scratch):
     """Linearise, and check the squared residual by the kernel that computes nothing else."""
     p, m, c, J = pointer(pose), pointer(mount), pointer(canonical), pointer(scratch)
-    s = kernels.linearize(p, mounted, m, c, x, y, z, u, v, loss, scale2, 0.0, True, J)
-    if abs(s - kernels.squared_residual(p, c, x, y, z, u, v, 0.0)) > 1e-9 * s:
+    s = kernels.linearize(p, mounted, m, c, point, pixel, loss, 0.0, True, J)
+    if abs(s - kernels.squared_residual(p, c, point, pixel, 0.0)) > 1e-9 * s:
         return np.nan
     return s
 
@@ -91,8 +91,8 @@ def test_jacobians_equal_central_differences(model, rotation, point, translation
     kernels.fill_rows(rigid3.from_matrix(turn, t)[None], np.zeros(1, np.int32), of_image, mounts, pose)
     scratch = np.zeros(kernels.SCRATCH)
     observed = pixel(np.zeros(17)) - [3.0, -4.0]
-    args = (pose[0], mounting is not None, mounts[0], camera.canonical, *world, *observed)
-    s = observe(*args, 0, 1.0, scratch)
+    args = (pose[0], mounting is not None, mounts[0], camera.canonical, tuple(world), tuple(observed))
+    s = observe(*args, kernels.RobustLoss(0, 1.0), scratch)
     assert s == pytest.approx(25.0, rel=1e-9)
     rows = scratch.reshape(-1, 2, 8)
     ours = np.hstack([rows[0][:, :6], rows[5][:, :3], scratch[16:32].reshape(8, 2).T])
@@ -102,7 +102,7 @@ def test_jacobians_equal_central_differences(model, rotation, point, translation
     np.testing.assert_allclose(rows[5][:, 3], [3.0, -4.0], atol=1e-9)
     # a robust weight scales residual and Jacobians by the root of rho'
     weighted = np.zeros(kernels.SCRATCH)
-    observe(*args, 2, 4.0, weighted)
+    observe(*args, kernels.RobustLoss(2, 4.0), weighted)
     np.testing.assert_allclose(weighted, scratch * math.sqrt(4.0 / 29.0), rtol=1e-9, atol=1e-9)
 
 
@@ -119,13 +119,13 @@ def test_losses_are_the_textbook_ones(loss):
             return np.where(s <= scale2, s, 2 * np.sqrt(s * scale2) - scale2)
         return scale2 * np.log1p(s / scale2)
 
-    state = (0.0, 1.0)
+    robust, state = kernels.RobustLoss(loss, scale2), (0.0, 1.0)
     for s in values:
-        state = kernels.add_loss(loss, scale2, s, *state)
+        state = kernels.add_loss(robust, s, *state)
         h = 1e-6 * s
         slope = (rho(s + h) - rho(s - h)) / (2 * h)
-        assert kernels.robust_weight(loss, scale2, s) == pytest.approx(slope, rel=1e-4)
-    assert kernels.total_loss(scale2, *state) == pytest.approx(0.5 * rho(values).sum(), rel=1e-12)
+        assert kernels.robust_weight(robust, s) == pytest.approx(slope, rel=1e-4)
+    assert kernels.total_loss(robust, *state) == pytest.approx(0.5 * rho(values).sum(), rel=1e-12)
 
 
 # --- the minimum ------------------------------------------------------------------------------------------------------

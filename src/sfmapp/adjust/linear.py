@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.kernels import find_slot
+from sfmapp.adjust.kernels import BlockArrays, ImageArrays, LensArrays, Sums, find_slot
 from sfmapp.simd.f64x8 import assign8, subtract8
 
 Array = NDArray[np.float64]
@@ -21,15 +21,18 @@ def aligned_zeros(*shape: int) -> Array:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def assemble(  # type: ignore[no-untyped-def]
-    tiles, own, cross, gradient, image_block, image_camera, camera_block, block_dim, hash_keys, hash_values, extra_own,
-    extra_gradient, diagonal,
-):  # fmt: skip
-    """Sum the chunks, in order, into the first: tiles (K, N * 64) and own, cross, gradient likewise.
+def assemble(
+    sums: Sums, images: ImageArrays, lenses: LensArrays, blocks: BlockArrays, extra_own: Array, extra_gradient: Array,
+    diagonal: Array,
+) -> None:  # fmt: skip
+    """Add up the sums of all chunks (K, ...), in order, in the first.
 
     Adds extra_own (B * 64,) and extra_gradient (B * 8,), what priors say about single blocks; fills diagonal (B * 8,)
     with the diagonal before elimination, on which the damping is based, and puts ``own`` and ``cross`` into the tiles.
     """
+    tiles, own, cross, gradient = sums
+    block_dim, hash_keys, hash_values = blocks
+    image_block, image_camera, camera_block = images.block, images.camera, lenses.block
     num_blocks = block_dim.shape[0]
     for k in range(1, tiles.shape[0]):
         tiles[0] += tiles[k]

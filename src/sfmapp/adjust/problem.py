@@ -9,6 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.adjust.kernels import ImageArrays, LensArrays, PointArrays
 from sfmapp.camera.camera import PARAM_NAMES, Camera, canonical_from_params
 from sfmapp.camera.lens import ROW
 from sfmapp.geometry import rigid3
@@ -65,6 +66,20 @@ class Problem:
     block_dim: NDArray[np.int64]
     penalty: Array
     free: FreeIntrinsics
+
+    @property
+    def points(self) -> PointArrays:
+        """For the kernels, at the current state; so are the two below."""
+        return PointArrays(self.point_ptr, self.obs_image, self.obs_xy, self.xyz, self.is_constant)
+
+    def images(self, rows: Array) -> ImageArrays:
+        """Images with rows (I, 12) of their poses."""
+        return ImageArrays(rows, self.image_mount, self.mounts, self.image_camera, self.image_block)
+
+    @property
+    def lenses(self) -> LensArrays:
+        free = self.free
+        return LensArrays(self.canonical, self.penalty, self.camera_block, free.ptr, free.slot, free.column)
 
     @property
     def num_blocks(self) -> int:

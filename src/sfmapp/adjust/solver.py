@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust import kernels
-from sfmapp.adjust.kernels import find_slot
+from sfmapp.adjust.kernels import BlockArrays, RobustLoss, Scratch, State, Sums, find_slot
 from sfmapp.adjust.linear import aligned_zeros, assemble, factorize_tiles, mark_pairs, number_keys, solve_tiles
 from sfmapp.adjust.problem import Problem, free_values, make_problem
 from sfmapp.camera.camera import PARAM_NAMES, Camera
@@ -272,7 +272,7 @@ class Engine:
     def __init__(self, problem: Problem, options: AdjustOptions, priors: IntrinsicPriors, extras: Any = None) -> None:
         p = problem
         self.problem, self.priors, self.extras = p, priors, extras
-        self.loss, self.scale2 = kernels.LOSS_IDS[options.loss], options.loss_scale_px**2
+        self.loss = RobustLoss(kernels.LOSS_IDS[options.loss], options.loss_scale_px**2)
         blocks, images = p.num_blocks, len(p.image_idx)
         empty = np.zeros(0, np.int64)
         self.solver, self.hash_keys, self.hash_values, self.num_tiles = "dense", empty, empty, blocks * blocks
@@ -295,7 +295,7 @@ class Engine:
             kernels.scratch_size(self.limits[k], self.limits[k + 1], p.point_ptr, blocks, len(p.free.slot))
             for k in range(chunks)
         ]
-        self.scratch = [(aligned_zeros(doubles), np.zeros(integers, np.int64)) for doubles, integers in sizes]
+        self.scratch = [Scratch(aligned_zeros(doubles), np.zeros(integers, np.int64)) for doubles, integers in sizes]
         self.rows = np.empty((images, 12))
         kernels.fill_rows(p.poses, p.image_pose, p.image_mount, p.mounts, self.rows)
         self.new_poses, self.new_rows = np.empty_like(p.poses), np.empty_like(self.rows)
@@ -321,14 +321,14 @@ class Engine:
     def linearize(self, damping: float, run: Callable[..., Any]) -> float:
         """Reduced system at the current state with damped points; returns the cost of the state."""
         p, self.damping = self.problem, damping
+        points, images, lenses = p.points, p.images(self.rows), p.lenses
+        blocks = BlockArrays(p.block_dim, self.hash_keys, self.hash_values)
 
         def chunk(k: int) -> float:
+            sums = Sums(self.tiles[k], self.own[k], self.cross[k], self.gradient[k])
             cost: float = kernels.reduce_points(
-                self.limits[k], self.limits[k + 1], p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, self.rows,
-                p.image_mount, p.mounts, p.image_camera, p.image_block, p.canonical, p.penalty,
-                p.camera_block, p.free.ptr, p.free.slot, p.free.column, p.block_dim, self.loss, self.scale2, damping,
-                self.hash_keys, self.hash_values, self.tiles[k], self.own[k], self.cross[k], self.gradient[k],
-                self.factor, *self.scratch[k],
+                (self.limits[k], self.limits[k + 1]), points, images, lenses, blocks, self.loss, damping, sums,
+                self.factor, self.scratch[k],
             )  # fmt: skip
             return cost
 
@@ -337,10 +337,8 @@ class Engine:
         self.priors.add(p.canonical, own, gradient)
         if self.extras is not None:
             self.extras.linearize(own, gradient)
-        assemble(
-            self.tiles, self.own, self.cross, self.gradient, p.image_block, p.image_camera, p.camera_block, p.block_dim,
-            self.hash_keys, self.hash_values, own, gradient, self.diagonal,
-        )  # fmt: skip
+        every = Sums(self.tiles, self.own, self.cross, self.gradient)
+        assemble(every, images, lenses, blocks, own, gradient, self.diagonal)
         return cost + self.other_cost(p.poses, p.canonical)
 
     def other_cost(self, poses: Array, canonical: Array) -> float:
@@ -373,17 +371,14 @@ class Engine:
     def attempt(self, step: Array, run: Callable[..., Any]) -> tuple[float, float]:
         """Try a step: cost of the new state, and the decrease that the quadratic model predicts."""
         p = self.problem
-        kernels.retract(
-            p.poses, p.pose_block, p.image_pose, p.image_mount, p.mounts, p.canonical, p.camera_block, p.free.ptr,
-            p.free.slot, p.free.column, step, self.new_poses, self.new_rows, self.new_canonical,
-        )  # fmt: skip
+        points, images, lenses = p.points, p.images(self.rows), p.lenses
+        new = State(self.new_rows, self.new_canonical, self.new_xyz)
+        kernels.retract(p.poses, p.pose_block, p.image_pose, images, lenses, step, self.new_poses, new)
 
         def chunk(k: int) -> None:
             kernels.substitute_points(
-                self.limits[k], self.limits[k + 1], p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, self.rows,
-                p.image_mount, p.mounts, p.image_camera, p.image_block, p.canonical, p.penalty,
-                p.camera_block, p.free.ptr, p.free.slot, p.free.column, p.block_dim, self.loss, self.scale2,
-                self.factor, step, self.new_rows, self.new_canonical, self.new_xyz, self.sums[k], self.scratch[k][0],
+                (self.limits[k], self.limits[k + 1]), points, images, lenses, self.loss, self.factor, step, new,
+                self.sums[k], self.scratch[k].doubles,
             )  # fmt: skip
 
         list(run(chunk, range(self.num_chunks)))
