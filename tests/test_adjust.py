@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfmapp.adjust import kernels, solver
-from sfmapp.adjust.problem import pose_rows
+from sfmapp.adjust.problem import Varying, pose_rows
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, project
 from sfmapp.camera.lens import ROW, distort
@@ -226,7 +226,7 @@ def test_constant_things_keep_their_bits():
     rng = np.random.default_rng(0)
     images, points = rng.random(10) < 0.5, rng.random(600) < 0.3
     report = adjust_bundle(
-        found, variable_images=images, variable_cameras=np.array([True, False]), constant_points=points
+        found, varying=Varying(images=images, cameras=np.array([True, False]), constant_points=points)
     )
     assert report.final_cost < report.initial_cost
     np.testing.assert_array_equal(found.cam_from_world[~images], start.cam_from_world[~images])
@@ -244,7 +244,7 @@ def test_only_chosen_points_and_inliers_take_part():
     chosen = np.zeros(300, bool)
     chosen[:100] = True
     found = start.copy()
-    report = adjust_bundle(found, points=chosen)
+    report = adjust_bundle(found, varying=Varying(points=chosen))
     assert report.num_points == 99  # the first point is left with one observation
     np.testing.assert_array_equal(found.point_xyz[100:], start.point_xyz[100:])
     np.testing.assert_array_equal(found.point_xyz[0], start.point_xyz[0])
@@ -303,7 +303,7 @@ def focal_only(sigma):
     weight = 1 / sigma**2
     expected = (design @ (xy - [504.0, 372.0]).ravel() + weight * 950.0) / (design @ design + weight)
     every = np.ones(100, bool)
-    return model, prior, expected, {"variable_images": np.zeros(3, bool), "points": every, "constant_points": every}
+    return model, prior, expected, {"varying": Varying(images=np.zeros(3, bool), points=every, constant_points=every)}
 
 
 @pytest.mark.parametrize("sigma", [1e-3, 0.1, 1.0, 100.0])

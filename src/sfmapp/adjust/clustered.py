@@ -54,10 +54,7 @@ def clustered_covariances(reconstruction: Reconstruction, options: AdjustOptions
     """
     if any(options.refine):
         raise ValueError("intrinsics must be constant")
-    engine = make_engine(
-        reconstruction, options, variable_images=None, variable_cameras=None, points=None, constant_points=None,
-        prior_cameras=None, extra_factors=None,
-    )  # fmt: skip
+    engine = make_engine(reconstruction, options)
     problem = engine.problem
     engine.linearize(0.0, map)
     used = (np.arange(8) < problem.block_dim[:, None]).ravel()

@@ -31,7 +31,7 @@ from sfmapp.adjust.kernels import (
     linearize,
     robust_weight,
 )
-from sfmapp.adjust.problem import Problem
+from sfmapp.adjust.problem import EVERYTHING, Problem, Varying
 from sfmapp.adjust.solver import AdjustOptions, Engine, make_engine
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import ROW
@@ -81,10 +81,7 @@ def estimate_covariances(
     options: AdjustOptions = _DEFAULTS,
     *,
     sigma_px: float | None = None,
-    variable_images: Mask | None = None,
-    variable_cameras: Mask | None = None,
-    points: Mask | None = None,
-    constant_points: Mask | None = None,
+    varying: Varying = EVERYTHING,
     prior_cameras: Sequence[Camera] | None = None,
     extra_factors: Any = None,
 ) -> Covariances:
@@ -95,10 +92,7 @@ def estimate_covariances(
 
     Memory is that of two dense matrices over all unknowns of cameras and poses.
     """
-    engine = make_engine(
-        reconstruction, options, variable_images=variable_images, variable_cameras=variable_cameras, points=points,
-        constant_points=constant_points, prior_cameras=prior_cameras, extra_factors=extra_factors,
-    )  # fmt: skip
+    engine = make_engine(reconstruction, options, varying, prior_cameras=prior_cameras, extra_factors=extra_factors)
     problem, extras = engine.problem, engine.extras
     used = (np.arange(8) < problem.block_dim[:, None]).ravel()
     variance = sigma_px**2 if sigma_px is not None else _variance(engine, int(used.sum()))

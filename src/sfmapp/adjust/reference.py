@@ -17,7 +17,7 @@ from gtsam.symbol_shorthand import C, K, L, V, X
 from numpy.typing import NDArray
 
 from sfmapp.adjust.factors import ExtraFactors, gtsam_pose
-from sfmapp.adjust.problem import Problem, free_values, make_problem
+from sfmapp.adjust.problem import Problem, Varying, free_values, make_problem
 from sfmapp.adjust.solver import AdjustOptions, AdjustReport, IntrinsicPriors, write_back
 from sfmapp.camera.camera import PARAM_NAMES, Camera, canonical_from_params
 from sfmapp.errors import UsageError
@@ -39,12 +39,8 @@ _HELD = 1e-7
 def adjust_with_gtsam(
     reconstruction: Reconstruction,
     options: AdjustOptions,
+    varying: Varying,
     *,
-    variable_images: Mask | None = None,
-    variable_cameras: Mask | None = None,
-    variable_centers: Mask | None = None,
-    points: Mask | None = None,
-    constant_points: Mask | None = None,
     prior_cameras: Sequence[Camera] | None = None,
     extra_factors: Any = None,
     events: Events | None = None,
@@ -55,8 +51,7 @@ def adjust_with_gtsam(
         events.raise_if_cancelled()
     extras = ExtraFactors(extra_factors) if extra_factors is not None else None
     problem = make_problem(
-        reconstruction, refine=options.refine, variable_images=variable_images, variable_cameras=variable_cameras,
-        variable_centers=variable_centers, points=points, constant_points=constant_points,
+        reconstruction, refine=options.refine, varying=varying,
         extra_images=extras.images if extras else (), extra_cameras=extras.cameras if extras else (),
     )  # fmt: skip
     if problem.num_observations == 0:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sfmapp.adjust import kernels
 from sfmapp.adjust.kernels import BlockArrays, RobustLoss, Scratch, State, Sums, find_slot
 from sfmapp.adjust.linear import aligned_zeros, assemble, factorize_tiles, mark_pairs, number_keys, solve_tiles
-from sfmapp.adjust.problem import Problem, free_values, make_problem
+from sfmapp.adjust.problem import EVERYTHING, Problem, Varying, free_values, make_problem
 from sfmapp.camera.camera import PARAM_NAMES, Camera
 from sfmapp.events import Events
 from sfmapp.option_checks import Range, check_options, positive
@@ -103,11 +103,7 @@ def adjust_bundle(
     reconstruction: Reconstruction,
     options: AdjustOptions = AdjustOptions(),
     *,
-    variable_images: Mask | None = None,
-    variable_cameras: Mask | None = None,
-    variable_centers: Mask | None = None,
-    points: Mask | None = None,
-    constant_points: Mask | None = None,
+    varying: Varying = EVERYTHING,
     prior_cameras: Sequence[Camera] | None = None,
     extra_factors: Any = None,
     threads: int = 1,
@@ -120,14 +116,7 @@ def adjust_bundle(
 
     Args:
         reconstruction: poses, points and cameras are replaced; whatever is constant keeps its bits.
-        variable_images: (I,) bool, which poses may change; None for all registered ones. Images that share a rig's
-            pose (``reconstruction.rig``) move together: those that take part must all be marked or none.
-        variable_cameras: (C,) bool, which intrinsics may change, beside ``options.refine_*``; cameras with ``is_fixed``
-            never do. None for all.
-        variable_centers: (C,) bool, of which cameras the principal points may change where the options let them; None
-            for all. In a rig, that of another camera than the first stands for how it is turned.
-        points: (T,) bool, which points take part and vary; None for those that a variable image observes.
-        constant_points: (T,) bool, which of the points take part without moving.
+        varying: which poses, intrinsics and points take part and may change; all by default.
         prior_cameras: (C,) cameras as they were known beforehand: Gaussian priors around their parameters, with
             ``focal_sigma`` for focal lengths and the options' sigmas for the rest. None for no priors.
         extra_factors: gtsam.NonlinearFactorGraph over ``X(i)`` (Pose3 world_from_cam of image i; for a rig's pose,
@@ -145,15 +134,9 @@ def adjust_bundle(
         from sfmapp.adjust.reference import adjust_with_gtsam
 
         return adjust_with_gtsam(
-            reconstruction, options, variable_images=variable_images, variable_cameras=variable_cameras,
-            variable_centers=variable_centers, points=points, constant_points=constant_points,
-            prior_cameras=prior_cameras, extra_factors=extra_factors, events=events,
-        )  # fmt: skip
-    engine = make_engine(
-        reconstruction, options, variable_images=variable_images, variable_cameras=variable_cameras,
-        variable_centers=variable_centers, points=points, constant_points=constant_points,
-        prior_cameras=prior_cameras, extra_factors=extra_factors,
-    )  # fmt: skip
+            reconstruction, options, varying, prior_cameras=prior_cameras, extra_factors=extra_factors, events=events
+        )
+    engine = make_engine(reconstruction, options, varying, prior_cameras=prior_cameras, extra_factors=extra_factors)
     problem = engine.problem
     workers = min(threads, engine.num_chunks)
     with ThreadPoolExecutor(workers) if workers > 1 else nullcontext() as pool:
@@ -171,14 +154,10 @@ def adjust_bundle(
 def make_engine(
     reconstruction: Reconstruction,
     options: AdjustOptions,
+    varying: Varying = EVERYTHING,
     *,
-    variable_images: Mask | None,
-    variable_cameras: Mask | None,
-    variable_centers: Mask | None = None,
-    points: Mask | None,
-    constant_points: Mask | None,
-    prior_cameras: Sequence[Camera] | None,
-    extra_factors: Any,
+    prior_cameras: Sequence[Camera] | None = None,
+    extra_factors: Any = None,
 ) -> Engine:
     """The engine over a reconstruction's problem, priors and extra factors; arguments as of :func:`adjust_bundle`."""
     extras = None
@@ -187,8 +166,7 @@ def make_engine(
 
         extras = ExtraFactors(extra_factors)
     problem = make_problem(
-        reconstruction, refine=options.refine, variable_images=variable_images, variable_cameras=variable_cameras,
-        variable_centers=variable_centers, points=points, constant_points=constant_points,
+        reconstruction, refine=options.refine, varying=varying,
         extra_images=extras.images if extras else (), extra_cameras=extras.cameras if extras else (),
     )  # fmt: skip
     if extras is not None:
@@ -205,7 +183,7 @@ def compile_kernels() -> None:
 
     scene = make_scene(0, 3, 8)
     model = scene.observed.copy()
-    adjust_bundle(model, AdjustOptions(max_iterations=2), variable_images=np.array([True, True, False]))
+    adjust_bundle(model, AdjustOptions(max_iterations=2), varying=Varying(images=np.array([True, True, False])))
     fixed = AdjustOptions(refine_focal=False, refine_distortion=False)
     estimate_covariances(model, fixed)
     clustered_covariances(make_scene(0, 3, 40).observed, fixed)

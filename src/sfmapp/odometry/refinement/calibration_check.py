@@ -22,6 +22,7 @@ from scipy.special import chdtri
 
 from sfmapp.adjust.calibration import RAW, CalibrationSystem, reduce_to_calibration
 from sfmapp.adjust.covariance import similarity_basis
+from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.camera.camera import CameraModel
 from sfmapp.contradictions import Contradiction
@@ -276,7 +277,7 @@ def adjust_poses(model: Reconstruction, sigma: float, max_steps: int, tolerance:
         loss="cauchy", loss_scale_px=LOSS_SIGMAS * sigma, max_iterations=max_steps, relative_cost_tolerance=tolerance,
         refine_focal=False, refine_distortion=False,
     )  # fmt: skip
-    return 2 * adjust_bundle(model, options, variable_images=variable).final_cost / sigma**2
+    return 2 * adjust_bundle(model, options, varying=Varying(images=variable)).final_cost / sigma**2
 
 
 def _look(model: Reconstruction, x: Array, cost: float, sigma: float, unknowns: Unknowns) -> _Look | None:
