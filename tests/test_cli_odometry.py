@@ -149,7 +149,7 @@ def test_ctrl_c_writes_what_was_tracked(tmp_path: Path, sign: signal.Signals) ->
     script = (
         "import sys; sys.path.insert(0, sys.argv.pop(1))\n"
         "from odometry_fakes import FakeRunner, FakeSequence\n"
-        "from sfmapp.pipelines import odometry as pipeline\n"
+        "from sfmapp.pipelines.odometry import track as pipeline\n"
         "pipeline.open_sequence = lambda *_, **__: FakeSequence(pause_s=0.1)\n"
         "pipeline.run_odometry = FakeRunner()\n"
         "pipeline.compile_odometry_kernels = lambda *_, **__: {}\n"

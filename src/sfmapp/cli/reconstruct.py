@@ -27,6 +27,7 @@ examples:
   sfmapp reconstruct photos/ -o out/
   sfmapp reconstruct photos/ -o out/ --preset quality --set features.max_num_features=12000
   sfmapp reconstruct photos/ -o out/ --dense --mesh
+  sfmapp reconstruct photos/ -o out/ --camera calibration.yaml
   sfmapp reconstruct 'frames/*.png' -o out/ --camera-model OPENCV_FISHEYE --seed 7
 
 The same command again resumes a run that was cut off, does nothing where all is done, and re-runs only what a changed
@@ -70,7 +71,13 @@ def _add_option_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--set", metavar="STAGE.OPTION=VALUE", action="append", default=[], help="may be repeated")
     group.add_argument("--seed", metavar="N", help="start of every random choice; the same seed, the same bytes")
     group.add_argument("--threads", metavar="N", help="workers; default: all cores. Results do not depend on it")
-    group.add_argument("--camera-model", metavar="MODEL", help=", ".join(CAMERA_MODELS))
+    cameras = group.add_mutually_exclusive_group()
+    cameras.add_argument(
+        "--camera", metavar="MODEL,...|FILE",
+        help="what is known of the camera: a calibration of COLMAP, OpenCV, Kalibr, ROS, ... (several are told apart "
+        "by the names of images, or of folders such as cam0), or numbers such as PINHOLE,fx,fy,cx,cy",
+    )  # fmt: skip
+    cameras.add_argument("--camera-model", metavar="MODEL", help=", ".join(CAMERA_MODELS))
     group.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black is ignored")
     group.add_argument("--min-registered", metavar="N", help="exit code 5 if fewer images are registered")
     group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, which replays the run")
@@ -84,6 +91,7 @@ def _options(args: argparse.Namespace) -> Options:
     flags = {
         "seed": args.seed,
         "threads": args.threads,
+        "images.camera": args.camera,
         "images.camera_model": args.camera_model,
         "images.mask_path": args.mask_path,
         "min_registered": args.min_registered,

@@ -57,10 +57,12 @@ class CameraGroup:
     Attributes:
         names: of the photographs.
         params: initial parameters in COLMAP's order, taken for a good prior; None: from EXIF or pycolmap's default.
+        model: COLMAP's name of the camera model; None: that of the options.
     """
 
     names: tuple[str, ...]
     params: tuple[float, ...] | None = None
+    model: str | None = None
 
 
 @dataclass(frozen=True)
@@ -224,9 +226,10 @@ def _extract(pycolmap: Any, request: dict[str, Any], options: SecondOpinionOptio
         extraction.num_threads = options.num_threads
     pycolmap.Database.open(database).close()  # an empty one: import_images wants the file to exist
     for group in request["camera_groups"] or ():
+        reader.camera_model = group["model"] or options.camera_model
         reader.camera_params = ", ".join(map(repr, group["params"] or ()))
         pycolmap.import_images(database, request["image_root"], pycolmap.CameraMode.SINGLE, group["names"], reader)
-    reader.camera_params = ""
+    reader.camera_model, reader.camera_params = options.camera_model, ""
     mode = pycolmap.CameraMode.__members__[options.camera_mode.upper()]
     pycolmap.extract_features(
         database, request["image_root"], request["image_names"], mode, reader, extraction, pycolmap.Device.cpu

@@ -55,9 +55,11 @@ def read_binary_images(folder: Path) -> PosedImages:
     return PosedImages(ids, camera_ids, names, poses, xy, point_ids, rigs, frames, notes)
 
 
-def read_binary_cameras(folder: Path, images: PosedImages) -> tuple[NDArray[np.int64], list[Camera], tuple[str, ...]]:
+def read_binary_cameras(
+    folder: Path, images: PosedImages | None
+) -> tuple[NDArray[np.int64], list[Camera], tuple[str, ...]]:
     """Ids, cameras, and a note of those that are left out: of a model that is not ours, and that no image uses."""
-    return _read_cameras(_Reader(folder / "cameras.bin"), set(images.camera_ids.tolist()))
+    return _read_cameras(_Reader(folder / "cameras.bin"), set(images.camera_ids.tolist()) if images else ())
 
 
 def read_binary(folder: Path) -> ColmapModel:

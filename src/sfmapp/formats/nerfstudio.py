@@ -127,6 +127,17 @@ def read_nerfstudio_poses(path: str | Path) -> tuple[list[str], NDArray[np.float
         return names, poses, None
 
 
+def read_nerfstudio_cameras(path: str | Path) -> tuple[list[str], list[Camera]]:
+    """Names of the frames, as :func:`read_nerfstudio` gives them, and the camera of each.
+
+    Raises:
+        InputError: the file is not JSON of this form, or a camera is not one of ours.
+    """
+    path = Path(path)
+    document = read_json_object(path)
+    return _poses(path, document)[0], _cameras(path, document)
+
+
 def _poses(path: Path, document: Mapping[str, Any]) -> tuple[list[str], NDArray[np.float64]]:
     """Names of N frames and their poses (N, 7)."""
     frames = document.get("frames")

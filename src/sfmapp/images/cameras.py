@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Hashable, Sequence
@@ -10,6 +11,7 @@ from pathlib import PurePosixPath
 from statistics import median, pstdev
 from typing import Any
 
+from sfmapp.calibration.photographs import GivenCamera, Photograph, read_given_cameras
 from sfmapp.camera.camera import Camera, simple_camera
 from sfmapp.errors import UsageError
 from sfmapp.geometry.orientation import MIRRORED
@@ -27,6 +29,9 @@ _SERIES_LENGTH = 5
 # Editors and converters write a focal length as another fraction, which changes its fifth digit or a later one; the
 # nearest settings of a zoom are about a per cent apart, and focusing alone changes the picture by more than this.
 _SAME_FOCAL = 1e-3
+# EXIF contradicts a given focal length that it misses by more than so many standard deviations of both: 35 mm
+# equivalents are off by 10 % here and there, another setting of a zoom by a factor.
+_CONTRADICTS_SIGMAS = 4.0
 _SOURCE_RANK = ("exif_35mm", "exif_sensor", "default")
 
 
@@ -41,19 +46,26 @@ class Shot:
 
 
 def group_cameras(
-    shots: Sequence[Shot], options: ImageOptions
+    shots: Sequence[Shot], options: ImageOptions, root: str = ""
 ) -> tuple[list[Camera], list[int], list[dict[str, Any]], list[tuple[str, str]]]:
     """Cameras, the camera index of each shot, a report entry per camera, and warnings.
 
     ``auto`` shares a camera between shots with the same make, model, lens, serial number, focal length and size. Where
     EXIF does not tell, a series (one folder, one file type, names that differ in their numbers alone) shares a camera
     if nearly all of it has one size; otherwise the photographs may come from anyone, and each has a camera of its own.
+    Photographs that one of the given cameras took share it.
+
+    Args:
+        shots: in the order of the images.
+        options: what is known about the cameras.
+        root: folder that the names are relative to, whose own name may be that of a camera.
 
     Returns:
         cameras in order of first use; camera_idx per shot; JSON-able dicts; (image name, problem) pairs.
 
     Raises:
         UsageError: ``camera_params`` with images of several sizes, or for pictures that EXIF's orientation has turned.
+        InputError: the given cameras cannot be read, or do not fit the images.
     """
     sizes = {(shot.width, shot.height) for shot in shots}
     if options.camera_params is not None and len(sizes) > 1:
@@ -62,44 +74,57 @@ def group_cameras(
             f"camera_params describe one camera, but the images have several sizes: {shown}",
             "give focal_px instead, or leave out the images of other sizes",
         )
+    given = _given_cameras(shots, options, root)
     keys, rules = _sharing_keys(shots, options)
+    keys = [(known.name if known else None, key) for known, key in zip(given, keys, strict=True)]
     index = {key: i for i, key in enumerate(dict.fromkeys(keys))}
     members: list[list[int]] = [[] for _ in index]
     for i, key in enumerate(keys):
         members[index[key]].append(i)
     priors = [focal_prior(shot.facts, shot.width, shot.height) for shot in shots]
     warnings = [(shot.name, problem) for shot, prior in zip(shots, priors, strict=True) for problem in prior.problems]
-    cameras, entries = [], []
-    for camera_idx, group in enumerate(members):
-        shot = shots[group[0]]
-        camera, reason = _camera(shot, [priors[i] for i in group], options)
+    warnings += _contradicted(shots, priors, given)
+    cameras: list[Camera] = []
+    entries: list[dict[str, Any]] = []
+    for group in members:
+        camera, reason = _camera(shots[group[0]], [priors[i] for i in group], options, given[group[0]])
         if options.camera_params is not None:
             _check_not_of_upright(camera, [shots[i] for i in group])
+        entry = {"camera_idx": len(cameras), "num_images": len(group), **_described(camera, reason)}
+        facts = shots[group[0]].facts
+        entries.append(entry | {"make": facts.make, "camera": facts.model, "sharing": rules[group[0]]})
         cameras.append(camera)
-        entries.append(
-            {
-                "camera_idx": camera_idx,
-                "num_images": len(group),
-                "model": camera.model.name,
-                "width": camera.width,
-                "height": camera.height,
-                "params": [float(value) for value in camera.params],
-                "focal_px": camera.focal,
-                "focal_sigma_px": camera.focal_sigma,
-                "focal_source": camera.focal_source,
-                "focal_reason": reason,
-                "is_fixed": camera.is_fixed,
-                "make": shot.facts.make,
-                "camera": shot.facts.model,
-                "sharing": rules[group[0]],
-            }
-        )
     return cameras, [index[key] for key in keys], entries, warnings
 
 
-def _camera(shot: Shot, priors: list[FocalPrior], options: ImageOptions) -> tuple[Camera, str]:
+def _given_cameras(shots: Sequence[Shot], options: ImageOptions, root: str) -> Sequence[GivenCamera | None]:
+    if options.camera is None or not shots:
+        return [None] * len(shots)
+    photographs = [Photograph(shot.name, (shot.width, shot.height), shot.facts.orientation) for shot in shots]
+    return read_given_cameras(options.camera).of_photographs(root, photographs)
+
+
+def _described(camera: Camera, reason: str) -> dict[str, Any]:
+    return {
+        "model": camera.model.name,
+        "width": camera.width,
+        "height": camera.height,
+        "params": [float(value) for value in camera.params],
+        "focal_px": camera.focal,
+        "focal_sigma_px": camera.focal_sigma,
+        "focal_source": camera.focal_source,
+        "focal_reason": reason,
+        "is_fixed": camera.is_fixed,
+    }
+
+
+def _camera(
+    shot: Shot, priors: list[FocalPrior], options: ImageOptions, given: GivenCamera | None
+) -> tuple[Camera, str]:
     model, width, height = options.camera_model, shot.width, shot.height
-    if options.camera_params is not None:
+    if given is not None:
+        camera, reason = given.camera, given.reason
+    elif options.camera_params is not None:
         camera = simple_camera(model, width, height, 1.0, source="user").with_params(options.camera_params)
         camera = replace(camera, focal_sigma=SIGMA_USER_PARAMS * camera.focal)
         reason = "camera_params"
@@ -135,10 +160,25 @@ def _common_prior(priors: list[FocalPrior]) -> FocalPrior:
     return replace(of_best[0], focal_px=float(median(focals)), sigma_px=sigma)
 
 
+def _contradicted(
+    shots: Sequence[Shot], priors: Sequence[FocalPrior], given: Sequence[GivenCamera | None]
+) -> list[tuple[str, str]]:
+    """(image name, problem) of photographs whose EXIF tells clearly another focal length than the given camera has."""
+    found = []
+    for shot, prior, known in zip(shots, priors, given, strict=True):
+        if known is None or prior.source == "default":
+            continue
+        focal, sigma = known.camera.focal, math.hypot(prior.sigma_px, known.camera.focal_sigma or 0.0)
+        if abs(prior.focal_px - focal) > _CONTRADICTS_SIGMAS * sigma:
+            problem = f"the given camera has a focal length of {focal:.0f} px, EXIF says {prior.focal_px:.0f} px"
+            found.append((shot.name, f"{problem} ({prior.reason}): is it of another camera, zoom or size of picture?"))
+    return found
+
+
 def _sharing_keys(shots: Sequence[Shot], options: ImageOptions) -> tuple[list[Hashable], list[str]]:
     """A key per shot, equal for those that share a camera, and the rule behind it."""
     sharing = options.camera_sharing
-    if sharing == "auto" and options.camera_params is not None:
+    if sharing == "auto" and (options.camera is not None or options.camera_params is not None):
         sharing = "all"
     if sharing == "per_image":
         return [shot.name for shot in shots], ["a camera per image"] * len(shots)

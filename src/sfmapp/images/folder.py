@@ -64,7 +64,7 @@ def load_images(
         The set, which may be empty, and a JSON-able report.
 
     Raises:
-        InputError: the source or the mask folder does not exist, or no mask fits any image.
+        InputError: the source or the mask folder does not exist, no mask fits any image, or the given cameras do not.
         UsageError: ``camera_params`` with images of several sizes.
         InterruptedRunError: a stop was asked for.
     """
@@ -79,7 +79,7 @@ def load_images(
         else:
             skipped.append(outcome)
     cameras, camera_idx, entries, focal_problems = group_cameras(
-        [Shot(s.record.name, s.record.width, s.record.height, s.facts) for s in scans], options
+        [Shot(s.record.name, s.record.width, s.record.height, s.facts) for s in scans], options, str(found.root)
     )
     images = tuple(replace(scan.record, camera_idx=idx) for scan, idx in zip(scans, camera_idx, strict=True))
     skipped.sort(key=lambda item: natural_key(item[0]))

@@ -21,6 +21,11 @@ class ImageOptions:
     """What to read and what is known about the cameras.
 
     Attributes:
+        camera: ``MODEL,PARAMETER,...``, as of ``camera_model`` and ``camera_params``, or the path of a calibration: of
+            COLMAP (cameras.txt or .bin, or the folder of a model), OpenCV, Kalibr, ROS, ORB-SLAM, VINS, nerfstudio, or
+            JSON. Several cameras are told apart by the names of images, or of folders such as cam0 and left. It is a
+            prior, of one per cent of the focal length, unless ``fix_intrinsics`` holds it. None: from EXIF or a
+            default.
         camera_model: lens model of all cameras.
         camera_params: parameters of ``camera_model`` in COLMAP's order, in pixels as the files store them, whatever
             EXIF's orientation; they describe one camera, so all images must have one size. None: from EXIF or a
@@ -36,6 +41,7 @@ class ImageOptions:
         max_pixels: images with more pixels are skipped, by what their headers say.
     """
 
+    camera: str | None = None
     camera_model: CameraModel = CameraModel.SIMPLE_RADIAL
     camera_params: tuple[float, ...] | None = None
     focal_px: float | None = None
@@ -56,6 +62,20 @@ class ImageOptions:
         check_options("images", self, ranges)
         if self.camera_params is not None:
             self._check_params(tuple(float(value) for value in self.camera_params))
+        if self.camera is not None:
+            self._check_camera_is_alone()
+
+    def _check_camera_is_alone(self) -> None:
+        others = {
+            "camera_model": self.camera_model != CameraModel.SIMPLE_RADIAL,
+            "camera_params": self.camera_params is not None,
+            "focal_px": self.focal_px is not None,
+        }
+        given = [f"images.{name}" for name, is_given in others.items() if is_given]
+        if given:
+            raise UsageError(
+                f"images.camera and {' and '.join(given)} both say what the camera is", "leave one of them out"
+            )
 
     def _check_params(self, params: tuple[float, ...]) -> None:
         object.__setattr__(self, "camera_params", params)

@@ -320,7 +320,7 @@ def _notes(result: Evaluation, options: EvaluateOptions) -> list[str]:
     left = pairs.num_estimate - len(np.unique(pairs.estimate_idx))
     if left and pairs.num_ground_truth > pairs.num_estimate:
         notes.append(f"{left} poses of the estimate have no true one within {options.max_difference_s:g} s")
-    for name, file in (("estimate", result.estimate), ("ground_truth", result.ground_truth)):
+    for name, file in (("estimate", result.estimate), ("ground truth", result.ground_truth)):
         notes += [file.note] if file.note else []
         times = file.trajectory.timestamps_s
         steps = np.diff(times) if times is not None else np.ones(0)

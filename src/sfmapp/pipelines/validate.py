@@ -189,13 +189,16 @@ def _ask(
 
 def _camera_groups(image_set: ImageSet, image_options: ImageOptions) -> list[CameraGroup] | None:
     """Our cameras where the user has said something about them; else None, and pycolmap decides for itself."""
-    is_given = image_options.camera_params is not None or image_options.focal_px is not None
+    is_given = any(
+        known is not None for known in (image_options.camera, image_options.camera_params, image_options.focal_px)
+    )
     if image_options.camera_sharing == "auto" and not is_given and not image_options.fix_intrinsics:
         return None
     return [
         CameraGroup(
             tuple(image.name for image in image_set.images if image.camera_idx == idx),
             tuple(camera.params.tolist()) if is_given or camera.is_fixed else None,
+            camera.model.name,
         )
         for idx, camera in enumerate(image_set.cameras)
     ]

@@ -238,7 +238,7 @@ def _legend(page: Drawing, panel: _Panel, *, has_gaps: bool) -> None:
         x += sample + 12 + page.text_width(text, 20) + 40
 
     page.line(np.array([[x, y], [x + 44, y]]), _GROUND_TRUTH, 9)
-    entry("ground_truth", 44)
+    entry("ground truth", 44)
     tones = np.linspace(0, 1, 45)
     page.colored_line(np.stack([x + np.arange(45.0), np.full(45, y)], 1), colormap(tones[1:]), 4.5)
     entry("estimate", 44)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import os
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.calibration.fields import camera_from_text, is_calibration_path
 from sfmapp.calibration.opencv_lens import sampling_map
-from sfmapp.calibration.reading import Calibration, camera_from_text, read_calibration
+from sfmapp.calibration.reading import Calibration, read_calibration
 from sfmapp.camera.camera import Camera, CameraModel, simple_camera
 from sfmapp.errors import InputError
 from sfmapp.events import Events
@@ -166,10 +166,8 @@ def _calibration(
 ) -> Calibration | None:
     """The user's calibration, else the layout's own, else a file beside the frames (before a published one)."""
     if given is not None:
-        if os.path.isfile(given):
+        if is_calibration_path(given):
             chosen = _read_calibration(given, sizes, orientation)
-        elif "," not in given and any(c in given for c in "./\\"):
-            raise InputError(f"camera {given}: expected a calibration file, found nothing")
         else:
             camera = camera_from_text(given, sizes[0])
             _check_not_of_upright(f"camera {given}", camera, orientation)

@@ -94,14 +94,16 @@ def options_from_dict(values: Mapping[str, Any]) -> Options:
 
 def with_absolute_paths(options: Options) -> Options:
     """The same options, good in any working directory."""
-    masks, sequence = options.images.mask_path, options.sequence
-    if masks is not None:
-        images = dataclasses.replace(options.images, mask_path=os.path.abspath(masks))
-        options = dataclasses.replace(options, images=images)
-    given = {name: path for name in ("camera", "imu", "ground_truth") if (path := getattr(sequence, name)) is not None}
+    images = _with_absolute_paths(options.images, "camera", "mask_path")
+    sequence = _with_absolute_paths(options.sequence, "camera", "imu", "ground_truth")
+    return dataclasses.replace(options, images=images, sequence=sequence)
+
+
+def _with_absolute_paths(stage: Any, *names: str) -> Any:
+    given = {name: path for name in names if (path := getattr(stage, name)) is not None}
     # a camera may be a file or numbers
     found = {name: os.path.abspath(path) for name, path in given.items() if name != "camera" or os.path.exists(path)}
-    return dataclasses.replace(options, sequence=dataclasses.replace(sequence, **found)) if found else options
+    return dataclasses.replace(stage, **found) if found else stage
 
 
 def options_to_dict(options: Any) -> dict[str, Any]:

@@ -163,7 +163,7 @@ def _reconstruct(source: str, frames: list[Frame], options: Options, events: Eve
         for number, frame in enumerate(frames):
             cv2.imwrite(str(folder / f"{number:03d}.png"), frame.images[0])
         for model in models:
-            images = replace(options.images, camera_model=model, camera_sharing="all", mask_path=None)
+            images = replace(options.images, camera=None, camera_model=model, camera_sharing="all", mask_path=None)
             wanted = replace(options, images=images, min_registered=None)
             try:
                 runs.append(reconstruct(folder, Path(name) / "out", wanted, events=events, record=False))

@@ -1,0 +1,42 @@
+"""Hooks of mkdocs: help texts and options are those of the code that is there, not copies of them."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from html import escape
+from typing import Any
+
+HELP = re.compile(r"^<!-- help: (\w+) -->$", re.MULTILINE)
+OPTIONS = re.compile(r"^<!-- options: (\w+) -->$", re.MULTILINE)
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Put ``sfmapp COMMAND --help`` and the options of a stage where a page asks for them."""
+    markdown = HELP.sub(lambda found: f"```text\n{help_of(found[1])}```", markdown)
+    return OPTIONS.sub(lambda found: options_of(found[1]), markdown)
+
+
+def help_of(command: str) -> str:
+    """The help text of a command."""
+    import os
+
+    os.environ["COLUMNS"] = "110"
+    from sfmapp.cli.main import make_parser
+
+    (commands,) = (action for action in make_parser()._actions if isinstance(action, argparse._SubParsersAction))
+    return str(commands.choices[command].format_help())
+
+
+def options_of(stage: str) -> str:
+    """A table of the options of a stage."""
+    from sfmapp.workspace.options import list_options
+
+    rows = [row for row in list_options() if row[0].partition(".")[0] == stage]
+    if not rows:
+        raise ValueError(f"expected the name of a stage, found {stage}")
+    lines = ["| option | default | effect |", "|---|---|---|"]
+    for name, _, default, comment in rows:
+        effect = escape(comment.replace("``", "`"), quote=False).replace("|", "\\|").replace("\n", " ")
+        lines.append(f"| `{name}` | `{default}` | {effect} |")
+    return "\n".join(lines)
