@@ -65,7 +65,7 @@ def assemble(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def factorize_tiles(tiles, num_blocks, inverse):  # type: ignore[no-untyped-def]
+def factorize_tiles(tiles: Array, num_blocks: int, inverse: Array) -> bool:
     """Cholesky factor U^T U of the upper tiles (B * B * 64,), in place; inverse (B * 64,) gets the U_kk^-1.
 
     Returns False, with the tiles spoilt, where a pivot is not clearly positive. Tiles of zeros are skipped, so that a
@@ -128,7 +128,7 @@ def factorize_tiles(tiles, num_blocks, inverse):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def solve_tiles(tiles, num_blocks, inverse, x):  # type: ignore[no-untyped-def]
+def solve_tiles(tiles: Array, num_blocks: int, inverse: Array, x: Array) -> None:
     """Solve U^T U x = x in place (B * 8,) with the factor of :func:`factorize_tiles`."""
     y = np.empty(8)
     for k in range(num_blocks):
@@ -162,7 +162,10 @@ def solve_tiles(tiles, num_blocks, inverse, x):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def mark_pairs(point_ptr, obs_image, image_camera, image_block, camera_block, pairs):  # type: ignore[no-untyped-def]
+def mark_pairs(
+    point_ptr: NDArray[np.int64], obs_image: NDArray[np.int32], image_camera: NDArray[np.int32],
+    image_block: NDArray[np.int32], camera_block: NDArray[np.int32], pairs: NDArray[np.bool_],
+) -> None:  # fmt: skip
     """Set pairs[a, b], (B, B) bool, for all blocks a <= b that meet in a point."""
     longest = 1
     for p in range(point_ptr.shape[0] - 1):
@@ -186,7 +189,7 @@ def mark_pairs(point_ptr, obs_image, image_camera, image_block, camera_block, pa
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def number_keys(keys):  # type: ignore[no-untyped-def]
+def number_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """An open hash table, half full at most, that gives each of the different keys (N,) its position."""
     size = 16
     while size < 2 * keys.shape[0] + 1:

@@ -302,7 +302,10 @@ def _free_columns(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _tracks_of_images(images, image_ptr, image_obs, obs_track_idx, num_tracks):  # type: ignore[no-untyped-def]
+def _tracks_of_images(
+    images: NDArray[np.int64], image_ptr: NDArray[np.int64], image_obs: NDArray[np.int64],
+    obs_track_idx: NDArray[np.int32], num_tracks: int,
+) -> NDArray[np.int64]:  # fmt: skip
     """Ascending tracks that some of the images observe."""
     seen = np.zeros(num_tracks, np.bool_)
     for i in images:
@@ -312,7 +315,10 @@ def _tracks_of_images(images, image_ptr, image_obs, obs_track_idx, num_tracks): 
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _gather(selected, is_constant, track_ptr, obs_image_idx, obs_xy, is_inlier, registered, xyz):  # type: ignore[no-untyped-def]
+def _gather(
+    selected: NDArray[np.int64], is_constant: Mask, track_ptr: NDArray[np.int64], obs_image_idx: NDArray[np.int32],
+    obs_xy: Array, is_inlier: Mask, registered: Mask, xyz: Array,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32], Array, Mask]:  # fmt: skip
     """Points that are kept, as positions in ``selected``, and their observations.
 
     An observation counts if it is an inlier of a registered image with finite pixels, a point if it is triangulated and

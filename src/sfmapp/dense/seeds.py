@@ -14,7 +14,18 @@ import numpy as np
 from numba import float32 as f32
 from numpy.typing import NDArray
 
-from sfmapp.dense.arrays import LAYERS, cell_pointers, copy_patch, image_pointers, store_pointers
+from sfmapp.dense.arrays import (
+    LAYERS,
+    Cells,
+    ImagePointers,
+    Images,
+    Limits,
+    Store,
+    cell_pointers,
+    copy_patch,
+    image_pointers,
+    store_pointers,
+)
 from sfmapp.dense.expand import (
     CANDIDATES,
     CONTENT,
@@ -26,7 +37,7 @@ from sfmapp.dense.expand import (
 )
 from sfmapp.dense.patch_kernels import Trial, cell_of, holds_window, judge, measure, project, refine
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
-from sfmapp.simd.pointers import offset, pointer
+from sfmapp.simd.pointers import Pointer, offset, pointer
 
 # NCC of a fronto-parallel window with one image, and on average with two, from which a place is worth refining
 LEAST_LIKENESS, LEAST_SUPPORT = f32(0.55), f32(0.5)
@@ -69,9 +80,11 @@ class CornerSearch(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def match_corners(  # type: ignore[no-untyped-def]
-    image_arrays, m, places, store_arrays, cell_arrays, search, part, limits, scratch, found_arrays, spare
-):  # fmt: skip
+def match_corners(
+    image_arrays: Images, m: int, places: NDArray[np.int32], store_arrays: Store, cell_arrays: Cells,
+    search: CornerSearch, part: tuple[int, int], limits: Limits, scratch: NDArray[np.float32], found_arrays: Store,
+    spare: int,
+) -> None:  # fmt: skip
     """Look for corners ``part[0]`` to ``part[1]`` of view m in its neighbours; patches at the same positions of found.
 
     ``spare``: a position of ``found`` that nobody else uses. What is in a cell already stays; a second layer has to
@@ -110,7 +123,10 @@ def match_corners(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _refine_best(images, m, u, v, depths, limits, trial, found_arrays, spare, i):  # type: ignore[no-untyped-def]
+def _refine_best(
+    images: ImagePointers, m: int, u: float, v: float, depths: NDArray[np.float32], limits: Limits, trial: Trial,
+    found_arrays: Store, spare: int, i: int,
+) -> None:  # fmt: skip
     """Refine what the search has left of pixel (u, v), and enter the best at position i of ``found``."""
     found, plane, slots = store_pointers(found_arrays), trial.plane, trial.slots
     best = f32(-1.0)
@@ -133,7 +149,10 @@ def _refine_best(images, m, u, v, depths, limits, trial, found_arrays, spare, i)
 
 
 @numba.njit(cache=True, nogil=True)
-def _search(images, m, slot, u, v, search, likes, depths, work):  # type: ignore[no-untyped-def]
+def _search(
+    images: ImagePointers, m: int, slot: int, u: float, v: float, search: CornerSearch, likes: NDArray[np.float32],
+    depths: NDArray[np.float32], work: Pointer,
+) -> None:  # fmt: skip
     """Walk the epipolar line of (u, v) in one neighbour, and keep the best places in ``likes`` and ``depths``."""
     pair = m * images.num_slots + slot
     a, b, s = offset(images.a, 9 * pair), offset(images.b, 3 * pair), images.neighbors[pair]
@@ -167,7 +186,9 @@ def _search(images, m, slot, u, v, search, likes, depths, work):  # type: ignore
 
 
 @numba.njit(cache=True, nogil=True)
-def _visible_range(q0, q1, q2, b, low, high, width, height):  # type: ignore[no-untyped-def]
+def _visible_range(
+    q0: float, q1: float, q2: float, b: Pointer, low: float, high: float, width: int, height: int
+) -> tuple[float, float]:
     """The part of a range of inverse depth in which ``q + b w`` lies in front of the camera and inside its image."""
     # q2 + b2 w > 0, q0 + b0 w > 0, (W - 1) (q2 + b2 w) - (q0 + b0 w) > 0 and so on: each cuts off one side
     for n in range(5):
@@ -191,7 +212,7 @@ def _visible_range(q0, q1, q2, b, low, high, width, height):  # type: ignore[no-
 
 
 @numba.njit(cache=True, nogil=True)
-def _keep(like, depth, likes, depths):  # type: ignore[no-untyped-def]
+def _keep(like: float, depth: float, likes: NDArray[np.float32], depths: NDArray[np.float32]) -> None:
     """Insert a place among the best few, sorted."""
     for j in range(likes.shape[0]):
         if like > likes[j]:
@@ -202,7 +223,10 @@ def _keep(like, depth, likes, depths):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def try_points(image_arrays, m, places, point_arrays, part, limits, scratch, found_arrays):  # type: ignore[no-untyped-def]
+def try_points(
+    image_arrays: Images, m: int, places: NDArray[np.int32], point_arrays: Store, part: tuple[int, int], limits: Limits,
+    scratch: NDArray[np.float32], found_arrays: Store,
+) -> None:  # fmt: skip
     """Patches at sparse points ``part[0]`` to ``part[1]``, given as a store, in the pixels of view m that show them."""
     images, found = image_pointers(image_arrays), store_pointers(found_arrays)
     slot_array, work = np.empty(MOST_SLOTS, np.int64), pointer(scratch)
@@ -231,7 +255,10 @@ def try_points(image_arrays, m, places, point_arrays, part, limits, scratch, fou
 
 
 @numba.njit(cache=True, nogil=True)
-def finer_cells(images, cells, m, coarse_images, coarse_cells, places, candidates):  # type: ignore[no-untyped-def]
+def finer_cells(
+    images: Images, cells: Cells, m: int, coarse_images: Images, coarse_cells: Cells, places: NDArray[np.int32],
+    candidates: NDArray[np.int32],
+) -> int:  # fmt: skip
     """Empty cells of view m where the coarser level has patches: pixels to ``places``, patches to ``candidates``."""
     start, columns, rows, side = images.cell_start[m], images.columns[m], images.rows[m], images.cell_px[0]
     coarse_start, coarse_columns, coarse_rows = (

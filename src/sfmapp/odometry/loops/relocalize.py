@@ -327,9 +327,10 @@ def roll_step(roll: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def _nearest_within(  # type: ignore[no-untyped-def]
-    expected, scale_idx, descriptors, xy, described, radius, corner, product
-):
+def _nearest_within(
+    expected: Array, scale_idx: Ids, descriptors: Bytes, xy: Array, described: Bytes, radius: float, corner: Ids,
+    product: Ids,
+) -> None:  # fmt: skip
     """For every point the corner within a radius with the largest product, beyond the bound that product holds.
 
     Args:
