@@ -336,12 +336,12 @@ def test_another_size_of_the_same_shape_is_scaled_and_said(tmp_path: Path, scale
 
 def test_photographs_of_two_sizes_need_a_calibration_that_states_its_own(tmp_path: Path) -> None:
     write_photos(tmp_path / "photos", "a.png", "b.png")
-    write_photos(tmp_path / "photos", "c.png", size=(2 * W, 2 * H))
+    write_photos(tmp_path / "photos", "c.png", size=(W // 2, H // 2))
     image_set, _, _ = load(tmp_path / "photos", own_json(tmp_path))
-    assert [camera.params[0] for camera in image_set.cameras] == pytest.approx([FX, 2 * FX])
+    assert [camera.params[0] for camera in image_set.cameras] == pytest.approx([FX, FX / 2])
     (tmp_path / "sizeless.json").write_text(json.dumps({"K": MATRIX.tolist(), "dist": LENS}))
     for given in (tmp_path / "sizeless.json", ",".join(["OPENCV", *map(str, BARREL.params)])):
-        with pytest.raises(InputError, match="photographs of several: 400x300, 800x600"):
+        with pytest.raises(InputError, match="photographs of several: 200x150, 400x300"):
             load(tmp_path / "photos", given)
 
 
@@ -383,6 +383,21 @@ def test_pictures_turned_both_ways_do_not_tell_how_a_calibration_was_turned(tmp_
         load(photos, tmp_path / "calib.json")
 
 
+def test_a_lens_of_more_coefficients_is_held_by_the_nearest_or_refused(tmp_path: Path) -> None:
+    photos, path = write_photos(tmp_path / "photos"), tmp_path / "calib.json"
+    k3 = np.array([*LENS, 0.002])
+    path.write_text(json.dumps({"K": MATRIX.tolist(), "dist": k3.tolist(), "width": W, "height": H}))
+    image_set, report, _ = load(photos, path)
+    expected = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), MATRIX, k3)[0].reshape(-1, 2) + 0.5
+    assert np.abs(project(image_set.cameras[0], RAYS) - expected).max() < 0.1
+    assert "the nearest lens with k1, k2, p1, p2 is off by" in report["cameras"][0]["focal_reason"]
+    wide = {"fx": 220.0, "fy": 220.0, "cx": 199.5, "cy": 149.5, "dist": [-0.25, 0.09, 0, 0, -0.016]}
+    path.write_text(json.dumps(wide | {"width": W, "height": H}))
+    with pytest.raises(InputError, match=r"calib.json.*5 coefficients.*off by 0\.\d px") as caught:
+        load(photos, path)
+    assert "CALIB_FIX_K3" in str(caught.value.advice)
+
+
 # ----------------------------------------------------------------------------------------------------- contradictions
 
 
@@ -395,6 +410,21 @@ def test_exif_that_clearly_says_another_focal_length_is_told(tmp_path: Path, foc
     told = [message for message in warnings_of(log) if "focal length of 442 px, EXIF says" in message]
     assert len(told) == is_told
     assert all("a.jpg, b.jpg" in message for message in told)
+
+
+def test_numbers_that_no_camera_has_are_told(tmp_path: Path) -> None:
+    numbers = {"fx": 1.1, "fy": 1.1, "cx": 0.5, "cy": 0.5, "width": W, "height": H}
+    (tmp_path / "calib.json").write_text(json.dumps(numbers))
+    (told,) = warnings_of(load(write_photos(tmp_path / "photos"), tmp_path / "calib.json")[2])
+    assert "a.png, b.png, c.png: the calibration is unlike that of any camera: fx 1.1" in told
+
+
+def test_a_calibration_of_another_size_that_it_does_not_state_is_told(tmp_path: Path) -> None:
+    (tmp_path / "calib.json").write_text(json.dumps({"K": MATRIX.tolist(), "dist": LENS}))
+    photos = write_photos(tmp_path / "photos", size=(2 * W, 2 * H))
+    (told,) = warnings_of(load(photos, tmp_path / "calib.json")[2])
+    assert "states no image size, and its principal point (196, 152) is far from the middle of 800x600 pixels" in told
+    assert not warnings_of(load(write_photos(tmp_path / "fitting"), tmp_path / "calib.json")[2])
 
 
 @pytest.mark.parametrize(

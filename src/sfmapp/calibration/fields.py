@@ -181,7 +181,7 @@ def rectified_intrinsics(place: str, fields: Fields, name: str) -> list[float]:
 
 def camera_of_fields(place: str, fields: dict[str, Any], image_size: Size) -> CalibratedCamera:
     """One camera of a section, at the size that the section states, or else at that of the images."""
-    size = _size(place, fields) or image_size
+    size = stated_size(place, fields) or image_size
     if isinstance(fields.get("params"), list) and isinstance(fields.get("model"), str):
         return camera_from_colmap(place, fields["model"].upper(), size, numbers(place, fields["params"], None))
     nested = [fields[name] for name in (*_MATRIX_NAMES, *_DISTORTION_NAMES) if isinstance(fields.get(name), dict)]
@@ -224,7 +224,8 @@ def _coefficients(place: str, fields: dict[str, Any], lens: LensType | None) -> 
     return numbers(f"{place}: k1, k2, p1, p2, ...", named_coefficients(place, section, lens), None)
 
 
-def _size(place: str, fields: dict[str, Any]) -> Size | None:
+def stated_size(place: str, fields: Fields) -> Size | None:
+    """Width and height of the images that a camera was calibrated with; None where that is not said."""
     pairs = (("width", "height"), ("image_width", "image_height"))
     found = next(([fields[w], fields[h]] for w, h in pairs if w in fields and h in fields), None)
     if found is None:
@@ -235,6 +236,18 @@ def _size(place: str, fields: dict[str, Any]) -> Size | None:
     if not (width % 1 == 0 and height % 1 == 0 and min(width, height) > 0 and max(width, height) < 1e6):
         raise InputError(f"{place}: expected an image size in pixels, found {width:g} x {height:g}")
     return int(width), int(height)
+
+
+def oddity(camera: Camera) -> str | None:
+    """What is odd about a calibration that is unlike that of any camera; None for nothing."""
+    fx, fy, cx, cy = camera.canonical[:4]
+    long_side = max(camera.width, camera.height)
+    # 0.2 is a fisheye lens of the widest kind, 20 a telescope
+    is_odd = not (0.2 * long_side < min(fx, fy) <= max(fx, fy) < 20 * long_side)
+    if is_odd or not (0 < cx < camera.width and 0 < cy < camera.height):
+        text = f"fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g} for {camera.width}x{camera.height} pixels"
+        return f"the calibration is unlike that of any camera: {text}"
+    return None
 
 
 def read_pose(place: str, value: Any) -> Array:

@@ -9,7 +9,16 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePath, PurePosixPath
 
-from sfmapp.calibration.fields import camera_from_text, camera_of_fields, cameras_in, is_calibration_path
+import numpy as np
+
+from sfmapp.calibration.fields import (
+    camera_from_text,
+    camera_of_fields,
+    cameras_in,
+    is_calibration_path,
+    oddity,
+    stated_size,
+)
 from sfmapp.calibration.files import read_fields
 from sfmapp.calibration.opencv_lens import CalibratedCamera, Size, scaled_to
 from sfmapp.camera.camera import Camera
@@ -24,6 +33,10 @@ CameraAt = Callable[[Size], CalibratedCamera]
 _NUMBERED = re.compile(r"(?:cam|camera|image|images|img)[_-]?(\d+)")
 _OF_A_PAIR = re.compile(r"(?:(?:cam|camera|image|images|img)[_-]?)?(left|right)")
 _NAMES_SHOWN = 4
+# half of what keypoints are located to
+_LARGEST_MISFIT_PX = 0.25
+# a share of a side of the picture: lenses are decentred by some per cent at most, crops by more
+_FAR_OFF_CENTER = 0.15
 
 
 @dataclass(frozen=True)
@@ -44,11 +57,13 @@ class GivenCamera:
         name: in the file; may be empty where there is one only.
         camera: with ``focal_source`` ``user`` and a sigma of its focal length.
         reason: where it is from, and what was changed on the way.
+        problem: what is odd about it; None for nothing.
     """
 
     name: str
     camera: Camera
     reason: str
+    problem: str | None = None
 
 
 @dataclass(frozen=True)
@@ -58,11 +73,13 @@ class GivenCameras:
     Attributes:
         place: what was given; begins the messages.
         cameras: by name; of a file with one, the name may be empty.
+        sizeless: names of those that do not state the size of their images.
         of_image: names of cameras by the names of images that they took, where the file lists them.
     """
 
     place: str
     cameras: Mapping[str, CameraAt]
+    sizeless: Collection[str] = ()
     of_image: Mapping[str, str] = field(default_factory=dict)
 
     def of_photographs(self, root: str, photographs: Sequence[Photograph]) -> list[GivenCamera]:
@@ -85,7 +102,7 @@ class GivenCameras:
         groups: defaultdict[tuple[str, Size], list[Photograph]] = defaultdict(list)
         for name, photograph in zip(whose, photographs, strict=True):
             groups[name, photograph.size].append(photograph)
-        for name in set(whose):
+        for name in dict.fromkeys(whose):
             self._check_states_size(name, [group[0] for (of, _), group in groups.items() if of == name])
         found = {key: self._in_pixels_of(key[0], group) for key, group in groups.items()}
         return [found[name, photograph.size] for name, photograph in zip(whose, photographs, strict=True)]
@@ -146,11 +163,10 @@ class GivenCameras:
     # ----------------------------------------------------------------------------------------------- of which pixels
 
     def _check_states_size(self, name: str, photographs: Sequence[Photograph]) -> None:
-        """Refuse a camera that takes the size of whatever photograph it is asked for, if these have several."""
-        found = [self.cameras[name](photograph.size).camera for photograph in photographs]
-        sizes = [photograph.size for photograph in photographs]
-        if len(sizes) > 1 and [(camera.width, camera.height) for camera in found] == sizes:
-            shown = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)[:_NAMES_SHOWN])
+        """Refuse a camera that states no size for photographs of several."""
+        if len(photographs) > 1 and name in self.sizeless:
+            sizes = sorted(photograph.size for photograph in photographs)
+            shown = ", ".join(f"{width}x{height}" for width, height in sizes[:_NAMES_SHOWN])
             raise InputError(
                 f"{self.place}: expected a camera of one image size, found none stated, and photographs of several: "
                 f"{shown}",
@@ -172,15 +188,37 @@ class GivenCameras:
             found = replace(found, camera=turned, notes=(*found.notes, note))
         else:
             raise self._misshapen(own, first)
-        if found.lens is not None:
+        self._check_fits(found)
+        source = ": ".join([PurePath(self.place).name, *([name] if name else [])])
+        notes = [note.removeprefix(f"{self.place}: ").partition(": frames are")[0] for note in found.notes]
+        reason = ", ".join([source, *notes])
+        problem = oddity(found.camera) or self._other_size(name, found.camera)
+        return GivenCamera(name, replace(found.camera, focal_source="user"), reason, problem)
+
+    def _check_fits(self, found: CalibratedCamera) -> None:
+        """Refuse a camera that is not the lens of the calibration: photographs are not resampled, as frames are."""
+        if found.lens is None:
+            return
+        misfit_px = found.misfit_px * found.camera.width / found.lens.size[0]
+        if misfit_px > _LARGEST_MISFIT_PX:
             raise InputError(
                 f"{self.place}: expected a lens that k1, k2, p1 and p2 can hold, found one with "
-                f"{len(found.lens.coefficients)} coefficients that they cannot",
-                "calibrate with k1, k2, p1 and p2 alone, or undistort the photographs first",
+                f"{len(found.lens.coefficients)} coefficients, of which the nearest such lens is off by "
+                f"{misfit_px:.1f} px",
+                "calibrate with k1, k2, p1 and p2 alone (cv2.CALIB_FIX_K3), or undistort the photographs first",
             )
-        source = ": ".join([PurePath(self.place).name, *([name] if name else [])])
-        reason = ", ".join([source, *(note.removeprefix(f"{self.place}: ") for note in found.notes)])
-        return GivenCamera(name, replace(found.camera, focal_source="user"), reason)
+
+    def _other_size(self, name: str, camera: Camera) -> str | None:
+        """What speaks for a calibration with pictures of another size, where it states none."""
+        size = np.array([camera.width, camera.height])
+        off = np.abs(camera.canonical[2:4] / size - 0.5).max()
+        if off < _FAR_OFF_CENTER or name not in self.sizeless:
+            return None
+        cx, cy = camera.canonical[2:4]
+        return (
+            f"the calibration states no image size, and its principal point ({cx:.0f}, {cy:.0f}) is far from the "
+            f"middle of {camera.width}x{camera.height} pixels: if it is of another size, write width and height into it"
+        )
 
     def _check_not_of_upright(self, camera: Camera, photograph: str, sideways: Collection[int]) -> None:
         for orientation in sideways:
@@ -215,14 +253,18 @@ def read_given_cameras(given: str) -> GivenCameras:
         UsageError: neither a file nor a camera.
     """
     if not is_calibration_path(given):
-        return GivenCameras(f"camera {given}", {"": lambda size: CalibratedCamera(camera_from_text(given, size))})
+        return GivenCameras(f"camera {given}", {"": lambda size: CalibratedCamera(camera_from_text(given, size))}, {""})
     fields = read_fields(Path(given))
     cameras: dict[str, CameraAt] = {}
+    sizeless: set[str] = set()
     of_image: dict[str, str] = {}
     for name, section in cameras_in(given, fields).items():
-        cameras[name] = partial(camera_of_fields, f"{given}: {name}" if name else given, section)
+        place = f"{given}: {name}" if name else given
+        cameras[name] = partial(camera_of_fields, place, section)
         of_image |= dict.fromkeys(section.get("files", ()), name)
-    return GivenCameras(given, cameras, of_image)
+        if stated_size(place, section) is None:
+            sizeless.add(name)
+    return GivenCameras(given, cameras, sizeless, of_image)
 
 
 def _has_shape(own: Size, size: Size) -> bool:

@@ -26,8 +26,9 @@ examples:
   sfmapp dense out/ --set dense.level=0 --region -1 -1 0 1 1 2 --maps
 
 SOURCE is a workspace of sfmapp reconstruct, or a COLMAP model (binary or text, any of our camera models) with the
-folder of its photographs. Writes OUT/dense/fused.ply (places, normals, colours, number of views, score, sigma) and
-patches.npz; the same command again resumes a run that was cut off, and does nothing where all is done."""
+folder of its photographs. Its poses belong to its cameras: a calibration counts when the model is made, with
+sfmapp reconstruct --camera FILE. Writes OUT/dense/fused.ply (places, normals, colours, number of views, score, sigma)
+and patches.npz; the same command again resumes a run that was cut off, and does nothing where all is done."""
 
 
 MESH_EXAMPLES = """\

@@ -83,7 +83,7 @@ def group_cameras(
         members[index[key]].append(i)
     priors = [focal_prior(shot.facts, shot.width, shot.height) for shot in shots]
     warnings = [(shot.name, problem) for shot, prior in zip(shots, priors, strict=True) for problem in prior.problems]
-    warnings += _contradicted(shots, priors, given)
+    warnings += _doubts(shots, priors, given)
     cameras: list[Camera] = []
     entries: list[dict[str, Any]] = []
     for group in members:
@@ -160,12 +160,14 @@ def _common_prior(priors: list[FocalPrior]) -> FocalPrior:
     return replace(of_best[0], focal_px=float(median(focals)), sigma_px=sigma)
 
 
-def _contradicted(
+def _doubts(
     shots: Sequence[Shot], priors: Sequence[FocalPrior], given: Sequence[GivenCamera | None]
 ) -> list[tuple[str, str]]:
-    """(image name, problem) of photographs whose EXIF tells clearly another focal length than the given camera has."""
+    """(image name, problem) of photographs whose given camera is odd, or has clearly another focal length than EXIF."""
     found = []
     for shot, prior, known in zip(shots, priors, given, strict=True):
+        if known is not None and known.problem is not None:
+            found.append((shot.name, known.problem))
         if known is None or prior.source == "default":
             continue
         focal, sigma = known.camera.focal, math.hypot(prior.sigma_px, known.camera.focal_sigma or 0.0)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.calibration.fields import camera_from_text, is_calibration_path
+from sfmapp.calibration.fields import camera_from_text, is_calibration_path, oddity
 from sfmapp.calibration.opencv_lens import sampling_map
 from sfmapp.calibration.reading import Calibration, read_calibration
 from sfmapp.camera.camera import Camera, CameraModel, simple_camera
@@ -254,13 +254,8 @@ def _rig(
         baseline = np.linalg.norm(rig.cam_from_rig[1, 4:])
         events.warned(STAGE, f"{what}: the cameras of the pair are {baseline:.0f} m apart: are lengths in millimetres?")
     for camera in rig.cameras:
-        fx, fy, cx, cy = camera.canonical[:4]
-        long_side = max(camera.width, camera.height)
-        # 0.2 is a fisheye lens of the widest kind, 20 a telescope
-        is_odd = not (0.2 * long_side < min(fx, fy) <= max(fx, fy) < 20 * long_side)
-        if is_odd or not (0 < cx < camera.width and 0 < cy < camera.height):
-            text = f"fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g} for {camera.width}x{camera.height} pixels"
-            events.warned(STAGE, f"{what}: the calibration is unlike that of any camera: {text}")
+        if odd := oddity(camera):
+            events.warned(STAGE, f"{what}: {odd}")
     return rig
 
 
