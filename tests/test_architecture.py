@@ -18,6 +18,7 @@ SOURCE = Path(sfmapp.__file__).parent
 # from the top of the house to the ground; a room may import from its own floor only where it is the same room
 FLOORS = (
     ("cli",),
+    ("api",),
     ("pipelines",),
     ("workspace",),
     ("report", "viewer"),
@@ -147,7 +148,12 @@ def test_help_is_light() -> None:
 
 MOST_PARAMETERS, MOST_OF_KERNELS = 8, 12
 # what users call with keywords, each of which stands for itself
-LONG_LISTS = {"matching/stage.py match_images", "scene/synthetic.py make_scene"}
+LONG_LISTS = {
+    "api/jobs.py track_sequence",
+    "api/stages.py match_images",
+    "matching/stage.py match_images",
+    "scene/synthetic.py make_scene",
+}
 
 
 def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:

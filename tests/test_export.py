@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sfmapp
 from sfmapp.camera.camera import CameraModel
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.formats import ply
 from sfmapp.formats.colmap import read_model, write_model
 from sfmapp.formats.nerfstudio import read_nerfstudio
+from sfmapp.pipelines.dense.source import find_source
 from sfmapp.pipelines.export import EXPORTS, export_model
 from sfmapp.scene.synthetic import synthetic_camera
 from test_formats_exchange import centered_camera, scene
@@ -52,25 +54,43 @@ def test_images_are_found_from_transforms_json(workspace: Path, tmp_path: Path) 
             assert (Path(file).parent / name).resolve().parent == (tmp_path / "photos").resolve()
 
 
-@pytest.mark.parametrize("kind", ["folder", "pattern", "list", "nested pattern"])
-def test_images_of_any_source_are_found_from_transforms_json(workspace: Path, tmp_path: Path, kind: str) -> None:
-    photos = tmp_path / "photos"
-    for name in read_model(workspace / "sparse" / "0")[0].image_names:
-        (photos / name).parent.mkdir(parents=True, exist_ok=True)
-        (photos / name).write_bytes(b"a photograph")
-    (tmp_path / "list.txt").write_text("".join(f"{path}\n" for path in photos.rglob("*.*")))
-    sources = {
-        "folder": photos, "pattern": f"{photos}/*.*", "list": tmp_path / "list.txt", "nested pattern": f"{photos}/**",
-    }  # fmt: skip
-    manifest = {"format": "sfmapp workspace 1", "source": str(sources[kind]), "stages": {}, "inputs": {}}
-    (workspace / "run.json").write_text(json.dumps(manifest))
-    report = export_model(workspace, "nerfstudio", tmp_path / "deep" / "nerf")
+@pytest.mark.parametrize("kind", ["folder", "pattern", "nested pattern", "list"])
+def test_images_of_any_source_are_found(photos: Path, tmp_path: Path, kind: str) -> None:
+    """Whatever the run was told, every command that follows finds the photographs, wherever it is called from."""
+    folder = tmp_path / "photos"
+    shutil.copytree(photos, folder / "deep")
+    (tmp_path / "list.txt").write_text("".join(f"{path}\n" for path in sorted(folder.rglob("*.*"))))
+    source, root = {
+        "folder": (folder, folder), "pattern": (f"{folder}/deep/*.*", folder / "deep"),
+        "nested pattern": (f"{folder}/**/*.png", folder), "list": (tmp_path / "list.txt", folder / "deep"),
+    }[kind]  # fmt: skip
+    options = sfmapp.load_options(settings=["features.max_num_features=600"])
+    model, _ = sfmapp.reconstruct(source, tmp_path / "out", options, record=False)
+    report = sfmapp.export(tmp_path / "out", "nerfstudio", tmp_path / "far" / "nerf")
     assert report["notes"] == []
     for name in read_nerfstudio(report["files"][0]).image_names:
-        assert (tmp_path / "deep" / "nerf" / name).read_bytes() == b"a photograph"
-    shutil.rmtree(photos)
-    (note,) = export_model(workspace, "nerfstudio", tmp_path / "deep" / "nerf")["notes"]
-    assert "4 of 4 photographs are not in" in note
+        assert (tmp_path / "far" / "nerf" / name).is_file()
+    where = find_source(tmp_path / "out", None, None, sfmapp.Options())
+    assert where.images == root
+    assert all((where.images / name).is_file() for name in model.image_names)
+    shutil.rmtree(folder)
+    (note,) = sfmapp.export(tmp_path / "out", "nerfstudio", tmp_path / "far" / "nerf")["notes"]
+    assert "photographs are not in" in note
+    with pytest.raises(sfmapp.InputError, match="expected its photographs in"):
+        find_source(tmp_path / "out", None, None, sfmapp.Options())
+
+
+def test_a_reconstruction_in_memory_is_exported_as_it_is(workspace: Path, tmp_path: Path) -> None:
+    model = sfmapp.load(workspace)
+    (tmp_path / "elsewhere").mkdir()
+    for target in ("colmap-text", "nerfstudio"):
+        in_memory = sfmapp.export(model, target, tmp_path / "a" / target, images=tmp_path / "elsewhere")
+        from_files = sfmapp.export(workspace, target, tmp_path / "b" / target, images=tmp_path / "elsewhere")
+        assert in_memory["num_observations"] == from_files["num_observations"]
+        for ours, theirs in zip(in_memory["files"], from_files["files"], strict=True):
+            assert Path(ours).read_bytes() == Path(theirs).read_bytes()
+    text = (tmp_path / "a" / "nerfstudio" / "transforms.json").read_text()
+    assert "elsewhere" in text
 
 
 def test_images_beside_a_colmap_model_are_found_from_transforms_json(workspace: Path, tmp_path: Path) -> None:

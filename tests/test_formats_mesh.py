@@ -30,7 +30,7 @@ def test_normals_are_outward_and_areas_exact() -> None:
     mesh = tetrahedron()
     vectors = face_vectors(mesh.xyz, mesh.faces)
     np.testing.assert_allclose(vectors[:3], [[0, 0, -1.0], [0, -1.5, 0], [-3.0, 0, 0]], atol=1e-12)
-    np.testing.assert_allclose(vectors.sum(axis=0), 0.0, atol=1e-12)  # as forevery closed surface
+    np.testing.assert_allclose(vectors.sum(axis=0), 0.0, atol=1e-12)  # as for every closed surface
     outward = np.einsum("nc,nc->n", mesh.normal, mesh.xyz - mesh.xyz.mean(axis=0))
     assert (outward > 0.0).all()
 

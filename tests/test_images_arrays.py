@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sfmapp
 from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.errors import InputError
 from sfmapp.events import Events
@@ -72,12 +73,12 @@ def test_deep_pixels_are_scaled_as_those_of_files() -> None:
 
 def test_a_camera_that_is_given_counts_as_known() -> None:
     camera = Camera(CameraModel.PINHOLE, 60, 40, np.array([50.0, 51.0, 30.0, 20.0]))
-    images = describe_source(ArraySource({"a": noise(40, 60)}, {}), camera=camera)
+    images = sfmapp.load_images({"a": noise(40, 60)}, camera=camera)
     assert images.cameras[0].focal_source == "user"
     assert images.cameras[0].focal_sigma == pytest.approx(0.01 * 50.5)
     assert images.camera_of(0).params.tolist() == camera.params.tolist()
     with pytest.raises(InputError, match="61x40 pixels, but its camera has 60x40"):
-        describe_source(ArraySource({"a": noise(40, 61)}, {}), camera=camera)
+        sfmapp.load_images({"a": noise(40, 61)}, camera=camera)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
+from sfmapp.errors import InputError
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.rigid3 import Rigid3
 
 vectors = arrays(np.float64, (3,), elements=st.floats(-10, 10))
 poses = st.builds(lambda w, t: rigid3.from_matrix(rigid3.exp_so3(w), t), vectors, vectors)
@@ -54,3 +56,45 @@ def test_functions_broadcast():
     one = rigid3.compose(many[2, 3], many[1, 1])
     np.testing.assert_allclose(rigid3.compose(many, many[1, 1])[2, 3], one, atol=1e-14)
     np.testing.assert_allclose(rigid3.inverse(many)[3, 4], rigid3.inverse(many[3, 4]), atol=1e-14)
+
+
+@given(poses, poses, vectors)
+def test_a_pose_as_a_value_does_what_the_functions_do(a, b, x):
+    left, right = Rigid3(a), Rigid3(b)
+    np.testing.assert_allclose(left @ right, rigid3.compose(a, b), atol=1e-12)
+    np.testing.assert_allclose(left @ x, rigid3.apply(a, x), atol=1e-12)
+    np.testing.assert_allclose(left.inverse() @ (left @ x), x, atol=1e-12)
+    np.testing.assert_allclose((left.matrix @ [*x, 1.0])[:3], left @ x, atol=1e-12)
+    np.testing.assert_allclose(left @ left.center, 0.0, atol=1e-12)
+    for same in (
+        Rigid3.from_matrix(left.rotation, left.translation),
+        Rigid3.from_matrix(left.matrix),
+        Rigid3.from_matrix(left.matrix[:3]),
+    ):
+        np.testing.assert_allclose(same.matrix, left.matrix, atol=1e-12)
+    assert Rigid3(left) == left
+    assert hash(Rigid3(left)) == hash(left)
+
+
+def test_a_pose_as_a_value_keeps_its_bits_and_cannot_be_changed():
+    given_pose = rigid3.from_matrix(rigid3.exp_so3([0.1, 0.2, 0.3]), [1.0, 2.0, 3.0])
+    pose = Rigid3(given_pose)
+    assert np.asarray(pose).tobytes() == given_pose.tobytes()
+    with pytest.raises(ValueError, match="read-only"):
+        pose.translation[0] = 0.0
+    assert np.asarray(Rigid3([0, 0, 0, 2, 1, 1, 1])).tolist() == [0, 0, 0, 1, 1, 1, 1]
+    np.testing.assert_allclose(Rigid3.identity() @ pose, pose, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "wrong", [np.zeros(7), np.ones(6), [np.nan, 0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0, np.inf], np.ones((1, 7))]
+)
+def test_what_is_no_pose_is_refused(wrong):
+    with pytest.raises(InputError, match="pose"):
+        Rigid3(wrong)
+
+
+@pytest.mark.parametrize("wrong", [2 * np.eye(3), np.diag([1.0, 1.0, -1.0]), np.eye(2), np.full((3, 3), np.nan)])
+def test_what_is_no_rotation_is_refused(wrong):
+    with pytest.raises(InputError, match="pose"):
+        Rigid3.from_matrix(wrong, np.zeros(3))

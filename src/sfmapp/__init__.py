@@ -1,4 +1,13 @@
-"""Photographs and video into cameras, points and surfaces, on an ordinary CPU, from pip alone."""
+"""Photographs and video into cameras, points and surfaces, on an ordinary CPU, from pip alone.
+
+Three levels. One call: ``reconstruct``, ``track_sequence``, ``densify``, ``make_mesh``, and what is done with their
+results. The stages, in memory: ``load_images``, ``extract_features``, ``match_images``, ``map_images``. The parts:
+``adjust_bundle``, ``triangulate``, ``estimate_pose``, ``verify_pair``.
+
+Conventions: a pose ``cam_from_world`` is a quaternion x, y, z, w and a translation, x_cam = R x_world + t, with camera
+axes x right, y down, z forward. The centre of the top-left pixel is (0.5, 0.5). ``events``, ``threads`` and ``seed``
+can always be left out; of these, results depend on the seed alone.
+"""
 
 from __future__ import annotations
 
@@ -7,45 +16,150 @@ from typing import TYPE_CHECKING, Any
 from sfmapp.kernel_cache import provide_kernel_cache
 
 if TYPE_CHECKING:
+    from sfmapp.adjust.solver import AdjustOptions
+    from sfmapp.api.geometry import adjust_bundle, estimate_pose, triangulate, verify_pair
+    from sfmapp.api.images import load_images
+    from sfmapp.api.jobs import (
+        RunResult,
+        TrackResult,
+        densify,
+        evaluate,
+        export,
+        make_mesh,
+        reconstruct,
+        refine,
+        track_sequence,
+        undistort,
+        validate,
+    )
+    from sfmapp.api.reconstruction import Reconstruction, load
+    from sfmapp.api.stages import Matcher, extract_features, map_images, match_images
     from sfmapp.camera.camera import Camera, CameraModel
-    from sfmapp.pipelines.odometry.refine import RefineResult, refine
-    from sfmapp.pipelines.odometry.track import TrackResult, track_sequence
-    from sfmapp.pipelines.sparse.reconstruct import RunResult, reconstruct
-    from sfmapp.pipelines.undistort import UndistortResult, undistort
-    from sfmapp.scene.reconstruction import Reconstruction
+    from sfmapp.errors import (
+        InputError,
+        InterruptedRunError,
+        NoReconstructionError,
+        SfmError,
+        TooFewImagesError,
+        UsageError,
+    )
+    from sfmapp.events import Event, Events
+    from sfmapp.features.extract import FeatureOptions
+    from sfmapp.geometry.rigid3 import Rigid3
+    from sfmapp.images.array_sequence import ArraySequence
+    from sfmapp.images.image_set import ImageOptions, ImageSet, ImageSource
+    from sfmapp.mapping.options import MappingOptions
+    from sfmapp.matching.options import MatchingOptions
+    from sfmapp.matching.pairs import PairOptions
+    from sfmapp.scene.correspondences import Correspondences
+    from sfmapp.scene.features import DescriptorMetric, Features
+    from sfmapp.scene.rig import Rig
+    from sfmapp.scene.tracks import Tracks
     from sfmapp.workspace.options import Options, load_options
 
 __version__ = "0.1.0"
 __all__ = [
+    "AdjustOptions",
+    "ArraySequence",
     "Camera",
     "CameraModel",
+    "Correspondences",
+    "DescriptorMetric",
+    "Event",
+    "Events",
+    "FeatureOptions",
+    "Features",
+    "ImageOptions",
+    "ImageSet",
+    "ImageSource",
+    "InputError",
+    "InterruptedRunError",
+    "MappingOptions",
+    "Matcher",
+    "MatchingOptions",
+    "NoReconstructionError",
     "Options",
+    "PairOptions",
     "Reconstruction",
-    "RefineResult",
+    "Rig",
+    "Rigid3",
     "RunResult",
+    "SfmError",
+    "TooFewImagesError",
     "TrackResult",
-    "UndistortResult",
+    "Tracks",
+    "UsageError",
+    "adjust_bundle",
+    "densify",
+    "estimate_pose",
+    "evaluate",
+    "export",
+    "extract_features",
+    "load",
+    "load_images",
     "load_options",
+    "make_mesh",
+    "map_images",
+    "match_images",
     "reconstruct",
     "refine",
     "track_sequence",
+    "triangulate",
     "undistort",
+    "validate",
+    "verify_pair",
 ]
 
 _HOMES = {
-    "Camera": "sfmapp.camera.camera",
-    "CameraModel": "sfmapp.camera.camera",
-    "Options": "sfmapp.workspace.options",
-    "Reconstruction": "sfmapp.scene.reconstruction",
-    "RefineResult": "sfmapp.pipelines.odometry.refine",
-    "RunResult": "sfmapp.pipelines.sparse.reconstruct",
-    "TrackResult": "sfmapp.pipelines.odometry.track",
-    "UndistortResult": "sfmapp.pipelines.undistort",
-    "load_options": "sfmapp.workspace.options",
-    "reconstruct": "sfmapp.pipelines.sparse.reconstruct",
-    "refine": "sfmapp.pipelines.odometry.refine",
-    "track_sequence": "sfmapp.pipelines.odometry.track",
-    "undistort": "sfmapp.pipelines.undistort",
+    "AdjustOptions": "adjust.solver",
+    "ArraySequence": "images.array_sequence",
+    "Camera": "camera.camera",
+    "CameraModel": "camera.camera",
+    "Correspondences": "scene.correspondences",
+    "DescriptorMetric": "scene.features",
+    "Event": "events",
+    "Events": "events",
+    "FeatureOptions": "features.extract",
+    "Features": "scene.features",
+    "ImageOptions": "images.image_set",
+    "ImageSet": "images.image_set",
+    "ImageSource": "images.image_set",
+    "InputError": "errors",
+    "InterruptedRunError": "errors",
+    "MappingOptions": "mapping.options",
+    "Matcher": "api.stages",
+    "MatchingOptions": "matching.options",
+    "NoReconstructionError": "errors",
+    "Options": "workspace.options",
+    "PairOptions": "matching.pairs",
+    "Reconstruction": "api.reconstruction",
+    "Rig": "scene.rig",
+    "Rigid3": "geometry.rigid3",
+    "RunResult": "api.jobs",
+    "SfmError": "errors",
+    "TooFewImagesError": "errors",
+    "TrackResult": "api.jobs",
+    "Tracks": "scene.tracks",
+    "UsageError": "errors",
+    "adjust_bundle": "api.geometry",
+    "densify": "api.jobs",
+    "estimate_pose": "api.geometry",
+    "evaluate": "api.jobs",
+    "export": "api.jobs",
+    "extract_features": "api.stages",
+    "load": "api.reconstruction",
+    "load_images": "api.images",
+    "load_options": "workspace.options",
+    "make_mesh": "api.jobs",
+    "map_images": "api.stages",
+    "match_images": "api.stages",
+    "reconstruct": "api.jobs",
+    "refine": "api.jobs",
+    "track_sequence": "api.jobs",
+    "triangulate": "api.geometry",
+    "undistort": "api.jobs",
+    "validate": "api.jobs",
+    "verify_pair": "api.geometry",
 }
 
 
@@ -55,9 +169,14 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    value = getattr(import_module(_HOMES[name]), name)
+    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
     globals()[name] = value
     return value
+
+
+def __dir__() -> list[str]:
+    """What is promised, and no more."""
+    return sorted([*__all__, "__version__"])
 
 
 provide_kernel_cache()

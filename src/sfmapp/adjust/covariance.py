@@ -35,6 +35,7 @@ from sfmapp.adjust.problem import EVERYTHING, Problem, Varying
 from sfmapp.adjust.solver import AdjustOptions, Engine, make_engine
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import ROW
+from sfmapp.errors import InputError
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.simd.pointers import offset, pointer
@@ -74,6 +75,25 @@ class Covariances:
     sigma_px: float
     num_gauge: int
     is_determined: bool
+
+    def of_point(self, track_idx: int) -> Array:
+        """(3, 3) of a point, in the world. Raises InputError if it had no part, for want of a place or of inliers."""
+        return self.points[_place(self.track_idx, track_idx, "point")]
+
+    def of_image(self, image_idx: int) -> Array:
+        """(6, 6) of an image's pose, as ``poses``. Raises InputError if it did not vary."""
+        return self.poses[_place(self.image_idx, image_idx, "image")]
+
+    def of_camera(self, camera_idx: int) -> Array:
+        """(Q, Q) of a camera's free parameters. Raises InputError if none of them varied."""
+        return self.intrinsics[_place(self.camera_idx, camera_idx, "camera")]
+
+
+def _place(varied: NDArray[np.integer], wanted: int, what: str) -> int:
+    found = np.flatnonzero(varied == wanted)
+    if not len(found):
+        raise InputError(f"{what} {wanted} has no covariance: it did not vary, or nothing was observed of it")
+    return int(found[0])
 
 
 def estimate_covariances(

@@ -1,0 +1,1 @@
+"""Lenses: project, unproject and their derivatives."""

@@ -88,6 +88,7 @@ class Camera:
 
     @property
     def is_fisheye(self) -> bool:
+        """Its coefficients are of the angle from the axis."""
         return self.model == CameraModel.OPENCV_FISHEYE
 
     @property

@@ -22,8 +22,8 @@ def add_output_flags(parser: argparse.ArgumentParser, *, has_log: bool = False) 
     parser.set_defaults(has_log=has_log)
     group = parser.add_argument_group("output")
     loudness = group.add_mutually_exclusive_group()
-    loudness.add_argument("-q", "--quiet", action="store_true", help="say only what went wrong")
-    loudness.add_argument("-v", "--verbose", action="store_true", help="say every decision; show tracebacks of bugs")
+    loudness.add_argument("-q", "--quiet", action="store_true", help="print errors only")
+    loudness.add_argument("-v", "--verbose", action="store_true", help="print every decision, and tracebacks of bugs")
     group.add_argument("--json", action="store_true", help="result as JSON on stdout, events as JSON lines on stderr")
 
 

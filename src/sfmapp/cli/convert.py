@@ -13,12 +13,12 @@ FORMATS = ("colmap-bin", "colmap-text", "ply", "bundler", "nerfstudio")
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the commands of this family to the parser."""
     parser = commands.add_parser(
-        "export", help="write a model in another program's format",
+        "export", help="export a model to another program's format",
         description="Write OUT/sparse/0 in another format, read it back, and print the worst reprojection difference.",
     )  # fmt: skip
     parser.add_argument("output", metavar="OUT", type=Path, help="folder of a run")
     parser.add_argument("--to", metavar="FORMAT", required=True, choices=FORMATS, help=", ".join(FORMATS))
-    parser.add_argument("-o", dest="path", metavar="PATH", type=Path, required=True, help="where to write it")
+    parser.add_argument("-o", dest="path", metavar="PATH", type=Path, required=True, help="file or folder to write")
     add_output_flags(parser)
     parser.set_defaults(run=_export)
 

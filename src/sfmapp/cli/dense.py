@@ -45,7 +45,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     raw = argparse.RawDescriptionHelpFormatter
     parser = commands.add_parser(
         "dense", help="cameras and photographs to a dense cloud of oriented patches", epilog=DENSE_EXAMPLES,
-        formatter_class=raw, description="Reconstruct oriented patches all over the surfaces that photographs show.",
+        formatter_class=raw, description="Reconstruct a dense cloud of oriented patches.",
     )  # fmt: skip
     parser.add_argument("source", metavar="SOURCE", type=Path, nargs="?", help="a workspace, or a COLMAP model")
     parser.add_argument(
@@ -56,45 +56,57 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="workspace of the results; default: SOURCE, or SOURCE/sfmapp for a COLMAP model",
     )
     parser.add_argument("--images", metavar="DIR", type=Path, help="folder of the photographs of a COLMAP model")
-    parser.add_argument("--maps", action="store_true", help="depth and normal maps of every view in OUT/dense/maps")
-    parser.add_argument("--list-options", action="store_true", help="list every stage.option and its default")
+    parser.add_argument("--maps", action="store_true", help="also write depth and normal maps to OUT/dense/maps")
+    parser.add_argument(
+        "--list-options", action="store_true", help="list every stage.option with its default and effect"
+    )
     _add_dense_flags(parser)
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_dense, parser=parser)
 
     parser = commands.add_parser(
         "mesh", help="dense patches to a mesh", epilog=MESH_EXAMPLES, formatter_class=raw,
-        description="Make a mesh of dense patches: Poisson, trimmed to what patches and photographs vouch for.",
+        description="Make a mesh of dense patches: a Poisson surface, trimmed to what patches and photographs support.",
     )  # fmt: skip
     parser.add_argument("source", metavar="SOURCE", type=Path, nargs="?", help="a workspace, or a PLY with normals")
-    parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="folder of the mesh of a PLY")
-    parser.add_argument("--list-options", action="store_true", help="list every stage.option and its default")
+    parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="output folder, for a PLY only")
+    parser.add_argument(
+        "--list-options", action="store_true", help="list every stage.option with its default and effect"
+    )
     group = _add_option_flags(parser)
-    group.add_argument("--texture", action="store_true", help="the photographs as a texture of mesh.glb")
-    group.add_argument("--depth", metavar="N", help="of the octree; default: from how dense the patches are")
-    group.add_argument("--no-recording", action="store_true", help="do not show it in dense/recording.rrd")
+    group.add_argument("--texture", action="store_true", help="texture mesh.glb with the photographs")
+    group.add_argument("--depth", metavar="N", help="depth of the octree; default: from the density of the patches")
+    group.add_argument("--no-recording", action="store_true", help="do not add the mesh to dense/recording.rrd")
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_mesh, parser=parser)
 
 
 def _add_option_flags(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
-    group = parser.add_argument_group("options (later ones win: presets in order, then --set, then the flags)")
-    group.add_argument("--preset", metavar="NAME|FILE", action="append", default=[], help="default, fast, or a file")
-    group.add_argument("--set", metavar="STAGE.OPTION=VALUE", action="append", default=[], help="may be repeated")
-    group.add_argument("--threads", metavar="N", help="workers; default: all cores. Results do not depend on it")
+    group = parser.add_argument_group("options (the last one wins: presets in order, then --set, then flags)")
+    group.add_argument(
+        "--preset", metavar="NAME|FILE", action="append", default=[], help="default, fast, or a TOML file"
+    )
+    group.add_argument(
+        "--set", metavar="STAGE.OPTION=VALUE", action="append", default=[], help="any option; repeatable"
+    )
+    group.add_argument(
+        "--threads", metavar="N", help="number of workers, default: all cores; results do not depend on it"
+    )
     return group
 
 
 def _add_dense_flags(parser: argparse.ArgumentParser) -> None:
     group = _add_option_flags(parser)
-    group.add_argument("--level", metavar="N", help="halve the photographs N times; default: 1600 px or less a side")
-    group.add_argument("--ground-sampling", metavar="D", help="instead: what a pixel measures, in units of the world")
-    group.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black is ignored")
+    group.add_argument("--level", metavar="N", help="halve the photographs N times; default: to 1600 px or less a side")
+    group.add_argument(
+        "--ground-sampling", metavar="D", help="instead: the size of a pixel on the surface, world units"
+    )
+    group.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black pixels are ignored")
     group.add_argument(
         "--region", metavar=("X", "Y", "Z", "X", "Y", "Z"), nargs=6,
-        help="lower and upper corner of the box to reconstruct",
+        help="lower and upper corners of the box to reconstruct",
     )  # fmt: skip
-    group.add_argument("--max-memory", metavar="MB", help="work in clusters of views that stay below this")
+    group.add_argument("--max-memory", metavar="MB", help="work on clusters of views that need less than this")
     group.add_argument("--no-recording", action="store_true", help="do not write dense/recording.rrd")
 
 

@@ -25,23 +25,27 @@ formats, told apart by what is in the files:
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command of this family to the parser."""
     parser = commands.add_parser(
-        "evaluate", help="hold a trajectory against the ground truth: ATE, RPE, KITTI's drift, and a picture",
+        "evaluate", help="compare a trajectory with ground truth: ATE, RPE, KITTI's drift, and a plot",
         description="Print the absolute error (ATE), the relative error (RPE) and KITTI's t_rel and r_rel of a "
-        "trajectory, and draw it against the ground truth.",
+        "trajectory, and plot it against the ground truth.",
         epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    parser.add_argument("trajectory", metavar="TRAJ", type=Path, help="the estimate, or the folder of an odometry run")
+    parser.add_argument(
+        "trajectory", metavar="TRAJ", type=Path, help="estimated trajectory, or the folder of an odometry run"
+    )
     parser.add_argument(
         "ground_truth",
         metavar="GROUND_TRUTH",
         type=Path,
-        help="the true poses: a file, or the folder of a sequence that has them",
+        help="ground-truth poses: a file, or the folder of a sequence that has them",
     )
     pairs = parser.add_argument_group("pairs of poses")
     pairs.add_argument("--max-diff", metavar="SECONDS", type=float, default=0.01,
-                       help="poses further apart in time are no pair; default: 0.01")  # fmt: skip
+                       help="largest time difference of a pair; default: 0.01")  # fmt: skip
     pairs.add_argument("--offset", metavar="SECONDS", type=float, default=0.0, help="added to the timestamps of TRAJ")
-    pairs.add_argument("--times", metavar="FILE", type=Path, help="a line of seconds for each of a KITTI trajectory")
+    pairs.add_argument(
+        "--times", metavar="FILE", type=Path, help="timestamps in seconds, a line for each of a KITTI trajectory"
+    )
     errors = parser.add_argument_group("errors")
     errors.add_argument("--align", choices=ALIGNMENTS, action="append",
                         help="sim3: best rotation, translation and scale; se3: the same without scale; origin: the "
@@ -50,12 +54,12 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
                         help="RPE over so many frames, seconds or metres of path, such as 1f, 0.5s, 10m. May be "
                         "repeated; default: a frame, a second, and about a tenth of the path")  # fmt: skip
     errors.add_argument("--all-pairs", action="store_true",
-                        help="RPE over motions from every pose, not from where the one before has ended")  # fmt: skip
-    errors.add_argument("--pairs-from", choices=("ground_truth", "estimate"), default="ground_truth",
-                        help="whose path measures the metres of --delta; default: ground truth")  # fmt: skip
-    drawing = parser.add_argument_group("picture").add_mutually_exclusive_group()
-    drawing.add_argument("--plot", metavar="PNG", type=Path, help="where to draw it; default: TRAJ.png")
-    drawing.add_argument("--no-plot", action="store_true", help="no picture")
+                        help="overlapping RPE: motions from every pose, not end to end")  # fmt: skip
+    errors.add_argument("--pairs-from", choices=("ground-truth", "estimate"), default="ground-truth",
+                        help="whose path the metres of --delta are measured along; default: ground-truth")  # fmt: skip
+    drawing = parser.add_argument_group("plot").add_mutually_exclusive_group()
+    drawing.add_argument("--plot", metavar="PNG", type=Path, help="file of the plot; default: TRAJ.png")
+    drawing.add_argument("--no-plot", action="store_true", help="do not plot")
     add_output_flags(parser)
     parser.set_defaults(run=_evaluate)
 

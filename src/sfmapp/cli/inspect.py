@@ -11,18 +11,20 @@ from sfmapp.cli.common import add_output_flags, listening, print_json
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the commands of this family to the parser."""
     parser = commands.add_parser(
-        "view", help="open the recording of a run in rerun",
-        description="Open OUT/dense/recording.rrd or, where there is none, OUT/recording.rrd in rerun's viewer; serve "
-        "it on 127.0.0.1 where there is no display.",
+        "view", help="replay a run in rerun",
+        description="Open OUT/dense/recording.rrd or, if there is none, OUT/recording.rrd in rerun; serve "
+        "it on 127.0.0.1 if there is no display.",
     )  # fmt: skip
     parser.add_argument("output", metavar="OUT", type=Path, help="folder of a run, or a recording in it (.rrd)")
-    parser.add_argument("--serve", action="store_true", help="for a browser on this machine, even if there is a screen")
-    parser.add_argument("--port", metavar="N", type=int, default=9090, help="where to serve; default: 9090")
+    parser.add_argument(
+        "--serve", action="store_true", help="serve it for a browser on this machine, even if there is a display"
+    )
+    parser.add_argument("--port", metavar="N", type=int, default=9090, help="port to serve on; default: 9090")
     add_output_flags(parser)
     parser.set_defaults(run=_view)
 
     parser = commands.add_parser(
-        "validate", help="compare with pycolmap on the same photographs, and with the ground truth",
+        "validate", help="compare a result with pycolmap and with ground truth",
         description="Run pycolmap on the same photographs and print both results side by side; with "
         "--ground-truth-cloud, score the dense cloud and the mesh instead.",
     )  # fmt: skip
@@ -34,14 +36,14 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument(
         "--ground-truth-cloud", metavar="PLY", type=Path,
-        help="true cloud or mesh: accuracy, completeness and F-score at 1, 2 and 5 times a distance; with "
+        help="ground-truth cloud or mesh: accuracy, completeness and F-score at 1, 2 and 5 times a distance; with "
         "--ground-truth the result is first aligned by its cameras",
     )  # fmt: skip
     parser.add_argument(
         "--distance",
         metavar="D",
         type=float,
-        help="in units of the true cloud; default: a pixel at the patches, median",
+        help="in units of the ground truth; default: the median size of a pixel",
     )
     add_output_flags(parser)
     parser.set_defaults(run=_validate)

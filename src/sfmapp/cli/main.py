@@ -72,7 +72,7 @@ def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     parser = argparse.ArgumentParser(
         prog="sfmapp",
-        description="Photographs and video into cameras, points and trajectories, on an ordinary CPU.",
+        description="Photographs and video into cameras, points, surfaces and trajectories, on an ordinary CPU.",
         epilog=EXIT_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

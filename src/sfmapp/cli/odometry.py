@@ -33,7 +33,7 @@ ground truth and IMU are found by themselves. With two cameras lengths are metre
 unless --scale tells it. OUT/report.html tells how good it is, where there are gaps, and why."""
 
 SCALE = (
-    "where metres come from: marker:DICT:METRES (side of an ArUco or AprilTag marker), distance:A:B:METRES (between "
+    "source of metric scale: marker:DICT:METRES (side of an ArUco or AprilTag marker), distance:A:B:METRES (between "
     "the cameras of two frames), camera_height:METRES (over level ground), imu (the default where there is one), or "
     "arbitrary"
 )
@@ -44,27 +44,31 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = commands.add_parser(
         "odometry", help="a sequence of frames to a trajectory and a map", epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Follow a camera, or a stereo pair, through a sequence.",
+        description="Estimate the trajectory of a camera or a stereo pair, and a map, from a sequence of frames.",
     )  # fmt: skip
-    parser.add_argument("sequence", metavar="SEQUENCE", nargs="?", help="folder, video, stream or data set")
-    parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="folder of the results, made if need be")
-    parser.add_argument("--list-options", action="store_true", help="list every stage.option and its default")
+    parser.add_argument(
+        "sequence", metavar="SEQUENCE", nargs="?", help="a folder of frames, a video, a stream or a data set"
+    )
+    parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="output folder, created if missing")
+    parser.add_argument(
+        "--list-options", action="store_true", help="list every stage.option with its default and effect"
+    )
     _add_sequence_flags(parser)
-    group = parser.add_argument_group("looking at it")
-    group.add_argument("--view", action="store_true", help="watch in rerun while it runs")
-    group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, which replays the run")
+    group = parser.add_argument_group("viewing")
+    group.add_argument("--view", action="store_true", help="watch the run live in rerun")
+    group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, the replay of the run")
     _add_option_flags(parser)
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_odometry, parser=parser)
 
     parser = commands.add_parser(
-        "refine", help="adjust the map of an odometry run whole, and add photographs",
-        description="Adjust the maps of an odometry run whole, move its trajectory with them, and add photographs.",
+        "refine", help="adjust the maps of an odometry run globally, and add photographs",
+        description="Adjust the maps of an odometry run globally, move its trajectory along, and register photographs.",
     )  # fmt: skip
-    parser.add_argument("run_folder", metavar="OUT", type=Path, help="folder of an odometry run; it is not changed")
-    parser.add_argument("-o", "--output", metavar="OUT2", type=Path, help="folder of the results; default: OUT/refined")
+    parser.add_argument("run_folder", metavar="OUT", type=Path, help="folder of an odometry run, which is not changed")
+    parser.add_argument("-o", "--output", metavar="OUT2", type=Path, help="output folder; default: OUT/refined")
     parser.add_argument("--add-photos", metavar="DIR", help="photographs to register in the largest map")
-    parser.add_argument("--free-intrinsics", action="store_true", help="refine the calibration of the sequence as well")
+    parser.add_argument("--free-intrinsics", action="store_true", help="also refine the calibration of the sequence")
     _add_option_flags(parser)
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_refine, parser=parser)
@@ -73,24 +77,32 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _add_sequence_flags(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("sequence")
     group.add_argument("--camera", metavar="MODEL,...|FILE", help="intrinsics, such as PINHOLE,fx,fy,cx,cy, or a file")
-    group.add_argument("--self-calibrate", action="store_true", help="find them from the first minute")
+    group.add_argument("--self-calibrate", action="store_true", help="calibrate the camera from the first minute")
     group.add_argument("--mono", action="store_true", help="use the first camera alone")
-    group.add_argument("--ground-truth", metavar="FILE", help="true trajectory of TUM, KITTI or EuRoC, to compare with")
-    group.add_argument("--imu", metavar="FILE", help="inertial measurements in EuRoC's form")
+    group.add_argument(
+        "--ground-truth", metavar="FILE", help="ground-truth trajectory (TUM, KITTI or EuRoC) to compare with"
+    )
+    group.add_argument("--imu", metavar="FILE", help="inertial measurements in EuRoC's format")
     group.add_argument("--scale", metavar="SOURCE", help=SCALE)
     group.add_argument("--start", metavar="N", help="first frame to play")
     group.add_argument("--stop", metavar="N", help="play the frames before this one")
-    group.add_argument("--step", metavar="N", help="play every N-th frame")
+    group.add_argument("--step", metavar="N", help="play every Nth frame")
     group.add_argument("--reverse", action="store_true", help="play it backwards")
-    group.add_argument("--fps", metavar="RATE", help="frames per second, in place of times that the sequence holds")
+    group.add_argument("--fps", metavar="RATE", help="frame rate; overrides the timestamps of the sequence")
 
 
 def _add_option_flags(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("options (later ones win: presets in order, then --set, then the flags)")
-    group.add_argument("--preset", metavar="NAME|FILE", action="append", default=[], help="may be repeated")
-    group.add_argument("--set", metavar="STAGE.OPTION=VALUE", action="append", default=[], help="may be repeated")
-    group.add_argument("--seed", metavar="N", help="start of every random choice; the same seed, the same bytes")
-    group.add_argument("--threads", metavar="N", help="workers; default: all cores. Results do not depend on it")
+    group = parser.add_argument_group("options (the last one wins: presets in order, then --set, then flags)")
+    group.add_argument(
+        "--preset", metavar="NAME|FILE", action="append", default=[], help="default, fast, quality, or a TOML file"
+    )
+    group.add_argument(
+        "--set", metavar="STAGE.OPTION=VALUE", action="append", default=[], help="any option; repeatable"
+    )
+    group.add_argument("--seed", metavar="N", help="seed of all random choices; the same seed gives the same bytes")
+    group.add_argument(
+        "--threads", metavar="N", help="number of workers, default: all cores; results do not depend on it"
+    )
 
 
 def _options(args: argparse.Namespace) -> Options:

@@ -41,18 +41,20 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "reconstruct", help="photographs to cameras and points", epilog=EXAMPLES, formatter_class=raw,
         description="Reconstruct cameras and points from photographs.",
     )  # fmt: skip
-    parser.add_argument("images", metavar="IMAGES", nargs="?", help="a folder, a glob in quotes, or a .txt list")
-    parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="folder of the results, made if need be")
-    parser.add_argument("--dense", action="store_true", help="go on to dense patches: OUT/dense/fused.ply")
-    parser.add_argument("--mesh", action="store_true", help="go on to a mesh as well: OUT/mesh/mesh.ply and mesh.glb")
-    parser.add_argument("--texture", action="store_true", help="with --mesh: the photographs as a texture of mesh.glb")
-    parser.add_argument("--list-options", action="store_true", help="list every stage.option and its default")
+    parser.add_argument("images", metavar="IMAGES", nargs="?", help="a folder, a quoted glob, or a .txt list of files")
+    parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="output folder, created if missing")
+    parser.add_argument("--dense", action="store_true", help="also compute dense patches: OUT/dense/fused.ply")
+    parser.add_argument("--mesh", action="store_true", help="also make a mesh: OUT/mesh/mesh.ply and mesh.glb")
+    parser.add_argument("--texture", action="store_true", help="with --mesh: texture mesh.glb with the photographs")
+    parser.add_argument(
+        "--list-options", action="store_true", help="list every stage.option with its default and effect"
+    )
     _add_option_flags(parser)
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_reconstruct, parser=parser)
 
     parser = commands.add_parser(
-        "demo", help="reconstruct the bundled sample and compare it with the ground truth",
+        "demo", help="reconstruct the bundled sample and compare it with its ground truth",
         description="Reconstruct the bundled sample, a rendered courtyard, and print the pose error against the "
         "ground truth.",
     )  # fmt: skip
@@ -63,14 +65,18 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _add_option_flags(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("options (later ones win: presets in order, then --set, then the flags)")
+    group = parser.add_argument_group("options (the last one wins: presets in order, then --set, then flags)")
     group.add_argument(
         "--preset", metavar="NAME|FILE", action="append", default=[],
-        help="default, fast, quality, or a TOML file of yours; may be repeated",
+        help="default, fast, quality, or a TOML file; repeatable",
     )  # fmt: skip
-    group.add_argument("--set", metavar="STAGE.OPTION=VALUE", action="append", default=[], help="may be repeated")
-    group.add_argument("--seed", metavar="N", help="start of every random choice; the same seed, the same bytes")
-    group.add_argument("--threads", metavar="N", help="workers; default: all cores. Results do not depend on it")
+    group.add_argument(
+        "--set", metavar="STAGE.OPTION=VALUE", action="append", default=[], help="any option; repeatable"
+    )
+    group.add_argument("--seed", metavar="N", help="seed of all random choices; the same seed gives the same bytes")
+    group.add_argument(
+        "--threads", metavar="N", help="number of workers, default: all cores; results do not depend on it"
+    )
     cameras = group.add_mutually_exclusive_group()
     cameras.add_argument(
         "--camera", metavar="MODEL,...|FILE",
@@ -78,9 +84,9 @@ def _add_option_flags(parser: argparse.ArgumentParser) -> None:
         "by the names of images, or of folders such as cam0), or numbers such as PINHOLE,fx,fy,cx,cy",
     )  # fmt: skip
     cameras.add_argument("--camera-model", metavar="MODEL", help=", ".join(CAMERA_MODELS))
-    group.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black is ignored")
-    group.add_argument("--min-registered", metavar="N", help="exit code 5 if fewer images are registered")
-    group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, which replays the run")
+    group.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black pixels are ignored")
+    group.add_argument("--min-registered", metavar="N", help="exit with code 5 if fewer images are registered")
+    group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, the replay of the run")
 
 
 def _options(args: argparse.Namespace) -> Options:

@@ -36,22 +36,22 @@ The same command again resumes a run that was cut off."""
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the commands of this family to the parser."""
     parser = commands.add_parser(
-        "undistort", help="photographs without distortion and a PINHOLE model, for splatting and stereo",
-        description="Take the distortion of the lens out of the photographs of a model.", epilog=EXAMPLES,
+        "undistort", help="undistorted photographs and a PINHOLE model, for splatting and stereo",
+        description="Remove the distortion of the lens from the photographs of a model.", epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("source", metavar="SOURCE", type=Path, help="a workspace, or a COLMAP model")
-    parser.add_argument(
-        "-o", "--output", metavar="DIR", type=Path, required=True, help="where to write; a new folder, or an empty one"
-    )
+    parser.add_argument("-o", "--output", metavar="DIR", type=Path, required=True, help="output folder, new or empty")
     parser.add_argument("--images", metavar="DIR", type=Path, help="folder of the photographs of a COLMAP model")
-    parser.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black is ignored")
+    parser.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black pixels are ignored")
     parser.add_argument(
         "--blank-pixels", metavar="SHARE", type=float, default=0.0,
-        help="from 0, cropped until no pixel is blank (default), to 1, all that the photograph shows",
+        help="0 crops until no pixel is blank (default), 1 keeps all that the photographs show",
     )  # fmt: skip
-    parser.add_argument("--max-size", metavar="PX", type=int, help="largest side of the pictures; default: no limit")
-    parser.add_argument("--threads", metavar="N", help="workers; default: all cores. Results do not depend on it")
+    parser.add_argument("--max-size", metavar="PX", type=int, help="limit of the longer side in pixels; default: none")
+    parser.add_argument(
+        "--threads", metavar="N", help="number of workers, default: all cores; results do not depend on it"
+    )
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_undistort)
 

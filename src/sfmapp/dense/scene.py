@@ -18,7 +18,7 @@ class DenseView:
     Attributes:
         name: of the photograph in the model.
         rgb: (H, W, 3) uint8.
-        mask: (H, W) bool, True where there is something to reconstruct; None foreverywhere.
+        mask: (H, W) bool, True where there is something to reconstruct; None for everywhere.
         k: (4,) float64 ``fx, fy, cx, cy`` in pixels of this resolution, the centre of the top-left one (0.5, 0.5).
         cam_from_world: (7,) float64.
         orientation: EXIF orientation 1 to 8 of these pixels, for whoever shows them to people.

@@ -96,7 +96,7 @@ def lay_out(
     Args:
         canvas: made for its camera.
         rgb: (H, W, 3).
-        mask: (H, W), True where it may be used; None foreverywhere.
+        mask: (H, W), True where it may be used; None for everywhere.
 
     Returns:
         (h, w, 3) colours and (h, w) mask, False also where the photograph shows nothing; None for True everywhere.

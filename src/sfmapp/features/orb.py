@@ -17,7 +17,7 @@ def extract_orb(
 
     Args:
         gray: (H, W) uint8.
-        usable: (H, W) bool, False where nothing may be detected; None foreverywhere.
+        usable: (H, W) bool, False where nothing may be detected; None for everywhere.
         max_num_features: the strongest so many are kept.
 
     Returns:

@@ -39,7 +39,7 @@ FloatImage = NDArray[np.float32]
 
 
 class Scratch:
-    """Memory for the scale space of one image at a time: taking 150 MB a megapixel and a half anew forevery image
+    """Memory for the scale space of one image at a time: taking 150 MB a megapixel and a half anew for every image
     costs as much time as its descriptors.
 
     Levels 1 to 3 of the first octave come first, as they are needed to the end. Its other three take as much memory as
@@ -95,7 +95,7 @@ def extract_sift(
 
     Args:
         gray: (H, W) uint8.
-        usable: (H, W) bool, False where nothing may be detected; None foreverywhere.
+        usable: (H, W) bool, False where nothing may be detected; None for everywhere.
         max_num_features: the strongest so many are kept, with some regard to their spread over the image.
         max_num_orientations: descriptors at one place, at most; seconds only where the budget has room.
         contrast_threshold: least difference of Gaussians, for grey levels in [0, 1]; lowered for flat images.

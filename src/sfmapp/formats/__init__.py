@@ -1,0 +1,1 @@
+"""File formats of other programs, and every change of convention."""

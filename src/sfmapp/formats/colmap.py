@@ -35,7 +35,7 @@ def write_model(folder: str | Path, reconstruction: Reconstruction, keypoints: K
     Args:
         folder: where the five files go.
         reconstruction: images without a pose and points without coordinates are left out.
-        keypoints: forevery image, registered or not, (N, 2) or wider, pixels: all become keypoints of the model, so
+        keypoints: for every image, registered or not, (N, 2) or wider, pixels: all become keypoints of the model, so
             that their positions agree with the database; tracked ones take the pixel from the tracks, which may have
             been refined. None: just the tracked ones, in the order of their positions.
 

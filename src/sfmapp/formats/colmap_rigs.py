@@ -174,7 +174,7 @@ def poses_from_frames(
             poses[image_id] = pose if is_reference else rigid3.compose(sensor_from_rig, pose)
     missing = [int(image_id) for image_id in image_ids if int(image_id) not in poses]
     if missing:
-        raise InputError(f"{path}: expected a frame forevery image, found none for image {missing[0]}")
+        raise InputError(f"{path}: expected a frame for every image, found none for image {missing[0]}")
     return np.array([poses[int(image_id)] for image_id in image_ids]).reshape(-1, 7)
 
 

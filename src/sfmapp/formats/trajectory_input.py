@@ -53,7 +53,7 @@ class TrajectoryFile:
     """
 
     path: Path
-    format: TrajectoryFormat | Literal["folder", "video"]
+    format: TrajectoryFormat | Literal["folder", "video", "arrays"]
     trajectory: Trajectory
     is_numbered: bool = False
     note: str = ""

@@ -1,0 +1,1 @@
+"""Pure functions on arrays: rotations, triangulation, resection, two views."""

@@ -1,14 +1,19 @@
 """Rigid motions in three dimensions as plain arrays.
 
 A pose ``b_from_a`` is ``(..., 7)`` float64: quaternion x, y, z, w, then translation, with ``x_b = R x_a + t``.
-Every function broadcasts over leading axes. Quaternions and rotation formulas follow Sola et al., "A micro Lie theory
-for state estimation in robotics", 2018, and Sola, "Quaternion kinematics for the error-state Kalman filter", 2017.
+Every function broadcasts over leading axes; :class:`Rigid3` is one such pose as a value. Quaternions and rotation
+formulas follow Sola et al., "A micro Lie theory for state estimation in robotics", 2018, and Sola, "Quaternion
+kinematics for the error-state Kalman filter", 2017.
 """
 
 from __future__ import annotations
 
+from typing import Any, overload
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from sfmapp.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -119,3 +124,114 @@ def log_so3(rotation: ArrayLike) -> Array:
 def rotation_angle_deg(rotation: ArrayLike) -> Array:
     """Angles (...) in degrees, 0 to 180, of rotation matrices (..., 3, 3)."""
     return np.degrees(np.linalg.norm(log_so3(rotation), axis=-1))
+
+
+class Rigid3:
+    """A rigid motion ``b_from_a``, ``x_b = R x_a + t``: one pose of the arrays that everything here works on.
+
+    It goes wherever an array of shape (7,) does, as ``numpy.asarray(pose)`` gives that; ``c_from_b @ b_from_a`` is the
+    one after the other, ``b_from_a @ points`` moves points (..., 3). It cannot be changed.
+
+    Args:
+        pose: (7,) quaternion x, y, z, w, then translation. A quaternion that is not of unit length is scaled to it.
+
+    Raises:
+        InputError: another shape, NaN or infinity, or a quaternion of length zero.
+
+    Example:
+        >>> cam_from_world = sfmapp.Rigid3.from_matrix(R, t)
+        >>> cam_from_world.center  # of the camera in the world: -R^T t
+        >>> x_cam = cam_from_world @ x_world
+    """
+
+    __slots__ = ("_pose",)
+
+    def __init__(self, pose: ArrayLike) -> None:
+        values = np.array(pose, np.float64)
+        if values.shape != (7,) or not np.isfinite(values).all() or not values[:4].any():
+            raise InputError(
+                f"pose: expected a quaternion x, y, z, w and a translation, 7 finite numbers, found {values}"
+            )
+        length = float(np.linalg.norm(values[:4]))
+        if abs(length - 1.0) > 1e-12:
+            values[:4] /= length
+        values.setflags(write=False)
+        self._pose = values
+
+    @classmethod
+    def identity(cls) -> Rigid3:
+        """No motion."""
+        return cls(IDENTITY)
+
+    @classmethod
+    def from_matrix(cls, rotation: ArrayLike, translation: ArrayLike | None = None) -> Rigid3:
+        """The motion of a rotation matrix (3, 3) and a translation (3,), or of both in one matrix (3, 4) or (4, 4).
+
+        Raises:
+            InputError: another shape, or no rotation: its columns are not orthonormal to 1e-3, or it is a reflection.
+        """
+        matrix = np.array(rotation, np.float64)
+        if translation is None and matrix.shape in ((3, 4), (4, 4)):
+            matrix, translation = matrix[:3, :3], matrix[:3, 3]
+        moved = np.zeros(3) if translation is None else np.asarray(translation, np.float64)
+        if matrix.shape != (3, 3) or moved.shape != (3,):
+            raise InputError(
+                "pose: expected a rotation (3, 3) and a translation (3,), or one matrix (3, 4) or (4, 4), found "
+                f"{matrix.shape} and {moved.shape}"
+            )
+        if not np.allclose(matrix.T @ matrix, np.eye(3), atol=1e-3) or np.linalg.det(matrix) < 0:
+            raise InputError("pose: expected a rotation matrix, found one that is not orthonormal or mirrors")
+        return cls(from_matrix(matrix, moved))
+
+    @property
+    def quaternion(self) -> Array:
+        """(4,) x, y, z, w."""
+        return self._pose[:4]
+
+    @property
+    def translation(self) -> Array:
+        """(3,) t: where the origin of a lies in b."""
+        return self._pose[4:]
+
+    @property
+    def rotation(self) -> Array:
+        """(3, 3) R."""
+        return rotation_matrix(self._pose)
+
+    @property
+    def matrix(self) -> Array:
+        """(4, 4) for homogeneous coordinates."""
+        out = np.eye(4)
+        out[:3, :3], out[:3, 3] = self.rotation, self.translation
+        return out
+
+    @property
+    def center(self) -> Array:
+        """(3,) where the origin of b lies in a: the camera centre of a pose ``cam_from_world``."""
+        return center(self._pose)
+
+    def inverse(self) -> Rigid3:
+        """``a_from_b``."""
+        return Rigid3(inverse(self._pose))
+
+    @overload
+    def __matmul__(self, other: Rigid3) -> Rigid3: ...
+    @overload
+    def __matmul__(self, other: ArrayLike) -> Array: ...
+    def __matmul__(self, other: Rigid3 | ArrayLike) -> Rigid3 | Array:
+        if isinstance(other, Rigid3):
+            return Rigid3(compose(self._pose, other._pose))
+        return apply(self._pose, other)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.array(self._pose, dtype) if copy or dtype is not None else self._pose
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Rigid3) and np.array_equal(self._pose, other._pose)
+
+    def __hash__(self) -> int:
+        return hash(self._pose.tobytes())
+
+    def __repr__(self) -> str:
+        q, t = (" ".join(f"{value:.6g}" for value in part) for part in (self.quaternion, self.translation))
+        return f"Rigid3(quaternion xyzw {q}, translation {t})"

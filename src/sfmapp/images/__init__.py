@@ -1,0 +1,1 @@
+"""Where pixels come from: files, arrays, video, EXIF and masks."""

@@ -45,44 +45,36 @@ class ArraySource:
         return self.masks.get(name)
 
 
-def describe_source(
-    source: ImageSource,
-    options: ImageOptions | None = None,
-    *,
-    camera: Camera | None = None,
-) -> ImageSet:
+def describe_source(source: ImageSource, options: ImageOptions | None = None) -> ImageSet:
     """The images of a source in its own order, with their cameras.
 
     Args:
         source: every image of it is looked at once.
         options: what is known about the cameras; names and sizes count as they do for files without EXIF.
-        camera: what took them all, in place of the options; its parameters count as known to a per cent, exactly if
-            ``is_fixed``.
 
     Returns:
         The set. Its ``root`` is None.
 
     Raises:
-        InputError: two images of one name, a name that leads out of its folder, or an array that is no picture, or of
-            another size than the camera's.
+        InputError: two images of one name, a name that leads out of its folder, or an array that is no picture.
     """
     options = options or ImageOptions()
     names = list(source.names)
     if len(set(names)) < len(names):
         raise InputError(f"images: expected unique names, found {len(names) - len(set(names))} of them twice")
     records = [_described(source, name, options) for name in names]
-    if camera is None:
-        shots = [Shot(record.name, record.width, record.height, ExifFacts()) for record in records]
-        cameras, camera_idx, _, _ = group_cameras(shots, options)
-        images = tuple(replace(record, camera_idx=idx) for record, idx in zip(records, camera_idx, strict=True))
-        return ImageSet(images, tuple(cameras))
-    for record in records:
-        if (record.width, record.height) != (camera.width, camera.height):
-            raise InputError(
-                f"{record.name}: {record.width}x{record.height} pixels, but its camera has "
-                f"{camera.width}x{camera.height}"
-            )
-    return ImageSet(tuple(records), (known_camera(camera),))
+    shots = [Shot(record.name, record.width, record.height, ExifFacts()) for record in records]
+    cameras, camera_idx, _, _ = group_cameras(shots, options)
+    images = tuple(replace(record, camera_idx=idx) for record, idx in zip(records, camera_idx, strict=True))
+    return ImageSet(images, tuple(cameras))
+
+
+def check_size(record: ImageRecord, camera: Camera) -> None:
+    """Raises InputError if an image has not the size of a camera."""
+    if (record.width, record.height) != (camera.width, camera.height):
+        raise InputError(
+            f"{record.name}: {record.width}x{record.height} pixels, but its camera has {camera.width}x{camera.height}"
+        )
 
 
 def known_camera(camera: Camera) -> Camera:

@@ -153,7 +153,7 @@ def decode_gray(data: bytes, header: Header, white: int) -> tuple[Pixels, int]:
     else:
         raw = decode_bytes(data, header)
         if raw is not None and raw.dtype == np.uint16:
-            raw, white = _scaled_to_8_bits(raw, white)
+            raw, white = scaled_to_8_bits(raw, white)
         gray = raw
         if raw is not None and raw.ndim == 3:
             gray = cv2.cvtColor(raw, cv2.COLOR_RGBA2GRAY if raw.shape[2] == 4 else cv2.COLOR_RGB2GRAY)
@@ -162,7 +162,7 @@ def decode_gray(data: bytes, header: Header, white: int) -> tuple[Pixels, int]:
     return gray, white
 
 
-def _scaled_to_8_bits(raw: NDArray[np.uint16], white: int) -> tuple[Pixels, int]:
+def scaled_to_8_bits(raw: NDArray[np.uint16], white: int) -> tuple[Pixels, int]:
     """uint16 values as uint8, with rounding, and the smallest white of 8, 10, 12, 14 or 16 bits that holds them all."""
     largest = max(white, int(raw.max(initial=0)))
     white = next(value for bits in (8, 10, 12, 14, 16) if largest <= (value := (1 << bits) - 1))

@@ -31,7 +31,7 @@ class Picture:
     Attributes:
         rgb: (H, W, 3) uint8.
         gray: (H, W) uint8.
-        mask: (H, W) bool, True where the picture may be used; None foreverywhere. Mask file and alpha combined.
+        mask: (H, W) bool, True where the picture may be used; None for everywhere. Mask file and alpha combined.
     """
 
     rgb: Pixels
@@ -81,7 +81,7 @@ def read_rgb_and_gray(record: ImageRecord) -> tuple[Pixels, Pixels]:
 
 
 def read_mask(record: ImageRecord) -> NDArray[np.bool_] | None:
-    """(H, W) bool, True where the picture may be used, from its mask file and its alpha channel; None foreverywhere.
+    """(H, W) bool, True where the picture may be used, from its mask file and its alpha channel; None for everywhere.
 
     Raises:
         InputError: the image or its mask cannot be read.

@@ -14,7 +14,7 @@ from sfmapp.option_checks import Range, check_options
 from sfmapp.scene.rig import Rig
 
 Array = NDArray[np.float64]
-SequenceKind = Literal["kitti", "tum", "euroc", "folder", "video"]
+SequenceKind = Literal["kitti", "tum", "euroc", "folder", "video", "arrays"]
 
 STAGE = "sequence"
 """Stage of the events that tell of opening and reading a sequence."""

@@ -1,0 +1,1 @@
+"""Verified matches to a reconstruction."""

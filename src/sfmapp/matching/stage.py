@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera
+from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.geometry import epipolar
 from sfmapp.matching import guided
-from sfmapp.matching.coarse_to_fine import is_guidable, match_features
+from sfmapp.matching.coarse_to_fine import Putative, is_guidable, match_features
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.products import Ints
 from sfmapp.matching.two_view import Ransac, TwoViewGeometry, error_threshold_px, verify_pair
@@ -33,6 +34,7 @@ __all__ = [
     "match_images",
     "match_pair",
     "split_pairs",
+    "verify_matches",
 ]
 
 _STAGE = "matching"
@@ -132,18 +134,92 @@ def match_images(
     return join_pairs(pair_image_idx, results), report
 
 
+def verify_matches(
+    image_set: ImageSet,
+    features: Sequence[Features],
+    matches: Iterable[tuple[int, int, NDArray[np.integer]]],
+    options: MatchingOptions,
+    *,
+    seed: int,
+    threads: int,
+    events: Events,
+) -> tuple[Correspondences, dict[str, Any]]:
+    """Verify matches that somebody else has found; otherwise as :func:`match_images`.
+
+    Args:
+        matches: two positions i < j of images, no two pairs alike, and (K, 2) positions of their keypoints. What gives
+            them is asked in the calling thread, one pair after the other.
+
+    Raises:
+        InputError: positions of images or keypoints that are not there, or a pair that comes twice.
+        InterruptedRunError: a stop was asked for.
+    """
+    start = time.monotonic()
+    cameras = [image_set.cameras[image.camera_idx] for image in image_set.images]
+    events.started(_STAGE, "verifying matches", total=None)
+    futures: dict[tuple[int, int], Future[MatchedPair]] = {}
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        try:
+            for i, j, found in matches:
+                if not 0 <= i < j < len(cameras) or (i, j) in futures:
+                    text = f"expected each pair once, with positions i < j below {len(cameras)}"
+                    raise InputError(f"matches of images {i} and {j}: {text}")
+                pair = features[i], features[j]
+                checked = _checked_matches(found, (len(pair[0]), len(pair[1])), (i, j))
+                futures[i, j] = pool.submit(
+                    match_pair, pair, (None, None), (cameras[i], cameras[j]), options, (seed, i, j), checked
+                )
+                events.advanced(_STAGE)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+        pairs = sorted(futures)
+        results = [futures[pair].result() for pair in pairs]
+    report = _report(pairs, results, 0, time.monotonic() - start)
+    events.finished(_STAGE, f"{report['num_verified_pairs']} of {len(pairs)} pairs verified", **report)
+    return join_pairs(np.array(pairs, np.int32), results), report
+
+
+def _checked_matches(
+    matches: NDArray[np.integer], num_keypoints: tuple[int, int], images: tuple[int, int]
+) -> NDArray[np.int32]:
+    array = np.asarray(matches)
+    if array.size == 0:
+        return np.zeros((0, 2), np.int32)
+    where = f"matches of images {images[0]} and {images[1]}"
+    if array.ndim != 2 or array.shape[1] != 2 or array.dtype.kind not in "iu":
+        raise InputError(f"{where}: expected whole numbers (K, 2), found {array.dtype} {array.shape}")
+    low, high = array.min(axis=0), array.max(axis=0)
+    if low.min() < 0 or (high >= num_keypoints).any():
+        raise InputError(
+            f"{where}: expected positions among {num_keypoints[0]} and {num_keypoints[1]} keypoints, found "
+            f"{low.tolist()} to {high.tolist()}"
+        )
+    return np.ascontiguousarray(array, np.int32)
+
+
 def match_pair(
     features: tuple[Features, Features],
     backgrounds: tuple[Ints | None, Ints | None],
     cameras: tuple[Camera, Camera],
     options: MatchingOptions,
     seed: tuple[int, int, int],
+    given: NDArray[np.int32] | None = None,
 ) -> MatchedPair:
-    """Match and verify one pair; seed is the run's seed and the positions of the two images."""
+    """Match and verify one pair, or verify matches that are given.
+
+    Args:
+        backgrounds: see ``match_features``.
+        seed: the run's seed and the positions of the two images.
+        given: (K, 2) int32 matches, in place of those that we find.
+    """
     start = time.thread_time()
     # 31 bits: OpenCV's state is a signed int
     ransac = Ransac(options.max_ransac_trials, int(np.random.SeedSequence(seed).generate_state(1)[0]) & 0x7FFFFFFF)
-    putative = match_features(features, backgrounds, error_threshold_px(*cameras, options), options, ransac)
+    if given is not None:
+        putative = Putative(given)
+    else:
+        putative = match_features(features, backgrounds, error_threshold_px(*cameras, options), options, ransac)
     xy1, xy2 = (
         np.ascontiguousarray(f.keypoints[putative.matches[:, side], :2], np.float64) for side, f in enumerate(features)
     )

@@ -1,0 +1,1 @@
+"""Frames to a trajectory and a keyframe map."""

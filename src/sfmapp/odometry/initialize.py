@@ -71,7 +71,7 @@ class MapInitializer:
 
     Attributes:
         first: pyramid of the first view. corners: (N, 2) where they were in it.
-        seen: forevery frame since, (N, 2) where the corners are, NaN where they were lost; first the corners.
+        seen: for every frame since, (N, 2) where the corners are, NaN where they were lost; first the corners.
         reason: why there is no map yet.
         is_still, is_turn: of the last frame: the picture has hardly moved since the first view, or as by a mere turn.
     """

@@ -1,0 +1,1 @@
+"""Policies: what is done in which order, kept and written."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model, write_model, write_model_text
-from sfmapp.images.sources import find_images
+from sfmapp.formats.colmap_model import model_from_reconstruction, reconstruction_from_model
 from sfmapp.pipelines.stored_pixels import check_pixels
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.workspace.layout import USUAL_FOLDERS
-from sfmapp.workspace.manifest import read_manifest
+from sfmapp.workspace.manifest import image_root, read_manifest
 
 _NOTICEABLE_PX = 0.1  # below the noise of a keypoint
 
 
 @dataclass(frozen=True)
 class _Source:
-    """The model to export: where it lies, and where its images do, if that is known."""
+    """The model to export: where it lies, if it does, and where its images do, if that is known."""
 
-    folder: Path
+    folder: Path | None
     model: Reconstruction
     keypoints: list[NDArray[np.float64]]
     image_folder: Path | None
@@ -44,13 +44,23 @@ class _Copy:
     notes: tuple[str, ...] = ()
 
 
-def export_model(output: str | os.PathLike[str], target: str, path: str | os.PathLike[str]) -> dict[str, Any]:
+def export_model(
+    output: str | os.PathLike[str] | Reconstruction,
+    target: str,
+    path: str | os.PathLike[str],
+    *,
+    images: str | os.PathLike[str] | None = None,
+    keypoints: list[NDArray[np.float64]] | None = None,
+) -> dict[str, Any]:
     """Write a model in another format, read it back and re-project every inlier with what was read.
 
     Args:
-        output: the workspace of a run, of which the largest model is taken, or the folder of a COLMAP model.
+        output: the workspace of a run, of which the largest model is taken, the folder of a COLMAP model, or a
+            reconstruction in memory.
         target: one of ``EXPORTS``.
         path: where to write: a folder for COLMAP's formats, a file or folder for the others.
+        images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
+        keypoints: of a reconstruction in memory, (N, 2) pixels for each image; None: the tracked ones.
 
     Returns:
         JSON-able: ``format``, ``files``, ``reader`` (what read it back), ``num_images``, ``num_points``,
@@ -65,7 +75,12 @@ def export_model(output: str | os.PathLike[str], target: str, path: str | os.Pat
     """
     if target not in EXPORTS:
         raise UsageError(f"unknown export format {target!r}, expected one of {', '.join(EXPORTS)}")
-    source = _source(Path(output))
+    if isinstance(output, Reconstruction):
+        source = _in_memory(output, keypoints)
+    else:
+        source = _source(Path(output))
+    if images is not None:
+        source = replace(source, image_folder=Path(images))
     copy = EXPORTS[target](source, Path(path))
     ours, theirs = source.model, copy.model
     same_names = len(theirs.image_names) == len(ours.image_names) and all(
@@ -89,38 +104,30 @@ def export_model(output: str | os.PathLike[str], target: str, path: str | os.Pat
     }
 
 
+def _in_memory(model: Reconstruction, keypoints: list[NDArray[np.float64]] | None) -> _Source:
+    """What a file would hold of a reconstruction: the registered images, the triangulated points, the inliers."""
+    written = model_from_reconstruction(model, keypoints)
+    held, held_keypoints, _ = reconstruction_from_model(Path("reconstruction"), written)
+    return _Source(None, held, held_keypoints, None)
+
+
 def _source(output: Path) -> _Source:
-    folder, image_source = output, None
+    folder, image_folder = output, None
     if (output / "run.json").is_file():
         manifest = read_manifest(output)
         check_pixels(output, manifest)
-        image_source = str(manifest.get("source") or "")
+        image_folder = image_root(manifest)
         folder = output / "sparse" / "0"
         if not has_model(folder):
             raise NoReconstructionError(f"{output} holds no model to export", "run sfmapp reconstruct first")
-    elif not has_model(output) and has_model(output / "sparse" / "0"):
-        folder = output / "sparse" / "0"
+    else:
+        if not has_model(output) and has_model(output / "sparse" / "0"):
+            folder = output / "sparse" / "0"
+        image_folder = next((folder / name for name in USUAL_FOLDERS if (folder / name).is_dir()), None)
     events, notes = Events(), list[str]()
     events.subscribe(lambda event: notes.append(event.message))
     model, keypoints = read_model(folder, events)
-    return _Source(folder, model, keypoints, _image_folder(folder, image_source), tuple(notes))
-
-
-def _image_folder(model: Path, image_source: str | None) -> Path | None:
-    """The folder that the names of a model are relative to, None where it is not known.
-
-    Args:
-        model: its folder.
-        image_source: what a run was made of: a folder, a pattern or a list; None for a model that no run of ours made.
-    """
-    if image_source is None:
-        return next((model / name for name in USUAL_FOLDERS if (model / name).is_dir()), None)
-    if image_source and os.path.isdir(image_source):
-        return Path(image_source)
-    try:
-        return find_images(image_source).root if image_source else None
-    except InputError:  # it is gone, or no longer holds images
-        return None
+    return _Source(folder, model, keypoints, image_folder, tuple(notes))
 
 
 def _worst_px(ours: Reconstruction, theirs: Reconstruction) -> float:
@@ -153,7 +160,7 @@ def _export_colmap(
     def export(source: _Source, path: Path) -> _Copy:
         from sfmapp.formats.pycolmap_reader import read_with_pycolmap
 
-        if path.exists() and path.resolve() == source.folder.resolve():
+        if source.folder is not None and path.exists() and path.resolve() == source.folder.resolve():
             raise UsageError(f"{path} is the model itself", "choose another folder to export to")
         write(path, source.model, source.keypoints)
         ours = read_model(path)[0]

@@ -248,7 +248,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _undistorted(record: ImageRecord, how: Undistortion) -> tuple[bytes, NDArray[np.bool_] | None]:
-    """The file of a photograph, and (h, w) True where it may be used; None foreverywhere.
+    """The file of a photograph, and (h, w) True where it may be used; None for everywhere.
 
     Raises:
         InputError: it, or its mask, cannot be read.

@@ -155,8 +155,7 @@ def _ask(
     notes: list[str],
 ) -> SecondOpinion | None:
     """pycolmap's opinion; None, and a note, if it fails: our own numbers are worth printing all the same."""
-    first = image_set.images[0]
-    root = Path(str(first.path)[: -len(first.name)])
+    assert image_set.root is not None  # photographs of a workspace are files
     if options is None:
         options = SecondOpinionOptions(
             camera_model=image_options.camera_model.name,
@@ -171,8 +170,8 @@ def _ask(
     digest = hashlib.blake2b("".join(image.digest for image in image_set.images).encode(), digest_size=16)
     try:
         return ask_second_opinion(
-            root,
-            [image.name for image in image_set.images],
+            image_set.root,
+            image_set.names,
             output,
             options,
             camera_groups=groups,

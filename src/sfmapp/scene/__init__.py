@@ -1,0 +1,1 @@
+"""Plain arrays: reconstructions, tracks, rigs, features and meshes."""

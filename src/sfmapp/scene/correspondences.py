@@ -56,6 +56,7 @@ class Correspondences:
 
     @property
     def num_pairs(self) -> int:
+        """P."""
         return len(self.pair_image_idx)
 
     @property

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numba
 import numpy as np
@@ -62,18 +63,17 @@ class Reconstruction:
             np.zeros(tracks.num_observations, bool),
         )
 
-    def copy(self) -> Reconstruction:
+    def copy(self) -> Self:
         """A copy that shares only the tracks, the rig and the (immutable) cameras."""
-        return Reconstruction(
-            list(self.cameras),
-            list(self.image_names),
-            self.image_camera_idx.copy(),
-            self.cam_from_world.copy(),
-            self.tracks,
-            self.point_xyz.copy(),
-            self.obs_is_inlier.copy(),
-            self.point_rgb.copy(),
-            self.rig,
+        return replace(
+            self,
+            cameras=list(self.cameras),
+            image_names=list(self.image_names),
+            image_camera_idx=self.image_camera_idx.copy(),
+            cam_from_world=self.cam_from_world.copy(),
+            point_xyz=self.point_xyz.copy(),
+            obs_is_inlier=self.obs_is_inlier.copy(),
+            point_rgb=self.point_rgb.copy(),
         )
 
     @property

@@ -193,7 +193,7 @@ def perturb(
 
 
 def true_correspondences(scene: SyntheticScene, min_matches: int = 15) -> Correspondences:
-    """What a perfect matcher would find: forevery pair of images the shared tracks (outliers left out), with the true
+    """What a perfect matcher would find: for every pair of images the shared tracks (outliers left out), with the true
     two-view geometry. Pairs with fewer than ``min_matches`` stay in as failures.
 
     Feature positions are those of ``scene.observed.tracks.obs_feature_idx``.

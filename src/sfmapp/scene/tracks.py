@@ -32,14 +32,17 @@ class Tracks:
 
     @property
     def num_tracks(self) -> int:
+        """T."""
         return len(self.track_ptr) - 1
 
     @property
     def num_images(self) -> int:
+        """I."""
         return len(self.image_ptr) - 1
 
     @property
     def num_observations(self) -> int:
+        """O."""
         return len(self.obs_image_idx)
 
     def observations_of_image(self, image_idx: int) -> NDArray[np.int64]:

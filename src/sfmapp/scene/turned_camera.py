@@ -15,7 +15,7 @@ _NEAR_CENTER, _FAR_OFF_CENTER = 0.04, 0.08
 
 
 def turned_camera(camera: Camera, orientation: int) -> Camera:
-    """The camera of the same pictures turned, and mirrored, as an EXIF orientation says; exact forevery model."""
+    """The camera of the same pictures turned, and mirrored, as an EXIF orientation says; exact for every model."""
     values = dict(zip(PARAM_NAMES[camera.model], camera.params.tolist(), strict=True))
     center = upright_xy(orientation, [values["cx"], values["cy"]], camera.width, camera.height)
     values["cx"], values["cy"] = center.tolist()

@@ -1,0 +1,1 @@
+"""Frames in order: folders, videos, KITTI, TUM and EuRoC."""

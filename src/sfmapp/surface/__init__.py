@@ -1,0 +1,1 @@
+"""Patches to a mesh, and its texture."""

@@ -69,6 +69,15 @@ def check_command(folder: Path, manifest: dict[str, Any], command: str) -> None:
         )
 
 
+def image_root(manifest: dict[str, Any]) -> Path | None:
+    """The folder that the names of a workspace's images are relative to; None where it is not known, or gone.
+
+    A reconstruction has noted it, as a pattern or a list names photographs, not their folder; all else is made of one.
+    """
+    noted = manifest.get("image_root") or manifest.get("source")
+    return Path(noted) if noted and os.path.isdir(noted) else None
+
+
 def recorded_versions() -> dict[str, str]:
     """Versions of what a result depends on."""
     from importlib import metadata

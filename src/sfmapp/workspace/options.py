@@ -74,10 +74,20 @@ class Options:
 
 
 def load_options(presets: Iterable[str] = (), settings: Iterable[str] = ()) -> Options:
-    """Defaults, then presets or TOML files in order, then ``stage.option=value`` settings; the last word counts.
+    """The options of a whole run: defaults, then presets in order, then settings; the last word counts.
+
+    Args:
+        presets: names of presets (``default``, ``fast``, ``quality``), or paths of TOML files.
+        settings: texts ``stage.option=value``; ``sfmapp reconstruct --list-options`` shows them all.
+
+    Returns:
+        The options, checked.
 
     Raises:
         UsageError: an unknown preset, stage or option, or an impossible value; it names the nearest right spelling.
+
+    Example:
+        >>> options = sfmapp.load_options(presets=["quality"], settings=["images.camera_model=OPENCV"])
     """
     values: dict[str, Any] = {}
     for preset in presets:

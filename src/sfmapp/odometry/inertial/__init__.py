@@ -1,0 +1,1 @@
+"""Metres and gravity: inertial measurements, markers, known lengths."""

@@ -46,7 +46,7 @@ class SmoothingOptions:
 
 @dataclass(frozen=True)
 class SmoothedTrajectory:
-    """A pose forevery frame that is in reach of a measurement.
+    """A pose for every frame that is in reach of a measurement.
 
     Attributes:
         cam_from_world: (F, 7), NaN before the first measurement and in longer gaps.

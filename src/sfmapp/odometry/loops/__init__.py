@@ -1,0 +1,1 @@
+"""Places recognised again, loops closed, and tracking after a loss."""

@@ -1,0 +1,1 @@
+"""Keyframes and landmarks, and the adjustment of a window of them."""

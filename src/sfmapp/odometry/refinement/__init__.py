@@ -1,0 +1,1 @@
+"""The calibration held against the map, and the final adjustment."""

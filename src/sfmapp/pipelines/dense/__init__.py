@@ -1,0 +1,1 @@
+"""Patches and meshes of a workspace or a COLMAP model."""

@@ -17,12 +17,11 @@ from sfmapp.dense.prepare import DensePlan, plan_views
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model
-from sfmapp.images.sources import find_images
 from sfmapp.pipelines.stored_pixels import has_stored_pixels
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.layout import DENSE, ODOMETRY, RECONSTRUCT, UNDISTORT, USUAL_FOLDERS
 from sfmapp.workspace.listeners import DecisionLog, EventLog
-from sfmapp.workspace.manifest import read_manifest
+from sfmapp.workspace.manifest import image_root, read_manifest
 from sfmapp.workspace.options import Options, options_from_dict, options_to_dict
 from sfmapp.workspace.usage import Stopwatch
 from sfmapp.workspace.workspace import open_workspace
@@ -177,7 +176,7 @@ def _in_workspace(
         is_upright = bool(manifest.get("is_upright"))
     else:
         model = folder / "sparse" / "0"
-        found = Path(images) if images is not None else image_root(str(manifest.get("source") or ""))
+        found = Path(images) if images is not None else _photograph_folder(folder, manifest)
         is_upright = not has_stored_pixels(manifest)
         if not has_model(model):
             raise NoReconstructionError(f"{folder} holds no model", "run sfmapp reconstruct first")
@@ -186,6 +185,15 @@ def _in_workspace(
         images_options = dataclasses.replace(options.images, mask_path=earlier.mask_path)
         options = dataclasses.replace(options, images=images_options)
     return DenseSource(model, found, target, command if is_own else DENSE, is_upright, options)
+
+
+def _photograph_folder(folder: Path, manifest: dict[str, Any]) -> Path:
+    """The folder of a reconstruction's photographs. Raises InputError if they are gone."""
+    found = image_root(manifest)
+    if found is None:
+        place = manifest.get("image_root") or manifest.get("source") or "a folder that run.json does not name"
+        raise InputError(f"{folder}: expected its photographs in {place}, found no such folder", "give --images DIR")
+    return found
 
 
 def _frame_folder(manifest: dict[str, Any], images: str | os.PathLike[str] | None) -> Path:
@@ -197,23 +205,6 @@ def _frame_folder(manifest: dict[str, Any], images: str | os.PathLike[str] | Non
             "name the folder that holds the keyframes as files: --images DIR",
         )
     return folder
-
-
-def image_root(source: str) -> Path:
-    """The folder that the names of a reconstruction are relative to: its source, or what a glob or list spans.
-
-    Raises:
-        InputError: the photographs are gone.
-    """
-    path = Path(source)
-    if path.is_dir() and source:
-        return path
-    if not source:
-        raise InputError("run.json does not name the photographs", "name their folder: --images DIR")
-    try:
-        return find_images(source).root
-    except InputError as error:
-        raise InputError(f"the photographs of this workspace are gone: {error}", "give --images DIR") from error
 
 
 def _image_folder(model: Path, images: str | os.PathLike[str] | None) -> Path:

@@ -1,0 +1,1 @@
+"""A sequence to a trajectory, and a finished run refined."""

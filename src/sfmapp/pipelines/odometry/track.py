@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sfmapp
-from sfmapp.errors import InterruptedRunError, NoReconstructionError
+from sfmapp.errors import InterruptedRunError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.images.frame_reader import FileSequence
 from sfmapp.images.sequence import Frame, GroundTruth, Imu, Sequence, SequenceKind
@@ -83,7 +83,7 @@ class Tracking(Job):
 
 
 def track_sequence(
-    source: str | os.PathLike[str],
+    source: str | os.PathLike[str] | Sequence,
     output: str | os.PathLike[str],
     options: Options | None = None,
     *,
@@ -96,7 +96,8 @@ def track_sequence(
     """Follow a camera (or a stereo rig) through a sequence.
 
     Args:
-        source: a folder of frames, a video file or stream, or the folder of a KITTI, TUM or EuRoC sequence.
+        source: a folder of frames, a video file or stream, or the folder of a KITTI, TUM or EuRoC sequence; or an
+            open sequence, such as one of frames in memory.
         output: folder of the results: new, empty, or of an earlier odometry run, whose results are replaced.
         options: of all stages; ``sequence`` and ``odometry`` count here. See :func:`sfmapp.load_options`.
         events: listens in, and can ask the run to stop: what was tracked until then is written.
@@ -113,7 +114,11 @@ def track_sequence(
     """
     from threadpoolctl import threadpool_limits
 
-    source, options, events = os.fspath(source), with_absolute_paths(options or Options()), events or Events()
+    options, events = with_absolute_paths(options or Options()), events or Events()
+    sequence = None if isinstance(source, str | os.PathLike) else source
+    source = os.fspath(source) if isinstance(source, str | os.PathLike) else source.source
+    if sequence is not None and self_calibrate:
+        raise UsageError("frames in memory come with their camera, and cannot be looked at twice to calibrate it")
     scale_request = parse_scale(options.scale.source) if options.scale.source is not None else None
     threads = options.num_workers
     with ExitStack() as stack:
@@ -128,6 +133,7 @@ def track_sequence(
             source, workspace, options, events, watch or Stopwatch(), DecisionLog(), threads,
             frames=FrameLog(), threads_cpu=ThreadTimes(), live=live,
             keyframes=KeyframeWatch(scale_request.detector() if scale_request else None), scale_request=scale_request,
+            sequence=sequence,
         )  # fmt: skip
         growing = stack.enter_context(closing(GrowingTrajectories(workspace.folder, events, run.make_room)))
         for listener in (growing, event_log, run.log, run.frames, run.keyframes, live):
@@ -145,7 +151,8 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
             from sfmapp.pipelines.odometry.self_calibrate import self_calibrated
 
             options, run.stages["self_calibration"] = self_calibrated(run.source, options, events)
-        run.sequence = open_sequence(run.source, options.sequence, events)
+        if run.sequence is None:
+            run.sequence = open_sequence(run.source, options.sequence, events)
         run.scale_request = resolve_scale_request(run.scale_request, options.scale.source is None, run.sequence)
     if run.live is not None:
         run.live.begin(run.sequence)

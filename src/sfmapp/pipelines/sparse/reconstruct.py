@@ -92,7 +92,7 @@ def reconstruct(
     if options.min_registered is not None and found < options.min_registered:
         raise TooFewImagesError(
             f"{found} images are registered, {options.min_registered} were asked for",
-            f"{output}/report.html tells forevery image why",
+            f"{output}/report.html tells for every image why",
         )
     return RunResult(model, report)
 
@@ -106,6 +106,7 @@ def _run(run: Run) -> dict[str, Any]:
     keys = stage_keys(run.options, run.image_set)
     if report := results.earlier_report(run, keys):
         return report
+    run.workspace.manifest["image_root"] = os.fspath(run.image_set.root or "")
     run.note_inputs(keys.inputs)
     try:
         models = _reconstruct(run, run.image_set, keys)

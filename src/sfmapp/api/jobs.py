@@ -1,0 +1,477 @@
+"""One call: photographs or video to a reconstruction, a trajectory, patches, a mesh, and what is done with them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from sfmapp.api.images import Images, load_images
+from sfmapp.api.reconstruction import Reconstruction
+from sfmapp.api.stages import extract_features, map_images, match_images
+from sfmapp.errors import UsageError
+from sfmapp.events import Event, Events
+from sfmapp.workspace.options import Options
+
+if TYPE_CHECKING:
+    from sfmapp.evaluation.second_opinion import SecondOpinionOptions
+    from sfmapp.images.sequence import Sequence
+    from sfmapp.odometry.result import OdometryResult
+    from sfmapp.odometry.snapshot import FrameSnapshot
+    from sfmapp.pipelines.dense.densify import DenseResult
+    from sfmapp.pipelines.dense.mesh import MeshResult
+    from sfmapp.pipelines.evaluate import EvaluateOptions, Evaluation
+    from sfmapp.pipelines.undistort import UndistortResult
+    from sfmapp.pipelines.validate import Validation
+
+FilePath = str | os.PathLike[str]
+
+
+class RunResult(NamedTuple):
+    """What ``reconstruct`` found.
+
+    Attributes:
+        reconstruction: the largest model, with views of its images and points.
+        report: what is in ``report.json``; None where nothing was written.
+    """
+
+    reconstruction: Reconstruction
+    report: Any
+
+
+class TrackResult(NamedTuple):
+    """What ``track_sequence`` or ``refine`` found.
+
+    Attributes:
+        odometry: the trajectory over all frames, and the keyframe maps, the largest first: ``cam_from_world`` (F, 7),
+            NaN in gaps, ``timestamps_s`` (F,), ``maps[0].reconstruction``.
+        report: what is in ``report.json``; None where nothing was written.
+    """
+
+    odometry: OdometryResult
+    report: Any
+
+
+def reconstruct(
+    images: Images,
+    output: FilePath | None = None,
+    options: Options | None = None,
+    *,
+    record: bool = True,
+    events: Events | None = None,
+    threads: int | None = None,
+    seed: int | None = None,
+) -> RunResult:
+    """Reconstruct cameras and points from photographs.
+
+    With an output folder, what an earlier run in it has done is used where it still holds.
+
+    Args:
+        images: a folder, a glob pattern or a ``.txt`` list of files; or, without an output folder, whatever
+            ``load_images`` takes: arrays by name, an :class:`ImageSource`, an :class:`ImageSet`.
+        output: folder of the results: new, empty, or of an earlier run. None: nothing is written.
+        options: of all stages; see ``load_options``.
+        record: write ``recording.rrd``, which replays the run.
+        events: told of everything that happens, and can ask the run to stop.
+        threads: workers; None: as ``options.threads`` says, or as many as there are cores.
+        seed: in place of ``options.seed``. The same seed gives the same bytes, for any number of threads.
+
+    Returns:
+        The largest model (as it is read back from ``sparse/0``, if it was written), and the report.
+
+    Raises:
+        UsageError: the output folder holds something else, or another run is at work in it; or it was given with
+            photographs that are no files.
+        InputError: the photographs do not exist or cannot be read.
+        NoReconstructionError: they hold no reconstruction; the report is written.
+        TooFewImagesError: fewer images than ``options.min_registered``; everything is written.
+        InterruptedRunError: ``events`` was asked to stop; the same call resumes.
+
+    Example:
+        >>> reconstruction, report = sfmapp.reconstruct("photos/", "out/")
+        >>> reconstruction.points.xyz, reconstruction.image("a.jpg").cam_from_world
+    """
+    options = _with(options, threads, seed)
+    if output is not None:
+        from sfmapp.pipelines.sparse import reconstruct as pipeline
+
+        if not isinstance(images, str | os.PathLike):
+            raise UsageError(
+                "a workspace needs photographs that are files, to look at them again",
+                "leave the output folder out, and save what is returned: reconstruction.save(folder)",
+            )
+        found, report = pipeline.reconstruct(images, output, options, events=events, record=record)
+        return RunResult(Reconstruction.of(found), report)
+    workers, seed_used = options.num_workers, options.seed
+    image_set = load_images(images, options.images, events=events, threads=threads)
+    features = extract_features(image_set, options.features, events=events, threads=workers)
+    correspondences = match_images(
+        image_set, features, options.pairs, options.matching, events=events, threads=workers, seed=seed_used
+    )
+    models = map_images(
+        image_set, features, correspondences, options.mapping,
+        adjust_options=options.adjust, events=events, threads=workers,
+    )  # fmt: skip
+    return RunResult(models[0], None)
+
+
+def track_sequence(
+    source: FilePath | Sequence,
+    output: FilePath | None = None,
+    options: Options | None = None,
+    *,
+    self_calibrate: bool = False,
+    record: bool = True,
+    on_frame: Callable[[FrameSnapshot], None] | None = None,
+    events: Events | None = None,
+    threads: int | None = None,
+    seed: int | None = None,
+) -> TrackResult:
+    """Follow a camera, or a stereo rig, through a sequence.
+
+    Args:
+        source: a folder of frames, a video file or stream, or the folder of a KITTI, TUM or EuRoC sequence; or frames
+            in memory, :class:`ArraySequence`, or whatever has the members of one.
+        output: folder of the results: new, empty, or of an earlier odometry run, whose results are replaced. None, for
+            frames in memory alone: nothing is written, and one camera has no unit of length.
+        options: of these, ``sequence``, ``odometry`` and ``scale``.
+        self_calibrate: find the intrinsics by a reconstruction from the first minute.
+        record: write ``recording.rrd``, which replays the run.
+        on_frame: called with each frame as soon as its pose is known, in the thread that tracks: ``cam_from_world``
+            (7,), NaN without a pose, ``state``, ``xy`` (N, 2) tracked pixels.
+        events: told of everything that happens, and can ask the run to stop: what was tracked until then is written.
+        threads: workers; None: as ``options.threads`` says, or as many as there are cores.
+        seed: in place of ``options.seed``. The same seed gives the same bytes, for any number of threads.
+
+    Returns:
+        Poses of all frames in the world of their map (that of its first camera), maps, and the report.
+
+    Raises:
+        UsageError: the output folder holds something else, or another run is at work in it, or there is none and the
+            frames are not in memory.
+        InputError: the sequence does not exist or cannot be read, or its camera is not known.
+        NoReconstructionError: no map could be made; the report is written.
+        InterruptedRunError: ``events`` was asked to stop.
+
+    Example:
+        >>> frames = sfmapp.ArraySequence(grab(), camera, fps=20)
+        >>> sfmapp.track_sequence(frames, on_frame=lambda frame: steer(frame.cam_from_world))
+    """
+    options, events = _with(options, threads, seed), events or Events()
+    if on_frame is not None:
+        events.subscribe(_each_frame(on_frame))
+    if output is None:
+        return TrackResult(_tracked_in_memory(source, options, events), None)
+    from sfmapp.pipelines.odometry import track
+
+    found, report = track.track_sequence(
+        source, output, options, events=events, record=record, self_calibrate=self_calibrate
+    )
+    return TrackResult(_with_views(found), report)
+
+
+def refine(
+    output: FilePath,
+    refined: FilePath | None = None,
+    options: Options | None = None,
+    *,
+    photos: FilePath | None = None,
+    free_intrinsics: bool = False,
+    events: Events | None = None,
+    threads: int | None = None,
+    seed: int | None = None,
+) -> TrackResult:
+    """Adjust the maps of an odometry run whole, reject what does not fit, and move the frames with their keyframes.
+
+    Args:
+        output: workspace of an odometry run; it is not changed.
+        refined: folder of the results; None: ``refined`` in that workspace.
+        options: of these, ``mapping`` and ``adjust``, and with photographs ``images``, ``features`` and ``matching``.
+        photos: photographs to add to the largest map: a folder, a glob pattern or a list.
+        free_intrinsics: refine the calibration of the sequence as well.
+        events: told of everything that happens, and can ask the run to stop.
+        threads: workers; None: as ``options.threads`` says, or as many as there are cores.
+        seed: in place of ``options.seed``.
+
+    Returns:
+        The refined trajectory and maps, and the report.
+
+    Raises:
+        UsageError: ``refined`` holds something else.
+        InputError: ``output`` is no workspace, or the photographs or, with them, the sequence cannot be read.
+        NoReconstructionError: there is no map in it.
+        InterruptedRunError: ``events`` was asked to stop.
+
+    Example:
+        >>> sfmapp.refine("track/", photos="photos/").odometry.maps[0].reconstruction
+    """
+    from sfmapp.pipelines.odometry import refine as pipeline
+
+    found, report = pipeline.refine(
+        output, refined, _with(options, threads, seed), photos=photos, free_intrinsics=free_intrinsics, events=events
+    )
+    return TrackResult(_with_views(found), report)
+
+
+def densify(
+    source: FilePath,
+    output: FilePath | None = None,
+    options: Options | None = None,
+    *,
+    images: FilePath | None = None,
+    maps: bool = False,
+    record: bool = True,
+    events: Events | None = None,
+    threads: int | None = None,
+) -> DenseResult:
+    """Reconstruct oriented patches all over the surfaces that the photographs of a model show.
+
+    What an earlier run in the same workspace has done is used where it still holds.
+
+    Args:
+        source: a workspace of ``reconstruct``, or the folder of a COLMAP model.
+        output: workspace of the results; None: ``source`` itself, or the folder ``sfmapp`` of a COLMAP model.
+        options: of these, ``dense`` and, for masks, ``images``.
+        images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
+        maps: write depth and normals of each view as well.
+        record: write ``dense/recording.rrd``.
+        events: told of everything that happens, and can ask the run to stop.
+        threads: workers; None: as ``options.threads`` says, or as many as there are cores.
+
+    Returns:
+        ``patches`` with xyz (N, 3) in the world, normal (N, 3), rgb (N, 3) and more, the names of the images that they
+        count, and the report.
+
+    Raises:
+        UsageError: a workspace of another command.
+        InputError: no model, or too few of its photographs are there.
+        NoReconstructionError: hardly a patch was found; the report and what there is are written.
+        InterruptedRunError: ``events`` was asked to stop; the same call resumes.
+
+    Example:
+        >>> sfmapp.densify("out/").patches.xyz
+    """
+    from sfmapp.pipelines.dense.densify import dense
+
+    return dense(source, output, _with(options, threads), images=images, maps=maps, record=record, events=events)
+
+
+def make_mesh(
+    source: FilePath,
+    output: FilePath | None = None,
+    options: Options | None = None,
+    *,
+    record: bool = True,
+    events: Events | None = None,
+    threads: int | None = None,
+) -> MeshResult:
+    """Make a mesh of patches or of a cloud of oriented points: ``mesh/mesh.ply`` and ``mesh/mesh.glb``.
+
+    Args:
+        source: a workspace in which ``densify`` has been at work, or a PLY of points with normals.
+        output: folder of the results of a PLY. A workspace takes its own: None.
+        options: of these, ``surface``.
+        record: show the mesh in ``dense/recording.rrd``.
+        events: told of everything that happens, and can ask the run to stop.
+        threads: workers; None: as ``options.threads`` says, or as many as there are cores.
+
+    Returns:
+        ``mesh`` with vertices (V, 3), faces (F, 3) and colours, None where that of an earlier run holds; the report.
+
+    Raises:
+        UsageError: a folder for the mesh of a workspace, none for that of a PLY, or a texture without photographs.
+        InputError: no patches, not such a file, or the photographs are gone.
+        NoReconstructionError: they hold no surface; the report is written.
+        InterruptedRunError: ``events`` was asked to stop.
+
+    Example:
+        >>> sfmapp.make_mesh("out/", options=sfmapp.load_options(settings=["surface.texture=true"]))
+    """
+    from sfmapp.pipelines.dense.mesh import mesh_cloud, mesh_workspace
+
+    options = _with(options, threads)
+    if Path(source).is_dir():
+        if output is not None:
+            raise UsageError(f"the mesh of {source} is written into it", "leave the output folder out")
+        return mesh_workspace(source, options, record=record, events=events)
+    if output is None:
+        raise UsageError(f"where is the mesh of {source} to be written?", "name a folder for it")
+    return mesh_cloud(source, output, options, events=events)
+
+
+def validate(
+    output: FilePath,
+    ground_truth: FilePath | None = None,
+    *,
+    options: SecondOpinionOptions | None = None,
+    events: Events | None = None,
+) -> Validation:
+    """Compare a reconstruction with pycolmap's on the same photographs, and both with a ground truth.
+
+    pycolmap's result is kept in the workspace and used again while photographs and options are the same.
+
+    Args:
+        output: the workspace of a run.
+        ground_truth: COLMAP model, ``cameras.json`` or TUM trajectory; None: no ground truth.
+        options: of pycolmap; None: its defaults, with what the user said of the cameras of our run.
+        events: told of progress, and can ask to stop.
+
+    Returns:
+        Both results side by side, as numbers and as a ``table()``.
+
+    Raises:
+        InputError: no workspace, no ground truth, or the photographs are gone.
+        NoReconstructionError: the workspace holds no model.
+        InterruptedRunError: ``events`` was asked to stop.
+
+    Example:
+        >>> print(sfmapp.validate("out/").table())
+    """
+    from sfmapp.pipelines import validate as pipeline
+
+    return pipeline.validate(output, ground_truth, options=options, events=events)
+
+
+def evaluate(
+    estimate: FilePath,
+    ground_truth: FilePath,
+    options: EvaluateOptions | None = None,
+    *,
+    times: FilePath | None = None,
+) -> Evaluation:
+    """Compare a trajectory with the true one: absolute and relative errors, and KITTI's drift.
+
+    Args:
+        estimate: trajectory of TUM, KITTI or EuRoC, or the folder of an odometry run.
+        ground_truth: a trajectory of these formats, not necessarily the same one, or the folder of a sequence.
+        options: alignments, intervals and time offset.
+        times: file with the seconds of the lines of KITTI trajectories.
+
+    Returns:
+        Errors in metres and degrees for each alignment, and a ``table()``.
+
+    Raises:
+        InputError: a file cannot be read, the two have no poses in common, or they do not determine an alignment.
+        UsageError: an option that cannot be obeyed.
+
+    Example:
+        >>> print(sfmapp.evaluate("track/", "groundtruth.txt").table())
+    """
+    from sfmapp.pipelines import evaluate as pipeline
+
+    return pipeline.evaluate(estimate, ground_truth, options, times=times)
+
+
+def undistort(
+    source: FilePath,
+    output: FilePath,
+    options: Options | None = None,
+    *,
+    images: FilePath | None = None,
+    blank_pixels: float = 0.0,
+    max_size: int | None = None,
+    events: Events | None = None,
+    threads: int | None = None,
+) -> UndistortResult:
+    """Write the photographs of a model without distortion, and the model with PINHOLE cameras beside them.
+
+    The same call again resumes one that was cut off.
+
+    Args:
+        source: the workspace of a reconstruction or of odometry on a folder of frames, or the folder of a COLMAP model.
+        output: a new folder, an empty one, or that of an earlier call.
+        options: of these, the masks (``images.mask_path``).
+        images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
+        blank_pixels: from 0 for pictures without a blank pixel to 1 for all that the photographs show.
+        max_size: largest side of the pictures in pixels; None for no limit.
+        events: told of progress, and can ask to stop.
+        threads: photographs worked on at a time; None: as ``options.threads`` says, or one for each core.
+
+    Returns:
+        The folder, and the report of what is in it.
+
+    Raises:
+        UsageError: a share or size that makes no sense, or an output that holds something else.
+        InputError: no model, or none of its photographs.
+        NoReconstructionError: the workspace holds no model.
+        InterruptedRunError: ``events`` was asked to stop.
+
+    Example:
+        >>> sfmapp.undistort("out/", "splat/")  # for trainers of Gaussian splats
+    """
+    from sfmapp.pipelines import undistort as pipeline
+
+    return pipeline.undistort(
+        source, output, _with(options, threads), images=images, blank_pixels=blank_pixels, max_size=max_size,
+        events=events,
+    )  # fmt: skip
+
+
+def export(source: FilePath | Reconstruction, target: str, path: FilePath, *, images: FilePath | None = None) -> Any:
+    """Write a model in another program's format, read it back, and compare every reprojection.
+
+    Args:
+        source: the workspace of a run, of which the largest model is taken, the folder of a COLMAP model, or a
+            reconstruction in memory.
+        target: ``colmap-bin``, ``colmap-text``, ``ply``, ``bundler`` or ``nerfstudio``.
+        path: where to write: a folder for COLMAP's formats, a file or folder for the others.
+        images: folder of the photographs, for formats that name them; None: as noted in the workspace, or where COLMAP
+            has them.
+
+    Returns:
+        ``files`` that were written, the worst differences, and notes for whoever uses them.
+
+    Raises:
+        UsageError: an unknown format, a camera or name that it cannot hold, or the model's own folder as the target.
+        NoReconstructionError: the workspace holds no model.
+        InputError: there is no model, nothing can be written, or what was read back is not what was written.
+
+    Example:
+        >>> sfmapp.export("out/", "nerfstudio", "nerf/")
+    """
+    from sfmapp.pipelines.export import export_model
+
+    keypoints = source.keypoints if isinstance(source, Reconstruction) else None
+    return export_model(source, target, path, images=images, keypoints=keypoints)
+
+
+def _with(options: Options | None, threads: int | None, seed: int | None = None) -> Options:
+    """The options with what was given beside them."""
+    options = options or Options()
+    if threads is not None:
+        options = replace(options, threads=threads)
+    return options if seed is None else replace(options, seed=seed)
+
+
+def _each_frame(on_frame: Callable[[FrameSnapshot], None]) -> Callable[[Event], None]:
+    from sfmapp.odometry.snapshot import FrameSnapshot
+
+    def listen(event: Event) -> None:
+        snapshot = event.data.get("snapshot")
+        if isinstance(snapshot, FrameSnapshot):
+            on_frame(snapshot)
+
+    return listen
+
+
+def _tracked_in_memory(source: FilePath | Sequence, options: Options, events: Events) -> OdometryResult:
+    from threadpoolctl import threadpool_limits
+
+    from sfmapp.errors import NoReconstructionError
+    from sfmapp.odometry.run import run_odometry
+
+    if isinstance(source, str | os.PathLike):
+        raise UsageError("a sequence of files needs a folder for its results", "give one as the second argument")
+    with threadpool_limits(1, "blas"):
+        found = run_odometry(source, options.odometry, seed=options.seed, threads=options.num_workers, events=events)
+    if not found.maps:
+        raise NoReconstructionError(f"{len(found.frame_idx)} frames were given, but no map could be begun")
+    return _with_views(found)
+
+
+def _with_views(found: OdometryResult) -> OdometryResult:
+    for entry in found.maps:
+        entry.reconstruction = Reconstruction.of(entry.reconstruction)
+    return found
