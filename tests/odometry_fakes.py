@@ -13,6 +13,7 @@ from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Frame, GroundTruth, Sequence
+from sfmapp.odometry.keyframe_images import KeyframeImages
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
@@ -72,7 +73,7 @@ class FakeRunner:
     finds_nothing: bool = False
 
     def __call__(
-        self, sequence: Sequence, options: OdometryOptions, *, seed: int, threads: int, events: Events
+        self, sequence: Sequence, options: OdometryOptions, *, seed: int, threads: int, events: Events, markers: object
     ) -> OdometryResult:
         events.started("odometry", total=sequence.num_frames)
         assert sequence.ground_truth is not None
@@ -80,6 +81,7 @@ class FakeRunner:
         noise = np.random.default_rng(seed).normal(0, 0.01, (len(self.poses), 3))
         self.poses[:, 4:] = 0.5 * self.poses[:, 4:] + noise
         self.maps: list[KeyframeMap] = []
+        self.images = KeyframeImages()
         rows = []
         for frame in sequence.frames():
             state = FrameState.LOST if frame.idx in self.lost or self.finds_nothing else FrameState.TRACKED
@@ -112,6 +114,7 @@ class FakeRunner:
             for before in ours.keyframes[-1:]:
                 self._see_again(before, ours, ids, rig)
             self._add(ours, frame, pose, ids, rig)
+            self.images.look(frame.idx, frame.images[0])
             recent = ours.keyframes[-3:]
             frames = np.array([k.frame_idx for k in recent])
             poses = np.array([k.rig_from_world for k in recent])
@@ -148,6 +151,7 @@ class FakeRunner:
             covariance = np.tile(np.diag([1e-6] * 3 + [1e-4] * 3), (count, 1, 1))
             frames = np.array([k.frame_idx for k in ours.keyframes])
             images = np.arange(count) * len(ours.rig.cameras)
+            model.point_rgb = self.images.colors(model, frames, images)
             maps.append(MapResult(model, frames, images, covariance, "the first keyframe is held"))
         poses = np.array([row[5] for row in rows]).reshape(-1, 7)
         return OdometryResult(

@@ -282,3 +282,46 @@ def test_copies_stay_what_they_are(scene: SyntheticScene) -> None:
     copy.cam_from_world[0] = 0.0
     assert (model.cam_from_world[0] != 0.0).any()
     assert sfmapp.Reconstruction.of(model) is model
+
+
+def test_one_call_gives_the_same_with_and_without_a_folder(photos: Path, tmp_path: Path) -> None:
+    options = sfmapp.load_options(settings=["features.max_num_features=800"])
+    in_memory, report = sfmapp.reconstruct(photos, options=options, seed=2, threads=1)
+    assert report is None
+    written, _ = sfmapp.reconstruct(photos, tmp_path / "out", options, record=False, seed=2, threads=2)
+    assert in_memory.cam_from_world.tobytes() == written.cam_from_world.tobytes()
+    assert in_memory.points.xyz.tobytes() == written.point_xyz.tobytes()
+    in_memory.save(tmp_path / "saved")
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        saved, ours = tmp_path / "saved" / name, tmp_path / "out" / "sparse" / "0" / name
+        assert saved.read_bytes() == ours.read_bytes(), name
+    with pytest.raises(sfmapp.UsageError, match="photographs that are files"):
+        sfmapp.reconstruct({"a": np.zeros((20, 20), np.uint8)}, tmp_path / "none")
+
+
+def test_a_reconstruction_of_ones_own_arrays(scene: SyntheticScene, tmp_path: Path) -> None:
+    """Whatever another program has found becomes a model that COLMAP reads."""
+    import pycolmap
+
+    truth = scene.ground_truth
+    order = np.random.default_rng(0).permutation(truth.tracks.num_observations)
+    tracks = sfmapp.Tracks.from_observations(
+        truth.tracks.obs_track_idx[order], truth.tracks.obs_image_idx[order], truth.tracks.obs_xy[order]
+    )
+    model = sfmapp.Reconstruction(
+        truth.cameras, truth.image_names, truth.image_camera_idx, truth.cam_from_world, tracks,
+        truth.point_xyz, np.ones(tracks.num_observations, bool),
+    )  # fmt: skip
+    np.testing.assert_allclose(model.residuals_px(), 0.0, atol=1e-9)
+    model.save(tmp_path)
+    theirs = pycolmap.Reconstruction(str(tmp_path))
+    assert theirs.num_reg_images() == 6
+    assert theirs.num_points3D() == len(model.points)
+    assert theirs.compute_num_observations() == tracks.num_observations
+    for wrong in (
+        ([0, 0], [0], np.zeros((2, 2))), ([0, 0], [1, 1], np.zeros((2, 2))), ([-1, 0], [0, 1], np.zeros((2, 2))),
+        ([0, 0], [0, 1], np.full((2, 2), np.nan)), ([0.5, 0.5], [0, 1], np.zeros((2, 2))),
+    ):  # fmt: skip
+        with pytest.raises(sfmapp.InputError, match="tracks: expected"):
+            sfmapp.Tracks.from_observations(*wrong)
+    assert sfmapp.Tracks.from_observations([], [], np.zeros((0, 2)), num_images=3).num_images == 3

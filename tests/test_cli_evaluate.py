@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from schemas import check_schema
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError, UsageError
 from sfmapp.evaluation.trajectory import Trajectory, absolute_error, associate
 from sfmapp.formats.trajectory_input import read_trajectory
 from sfmapp.geometry import rigid3
 from sfmapp.pipelines.evaluate import EvaluateOptions, draw, evaluate, parse_delta
+from sfmapp.reporting import plain
 
 Array = NDArray[np.float64]
 
@@ -303,7 +305,8 @@ def test_a_short_path_tells_why_there_is_no_t_rel(tmp_path: Path) -> None:
     assert "drift (%)" in result.table()
     assert "t_rel (%)" not in result.table()
     assert any("no t_rel" in note for note in result.notes)
-    found = result.to_dict()["alignments"]["se3"]
+    check_schema("evaluate", plain(result.report()))
+    found = result.report()["alignments"]["se3"]
     assert found["kitti"] is None
     assert [entry["length_m"] for entry in found["drift_by_length"]] == pytest.approx(
         [0.1 * k * result.pairs.ground_truth.path_m for k in range(1, 9)]

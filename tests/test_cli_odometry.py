@@ -13,6 +13,7 @@ import pytest
 from odometry_fakes import FakeRunner, FakeSequence
 from sfmapp.cli.main import main
 from sfmapp.pipelines.odometry import track as pipeline
+from sfmapp.reporting import Usage
 
 Patch = pytest.MonkeyPatch
 Capture = pytest.CaptureFixture[str]
@@ -28,7 +29,7 @@ def fake(monkeypatch: Patch) -> Patch:
 def use(monkeypatch: Patch, runner: FakeRunner) -> None:
     monkeypatch.setattr(pipeline, "open_sequence", lambda *_, **__: FakeSequence())
     monkeypatch.setattr(pipeline, "run_odometry", runner)
-    monkeypatch.setattr(pipeline, "compile_odometry_kernels", lambda *_, **__: {})
+    monkeypatch.setattr(pipeline, "compile_odometry_kernels", lambda *_, **__: Usage(wall_s=0.0, cpu_s=0.0))
 
 
 def test_help_names_the_commands_and_their_flags(capsys: Capture) -> None:

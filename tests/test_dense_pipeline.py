@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dense_models import DEPTH, PINHOLE, row_of_poses, texture, write_wall
+from schemas import check_schema
 from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.dense.files import read_patches
 from sfmapp.dense.options import DenseOptions
@@ -33,6 +34,7 @@ FAST = Options(dense=DenseOptions(cell_px=2), threads=1)
 
 def report_of(output: Path) -> dict[str, Any]:
     report: dict[str, Any] = json.loads((output / "report.json").read_text())
+    check_schema("reconstruct" if "models" in report else "dense", report)
     return report
 
 

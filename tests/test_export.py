@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import sfmapp
+from schemas import check_schema
 from sfmapp.camera.camera import CameraModel
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.formats import ply
@@ -17,6 +18,7 @@ from sfmapp.formats.colmap import read_model, write_model
 from sfmapp.formats.nerfstudio import read_nerfstudio
 from sfmapp.pipelines.dense.source import find_source
 from sfmapp.pipelines.export import EXPORTS, export_model
+from sfmapp.reporting import plain
 from sfmapp.scene.synthetic import synthetic_camera
 from test_formats_exchange import centered_camera, scene
 
@@ -44,7 +46,7 @@ def test_every_format_is_read_back(workspace: Path, tmp_path: Path, target: str)
     assert report["max_px"] < (1e-3 if target in ("ply", "nerfstudio") else 1e-7)
     assert report["max_coordinate"] < 1e-6 * np.ptp(model.point_xyz, axis=0).max()
     assert all(Path(file).is_file() for file in report["files"])
-    json.dumps(report)
+    check_schema("export", plain(report))
 
 
 def test_images_are_found_from_transforms_json(workspace: Path, tmp_path: Path) -> None:

@@ -16,7 +16,9 @@ from sfmapp.errors import InputError, InterruptedRunError
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3
 from sfmapp.matching import euclidean
+from sfmapp.matching.report import MatchingReport
 from sfmapp.matching.stage import MatchedPair, MatchingOptions, compile_kernels, join_pairs, match_images, split_pairs
+from sfmapp.reporting import from_plain, plain
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.features import DescriptorMetric, Features
 
@@ -86,7 +88,7 @@ def test_matches_and_poses_are_right(coarse_features: int) -> None:
         pose = found.cam2_from_cam1[p]
         assert rigid3.rotation_angle_deg(rigid3.rotation_matrix(pose) @ rigid3.rotation_matrix(ground_truth).T) < 0.15
         assert pose[4:] @ ground_truth[4:] / np.linalg.norm(ground_truth[4:]) > np.cos(np.radians(1.0))
-    json.dumps(report)
+    assert from_plain(MatchingReport, plain(report)) == report
 
 
 @pytest.mark.parametrize("coarse_features", [300, 100_000], ids=["guided", "full"])

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rendered_worlds import sequences as rendered
+from schemas import check_schema
 from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.contradictions import Contradiction
 from sfmapp.errors import InputError, InterruptedRunError, UsageError
@@ -25,6 +26,7 @@ from sfmapp.pipelines.odometry.results import read_odometry
 from sfmapp.pipelines.odometry.self_calibrate import choose_frames, self_calibrated
 from sfmapp.pipelines.odometry.track import TrackResult, track_sequence
 from sfmapp.pipelines.validate import validate
+from sfmapp.reporting import plain
 from sfmapp.workspace.options import Options, load_options
 
 FPS, NUM_FRAMES, NUM_PHOTOS = 30.0, 72, 2
@@ -105,9 +107,10 @@ def test_what_contradicts_a_map_is_read_again_with_it(tracked: tuple[Path, Track
     output = tmp_path / "out"
     found = Contradiction("given calibration", "f is too long", "calibrate", {"sigmas": 9.0}, 0.3)
     shutil.copytree(tracked[0], output)
-    report = json.loads((output / "report.json").read_text())
-    report["maps"][0]["contradictions"] = [found.describe()]
-    (output / "report.json").write_text(json.dumps(report))
+    manifest = json.loads((output / "run.json").read_text())
+    manifest["stages"]["odometry"]["maps"][0]["contradictions"] = [plain(found)]
+    (output / "run.json").write_text(json.dumps(manifest))
+    (output / "report.json").unlink()  # nothing is read back from it
     assert read_odometry(output).maps[0].contradictions == [found]
     assert read_odometry(tracked[0]).maps[0].contradictions == tracked[1].odometry.maps[0].contradictions == []
 
@@ -250,6 +253,7 @@ def test_a_disturbed_map_is_put_right(room: Path, tracked: tuple[Path, TrackResu
 
 def test_photographs_join_the_map(room: Path, tracked: tuple[Path, TrackResult], tmp_path: Path) -> None:
     _, report = refine(tracked[0], tmp_path / "refined", options_of(room), photos=room / "photos")
+    check_schema("refine", json.loads((tmp_path / "refined" / "report.json").read_text()))
     assert [row["is_registered"] for row in report["photographs"]] == [True] * NUM_PHOTOS
     model, _ = read_model(tmp_path / "refined" / "sparse" / "0")
     is_photo = np.array([name.startswith("photos/") for name in model.image_names])
@@ -329,4 +333,6 @@ def test_a_run_without_a_camera_says_how_to_get_one(room: Path, tmp_path: Path) 
 def test_states_are_those_that_the_table_names(tracked: tuple[Path, TrackResult]) -> None:
     lines = (tracked[0] / "frames.csv").read_text().splitlines()[1:]
     assert {line.split(",")[3] for line in lines} <= {state.name.lower() for state in FrameState}
-    assert json.loads((tracked[0] / "report.json").read_text())["format"] == "sfmapp odometry report 1"
+    report = json.loads((tracked[0] / "report.json").read_text())
+    assert report["format"] == "sfmapp odometry report 2"
+    check_schema("odometry", report)

@@ -13,7 +13,7 @@ from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.frontend.alignment import align_patches
 from sfmapp.odometry.frontend.pyramid import build_pyramid
-from sfmapp.odometry.initialize import MapInitializer, TwoViews, pose_between
+from sfmapp.odometry.initialize import MapInitializer, TwoViews
 from sfmapp.odometry.map.backend import LAG, Backend, choose_window, classify, make_job, take_over
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
@@ -265,14 +265,6 @@ def test_black_and_plain_images_make_no_two_views() -> None:
     initializer = MapInitializer(played.PINHOLE, OPTIONS, 0)
     for value in (0, 0, 128, 255, 255):
         assert initializer.add(build_pyramid(np.full((240, 320), value, np.uint8))) is None
-
-
-def test_poses_between_are_on_the_way() -> None:
-    first, last = poses_along(np.array([0.3, 0.1, -0.2]), np.array([0.1, 0.5, -0.2]), 2)
-    np.testing.assert_allclose(pose_between(first, last, 0.0), first, atol=1e-12)
-    np.testing.assert_allclose(pose_between(first, last, 1.0), last, atol=1e-12)
-    middle = pose_between(first, last, 0.5)
-    np.testing.assert_allclose(rigid3.center(middle), (rigid3.center(first) + rigid3.center(last)) / 2, atol=1e-12)
 
 
 # ------------------------------------------------------------------ memory that was never written

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from odometry_fakes import FPS, FakeRunner, FakeSequence, path
+from schemas import check_schema
 from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.errors import InterruptedRunError, NoReconstructionError, UsageError
 from sfmapp.evaluation.trajectory import Trajectory, absolute_error, associate
@@ -19,8 +21,8 @@ from sfmapp.formats.colmap import read_model
 from sfmapp.formats.trajectory import read_tum
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu, SequenceOptions
+from sfmapp.odometry.inertial import faults as inertial_faults
 from sfmapp.odometry.inertial.visual_inertial import contradicted
-from sfmapp.odometry.inertial.visual_inertial import faults as inertial_faults
 from sfmapp.odometry.records import _covariance_gap
 from sfmapp.odometry.refinement.final_adjustment import MAX_COVARIANCE_KEYFRAMES, FinalAdjustment
 from sfmapp.odometry.result import FrameState
@@ -30,8 +32,10 @@ from sfmapp.pipelines.odometry.timing import ThreadTimes
 from sfmapp.pipelines.odometry.track import TrackResult, track_sequence
 from sfmapp.pipelines.sparse.reconstruct import reconstruct
 from sfmapp.pipelines.validate import validate
+from sfmapp.report.model import MedianMax
 from sfmapp.report.odometry_document import FrameTable, make_checks
 from sfmapp.report.plots import Curve, plot_svg, ticks
+from sfmapp.reporting import Usage
 from sfmapp.scene.rig import Rig
 from sfmapp.workspace.options import Options, load_options, options_from_dict
 
@@ -41,7 +45,7 @@ Patch = pytest.MonkeyPatch
 def use(monkeypatch: Patch, sequence: FakeSequence, runner: object) -> None:
     monkeypatch.setattr(pipeline, "open_sequence", lambda *_, **__: sequence)
     monkeypatch.setattr(pipeline, "run_odometry", runner)
-    monkeypatch.setattr(pipeline, "compile_odometry_kernels", lambda *_, **__: {})
+    monkeypatch.setattr(pipeline, "compile_odometry_kernels", lambda *_, **__: Usage(wall_s=0.0, cpu_s=0.0))
 
 
 def run(output: Path, *settings: str, events: Events | None = None) -> TrackResult:
@@ -119,9 +123,10 @@ def test_missing_covariances_are_said_and_not_green(finished: tuple[Path, TrackR
     """None at all is red, some amber; all, or none asked for, is no row."""
     report = finished[1].report
     facts = FrameTable(np.full(1, np.nan), np.full(1, np.nan), np.full(1, np.nan), np.full(1, -1))
-    for gap, sigma, light in (("", {"median": 1.0}, None), ("2 of 9", {"median": 1.0}, "amber"), ("open", None, "red")):
-        maps = [report["maps"][0] | {"covariance_gap": gap, "position_sigma": sigma}]
-        rows = [row for row in make_checks(report["frames"], maps, {}, facts) if "uncertainty" in row["name"]]
+    known = MedianMax(median=1.0, max=1.0)
+    for gap, sigma, light in (("", known, None), ("2 of 9", known, "amber"), ("open", None, "red")):
+        maps = [replace(report["maps"][0], covariance_gap=gap, position_sigma=sigma)]
+        rows = [row for row in make_checks(report["frames"], maps, None, facts) if "uncertainty" in row["name"]]
         assert [row["light"] for row in rows] == ([] if light is None else [light])
         assert [row["value"] for row in rows] == ([] if light is None else [gap])
 
@@ -164,6 +169,7 @@ def test_a_stereo_map_holds_both_cameras(tmp_path: Path, monkeypatch: Patch) -> 
 
 def test_the_report_compares_with_the_ground_truth(finished: tuple[Path, TrackResult]) -> None:
     report = json.loads((finished[0] / "report.json").read_text())
+    check_schema("odometry", report)
     final, live = report["ground_truth"]
     assert (final["poses"], final["alignment"], final["num_pairs"], live["poses"]) == ("final", "sim3", 45, "live")
     assert 0.01 < final["ate_m"]["rmse"] < 0.06
@@ -315,12 +321,12 @@ def test_workspaces_of_other_commands_are_refused(
 # -------------------------------------------------------------------------------------------------------------- scale
 
 
-@pytest.mark.parametrize("wish", ["distance:000000.png:000040:{:.4f}", "distance:0:40:{:.4f}"])
-def test_a_known_distance_makes_metres(request: str, tmp_path: Path, monkeypatch: Patch) -> None:
+@pytest.mark.parametrize("source", ["distance:000000.png:000040:{:.4f}", "distance:0:40:{:.4f}"])
+def test_a_known_distance_makes_metres(source: str, tmp_path: Path, monkeypatch: Patch) -> None:
     use(monkeypatch, FakeSequence(), FakeRunner())
     centers = rigid3.center(path(50))
     length = float(np.linalg.norm(centers[40] - centers[0]))
-    result = run(tmp_path / "out", f"scale.source={request.format(length)}")
+    result = run(tmp_path / "out", f"scale.source={source.format(length)}")
     row = result.report["maps"][0]
     assert (row["unit"], row["scale_source"]) == ("m", "distance")
     assert result.report["ground_truth"][0]["alignment"] == "se3"

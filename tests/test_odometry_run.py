@@ -17,13 +17,13 @@ from odometry_sequences import Played, Told, absolute_error, path_length, run
 from rendered_worlds import sequences as rendered
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.odometry.frontend.active_tracks import ActiveTracks
+from sfmapp.odometry.map.atlas import Atlas
 from sfmapp.odometry.map.local_map import LocalMap, View
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.recognition import Recognition
 from sfmapp.odometry.records import FrameRecord
 from sfmapp.odometry.result import FrameState, OdometryResult
-from sfmapp.odometry.run import Odometry, run_odometry
+from sfmapp.odometry.run import run_odometry
 
 Array = np.ndarray
 
@@ -168,7 +168,7 @@ def test_the_frame_at_which_worlds_change_has_its_live_pose_in_the_new_one(monke
             keyframe.rig_from_world = similarity.transform_poses(shift, keyframe.rig_from_world)
         local.keyframes.point_xyz[:] = similarity.apply(shift, local.keyframes.point_xyz)
         for record in records:
-            record.frame_from_keyframe[4:] *= 1.7
+            record.move(1.7, np.arange(local.keyframes.num_points, dtype=np.int32))
         return local, 1.7
 
     monkeypatch.setattr(Recognition, "remember", remember)
@@ -184,14 +184,14 @@ def test_the_frame_at_which_worlds_change_has_its_live_pose_in_the_new_one(monke
 
 def test_a_map_that_was_taken_into_another_leaves_its_number_unused() -> None:
     """Live poses are told apart by the numbers of the worlds they were given out in."""
-    odometry = Odometry(played.room(2), OdometryOptions(), seed=0, threads=1, events=Events())  # type: ignore[arg-type]
-    first = odometry._new_map()
-    assert odometry._new_map().map_idx == first.map_idx  # one that did not begin is forgotten
+    rig, atlas = played.room_rig(False), Atlas(OdometryOptions(), None)
+    first = atlas.new_map(rig)
+    assert atlas.new_map(rig).map_idx == first.map_idx  # one that did not begin is forgotten
     for _ in range(2):
-        local = odometry._new_map()
-        odometry._enter(local, ActiveTracks.none(), rigid3.IDENTITY)
-    del odometry.maps[local.map_idx]
-    assert odometry._new_map().map_idx == local.map_idx + 1
+        local = atlas.new_map(rig)
+        atlas.begin(local)
+    del atlas.maps[local.map_idx]
+    assert atlas.new_map(rig).map_idx == local.map_idx + 1
 
 
 @pytest.mark.parametrize("is_stereo", [False, True], ids=["mono", "stereo"])

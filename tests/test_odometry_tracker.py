@@ -7,6 +7,7 @@ import pytest
 
 from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.geometry import rigid3
+from sfmapp.odometry.keyframe_images import KeyframeImages
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.records import FrameRecord, gather, measure_again
 from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment
@@ -105,9 +106,8 @@ def record(frame: int, map_idx: int = -1, keyframe: int = -1, shift: float = 0.0
     out = FrameRecord(frame, f"{frame}.png", 0.1 * frame)
     out.state = FrameState.LOST
     if map_idx >= 0:
-        out.state, out.map_idx, out.keyframe = FrameState.TRACKED, map_idx, keyframe
-        out.frame_from_keyframe = np.array([0, 0, 0, 1.0, shift, 0, 0])
-        out.live = np.full(7, float(frame))
+        out.settle(FrameState.TRACKED, map_idx, keyframe, np.array([0, 0, 0, 1.0, shift, 0, 0]))
+        out.give_out(np.full(7, float(frame)))
     return out
 
 
@@ -117,7 +117,7 @@ NO_WORD = FinalAdjustment(None, "", {})
 def test_the_map_with_the_most_frames_comes_first_and_gaps_stay_gaps() -> None:
     maps = {3: keyframes_along(0.0), 5: keyframes_along(1.0)}
     records = [record(0, 3, 0), record(1, 3, 0, 0.1), record(2), record(3, 5, 0), record(4, 5, 1), record(5, 5, 1, 0.3)]
-    result = gather(records, maps, dict.fromkeys(maps, NO_WORD))
+    result = gather(records, maps, dict.fromkeys(maps, NO_WORD), KeyframeImages())
     np.testing.assert_array_equal(result.frame_map, [1, 1, -1, 0, 0, 0])
     np.testing.assert_allclose(result.cam_from_world[[0, 1, 3, 4, 5], 4], [0.0, 0.1, 1.0, 0.8, 1.1])
     assert np.isnan(result.cam_from_world[2]).all()
@@ -129,7 +129,7 @@ def test_the_map_with_the_most_frames_comes_first_and_gaps_stay_gaps() -> None:
 
 
 def test_no_map_at_all_is_a_result() -> None:
-    result = gather([record(0), record(1)], {}, {})
+    result = gather([record(0), record(1)], {}, {}, KeyframeImages())
     assert result.maps == []
     np.testing.assert_array_equal(result.frame_map, [-1, -1])
     assert np.isnan(result.cam_from_world).all()

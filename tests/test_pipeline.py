@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import sfmapp
+from schemas import check_schema
 from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError, TooFewImagesError
 from sfmapp.events import Event, Events
 from sfmapp.pipelines.sparse.reconstruct import RunResult, reconstruct
@@ -65,6 +66,7 @@ def copy(finished: Path, tmp_path: Path) -> Path:
 
 def test_all_photographs_are_registered_and_the_report_says_so(photos: Path, finished: Path) -> None:
     report = json.loads((finished / "report.json").read_text())
+    check_schema("reconstruct", report)
     assert report["outcome"]["exit_code"] == 0
     assert report["models"][0]["num_registered"] == 7
     assert 0.05 < report["models"][0]["mean_reprojection_error_px"] < 1.0
@@ -346,6 +348,7 @@ def test_photographs_without_a_reconstruction_end_with_a_report(tmp_path: Path, 
         run(photos, output)
     assert caught.value.advice
     report = json.loads((output / "report.json").read_text())
+    check_schema("reconstruct", report)
     assert report["outcome"] == {"exit_code": 4, "message": str(caught.value), "advice": caught.value.advice}
     assert len(report["images"]) == len(list(photos.iterdir()))
     assert all(image["remedy"] and image["reason"] and not image["is_registered"] for image in report["images"])

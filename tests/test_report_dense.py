@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import re
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -11,14 +11,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sfmapp.dense.report import DensifyReport, LevelReport, SeedsReport, WaveReport
 from sfmapp.dense.scene import DenseScene, DenseView, Patches
 from sfmapp.geometry import rigid3
 from sfmapp.report.coverage import REASONS, coverage
 from sfmapp.report.dense_document import dense_document
 from sfmapp.report.dense_html import dense_section, render_dense_html
 from sfmapp.report.dense_pictures import dense_pictures, turned_eye
+from sfmapp.report.model import DensePart, DenseRunReport, Outcome, RunFacts, Stages
 from sfmapp.report.plots import bars_svg
+from sfmapp.reporting import Step, Usage, from_plain, plain, to_json
 from sfmapp.scene.mesh import Mesh, vertex_normals
+from sfmapp.surface.report import MeshReport
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 160, 96, 120.0, 4.0
 
@@ -56,28 +60,25 @@ def wall(first: int = 0, last: int = WIDTH, views: tuple[int, ...] = (0, 1, 2)) 
     return on_pixels(x, y, views)
 
 
-def report_of(num_patches: int) -> dict[str, Any]:
-    level = {
-        "level": 0, "carried": 50, "points": 5, "expanded": 90, "corners": 7, "accepted": num_patches + 30,
-        "contradicted": 20, "without neighbours": 4, "in small groups": 6, "patches": num_patches,
-        "seconds": 1.25, "cpu_s": 2.5,
-    }  # fmt: skip
-    funnel = [{"name": "accepted", "count": num_patches + 30}]
-    funnel += [{"name": name, "count": level[name]} for name in ("contradicted", "without neighbours")]
-    funnel += [{"name": "in small groups", "count": 6}, {"name": "patches", "count": num_patches}]
-    return {
-        "num_patches": num_patches, "levels": [level], "seeds": {"carried": 50, "points": 5, "corners": 7},
-        "waves": [{"wave": 2, "tried": 100, "accepted": 60}, {"wave": 3, "tried": 50, "accepted": 30}],
-        "funnel": funnel,
-    }  # fmt: skip
+def report_of(num_patches: int) -> DensifyReport:
+    level = LevelReport(
+        level=0, carried=50, points=5, expanded=90, corners=7, seen_by_few=3, accepted=num_patches + 30,
+        contradicted=20, without_neighbours=4, in_small_groups=6, patches=num_patches, wall_s=1.25, cpu_s=2.5,
+    )  # fmt: skip
+    funnel = {"accepted": num_patches + 30, "contradicted": 20, "without neighbours": 4, "in small groups": 6}
+    return DensifyReport(
+        num_patches=num_patches, levels=[level], seeds=SeedsReport(carried=50, points=5, corners=7),
+        waves=[WaveReport(wave=2, tried=100, accepted=60), WaveReport(wave=3, tried=50, accepted=30)],
+        funnel=[Step(name=name, count=count) for name, count in (*funnel.items(), ("patches", num_patches))],
+    )  # fmt: skip
 
 
-def mesh_report() -> dict[str, Any]:
-    return {
-        "depth": 7, "spacing": 0.0333, "num_vertices": 4, "num_faces": 2, "num_rim_edges": 4,
-        "funnel": [{"name": "Poisson", "count": 10}, {"name": "near patches", "count": 2}],
-        "poisson": {"seconds": 3.0, "cpu_s": 2.0, "peak_memory_mb": 100.0}, "seconds": 4.0, "cpu_s": 3.0,
-    }  # fmt: skip
+def mesh_report() -> MeshReport:
+    return MeshReport(
+        depth=7, spacing=0.0333, num_vertices=4, num_faces=2, num_rim_edges=4,
+        funnel=[Step(name="Poisson", count=10), Step(name="near patches", count=2)],
+        poisson=Usage(wall_s=3.0, cpu_s=2.0, peak_memory_mb=100.0), wall_s=4.0, cpu_s=3.0,
+    )  # fmt: skip
 
 
 def quad() -> Mesh:
@@ -86,12 +87,15 @@ def quad() -> Mesh:
     return Mesh(xyz, faces, vertex_normals(xyz, faces), np.full((4, 3), 200, np.uint8))
 
 
-def page_report(dense: dict[str, Any] | None) -> dict[str, Any]:
-    run = {"source": "a & b", "started": "2026-01-01", "versions": {"sfmapp": "1"}, "wall_s": 1.0, "cpu_s": 2.0}
-    return {
-        "outcome": {"exit_code": 0 if dense else 4, "message": "nothing agreed", "advice": None}, "run": run,
-        "usage": {}, "warnings": [], "decisions": [], "dense": dense,
-    }  # fmt: skip
+def page_report(dense: DensePart | None) -> DenseRunReport:
+    run = RunFacts(
+        source="a & b", seed=0, threads=1, options={}, started="2026-01-01", versions={"sfmapp": "1"},
+        is_up_to_date=False, wall_s=1.0, cpu_s=2.0,
+    )  # fmt: skip
+    return DenseRunReport(
+        format="", outcome=Outcome(exit_code=0 if dense else 4, message="nothing agreed", advice=None), run=run,
+        usage={}, warnings=[], decisions=[], stages=Stages(), dense=dense,
+    )  # fmt: skip
 
 
 # ------------------------------------------------------------------------------------------------------------ coverage
@@ -111,7 +115,8 @@ def test_what_is_covered_is_what_has_patches() -> None:
     # the other half is textured and in sight of the others but for their edges
     assert rows[0]["unmatched"] == pytest.approx(0.5, abs=0.06)
     assert rows[0]["reason"] == REASONS["unmatched"]
-    assert coverage(scene, wall())[0] | {"coverage": 1.0, "reason": ""} == coverage(scene, wall())[0]
+    whole = coverage(scene, wall())[0]
+    assert replace(whole, coverage=1.0, reason="") == whole
 
 
 def test_bare_walls_are_called_plain() -> None:
@@ -164,7 +169,7 @@ def test_the_counts_of_a_document_add_up() -> None:
     funnel = [step["count"] for step in document["funnel"]]
     assert funnel[0] - sum(funnel[1:-1]) == funnel[-1] == document["num_patches"]
     assert {check["light"] for check in document["checks"]} <= {"green", "amber", "red"}
-    assert json.loads(json.dumps(document)) == document
+    assert from_plain(DensePart, plain(document)) == document
 
 
 def test_values_out_of_range_and_unknown_ones_are_counted() -> None:
@@ -175,7 +180,7 @@ def test_values_out_of_range_and_unknown_ones_are_counted() -> None:
     assert all(sum(entry["counts"]) == len(patches) for entry in document["histograms"].values())
     assert document["histograms"]["score"]["counts"][0] >= 2
     assert document["histograms"]["sigma_px"]["counts"][-1] >= 3
-    json.dumps(document, allow_nan=False)
+    assert "NaN" not in to_json(document)
 
 
 def test_what_went_away_after_densification_is_a_step_of_its_own() -> None:

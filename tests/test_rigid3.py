@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from sfmapp.errors import InputError
 from sfmapp.geometry import rigid3
@@ -56,6 +56,28 @@ def test_functions_broadcast():
     one = rigid3.compose(many[2, 3], many[1, 1])
     np.testing.assert_allclose(rigid3.compose(many, many[1, 1])[2, 3], one, atol=1e-14)
     np.testing.assert_allclose(rigid3.inverse(many)[3, 4], rigid3.inverse(many[3, 4]), atol=1e-14)
+
+
+@given(poses, poses, st.floats(0, 1))
+def test_interpolation_agrees_with_scipy_and_moves_the_centre_on_a_line(first, last, share):
+    rotations = Rotation.from_matrix(rigid3.rotation_matrix(np.stack([first, last])))
+    if (rotations[1] * rotations[0].inv()).magnitude() > 3.1:  # the way round is open
+        return
+    found = rigid3.interpolate(first, last, share)
+    oracle = Slerp([0.0, 1.0], rotations)(share)
+    np.testing.assert_allclose(rigid3.rotation_matrix(found), oracle.as_matrix(), atol=1e-9)
+    centers = (1 - share) * rigid3.center(first) + share * rigid3.center(last)
+    np.testing.assert_allclose(rigid3.center(found), centers, atol=1e-12)
+
+
+def test_interpolation_of_many_is_that_of_each():
+    rng = np.random.default_rng(0)
+    first, last = rigid3.from_matrix(rigid3.exp_so3(rng.normal(size=(2, 5, 3))), rng.normal(size=(2, 5, 3)))
+    shares = rng.random(5)
+    each = [rigid3.interpolate(*row) for row in zip(first, last, shares, strict=True)]
+    np.testing.assert_array_equal(rigid3.interpolate(first, last, shares), each)
+    np.testing.assert_allclose(rigid3.interpolate(first, last, 0.0), first, atol=1e-12)
+    np.testing.assert_allclose(rigid3.interpolate(first, last, np.ones(5)), last, atol=1e-12)
 
 
 @given(poses, poses, vectors)

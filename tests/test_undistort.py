@@ -15,6 +15,7 @@ from PIL import Image, ImageOps
 
 import sfmapp
 from dense_models import make_model, row_of_poses, see_wall, texture
+from schemas import check_schema
 from sfmapp.camera.camera import Camera, CameraModel, pixels_to_normalized
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError, UsageError
@@ -24,6 +25,7 @@ from sfmapp.images.exif import read_exif
 from sfmapp.images.headers import read_header
 from sfmapp.images.rewrite import encode, without_turn
 from sfmapp.pipelines.dense.source import find_source
+from sfmapp.reporting import plain
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import RigImages
 from sfmapp.scene.undistortion import move_pixels, plan_undistortion, undistort_reconstruction
@@ -109,6 +111,7 @@ def test_pictures_and_cameras_are_those_of_pycolmap(tmp_path: Path, blank: float
         tmp_path / "theirs", tmp_path / "sparse" / "0", tmp_path / "images", undistort_options=wanted
     )
     assert result.report["num_images"] == 4
+    check_schema("undistort", plain(result.report))
     for m in range(4):
         ours, theirs = (stored(tmp_path / place / "images" / f"view_{m}.png") for place in ("out", "theirs"))
         assert ours.shape == theirs.shape

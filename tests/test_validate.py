@@ -11,12 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from schemas import check_schema
 from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError, SfmError
+from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.evaluation.second_opinion import SecondOpinion
 from sfmapp.events import Events
 from sfmapp.formats.colmap import write_model
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.pipelines import validate as pipeline
+from sfmapp.report.validation import PycolmapSide, Side, Validation
+from sfmapp.reporting import plain
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene
 from sfmapp.workspace.layout import FORMAT
@@ -47,8 +51,9 @@ def workspace(tmp_path: Path, scene: Reconstruction) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(rng.integers(0, 255, (40, 50), np.uint8)).save(path)
     write_model(out / "sparse" / "0", scene)
-    (out / "run.json").write_text(json.dumps({"format": FORMAT, "stages": {}, "source": str(photos), "options": {}}))
-    (out / "report.json").write_text(json.dumps({"run": {"wall_s": 2.0, "cpu_s": 4.0, "peak_memory_mb": 200.0}}))
+    stages = {"mapping": {"run": {"wall_s": 2.0, "cpu_s": 4.0, "peak_memory_mb": 200.0}}}
+    manifest = {"format": FORMAT, "stages": stages, "source": str(photos), "options": {}}
+    (out / "run.json").write_text(json.dumps(manifest))
     return out
 
 
@@ -111,12 +116,13 @@ def test_the_same_model_in_another_world_agrees(
         assert side["reprojection_error_px"] < 1e-9
         assert side["ground_truth"]["center_error"]["max"] < 1e-9
         assert side["ground_truth"]["auc"]["0.5"] == pytest.approx(1.0, abs=1e-4)
+    check_schema("validate", plain(result))
     table = result.table()
     assert max(map(len, table.splitlines())) <= 100
     for words in ("registered images", "6 of 6", "2.0 s", "10.0 s   5.00 x less", "4.50 x less", "2.00 x more",
                   "worst 0.0000 deg", "AUC at 0.5 deg", "cameras.json"):  # fmt: skip
         assert words in table, words
-    assert json.loads((workspace / "validation" / "report.json").read_text()) == result.to_dict()
+    assert json.loads((workspace / "validation" / "report.json").read_text()) == plain(result)
 
 
 def test_known_differences_come_out(
@@ -186,7 +192,8 @@ def test_no_model_of_pycolmap_and_no_opinion_at_all(workspace: Path, monkeypatch
 
 def test_what_is_not_recorded_is_said(workspace: Path, scene: Reconstruction, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pipeline, "ask_second_opinion", opinion_on(scene, []))
-    (workspace / "report.json").unlink()
+    manifest = json.loads((workspace / "run.json").read_text())
+    (workspace / "run.json").write_text(json.dumps(manifest | {"stages": {}}))
     result = pipeline.validate(workspace)
     assert result.ours["wall_s"] is None
     assert result.table().count("not recorded") == 3
@@ -236,12 +243,13 @@ def test_refusals(workspace: Path, tmp_path: Path) -> None:
         pipeline.validate(workspace)
 
 
-def test_table_without_ground_truth_or_opinion_has_no_gaps(workspace: Path) -> None:
-    ours = {"registered": 3, "images": 3, "points": 5, "track_length": None, "reprojection_error_px": None,
-            "wall_s": 1.0, "cpu_s": None, "peak_memory_mb": 10.0}  # fmt: skip
-    empty = pipeline.Validation(ours, None, None, None, [])
+def test_table_without_ground_truth_or_opinion_has_no_gaps(scene: Reconstruction) -> None:
+    ours = Side(registered=3, images=3, points=5, track_length=None, reprojection_error_px=None,
+                wall_s=1.0, cpu_s=None, peak_memory_mb=10.0)  # fmt: skip
+    empty = Validation(ours, None, None, None, [])
     assert "None" not in empty.table()
-    tilted = replace(empty, pycolmap=ours | {"wall_s": 0.5}, agreement={"num_common": 1, "num_outliers": 0,
-                     "center_error": None})  # fmt: skip
+    theirs = PycolmapSide(**{**ours, "wall_s": 0.5}, phases={}, version="4.2", options={})
+    nothing = evaluate_poses([], [], scene.image_names, scene.cam_from_world)
+    tilted = replace(empty, pycolmap=theirs, agreement=nothing.summary())
     assert "too few to align" in tilted.table()
     assert "2.00 x more" in tilted.table()

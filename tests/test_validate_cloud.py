@@ -4,18 +4,21 @@ meshes."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from schemas import check_schema
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.colmap import write_model
 from sfmapp.formats.ply import write_ply
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.pipelines.validate_cloud import validate_cloud
+from sfmapp.reporting import plain
 from sfmapp.scene.synthetic import make_scene
 from sfmapp.viewer.cloud_error import error_colors
 
@@ -55,7 +58,8 @@ def test_known_errors_are_told_at_one_two_and_five_pixels(workspace: Path, tmp_p
     # 45 of 60 rows are there; behind them, the columns that lie right reach a pixel further than the others
     assert [score["completeness"] for score in (one, two, five)] == [45.5 / 60, 46.5 / 60, 49.5 / 60]
     assert two["f_score"] == pytest.approx(2 * two["completeness"] / (1 + two["completeness"]), abs=1e-12)
-    assert json.loads((workspace / "validation" / "cloud.json").read_text()) == result.to_dict()
+    assert json.loads((workspace / "validation" / "cloud.json").read_text()) == plain(result)
+    check_schema("validate-cloud", plain(result))
     assert (workspace / "validation" / "cloud_error.rrd").stat().st_size > 10_000
     table = result.table()
     for words in ("2700 points, 3600 true points", "50.00 %", "100.00 %", "F-score"):
@@ -137,13 +141,13 @@ def test_colours_change_at_the_limits() -> None:
 
 def test_points_that_are_nowhere_are_counted_in_the_notes(workspace: Path, tmp_path: Path) -> None:
     """A ground truth as a scanner writes it: text, line ends of Windows, NaN where it saw nothing."""
-    plain = validate_cloud(workspace, save(tmp_path / "ground_truth.ply", floor()))
+    known = validate_cloud(workspace, save(tmp_path / "ground_truth.ply", floor()))
     rows = [*(" ".join(map(repr, row)) for row in floor().tolist()), "nan nan nan", "1 2 inf"]
     head = ["ply", "format ascii 1.0", "obj_info a scanner", f"element vertex {len(rows)}"]
     head += [f"property double {axis}" for axis in "xyz"] + ["end_header"]
     (tmp_path / "scan.ply").write_text("\r\n".join([*head, *rows, ""]), newline="")
     result = validate_cloud(workspace, tmp_path / "scan.ply")
-    assert result.scores == plain.scores | {
-        name: scores | {"num_ground_truth_left_out": 2} for name, scores in plain.scores.items()
+    assert result.scores == {
+        name: replace(scores, num_ground_truth_left_out=2) for name, scores in known.scores.items()
     }
     assert f"2 of {len(rows)} points are not finite and are left out" in result.table()

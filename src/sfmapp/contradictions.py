@@ -7,17 +7,17 @@ stated uncertainty. Stages find contradictions; reports and the command line onl
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.reporting import Plain, Report
+
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Contradiction:
+class Contradiction(Report, kw_only=False):
     """One piece of evidence that stands against a result and could not be resolved.
 
     Attributes:
@@ -34,18 +34,10 @@ class Contradiction:
     subject: str
     message: str
     advice: str = ""
-    evidence: Mapping[str, Any] = field(default_factory=dict)
+    evidence: Mapping[str, Plain] = field(default_factory=dict)
     rotation_sigma_deg: float = 0.0
     position_sigma_share: float = 0.0
     scale_sigma: float = 0.0
-
-    def describe(self) -> dict[str, Any]:
-        """The contradiction as it stands in ``report.json``."""
-        return {
-            "subject": self.subject, "message": self.message, "advice": self.advice, "evidence": dict(self.evidence),
-            "rotation_sigma_deg": self.rotation_sigma_deg, "position_sigma_share": self.position_sigma_share,
-            "scale_sigma": self.scale_sigma,
-        }  # fmt: skip
 
 
 def widened(covariance: Array, spread: float, contradictions: Sequence[Contradiction]) -> Array:

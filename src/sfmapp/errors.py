@@ -7,7 +7,8 @@ exit code. A message names the file or option, what was expected and what was fo
 from __future__ import annotations
 
 import errno
-from typing import Any
+
+from sfmapp.reporting import Report
 
 _NO_SPACE = "free some space, or choose another place, and run the same command again"
 _NOT_ALLOWED = "check the permissions, or choose another place"
@@ -79,7 +80,7 @@ class NoReconstructionError(SfmError):
     """
 
     exit_code = 4
-    report: dict[str, Any] | None = None
+    report: Report | None = None
 
 
 class TooFewImagesError(SfmError):

@@ -135,7 +135,7 @@ def track_sequence(
         source: a folder of frames, a video file or stream, or the folder of a KITTI, TUM or EuRoC sequence; or frames
             in memory, :class:`ArraySequence`, or whatever has the members of one.
         output: folder of the results: new, empty, or of an earlier odometry run, whose results are replaced. None, for
-            frames in memory alone: nothing is written, and one camera has no unit of length.
+            frames in memory alone: nothing is written.
         options: of these, ``sequence``, ``odometry`` and ``scale``.
         self_calibrate: find the intrinsics by a reconstruction from the first minute.
         record: write ``recording.rrd``, which replays the run.
@@ -461,11 +461,19 @@ def _tracked_in_memory(source: FilePath | Sequence, options: Options, events: Ev
 
     from sfmapp.errors import NoReconstructionError
     from sfmapp.odometry.run import run_odometry
+    from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps
 
     if isinstance(source, str | os.PathLike):
         raise UsageError("a sequence of files needs a folder for its results", "give one as the second argument")
+    wanted = options.scale.source
+    request = resolve_scale_request(None if wanted is None else parse_scale(wanted), wanted is None, source)
     with threadpool_limits(1, "blas"):
-        found = run_odometry(source, options.odometry, seed=options.seed, threads=options.num_workers, events=events)
+        found = run_odometry(
+            source, options.odometry, seed=options.seed, threads=options.num_workers, events=events,
+            markers=None if request is None else request.detector(),
+        )  # fmt: skip
+    if request is not None:
+        scale_maps(found, request, source.imu, events)
     if not found.maps:
         raise NoReconstructionError(f"{len(found.frame_idx)} frames were given, but no map could be begun")
     return _with_views(found)

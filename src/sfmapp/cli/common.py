@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from sfmapp.cli.progress import make_listener
 from sfmapp.cli.signals import signals_stop
 
 if TYPE_CHECKING:
+    from sfmapp.contradictions import Contradiction
     from sfmapp.events import Events
+    from sfmapp.reporting import Usage
 
 
 def add_output_flags(parser: argparse.ArgumentParser, *, has_log: bool = False) -> None:
@@ -44,22 +45,22 @@ def listening(args: argparse.Namespace) -> Iterator[Events]:
 
 def print_json(value: Any) -> None:
     """The machine-readable result of a command: one JSON document on stdout."""
-    from sfmapp.workspace.plain_json import plain_number
+    from sfmapp.reporting import to_json
 
-    print(json.dumps(value, default=plain_number), flush=True)
-
-
-def took(run: dict[str, Any]) -> str:
-    """What a run took: ``run`` of its report in words."""
-    return f"took {run['wall_s']:.1f} s, {run['cpu_s']:.1f} CPU s, {run['peak_memory_mb']:.0f} MB"
+    print(to_json(value), flush=True)
 
 
-def print_contradictions(found: Iterable[Mapping[str, Any]]) -> None:
-    """Contradictions as ``Contradiction.describe`` gives them: a line for each, and what to do about it."""
-    for row in found:
-        print(f"  CONTRADICTED: {row['message']}")
-        if row["advice"]:
-            print(f"    {row['advice']}")
+def took(run: Usage) -> str:
+    """What a run took, in words."""
+    return f"took {run.wall_s:.1f} s, {run.cpu_s:.1f} CPU s, {run.peak_memory_mb or 0.0:.0f} MB"
+
+
+def print_contradictions(found: Iterable[Contradiction]) -> None:
+    """A line for each contradiction, and what to do about it."""
+    for each in found:
+        print(f"  CONTRADICTED: {each.message}")
+        if each.advice:
+            print(f"    {each.advice}")
 
 
 def limit_library_threads() -> None:

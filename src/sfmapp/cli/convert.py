@@ -30,7 +30,7 @@ def _export(args: argparse.Namespace) -> int:
     if args.json:
         print_json({"exit_code": 0, **result})
     else:
-        print(f"wrote {args.path} ({args.to}), read it back: worst reprojection difference {result['max_px']:.2g} px")
-        for note in result["notes"]:
+        print(f"wrote {args.path} ({args.to}), read it back: worst reprojection difference {result.max_px:.2g} px")
+        for note in result.notes:
             print(f"note: {note}")
     return 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sfmapp.cli.common import (
     add_output_flags,
@@ -17,6 +17,7 @@ from sfmapp.cli.common import (
 )
 
 if TYPE_CHECKING:
+    from sfmapp.report.model import DenseReport, MeshRunReport
     from sfmapp.workspace.options import Options
 
 DENSE_EXAMPLES = """\
@@ -167,53 +168,53 @@ def _mesh(args: argparse.Namespace) -> int:
     watch = Stopwatch(whole_process=True)
     with listening(args) as events:
         if is_cloud:
-            result = mesh_cloud(args.source, args.output, options, events=events)
+            result = mesh_cloud(args.source, args.output, options, events=events, watch=watch)
         else:
             result = mesh_workspace(args.source, options, record=not args.no_recording, events=events, watch=watch)
-    report = result.report if "run" in result.report else result.report | {"run": watch.read()}
     output = args.output or args.source
     if args.json:
-        print_json({"exit_code": 0, **mesh_result(output, report)})
+        print_json({"exit_code": 0, **mesh_result(output, result.report)})
     elif not args.quiet:
-        print_mesh(output, report)
+        print_mesh(output, result.report)
     return 0
 
 
-def dense_result(output: Path, report: dict[str, Any]) -> dict[str, Any]:
+def dense_result(output: Path, report: DenseReport) -> dict[str, object]:
     """What ``--json`` prints of a cloud; the rest is in report.json."""
     names = ("num_patches", "mean_views", "median_score", "median_sigma", "median_size", "shares", "run")
     paths = {"cloud": str(output / "dense" / "fused.ply"), "patches": str(output / "dense" / "patches.npz")}
     return {"output": str(output), **paths, **{name: report[name] for name in names if name in report}}
 
 
-def print_dense(output: Path, report: dict[str, Any]) -> None:
+def print_dense(output: Path, report: DenseReport) -> None:
     """A cloud in three lines."""
+    num_views = report.views.num_views if report.views is not None else 0
     print(
-        f"{report['num_patches']} patches from {report['views']['num_views']} views, each in {report['mean_views']:.1f}"
-        f" of them, score {report['median_score']:.3f}, sigma {report['median_sigma']:.3g},"
-        f" a pixel measures {report['median_size']:.3g}"
+        f"{report.num_patches} patches from {num_views} views, each in {report.mean_views:.1f}"
+        f" of them, score {report.median_score:.3f}, sigma {report.median_sigma:.3g},"
+        f" a pixel measures {report.median_size:.3g}"
     )
     _print_end(output, report)
     print(f"cloud {output / 'dense' / 'fused.ply'}; a surface of it: sfmapp mesh {output}")
 
 
-def mesh_result(output: Path, report: dict[str, Any]) -> dict[str, Any]:
+def mesh_result(output: Path, report: MeshRunReport) -> dict[str, object]:
     """What ``--json`` prints of a mesh; the rest is in report.json."""
     names = ("num_vertices", "num_faces", "num_rim_edges", "depth", "spacing", "texture", "run")
     paths = {"mesh": str(output / "mesh" / "mesh.ply"), "glb": str(output / "mesh" / "mesh.glb")}
     return {"output": str(output), **paths, **{name: report[name] for name in names if name in report}}
 
 
-def print_mesh(output: Path, report: dict[str, Any]) -> None:
+def print_mesh(output: Path, report: MeshRunReport) -> None:
     """A mesh in three lines."""
-    rim = report["num_rim_edges"]
+    rim = report.num_rim_edges
     print(
-        f"{report['num_faces']} triangles, {report['num_vertices']} vertices, octree of depth {report['depth']},"
+        f"{report.num_faces} triangles, {report.num_vertices} vertices, octree of depth {report.depth},"
         f" {'closed' if rim == 0 else f'{rim} edges at its rim'}"
     )
     _print_end(output, report)
     print(f"mesh {output / 'mesh' / 'mesh.ply'} and {output / 'mesh' / 'mesh.glb'}")
 
 
-def _print_end(output: Path, report: dict[str, Any]) -> None:
-    print(f"{output} is up to date: nothing to do" if report.get("is_up_to_date") else took(report["run"]))
+def _print_end(output: Path, report: DenseReport | MeshRunReport) -> None:
+    print(f"{output} is up to date: nothing to do" if report.is_up_to_date else took(report.run))

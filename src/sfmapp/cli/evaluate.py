@@ -82,7 +82,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         if not args.json and not args.quiet:
             print(result.table())
     if args.json:
-        print_json({"exit_code": 0, **result.to_dict(), "plot": None if picture is None else str(picture)})
+        print_json({"exit_code": 0, **result.report(), "plot": None if picture is None else str(picture)})
     elif picture is not None and not args.quiet:
         print(f"drawn: {picture}")
     return 0

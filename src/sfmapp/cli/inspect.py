@@ -78,8 +78,9 @@ def _recordings(output: Path) -> list[Path]:
 
 def _validate(args: argparse.Namespace) -> int:
     from sfmapp.errors import UsageError
-    from sfmapp.pipelines.validate import Validation, validate
-    from sfmapp.pipelines.validate_cloud import CloudValidation, validate_cloud
+    from sfmapp.pipelines.validate import validate
+    from sfmapp.pipelines.validate_cloud import validate_cloud
+    from sfmapp.report.validation import CloudValidation, Validation
 
     if args.distance is not None and args.ground_truth_cloud is None:
         raise UsageError("--distance is of no use without --ground-truth-cloud")
@@ -96,7 +97,7 @@ def _validate(args: argparse.Namespace) -> int:
         else:
             result = validate(args.output, args.ground_truth, events=events)
     if args.json:
-        print_json({"exit_code": 0, **result.to_dict()})
+        print_json({"exit_code": 0, **result})
     else:
         print(result.table())
     return 0

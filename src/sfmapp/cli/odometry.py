@@ -18,6 +18,7 @@ from sfmapp.cli.common import (
 )
 
 if TYPE_CHECKING:
+    from sfmapp.report.model import OdometryRunReport, RefineReport
     from sfmapp.viewer.view import LiveViewer
     from sfmapp.workspace.options import Options
 
@@ -173,22 +174,22 @@ def _refine(args: argparse.Namespace) -> int:
     return 0
 
 
-def _print_refined(output: Path, report: dict[str, Any]) -> None:
-    for before, after in zip(report["maps"]["before"], report["maps"]["after"], strict=True):
+def _print_refined(output: Path, report: RefineReport) -> None:
+    for before, after in zip(report.maps.before, report.maps.after, strict=True):
         print(
-            f"map {after['idx']}: {before['num_points']} to {after['num_points']} points, reprojection error"
-            f" {before['mean_reprojection_error_px']:.3f} to {after['mean_reprojection_error_px']:.3f} px"
+            f"map {after.idx}: {before.num_points} to {after.num_points} points, reprojection error"
+            f" {before.mean_reprojection_error_px:.3f} to {after.mean_reprojection_error_px:.3f} px"
         )
-    for before, after in zip(report["ground_truth"]["before"], report["ground_truth"]["after"], strict=False):
-        errors = [row["ate_m"]["rmse"] for row in (before, after)]
-        print(f"  against the ground truth: {errors[0]:.4f} to {errors[1]:.4f} m rmse ({before['alignment'].upper()})")
-    photos, run = report["photographs"], report["run"]
+    for first, last in zip(report.ground_truth.before, report.ground_truth.after, strict=False):
+        errors = f"{first.ate_m.rmse:.4f} to {last.ate_m.rmse:.4f}"
+        print(f"  against the ground truth: {errors} m rmse ({first.alignment.upper()})")
+    photos, run = report.photographs, report.run
     if photos:
-        print(f"{sum(row['is_registered'] for row in photos)} of {len(photos)} photographs registered")
+        print(f"{sum(row.is_registered for row in photos)} of {len(photos)} photographs registered")
         for row in photos:
-            if not row["is_registered"]:
-                print(f"  not registered: {row['name']}: {row['reason']}")
-    print_contradictions(row for found in report["maps"]["after"] for row in found["contradictions"])
+            if not row.is_registered:
+                print(f"  not registered: {row.name}: {row.reason}")
+    print_contradictions(row for found in report.maps.after for row in found.contradictions)
     print(took(run))
     print(f"model {output / 'sparse' / '0'}, trajectory {output / 'trajectory.tum'}, report {output / 'report.html'}")
 
@@ -203,7 +204,7 @@ def _open_viewer(args: argparse.Namespace) -> LiveViewer | None:
     return open_live_viewer(tell=lambda line: print(line, file=sys.stderr, flush=True))
 
 
-def summary(output: Path, report: dict[str, Any]) -> dict[str, Any]:
+def summary(output: Path, report: OdometryRunReport) -> dict[str, object]:
     """What ``--json`` prints: the outcome in numbers; the rest is in report.json."""
     paths = {name: str(output / path) for name, path in (
         ("trajectory", "trajectory.tum"), ("model", "sparse/0"), ("report", "report.json"),
@@ -212,33 +213,33 @@ def summary(output: Path, report: dict[str, Any]) -> dict[str, Any]:
     return {"output": str(output), **paths, **{name: report[name] for name in named}}
 
 
-def _print_summary(args: argparse.Namespace, report: dict[str, Any]) -> None:
+def _print_summary(args: argparse.Namespace, report: OdometryRunReport) -> None:
     from sfmapp.report.odometry_html import scale_text
 
     output, frames, first, run, timing = (
-        args.output, report["frames"], report["maps"][0], report["run"], report["timing"],
+        args.output, report.frames, report.maps[0], report.run, report.timing,
     )  # fmt: skip
     print(
-        f"{frames['num_with_pose']} of {frames['num_frames']} frames have a pose; path of {first['path_length']:.4g},"
-        f" unit: {scale_text(first)}; {first['num_keyframes']} keyframes, {first['num_points']} points"
+        f"{frames.num_with_pose} of {frames.num_frames} frames have a pose; path of {first.path_length:.4g},"
+        f" unit: {scale_text(first)}; {first.num_keyframes} keyframes, {first.num_points} points"
     )
-    for gap in frames["gaps"]:
-        if gap["num_frames"]:
-            print(f"  no pose from frame {gap['first_frame']} to {gap['last_frame']} ({gap['seconds']:.1f} s)")
-    if len(report["maps"]) > 1:
-        sizes = ", ".join(str(other["num_frames"]) for other in report["maps"])
-        print(f"  it falls into {len(report['maps'])} maps of {sizes} frames, each with a world of its own")
-    for row in report["ground_truth"]:
-        if row["poses"] == "final":
-            ate, which = row["ate_m"], f", map {row['map']}" if row["map"] else ""
+    for gap in frames.gaps:
+        if gap.num_frames:
+            print(f"  no pose from frame {gap.first_frame} to {gap.last_frame} ({gap.seconds:.1f} s)")
+    if len(report.maps) > 1:
+        sizes = ", ".join(str(other.num_frames) for other in report.maps)
+        print(f"  it falls into {len(report.maps)} maps of {sizes} frames, each with a world of its own")
+    for row in report.ground_truth:
+        if row.poses == "final":
+            ate, which = row.ate_m, f", map {row.map}" if row.map else ""
             print(
-                f"  against the ground truth{which}: off by {ate['rmse']:.3f} m rmse,"
-                f" {ate['max']:.3f} m at worst, over {row['true_path_m']:.1f} m ({row['alignment'].upper()})"
+                f"  against the ground truth{which}: off by {ate.rmse:.3f} m rmse,"
+                f" {ate.max:.3f} m at worst, over {row.true_path_m:.1f} m ({row.alignment.upper()})"
             )
-    print_contradictions(row for found in report["maps"] for row in found["contradictions"])
-    print(
-        f"{took(run)}; {timing['cpu_ms_per_frame']:.1f} CPU ms a frame,"
-        f" {timing['frames_per_second']:.1f} frames a second"
-    )
+    print_contradictions(row for found in report.maps for row in found.contradictions)
+    pace = ""
+    if timing is not None:
+        pace = f"; {timing.cpu_ms_per_frame:.1f} CPU ms a frame, {timing.frames_per_second:.1f} frames a second"
+    print(took(run) + pace)
     looks = "" if args.no_recording else f"; look at it: sfmapp view {output}"
     print(f"trajectory {output / 'trajectory.tum'}, report {output / 'report.html'}{looks}")

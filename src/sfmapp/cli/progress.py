@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from typing import TYPE_CHECKING, Any, Protocol
@@ -38,10 +37,10 @@ class JsonLines:
     """Every event as one line of JSON."""
 
     def __call__(self, event: Event) -> None:
-        from sfmapp.workspace.listeners import event_to_dict
-        from sfmapp.workspace.plain_json import plain_number
+        from sfmapp.reporting import to_json
+        from sfmapp.workspace.listeners import log_line
 
-        _say(json.dumps(event_to_dict(event), default=plain_number))
+        _say(to_json(log_line(event)))
 
     def close(self) -> None:
         pass

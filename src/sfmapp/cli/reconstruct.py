@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sfmapp.cli.common import (
     add_output_flags,
@@ -18,6 +18,7 @@ from sfmapp.cli.common import (
 )
 
 if TYPE_CHECKING:
+    from sfmapp.report.model import ReconstructionReport
     from sfmapp.workspace.options import Options
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
@@ -127,7 +128,7 @@ def _reconstruct(args: argparse.Namespace) -> int:
     return 0
 
 
-def _go_on(args: argparse.Namespace, options: Options) -> dict[str, Any]:
+def _go_on(args: argparse.Namespace, options: Options) -> dict[str, object]:
     """Dense patches and maybe a mesh of what was reconstructed; what ``--json`` prints of them."""
     from sfmapp.cli.dense import dense_result, mesh_result, print_dense, print_mesh
     from sfmapp.pipelines.dense.densify import dense
@@ -138,7 +139,7 @@ def _go_on(args: argparse.Namespace, options: Options) -> dict[str, Any]:
         # the recording shows patches and mesh: it is written once, by the last stage
         record = not args.no_recording
         cloud = dense(args.output, options=options, record=record and not args.mesh, events=events).report
-        result = {"dense": dense_result(args.output, cloud)}
+        result: dict[str, object] = {"dense": dense_result(args.output, cloud)}
         if is_talking:
             print_dense(args.output, cloud)
         if args.mesh:
@@ -162,17 +163,19 @@ def _demo(args: argparse.Namespace) -> int:
         return 0
     if not args.quiet:
         _print_summary(args.output, report)
-    center, rotation = errors["center_error"], errors["rotation_error_deg"]
-    whose = f"{errors['num_common']} of {errors['num_reference_images']} images, {errors['scene_size']:.1f} m apart"
+    center, rotation = errors.center_error, errors.rotation_error_deg
+    assert center is not None
+    assert rotation is not None
+    whose = f"{errors.num_common} of {errors.num_reference_images} images, {errors.scene_size:.1f} m apart"
     print(
-        f"against the ground truth: camera centres off by {1000 * center['mean']:.2f} mm on average,"
-        f" {1000 * center['max']:.2f} mm at worst; rotations by {rotation['mean']:.4f} and {rotation['max']:.4f}"
+        f"against the ground truth: camera centres off by {1000 * center.mean:.2f} mm on average,"
+        f" {1000 * center.max:.2f} mm at worst; rotations by {rotation.mean:.4f} and {rotation.max:.4f}"
         f" degrees ({whose})"
     )
     return 0
 
 
-def _run(args: argparse.Namespace, images: str, options: Options) -> dict[str, Any]:
+def _run(args: argparse.Namespace, images: str, options: Options) -> ReconstructionReport:
     load_numba_without_blas()
     from sfmapp.pipelines.sparse.reconstruct import reconstruct
     from sfmapp.workspace.usage import Stopwatch
@@ -183,30 +186,30 @@ def _run(args: argparse.Namespace, images: str, options: Options) -> dict[str, A
     return result.report
 
 
-def _result(output: Path, report: dict[str, Any]) -> dict[str, Any]:
+def _result(output: Path, report: ReconstructionReport) -> dict[str, object]:
     """What ``--json`` prints: the outcome in numbers; the rest is in report.json."""
-    missing = [image["name"] for image in report["images"] if not image["is_registered"]]
+    missing = [image.name for image in report.images if not image.is_registered]
     paths = {"model": str(output / "sparse" / "0"), "report": str(output / "report.json")}
-    return {"output": str(output), **paths, **report["models"][0], "not_registered": missing, "run": report["run"]}
+    return {"output": str(output), **paths, **report.models[0], "not_registered": missing, "run": report.run}
 
 
-def _print_summary(output: Path, report: dict[str, Any]) -> None:
-    model, run = report["models"][0], report["run"]
+def _print_summary(output: Path, report: ReconstructionReport) -> None:
+    model, run = report.models[0], report.run
     print(
-        f"{model['num_registered']} of {model['num_images']} images registered, {model['num_points']} points,"
-        f" tracks of {model['mean_track_length']:.2f}, reprojection error {model['mean_reprojection_error_px']:.2f} px"
+        f"{model.num_registered} of {model.num_images} images registered, {model.num_points} points,"
+        f" tracks of {model.mean_track_length:.2f}, reprojection error {model.mean_reprojection_error_px:.2f} px"
     )
-    for image in report["images"]:
-        if not image["is_registered"]:
-            print(f"  not registered: {image['name']}: {image['reason']}. {image['remedy']}")
-    if len(report["models"]) > 1:
-        sizes = ", ".join(str(other["num_registered"]) for other in report["models"])
-        print(f"  the photographs fall into {len(report['models'])} models of {sizes} images: sparse/0, sparse/1, ...")
-        for m, other in enumerate(report["models"][1:], 1):
-            if other["apart"]:
-                print(f"  model {m} is {other['apart']}")
-    print_contradictions(found for one in report["models"] for found in one["contradictions"])
-    if run["is_up_to_date"]:
+    for image in report.images:
+        if not image.is_registered:
+            print(f"  not registered: {image.name}: {image.reason}. {image.remedy}")
+    if len(report.models) > 1:
+        sizes = ", ".join(str(other.num_registered) for other in report.models)
+        print(f"  the photographs fall into {len(report.models)} models of {sizes} images: sparse/0, sparse/1, ...")
+        for m, other in enumerate(report.models[1:], 1):
+            if other.apart:
+                print(f"  model {m} is {other.apart}")
+    print_contradictions(found for one in report.models for found in one.contradictions)
+    if run.is_up_to_date:
         print(f"{output} is up to date: nothing to do")
     else:
         print(took(run))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from sfmapp.cli.common import (
     add_output_flags,
@@ -14,6 +14,9 @@ from sfmapp.cli.common import (
     print_json,
     took,
 )
+
+if TYPE_CHECKING:
+    from sfmapp.report.model import UndistortReport
 
 EXAMPLES = """\
 examples:
@@ -79,15 +82,15 @@ def _undistort(args: argparse.Namespace) -> int:
     return 0
 
 
-def _print(output: Path, report: dict[str, Any]) -> None:
+def _print(output: Path, report: UndistortReport) -> None:
     """A result in three lines."""
-    sizes = sorted({(camera["width"], camera["height"]) for camera in report["cameras"]})
+    sizes = sorted({(camera.width, camera.height) for camera in report.cameras})
     shown = ", ".join(f"{width}x{height}" for width, height in sizes[:3]) + (", ..." if len(sizes) > 3 else "")
-    copied = f", {report['num_copied']} of them copied as they were" if report["num_copied"] else ""
-    masks = f", {report['num_masks']} masks" if report["num_masks"] else ""
+    copied = f", {report.num_copied} of them copied as they were" if report.num_copied else ""
+    masks = f", {report.num_masks} masks" if report.num_masks else ""
     print(
-        f"{report['num_images']} photographs without distortion ({shown}){copied}{masks},"
-        f" {report['num_points']} points, {report['num_observations']} observations ({report['num_dropped']} dropped)"
+        f"{report.num_images} photographs without distortion ({shown}){copied}{masks},"
+        f" {report.num_points} points, {report.num_observations} observations ({report.num_dropped} dropped)"
     )
-    print(f"{output} is up to date: nothing to do" if report["is_up_to_date"] else took(report["run"]))
+    print(f"{output} is up to date: nothing to do" if report.is_up_to_date else took(report.run))
     print(f"photographs {output / 'images'}, model {output / 'sparse' / '0'}")

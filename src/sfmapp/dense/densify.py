@@ -12,10 +12,12 @@ from sfmapp.dense.arrays import Limits, Store
 from sfmapp.dense.growth import Growth, inverse_depth_range
 from sfmapp.dense.options import DenseOptions
 from sfmapp.dense.pyramid import Frame, frame_of, gray_pyramids, make_images
+from sfmapp.dense.report import DensifyReport, LevelReport, SeedsReport, WaveReport
 from sfmapp.dense.scene import DenseScene, DenseView, Patches
 from sfmapp.dense.seeds import corners
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
+from sfmapp.reporting import Step
 
 STAGE = "dense"
 # the longer side of the coarsest level is at least half of this
@@ -27,7 +29,7 @@ TRUSTED, PROMISING, MAX_REFINED = 0.7, 0.4, 4
 
 def densify(
     scene: DenseScene, options: DenseOptions, *, threads: int = 1, events: Events | None = None
-) -> tuple[Patches, dict[str, Any]]:
+) -> tuple[Patches, DensifyReport]:
     """Reconstruct oriented patches all over the surfaces that the views show.
 
     Args:
@@ -37,7 +39,7 @@ def densify(
         events: progress and cancellation.
 
     Returns:
-        The patches, and the report: ``num_patches``, ``waves``, ``levels``, ``funnel``, ``seeds``.
+        The patches, and the report.
 
     Raises:
         InterruptedRunError: ``events`` was asked to stop.
@@ -55,20 +57,20 @@ def densify(
 
 def _coarse_to_fine(
     scene: DenseScene, options: DenseOptions, num_levels: int, threads: int, events: Events
-) -> tuple[Patches, dict[str, Any]]:
+) -> tuple[Patches, DensifyReport]:
     frame = frame_of(scene)
     grays = gray_pyramids(scene.views, num_levels, threads)
     limits = Limits(options.min_views, options.min_views, TRUSTED, PROMISING, MAX_REFINED)
     points, depth_range = _sparse_points(scene, frame), _depth_ranges(scene, frame)
-    rows: list[dict[str, Any]] = []
-    waves: list[dict[str, int]] = []
+    rows: list[LevelReport] = []
+    waves: list[WaveReport] = []
     growth: Growth | None = None
     for level in range(num_levels - 1, -1, -1):
         images = make_images(scene, grays[level], frame, options.cell_px)
         coarser, growth = growth, Growth(images, limits, threads, growth.wave if growth else 0)
         found = [corners(gray, BLOCK_PX, float(images.noise[m])) for m, gray in enumerate(grays[level])]
         steps = 4 ** (num_levels - 1 - level)
-        rows.append({"level": level} | _grow(growth, coarser, points, found, depth_range, steps, events))
+        rows.append(_grow(growth, coarser, level, points, found, depth_range, steps, events))
         waves += growth.waves
     assert growth is not None
     store, count = growth.store._asdict(), growth.count
@@ -82,49 +84,57 @@ def _coarse_to_fine(
 def _grow(
     growth: Growth,
     coarser: Growth | None,
+    level: int,
     points: Store,
     found: list[NDArray[np.int32]],
     depth_range: NDArray[np.float64],
     steps: int,
     events: Events,
-) -> dict[str, Any]:
+) -> LevelReport:
     """Work on one level, from the patches of the coarser one, sparse points and corners; what came of it.
 
     ``steps``: of progress that a view of this level is worth.
     """
     wall, cpu = time.monotonic(), time.process_time()
-    row: dict[str, Any] = {}
+    carried = None
     if coarser is not None:
-        row["carried"] = growth.refine_coarser(coarser, lambda: events.advanced(STAGE, steps))
+        carried = growth.refine_coarser(coarser, lambda: events.advanced(STAGE, steps))
         coarser.close()
-    row["points"] = growth.seed_points(points)
-    row["expanded"] = growth.expand(events, everywhere=True)
+    from_points = growth.seed_points(points)
+    expanded = growth.expand(events, everywhere=True)
     if coarser is not None:
         depth_range = growth.depth_ranges(depth_range)
-    row["corners"] = growth.seed_corners(found, depth_range, everywhere=coarser is None)
-    row["expanded"] += growth.expand(events, everywhere=False)
+    from_corners = growth.seed_corners(found, depth_range, everywhere=coarser is None)
+    expanded += growth.expand(events, everywhere=False)
     events.advanced(STAGE, steps * growth.num_views * (2 if coarser is None else 1))
-    row["seen_by_few"] = growth.expand_where_few_see(events)
-    row["accepted"] = growth.count
-    row |= growth.filter()
+    seen_by_few = growth.expand_where_few_see(events)
+    accepted = growth.count
+    filtered = growth.filter()
     growth.settle()
-    row["patches"] = growth.count
-    took = {"seconds": round(time.monotonic() - wall, 3), "cpu_s": round(time.process_time() - cpu, 3)}
-    return row | took
+    return LevelReport(
+        level=level, carried=carried, points=from_points, expanded=expanded, corners=from_corners,
+        seen_by_few=seen_by_few, accepted=accepted, contradicted=filtered.contradicted,
+        without_neighbours=filtered.without_neighbours, in_small_groups=filtered.in_small_groups, patches=growth.count,
+        wall_s=round(time.monotonic() - wall, 3), cpu_s=round(time.process_time() - cpu, 3),
+    )  # fmt: skip
 
 
-def _report(rows: list[dict[str, Any]], waves: list[dict[str, int]], num_patches: int) -> dict[str, Any]:
+def _report(rows: list[LevelReport], waves: list[WaveReport], num_patches: int) -> DensifyReport:
     last = rows[-1]
-    funnel = [{"name": "accepted", "count": last["accepted"]}]
-    for name in ("contradicted", "without neighbours", "in small groups"):
-        funnel.append({"name": name, "count": last[name]})
-    return {
-        "num_patches": num_patches,
-        "levels": rows,
-        "waves": waves,
-        "seeds": {name: last.get(name, 0) for name in ("carried", "points", "corners")},
-        "funnel": [*funnel, {"name": "patches", "count": num_patches}],
+    steps = {
+        "accepted": last.accepted,
+        "contradicted": last.contradicted,
+        "without neighbours": last.without_neighbours,
+        "in small groups": last.in_small_groups,
+        "patches": num_patches,
     }
+    return DensifyReport(
+        num_patches=num_patches,
+        levels=rows,
+        waves=waves,
+        seeds=SeedsReport(carried=last.carried or 0, points=last.points, corners=last.corners),
+        funnel=[Step(name=name, count=count) for name, count in steps.items()],
+    )
 
 
 def compile_kernels() -> None:
@@ -179,7 +189,7 @@ def _depth_ranges(scene: DenseScene, frame: Frame) -> NDArray[np.float64]:
     return ranges
 
 
-def _patches(scene: DenseScene, store: dict[str, Any], n: int, frame: Frame) -> Patches:
+def _patches(scene: DenseScene, store: dict[str, NDArray[Any]], n: int, frame: Frame) -> Patches:
     """The first n of a store, back in the world and with colours. Its large arrays are let go of in turn."""
     views, num_views = store.pop("views"), store.pop("num_views")
     reference = views[:n, 0].copy()
@@ -197,6 +207,7 @@ def _patches(scene: DenseScene, store: dict[str, Any], n: int, frame: Frame) -> 
         rgb[mine] = view.rgb[y, x]
     unit = np.float32(frame.scale)
     return Patches(
-        xyz, store.pop("normal")[:n].copy(), rgb, store.pop("score")[:n].copy(), store.pop("sigma")[:n] / unit,
-        store.pop("size")[:n] / unit, store.pop("wave")[:n].copy(), view_ptr, view_idx,
+        xyz, store.pop("normal")[:n].copy(), rgb, store.pop("score")[:n].copy(),
+        np.asarray(store.pop("sigma")[:n] / unit, np.float32), np.asarray(store.pop("size")[:n] / unit, np.float32),
+        store.pop("wave")[:n].copy(), view_ptr, view_idx,
     )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from sfmapp.dense import filters, layers, seeds
 from sfmapp.dense.arrays import LAYERS, Cells, Images, Limits, Store
 from sfmapp.dense.expand import CANDIDATES, enter, frontier, retry, try_cells
+from sfmapp.dense.report import WaveReport
 from sfmapp.dense.settle import settle
 from sfmapp.dense.window import make_scratch
 from sfmapp.events import Events
@@ -38,6 +40,14 @@ FEWEST_VIEWS = 2
 SEARCHED_EVERYWHERE, SEARCHED_IN_GAPS = 4, 2
 
 
+class Filtered(NamedTuple):
+    """Patches that the filters took away."""
+
+    contradicted: int
+    without_neighbours: int
+    in_small_groups: int
+
+
 class Growth:
     """Patches of one level."""
 
@@ -45,7 +55,7 @@ class Growth:
         self.images, self.limits = images, limits
         self.wave = first_wave
         self.count = 0
-        self.waves: list[dict[str, int]] = []
+        self.waves: list[WaveReport] = []
         num_cells = len(images.closed)
         self.cells = Cells(np.full((num_cells, LAYERS), -1, np.int32), np.zeros(num_cells, np.uint8))
         self.num_neighbors = images.neighbors.shape[1]
@@ -164,7 +174,7 @@ class Growth:
                 tried += n
                 self._grow(m, n, self.store, self.wave)
             if tried:
-                self.waves.append({"wave": self.wave, "tried": tried, "accepted": self.count - start})
+                self.waves.append(WaveReport(wave=self.wave, tried=tried, accepted=self.count - start))
             events.raise_if_cancelled()
             if self.count == start:
                 return self.count - before
@@ -230,7 +240,7 @@ class Growth:
 
     # ---------------------------------------------------------------------------------------------------------- filters
 
-    def filter(self) -> dict[str, int]:
+    def filter(self) -> Filtered:
         """Take away what other images contradict, what stands alone and what hangs together in too small groups."""
         self._refill()
         self._resolve_layers()
@@ -248,7 +258,7 @@ class Growth:
         del sizes
         self._compact(is_surface)
         in_small_groups = int((~is_surface).sum())
-        return {"contradicted": contradicted, "without neighbours": alone, "in small groups": in_small_groups}
+        return Filtered(contradicted, alone, in_small_groups)
 
     def _resolve_layers(self) -> None:
         """Where an image trusts two patches in one cell, let it decide between them."""

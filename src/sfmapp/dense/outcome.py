@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from sfmapp.dense.prepare import DensePlan
 from sfmapp.dense.pyramid import noise_deviation
+from sfmapp.dense.report import SharesReport
 from sfmapp.dense.scene import DenseView, Patches
 from sfmapp.errors import NoReconstructionError
 from sfmapp.geometry import rigid3
@@ -41,12 +41,8 @@ def textured_pixels(view: DenseView) -> tuple[int, int]:
     return int((textured & is_open).sum()), int(is_open.sum())
 
 
-def judge(
-    patches: Patches, texture: Sequence[tuple[int, int]], points: tuple[int, int], cell_px: int
-) -> dict[str, Any]:
-    """Shares: ``textured``, of the open pixels of all views; ``covered``, cells that trust a patch to textured ones,
-    more than 1 where patches lie on more than is textured by our measure; ``points``, of the sparse points those that
-    hold up as patches, None where there are too few to tell.
+def judge(patches: Patches, texture: Sequence[tuple[int, int]], points: tuple[int, int], cell_px: int) -> SharesReport:
+    """What patches cover of what is textured, and how many of the sparse points hold up.
 
     Args:
         patches: the result.
@@ -56,11 +52,11 @@ def judge(
     """
     textured, is_open = (sum(column) for column in zip(*texture, strict=True))
     cells = max(textured, LEAST_TEXTURED * is_open) / cell_px**2
-    return {
-        "textured": textured / max(is_open, 1),
-        "covered": len(patches.view_idx) / max(cells, 1.0),
-        "points": points[0] / points[1] if points[1] >= LEAST_POINTS else None,
-    }
+    return SharesReport(
+        textured=textured / max(is_open, 1),
+        covered=len(patches.view_idx) / max(cells, 1.0),
+        points=points[0] / points[1] if points[1] >= LEAST_POINTS else None,
+    )
 
 
 def confirmed_share(patches: Patches, plan: DensePlan, min_views: int) -> float | None:
@@ -87,7 +83,7 @@ def confirmed_share(patches: Patches, plan: DensePlan, min_views: int) -> float 
     return float((num_views[asked] > min_views).mean())
 
 
-def check(patches: Patches, shares: dict[str, Any], plan: DensePlan, min_views: int) -> str | None:
+def check(patches: Patches, shares: SharesReport, plan: DensePlan, min_views: int) -> str | None:
     """A warning if little was found, None if all is well. Of a region no more is asked than that it is not empty.
 
     Args:
@@ -101,7 +97,7 @@ def check(patches: Patches, shares: dict[str, Any], plan: DensePlan, min_views: 
             contradict the images.
     """
     found = f"{len(patches)} patches"
-    if shares["textured"] < LEAST_TEXTURED and shares["covered"] < GOOD_COVERED:
+    if shares.textured < LEAST_TEXTURED and shares.covered < GOOD_COVERED:
         raise NoReconstructionError(
             f"{found}: the images show next to no texture ({100 * shares['textured']:.1f} % of their area)",
             "patches need texture to be matched: sharper or closer photographs, or a pattern on the surface",
@@ -115,20 +111,20 @@ def check(patches: Patches, shares: dict[str, Any], plan: DensePlan, min_views: 
             "check its corners against the coordinates of the model, or leave it out to see what is there",
         )
     share = f"{found} cover {100 * shares['covered']:.1f} % of what is textured in the images"
-    confirmed = confirmed_share(patches, plan, min_views) if shares["covered"] < CHANCE_COVERED else None
+    confirmed = confirmed_share(patches, plan, min_views) if shares.covered < CHANCE_COVERED else None
     is_chance = confirmed is not None and confirmed < CHANCE_CONFIRMED
     if is_chance:
         share += f", and {100 * (confirmed or 0.0):.0f} % of them agree with more than {min_views} views"
-    is_weak = shares["covered"] < WEAK_COVERED and (not len(patches) or float(np.median(patches.score)) < WEAK_SCORE)
-    if is_weak and shares["points"] is not None and shares["points"] < LEAST_POINTS_SHARE:
+    is_weak = shares.covered < WEAK_COVERED and (not len(patches) or float(np.median(patches.score)) < WEAK_SCORE)
+    if is_weak and shares.points is not None and shares.points < LEAST_POINTS_SHARE:
         share += f", and {100 * shares['points']:.0f} % of the sparse points hold up"
         is_chance = True
-    if shares["covered"] < LEAST_COVERED or is_chance:
+    if shares.covered < LEAST_COVERED or is_chance:
         raise NoReconstructionError(
             f"{share}: the poses contradict the images",
             "check that model and photographs belong together (names, sizes, orientation), that the poses are "
             "camera from world, and the reprojection error of the model",
         )
-    if shares["covered"] < GOOD_COVERED:
+    if shares.covered < GOOD_COVERED:
         return f"only {share}: are the poses exact, and do the photographs overlap?"
     return None

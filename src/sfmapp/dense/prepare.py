@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.dense.options import DenseOptions
 from sfmapp.dense.photographs import STAGE, Photographs
+from sfmapp.dense.report import ViewReport, ViewsReport
 from sfmapp.dense.scene import DenseScene, DenseView, Region
 from sfmapp.dense.selection import MIN_SHARED, meeting_point, select_neighbors
 from sfmapp.dense.undistort import Canvas, lay_out, make_canvas
@@ -20,6 +20,7 @@ from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import read_on_white
+from sfmapp.reporting import NamedReason
 from sfmapp.scene.reconstruction import Reconstruction
 
 # without a level: the largest longer side
@@ -61,12 +62,11 @@ class DensePlan:
 
 def plan_views(
     model: Reconstruction, photographs: Photographs, options: DenseOptions, events: Events | None = None
-) -> tuple[DensePlan, dict[str, Any]]:
+) -> tuple[DensePlan, ViewsReport]:
     """Decide on the resolution of every view and on its neighbours.
 
     Returns:
-        The plan, and the report: ``num_views``, ``num_points``, ``shrink`` (least, median and largest), ``neighbors``
-        (see :func:`select_neighbors`), ``views`` (a row for each), ``missing`` and ``copies``.
+        The plan, and the report.
 
     Raises:
         InputError: fewer images than have to agree on a patch.
@@ -96,15 +96,15 @@ def plan_views(
     region = None if options.region is None else Region(np.array(options.region[:3]), np.array(options.region[3:]))
     plan = DensePlan(photographs.records, canvases, poses, neighbors, xyz, ptr, view_idx, region)
     shrink = np.array([canvas.shrink for canvas in canvases])
-    report = {
-        "num_views": len(names),
-        "num_points": len(xyz),
-        "shrink": [float(shrink.min()), float(np.median(shrink)), float(shrink.max())],
-        "neighbors": chosen,
-        "views": [_row(plan, m) for m in range(len(names))],
-        "missing": [{"name": name, "reason": reason} for name, reason in photographs.missing],
-        "copies": list(photographs.copies),
-    }
+    report = ViewsReport(
+        num_views=len(names),
+        num_points=len(xyz),
+        shrink=[float(shrink.min()), float(np.median(shrink)), float(shrink.max())],
+        neighbors=chosen,
+        views=[_view_report(plan, m) for m in range(len(names))],
+        missing=[NamedReason(name=name, reason=reason) for name, reason in photographs.missing],
+        copies=list(photographs.copies),
+    )
     width, height = canvases[0].working_size
     events.decided(
         STAGE, f"{len(names)} views, the first of {width}x{height} pixels, {len(xyz)} sparse points", **chosen
@@ -253,7 +253,7 @@ def _check_baseline(poses: NDArray[np.float64], depth: NDArray[np.float64], phot
         )
 
 
-def _row(plan: DensePlan, m: int) -> dict[str, Any]:
+def _view_report(plan: DensePlan, m: int) -> ViewReport:
     width, height = plan.canvases[m].working_size
     names = [plan.records[s].name for s in plan.neighbors[m] if s >= 0]
-    return {"name": plan.records[m].name, "width": width, "height": height, "neighbors": names}
+    return ViewReport(name=plan.records[m].name, width=width, height=height, neighbors=names)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.dense.report import NeighborsReport
 from sfmapp.geometry import rigid3
 
 Array = NDArray[np.float64]
@@ -29,7 +28,7 @@ def select_neighbors(
     point_ptr: NDArray[np.int64],
     point_view_idx: NDArray[np.int32],
     max_neighbors: int,
-) -> tuple[NDArray[np.int32], dict[str, Any]]:
+) -> tuple[NDArray[np.int32], NeighborsReport]:
     """Choose the neighbours of every view.
 
     A common point counts the more the nearer its triangulation angle is to 8 to 20 degrees (Goesele et al., ICCV 2007)
@@ -44,8 +43,7 @@ def select_neighbors(
         max_neighbors: K.
 
     Returns:
-        (V, K) int32 positions of views, best first, -1 behind the last; and the report: ``num_without`` neighbours,
-        ``num_by_points``, ``num_by_cameras`` (pairs), ``median_angle_deg`` between neighbours.
+        (V, K) int32 positions of views, best first, -1 behind the last; and the report.
     """
     num_views = len(cam_from_world)
     score, angle, shared = np.zeros((3, num_views, num_views))
@@ -74,12 +72,12 @@ def select_neighbors(
         counts[0] += len(first)
         counts[1] += len(rest)
         angles += [*angle[m, first], *geometric_angle[m, rest]]
-    return neighbors, {
-        "num_without": int((neighbors[:, 0] < 0).sum()),
-        "num_by_points": counts[0],
-        "num_by_cameras": counts[1],
-        "median_angle_deg": float(np.median(angles)) if angles else None,
-    }
+    return neighbors, NeighborsReport(
+        num_without=int((neighbors[:, 0] < 0).sum()),
+        num_by_points=counts[0],
+        num_by_cameras=counts[1],
+        median_angle_deg=float(np.median(angles)) if angles else None,
+    )
 
 
 @numba.njit(cache=True, nogil=True)

@@ -14,10 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from sfmapp.evaluation.report import CloudScoreSummary, ScoreAt
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -49,21 +51,21 @@ class CloudScore:
     point_distance: Array
     ground_truth_distance: Array
 
-    def summary(self) -> dict[str, Any]:
-        """JSON-able numbers."""
+    def summary(self) -> CloudScoreSummary:
+        """The scores in numbers."""
         point, ground_truth = ~np.isnan(self.point_distance), ~np.isnan(self.ground_truth_distance)
         within = self.point_distance[np.isfinite(self.point_distance)]
-        return {
-            "num_points": int(point.sum()),
-            "num_points_left_out": int((~point).sum()),
-            "num_ground_truth": int(ground_truth.sum()),
-            "num_ground_truth_left_out": int((~ground_truth).sum()),
-            "median_error": float(np.median(within)) if len(within) else None,
-            "scores": [
-                {"distance": float(d), "accuracy": float(a), "completeness": float(c), "f_score": float(f)}
+        return CloudScoreSummary(
+            num_points=int(point.sum()),
+            num_points_left_out=int((~point).sum()),
+            num_ground_truth=int(ground_truth.sum()),
+            num_ground_truth_left_out=int((~ground_truth).sum()),
+            median_error=float(np.median(within)) if len(within) else None,
+            scores=[
+                ScoreAt(distance=float(d), accuracy=float(a), completeness=float(c), f_score=float(f))
                 for d, a, c, f in zip(self.distances, self.accuracy, self.completeness, self.f_score, strict=True)
             ],
-        }
+        )
 
 
 def score_cloud(

@@ -24,11 +24,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sfmapp.evaluation.report import PoseErrorSummary, PoseStatistics
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.scene.reconstruction import Reconstruction
 
@@ -65,19 +65,19 @@ class PoseErrors:
     is_inlier: NDArray[np.bool_]
     scene_size: float
 
-    def summary(self) -> dict[str, Any]:
-        """JSON-able numbers; None where there is nothing to measure."""
+    def summary(self) -> PoseErrorSummary:
+        """The errors in numbers."""
         share = self.center_error / self.scene_size if self.scene_size > 0 else np.full_like(self.center_error, np.nan)
-        return {
-            "num_reference_images": len(self.names),
-            "num_common": int(self.is_common.sum()),
-            "num_outliers": int((np.isfinite(self.center_error) & ~self.is_inlier).sum()),
-            "scene_size": self.scene_size,
-            "center_error": _statistics(self.center_error),
-            "center_error_share": _statistics(share),
-            "rotation_error_deg": _statistics(self.rotation_error_deg),
-            "auc": {f"{t:g}": v for t, v in zip(AUC_THRESHOLDS_DEG, auc(self.pair_error_deg), strict=True)},
-        }
+        return PoseErrorSummary(
+            num_reference_images=len(self.names),
+            num_common=int(self.is_common.sum()),
+            num_outliers=int((np.isfinite(self.center_error) & ~self.is_inlier).sum()),
+            scene_size=self.scene_size,
+            center_error=_statistics(self.center_error),
+            center_error_share=_statistics(share),
+            rotation_error_deg=_statistics(self.rotation_error_deg),
+            auc={f"{t:g}": v for t, v in zip(AUC_THRESHOLDS_DEG, auc(self.pair_error_deg), strict=True)},
+        )
 
 
 def evaluate_poses(
@@ -278,14 +278,14 @@ def _angle_between_deg(a: Array, b: Array) -> Array:
     return np.where(half < 90.0, half, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
-def _statistics(values: Array) -> dict[str, float] | None:
+def _statistics(values: Array) -> PoseStatistics | None:
     """Mean, median, rms and maximum of the finite values; None if there are none."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return None
-    return {
-        "mean": float(finite.mean()),
-        "median": float(np.median(finite)),
-        "rmse": float(np.sqrt((finite**2).mean())),
-        "max": float(finite.max()),
-    }
+    return PoseStatistics(
+        mean=float(finite.mean()),
+        median=float(np.median(finite)),
+        rmse=float(np.sqrt((finite**2).mean())),
+        max=float(finite.max()),
+    )

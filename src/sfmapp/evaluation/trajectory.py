@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.errors import InputError, UsageError
+from sfmapp.evaluation.report import Statistics
 from sfmapp.geometry import rigid3, similarity
 
 Array = NDArray[np.float64]
@@ -198,19 +199,19 @@ class Drift:
         return float(self.rotation_deg_per_m.mean()) if len(self.first) else float("nan")
 
 
-def statistics(values: ArrayLike) -> dict[str, float] | None:
+def statistics(values: ArrayLike) -> Statistics | None:
     """Rmse, mean, median, standard deviation, least and largest of errors (N,); None without any."""
     errors = np.asarray(values, np.float64)
     if not len(errors):
         return None
-    return {
-        "rmse": float(np.sqrt((errors**2).mean())),
-        "mean": float(errors.mean()),
-        "median": float(np.median(errors)),
-        "std": float(errors.std()),
-        "min": float(errors.min()),
-        "max": float(errors.max()),
-    }
+    return Statistics(
+        rmse=float(np.sqrt((errors**2).mean())),
+        mean=float(errors.mean()),
+        median=float(np.median(errors)),
+        std=float(errors.std()),
+        min=float(errors.min()),
+        max=float(errors.max()),
+    )
 
 
 # ---------------------------------------------------------------------------------------------------------- association

@@ -8,13 +8,14 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.features.orb import extract_orb
+from sfmapp.features.report import FeaturesReport, ImageFeatures
 from sfmapp.features.sift import Scratch, compile_kernels, extract_sift
 from sfmapp.option_checks import RESOURCE, Range, check_options, positive
 from sfmapp.scene.features import DescriptorMetric, Features
@@ -71,7 +72,7 @@ def extract_features(
     events: Events,
     known: Mapping[int, Features] | None = None,
     on_features: Callable[[int, Features], None] | None = None,
-) -> tuple[list[Features], dict[str, Any]]:
+) -> tuple[list[Features], FeaturesReport]:
     """Find and describe the keypoints of all images.
 
     Args:
@@ -84,66 +85,67 @@ def extract_features(
             order in which images are done: the place to store them.
 
     Returns:
-        Features in the order of the images, empty for an image that cannot be read, and a JSON-able report.
+        Features in the order of the images, empty for an image that cannot be read, and the report.
     """
     known = known or {}
     images = image_set.images
     result = [known.get(i) for i in range(len(images))]
     todo = [i for i in range(len(images)) if result[i] is None]
-    reports: dict[int, dict[str, Any]] = {}
+    lines: dict[int, ImageFeatures] = {}
     start, start_cpu = time.perf_counter(), time.process_time()
     events.started(STAGE, f"{options.kind} on {len(todo)} images", total=len(todo), num_known=len(images) - len(todo))
     budget, local = _MemoryBudget(_budget_bytes(options)), threading.local()
 
-    def work(i: int) -> tuple[Features, dict[str, Any]]:
+    def work(i: int) -> tuple[Features, ImageFeatures]:
         with budget.hold(_bytes_needed(images[i], options)):
             if not hasattr(local, "scratch"):
                 local.scratch = Scratch()
             return extract_image(images[i], options, local.scratch)
 
     with _single_threaded_opencv(), ThreadPoolExecutor(max(1, threads)) as pool:
-        jobs: dict[Future[tuple[Features, dict[str, Any]]], int] = {pool.submit(work, i): i for i in todo}
+        jobs: dict[Future[tuple[Features, ImageFeatures]], int] = {pool.submit(work, i): i for i in todo}
         try:
             for job in as_completed(jobs):
                 i = jobs[job]
-                features, reports[i] = job.result()
+                features, lines[i] = job.result()
                 result[i] = features
                 if on_features is not None:
                     on_features(i, features)
-                for warning in reports[i]["warnings"]:
+                for warning in lines[i].warnings:
                     events.warned(STAGE, warning, image=images[i].name)
                 events.advanced(STAGE, message=images[i].name, image_idx=i, num_features=len(features))
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise
     done = [features for features in result if features is not None]
-    report = _report(images, done, reports, options)
-    report |= {"seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - start_cpu}
-    events.finished(STAGE, f"{report['num_features']} keypoints in {len(images)} images", **report)
+    took = time.perf_counter() - start, time.process_time() - start_cpu
+    report = _report(images, done, lines, options, took)
+    events.finished(STAGE, f"{report.num_features} keypoints in {len(images)} images", **report)
     return done, report
 
 
 def extract_image(
     record: ImageRecord, options: FeatureOptions, scratch: Scratch | None = None
-) -> tuple[Features, dict[str, Any]]:
+) -> tuple[Features, ImageFeatures]:
     """Features of one image and the line of the report about it; no features if it cannot be read."""
     from sfmapp.images.pixels import read_picture
 
     start = time.thread_time()
-    line: dict[str, Any] = {"name": record.name, "num_features": 0, "warnings": []}
     try:
         picture = read_picture(record)
     except InputError as error:
-        line["warnings"].append(f"{record.name}: no features, {error}")
-        return empty_features(options.kind), line
-    features, line["scale"], line["contrast_threshold"] = features_from_picture(picture, options, scratch)
-    line["num_features"] = len(features)
-    line["cpu_seconds"] = time.thread_time() - start
+        warning = f"{record.name}: no features, {error}"
+        return empty_features(options.kind), ImageFeatures(name=record.name, num_features=0, warnings=[warning])
+    features, scale, threshold = features_from_picture(picture, options, scratch)
+    warnings = []
     if len(features) == 0:
-        line["warnings"].append(f"{record.name}: no features found ({_why_none(picture)})")
+        warnings.append(f"{record.name}: no features found ({_why_none(picture)})")
     elif len(features) < min(FEW_FEATURES, options.max_num_features):
-        line["warnings"].append(f"{record.name}: only {len(features)} features found: too little texture or contrast")
-    return features, line
+        warnings.append(f"{record.name}: only {len(features)} features found: too little texture or contrast")
+    return features, ImageFeatures(
+        name=record.name, num_features=len(features), warnings=warnings, scale=scale, contrast_threshold=threshold,
+        cpu_s=time.thread_time() - start,
+    )  # fmt: skip
 
 
 def features_from_picture(
@@ -203,20 +205,23 @@ def _why_none(picture: Picture) -> str:
 
 
 def _report(
-    images: tuple[ImageRecord, ...], done: list[Features], lines: dict[int, dict[str, Any]], options: FeatureOptions
-) -> dict[str, Any]:
+    images: tuple[ImageRecord, ...], done: list[Features], lines: Mapping[int, ImageFeatures], options: FeatureOptions,
+    took: tuple[float, float],
+) -> FeaturesReport:  # fmt: skip
     per_image = [
-        lines.get(i, {"name": image.name, "num_features": len(done[i]), "known": True, "warnings": []})
+        lines.get(i) or ImageFeatures(name=image.name, num_features=len(done[i]), warnings=[], known=True)
         for i, image in enumerate(images)
     ]
-    return {
-        "kind": options.kind,
-        "num_images": len(images),
-        "num_known": len(images) - len(lines),
-        "num_features": sum(len(features) for features in done),
-        "images": per_image,
-        "warnings": [warning for line in per_image for warning in line["warnings"]],
-    }
+    return FeaturesReport(
+        kind=options.kind,
+        num_images=len(images),
+        num_known=len(images) - len(lines),
+        num_features=sum(len(features) for features in done),
+        images=per_image,
+        warnings=[warning for line in per_image for warning in line.warnings],
+        wall_s=took[0],
+        cpu_s=took[1],
+    )
 
 
 def _bytes_needed(record: ImageRecord, options: FeatureOptions) -> int:

@@ -121,6 +121,17 @@ def log_so3(rotation: ArrayLike) -> Array:
     return factor * q[..., :3]
 
 
+def interpolate(first: ArrayLike, last: ArrayLike, share: ArrayLike) -> Array:
+    """Poses (..., 7) a share (...) of the way from ``first`` (..., 7) to ``last``: centres on a line, rotations about a
+    fixed axis at a steady rate."""
+    share = np.asarray(share, np.float64)[..., None]
+    start = rotation_matrix(first)
+    turn = log_so3(rotation_matrix(last) @ start.swapaxes(-1, -2))
+    rotation = exp_so3(share * turn) @ start
+    centers = (1 - share) * center(first) + share * center(last)
+    return from_matrix(rotation, -(rotation @ centers[..., None])[..., 0])
+
+
 def rotation_angle_deg(rotation: ArrayLike) -> Array:
     """Angles (...) in degrees, 0 to 180, of rotation matrices (..., 3, 3)."""
     return np.degrees(np.linalg.norm(log_so3(rotation), axis=-1))

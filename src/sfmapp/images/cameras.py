@@ -9,7 +9,6 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from statistics import median, pstdev
-from typing import Any
 
 from sfmapp.calibration.photographs import GivenCamera, Photograph, read_given_cameras
 from sfmapp.camera.camera import Camera, simple_camera
@@ -17,6 +16,7 @@ from sfmapp.errors import UsageError
 from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.images.exif import ExifFacts, FocalPrior, focal_prior
 from sfmapp.images.image_set import ImageOptions
+from sfmapp.images.report import CameraPrior
 from sfmapp.scene.turned_camera import turned_back
 
 # Trust in what a user gives without fixing it: a focal length copied from a data sheet, or a calibration.
@@ -47,7 +47,7 @@ class Shot:
 
 def group_cameras(
     shots: Sequence[Shot], options: ImageOptions, root: str = ""
-) -> tuple[list[Camera], list[int], list[dict[str, Any]], list[tuple[str, str]]]:
+) -> tuple[list[Camera], list[int], list[CameraPrior], list[tuple[str, str]]]:
     """Cameras, the camera index of each shot, a report entry per camera, and warnings.
 
     ``auto`` shares a camera between shots with the same make, model, lens, serial number, focal length and size. Where
@@ -61,7 +61,7 @@ def group_cameras(
         root: folder that the names are relative to, whose own name may be that of a camera.
 
     Returns:
-        cameras in order of first use; camera_idx per shot; JSON-able dicts; (image name, problem) pairs.
+        cameras in order of first use; camera_idx per shot; what is known of each camera; (image name, problem) pairs.
 
     Raises:
         UsageError: ``camera_params`` with images of several sizes, or for pictures that EXIF's orientation has turned.
@@ -85,14 +85,30 @@ def group_cameras(
     warnings = [(shot.name, problem) for shot, prior in zip(shots, priors, strict=True) for problem in prior.problems]
     warnings += _doubts(shots, priors, given)
     cameras: list[Camera] = []
-    entries: list[dict[str, Any]] = []
+    entries: list[CameraPrior] = []
     for group in members:
         camera, reason = _camera(shots[group[0]], [priors[i] for i in group], options, given[group[0]])
         if options.camera_params is not None:
             _check_not_of_upright(camera, [shots[i] for i in group])
-        entry = {"camera_idx": len(cameras), "num_images": len(group), **_described(camera, reason)}
         facts = shots[group[0]].facts
-        entries.append(entry | {"make": facts.make, "camera": facts.model, "sharing": rules[group[0]]})
+        entries.append(
+            CameraPrior(
+                camera_idx=len(cameras),
+                num_images=len(group),
+                model=camera.model.name,
+                width=camera.width,
+                height=camera.height,
+                params=[float(value) for value in camera.params],
+                focal_px=camera.focal,
+                focal_sigma_px=camera.focal_sigma,
+                focal_source=camera.focal_source,
+                focal_reason=reason,
+                is_fixed=camera.is_fixed,
+                make=facts.make,
+                camera=facts.model,
+                sharing=rules[group[0]],
+            )
+        )
         cameras.append(camera)
     return cameras, [index[key] for key in keys], entries, warnings
 
@@ -102,20 +118,6 @@ def _given_cameras(shots: Sequence[Shot], options: ImageOptions, root: str) -> S
         return [None] * len(shots)
     photographs = [Photograph(shot.name, (shot.width, shot.height), shot.facts.orientation) for shot in shots]
     return read_given_cameras(options.camera).of_photographs(root, photographs)
-
-
-def _described(camera: Camera, reason: str) -> dict[str, Any]:
-    return {
-        "model": camera.model.name,
-        "width": camera.width,
-        "height": camera.height,
-        "params": [float(value) for value in camera.params],
-        "focal_px": camera.focal,
-        "focal_sigma_px": camera.focal_sigma,
-        "focal_source": camera.focal_source,
-        "focal_reason": reason,
-        "is_fixed": camera.is_fixed,
-    }
 
 
 def _camera(

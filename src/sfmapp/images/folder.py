@@ -15,7 +15,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 from sfmapp.errors import InputError
 from sfmapp.events import Events
@@ -25,7 +24,9 @@ from sfmapp.images.exif import ExifFacts, read_exif
 from sfmapp.images.headers import Header, UnusableImage, read_header
 from sfmapp.images.image_set import ImageOptions, ImageRecord, ImageSet
 from sfmapp.images.pixels import mask_fit
+from sfmapp.images.report import CameraPrior, ImageFacts, ImageProblem, ImagesReport
 from sfmapp.images.sources import Found, find_images, natural_key, printable
+from sfmapp.reporting import NamedReason
 
 __all__ = ["ImageOptions", "ImageRecord", "ImageSet", "load_images"]
 
@@ -48,7 +49,7 @@ class _Scan:
 
 def load_images(
     source: str | os.PathLike[str], options: ImageOptions, events: Events, *, threads: int | None = None
-) -> tuple[ImageSet, dict[str, Any]]:
+) -> tuple[ImageSet, ImagesReport]:
     """List, check and describe the photographs of a source.
 
     Args:
@@ -61,7 +62,7 @@ def load_images(
         threads: how many files are read at a time; None: as many as there are processors, 8 at most.
 
     Returns:
-        The set, which may be empty, and a JSON-able report.
+        The set, which may be empty, and the report.
 
     Raises:
         InputError: the source or the mask folder does not exist, no mask fits any image, or the given cameras do not.
@@ -98,8 +99,7 @@ def load_images(
         raise InputError(
             f"no mask in {options.mask_path} fits any image", f"expected for example {options.mask_path}/{name}.png"
         )
-    report = _report(os.fspath(source), found, image_set, scans, entries, problems, duplicates)
-    report["seconds"] = round(time.monotonic() - start, 3)
+    report = _report(os.fspath(source), found, image_set, scans, entries, problems, duplicates, start)
     passed_over = f", results of sfmapp in {_some(found.results)} passed over" if found.results else ""
     events.finished(
         STAGE, f"{len(images)} images, {len(cameras)} cameras, {len(skipped)} files skipped{passed_over}", **report
@@ -249,7 +249,7 @@ def _tell(
     events: Events,
     image_set: ImageSet,
     scans: list[_Scan],
-    entries: list[dict[str, Any]],
+    entries: Sequence[CameraPrior],
     problems: list[tuple[str, str]],
     duplicates: list[list[str]],
 ) -> None:
@@ -274,8 +274,8 @@ def _tell(
     for entry in entries:
         events.decided(
             STAGE,
-            f"camera {entry['camera_idx']}: {entry['num_images']} images, {entry['width']}x{entry['height']}, focal "
-            f"length {entry['focal_px']:.0f} +- {entry['focal_sigma_px']:.0f} px ({entry['focal_reason']})",
+            f"camera {entry.camera_idx}: {entry.num_images} images, {entry.width}x{entry.height}, focal "
+            f"length {entry.focal_px:.0f} +- {entry.focal_sigma_px:.0f} px ({entry.focal_reason})",
             **entry,
         )
 
@@ -316,40 +316,43 @@ def _report(
     found: Found,
     image_set: ImageSet,
     scans: list[_Scan],
-    entries: list[dict[str, Any]],
+    entries: Sequence[CameraPrior],
     problems: list[tuple[str, str]],
     duplicates: list[list[str]],
-) -> dict[str, Any]:
-    return {
-        "source": printable(source),
-        "root": printable(str(found.root)),
-        "results_passed_over": found.results,
-        "num_found": len(scans) + len(image_set.skipped),
-        "num_used": len(scans),
-        "num_skipped": len(image_set.skipped),
-        "num_bytes": sum(scan.num_bytes for scan in scans),
-        "num_with_gps": sum(image.gps is not None for image in image_set.images),
-        "num_with_time": sum(image.timestamp is not None for image in image_set.images),
-        "num_with_mask": sum(image.mask_path is not None for image in image_set.images),
-        "skipped": [{"name": name, "reason": reason} for name, reason in image_set.skipped],
-        "problems": [{"name": name, "problem": problem} for name, problem in problems],
-        "duplicates": duplicates,
-        "cameras": entries,
-        "images": [
-            {
-                "name": image.name,
-                "width": image.width,
-                "height": image.height,
-                "orientation": image.orientation,
-                "camera_idx": image.camera_idx,
-                "digest": image.digest,
-                "mask": None if image.mask_path is None else printable(str(image.mask_path)),
-                "format": scan.header.format,
-                "kind": scan.header.kind,
-                "bits": scan.header.bits,
-                "timestamp": image.timestamp,
-                "gps": image.gps and list(image.gps),
-            }
-            for image, scan in zip(image_set.images, scans, strict=True)
-        ],
-    }
+    start: float,
+) -> ImagesReport:
+    return ImagesReport(
+        source=printable(source),
+        root=printable(str(found.root)),
+        results_passed_over=found.results,
+        num_found=len(scans) + len(image_set.skipped),
+        num_used=len(scans),
+        num_skipped=len(image_set.skipped),
+        num_bytes=sum(scan.num_bytes for scan in scans),
+        num_with_gps=sum(image.gps is not None for image in image_set.images),
+        num_with_time=sum(image.timestamp is not None for image in image_set.images),
+        num_with_mask=sum(image.mask_path is not None for image in image_set.images),
+        skipped=[NamedReason(name=name, reason=reason) for name, reason in image_set.skipped],
+        problems=[ImageProblem(name=name, problem=problem) for name, problem in problems],
+        duplicates=duplicates,
+        cameras=entries,
+        images=[_facts(image, scan.header) for image, scan in zip(image_set.images, scans, strict=True)],
+        wall_s=round(time.monotonic() - start, 3),
+    )
+
+
+def _facts(image: ImageRecord, header: Header) -> ImageFacts:
+    return ImageFacts(
+        name=image.name,
+        width=image.width,
+        height=image.height,
+        orientation=image.orientation,
+        camera_idx=image.camera_idx,
+        digest=image.digest,
+        mask=None if image.mask_path is None else printable(str(image.mask_path)),
+        format=header.format,
+        kind=header.kind,
+        bits=header.bits,
+        timestamp=image.timestamp,
+        gps=image.gps and list(image.gps),
+    )

@@ -10,13 +10,13 @@ the motion is planar, as on a turntable; the likelihood is merely flat there.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.geometry import epipolar
+from sfmapp.mapping.report import FocalReport
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.tracks import Tracks
 
@@ -32,7 +32,7 @@ MAX_PAIRS, MAX_MATCHES = 20, 150
 
 def estimate_focal_ratio(
     cameras: list[Camera], image_camera_idx: NDArray[np.int32], correspondences: Correspondences, tracks: Tracks
-) -> tuple[float | None, dict[str, Any]]:
+) -> tuple[float | None, FocalReport]:
     """The focal length as a multiple of max(width, height) that the pairs of default cameras agree on.
 
     Args:
@@ -41,7 +41,7 @@ def estimate_focal_ratio(
         tracks: the observations behind them.
 
     Returns:
-        The ratio, or None where the pairs do not prefer one clearly to the default, and the decision's numbers.
+        The ratio, or None where the pairs do not prefer one clearly to the default, and the numbers behind that.
     """
     unknown = np.array([c.focal_source == "default" and not c.is_fixed for c in cameras], bool)
     pairs = np.flatnonzero(
@@ -51,16 +51,16 @@ def estimate_focal_ratio(
     )
     pairs = pairs[np.argsort(-correspondences.num_inliers[pairs], kind="stable")][:MAX_PAIRS]
     if len(pairs) == 0:
-        return None, {"num_pairs": 0}
+        return None, FocalReport(num_pairs=0)
     samples = [_sample(cameras, image_camera_idx, correspondences, tracks, int(pair)) for pair in pairs]
     coarse = _total_loss(COARSE_RATIOS, samples)
     fine_ratios = COARSE_RATIOS[np.argmin(coarse)] * FINE_STEPS
     fine = _total_loss(fine_ratios, samples)
     ratio, least = float(fine_ratios[np.argmin(fine)]), float(fine.min())
     at_default = float(_total_loss(np.array([PRIOR_RATIO]), samples)[0])
-    data = {"num_pairs": len(pairs), "ratio": ratio, "loss": least, "loss_at_default": at_default}
+    report = FocalReport(num_pairs=len(pairs), ratio=ratio, loss=least, loss_at_default=at_default)
     # a log-likelihood ratio of 4.5 is three standard deviations
-    return (ratio if at_default - least > 4.5 else None), data
+    return (ratio if at_default - least > 4.5 else None), report
 
 
 def matched_pixels(

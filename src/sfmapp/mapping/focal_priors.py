@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from sfmapp.images.exif import DEFAULT_FOCAL, DEFAULT_FOCAL_SIGMA
 from sfmapp.mapping import structure
 from sfmapp.mapping.mapper import STAGE, Mapper
 from sfmapp.mapping.register import Registration
+from sfmapp.mapping.report import AgreeingObservations, FocalEvidence, FocalReport, StartReport, Uncertainty
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -55,8 +55,8 @@ class Mapped:
 
     cameras: list[Camera]
     models: list[Reconstruction]
-    initial_reports: list[dict[str, Any]]
-    focal_report: dict[str, Any]
+    initial_reports: list[StartReport]
+    focal_report: FocalReport
     attempts: dict[int, Registration]
     mapper_of: Callable[..., Mapper]
     apart: list[str]
@@ -75,7 +75,7 @@ def as_unknown(camera: Camera) -> Camera:
     return replace(camera.with_focal(focal), focal_sigma=sigma, focal_source="default", is_fixed=False)
 
 
-def settle_focal_lengths(mapped: Mapped, map_from: MapFrom, events: Events) -> tuple[Mapped, dict[str, Any]]:
+def settle_focal_lengths(mapped: Mapped, map_from: MapFrom, events: Events) -> Mapped:
     """Map again without the focal lengths that a map has left far behind, and keep what explains more matches.
 
     Args:
@@ -84,26 +84,27 @@ def settle_focal_lengths(mapped: Mapped, map_from: MapFrom, events: Events) -> t
         events: warned of every prior that is not believed any more.
 
     Returns:
-        The better of both, and the decision for the report.
+        The better of both, with the decision in its report.
     """
     doubted = _doubted_cameras(mapped)
     if not doubted.any():
-        return mapped, {}
+        return mapped
     events.decided(STAGE, f"the focal lengths of {int(doubted.sum())} camera(s) are doubtful: mapping without them")
     again = map_from([as_unknown(c) if d else c for c, d in zip(mapped.cameras, doubted, strict=True)])
     again = replace(again, without_prior=tuple(np.flatnonzero(doubted).tolist()))
     support = _support((mapped.models, again.models))
     wanted = SAME_SUPPORT if (_judge_priors(mapped)[0] > REFUTED_SIGMAS).any() else MORE_SUPPORT
     better = again if support[1] >= wanted * support[0] and support[1] > 0 else mapped
-    report = {
-        "doubted_cameras": list(again.without_prior),
-        "agreeing_observations": {"as_given": support[0], "as_unknown": support[1]},
-        "kept": "as_unknown" if better is again else "as_given",
-    }
+    report = replace(
+        better.focal_report,
+        doubted_cameras=list(again.without_prior),
+        agreeing_observations=AgreeingObservations(as_given=support[0], as_unknown=support[1]),
+        kept="as_unknown" if better is again else "as_given",
+    )
     refuted = doubted & (_judge_priors(replace(better, cameras=mapped.cameras))[0] > REFUTED_SIGMAS)
     if refuted.any():
         events.warned(STAGE, _refutation(mapped.cameras, better, np.flatnonzero(refuted)))
-    return better, report
+    return replace(better, focal_report=report)
 
 
 def _doubted_cameras(mapped: Mapped) -> Mask:
@@ -198,14 +199,14 @@ class FocalSigmas:
         """Of both together."""
         return float((self.data_px**-2 + self.prior_px**-2) ** -0.5)
 
-    def describe(self) -> dict[str, Any]:
+    def report(self) -> FocalEvidence:
         """For the report; an infinite sigma is None."""
         own = self.data_px if np.isfinite(self.data_px) else None
-        return {"data_sigma_px": own, "prior_sigma_px": self.prior_px, "is_determined": self.is_determined}
+        return FocalEvidence(data_sigma_px=own, prior_sigma_px=self.prior_px, is_determined=self.is_determined)
 
 
 def focal_sigmas(
-    mapped: Mapped, model: Reconstruction, uncertainty: dict[str, Any]
+    mapped: Mapped, model: Reconstruction, uncertainty: Uncertainty
 ) -> tuple[dict[int, FocalSigmas], Reconstruction | None]:
     """By camera, for free focal lengths with a prior; empty where the uncertainty is not known. Where there was doubt,
     also the model with a lens of more terms.
@@ -213,9 +214,9 @@ def focal_sigmas(
     A prior adds its information to the marginal one of the data (Schur complement), from which it is taken off again.
     """
     sigmas = {}
-    for entry in uncertainty.get("cameras", ()):
-        c, prior = entry["camera"], mapped.cameras[entry["camera"]].focal_sigma
-        found = [sigma for name, sigma in entry["sigma"].items() if name[0] == "f"]
+    for entry in uncertainty.cameras or ():
+        c, prior = entry.camera, mapped.cameras[entry.camera].focal_sigma
+        found = [sigma for name, sigma in entry.sigma.items() if name[0] == "f"]
         if not found or not prior:
             continue
         information = 1.0 / np.mean(np.square(found)) - 1.0 / prior**2

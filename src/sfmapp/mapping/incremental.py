@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +35,7 @@ from sfmapp.mapping.one_place import OnePlace, find_one_place
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images
 from sfmapp.mapping.repair import repaired
+from sfmapp.mapping.report import FocalReport, InitialPairReport, MappedImage, MappingReport, ModelReport, StartReport
 from sfmapp.mapping.tracks import build_tracks, track_colors
 from sfmapp.mapping.verified_pairs import contradictions_of
 from sfmapp.scene.correspondences import Correspondences
@@ -61,7 +61,7 @@ def map_images(
     adjust_options: AdjustOptions,
     threads: int,
     events: Events,
-) -> tuple[list[Reconstruction], dict[str, Any]]:
+) -> tuple[list[Reconstruction], MappingReport]:
     """Reconstruct cameras and points from verified matches.
 
     Args:
@@ -89,14 +89,14 @@ def map_images(
             f"{num_flat} pairs match on something flat alone that is no part of the scene; they were left out. Masks "
             "over it (images.mask_path) would save what else they share",
         )
-    events.decided(STAGE, f"{track_report['num_tracks']} tracks", **track_report)
+    events.decided(STAGE, f"{track_report.num_tracks} tracks", **track_report)
     with ThreadPoolExecutor(threads) as pool:
         task = _Task(names, image_camera_idx, options, adjust_options, events, pool)
 
         def map_all(given: list[Camera]) -> Mapped:
             return task.map_from(given, correspondences, tracks)
 
-        mapped, doubts = settle_focal_lengths(map_all(list(image_set.cameras)), map_all, events)
+        mapped = settle_focal_lengths(map_all(list(image_set.cameras)), map_all, events)
 
         def map_again(found: Correspondences) -> Mapped:
             return task.map_from(list(mapped.cameras), found, build_tracks(found, features)[0])
@@ -107,18 +107,18 @@ def map_images(
             mapped.mapper_of(model).polish()
             model.point_rgb = track_colors(model.tracks, features)
         contradictions = contradictions_of(models, correspondences)
-        model_reports: list[dict[str, Any]] = [
-            model.summary() | _check(mapped, model, found, map_all, events) | {"apart": apart}
+        model_reports = [
+            _model_report(mapped, model, found, apart, map_all, events)
             for model, found, apart in zip(models, contradictions, mapped.apart, strict=True)
         ]
-    report = {
-        "tracks": track_report,
-        "focal": mapped.focal_report | doubts,
-        "look_alikes": look_alikes,
-        "initial_pairs": mapped.initial_reports,
-        "images": _image_reports(names, models, mapped.attempts),
-        "models": model_reports,
-    }
+    report = MappingReport(
+        tracks=track_report,
+        focal=mapped.focal_report,
+        look_alikes=look_alikes,
+        initial_pairs=mapped.initial_reports,
+        images=_image_reports(names, models, mapped.attempts),
+        models=model_reports,
+    )
     events.finished(STAGE, f"{len(models)} model(s)", num_models=len(models))
     if not models:
         here = find_one_place(correspondences, tracks, image_set.cameras, image_camera_idx)
@@ -160,35 +160,35 @@ class _Task:
         return Mapped(cameras, models, initial_reports, focal_report, attempts, mapper_of, apart)
 
 
-def _check(
-    mapped: Mapped, model: Reconstruction, found: Sequence[Contradiction], map_all: MapFrom, events: Events
-) -> dict[str, Any]:
-    """``uncertainty`` and ``contradictions`` of a model, those that were found among the verified pairs included."""
-    checked = check_intrinsics(mapped, model, map_all, events)
+def _model_report(
+    mapped: Mapped, model: Reconstruction, found: Sequence[Contradiction], apart: str, map_all: MapFrom, events: Events
+) -> ModelReport:
+    """What a finished model says; contradictions that were found among the verified pairs widen its uncertainty."""
+    summary = model.summary()  # as it was grown: what follows may lean on priors
+    uncertainty, contradictions = check_intrinsics(mapped, model, map_all, events)
     for contradiction in found:
         events.warned(STAGE, contradiction.message, **contradiction.evidence)
-        checked["contradictions"].append(contradiction.describe())
-        checked["uncertainty"] = widened_uncertainty(
-            checked["uncertainty"], model, contradiction.position_sigma_share, contradiction.rotation_sigma_deg
+        uncertainty = widened_uncertainty(
+            uncertainty, model, contradiction.position_sigma_share, contradiction.rotation_sigma_deg
         )
-    return checked
+    return ModelReport(**summary, uncertainty=uncertainty, contradictions=[*contradictions, *found], apart=apart)
 
 
 def _grow_models(
     empty: Reconstruction, mapper_of: Callable[..., Mapper], options: MappingOptions, events: Events
-) -> tuple[list[Reconstruction], list[dict[str, Any]]]:
+) -> tuple[list[Reconstruction], list[StartReport]]:
     """One model after another, each begun from images that no earlier one holds, and the initial pairs tried.
 
     A model may grow into images of earlier, smaller ones: it may see more of the points that they need. But one that
     holds most of the images is not handed over to what it refused itself, as repeated structure would have it.
     """
     models: list[Reconstruction] = []
-    initial_reports: list[dict[str, Any]] = []
+    initial_reports: list[StartReport] = []
     seeds = np.ones(len(empty.image_names), bool)
     locked = np.zeros(len(seeds), bool)
     while seeds.sum() >= 2 and (options.multiple_models or not models):
         model, tried = _grow_model(empty, seeds, partial(mapper_of, locked=locked), events)
-        initial_reports.append({"pairs": tried})
+        initial_reports.append(StartReport(pairs=tried))
         if model is None:
             break
         seeds &= ~model.is_registered
@@ -204,7 +204,7 @@ def _grow_models(
 
 def _grow_model(
     empty: Reconstruction, seeds: NDArray[np.bool_], mapper_of: Callable[[Reconstruction], Mapper], events: Events
-) -> tuple[Reconstruction | None, list[dict[str, Any]]]:
+) -> tuple[Reconstruction | None, list[InitialPairReport]]:
     """A model grown from two of the seeds (I,) bool, None if there is no pair to start from, and the pairs tried.
 
     A start may be bad, however good it looks: few points, a small angle, a guess at the focal length. Then the map is
@@ -213,7 +213,8 @@ def _grow_model(
     chance which start looked best.
     """
     best: Reconstruction | None = None
-    most, tried, seeds = -math.inf, [], seeds.copy()
+    most, seeds = -math.inf, seeds.copy()
+    tried: list[InitialPairReport] = []
     for _ in range(MAX_STARTS):
         model = empty.copy()
         mapper = mapper_of(model)
@@ -367,11 +368,11 @@ def _with_left_over(
     return out
 
 
-def no_reconstruction(report: dict[str, Any], here: OnePlace | None) -> NoReconstructionError:
+def no_reconstruction(report: MappingReport, here: OnePlace | None) -> NoReconstructionError:
     """The failure of a run in which no model could be started: what all pairs have in common, or the reason of the
     best."""
-    pairs = report["initial_pairs"][0]["pairs"] if report["initial_pairs"] else []
-    reason = pairs[0]["reason"] if pairs else "no two images share enough verified matches"
+    pairs = report.initial_pairs[0].pairs if report.initial_pairs else []
+    reason = pairs[0].reason if pairs else "no two images share enough verified matches"
     advice = "take photographs that overlap by more than half while moving sideways between them"
     if here is not None:
         reason, advice = here.describe()
@@ -387,39 +388,42 @@ def _first_cameras(
     tracks: Tracks,
     options: MappingOptions,
     events: Events,
-) -> tuple[list[Camera], dict[str, Any]]:
+) -> tuple[list[Camera], FocalReport]:
     """The cameras with a focal length from the pairs where nothing else is known."""
     cameras = list(cameras)
     if not options.estimate_focal:
-        return cameras, {}
-    ratio, data = estimate_focal_ratio(cameras, image_camera_idx, correspondences, tracks)
+        return cameras, FocalReport()
+    ratio, report = estimate_focal_ratio(cameras, image_camera_idx, correspondences, tracks)
     if ratio is None:
-        return cameras, data
-    events.decided(STAGE, f"first focal length {ratio:.2f} x the longer side, from {data['num_pairs']} pairs", **data)
-    return [c.with_focal(ratio * max(c.width, c.height)) if c.focal_source == "default" else c for c in cameras], data
+        return cameras, report
+    events.decided(STAGE, f"first focal length {ratio:.2f} x the longer side, from {report.num_pairs} pairs", **report)
+    return [c.with_focal(ratio * max(c.width, c.height)) if c.focal_source == "default" else c for c in cameras], report
 
 
 def _image_reports(
     names: list[str], models: list[Reconstruction], attempts: dict[int, Registration]
-) -> list[dict[str, Any]]:
+) -> list[MappedImage]:
     """Per image: the model it is in, its points and observations, and what the last attempt to register it met."""
-    reports: list[dict[str, Any]] = []
+    reports = []
     for i, name in enumerate(names):
         model = next((m for m, r in enumerate(models) if r.is_registered[i]), None)
         attempt = attempts.get(i)
-        entry: dict[str, Any] = {"name": name, "model": model, "reason": "", "num_observations": 0}
-        if attempt is not None:
-            entry.update(num_correspondences=attempt.num_correspondences, num_pose_inliers=attempt.num_inliers)
+        reason, num_observations = "", 0
         if model is not None:
             reconstruction = models[model]
-            obs = reconstruction.tracks.observations_of_image(i)
-            used = obs[reconstruction.obs_is_inlier[obs]]
-            entry["num_observations"] = len(used)
-        elif attempt is not None:
-            entry["reason"] = attempt.reason
+            num_observations = int(reconstruction.obs_is_inlier[reconstruction.tracks.observations_of_image(i)].sum())
         else:
-            entry["reason"] = "shares too few verified matches with any model"
-        reports.append(entry)
+            reason = attempt.reason if attempt is not None else "shares too few verified matches with any model"
+        reports.append(
+            MappedImage(
+                name=name,
+                model=model,
+                reason=reason,
+                num_observations=num_observations,
+                num_correspondences=attempt.num_correspondences if attempt is not None else None,
+                num_pose_inliers=attempt.num_inliers if attempt is not None else None,
+            )
+        )
     return reports
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from sfmapp.camera.camera import pixels_to_normalized
 from sfmapp.geometry import epipolar, rigid3
 from sfmapp.mapping.focal import matched_pixels
 from sfmapp.mapping.options import MappingOptions
+from sfmapp.mapping.report import InitialPairReport
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.reconstruction import Reconstruction
 
@@ -63,14 +64,15 @@ class InitialPair:
             )
         return ""
 
-    def describe(self, names: list[str]) -> dict[str, Any]:
-        """The pair for the report."""
-        return {
-            "images": [names[i] for i in self.image_idx],
-            "num_matches": self.num_matches,
-            "num_points": self.num_points,
-            "median_angle_deg": round(self.median_angle_deg, 3),
-        }
+    def report(self, names: Sequence[str], reason: str) -> InitialPairReport:
+        """The pair for the report, with what spoke against it when it was tried."""
+        return InitialPairReport(
+            images=[names[i] for i in self.image_idx],
+            num_matches=self.num_matches,
+            num_points=self.num_points,
+            median_angle_deg=round(self.median_angle_deg, 3),
+            reason=reason,
+        )
 
 
 def rank_initial_pairs(

@@ -6,9 +6,8 @@ do the held parameters, once freed and fitted to half of the tracks, explain the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,9 @@ from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.mapping import structure
-from sfmapp.mapping.focal_priors import MapFrom, Mapped, as_unknown, focal_sigmas, lean_on_priors
+from sfmapp.mapping.focal_priors import FocalSigmas, MapFrom, Mapped, as_unknown, focal_sigmas, lean_on_priors
 from sfmapp.mapping.mapper import MAX_UNCERTAINTY_IMAGES, STAGE
+from sfmapp.mapping.report import CameraSigmas, FocalEvidence, ImageSigmas, Uncertainty
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -99,8 +99,10 @@ def _improved_share(image_idx: NDArray[np.int32], before: Array, after: Array) -
     return float(np.mean(improved)) if improved else 0.0
 
 
-def check_intrinsics(mapped: Mapped, model: Reconstruction, map_from: MapFrom, events: Events) -> dict[str, Any]:
-    """What the photographs say of parameters that were held, as entries of the model's report.
+def check_intrinsics(
+    mapped: Mapped, model: Reconstruction, map_from: MapFrom, events: Events
+) -> tuple[Uncertainty, list[Contradiction]]:
+    """What the photographs say of parameters that were held.
 
     Args:
         mapped: whose model it is.
@@ -109,8 +111,8 @@ def check_intrinsics(mapped: Mapped, model: Reconstruction, map_from: MapFrom, e
         events: warned of contradictions.
 
     Returns:
-        ``uncertainty`` as of :meth:`Mapper.uncertainty`, with what the held parameters add to it, and the
-        ``contradictions`` that stand.
+        The uncertainty as of :meth:`Mapper.uncertainty`, with what the held parameters add to it, and the
+        contradictions that stand.
     """
     uncertainty = _with_open_focals(mapped, model)
     used = np.unique(model.image_camera_idx[model.is_registered])
@@ -126,10 +128,10 @@ def check_intrinsics(mapped: Mapped, model: Reconstruction, map_from: MapFrom, e
         contradictions.append(cut)
         events.warned(STAGE, cut.message)
         uncertainty = widened_uncertainty(uncertainty, model, cut.position_sigma_share, cut.rotation_sigma_deg)
-    return {"uncertainty": uncertainty, "contradictions": [c.describe() for c in contradictions]}
+    return uncertainty, contradictions
 
 
-def _with_open_focals(mapped: Mapped, model: Reconstruction) -> dict[str, Any]:
+def _with_open_focals(mapped: Mapped, model: Reconstruction) -> Uncertainty:
     """The uncertainty of a model whose focal lengths come to lie nearer their priors where nothing else tells them."""
     uncertainty = mapped.mapper_of(model).uncertainty()
     sigmas, richer = focal_sigmas(mapped, model, uncertainty)
@@ -145,13 +147,20 @@ def _with_open_focals(mapped: Mapped, model: Reconstruction) -> dict[str, Any]:
         uncertainty = widened_uncertainty(uncertainty, model, share * spread, share * turn)
     if open_:  # a scene that does not tell the focal length does not tell a lens from a bend of the whole either
         uncertainty = widened_uncertainty(uncertainty, model, *bend)
-    for entry in uncertainty.get("cameras", ()):
-        c = entry["camera"]
-        if c in open_:
-            entry["sigma"] |= {name: open_[c].posterior_px for name in entry["sigma"] if name[0] == "f"}
-        entry["focal"] = sigmas[c].describe() if c in sigmas else {}
-        entry["focal"]["is_prior_left_out"] = c in mapped.without_prior
-    return uncertainty
+    if uncertainty.cameras is None:
+        return uncertainty
+    return replace(uncertainty, cameras=[_with_evidence(e, mapped, sigmas, open_) for e in uncertainty.cameras])
+
+
+def _with_evidence(
+    entry: CameraSigmas, mapped: Mapped, sigmas: Mapping[int, FocalSigmas], open_: Mapping[int, FocalSigmas]
+) -> CameraSigmas:
+    """A camera's parameters with what the photographs tell of its focal length."""
+    c, sigma = entry.camera, dict(entry.sigma)
+    if c in open_:
+        sigma |= {name: open_[c].posterior_px for name in sigma if name[0] == "f"}
+    evidence = sigmas[c].report() if c in sigmas else FocalEvidence()
+    return replace(entry, sigma=sigma, focal=replace(evidence, is_prior_left_out=c in mapped.without_prior))
 
 
 def _held_against_free(
@@ -282,24 +291,25 @@ def _values(camera: Camera) -> str:
     )
 
 
-def widened_uncertainty(
-    uncertainty: dict[str, Any], model: Reconstruction, spread: float, turn: float
-) -> dict[str, Any]:
+def widened_uncertainty(uncertainty: Uncertainty, model: Reconstruction, spread: float, turn: float) -> Uncertainty:
     """The uncertainty with an independent error of all poses: a share of the rms spread of the centres, and degrees."""
-    if not uncertainty:
-        return {"median_center_sigma_share": spread, "worst_center_sigma_share": spread}
+    if uncertainty.median_center_sigma_share is None or uncertainty.worst_center_sigma_share is None:
+        return Uncertainty(median_center_sigma_share=spread, worst_center_sigma_share=spread)
     centers = model.centers[model.is_registered]
     distances = np.linalg.norm(centers - centers.mean(0), axis=1)
     share = spread * float(np.sqrt((distances**2).mean()) / distances.max())  # of the uncertainty's size
-    out = dict(uncertainty)
-    for name in ("median_center_sigma_share", "worst_center_sigma_share"):
-        out[name] = float(np.hypot(out[name], share))
-    out["median_rotation_sigma_deg"] = float(np.hypot(out["median_rotation_sigma_deg"], turn))
-    out["images"] = {
-        name: {
-            "center_sigma_share": float(np.hypot(entry["center_sigma_share"], share)),
-            "rotation_sigma_deg": float(np.hypot(entry["rotation_sigma_deg"], turn)),
-        }
-        for name, entry in uncertainty["images"].items()
-    }
-    return out
+    return replace(
+        uncertainty,
+        median_center_sigma_share=float(np.hypot(uncertainty.median_center_sigma_share, share)),
+        worst_center_sigma_share=float(np.hypot(uncertainty.worst_center_sigma_share, share)),
+        median_rotation_sigma_deg=float(np.hypot(uncertainty.median_rotation_sigma_deg or 0.0, turn)),
+        images=None
+        if uncertainty.images is None
+        else {
+            name: ImageSigmas(
+                center_sigma_share=float(np.hypot(entry.center_sigma_share, share)),
+                rotation_sigma_deg=float(np.hypot(entry.rotation_sigma_deg, turn)),
+            )
+            for name, entry in uncertainty.images.items()
+        },
+    )

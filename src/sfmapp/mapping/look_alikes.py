@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.mapping.focal_priors import Mapped
 from sfmapp.mapping.mapper import STAGE
+from sfmapp.mapping.report import LookAlikesReport, NamedPair
 from sfmapp.mapping.verified_pairs import (
     CLEARLY,
     NUM_NAMED,
@@ -50,7 +50,7 @@ class _Attempt:
 
 def tell_apart(
     mapped: Mapped, correspondences: Correspondences, map_again: Callable[[Correspondences], Mapped], events: Events
-) -> tuple[Mapped, dict[str, Any]]:
+) -> tuple[Mapped, LookAlikesReport]:
     """Map again without the pairs that stronger ones refute, if verified pairs stand against a map.
 
     Args:
@@ -65,7 +65,7 @@ def tell_apart(
     standing = _standing(mapped, correspondences)
     before = best = _Attempt(mapped, np.zeros(0, np.int64), _weight(standing), _doubt(standing))
     if before.against == 0:
-        return mapped, {}
+        return mapped, LookAlikesReport()
     clearly, last = CLEARLY, before
     for _ in range(MAX_ROUNDS):
         is_settled = last.against == 0
@@ -169,20 +169,20 @@ def _size(mapped: Mapped) -> int:
     return max((int(model.is_registered.sum()) for model in mapped.models), default=0)
 
 
-def _report(correspondences: Correspondences, best: _Attempt, before: _Attempt) -> dict[str, Any]:
+def _report(correspondences: Correspondences, best: _Attempt, before: _Attempt) -> LookAlikesReport:
     matches = correspondences.num_inliers[best.dropped]
     names = best.mapped.models[0].image_names
     strongest = best.dropped[np.argsort(-matches, kind="stable")[:NUM_NAMED]]
-    return {
-        "num_pairs_dropped": len(best.dropped),
-        "num_matches_dropped": int(matches.sum()),
-        "num_matches_against_before": before.against,
-        "num_matches_against": best.against,
-        "pairs": [
-            {
-                "images": [names[i] for i in correspondences.pair_image_idx[p]],
-                "num_matches": int(correspondences.num_inliers[p]),
-            }
+    return LookAlikesReport(
+        num_pairs_dropped=len(best.dropped),
+        num_matches_dropped=int(matches.sum()),
+        num_matches_against_before=before.against,
+        num_matches_against=best.against,
+        pairs=[
+            NamedPair(
+                images=[names[i] for i in correspondences.pair_image_idx[p]],
+                num_matches=int(correspondences.num_inliers[p]),
+            )
             for p in strongest
         ],
-    }
+    )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from sfmapp.mapping import structure
 from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_initial_pairs
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
+from sfmapp.mapping.report import CameraSigmas, ImageSigmas, InitialPairReport, Uncertainty
 from sfmapp.mapping.tracks import USELESS_CONFIGS
 from sfmapp.mapping.verified_pairs import MIN_MATCHES, pair_agreement
 from sfmapp.scene.correspondences import Correspondences
@@ -72,10 +72,10 @@ class Mapper:
 
     # ------------------------------------------------------------------ start
 
-    def start(self, seeds: NDArray[np.bool_]) -> list[dict[str, Any]]:
+    def start(self, seeds: NDArray[np.bool_]) -> list[InitialPairReport]:
         """Register two of the seeds (I,) bool; returns the pairs that were tried, each with the reason against it."""
         options = self.options
-        tried: list[dict[str, Any]] = []
+        tried: list[InitialPairReport] = []
         ranked = rank_initial_pairs(self.reconstruction, self.correspondences, seeds, options)
         inliers = options.min_initial_inliers
         while True:
@@ -83,7 +83,7 @@ class Mapper:
             for angle in self._initial_angles():
                 for pair in ranked:
                     reason = pair.reason or pair.shortfall(inliers, angle)
-                    tried.append({**pair.describe(self.reconstruction.image_names), "reason": reason})
+                    tried.append(pair.report(self.reconstruction.image_names, reason))
                     if not reason and self._start_from(pair):
                         return tried
             if inliers <= options.min_pose_inliers:
@@ -367,7 +367,7 @@ class Mapper:
         sigma_px = self.options.principal_point_sigma * size / noise_px
         return replace(options, refine_principal_point=True, principal_point_sigma_px=sigma_px)
 
-    def uncertainty(self) -> dict[str, Any]:
+    def uncertainty(self) -> Uncertainty:
         """Standard deviations of the finished model for the report: of parameters, and of centres against its size.
 
         They follow from the residuals under the model (independent errors, a right lens model) in the gauge of inner
@@ -376,13 +376,13 @@ class Mapper:
         """
         reconstruction, options = self.reconstruction, self.adjust_options
         if reconstruction.is_registered.sum() > MAX_UNCERTAINTY_IMAGES:
-            return {}
+            return Uncertainty()
         chosen = self._free_principal_points()
         if chosen.any():
             options = self.with_free_centers(options, chosen)
         found = estimate_covariances(reconstruction, options, prior_cameras=self.prior_cameras)
         if not found.is_determined:
-            return {}
+            return Uncertainty()
         rotation = rigid3.rotation_matrix(reconstruction.cam_from_world[found.image_idx])
         # c = -R^T t moves by -R^T v; its variance along one axis is a third of the trace
         center_sigma = np.sqrt(np.trace(found.poses[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
@@ -390,26 +390,28 @@ class Mapper:
         centers = -np.einsum("nji,nj->ni", rotation, reconstruction.cam_from_world[found.image_idx, 4:])
         size = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
         parameters = [
-            {
-                "camera": int(c),
-                "sigma": {
+            CameraSigmas(
+                camera=int(c),
+                sigma={
                     PARAM_NAMES[reconstruction.cameras[c].model][k]: float(np.sqrt(variance))
                     for k, variance in zip(free, np.diag(covariance), strict=True)
                 },
-            }
+            )
             for c, free, covariance in zip(found.camera_idx, found.free_params, found.intrinsics, strict=True)
         ]
-        return {
-            "noise_px": found.sigma_px,
-            "cameras": parameters,
-            "median_center_sigma_share": float(np.median(center_sigma)) / size,
-            "worst_center_sigma_share": float(center_sigma.max()) / size,
-            "median_rotation_sigma_deg": float(np.median(angle_sigma)),
-            "images": {
-                reconstruction.image_names[i]: {"center_sigma_share": float(c) / size, "rotation_sigma_deg": float(a)}
+        return Uncertainty(
+            noise_px=found.sigma_px,
+            cameras=parameters,
+            median_center_sigma_share=float(np.median(center_sigma)) / size,
+            worst_center_sigma_share=float(center_sigma.max()) / size,
+            median_rotation_sigma_deg=float(np.median(angle_sigma)),
+            images={
+                reconstruction.image_names[i]: ImageSigmas(
+                    center_sigma_share=float(c) / size, rotation_sigma_deg=float(a)
+                )
                 for i, c, a in zip(found.image_idx, center_sigma, angle_sigma, strict=True)
             },
-        }
+        )
 
     def _settle_points(self) -> None:
         """Measure the noise; filter accordingly, and triangulate again what was lost or has become possible."""
@@ -517,14 +519,14 @@ class Mapper:
     def _decided(self, message: str, images: list[int]) -> None:
         summary = self.reconstruction.summary()
         self.events.decided(
-            STAGE, f"{message}; {summary['num_points']} points, {summary['mean_reprojection_error_px']:.2f} px",
+            STAGE, f"{message}; {summary.num_points} points, {summary.mean_reprojection_error_px:.2f} px",
             **summary,
             snapshot={
                 "image_idx": images,
                 "cam_from_world": self.reconstruction.cam_from_world.copy(),
                 "point_xyz": self.reconstruction.point_xyz.astype(np.float32),
-                "num_registered": summary["num_registered"],
-                "num_points": summary["num_points"],
-                "mean_error_px": summary["mean_reprojection_error_px"],
+                "num_registered": summary.num_registered,
+                "num_points": summary.num_points,
+                "mean_error_px": summary.mean_reprojection_error_px,
             },
         )  # fmt: skip

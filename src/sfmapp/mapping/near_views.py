@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from sfmapp.camera.lens import distort
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry.triangulation import Views
+from sfmapp.mapping.report import NearPair
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
 
@@ -98,11 +99,11 @@ def contradiction_of(model: Reconstruction, correspondences: Correspondences) ->
     if len(missing) < MIN_PAIRS:
         return []
     order = missing[np.argsort(-found.num_visible[missing], kind="stable")][:_NUM_NAMED]
-    named: list[dict[str, Any]] = [
-        {
-            "images": [model.image_names[i] for i in found.image_idx[k]], "num_visible": int(found.num_visible[k]),
-            "num_shared": int(found.num_shared[k]),
-        }
+    named = [
+        NearPair(
+            images=[model.image_names[i] for i in found.image_idx[k]], num_visible=int(found.num_visible[k]),
+            num_shared=int(found.num_shared[k]),
+        )
         for k in order
     ]  # fmt: skip
     first = named[0]
@@ -110,8 +111,8 @@ def contradiction_of(model: Reconstruction, correspondences: Correspondences) ->
         Contradiction(
             "near views",
             f"{len(missing)} pairs of photographs stand side by side in the model and do not show the same: "
-            f"{first['images'][0]} and {first['images'][1]} should share {first['num_visible']} points and share "
-            f"{first['num_shared']}",
+            f"{first.images[0]} and {first.images[1]} should share {first.num_visible} points and share "
+            f"{first.num_shared}",
             "some of them were put in a wrong place, by parts that look alike: add photographs between them and the "
             "rest, with more of what is around in the picture",
             {"num_pairs": len(missing), "num_near_pairs": len(found.num_visible), "pairs": named},

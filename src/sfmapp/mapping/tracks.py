@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.mapping.report import TracksReport
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.features import Features
 from sfmapp.scene.tracks import Tracks, make_tracks
@@ -66,7 +67,7 @@ def _join(
     return refused
 
 
-def build_tracks(correspondences: Correspondences, features: Sequence[Features]) -> tuple[Tracks, dict[str, float]]:
+def build_tracks(correspondences: Correspondences, features: Sequence[Features]) -> tuple[Tracks, TracksReport]:
     """Join verified matches into tracks of at least two keypoints, at most one of each image.
 
     Matches of the pairs with most inliers are joined first, as they are the likeliest to be right; a later match that
@@ -100,12 +101,12 @@ def build_tracks(correspondences: Correspondences, features: Sequence[Features])
     feature_idx = nodes - offset[image_of_node[nodes]]
     xy = np.concatenate([np.zeros((0, 2))] + [f.keypoints[:, :2].astype(np.float64) for f in features])[nodes]
     tracks = make_tracks(len(features), num_tracks, track_idx, image_of_node[nodes], feature_idx, xy)
-    report = {
-        "num_tracks": num_tracks,
-        "num_observations": len(nodes),
-        "mean_track_length": len(nodes) / max(1, num_tracks),
-        "num_conflicting_matches": int(refused),
-    }
+    report = TracksReport(
+        num_tracks=num_tracks,
+        num_observations=len(nodes),
+        mean_track_length=len(nodes) / max(1, num_tracks),
+        num_conflicting_matches=int(refused),
+    )
     return tracks, report
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -22,6 +22,7 @@ from sfmapp.camera.lens import undistort
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3
 from sfmapp.mapping import near_views
+from sfmapp.mapping.report import NamedPair
 from sfmapp.mapping.tracks import USELESS_CONFIGS
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
@@ -252,20 +253,20 @@ def _inside(model: Reconstruction, correspondences: Correspondences) -> list[Con
     agreement = standing.agreement
     matches, shared = agreement.num_matches[pairs], agreement.num_shared[pairs]
     order = np.argsort(-matches, kind="stable")[:NUM_NAMED]
-    named: list[dict[str, Any]] = [
-        {
-            "images": [model.image_names[i] for i in agreement.image_idx[pairs[k]]],
-            "num_matches": int(matches[k]), "num_agreeing": int(agreement.num_agreeing[pairs[k]]),
-            "num_shared_points": int(shared[k]),
-        }
+    named = [
+        NamedPair(
+            images=[model.image_names[i] for i in agreement.image_idx[pairs[k]]],
+            num_matches=int(matches[k]), num_agreeing=int(agreement.num_agreeing[pairs[k]]),
+            num_shared_points=int(shared[k]),
+        )
         for k in order
     ]  # fmt: skip
     total = int(agreement.num_matches.sum())
     strongest = named[0]
     message = (
         f"{_count(len(pairs), 'pair')} with {matches.sum()} verified matches lie elsewhere to each other than the "
-        f"model has them: {strongest['images'][0]} and {strongest['images'][1]} have {strongest['num_matches']}, of "
-        f"which {strongest['num_agreeing']} agree and {strongest['num_shared_points']} are points of the model"
+        f"model has them: {strongest.images[0]} and {strongest.images[1]} have {strongest.num_matches}, of "
+        f"which {strongest.num_agreeing} agree and {strongest.num_shared_points} are points of the model"
     )
     return [
         Contradiction(
@@ -309,14 +310,14 @@ def _between(
         return []
     matches = correspondences.num_inliers[pairs]
     order = np.argsort(-matches, kind="stable")[:NUM_NAMED]
-    named: list[dict[str, Any]] = [
-        {"images": [model.image_names[i] for i in images[pairs[k]]], "num_matches": int(matches[k])} for k in order
+    named = [
+        NamedPair(images=[model.image_names[i] for i in images[pairs[k]]], num_matches=int(matches[k])) for k in order
     ]
     strongest = named[0]
     message = (
         f"{_count(len(pairs), 'pair')} with {matches.sum()} verified matches link it to model {other_idx}, but no way "
-        f"was found to join the two: {strongest['images'][0]} and {strongest['images'][1]} have "
-        f"{strongest['num_matches']}"
+        f"was found to join the two: {strongest.images[0]} and {strongest.images[1]} have "
+        f"{strongest.num_matches}"
     )
     return [
         Contradiction(
@@ -345,13 +346,13 @@ def _left_out(
         return []
     matches = correspondences.num_inliers[pairs]
     left_out = np.unique(images[pairs][nowhere[images[pairs]]])
-    named: list[dict[str, Any]] = [
-        {"images": [model.image_names[i] for i in images[pairs[k]]], "num_matches": int(matches[k])}
+    named = [
+        NamedPair(images=[model.image_names[i] for i in images[pairs[k]]], num_matches=int(matches[k]))
         for k in np.argsort(-matches, kind="stable")[:NUM_NAMED]
     ]
     message = (
         f"{_count(len(left_out), 'photograph')} that no model holds match photographs of the model in most of the "
-        f"picture: {named[0]['images'][0]} and {named[0]['images'][1]} have {named[0]['num_matches']} verified matches"
+        f"picture: {named[0].images[0]} and {named[0].images[1]} have {named[0].num_matches} verified matches"
     )
     return [
         Contradiction(

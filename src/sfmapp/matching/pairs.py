@@ -16,13 +16,14 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Events
 from sfmapp.geometry.orientation import MIRRORED
+from sfmapp.matching.report import PairsReport
 from sfmapp.option_checks import Range, check_options
 from sfmapp.scene.features import Features
 
@@ -82,7 +83,7 @@ def select_pairs(
     seed: int,
     threads: int,
     events: Events,
-) -> tuple[NDArray[np.int32], dict[str, Any]]:
+) -> tuple[NDArray[np.int32], PairsReport]:
     """Choose the pairs of images to match.
 
     Args:
@@ -93,7 +94,7 @@ def select_pairs(
         threads: images worked on at a time. The result does not depend on it.
 
     Returns:
-        (P, 2) int32 positions i < j, sorted and without repetition, and a JSON-able report.
+        (P, 2) int32 positions i < j, sorted and without repetition, and the report.
     """
     images = image_set.images
     usable = np.array([i for i, f in enumerate(features) if len(f)], np.int64)
@@ -117,16 +118,16 @@ def select_pairs(
     is_mirrored = np.array([images[i].orientation in MIRRORED for i in usable], bool)
     pairs = pairs[is_mirrored[pairs[:, 0]] == is_mirrored[pairs[:, 1]]]
     result = usable[pairs].astype(np.int32).reshape(-1, 2)
-    report = {
-        "method": method,
-        "reason": reason,
-        "num_images": len(usable),
-        "num_pairs": len(result),
-        "num_possible": num_all,
-        "num_by_source": counts,
-        "images_without_features": [images[i].name for i, f in enumerate(features) if not len(f)],
-        "min_pairs_per_image": int(_degrees(result, len(images))[usable].min()) if len(usable) else 0,
-    }
+    report = PairsReport(
+        method=method,
+        reason=reason,
+        num_images=len(usable),
+        num_pairs=len(result),
+        num_possible=num_all,
+        num_by_source=counts,
+        images_without_features=[images[i].name for i, f in enumerate(features) if not len(f)],
+        min_pairs_per_image=int(_degrees(result, len(images))[usable].min()) if len(usable) else 0,
+    )
     events.decided(STAGE, f"{len(result)} of {num_all} pairs: {reason}", **report)
     events.finished(STAGE, f"{len(result)} pairs", **report)
     return result, report

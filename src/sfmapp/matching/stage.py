@@ -19,6 +19,7 @@ from sfmapp.matching import guided
 from sfmapp.matching.coarse_to_fine import Putative, is_guidable, match_features
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.products import Ints
+from sfmapp.matching.report import MatchingReport, PairReport
 from sfmapp.matching.two_view import Ransac, TwoViewGeometry, error_threshold_px, verify_pair
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.features import Features
@@ -74,7 +75,7 @@ def match_images(
     events: Events,
     known: Mapping[tuple[int, int], MatchedPair] | None = None,
     on_pair: Callable[[int, int, MatchedPair], None] | None = None,
-) -> tuple[Correspondences, dict[str, Any]]:
+) -> tuple[Correspondences, MatchingReport]:
     """Match and verify pairs of images. The result is the same, byte for byte, for any number of threads.
 
     Args:
@@ -123,14 +124,14 @@ def match_images(
             raise
     results = [done[p] for p in pairs]
     report = _report(pairs, results, num_known, time.monotonic() - start)
-    if (num_moving := report["num_pairs_with_moving_plane"]) >= _MANY_MOVING:
+    if (num_moving := report.num_pairs_with_moving_plane) >= _MANY_MOVING:
         events.warned(
             _STAGE,
             f"in {num_moving} pairs something flat moves otherwise than the scene (held into the picture, on the "
             "camera, or a background that stays while the object turns); its matches were left out. A mask over it "
             "(images.mask_path) is better",
         )
-    events.finished(_STAGE, f"{report['num_verified_pairs']} of {len(pairs)} pairs verified", **report)
+    events.finished(_STAGE, f"{report.num_verified_pairs} of {len(pairs)} pairs verified", **report)
     return join_pairs(pair_image_idx, results), report
 
 
@@ -143,7 +144,7 @@ def verify_matches(
     seed: int,
     threads: int,
     events: Events,
-) -> tuple[Correspondences, dict[str, Any]]:
+) -> tuple[Correspondences, MatchingReport]:
     """Verify matches that somebody else has found; otherwise as :func:`match_images`.
 
     Args:
@@ -281,36 +282,37 @@ def split_pairs(correspondences: Correspondences) -> list[MatchedPair]:
 
 def _report(
     pairs: Sequence[tuple[int, int]], results: Sequence[MatchedPair], num_known: int, wall_s: float
-) -> dict[str, Any]:
+) -> MatchingReport:
     configs = [r.geometry.config.name for r in results]
-    return {
-        "num_pairs": len(pairs),
-        "num_resumed_pairs": num_known,
-        "num_verified_pairs": sum(len(r.matches) > 0 for r in results),
-        "num_matches": sum(len(r.matches) for r in results),
-        "num_pairs_with_moving_plane": sum(r.geometry.num_moving_alone > 0 for r in results),
-        "configs": {name: configs.count(name) for name in sorted(set(configs))},
-        "cpu_s": sum(r.cpu_s for r in results),
-        "wall_s": wall_s,
-        "pairs": [
-            {
-                "image_idx": pair,
-                "config": result.geometry.config.name,
-                "num_coarse": result.num_coarse,
-                "is_guided": result.is_guided,
-                "num_putative": result.num_putative,
-                "num_verified": len(result.matches),
-                "num_inliers_f": result.geometry.num_inliers_f,
-                "num_inliers_e": result.geometry.num_inliers_e,
-                "num_inliers_h": result.geometry.num_inliers_h,
-                "median_angle_deg": None
-                if np.isnan(result.geometry.median_angle_deg)
-                else round(float(result.geometry.median_angle_deg), 3),
-                "cpu_s": round(result.cpu_s, 4),
-            }
-            for pair, result in zip(pairs, results, strict=True)
-        ],
-    }
+    return MatchingReport(
+        num_pairs=len(pairs),
+        num_resumed_pairs=num_known,
+        num_verified_pairs=sum(len(r.matches) > 0 for r in results),
+        num_matches=sum(len(r.matches) for r in results),
+        num_pairs_with_moving_plane=sum(r.geometry.num_moving_alone > 0 for r in results),
+        configs={name: configs.count(name) for name in sorted(set(configs))},
+        cpu_s=sum(r.cpu_s for r in results),
+        wall_s=wall_s,
+        pairs=[_pair_report(pair, result) for pair, result in zip(pairs, results, strict=True)],
+    )
+
+
+def _pair_report(pair: tuple[int, int], result: MatchedPair) -> PairReport:
+    geometry = result.geometry
+    angle_deg = float(geometry.median_angle_deg)
+    return PairReport(
+        image_idx=pair,
+        config=geometry.config.name,
+        num_coarse=result.num_coarse,
+        is_guided=result.is_guided,
+        num_putative=result.num_putative,
+        num_verified=len(result.matches),
+        num_inliers_f=geometry.num_inliers_f,
+        num_inliers_e=geometry.num_inliers_e,
+        num_inliers_h=geometry.num_inliers_h,
+        median_angle_deg=None if np.isnan(angle_deg) else round(angle_deg, 3),
+        cpu_s=round(result.cpu_s, 4),
+    )
 
 
 def compile_kernels() -> None:

@@ -213,7 +213,7 @@ class MapInitializer:
     def _errors_between(self, last_from_first: Array, n: int, xyz: Array, xy: Array) -> Array:
         """(N,) pixels by which points are off in the n-th view, its pose fitted to them; NaN behind the camera."""
         camera = self.camera
-        start = pose_between(rigid3.IDENTITY, last_from_first, n / (len(self.seen) - 1))
+        start = rigid3.interpolate(rigid3.IDENTITY, last_from_first, n / (len(self.seen) - 1))
         pose = refine_pose(camera.canonical, start, xyz, xy).cam_from_world
         return np.asarray(np.linalg.norm(project(camera, rigid3.apply(pose, xyz)) - xy, axis=1), np.float64)
 
@@ -266,11 +266,3 @@ def _left_by_turn(camera: Camera, xy1: Array, xy2: Array) -> float:
         median = float(np.median(error))
         weights = 1.0 / (1.0 + (error / max(median, 1e-9)) ** 2)
     return median
-
-
-def pose_between(first: Array, last: Array, share: float) -> Array:
-    """The pose (7,) at a share of the way from one pose to another, rotation and centre interpolated."""
-    step = rigid3.rotation_matrix(last) @ rigid3.rotation_matrix(first).T
-    rotation = rigid3.exp_so3(share * rigid3.log_so3(step)) @ rigid3.rotation_matrix(first)
-    center = (1 - share) * rigid3.center(first) + share * rigid3.center(last)
-    return rigid3.from_matrix(rotation, -rotation @ center)

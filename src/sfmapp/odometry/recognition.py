@@ -102,8 +102,7 @@ class Recognition:
         become = _renaming(local.keyframes.num_points, closed.renamed)
         for record in records:
             if record.map_idx == local.map_idx and record.has_pose:
-                record.frame_from_keyframe[4:] *= closed.corrections[record.keyframe, 7]
-                record.point_id = become[record.point_id]
+                record.move(closed.corrections[record.keyframe, 7], become)
         return local, float(closed.corrections[-1, 7])
 
     def _join(
@@ -117,12 +116,8 @@ class Recognition:
             place = [position[keyframe.frame_idx] for keyframe in local.keyframes.keyframes]
             for record in records:
                 if record.map_idx == local.map_idx and record.has_pose:
-                    record.keyframe = place[record.keyframe]
-                    record.frame_from_keyframe[4:] *= scale
-                    record.point_id = become[record.point_id + offset]
-        for record in records:
-            if record.map_idx == absorbed.map_idx:
-                record.map_idx = kept.map_idx
+                    record.move(scale, become, offset)
+                    record.join(kept.map_idx, place[record.keyframe])
         newest = absorbed if closure.new_map == absorbed.map_idx else kept
         kept.keyframes, kept.images = joined.keyframes, {len(position) - 1: newest.images[newest.newest]}
         return kept, float(joined.kept_from_absorbed[7]) if newest is absorbed else 1.0

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sfmapp.contradictions import widened, widened_scale_sigma
 from sfmapp.geometry import rigid3
+from sfmapp.odometry.keyframe_images import KeyframeImages
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.refinement.final_adjustment import MAX_COVARIANCE_KEYFRAMES, FinalAdjustment
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
@@ -52,6 +53,49 @@ class FrameRecord:
         """Whether the frame has a place in its map."""
         return bool(np.isfinite(self.frame_from_keyframe[0]))
 
+    def settle(
+        self, state: FrameState, map_idx: int, keyframe: int, frame_from_keyframe: Array, *, is_keyframe: bool = False
+    ) -> None:
+        """Give the frame its place in a map: a pose (7,) relative to a keyframe, which it may be itself."""
+        self.state, self.map_idx, self.keyframe, self.is_keyframe = state, map_idx, keyframe, is_keyframe
+        self.frame_from_keyframe = frame_from_keyframe
+
+    def give_out(self, cam_from_world: Array) -> None:
+        """Note the pose (7,) as it is given out, in the world and the unit that the map has at this time."""
+        self.live = cam_from_world.copy()
+
+    def see(self, point_id: NDArray[np.integer], xy: Array) -> None:
+        """Note the points (N,) that the pose was measured with, and the pixels (N, 2) at which they were seen."""
+        self.point_id, self.xy = point_id.astype(np.int32), xy.astype(np.float32)
+
+    def measure(self, covariance: Array, frame_from_keyframe: Array) -> None:
+        """Note how well the points hold the pose; a frame that is no keyframe takes the pose as well."""
+        self.covariance = covariance
+        if not self.is_keyframe:
+            self.frame_from_keyframe = frame_from_keyframe
+
+    def lose_keyframe(self, dropped_from_before: Array, dropped: Keyframe) -> None:
+        """The keyframe that the frame is, or hangs on, is dropped: hang on the one before it."""
+        self.frame_from_keyframe = rigid3.compose(self.frame_from_keyframe, dropped_from_before)
+        self.keyframe -= 1
+        if self.is_keyframe:
+            self.is_keyframe = False
+            good = dropped.is_inlier[:, 0]
+            self.see(dropped.point_id[good], dropped.xy[good, 0])
+
+    def move(self, scale: float, become: NDArray[np.int32], id_offset: int = 0) -> None:
+        """The map has changed under the frame: another unit of length, and other ids of points.
+
+        Args:
+            scale: new unit of length from the old one. become: (P,) new id by old id, ``id_offset`` added to that.
+        """
+        self.frame_from_keyframe[4:] *= scale
+        self.point_id = become[self.point_id + id_offset]
+
+    def join(self, map_idx: int, keyframe: int) -> None:
+        """The keyframe that the frame hangs on has another place, maybe in another map."""
+        self.map_idx, self.keyframe = map_idx, keyframe
+
 
 def leave_keyframe(
     records: list[FrameRecord], map_idx: int, position: int, dropped: Keyframe, before: Keyframe
@@ -62,13 +106,9 @@ def leave_keyframe(
         if record.map_idx != map_idx or record.keyframe < position:
             continue
         if record.keyframe == position:
-            record.frame_from_keyframe = rigid3.compose(record.frame_from_keyframe, change)
-            if record.is_keyframe:
-                good = dropped.is_inlier[:, 0]
-                record.is_keyframe = False
-                record.point_id = dropped.point_id[good].astype(np.int32)
-                record.xy = dropped.xy[good, 0].astype(np.float32)
-        record.keyframe -= 1
+            record.lose_keyframe(change, dropped)
+        else:
+            record.join(map_idx, record.keyframe - 1)
 
 
 def measure_again(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int) -> None:
@@ -88,13 +128,14 @@ def measure_again(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: i
         measured = measure_pose(camera, start, xyz[known], xy[known])
         if measured is None:
             continue
-        record.covariance = measured[1]
-        if not record.is_keyframe:
-            record.frame_from_keyframe = rigid3.compose(measured[0], rigid3.inverse(keyframe.rig_from_world))
+        record.measure(measured[1], rigid3.compose(measured[0], rigid3.inverse(keyframe.rig_from_world)))
 
 
 def gather(
-    records: list[FrameRecord], maps: dict[int, KeyframeMap], conclusions: dict[int, FinalAdjustment]
+    records: list[FrameRecord],
+    maps: dict[int, KeyframeMap],
+    conclusions: dict[int, FinalAdjustment],
+    images: KeyframeImages,
 ) -> OdometryResult:
     """The result of a run, the map with the most frames first."""
     poses = np.full((len(records), 7), np.nan)
@@ -106,7 +147,7 @@ def gather(
             frame_map[n] = record.map_idx
     order = sorted(maps, key=lambda m: (-int((frame_map == m).sum()), m))
     place = np.array([-1 if m < 0 else order.index(int(m)) for m in frame_map], np.int32)
-    results = [_map_result(maps[m], conclusions[m]) for m in order]
+    results = [_map_result(maps[m], conclusions[m], images) for m in order]
     covariance = [_covariance(record, results[m] if m >= 0 else None) for record, m in zip(records, place, strict=True)]
     return OdometryResult(
         np.array([r.frame_idx for r in records], np.int64), [r.name for r in records],
@@ -132,18 +173,20 @@ def _covariance(record: FrameRecord, found: MapResult | None) -> Array:
     return adjoint @ of_keyframe @ adjoint.T + record.covariance
 
 
-def _map_result(keyframes: KeyframeMap, final: FinalAdjustment) -> MapResult:
+def _map_result(keyframes: KeyframeMap, final: FinalAdjustment, images: KeyframeImages) -> MapResult:
     num, num_sensors = len(keyframes.keyframes), len(keyframes.rig.cameras)
     model, _ = keyframes.reconstruction(np.arange(num))
+    frame_idx = np.array([k.frame_idx for k in keyframes.keyframes], np.int64)
+    image_idx = np.arange(num, dtype=np.int64) * num_sensors
+    model.point_rgb = images.colors(model, frame_idx, image_idx)
     covariance, found = final.covariance, final.contradictions
     if covariance is not None:
         poses = np.array([k.rig_from_world for k in keyframes.keyframes])
         covariance = widened(covariance, rigid3.spread(poses), found)
     return MapResult(
-        model, np.array([k.frame_idx for k in keyframes.keyframes], np.int64),
-        np.arange(num, dtype=np.int64) * num_sensors, covariance, final.gauge,
-        "stereo" if num_sensors > 1 else "none", widened_scale_sigma(final.scale_sigma, found), found,
-        _covariance_gap(final, num), final.noise_covariance,
+        model, frame_idx, image_idx, covariance, final.gauge, "stereo" if num_sensors > 1 else "none",
+        widened_scale_sigma(final.scale_sigma, found), found, _covariance_gap(final, num), final.noise_covariance,
+        images.sightings(frame_idx, image_idx),
     )  # fmt: skip
 
 

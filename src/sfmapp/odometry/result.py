@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.contradictions import Contradiction
 from sfmapp.images.sequence import RepeatedFrame
+from sfmapp.odometry.inertial.markers import MarkerSightings
 from sfmapp.odometry.inertial.smoothing import SmoothedTrajectory
+from sfmapp.odometry.report import OdometryReport
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -33,7 +34,8 @@ class MapResult:
     """One connected map: keyframes, points, and how sure they are.
 
     Attributes:
-        reconstruction: images are keyframes (stereo: two images each, tied by ``rig``), named as the frames.
+        reconstruction: images are keyframes (stereo: two images each, tied by ``rig``), named as the frames; points
+            have the mean grey of where the keyframes saw them.
         keyframe_frame_idx: (K,) int64, the frame that each keyframe is.
         keyframe_image_idx: (K,) int64, its image (of the first camera) in the reconstruction.
         covariance: (K, 6, 6) of rotation (radians) and translation of ``x_cam <- exp(w) x_cam + v`` in the map's gauge
@@ -45,6 +47,7 @@ class MapResult:
         covariance_gap: why keyframes lack a covariance; empty where none does, or none was asked for.
         noise_covariance: (K, 6, 6) the part of ``covariance`` that the noise of the observations makes; the rest
             (calibration, contradictions) is common to neighbouring keyframes. In the map's first unit of length.
+        sightings: the markers in the keyframes, where they were looked for.
     """
 
     reconstruction: Reconstruction
@@ -57,6 +60,7 @@ class MapResult:
     contradictions: list[Contradiction] = field(default_factory=list)
     covariance_gap: str = ""
     noise_covariance: Array | None = None
+    sightings: MarkerSightings = field(default_factory=MarkerSightings.none)
 
 
 @dataclass
@@ -88,7 +92,7 @@ class OdometryResult:
     maps: list[MapResult]
     covariance: Array | None = None
     smoothed: list[SmoothedTrajectory] = field(default_factory=list)
-    report: dict[str, Any] = field(default_factory=dict)
+    report: OdometryReport | None = None
 
     @property
     def twin_rows(self) -> NDArray[np.int64]:

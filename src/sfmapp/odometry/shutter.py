@@ -117,7 +117,7 @@ def _move(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, read
         if record.map_idx == map_idx and len(record.xy):
             xy = record.xy.astype(np.float64)
             shift = shift_of(record.frame_idx, keyframes.point_xyz[record.point_id], xy)
-            record.xy = (xy - readout * shift).astype(np.float32)
+            record.see(record.point_id, xy - readout * shift)
 
 
 class _RowShift:

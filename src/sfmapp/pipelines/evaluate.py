@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 import os
 import re
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import InputError, UsageError
+from sfmapp.evaluation.report import Statistics
 from sfmapp.evaluation.trajectory import (
     KITTI_LENGTHS_M,
     MAX_DIFFERENCE_S,
@@ -34,6 +33,17 @@ from sfmapp.evaluation.trajectory import (
     statistics,
 )
 from sfmapp.formats.trajectory_input import TrajectoryFile, read_trajectory
+from sfmapp.report.evaluation import (
+    AlignmentReport,
+    DriftAtLength,
+    EvaluationReport,
+    KittiDrift,
+    MeanDrift,
+    PoseErrors,
+    RelativePoseErrors,
+    TrajectoryReport,
+    metres,
+)
 
 Array = NDArray[np.float64]
 
@@ -44,7 +54,6 @@ _COMPARABLE_COVERAGE = 0.99
 _METRIC_SCALE = 0.1
 # beyond, squares of errors overflow; the orbit of the earth is shorter
 _LONGEST_PATH_M = 1e15
-_FORMAT_NAMES = {"tum": "TUM", "kitti": "KITTI", "euroc": "EuRoC"}
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+)\s*(f|s|m)")
 _UNITS: dict[str, DeltaUnit] = {"f": "frames", "s": "s", "m": "m"}
 
@@ -107,29 +116,24 @@ class Evaluation:
             return "se3" if abs(math.log(self.errors["sim3"].absolute.scale)) < _METRIC_SCALE else "sim3"
         return next(iter(self.errors))
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able: metres (the ground truth's unit), degrees, seconds."""
+    def report(self) -> EvaluationReport:
+        """The errors in numbers: metres (the ground truth's unit), degrees, seconds."""
         pairs, times = self.pairs, self.pairs.ground_truth.timestamps_s
-        return {
-            "estimate": {"path": os.fspath(self.estimate.path), "format": self.estimate.format,
-                         "num_poses": pairs.num_estimate},
-            "ground_truth": {
-                "path": os.fspath(self.ground_truth.path),
-                "format": self.ground_truth.format,
-                "num_poses": pairs.num_ground_truth,
-            },
-            "num_pairs": len(pairs),
-            "num_gaps": int(pairs.is_gap.sum()),
-            "coverage": pairs.coverage,
-            "duration_s": None if times is None else float(np.ptp(times)),
-            "path_m": pairs.ground_truth.path_m,
-            "alignments": {how: _errors_dict(errors) for how, errors in self.errors.items()},
-            "notes": self.notes,
-        }  # fmt: skip
+        return EvaluationReport(
+            estimate=_file_report(self.estimate, pairs.num_estimate),
+            ground_truth=_file_report(self.ground_truth, pairs.num_ground_truth),
+            num_pairs=len(pairs),
+            num_gaps=int(pairs.is_gap.sum()),
+            coverage=pairs.coverage,
+            duration_s=None if times is None else float(np.ptp(times)),
+            path_m=pairs.ground_truth.path_m,
+            alignments={how: _alignment_report(errors) for how, errors in self.errors.items()},
+            notes=self.notes,
+        )
 
     def table(self) -> str:
         """The errors as plain text, a block for each alignment; no newline at its end."""
-        return "\n".join(_table_lines(self))
+        return self.report().table()
 
 
 def evaluate(
@@ -196,7 +200,7 @@ def draw(result: Evaluation, path: str | os.PathLike[str]) -> None:
         _ALIGNMENT_NAMES[how] + (f" {errors.absolute.scale:.4g}" if how == "sim3" else ""),
         f"{len(pairs)} poses",
         f"coverage {100 * pairs.coverage:.1f} %",
-        f"{_metres(pairs.ground_truth.path_m)} of path",
+        f"{metres(pairs.ground_truth.path_m)} of path",
     ]
     if len(errors.drift.first):
         facts.append(f"{'drift' if errors.is_by_share else 't_rel'} {errors.drift.t_rel_percent:.3g} %")
@@ -358,7 +362,7 @@ def _drift_note(result: Evaluation) -> str:
     if errors.is_by_share:
         return (
             f"no t_rel and r_rel: KITTI's stretches are 100 to 800 m long, this path is "
-            f"{_metres(result.pairs.ground_truth.path_m)}; the drift is over stretches of "
+            f"{metres(result.pairs.ground_truth.path_m)}; the drift is over stretches of "
             "10, 20, ..., 80 % of it instead"
         )
     longest = errors.drift.length_m.max(initial=0)
@@ -368,84 +372,52 @@ def _drift_note(result: Evaluation) -> str:
     return f"t_rel and r_rel are means over {len(errors.drift.first)} stretches of {lengths}"
 
 
-def _metres(length: float) -> str:
-    return f"{length:.0f} m" if length >= 1000 else f"{length:.4g} m"
+def _file_report(file: TrajectoryFile, num_poses: int) -> TrajectoryReport:
+    return TrajectoryReport(path=os.fspath(file.path), format=file.format, num_poses=num_poses)
 
 
-def _errors_dict(errors: Errors) -> dict[str, Any]:
+def _alignment_report(errors: Errors) -> AlignmentReport:
     drift = errors.drift
     by_length = []
     for length in drift.lengths_m:
         chosen = drift.length_m == length
         if chosen.any():
-            by_length.append({
-                "length_m": float(length), "num": int(chosen.sum()),
-                "t_percent": float(100 * drift.translation[chosen].mean()),
-                "r_deg_per_m": float(drift.rotation_deg_per_m[chosen].mean()),
-            })  # fmt: skip
-    kitti = None
+            by_length.append(
+                DriftAtLength(
+                    length_m=float(length), num=int(chosen.sum()),
+                    t_percent=float(100 * drift.translation[chosen].mean()),
+                    r_deg_per_m=float(drift.rotation_deg_per_m[chosen].mean()),
+                )
+            )  # fmt: skip
+    kitti = mean = None
+    if len(drift.first):
+        mean = MeanDrift(
+            t_percent=drift.t_rel_percent, r_deg_per_m=drift.r_rel_deg_per_m, is_by_share=errors.is_by_share
+        )
     if by_length and not errors.is_by_share:
-        kitti = {"t_rel_percent": drift.t_rel_percent, "r_rel_deg_per_m": drift.r_rel_deg_per_m,
-                 "r_rel_deg_per_100m": 100 * drift.r_rel_deg_per_m, "num": len(drift.first)}  # fmt: skip
-    return {
-        "ground_truth_from_estimate": errors.absolute.ground_truth_from_estimate.tolist(),
-        "scale": errors.absolute.scale,
-        "ate": {"translation_m": statistics(errors.absolute.translation_m),
-                "rotation_deg": statistics(errors.absolute.rotation_deg)},
-        "rpe": [
-            {"delta": error.delta, "unit": error.unit, "num": len(error.first),
-             "translation_m": statistics(error.translation_m), "rotation_deg": statistics(error.rotation_deg)}
+        kitti = KittiDrift(
+            t_rel_percent=drift.t_rel_percent, r_rel_deg_per_m=drift.r_rel_deg_per_m,
+            r_rel_deg_per_100m=100 * drift.r_rel_deg_per_m, num=len(drift.first),
+        )  # fmt: skip
+    absolute = errors.absolute
+    return AlignmentReport(
+        ground_truth_from_estimate=absolute.ground_truth_from_estimate.tolist(),
+        scale=absolute.scale,
+        ate=PoseErrors(**_statistics(absolute.translation_m, absolute.rotation_deg)),
+        rpe=[
+            RelativePoseErrors(
+                delta=error.delta, unit=error.unit, num=len(error.first),
+                **_statistics(error.translation_m, error.rotation_deg),
+            )
             for error in errors.relative
         ],
-        "kitti": kitti,
-        "drift_by_length": by_length,
-    }  # fmt: skip
+        kitti=kitti,
+        drift=mean,
+        drift_by_length=by_length,
+    )  # fmt: skip
 
 
-# ------------------------------------------------------------------------------------------------------------ the table
-
-
-def _table_lines(result: Evaluation) -> list[str]:
-    pairs = result.pairs
-    times = pairs.ground_truth.timestamps_s
-    duration = "" if times is None else f" in {np.ptp(times):.4g} s"
-    num_gaps = int(pairs.is_gap.sum())
-    lines = [
-        f"{result.estimate.path} ({_FORMAT_NAMES.get(result.estimate.format, result.estimate.format)})",
-        f"against {result.ground_truth.path} "
-        f"({_FORMAT_NAMES.get(result.ground_truth.format, result.ground_truth.format)})",
-        f"{len(pairs)} pairs of {pairs.num_estimate} estimated and {pairs.num_ground_truth} true poses, "
-        f"{_metres(pairs.ground_truth.path_m)}{duration}, coverage {100 * pairs.coverage:.1f} %, "
-        f"{num_gaps or 'no'} gap{'' if num_gaps == 1 else 's'}",
-        "",
-    ]
-    for how, errors in result.errors.items():
-        title = f"{how}, scale {errors.absolute.scale:.6f}"
-        lines.append(f"{title:<36}" + "".join(f"{key:>14}" for key in _COLUMNS))
-        lines += [f"{name:<36}" + "".join(f"{cell:>14}" for cell in cells) for name, cells in _rows(errors)]
-        lines.append("")
-    for note in result.notes:
-        lines += textwrap.wrap(f"note: {note}", 100, subsequent_indent="  ", break_long_words=False)
-    return lines
-
-
-_COLUMNS = ("rmse", "mean", "median", "max")
-
-
-def _rows(errors: Errors) -> list[tuple[str, list[str]]]:
-    rows = []
-
-    def add(name: str, translation: Array, rotation: Array) -> None:
-        for what, values in (("translation (m)", translation), ("rotation (deg)", rotation)):
-            numbers = statistics(values) or {}
-            rows.append((f"{name} {what}", [f"{numbers[key]:.6f}" for key in _COLUMNS]))
-
-    add("ATE", errors.absolute.translation_m, errors.absolute.rotation_deg)
-    for error in errors.relative:
-        unit = "frame" if (error.delta, error.unit) == (1, "frames") else error.unit
-        add(f"RPE {error.delta:g} {unit}", error.translation_m, error.rotation_deg)
-    if len(errors.drift.first):
-        names = ("drift (%)", "drift (deg/100 m)") if errors.is_by_share else ("t_rel (%)", "r_rel (deg/100 m)")
-        for name, value in zip(names, (errors.drift.t_rel_percent, 100 * errors.drift.r_rel_deg_per_m), strict=True):
-            rows.append((name, ["", f"{value:.6f}"]))
-    return rows
+def _statistics(translation_m: Array, rotation_deg: Array) -> dict[str, Statistics]:
+    """Of errors, of which there are some."""
+    found = {"translation_m": statistics(translation_m), "rotation_deg": statistics(rotation_deg)}
+    return {name: numbers for name, numbers in found.items() if numbers is not None}

@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model, write_model, write_model_text
 from sfmapp.formats.colmap_model import model_from_reconstruction, reconstruction_from_model
 from sfmapp.pipelines.stored_pixels import check_pixels
+from sfmapp.report.model import ExportReport
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.workspace.layout import USUAL_FOLDERS
 from sfmapp.workspace.manifest import image_root, read_manifest
@@ -51,7 +51,7 @@ def export_model(
     *,
     images: str | os.PathLike[str] | None = None,
     keypoints: list[NDArray[np.float64]] | None = None,
-) -> dict[str, Any]:
+) -> ExportReport:
     """Write a model in another format, read it back and re-project every inlier with what was read.
 
     Args:
@@ -63,10 +63,7 @@ def export_model(
         keypoints: of a reconstruction in memory, (N, 2) pixels for each image; None: the tracked ones.
 
     Returns:
-        JSON-able: ``format``, ``files``, ``reader`` (what read it back), ``num_images``, ``num_points``,
-        ``num_observations``, ``max_px`` (worst difference of a reprojection, in pixels), ``max_coordinate`` (worst
-        difference of a coordinate of a point, in units of the world) and ``notes``, what a user of the files has to
-        know.
+        What was written, and how well it was read back.
 
     Raises:
         UsageError: an unknown format, a camera or name that it cannot hold, or the model's own folder as the target.
@@ -91,17 +88,17 @@ def export_model(
             f"{path}: expected to read back {len(ours.image_names)} images and {len(ours.point_xyz)} points, found "
             f"{len(theirs.image_names)} and {len(theirs.point_xyz)}"
         )
-    return {
-        "format": target,
-        "files": [os.fspath(file) for file in copy.files],
-        "reader": copy.reader,
-        "num_images": len(ours.image_names),
-        "num_points": int(ours.is_triangulated.sum()),
-        "num_observations": int(ours.obs_is_inlier.sum()),
-        "max_px": _worst_px(ours, theirs),
-        "max_coordinate": float(np.abs(theirs.point_xyz - ours.point_xyz).max(initial=0.0)),
-        "notes": [*source.notes, *copy.notes],
-    }
+    return ExportReport(
+        format=target,
+        files=[os.fspath(file) for file in copy.files],
+        reader=copy.reader,
+        num_images=len(ours.image_names),
+        num_points=int(ours.is_triangulated.sum()),
+        num_observations=int(ours.obs_is_inlier.sum()),
+        max_px=_worst_px(ours, theirs),
+        max_coordinate=float(np.abs(theirs.point_xyz - ours.point_xyz).max(initial=0.0)),
+        notes=[*source.notes, *copy.notes],
+    )
 
 
 def _in_memory(model: Reconstruction, keypoints: list[NDArray[np.float64]] | None) -> _Source:

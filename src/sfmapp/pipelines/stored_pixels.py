@@ -5,8 +5,7 @@ Others are workspaces of earlier versions, which counted in pictures turned upri
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,11 +16,14 @@ from sfmapp.errors import InputError
 from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.orientation import INVERSE, MIRRORED, ROTATION_OF, upright_poses
+from sfmapp.workspace.layout import MANIFEST, REPORT
+from sfmapp.workspace.manifest import read_json
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sfmapp.formats.ground_truth import GroundTruth
+    from sfmapp.images.image_set import ImageRecord
     from sfmapp.scene.reconstruction import Reconstruction
 
 # what the mapping notes of its model in the manifest; earlier versions noted nothing
@@ -36,13 +38,26 @@ def has_stored_pixels(manifest: Mapping[str, Any]) -> bool:
     return bool(manifest.get("stages", {}).get("mapping", {}).get("pixels") == STORED)
 
 
+def noted_orientations(images: Iterable[ImageRecord]) -> dict[str, int]:
+    """What a reconstruction notes in the manifest: EXIF orientation by name, of photographs that it turns."""
+    return {image.name: image.orientation for image in images if image.orientation != 1}
+
+
 def orientations_of(folder: Path) -> dict[str, int]:
-    """EXIF orientation of each photograph of a reconstruction, by name, as its report tells; empty without one."""
+    """EXIF orientation of the photographs of a reconstruction that it turns, by name; empty where it is not known."""
+    manifest = read_json(folder / MANIFEST)
+    stages = manifest.get("stages", {}) if isinstance(manifest, dict) else {}
+    noted: dict[str, int] = stages.get("mapping", {}).get("orientations", {})
+    return noted
+
+
+def _orientations_of_earlier_version(folder: Path) -> dict[str, int]:
+    """The same of a version that noted none: its report alone tells."""
+    report = read_json(folder / REPORT)
     try:
-        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-        rows = report.get("stages", {}).get("images", {}).get("images", [])
+        rows = report["stages"]["images"]["images"]
         return {str(row["name"]): int(row["orientation"]) for row in rows}
-    except (OSError, ValueError, AttributeError, KeyError, TypeError):
+    except (KeyError, TypeError, ValueError):
         return {}
 
 
@@ -54,7 +69,7 @@ def check_pixels(folder: Path, manifest: Mapping[str, Any]) -> None:
     """
     if has_stored_pixels(manifest):
         return
-    turned = [name for name, orientation in orientations_of(folder).items() if orientation != 1]
+    turned = [name for name, held in _orientations_of_earlier_version(folder).items() if held != 1]
     if turned:
         raise InputError(
             f"{folder}: expected a model in the pixels of the files, found one of an earlier version of sfmapp, which "

@@ -30,6 +30,8 @@ from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import decode_file, read_file, read_mask_file
 from sfmapp.images.rewrite import encode, encode_mask, without_turn
 from sfmapp.pipelines.dense.source import DenseSource, find_source, model_digest
+from sfmapp.report.model import UndistortedCamera, UndistortNumbers, UndistortReport
+from sfmapp.reporting import NamedReason, from_plain
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.undistortion import Undistortion, has_distortion, plan_undistortion, undistort_reconstruction
 from sfmapp.workspace.keys import input_key, stage_key
@@ -51,14 +53,11 @@ class UndistortResult:
 
     Attributes:
         output: the folder.
-        report: JSON-able: ``num_images``, ``num_copied`` (of them, files that had no distortion), ``num_masks``,
-            ``cameras`` (a row for each pinhole), ``num_points``, ``num_observations``, ``num_dropped`` (observations
-            outside of the pictures, or in photographs that are missing), ``missing`` (name and reason),
-            ``is_up_to_date`` and ``run``.
+        report: of it.
     """
 
     output: Path
-    report: dict[str, Any]
+    report: UndistortReport
 
 
 @dataclass
@@ -131,15 +130,16 @@ def undistort(
             (__name__,), None, [blank_pixels, max_size, where.is_upright],
             model_digest(where.model), [input_key(record) for record in photographs.records], photographs.missing,
         )  # fmt: skip
-        report = _known_report(job, key)
-        if report is None:
+        known = _known_numbers(job, key)
+        numbers = known
+        if numbers is None:
             _begin(job, key)
             _write_photographs(job, options.num_workers)
-            report = _write_model(job, model, keypoints)
-            workspace.finish(STAGE, watch.read(), report=report)
+            numbers = _write_model(job, model, keypoints)
+            workspace.finish(STAGE, watch.read(), report=numbers)
             workspace.save()
-            report = {"is_up_to_date": False, **report}
-        return UndistortResult(workspace.folder, report | {"run": watch.read()})
+        report = UndistortReport(**numbers, is_up_to_date=known is not None, run=watch.read())
+        return UndistortResult(workspace.folder, report)
 
 
 def _check_target(where: DenseSource) -> None:
@@ -196,14 +196,17 @@ def _begin(job: _Job, key: str) -> None:
     workspace.begin(STAGE, key, names=names)
 
 
-def _known_report(job: _Job, key: str) -> dict[str, Any] | None:
-    """The report of an earlier run if all that it has written is there."""
+def _known_numbers(job: _Job, key: str) -> UndistortNumbers | None:
+    """What an earlier run has written, if all of it is there."""
     folder = job.workspace.folder
     wanted = [folder / IMAGES / record.name for record in job.photographs.records]
     wanted += [folder / "sparse" / "0" / name for name in MODEL_FILES]
     if not job.workspace.is_current(STAGE, key) or not all(path.is_file() for path in wanted):
         return None
-    return {**job.workspace.manifest["stages"][STAGE]["report"], "is_up_to_date": True}
+    try:
+        return from_plain(UndistortNumbers, job.workspace.manifest["stages"][STAGE]["report"])
+    except ValueError:
+        return None
 
 
 def _write_photographs(job: _Job, threads: int) -> None:
@@ -285,7 +288,7 @@ def _lay_out(how: Undistortion, pixels: NDArray[Any]) -> tuple[NDArray[Any], NDA
     return np.array(flat), shown
 
 
-def _write_model(job: _Job, model: Reconstruction, keypoints: list[NDArray[np.float64]]) -> dict[str, Any]:
+def _write_model(job: _Job, model: Reconstruction, keypoints: list[NDArray[np.float64]]) -> UndistortNumbers:
     """Write the model of the photographs that were written, and tell of it."""
     photographs, lost = job.photographs, {name for name, _ in job.lost}
     kept = [i for i, record in enumerate(photographs.records) if record.name not in lost]
@@ -296,16 +299,16 @@ def _write_model(job: _Job, model: Reconstruction, keypoints: list[NDArray[np.fl
         _share(job.workspace.model() / name, job.workspace.folder / "sparse" / name)
     names = [photographs.records[i].name for i in kept]
     masks = [job.workspace.folder / MASKS / f"{name}.png" for name in names]
-    return {
-        "num_images": len(kept),
-        "num_copied": sum(each.is_identity for each in undistortions),
-        "num_masks": sum(path.is_file() for path in masks),
-        "cameras": [{"width": c.width, "height": c.height, "params": c.params.tolist()} for c in flat.cameras],
-        "num_points": int(flat.is_triangulated.sum()),
-        "num_observations": flat.tracks.num_observations,
-        "num_dropped": int(model.obs_is_inlier.sum()) - flat.tracks.num_observations,
-        "missing": [{"name": name, "reason": reason} for name, reason in (*photographs.missing, *job.lost)],
-    }
+    return UndistortNumbers(
+        num_images=len(kept),
+        num_copied=sum(each.is_identity for each in undistortions),
+        num_masks=sum(path.is_file() for path in masks),
+        cameras=[UndistortedCamera(width=c.width, height=c.height, params=c.params.tolist()) for c in flat.cameras],
+        num_points=int(flat.is_triangulated.sum()),
+        num_observations=flat.tracks.num_observations,
+        num_dropped=int(model.obs_is_inlier.sum()) - flat.tracks.num_observations,
+        missing=[NamedReason(name=name, reason=reason) for name, reason in (*photographs.missing, *job.lost)],
+    )
 
 
 def _share(path: Path, other: Path) -> None:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +18,8 @@ from sfmapp.formats.ground_truth import read_ground_truth
 from sfmapp.formats.ply_reader import PlyGeometry, read_ply_geometry
 from sfmapp.geometry import similarity
 from sfmapp.pipelines.stored_pixels import ground_truth_in_stored_pixels, orientations_of
+from sfmapp.report.validation import CloudValidation
+from sfmapp.reporting import to_json
 
 FOLDER = "validation"
 CLOUD, MESH, PATCHES = Path("dense") / "fused.ply", Path("mesh") / "mesh.ply", Path("dense") / "patches.npz"
@@ -28,43 +27,6 @@ CLOUD, MESH, PATCHES = Path("dense") / "fused.ply", Path("mesh") / "mesh.ply", P
 # Surfaces become points so many to the square of the distance: none is missed for want of a sample (exp(-4 pi) = 3e-6).
 _SAMPLES_PER_SQUARE = 4
 _SAMPLES = (10_000, 5_000_000)
-
-
-@dataclass(frozen=True)
-class CloudValidation:
-    """Scores of what a result holds.
-
-    Attributes:
-        ground_truth: name of the true cloud.
-        distance: the distance D in units of the ground truth.
-        scores: by file, as :meth:`CloudScore.summary` gives them, at 1, 2 and 5 D.
-        recording: the coloured clouds, None if rerun failed.
-        notes: what a reader of the table has to know.
-    """
-
-    ground_truth: str
-    distance: float
-    scores: dict[str, dict[str, Any]]
-    recording: str | None
-    notes: list[str] = field(default_factory=list)
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return asdict(self)
-
-    def table(self) -> str:
-        """The scores as plain text; no newline at its end."""
-        head = f"{'':<28}" + "".join(f"{f'{factor:g} x D':>12}" for factor in DISTANCE_FACTORS)
-        lines = [f"against {self.ground_truth}, D = {self.distance:.6g}", head]
-        for name, summary in self.scores.items():
-            lines.append(f"{name}: {summary['num_points']} points, {summary['num_ground_truth']} true points")
-            for title, key in (("accuracy", "accuracy"), ("completeness", "completeness"), ("F-score", "f_score")):
-                values = "".join(f"{100 * score[key]:>10.2f} %" for score in summary["scores"])
-                lines.append(f"  {title:<26}{values}")
-        lines += [f"note: {note}" for note in self.notes]
-        if self.recording:
-            lines.append(f"coloured by error: {self.recording}")
-        return "\n".join(lines)
 
 
 def validate_cloud(
@@ -118,8 +80,8 @@ def validate_cloud(
     scores = {name: score.summary() for name, (_, score) in found.items()}
     result = CloudValidation(os.fspath(ground_truth_cloud), limit, scores, recording, notes)
     with replaced_file(place / "cloud.json") as beside:
-        beside.write_text(json.dumps(result.to_dict(), indent=1) + "\n", encoding="utf-8")
-    events.finished("validate", f"scored {', '.join(found)}", **result.to_dict())
+        beside.write_text(to_json(result, indent=1) + "\n", encoding="utf-8")
+    events.finished("validate", f"scored {', '.join(found)}", **result)
     return result
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sfmapp.dense.scene import DenseScene, DenseView, Patches
 from sfmapp.geometry import rigid3
+from sfmapp.report.model import CoverageReport
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -24,7 +25,7 @@ REASONS = {
 GOOD_SHARE = 0.8
 
 
-def coverage(scene: DenseScene, patches: Patches, *, block_px: int = 4, min_views: int = 3) -> list[dict[str, Any]]:
+def coverage(scene: DenseScene, patches: Patches, *, block_px: int = 4, min_views: int = 3) -> list[CoverageReport]:
     """What share of each photograph's blocks holds a patch that trusts it, and what became of the others.
 
     Args:
@@ -34,9 +35,7 @@ def coverage(scene: DenseScene, patches: Patches, *, block_px: int = 4, min_view
         min_views: photographs that have to show a place.
 
     Returns:
-        A row for each view: ``name``, ``num_neighbors``, ``num_patches`` (whose reference it is), ``num_trusting``
-        (patches that trust it), ``coverage``, the shares ``out_of_sight``, ``plain`` and ``unmatched``, which add up
-        to one with it, and ``reason``, the largest of these three in words, empty where the photograph is well covered.
+        A row for each view; its shares ``coverage``, ``out_of_sight``, ``plain`` and ``unmatched`` add up to one.
     """
     trusting = np.repeat(np.arange(len(patches)), patches.num_views)
     trusting = trusting[np.argsort(patches.view_idx, kind="stable")]
@@ -57,14 +56,14 @@ def coverage(scene: DenseScene, patches: Patches, *, block_px: int = 4, min_view
             "unmatched": float((wanted & ~covered & ~out_of_sight & ~plain).sum() / count),
         }
         rows.append(
-            {
-                "name": view.name,
-                "num_neighbors": int((scene.neighbors[v] >= 0).sum()),
-                "num_patches": int((patches.reference_idx == v).sum()),
-                "num_trusting": len(mine),
+            CoverageReport(
+                name=view.name,
+                num_neighbors=int((scene.neighbors[v] >= 0).sum()),
+                num_patches=int((patches.reference_idx == v).sum()),
+                num_trusting=len(mine),
                 **shares,
-                "reason": _reason(shares),
-            }
+                reason=_reason(shares),
+            )
         )
     return rows
 

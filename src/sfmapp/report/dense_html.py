@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sfmapp.dense.report import LevelReport, WaveReport
+from sfmapp.report.model import CoverageReport, DenseHistograms, DensePart, DenseRunReport
 from sfmapp.report.page import check_table, failure_box, log_table, render_page, table, usage_table
 from sfmapp.report.plots import Curve, bars_svg, plot_svg
+from sfmapp.reporting import Step
+from sfmapp.surface.report import MeshReport
 
 if TYPE_CHECKING:
     from sfmapp.report.dense_pictures import PictureRow
@@ -19,38 +23,37 @@ MAX_IMAGES = 30
 _BLUE, _GREY = "#4a7fd4", "#999"
 
 
-def render_dense_html(report: Mapping[str, Any], pictures: Sequence[PictureRow]) -> str:
+def render_dense_html(report: DenseRunReport, pictures: Sequence[PictureRow]) -> str:
     """The page of a report on densification or meshing alone.
 
     Args:
-        report: ``outcome``, ``run``, ``usage``, ``warnings`` and ``decisions`` as in the report of a reconstruction,
-            and ``dense`` as :func:`~sfmapp.report.dense_document.dense_document` makes it; None if it came to nothing.
+        report: of the run.
         pictures: of :func:`~sfmapp.report.dense_pictures.dense_pictures`.
     """
-    run = report["run"]
-    facts = "; ".join([run["source"], f"sfmapp {run['versions']['sfmapp']}", run["started"]])
-    body = [f'<p class="dim">{escape(facts)}</p>', failure_box(report["outcome"])]
-    if report["dense"] is not None:
-        body.append(dense_section(report["dense"], pictures))
-    body.append(usage_table(report["usage"], run))
-    body.append(log_table("Warnings", report["warnings"]) + log_table("Decisions", report["decisions"]))
-    return render_page(f"sfmapp dense: {run['source']}", body)
+    run = report.run
+    facts = "; ".join([run.source, f"sfmapp {run.versions['sfmapp']}", run.started])
+    body = [f'<p class="dim">{escape(facts)}</p>', failure_box(report.outcome)]
+    if report.dense is not None:
+        body.append(dense_section(report.dense, pictures))
+    body.append(usage_table(report.usage, run))
+    body.append(log_table("Warnings", report.warnings) + log_table("Decisions", report.decisions))
+    return render_page(f"sfmapp dense: {run.source}", body)
 
 
-def dense_section(document: Mapping[str, Any], pictures: Sequence[PictureRow]) -> str:
+def dense_section(document: DensePart, pictures: Sequence[PictureRow]) -> str:
     """The dense part of a page: pictures, checks, how sure the patches are, what is bare, their growth, the mesh.
 
     Args:
         document: of :func:`~sfmapp.report.dense_document.dense_document`.
         pictures: of :func:`~sfmapp.report.dense_pictures.dense_pictures`.
     """
-    mesh = document["mesh"]
-    facts = [f"{document['num_patches']} patches of {document['num_views']} photographs"]
-    facts += [f"a mesh of {mesh['num_faces']} triangles"] if mesh else []
+    mesh = document.mesh
+    facts = [f"{document.num_patches} patches of {document.num_views} photographs"]
+    facts += [f"a mesh of {mesh.num_faces} triangles"] if mesh else []
     parts = [f"<h2>Surface</h2><p>{' and '.join(facts)}</p>"]
     parts += [_picture_row(row, "row large" if k == 0 else "row") for k, row in enumerate(pictures)]
-    parts += [check_table(document["checks"]), _histograms(document["histograms"]) if document["num_patches"] else ""]
-    parts += [_images(document["images"]), _growth(document)]
+    parts += [check_table(document.checks), _histograms(document.histograms) if document.num_patches else ""]
+    parts += [_images(document.images), _growth(document)]
     parts += [_mesh(mesh)] if mesh else []
     return "".join(parts)
 
@@ -64,94 +67,93 @@ def _picture_row(row: PictureRow, kind: str) -> str:
     return f'<h3>{escape(row.title)}</h3><div class="{kind}">{"".join(figures)}</div>'
 
 
-def _histograms(histograms: Mapping[str, Mapping[str, Any]]) -> str:
+def _histograms(histograms: DenseHistograms) -> str:
     shown = (
-        ("views", "Photographs that agree", "photographs"),
-        ("score", "Score: mean correlation", "score"),
-        ("sigma_px", "Deviation along the ray", "pixels of the photograph on the surface"),
+        (histograms.views, "Photographs that agree", "photographs"),
+        (histograms.score, "Score: mean correlation", "score"),
+        (histograms.sigma_px, "Deviation along the ray", "pixels of the photograph on the surface"),
     )
     parts = []
-    for key, title, label in shown:
-        entry = histograms[key]
-        median = "" if entry["median"] is None else f", median {entry['median']:.3g}"
-        parts.append(f"<div><h3>{title}{median}</h3>{bars_svg(entry['edges'], entry['counts'], label)}</div>")
+    for entry, title, label in shown:
+        median = "" if entry.median is None else f", median {entry.median:.3g}"
+        parts.append(f"<div><h3>{title}{median}</h3>{bars_svg(entry.edges, entry.counts, label)}</div>")
     note = "Numbers of patches; the outermost bars hold what lies beyond them as well."
     return f'<h2>How sure the patches are</h2><div class="row">{"".join(parts)}</div><p class="dim">{note}</p>'
 
 
-def _images(images: Sequence[Mapping[str, Any]]) -> str:
+def _images(images: Sequence[CoverageReport]) -> str:
     """Worst first: these are the ones to do something about."""
     head = [
         ("t", "photograph"), ("", "neighbours"), ("", "own patches"), ("", "patches seen"),
         ("", "covered"), ("", "not in others"), ("", "plain"), ("", "unmatched"), ("t", "what is missing, mostly"),
     ]  # fmt: skip
     rows = []
-    for image in sorted(images, key=lambda row: row["coverage"])[:MAX_IMAGES]:
-        light = "green" if image["coverage"] >= 0.6 else "amber" if image["coverage"] >= 0.3 else "red"
+    for image in sorted(images, key=lambda row: row.coverage)[:MAX_IMAGES]:
+        light = "green" if image.coverage >= 0.6 else "amber" if image.coverage >= 0.3 else "red"
         shares = [f"{100 * image[key]:.0f} %" for key in ("coverage", "out_of_sight", "plain", "unmatched")]
         counts = [image[key] for key in ("num_neighbors", "num_patches", "num_trusting")]
         cells = [("", value) for value in (*counts, *shares)]
-        rows.append([(f"t {light}", image["name"]), *cells, ("w dim", image["reason"])])
+        rows.append([(f"t {light}", image.name), *cells, ("w dim", image.reason)])
     more = len(images) - MAX_IMAGES
     note = f"<p class=dim>{more} that are covered better are in report.json</p>" if more > 0 else ""
     return "<h2>What of each photograph is covered</h2>" + table(head, rows) + note
 
 
-def _growth(document: Mapping[str, Any]) -> str:
-    parts = ["<h2>How the patches came about</h2>", _levels(document["levels"]), _waves(document["waves"])]
-    seeds = ", ".join(f"{count} from {_SEEDS.get(name, name)}" for name, count in document["seeds"].items())
+def _growth(document: DensePart) -> str:
+    parts = ["<h2>How the patches came about</h2>", _levels(document.levels), _waves(document.waves)]
+    seeds = ", ".join(f"{count} from {_SEEDS.get(name, name)}" for name, count in document.seeds.items())
     parts.append(f"<p>Seeds of the finest level: {escape(seeds)}.</p>")
-    parts.append(_funnel("What was taken away again", "patches", document["funnel"][:-1], document["num_patches"]))
+    parts.append(_funnel("What was taken away again", "patches", document.funnel[:-1], document.num_patches))
     return "".join(parts)
 
 
 _SEEDS = {"carried": "the coarser level", "points": "sparse points", "corners": "corners matched along epipolar lines"}
 _LEVEL_COLUMNS = (
     ("carried", "carried over"), ("points", "sparse points"), ("corners", "corners"), ("expanded", "expanded"),
-    ("accepted", "accepted"), ("contradicted", "contradicted"), ("without neighbours", "without neighbours"),
-    ("in small groups", "in small groups"), ("patches", "patches"),
+    ("accepted", "accepted"), ("contradicted", "contradicted"), ("without_neighbours", "without neighbours"),
+    ("in_small_groups", "in small groups"), ("patches", "patches"),
 )  # fmt: skip
 
 
-def _levels(levels: Iterable[Mapping[str, Any]]) -> str:
+def _levels(levels: Iterable[LevelReport]) -> str:
     head = [("", "level"), *(("", label) for _, label in _LEVEL_COLUMNS), ("", "wall s"), ("", "CPU s")]
     rows = []
     for level in levels:
         counts = [("", level.get(key)) for key, _ in _LEVEL_COLUMNS]
-        rows.append([("", level["level"]), *counts, ("", f"{level['seconds']:.2f}"), ("", f"{level['cpu_s']:.2f}")])
+        rows.append([("", level.level), *counts, ("", f"{level.wall_s:.2f}"), ("", f"{level.cpu_s:.2f}")])
     note = "Level 0 is the working resolution, each further one half of it; the coarsest is worked on first."
     return table(head, rows) + f'<p class="dim">{note}</p>'
 
 
-def _waves(waves: Sequence[Mapping[str, int]]) -> str:
+def _waves(waves: Sequence[WaveReport]) -> str:
     if not waves:
         return ""
-    number = np.array([wave["wave"] for wave in waves], np.float64)
+    number = np.array([wave.wave for wave in waves], np.float64)
     tried, accepted = (np.array([wave[key] for wave in waves], np.float64) for key in ("tried", "accepted"))
     curves = [Curve("tried", tried, _GREY), Curve("accepted", accepted, _BLUE)]
     return "<h3>Patches by wave</h3>" + plot_svg(number, curves, [], "wave")
 
 
-def _mesh(mesh: Mapping[str, Any]) -> str:
-    poisson = mesh["poisson"]
+def _mesh(mesh: MeshReport) -> str:
+    poisson = mesh.poisson
     facts = [
-        ("triangles", mesh["num_faces"]), ("vertices", mesh["num_vertices"]),
-        ("edges at rims", mesh["num_rim_edges"] or "none: it is closed"), ("depth of the octree", mesh["depth"]),
-        ("spacing of the patches, world units", f"{mesh['spacing']:.4g}"),
-        ("wall s, of it Poisson", f"{mesh['seconds']:.1f}, {poisson['seconds']:.1f}"),
-        ("CPU s, of it Poisson", f"{mesh['cpu_s']:.1f}, {poisson['cpu_s']:.1f}"),
-        ("peak memory of Poisson, MB", f"{poisson['peak_memory_mb']:.0f}"),
+        ("triangles", mesh.num_faces), ("vertices", mesh.num_vertices),
+        ("edges at rims", mesh.num_rim_edges or "none: it is closed"), ("depth of the octree", mesh.depth),
+        ("spacing of the patches, world units", f"{mesh.spacing:.4g}"),
+        ("wall s, of it Poisson", f"{mesh.wall_s:.1f}, {poisson.wall_s:.1f}"),
+        ("CPU s, of it Poisson", f"{mesh.cpu_s:.1f}, {poisson.cpu_s:.1f}"),
+        ("peak memory of Poisson, MB", f"{poisson.peak_memory_mb or 0.0:.0f}"),
     ]  # fmt: skip
     rows = [[("t", name), ("", value)] for name, value in facts]
-    steps = [[("t", step["name"]), ("", step["count"])] for step in mesh["funnel"]]
+    steps = [[("t", step.name), ("", step.count)] for step in mesh.funnel]
     return (
         "<h2>Mesh</h2>" + table([("t", ""), ("", "")], rows)
         + "<h3>Triangles left after each step</h3>" + table([("t", "step"), ("", "triangles")], steps)
     )  # fmt: skip
 
 
-def _funnel(title: str, what: str, steps: Sequence[Mapping[str, Any]], left: int) -> str:
+def _funnel(title: str, what: str, steps: Sequence[Step], left: int) -> str:
     """The first step is what there was, the others what each took away."""
-    rows = [[("t", step["name"]), ("", step["count"] if k == 0 else -step["count"])] for k, step in enumerate(steps)]
+    rows = [[("t", step.name), ("", step.count if k == 0 else -step.count)] for k, step in enumerate(steps)]
     rows.append([("t", f"{what} left"), ("", left)])
     return f"<h3>{title}</h3>" + table([("t", "step"), ("", what)], rows)

@@ -1,13 +1,17 @@
-"""The report of a run as one JSON-able document: what came out, how good it is, and why each image is where it is."""
+"""The report of a reconstruction: what came out, how good it is, and why each image is where it is."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sfmapp.camera.camera import PARAM_NAMES, Camera
+from sfmapp.contradictions import Contradiction
+from sfmapp.mapping.report import FocalEvidence, MappedImage, ModelEntry, Uncertainty
+from sfmapp.report.model import CameraReport, Check, Failure, Funnel, ImageReport, Light
 
 if TYPE_CHECKING:
     from sfmapp.images.folder import ImageSet
@@ -16,28 +20,19 @@ if TYPE_CHECKING:
     from sfmapp.scene.features import Features
     from sfmapp.scene.reconstruction import Reconstruction
 
-FORMAT = "sfmapp report 1"
-FUNNEL_STEPS = (
-    "features",
-    "candidate_pairs",
-    "verified_pairs",
-    "putative_matches",
-    "verified_matches",
-    "correspondences_2d3d",
-    "pose_inliers",
-    "observations",
-)
+FORMAT = "sfmapp report 2"
 # fewer keypoints than this leave too few matches for any pair, whatever the other image holds
 FEW_FEATURES = 100
+_NOTHING = Funnel(**dict.fromkeys(Funnel.__dataclass_fields__))
 
 
 def funnel_of_images(
     names: Sequence[str],
     features: Sequence[Features],
     correspondences: Correspondences,
-    mapping_images: Sequence[Mapping[str, Any]],
+    mapping_images: Sequence[MappedImage],
     options: MappingOptions,
-) -> list[dict[str, Any]]:
+) -> list[ImageReport]:
     """What became of every image, from its keypoints to its pose, and what the user can do where it failed.
 
     Args:
@@ -59,172 +54,172 @@ def funnel_of_images(
     putative, agreeing = total(correspondences.num_putative), total(inliers)
     rows = []
     for i, name in enumerate(names):
-        entry = dict(mapping_images[i]) if mapping_images else {}
-        funnel = {
-            "features": len(features[i]),
-            "candidate_pairs": candidates[i],
-            "verified_pairs": verified[i],
-            "putative_matches": putative[i],
-            "verified_matches": agreeing[i],
-            "correspondences_2d3d": entry.get("num_correspondences"),
-            "pose_inliers": entry.get("num_pose_inliers"),
-            "observations": entry.get("num_observations", 0),
-        }
-        is_registered = entry.get("model") is not None
-        row = {"name": name, "is_registered": is_registered, "model": entry.get("model"), "funnel": funnel}
-        if not is_registered:
-            row |= explain_failure(funnel, entry.get("reason") or "", options)
-        rows.append(row)
+        entry = mapping_images[i] if mapping_images else None
+        funnel = Funnel(
+            features=len(features[i]),
+            candidate_pairs=candidates[i],
+            verified_pairs=verified[i],
+            putative_matches=putative[i],
+            verified_matches=agreeing[i],
+            correspondences_2d3d=entry.num_correspondences if entry else None,
+            pose_inliers=entry.num_pose_inliers if entry else None,
+            observations=entry.num_observations if entry else 0,
+        )
+        model = entry.model if entry else None
+        row = ImageReport(name=name, is_registered=model is not None, model=model, funnel=funnel)
+        reason = entry.reason if entry else ""
+        rows.append(row if row.is_registered else replace(row, **explain_failure(funnel, reason, options)))
     return rows
 
 
-def funnel_without_matches(names: Sequence[str], reason: str) -> list[dict[str, Any]]:
+def funnel_without_matches(names: Sequence[str], reason: str) -> list[ImageReport]:
     """The rows of a run that ended before any image was matched."""
-    nothing = dict.fromkeys(FUNNEL_STEPS)
-    row = {"is_registered": False, "model": None, "funnel": nothing}
-    failure = {"failed_at": "images", "reason": reason, "remedy": "Add photographs of the same thing."}
-    return [{"name": name, **row, **failure} for name in names]
+    failure = Failure(failed_at="images", reason=reason, remedy="Add photographs of the same thing.")
+    return [ImageReport(name=name, is_registered=False, model=None, funnel=_NOTHING, **failure) for name in names]
 
 
-def explain_failure(funnel: Mapping[str, Any], reason: str, options: MappingOptions) -> dict[str, str]:
-    """Where an image fell out of the funnel: ``failed_at``, the ``reason`` with its threshold, and a ``remedy``."""
-    if funnel["features"] < FEW_FEATURES:
-        return {
-            "failed_at": "features",
-            "reason": f"{funnel['features']} features, at least {FEW_FEATURES} are needed",
-            "remedy": "It is blurred, dark, plain or masked: take it again, or lower features.contrast_threshold.",
-        }
-    if not funnel["candidate_pairs"]:
-        return {
-            "failed_at": "pairs",
-            "reason": "no other image looked like it, so it was matched with none",
-            "remedy": "Match all pairs: --set pairs.method=exhaustive.",
-        }
-    if not funnel["verified_pairs"]:
-        return {
-            "failed_at": "matching",
-            "reason": f"none of {funnel['candidate_pairs']} pairs was verified"
-            f" ({funnel['putative_matches']} matches looked right, no pair of them agrees with a camera motion)",
-            "remedy": "It overlaps too little with the others: add photographs between, more than half of each shared.",
-        }
+def explain_failure(funnel: Funnel, reason: str, options: MappingOptions) -> Failure:
+    """Where an image fell out of the funnel, the reason with its threshold, and a remedy.
+
+    Args:
+        reason: of mapping; may be empty.
+    """
+    if (funnel.features or 0) < FEW_FEATURES:
+        return Failure(
+            failed_at="features",
+            reason=f"{funnel.features} features, at least {FEW_FEATURES} are needed",
+            remedy="It is blurred, dark, plain or masked: take it again, or lower features.contrast_threshold.",
+        )
+    if not funnel.candidate_pairs:
+        return Failure(
+            failed_at="pairs",
+            reason="no other image looked like it, so it was matched with none",
+            remedy="Match all pairs: --set pairs.method=exhaustive.",
+        )
+    if not funnel.verified_pairs:
+        return Failure(
+            failed_at="matching",
+            reason=f"none of {funnel.candidate_pairs} pairs was verified"
+            f" ({funnel.putative_matches} matches looked right, no pair of them agrees with a camera motion)",
+            remedy="It overlaps too little with the others: add photographs between, more than half of each shared.",
+        )
     needed = options.min_pose_inliers
-    if (funnel["correspondences_2d3d"] or 0) < needed:
-        return {
-            "failed_at": "visibility",
-            "reason": reason or f"it sees fewer than {needed} points of the map",
-            "remedy": "Its matches lie where the model has no points: add photographs between it and the others"
+    if (funnel.correspondences_2d3d or 0) < needed:
+        return Failure(
+            failed_at="visibility",
+            reason=reason or f"it sees fewer than {needed} points of the map",
+            remedy="Its matches lie where the model has no points: add photographs between it and the others"
             " that move sideways.",
-        }
-    return {
-        "failed_at": "pose",
-        "reason": reason or f"fewer than {needed} points agree with one pose",
-        "remedy": "Repeated structure, moving things or a wrong focal length: mask what moves, or give the focal.",
-    }
+        )
+    return Failure(
+        failed_at="pose",
+        reason=reason or f"fewer than {needed} points agree with one pose",
+        remedy="Repeated structure, moving things or a wrong focal length: mask what moves, or give the focal.",
+    )
 
 
-def camera_rows(
-    image_set: ImageSet, model: Reconstruction | None, uncertainty: Mapping[str, Any]
-) -> list[dict[str, Any]]:
+def camera_rows(image_set: ImageSet, model: Reconstruction | None, uncertainty: Uncertainty) -> list[CameraReport]:
     """Each camera with the parameters that it began with and, if a model holds it, those it ended with, and sigmas."""
-    entries = {entry["camera"]: entry for entry in uncertainty.get("cameras", ())}
+    entries = {entry.camera: entry for entry in uncertainty.cameras or ()}
     num_images = np.bincount([record.camera_idx for record in image_set.images], minlength=len(image_set.cameras))
     rows = []
     for idx, camera in enumerate(image_set.cameras):
-        row = {
-            "idx": idx,
-            "model": camera.model.name,
-            "width": camera.width,
-            "height": camera.height,
-            "num_images": int(num_images[idx]),
-            "focal_source": camera.focal_source,
-            "focal_sigma_px": camera.focal_sigma,
-            "is_fixed": camera.is_fixed,
-            "initial": _named_params(camera),
-            "refined": None,
-            "sigma": entries.get(idx, {}).get("sigma", {}),
-            "focal_evidence": entries.get(idx, {}).get("focal", {}),
-        }
+        refined = None
         if model is not None and model.is_registered[model.image_camera_idx == idx].any():
-            row["refined"] = _named_params(model.cameras[idx])
-        rows.append(row)
+            refined = named_params(model.cameras[idx])
+        entry = entries.get(idx)
+        rows.append(
+            CameraReport(
+                idx=idx,
+                model=camera.model.name,
+                width=camera.width,
+                height=camera.height,
+                num_images=int(num_images[idx]),
+                focal_source=camera.focal_source,
+                focal_sigma_px=camera.focal_sigma,
+                is_fixed=camera.is_fixed,
+                initial=named_params(camera),
+                refined=refined,
+                sigma=entry.sigma if entry else {},
+                focal_evidence=(entry.focal if entry else None) or FocalEvidence(),
+            )
+        )
     return rows
 
 
 def make_checks(
-    models: Sequence[Mapping[str, Any]],
-    images: Sequence[Mapping[str, Any]],
-    cameras: Sequence[Mapping[str, Any]],
-) -> list[dict[str, str]]:
+    models: Sequence[ModelEntry], images: Sequence[ImageReport], cameras: Sequence[CameraReport]
+) -> list[Check]:
     """Traffic lights over the largest model and the contradictions of all, each with its thresholds in words."""
     summary, num_models = models[0], len(models)
-    share = 100 * summary["num_registered"] / max(1, summary["num_images"])
-    features = float(np.median([image["funnel"]["features"] for image in images])) if images else 0.0
+    share = 100 * summary.num_registered / max(1, summary.num_images)
+    features = float(np.median([image.funnel.features or 0 for image in images])) if images else 0.0
     checks = [
         check("registered images", share, f"{share:.0f} %", 95, 65, "%"),
         check("features per image (median)", features, f"{features:.0f}", 1000, 300),
         check(
-            "observations per image (mean)", summary["mean_observations_per_image"],
-            f"{summary['mean_observations_per_image']:.0f}", 500, 100,
+            "observations per image (mean)", summary.mean_observations_per_image,
+            f"{summary.mean_observations_per_image:.0f}", 500, 100,
         ),
-        check("track length (mean)", summary["mean_track_length"], f"{summary['mean_track_length']:.2f}", 3, 2.3),
+        check("track length (mean)", summary.mean_track_length, f"{summary.mean_track_length:.2f}", 3, 2.3),
         check(
-            "reprojection error (mean)", -summary["mean_reprojection_error_px"],
-            f"{summary['mean_reprojection_error_px']:.2f} px", -1, -2, "px",
+            "reprojection error (mean)", -summary.mean_reprojection_error_px,
+            f"{summary.mean_reprojection_error_px:.2f} px", -1, -2, "px",
         ),
         check("separate models", -num_models, "; ".join([str(num_models), *_apart(models)]), -1, -2),
     ]  # fmt: skip
     for camera in cameras:
-        if camera["refined"] and camera["focal_sigma_px"]:
-            checks.append(_check_focal(camera))
-    return checks + check_contradictions(found for model in models for found in model["contradictions"])
+        if camera.refined and camera.focal_sigma_px:
+            checks.append(_check_focal(camera, camera.refined, camera.focal_sigma_px))
+    return checks + check_contradictions(found for model in models for found in model.contradictions)
 
 
-def _apart(models: Sequence[Mapping[str, Any]]) -> list[str]:
+def _apart(models: Sequence[ModelEntry]) -> list[str]:
     """Why models after the first are none with it."""
-    return [f"model {m} is {model['apart']}" for m, model in enumerate(models) if m and model.get("apart")]
+    return [f"model {m} is {model.apart}" for m, model in enumerate(models) if m and model.apart]
 
 
-def _check_focal(camera: Mapping[str, Any]) -> dict[str, str]:
+def _check_focal(camera: CameraReport, refined: Mapping[str, float], sigma_px: float) -> Check:
     """The refined focal length of a camera against its prior. Amber where the photographs do not tell it, as agreement
     means nothing then, and where they refute a prior that was left out: the result is right, the input is not."""
-    change = abs(_focal(camera["refined"]) - _focal(camera["initial"])) / camera["focal_sigma_px"]
+    change = abs(_focal(refined) - _focal(camera.initial)) / sigma_px
     found = check(
-        f"focal length of camera {camera['idx']} against its prior", -change, f"{change:.1f} sigma", -2, -4, "sigma"
+        f"focal length of camera {camera.idx} against its prior", -change, f"{change:.1f} sigma", -2, -4, "sigma"
     )
-    evidence = camera["focal_evidence"]
-    if evidence.get("is_prior_left_out") and found["light"] != "green":
-        found |= {"light": "amber", "value": f"{found['value']}; the photographs refute it, it was left out"}
-    elif evidence.get("is_determined") is False and camera["focal_source"] != "default":
-        own = evidence["data_sigma_px"]
+    evidence = camera.focal_evidence
+    if evidence.is_prior_left_out and found.light != "green":
+        return replace(found, light="amber", value=f"{found.value}; the photographs refute it, it was left out")
+    if evidence.is_determined is False and camera.focal_source != "default":
+        own = evidence.data_sigma_px
         told = f"within {own:.0f} px by themselves" if own is not None else "not at all"
         value = (
-            f"{found['value']}; not determined by these photographs, which tell it {told}, the prior within "
-            f"{evidence['prior_sigma_px']:.0f} px"
+            f"{found.value}; not determined by these photographs, which tell it {told}, the prior within "
+            f"{evidence.prior_sigma_px:.0f} px"
         )
-        found |= {"light": "amber" if found["light"] == "green" else found["light"], "value": value}
+        return replace(found, light="amber" if found.light == "green" else found.light, value=value)
     return found
 
 
-def check(name: str, value: float, text: str, green: float, amber: float, unit: str = "") -> dict[str, str]:
+def check(name: str, value: float, text: str, green: float, amber: float, unit: str = "") -> Check:
     """Green from one bound on, amber from the other; negative bounds are upper bounds."""
-    light = "green" if value >= green else "amber" if value >= amber else "red"
+    light: Light = "green" if value >= green else "amber" if value >= amber else "red"
     word = "at most" if green < 0 else "at least"
     thresholds = f"green: {word} {abs(green):g}, amber: {word} {abs(amber):g} {unit}".strip()
-    return {"name": name, "value": text, "light": light, "thresholds": thresholds}
+    return Check(name=name, value=text, light=light, thresholds=thresholds)
 
 
-def check_contradictions(found: Iterable[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """A red light for each contradiction as ``Contradiction.describe`` gives it, or one green light for none."""
+def check_contradictions(found: Iterable[Contradiction]) -> list[Check]:
+    """A red light for each contradiction, or one green light for none."""
     rows = [
-        {"name": f"contradiction: {row['subject']}", "value": row["message"], "light": "red",
-         "thresholds": row["advice"]}
-        for row in found
-    ]  # fmt: skip
+        Check(name=f"contradiction: {each.subject}", value=each.message, light="red", thresholds=each.advice)
+        for each in found
+    ]
     thresholds = "green: no evidence in hand contradicts the result"
-    return rows or [{"name": "contradictions", "value": "none found", "light": "green", "thresholds": thresholds}]
+    return rows or [Check(name="contradictions", value="none found", light="green", thresholds=thresholds)]
 
 
-def _named_params(camera: Camera) -> dict[str, float]:
+def named_params(camera: Camera) -> dict[str, float]:
+    """The parameters of a camera by name."""
     return dict(zip(PARAM_NAMES[camera.model], map(float, camera.params), strict=True))
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sfmapp.report.dense_html import dense_section
+from sfmapp.report.model import CameraReport, ImageReport, ReconstructionReport
 from sfmapp.report.page import check_table, failure_box, log_table, render_page, table, usage_table
 from sfmapp.report.top_view import top_view_svg
+from sfmapp.reporting import NamedReason
 
 if TYPE_CHECKING:
     from sfmapp.report.dense_pictures import PictureRow
@@ -27,64 +29,63 @@ FUNNEL = (
 
 
 def render_html(
-    report: Mapping[str, Any], model: Reconstruction | None, dense_pictures: Sequence[PictureRow] = ()
+    report: ReconstructionReport, model: Reconstruction | None, dense_pictures: Sequence[PictureRow] = ()
 ) -> str:
     """The page of a report.
 
     Args:
-        report: as the run writes it; where it has an entry ``dense``, of
-            :func:`~sfmapp.report.dense_document.dense_document`, the page has a part on it.
+        report: of the run.
         model: the largest model, for a view from above.
         dense_pictures: of the patches.
     """
-    body = [_headline(report), failure_box(report["outcome"]), check_table(report["checks"])]
+    body = [_headline(report), failure_box(report.outcome), check_table(report.checks)]
     if model is not None:
         note = "Points and cameras of the largest model; each triangle opens where its camera looks."
         body.append(f'<h2>From above</h2>{top_view_svg(model, _orientation(report, model))}<p class="dim">{note}</p>')
-    if report.get("dense") is not None:
-        body.append(dense_section(report["dense"], dense_pictures))
-    body.append(_failed(report["images"]) + _skipped(report["skipped"]))
-    body.append("<h2>Images</h2>" + _images(report["images"]))
-    body.append("<h2>Cameras</h2>" + _cameras(report["cameras"]))
-    body.append(usage_table(report["usage"], report["run"]))
-    body.append(log_table("Warnings", report["warnings"]) + log_table("Decisions", report["decisions"]))
-    return render_page(f"sfmapp: {report['run']['source']}", body)
+    if report.dense is not None:
+        body.append(dense_section(report.dense, dense_pictures))
+    body.append(_failed(report.images) + _skipped(report.skipped))
+    body.append("<h2>Images</h2>" + _images(report.images))
+    body.append("<h2>Cameras</h2>" + _cameras(report.cameras))
+    body.append(usage_table(report.usage, report.run))
+    body.append(log_table("Warnings", report.warnings) + log_table("Decisions", report.decisions))
+    return render_page(f"sfmapp: {report.run.source}", body)
 
 
-def _orientation(report: Mapping[str, Any], model: Reconstruction) -> list[int]:
+def _orientation(report: ReconstructionReport, model: Reconstruction) -> list[int]:
     """EXIF orientation of the images of a model."""
-    rows = report.get("stages", {}).get("images", {}).get("images", [])
-    known = {row["name"]: row["orientation"] for row in rows}
+    read = report.stages.images
+    known = {image.name: image.orientation for image in read.images} if read is not None else {}
     return [known.get(name, 1) for name in model.image_names]
 
 
-def _headline(report: Mapping[str, Any]) -> str:
-    run = report["run"]
+def _headline(report: ReconstructionReport) -> str:
+    run = report.run
     parts = []
-    if report["models"]:
-        model = report["models"][0]
-        parts.append(f"{model['num_registered']} of {model['num_images']} images registered")
-        parts.append(f"{model['num_points']} points")
-        parts.append(f"{model['mean_reprojection_error_px']:.2f} px")
-    parts += [f"{run['wall_s']:.1f} s", f"seed {run['seed']}", f"sfmapp {run['versions']['sfmapp']}", run["started"]]
+    if report.models:
+        model = report.models[0]
+        parts.append(f"{model.num_registered} of {model.num_images} images registered")
+        parts.append(f"{model.num_points} points")
+        parts.append(f"{model.mean_reprojection_error_px:.2f} px")
+    parts += [f"{run.wall_s:.1f} s", f"seed {run.seed}", f"sfmapp {run.versions['sfmapp']}", run.started]
     return f'<p class="dim">{escape("; ".join(parts))}</p>'
 
 
-def _images(images: Iterable[Mapping[str, Any]]) -> str:
+def _images(images: Iterable[ImageReport]) -> str:
     head = [("t", "image"), ("", "model"), *(("", label) for _, label in FUNNEL)]
     rows = []
     for image in images:
-        light = "green" if image["is_registered"] else "red"
-        counts = [("", image["funnel"][key]) for key, _ in FUNNEL]
-        rows.append([(f"t {light}", image["name"]), ("", image["model"]), *counts])
+        light = "green" if image.is_registered else "red"
+        counts = [("", image.funnel[key]) for key, _ in FUNNEL]
+        rows.append([(f"t {light}", image.name), ("", image.model), *counts])
     return table(head, rows)
 
 
-def _failed(images: Iterable[Mapping[str, Any]]) -> str:
+def _failed(images: Iterable[ImageReport]) -> str:
     rows = [
-        [("t red", image["name"]), ("t", image["failed_at"]), ("w", image["reason"]), ("w", image["remedy"])]
+        [("t red", image.name), ("t", image.failed_at), ("w", image.reason), ("w", image.remedy)]
         for image in images
-        if not image["is_registered"]
+        if not image.is_registered
     ]
     if not rows:
         return ""
@@ -92,28 +93,29 @@ def _failed(images: Iterable[Mapping[str, Any]]) -> str:
     return "<h2>Images in no model</h2>" + table(head, rows)
 
 
-def _skipped(skipped: Sequence[Mapping[str, str]]) -> str:
+def _skipped(skipped: Sequence[NamedReason]) -> str:
     if not skipped:
         return ""
-    rows = [[("t red", entry["name"]), ("w", entry["reason"])] for entry in skipped]
+    rows = [[("t red", entry.name), ("w", entry.reason)] for entry in skipped]
     return "<h2>Files that could not be used</h2>" + table([("t", "file"), ("t", "reason")], rows)
 
 
-def _cameras(cameras: Iterable[Mapping[str, Any]]) -> str:
+def _cameras(cameras: Iterable[CameraReport]) -> str:
     head = [("", "camera"), ("t", "model"), ("", "size"), ("", "images"), ("t", "focal prior"), ("t", "parameters")]
     rows = []
     for camera in cameras:
-        refined, texts = camera["refined"] or {}, []
-        for name, value in camera["initial"].items():
+        refined: Mapping[str, float] = camera.refined or {}
+        texts = []
+        for name, value in camera.initial.items():
             text = f"{name} {value:.5g}"
             if name in refined and refined[name] != value:
                 text += f" \N{RIGHTWARDS ARROW} {refined[name]:.5g}"
-            if name in camera["sigma"]:
-                text += f" \N{PLUS-MINUS SIGN} {camera['sigma'][name]:.2g}"
+            if name in camera.sigma:
+                text += f" \N{PLUS-MINUS SIGN} {camera.sigma[name]:.2g}"
             texts.append(text)
-        sigma = camera["focal_sigma_px"]
-        prior = camera["focal_source"] + (f" \N{PLUS-MINUS SIGN} {sigma:.0f} px" if sigma else "")
-        size = f"{camera['width']} x {camera['height']}"
-        cells = [("", camera["idx"]), ("t", camera["model"]), ("", size), ("", camera["num_images"])]
-        rows.append([*cells, ("t", prior + (", fixed" if camera["is_fixed"] else "")), ("w", ", ".join(texts))])
+        sigma = camera.focal_sigma_px
+        prior = camera.focal_source + (f" \N{PLUS-MINUS SIGN} {sigma:.0f} px" if sigma else "")
+        size = f"{camera.width} x {camera.height}"
+        cells = [("", camera.idx), ("t", camera.model), ("", size), ("", camera.num_images)]
+        rows.append([*cells, ("t", prior + (", fixed" if camera.is_fixed else "")), ("w", ", ".join(texts))])
     return table(head, rows)

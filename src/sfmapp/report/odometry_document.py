@@ -1,10 +1,10 @@
-"""What came of a sequence, as JSON-able rows: frames and gaps, maps, the error against the ground truth, and checks."""
+"""What came of a sequence: frames and gaps, maps, the error against the ground truth, and checks."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,9 @@ from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import GroundTruth
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.report.document import check, check_contradictions
+from sfmapp.report.model import Check, FramesReport, Gap, GroundTruthReport, Light, MapReport, MedianMax, TimingReport
 
-FORMAT = "sfmapp odometry report 1"
+FORMAT = "sfmapp odometry report 2"
 Array = NDArray[np.float64]
 
 
@@ -58,22 +59,22 @@ class GroundTruthFit:
     alignment: str
 
 
-def frame_summary(result: OdometryResult) -> dict[str, Any]:
+def frame_summary(result: OdometryResult) -> FramesReport:
     """Counts of the frames by what became of them, and the gaps."""
     counts = {state.name.lower(): int((result.frame_state == state).sum()) for state in FrameState}
     has_pose = np.isfinite(result.cam_from_world[:, 0])
     played = int(result.frame_idx[-1] - result.frame_idx[0]) + 1 if len(result.frame_idx) else 0
-    return {
-        "num_frames": len(result.frame_idx),
-        "num_unreadable": played - len(result.frame_idx),
-        "num_with_pose": int(has_pose.sum()),
-        "num_in_largest_map": int((result.frame_map == 0).sum()),
+    return FramesReport(
+        num_frames=len(result.frame_idx),
+        num_unreadable=played - len(result.frame_idx),
+        num_with_pose=int(has_pose.sum()),
+        num_in_largest_map=int((result.frame_map == 0).sum()),
         **counts,
-        "gaps": gaps(result),
-    }
+        gaps=gaps(result),
+    )
 
 
-def gaps(result: OdometryResult) -> list[dict[str, Any]]:
+def gaps(result: OdometryResult) -> list[Gap]:
     """Stretches of frames without a pose, in order; one of no frames where one map follows right after another."""
     has_pose = np.isfinite(result.cam_from_world[:, 0])
     edges = np.diff(np.concatenate([[0], (~has_pose).astype(np.int8), [0]]))
@@ -81,52 +82,56 @@ def gaps(result: OdometryResult) -> list[dict[str, Any]]:
     for first, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
         before, after = max(int(first) - 1, 0), min(int(end), len(has_pose) - 1)
         rows.append(
-            {
-                "first_frame": int(result.frame_idx[first]),
-                "last_frame": int(result.frame_idx[end - 1]),
-                "num_frames": int(end - first),
-                "seconds": float(result.timestamps_s[after] - result.timestamps_s[before]),
-                "map_before": int(result.frame_map[first - 1]) if first else None,
-                "map_after": int(result.frame_map[end]) if end < len(has_pose) else None,
-            }
+            Gap(
+                first_frame=int(result.frame_idx[first]),
+                last_frame=int(result.frame_idx[end - 1]),
+                num_frames=int(end - first),
+                seconds=float(result.timestamps_s[after] - result.timestamps_s[before]),
+                map_before=int(result.frame_map[first - 1]) if first else None,
+                map_after=int(result.frame_map[end]) if end < len(has_pose) else None,
+            )
         )
     changes = (np.diff(result.frame_map) != 0) & has_pose[1:] & has_pose[:-1]
     for k in np.flatnonzero(changes):
         rows.append(
-            {
-                "first_frame": int(result.frame_idx[k + 1]),
-                "last_frame": int(result.frame_idx[k]),
-                "num_frames": 0,
-                "seconds": float(result.timestamps_s[k + 1] - result.timestamps_s[k]),
-                "map_before": int(result.frame_map[k]),
-                "map_after": int(result.frame_map[k + 1]),
-            }
+            Gap(
+                first_frame=int(result.frame_idx[k + 1]),
+                last_frame=int(result.frame_idx[k]),
+                num_frames=0,
+                seconds=float(result.timestamps_s[k + 1] - result.timestamps_s[k]),
+                map_before=int(result.frame_map[k]),
+                map_after=int(result.frame_map[k + 1]),
+            )
         )
-    return sorted(rows, key=lambda row: row["first_frame"])
+    return sorted(rows, key=lambda gap: gap.first_frame)
 
 
-def map_row(result: OdometryResult, map_idx: int) -> dict[str, Any]:
+def map_row(result: OdometryResult, map_idx: int) -> MapReport:
     """One map in numbers; lengths in metres if its scale is known."""
     entry, mine = result.maps[map_idx], np.flatnonzero(result.frame_map == map_idx)
     summary = entry.reconstruction.summary()
     centers = rigid3.center(result.cam_from_world[mine])
-    return {
-        "idx": map_idx,
-        "num_frames": len(mine),
-        "first_frame": int(result.frame_idx[mine[0]]) if len(mine) else None,
-        "last_frame": int(result.frame_idx[mine[-1]]) if len(mine) else None,
-        "num_keyframes": len(entry.keyframe_frame_idx),
-        **{key: summary[key] for key in ("num_points", "num_observations", "mean_track_length")},
-        "mean_reprojection_error_px": summary["mean_reprojection_error_px"],
-        "path_length": float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum()),
-        "unit": unit_of(entry),
-        "scale_source": entry.scale_source,
-        "scale_sigma": entry.scale_sigma,
-        "gauge": entry.gauge,
-        **_uncertainty(entry),
-        "covariance_gap": entry.covariance_gap,
-        "contradictions": [found.describe() for found in entry.contradictions],
-    }
+    position, rotation_deg = _sigmas(entry)
+    return MapReport(
+        idx=map_idx,
+        num_frames=len(mine),
+        first_frame=int(result.frame_idx[mine[0]]) if len(mine) else None,
+        last_frame=int(result.frame_idx[mine[-1]]) if len(mine) else None,
+        num_keyframes=len(entry.keyframe_frame_idx),
+        num_points=summary.num_points,
+        num_observations=summary.num_observations,
+        mean_track_length=summary.mean_track_length,
+        mean_reprojection_error_px=summary.mean_reprojection_error_px,
+        path_length=float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum()),
+        unit=unit_of(entry),
+        scale_source=entry.scale_source,
+        scale_sigma=entry.scale_sigma,
+        gauge=entry.gauge,
+        position_sigma=position,
+        rotation_sigma_deg=rotation_deg,
+        covariance_gap=entry.covariance_gap,
+        contradictions=entry.contradictions,
+    )
 
 
 def unit_of(entry: MapResult) -> str:
@@ -134,18 +139,16 @@ def unit_of(entry: MapResult) -> str:
     return "" if entry.scale_source == "none" else "m"
 
 
-def _uncertainty(entry: MapResult) -> dict[str, Any]:
+def _sigmas(entry: MapResult) -> tuple[MedianMax | None, MedianMax | None]:
     """Standard deviations of the keyframes: position as the root of the trace, rotation in degrees likewise."""
     if entry.covariance is None or not np.isfinite(entry.covariance).any():
-        return {"position_sigma": None, "rotation_sigma_deg": None}
+        return None, None
     diagonal = np.maximum(np.diagonal(entry.covariance, axis1=1, axis2=2), 0)
     rotation, position = np.sqrt(diagonal[:, :3].sum(1)), np.sqrt(diagonal[:, 3:].sum(1))
-    return {
-        "position_sigma": {"median": float(np.nanmedian(position)), "max": float(np.nanmax(position))},
-        "rotation_sigma_deg": {
-            "median": float(np.degrees(np.nanmedian(rotation))), "max": float(np.degrees(np.nanmax(rotation))),
-        },
-    }  # fmt: skip
+    return (
+        MedianMax(median=float(np.nanmedian(position)), max=float(np.nanmax(position))),
+        MedianMax(median=float(np.degrees(np.nanmedian(rotation))), max=float(np.degrees(np.nanmax(rotation)))),
+    )
 
 
 def fit_to_ground_truth(result: OdometryResult, ground_truth: GroundTruth, map_idx: int) -> GroundTruthFit | None:
@@ -196,23 +199,28 @@ def errors_of_frames(result: OdometryResult, against: Sequence[GroundTruthFit | 
     return errors
 
 
-def ground_truth_row(against: GroundTruthFit) -> dict[str, Any]:
-    """The error in numbers: metres and degrees."""
-    return {
-        "alignment": against.alignment,
-        "num_pairs": len(against.pairs),
-        "scale": against.error.scale,
-        "true_path_m": against.pairs.ground_truth.path_m,
-        "ate_m": statistics(against.error.translation_m),
-        "rotation_deg": statistics(against.error.rotation_deg),
-    }
+def ground_truth_row(fit: GroundTruthFit, map_idx: int, poses: Literal["final", "live"] = "final") -> GroundTruthReport:
+    """The error of the poses of a map in numbers: metres and degrees."""
+    translation, rotation = statistics(fit.error.translation_m), statistics(fit.error.rotation_deg)
+    assert translation is not None
+    assert rotation is not None
+    return GroundTruthReport(
+        map=map_idx,
+        poses=poses,
+        alignment=fit.alignment,
+        num_pairs=len(fit.pairs),
+        scale=fit.error.scale,
+        true_path_m=fit.pairs.ground_truth.path_m,
+        ate_m=translation,
+        rotation_deg=rotation,
+    )
 
 
 def make_checks(
-    frames: Mapping[str, Any], maps: Sequence[Mapping[str, Any]], timing: Mapping[str, Any], facts: FrameTable
-) -> list[dict[str, str]]:
+    frames: FramesReport, maps: Sequence[MapReport], timing: TimingReport | None, facts: FrameTable
+) -> list[Check]:
     """Traffic lights over a run, each with its thresholds in words."""
-    share = 100 * frames["num_in_largest_map"] / max(1, frames["num_frames"])
+    share = 100 * frames.num_in_largest_map / max(1, frames.num_frames)
     rows = [
         check("frames with a pose in the largest map", share, f"{share:.1f} %", 98, 80, "%"),
         check("separate maps", -len(maps), str(len(maps)), -1, -2),
@@ -221,16 +229,16 @@ def make_checks(
         mapped = float(np.nanmedian(facts.num_mapped))
         rows.append(check("points that a pose was measured with (median)", mapped, f"{mapped:.0f}", 100, 40))
     if maps:
-        error = maps[0]["mean_reprojection_error_px"]
+        error = maps[0].mean_reprojection_error_px
         rows.append(check("reprojection error of the keyframes (mean)", -error, f"{error:.2f} px", -1, -2, "px"))
-    if timing.get("times_real_time"):
-        speed = timing["times_real_time"]
+    if timing is not None and timing.times_real_time:
+        speed = timing.times_real_time
         rows.append(check("speed against the camera's", speed, f"{speed:.2f} x", 1, 0.5, "x"))
     for found in maps:
-        if found["covariance_gap"]:
+        if found.covariance_gap:
             # a map without any is one whose sigmas nobody knows; one that lacks some states the others
-            light = "amber" if found["position_sigma"] is not None or found["num_keyframes"] < 2 else "red"
+            light: Light = "amber" if found.position_sigma is not None or found.num_keyframes < 2 else "red"
             thresholds = "green: every keyframe has a covariance, amber: some have"
-            name = f"uncertainty of the keyframes of map {found['idx']}"
-            rows.append({"name": name, "value": found["covariance_gap"], "light": light, "thresholds": thresholds})
-    return rows + check_contradictions(row for found in maps for row in found["contradictions"])
+            name = f"uncertainty of the keyframes of map {found.idx}"
+            rows.append(Check(name=name, value=found.covariance_gap, light=light, thresholds=thresholds))
+    return rows + check_contradictions(each for found in maps for each in found.contradictions)

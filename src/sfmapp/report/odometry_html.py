@@ -11,6 +11,17 @@ import numpy as np
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import GroundTruth
 from sfmapp.odometry.result import OdometryResult
+from sfmapp.report.model import (
+    Gap,
+    GroundTruthReport,
+    LogLine,
+    MapReport,
+    OdometryRunReport,
+    OdometryStages,
+    SequenceCamera,
+    SequenceReport,
+    TimingReport,
+)
 from sfmapp.report.odometry_document import FrameTable, GroundTruthFit, errors_of_frames, unit_of
 from sfmapp.report.page import check_table, failure_box, log_table, render_page, table, usage_table
 from sfmapp.report.path_view import GROUND_TRUTH_COLOR, PATH_COLOR, PathScene, legend, path_view_svg
@@ -22,38 +33,38 @@ _ORANGE, _GREY = "#e07b00", "#999"
 
 
 def render_odometry_html(
-    report: Mapping[str, Any], result: OdometryResult | None, facts: FrameTable | None,
+    report: OdometryRunReport, result: OdometryResult | None, facts: FrameTable | None,
     ground_truth: GroundTruth | None,
     against: Sequence[GroundTruthFit | None],
 ) -> str:  # fmt: skip
     """The page of a report; ``against``: each map against the ground truth, empty without one."""
-    body = [_headline(report), failure_box(report["outcome"]), check_table(report["checks"])]
+    body = [_headline(report), failure_box(report.outcome), check_table(report.checks)]
     if result is not None and facts is not None and len(result.frame_idx):
-        body.append(trajectory_views(result, ground_truth, against, report["sequence"]["orientation"]))
+        body.append(trajectory_views(result, ground_truth, against, report.sequence.orientation))
         body.append("<h2>Frame by frame</h2>" + _plots(result, facts, against))
-        body.append(_gaps(report["frames"]["gaps"]))
-    body.append(_maps(report["maps"]) + _ground_truth(report.get("ground_truth")))
-    body.append(_loops(report["decisions"]) + _sequence(report["sequence"], report["stages"]))
-    body.append(_timing(report.get("timing")) + usage_table(report["usage"], report["run"]))
-    body.append(log_table("Warnings", report["warnings"]) + log_table("Decisions", report["decisions"]))
-    return render_page(f"sfmapp odometry: {report['run']['source']}", body)
+        body.append(_gaps(report.frames.gaps))
+    body.append(_maps(report.maps) + _ground_truth(report.ground_truth))
+    body.append(_loops(report.decisions) + _sequence(report.sequence, report.stages))
+    body.append(_timing(report.timing) + usage_table(report.usage, report.run))
+    body.append(log_table("Warnings", report.warnings) + log_table("Decisions", report.decisions))
+    return render_page(f"sfmapp odometry: {report.run.source}", body)
 
 
-def _headline(report: Mapping[str, Any]) -> str:
-    run, frames, parts = report["run"], report["frames"], []
+def _headline(report: OdometryRunReport) -> str:
+    run, frames, parts = report.run, report.frames, list[str]()
     if frames:
-        parts.append(f"{frames['num_with_pose']} of {frames['num_frames']} frames with a pose")
-        if frames.get("repeated"):
-            parts.append(f"{frames['repeated']} of them repeat the one before, whose pose they have")
-    if report["maps"]:
-        first = report["maps"][0]
-        parts.append(f"path {first['path_length']:.4g} {first['unit'] or '(unit arbitrary)'}")
-        parts.append(f"{first['num_keyframes']} keyframes")
-        parts.append(f"{first['num_points']} points")
-    if timing := report.get("timing"):
-        parts.append(f"{timing['cpu_ms_per_frame']:.1f} CPU ms a frame")
-        parts.append(f"{timing['frames_per_second']:.1f} frames a second")
-    parts += [f"seed {run['seed']}", f"sfmapp {run['versions']['sfmapp']}", run["started"]]
+        parts.append(f"{frames.num_with_pose} of {frames.num_frames} frames with a pose")
+        if frames.repeated:
+            parts.append(f"{frames.repeated} of them repeat the one before, whose pose they have")
+    if report.maps:
+        first = report.maps[0]
+        parts.append(f"path {first.path_length:.4g} {first.unit or '(unit arbitrary)'}")
+        parts.append(f"{first.num_keyframes} keyframes")
+        parts.append(f"{first.num_points} points")
+    if timing := report.timing:
+        parts.append(f"{timing.cpu_ms_per_frame:.1f} CPU ms a frame")
+        parts.append(f"{timing.frames_per_second:.1f} frames a second")
+    parts += [f"seed {run.seed}", f"sfmapp {run.versions['sfmapp']}", run.started]
     return f'<p class="dim">{escape("; ".join(parts))}</p>'
 
 
@@ -128,7 +139,7 @@ def _plots(result: OdometryResult, facts: FrameTable, against: Sequence[GroundTr
     return "".join(parts)
 
 
-def _gaps(gaps: Sequence[Mapping[str, Any]]) -> str:
+def _gaps(gaps: Sequence[Gap]) -> str:
     if not gaps:
         return ""
     head = [
@@ -145,7 +156,7 @@ def _gaps(gaps: Sequence[Mapping[str, Any]]) -> str:
     return "<h2>Gaps: frames without a pose</h2>" + table(head, rows) + more
 
 
-def _maps(maps: Iterable[Mapping[str, Any]]) -> str:
+def _maps(maps: Iterable[MapReport]) -> str:
     head = [
         ("", "map"), ("", "frames"), ("", "from"), ("", "to"), ("", "keyframes"), ("", "points"), ("", "error px"),
         ("", "path"), ("t", "unit of length"),
@@ -155,34 +166,34 @@ def _maps(maps: Iterable[Mapping[str, Any]]) -> str:
     ]  # fmt: skip
     rows, sigmas = [], []
     for row in maps:
-        unit, position, rotation = row["unit"], row["position_sigma"], row["rotation_sigma_deg"]
+        unit, position, rotation = row.unit, row.position_sigma, row.rotation_sigma_deg
         rows.append(
             [
-                ("", row["idx"]), ("", row["num_frames"]), ("", row["first_frame"]), ("", row["last_frame"]),
-                ("", row["num_keyframes"]), ("", row["num_points"]), ("", f"{row['mean_reprojection_error_px']:.2f}"),
-                ("", f"{row['path_length']:.4g} {unit}".rstrip()), ("t", scale_text(row)),
+                ("", row.idx), ("", row.num_frames), ("", row.first_frame), ("", row.last_frame),
+                ("", row.num_keyframes), ("", row.num_points), ("", f"{row.mean_reprojection_error_px:.2f}"),
+                ("", f"{row.path_length:.4g} {unit}".rstrip()), ("t", scale_text(row)),
             ]
         )  # fmt: skip
         if position and rotation:
-            texts = [f"{position['median']:.2g} {unit}", f"{position['max']:.2g} {unit}"]
-            texts += [f"{rotation['median']:.2g}", f"{rotation['max']:.2g}"]
-            sigmas.append([("", row["idx"]), *(("", text) for text in texts), ("w dim", row["gauge"])])
+            texts = [f"{position.median:.2g} {unit}", f"{position.max:.2g} {unit}"]
+            texts += [f"{rotation.median:.2g}", f"{rotation.max:.2g}"]
+            sigmas.append([("", row.idx), *(("", text) for text in texts), ("w dim", row.gauge)])
     if not rows:
         return ""
     more = "<h3>Standard deviation of the keyframes (median)</h3>" + table(sure, sigmas) if sigmas else ""
     return "<h2>Maps</h2>" + table(head, rows) + more
 
 
-def scale_text(row: Mapping[str, Any]) -> str:
+def scale_text(row: MapReport) -> str:
     """Where a map's unit of length comes from, and how sure it is."""
-    if row["scale_source"] == "none":
+    if row.scale_source == "none":
         return "arbitrary"
-    sigma = row["scale_sigma"]
-    text = f"metres, from {row['scale_source'].replace('_', ' ')}"
+    sigma = row.scale_sigma
+    text = f"metres, from {row.scale_source.replace('_', ' ')}"
     return f"{text}, \N{PLUS-MINUS SIGN}{100 * sigma:.2g} %" if sigma else text
 
 
-def _ground_truth(rows: Sequence[Mapping[str, Any]] | None) -> str:
+def _ground_truth(rows: Sequence[GroundTruthReport]) -> str:
     if not rows:
         return ""
     head = [
@@ -191,20 +202,20 @@ def _ground_truth(rows: Sequence[Mapping[str, Any]] | None) -> str:
     ]  # fmt: skip
     cells = []
     for row in rows:
-        ate, path = row["ate_m"], row["true_path_m"]
-        share = f"{100 * ate['rmse'] / path:.2f}" if path else "-"
+        ate, path = row.ate_m, row.true_path_m
+        share = f"{100 * ate.rmse / path:.2f}" if path else "-"
         cells.append(
             [
-                ("", row["map"]), ("t", row["poses"]), ("t", row["alignment"].upper()), ("", row["num_pairs"]),
-                ("", f"{path:.1f}"), ("", f"{ate['rmse']:.3f}"), ("", share),
-                ("", f"{ate['mean']:.3f}"), ("", f"{ate['median']:.3f}"), ("", f"{ate['max']:.3f}"),
-                ("", f"{row['rotation_deg']['rmse']:.3f}"), ("", f"{row['scale']:.4g}"),
+                ("", row.map), ("t", row.poses), ("t", row.alignment.upper()), ("", row.num_pairs),
+                ("", f"{path:.1f}"), ("", f"{ate.rmse:.3f}"), ("", share),
+                ("", f"{ate.mean:.3f}"), ("", f"{ate.median:.3f}"), ("", f"{ate.max:.3f}"),
+                ("", f"{row.rotation_deg.rmse:.3f}"), ("", f"{row.scale:.4g}"),
             ]
         )  # fmt: skip
     return "<h2>Against the ground truth</h2>" + table(head, cells)
 
 
-def _loops(decisions: Iterable[Mapping[str, Any]]) -> str:
+def _loops(decisions: Iterable[LogLine]) -> str:
     """The decisions that laid one part of a map on another."""
     head = [
         ("", "frame"), ("t", "what"), ("", "shift, depths of the scene"), ("", "turn deg"), ("", "scale"),
@@ -212,46 +223,44 @@ def _loops(decisions: Iterable[Mapping[str, Any]]) -> str:
     ]  # fmt: skip
     rows = []
     for line in decisions:
-        data = line.get("data", {})
+        data: Mapping[str, Any] = line.data or {}
         if "shift_in_depths" in data:
             numbers = [f"{data['shift_in_depths']:.3g}", f"{data['rotation_deg']:.2f}", f"{data['scale']:.4f}"]
             inliers = ", ".join(map(str, np.atleast_1d(data["num_inliers"])))
             texts = [*numbers, inliers, f"{data['rms_px']:.2f}"]
-            rows.append([("", data["frame_idx"]), ("t", line["message"]), *(("", text) for text in texts)])
+            rows.append([("", data["frame_idx"]), ("t", line.message), *(("", text) for text in texts)])
     return "<h2>Loops and joined maps</h2>" + table(head, rows) if rows else ""
 
 
-def _sequence(sequence: Mapping[str, Any], stages: Mapping[str, Any]) -> str:
-    if not sequence:
-        return ""
+def _sequence(sequence: SequenceReport, stages: OdometryStages) -> str:
     rows = [[("t", key.replace("_", " ")), ("w", _short(value))] for key, value in sequence.items() if key != "cameras"]
-    if calibration := stages.get("self_calibration"):
-        rows.append([("t", "calibrated with the first minute"), ("w", calibration["text"])])
+    if (calibration := stages.self_calibration) is not None:
+        rows.append([("t", "calibrated with the first minute"), ("w", calibration.text)])
     head = [("", "camera"), ("t", "model"), ("", "size"), ("t", "parameters"), ("t", "refined in the end")]
     cameras = [
         [
-            ("", k), ("t", camera["model"]), ("", f"{camera['width']} x {camera['height']}"),
-            ("w", ", ".join(f"{name} {value:.6g}" for name, value in camera["params"].items())), ("w", refined(camera)),
+            ("", k), ("t", camera.model), ("", f"{camera.width} x {camera.height}"),
+            ("w", ", ".join(f"{name} {value:.6g}" for name, value in camera.params.items())), ("w", refined(camera)),
         ]
-        for k, camera in enumerate(sequence.get("cameras", ()))
+        for k, camera in enumerate(sequence.cameras)
     ]  # fmt: skip
     return "<h2>Sequence</h2>" + table([("t", ""), ("t", "")], rows) + (table(head, cameras) if cameras else "")
 
 
-def refined(camera: Mapping[str, Any]) -> str:
+def refined(camera: SequenceCamera) -> str:
     """Model and parameters that the last adjustment changed a camera to, in words."""
-    if not (found := camera.get("refined")):
+    if (found := camera.refined) is None:
         return ""
-    return f"{found['model']}: " + ", ".join(f"{name} {value:.6g}" for name, value in found["params"].items())
+    return f"{found.model}: " + ", ".join(f"{name} {value:.6g}" for name, value in found.params.items())
 
 
-def _timing(timing: Mapping[str, Any] | None) -> str:
+def _timing(timing: TimingReport | None) -> str:
     if not timing:
         return ""
-    rows = [[("t", part.replace("_", " ")), ("", f"{value:.1f}")] for part, value in timing["parts_cpu_ms"].items()]
-    rows.append([("t", "all"), ("", f"{timing['cpu_ms_per_frame']:.1f}")])
+    rows = [[("t", part.replace("_", " ")), ("", f"{value:.1f}")] for part, value in timing.parts_cpu_ms.items()]
+    rows.append([("t", "all"), ("", f"{timing.cpu_ms_per_frame:.1f}")])
     note = (
-        f"{timing['num_frames']} frames in {timing['wall_s']:.1f} s, {timing['frames_per_second']:.1f} a second. "
+        f"{timing.num_frames} frames in {timing.wall_s:.1f} s, {timing.frames_per_second:.1f} a second. "
         "Compiling kernels and drawing the recording are not counted."
     )
     return "<h2>Time of a frame</h2>" + table([("t", "part"), ("", "CPU ms")], rows) + f"<p class=dim>{note}</p>"

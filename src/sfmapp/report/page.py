@@ -6,6 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
+from sfmapp.report.model import Check, LogLine, Outcome
+from sfmapp.reporting import Usage
+
 MAX_DECISIONS = 400
 
 # Longer values are sentences, which are wrapped.
@@ -41,44 +44,44 @@ def render_page(title: str, body: Iterable[str]) -> str:
     )
 
 
-def failure_box(outcome: Mapping[str, Any]) -> str:
+def failure_box(outcome: Outcome) -> str:
     """Why there is no result and what helps, where there is none."""
-    if not outcome["exit_code"]:
+    if not outcome.exit_code:
         return ""
-    advice = f"<p>{escape(outcome['advice'])}</p>" if outcome.get("advice") else ""
-    return f'<div class="failure"><p><b>{escape(outcome["message"])}</b></p>{advice}</div>'
+    advice = f"<p>{escape(outcome.advice)}</p>" if outcome.advice else ""
+    return f'<div class="failure"><p><b>{escape(outcome.message)}</b></p>{advice}</div>'
 
 
-def check_table(checks: Iterable[Mapping[str, str]]) -> str:
-    """Traffic lights as :func:`~sfmapp.report.document.check` makes them; nothing without any."""
+def check_table(checks: Iterable[Check]) -> str:
+    """Traffic lights; nothing without any."""
     rows = [
         [
-            ("t " + check["light"], check["name"]),
-            ("w" if len(check["value"]) > _MAX_SHORT else "", check["value"]),
-            ("w dim", check["thresholds"]),
+            ("t " + check.light, check.name),
+            ("w" if len(check.value) > _MAX_SHORT else "", check.value),
+            ("w dim", check.thresholds),
         ]
         for check in checks
     ]
     return "<h2>Checks</h2>" + table([("t", "check"), ("", "value"), ("t", "thresholds")], rows) if rows else ""
 
 
-def usage_table(usage: Mapping[str, Mapping[str, Any]], run: Mapping[str, Any]) -> str:
+def usage_table(usage: Mapping[str, Usage], run: Usage) -> str:
     """Time and memory of the stages and of the whole run."""
     head = [("t", "stage"), ("", "wall s"), ("", "CPU s"), ("", "peak MB so far"), ("t", "")]
     rows = []
     for name, entry in [*usage.items(), ("whole run", run)]:
-        peak = f"{entry['peak_memory_mb']:.0f}" if "peak_memory_mb" in entry else None
+        peak = f"{entry.peak_memory_mb:.0f}" if entry.peak_memory_mb is not None else None
         note = "in the background of the others" if peak is None else ""
-        numbers = [("", f"{entry['wall_s']:.2f}"), ("", f"{entry['cpu_s']:.2f}"), ("", peak)]
+        numbers = [("", f"{entry.wall_s:.2f}"), ("", f"{entry.cpu_s:.2f}"), ("", peak)]
         rows.append([("t", name), *numbers, ("t dim", note)])
     return "<h2>Time and memory</h2>" + table(head, rows)
 
 
-def log_table(title: str, lines: Sequence[Mapping[str, Any]]) -> str:
+def log_table(title: str, lines: Sequence[LogLine]) -> str:
     """What was decided or warned of, folded away."""
     if not lines:
         return ""
-    rows = [[("", f"{line['time_s']:.2f}"), ("t", line["stage"]), ("w", line.get("message", ""))] for line in lines]
+    rows = [[("", f"{line.time_s:.2f}"), ("t", line.stage), ("w", line.message or "")] for line in lines]
     more = f"<p class=dim>{len(rows) - MAX_DECISIONS} more in report.json</p>" if len(rows) > MAX_DECISIONS else ""
     lines_table = table([("", "s"), ("t", "stage"), ("t", "what")], rows[:MAX_DECISIONS])
     return f"<details><summary>{title} ({len(rows)})</summary>{lines_table}{more}</details>"

@@ -13,8 +13,22 @@ from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import ROW, distort
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.triangulation import Views
+from sfmapp.reporting import Report
 from sfmapp.scene.rig import RigImages
 from sfmapp.scene.tracks import Tracks
+
+
+class ModelSummary(Report):
+    """Counts and errors of a model; lengths of residuals in pixels, over its observations."""
+
+    num_images: int
+    num_registered: int
+    num_points: int
+    num_observations: int
+    mean_track_length: float
+    mean_observations_per_image: float
+    mean_reprojection_error_px: float
+    rms_reprojection_error_px: float
 
 
 @dataclass
@@ -145,22 +159,22 @@ class Reconstruction:
         )
         return out
 
-    def summary(self) -> dict[str, float | int]:
-        """Counts and errors as the report prints them; the error is the mean length of the residuals in pixels."""
+    def summary(self) -> ModelSummary:
+        """Counts and errors."""
         used = self.obs_is_inlier
         errors = np.linalg.norm(self.residuals_px()[used], axis=1)
         num_points = int(self.is_triangulated.sum())
         num_registered = int(self.is_registered.sum())
-        return {
-            "num_images": len(self.image_names),
-            "num_registered": num_registered,
-            "num_points": num_points,
-            "num_observations": int(used.sum()),
-            "mean_track_length": float(used.sum() / num_points) if num_points else 0.0,
-            "mean_observations_per_image": float(used.sum() / num_registered) if num_registered else 0.0,
-            "mean_reprojection_error_px": float(errors.mean()) if len(errors) else 0.0,
-            "rms_reprojection_error_px": float(np.sqrt((errors**2).mean())) if len(errors) else 0.0,
-        }
+        return ModelSummary(
+            num_images=len(self.image_names),
+            num_registered=num_registered,
+            num_points=num_points,
+            num_observations=int(used.sum()),
+            mean_track_length=float(used.sum() / num_points) if num_points else 0.0,
+            mean_observations_per_image=float(used.sum() / num_registered) if num_registered else 0.0,
+            mean_reprojection_error_px=float(errors.mean()) if len(errors) else 0.0,
+            rms_reprojection_error_px=float(np.sqrt((errors**2).mean())) if len(errors) else 0.0,
+        )
 
 
 @numba.njit(cache=True, nogil=True)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from sfmapp.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -20,6 +22,12 @@ class Tracks:
         track_ptr: (T + 1,) int64; the observations of track t are ``track_ptr[t]:track_ptr[t + 1]``.
         image_ptr: (I + 1,) int64 and image_obs: (O,) int64; the observations of image i are
             ``image_obs[image_ptr[i]:image_ptr[i + 1]]``, ascending.
+
+    Example:
+        >>> tracks = sfmapp.Tracks.from_observations([0, 0, 1, 1], [0, 1, 0, 1], xy)
+        >>> model = sfmapp.Reconstruction(
+        ...     [camera], ["a.jpg", "b.jpg"], numpy.zeros(2, int), poses, tracks, xyz, numpy.ones(4, bool)
+        ... )
     """
 
     obs_image_idx: NDArray[np.int32]
@@ -29,6 +37,47 @@ class Tracks:
     track_ptr: NDArray[np.int64]
     image_ptr: NDArray[np.int64]
     image_obs: NDArray[np.int64]
+
+    @staticmethod
+    def from_observations(
+        track_ids: ArrayLike, image_idx: ArrayLike, xy: ArrayLike, *, num_images: int | None = None
+    ) -> Tracks:
+        """Tracks of observations in any order.
+
+        Args:
+            track_ids: (O,) whole numbers from 0, which point each observation shows.
+            image_idx: (O,) whole numbers from 0, positions of the images.
+            xy: (O, 2) pixels.
+            num_images: how many there are; None: as many as are observed in.
+
+        Returns:
+            The tracks; the keypoints of an image are numbered in the order of its observations.
+
+        Raises:
+            InputError: arrays of other shapes, negative numbers, pixels that are not finite, or a point that an image
+                sees twice.
+        """
+        track, image, pixels = np.asarray(track_ids), np.asarray(image_idx), np.asarray(xy, np.float64)
+        shape = (len(track),)
+        if track.shape != shape or image.shape != shape or pixels.shape != (*shape, 2):
+            raise InputError(
+                f"tracks: expected (O,) ids, (O,) images and (O, 2) pixels, found {track.shape}, {image.shape} and "
+                f"{pixels.shape}"
+            )
+        if len(track) and (
+            track.dtype.kind not in "iu" or image.dtype.kind not in "iu" or min(track.min(), image.min()) < 0
+        ):
+            raise InputError("tracks: expected whole numbers from 0 for ids and images")
+        largest = int(image.max(initial=-1)) + 1
+        if not np.isfinite(pixels).all() or (num_images is not None and num_images < largest):
+            raise InputError(f"tracks: expected finite pixels in at least {largest} images, found {num_images} or NaN")
+        if len(np.unique(np.stack([track, image], 1), axis=0)) < len(track):
+            raise InputError("tracks: expected at most one observation of each point in an image")
+        order = np.argsort(image, kind="stable")
+        feature = np.empty(len(track), np.int64)
+        feature[order] = np.arange(len(track)) - np.searchsorted(image[order], image[order])
+        num_tracks = int(track.max(initial=-1)) + 1
+        return make_tracks(largest if num_images is None else num_images, num_tracks, track, image, feature, pixels)
 
     @property
     def num_tracks(self) -> int:

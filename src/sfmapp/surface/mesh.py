@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +10,13 @@ from numpy.typing import NDArray
 from sfmapp.dense.scene import DenseScene
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
+from sfmapp.reporting import Step, Usage
 from sfmapp.scene.mesh import Mesh, vertex_normals
 from sfmapp.surface.gaps import close_gaps
 from sfmapp.surface.options import SurfaceOptions
 from sfmapp.surface.patch_cloud import make_patch_cloud
 from sfmapp.surface.poisson import ClosedSurface, depth_for, poisson
+from sfmapp.surface.report import MeshReport
 from sfmapp.surface.trim import Surroundings, in_view, look_around, rim, without_islands
 
 STAGE = "mesh"
@@ -31,7 +32,7 @@ def make_mesh(
     *,
     threads: int = 1,
     events: Events | None = None,
-) -> tuple[Mesh, dict[str, Any]]:
+) -> tuple[Mesh, MeshReport]:
     """Reconstruct the surface that oriented patches lie on.
 
     Args:
@@ -45,9 +46,7 @@ def make_mesh(
         events: progress and cancellation.
 
     Returns:
-        The mesh, and the report: ``depth``, ``spacing`` (of the patches, world units), ``num_vertices``, ``num_faces``,
-        ``num_rim_edges`` (0 for a closed mesh), ``funnel`` (faces after each step), ``poisson`` (seconds, CPU seconds
-        and peak memory of the child process), ``seconds``, ``cpu_s`` (child included).
+        The mesh, and the report.
 
     Raises:
         NoReconstructionError: too few patches, Poisson failed in its process, or nothing is left after trimming.
@@ -68,21 +67,21 @@ def make_mesh(
         # what bulges out of the region is pressed flat onto its sides: a closed surface stays closed
         moved = moved.clip(scene.region.low, scene.region.high)
     mesh = _cut(moved, surface.faces, around, kept)
-    report = {
-        "depth": depth,
-        "spacing": patches.median_spacing,
-        "num_vertices": len(mesh.xyz),
-        "num_faces": len(mesh.faces),
-        "num_rim_edges": len(rim(mesh.faces)),
-        "funnel": funnel,
-        "poisson": {
-            "seconds": round(surface.usage.wall_s, 3),
-            "cpu_s": round(surface.usage.cpu_s, 3),
-            "peak_memory_mb": round(surface.usage.peak_memory_mb, 1),
-        },
-        "seconds": round(time.monotonic() - wall, 3),
-        "cpu_s": round(time.process_time() - cpu + surface.usage.cpu_s, 3),
-    }
+    report = MeshReport(
+        depth=depth,
+        spacing=patches.median_spacing,
+        num_vertices=len(mesh.xyz),
+        num_faces=len(mesh.faces),
+        num_rim_edges=len(rim(mesh.faces)),
+        funnel=funnel,
+        poisson=Usage(
+            wall_s=round(surface.usage.wall_s, 3),
+            cpu_s=round(surface.usage.cpu_s, 3),
+            peak_memory_mb=round(surface.usage.peak_memory_mb, 1),
+        ),
+        wall_s=round(time.monotonic() - wall, 3),
+        cpu_s=round(time.process_time() - cpu + surface.usage.cpu_s, 3),
+    )
     events.advanced(STAGE)
     events.finished(STAGE, f"{len(mesh.faces)} triangles", **report)
     return mesh, report
@@ -90,13 +89,13 @@ def make_mesh(
 
 def _trim(
     surface: ClosedSurface, around: Surroundings, spacing: float, scene: DenseScene | None, options: SurfaceOptions
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[dict[str, Any]]]:
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[Step]]:
     """Where the vertices go (N, 3), the faces to keep (F,), and how many were left after each step."""
     faces = surface.faces
-    funnel = [{"name": "Poisson", "count": len(faces)}]
+    funnel = [Step(name="Poisson", count=len(faces))]
 
     def keep(name: str, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        funnel.append({"name": name, "count": int(kept.sum())})
+        funnel.append(Step(name=name, count=int(kept.sum())))
         if not kept.any():
             raise NoReconstructionError(
                 f"surface: nothing is left of {len(faces)} triangles after trimming ({name})",

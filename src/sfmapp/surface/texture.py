@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from sfmapp.scene.mesh import Mesh, face_areas, flat_areas
 from sfmapp.surface.child import run_child
 from sfmapp.surface.options import SurfaceOptions
 from sfmapp.surface.painting import fill_gaps, paint
+from sfmapp.surface.report import TextureReport
 from sfmapp.surface.seams import level_seams
 from sfmapp.surface.view_choice import choose_views, neighbor_pairs
 
@@ -51,7 +51,7 @@ class _Charts:
 
 def texture_mesh(
     mesh: Mesh, scene: DenseScene, options: SurfaceOptions, *, events: Events | None = None
-) -> tuple[Mesh, dict[str, Any]]:
+) -> tuple[Mesh, TextureReport]:
     """Unwrap a mesh and paint it with the photographs.
 
     Each chart is the part of a photograph that its triangles cover, moved to its place by xatlas: no pixel is sampled
@@ -64,10 +64,7 @@ def texture_mesh(
         events: progress and cancellation.
 
     Returns:
-        The mesh with a texture, its vertices doubled at the borders of charts, and the report: ``num_charts``,
-        ``width``, ``height``, ``scale`` (texels per pixel of the photographs), ``seen`` (share of the area that a view
-        shows), ``seam_before`` and ``seam_after`` (root mean square difference of the colours at seams, of 255),
-        ``seconds``.
+        The mesh with a texture, its vertices doubled at the borders of charts, and the report.
 
     Raises:
         NoReconstructionError: a child process ended without a result.
@@ -81,7 +78,7 @@ def texture_mesh(
     choice = choose_views(mesh, scene, events)
     events.advanced(STAGE, message="charts")
     charts = _cut_charts(mesh, scene, choice.view_idx)
-    places, has_texels, size, packed = _pack(charts, options.texture_px, events)
+    places, has_texels, size, num_charts, scale = _pack(charts, options.texture_px, events)
     events.advanced(STAGE, message="seams")
     color = _colors(mesh, scene, charts)
     offset = level_seams(color, charts.vertex_idx, charts.faces)
@@ -90,15 +87,17 @@ def texture_mesh(
     events.advanced(STAGE)
     area = face_areas(mesh.xyz, mesh.faces)
     idx = charts.vertex_idx
-    report = packed | {
-        "width": int(size[0]),
-        "height": int(size[1]),
-        "seen": float(area[choice.view_idx >= 0].sum() / area.sum()),
-        "seam_before": _seam(color, idx),
-        "seam_after": _seam(color + offset, idx),
-        "seconds": round(time.monotonic() - start, 3),
-    }
-    events.finished(STAGE, f"{packed['num_charts']} charts", **report)
+    report = TextureReport(
+        num_charts=num_charts,
+        scale=scale,
+        width=int(size[0]),
+        height=int(size[1]),
+        seen=float(area[choice.view_idx >= 0].sum() / area.sum()),
+        seam_before=_seam(color, idx),
+        seam_after=_seam(color + offset, idx),
+        wall_s=round(time.monotonic() - start, 3),
+    )
+    events.finished(STAGE, f"{num_charts} charts", **report)
     uv = (places / size).astype(np.float32)
     return Mesh(mesh.xyz[idx], charts.faces, mesh.normal[idx], mesh.rgb[idx], uv, texture), report
 
@@ -155,9 +154,9 @@ def _project_unseen(
 
 def _pack(
     charts: _Charts, side: int, events: Events
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int64], dict[str, Any]]:
-    """Places of the vertices in texels (N, 2), whether faces have any (F,), the texture's width and height (2,), and
-    what packing has to say."""
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int64], int, float]:
+    """Places of the vertices in texels (N, 2), whether faces have any (F,), the texture's width and height (2,), the
+    number of charts, and the texels for a pixel of the photographs, a side."""
     covered = flat_areas(charts.pixels, charts.faces).sum()
     arrays: dict[str, NDArray] = {
         "uv": charts.pixels.astype(np.float32),
@@ -175,8 +174,7 @@ def _pack(
     is_placed[found["vertex_idx"]] = found["is_placed"]
     _place_slivers(charts, places, is_placed)
     has_texels = np.asarray(is_placed[charts.faces].all(axis=1))
-    report = {"num_charts": int(found["num_charts"]), "scale": float(found["scale"])}
-    return places, has_texels, found["size"], report
+    return places, has_texels, found["size"], int(found["num_charts"]), float(found["scale"])
 
 
 def _place_slivers(charts: _Charts, places: NDArray[np.float64], is_placed: NDArray[np.bool_]) -> None:

@@ -205,18 +205,19 @@ def _history(
     moved = [_to_final_frame(s, final_poses, m) for s, m in zip(steps, model_of, strict=True)]
     kept = [(k, *pose) for k, pose in enumerate(moved) if pose is not None]
     clouds = [(k, xyz) for k, _, xyz in kept if xyz is not None]
-    summary = reconstructions[0].summary() if reconstructions else {}
+    num_registered, num_points, error_px = 0, 0, np.nan
     texts = [(end_of.get(m.step, 0), m.level, m.text) for m in messages]
     if reconstructions:
+        summary = reconstructions[0].summary()
+        num_registered, num_points = summary.num_registered, summary.num_points
+        error_px = summary.mean_reprojection_error_px
         texts.append((final_step, "INFO", _final_text(reconstructions)))
     return {
         "image_step": image_step.astype(np.int64),
         "step": np.append(ends, final_step).astype(np.int64),
-        "step_registered": np.array([s.num_registered for s in steps] + [summary.get("num_registered", 0)], np.int64),
-        "step_points": np.array([s.num_points for s in steps] + [summary.get("num_points", 0)], np.int64),
-        "step_error_px": np.array(
-            [s.mean_error_px for s in steps] + [summary.get("mean_reprojection_error_px", np.nan)], np.float32
-        ),
+        "step_registered": np.array([*(s.num_registered for s in steps), num_registered], np.int64),
+        "step_points": np.array([*(s.num_points for s in steps), num_points], np.int64),
+        "step_error_px": np.array([*(s.mean_error_px for s in steps), error_px], np.float32),
         "pose_step": np.array([ends[k] for k, _, _ in kept], np.int64),
         "pose_model": np.array([model_of[k] for k, _, _ in kept], np.int64),
         "pose_cam_from_world": upright_poses(
@@ -303,7 +304,7 @@ def _final_text(reconstructions: Sequence[Reconstruction]) -> str:
     for m, reconstruction in enumerate(reconstructions):
         s = reconstruction.summary()
         texts.append(
-            f"model {m}: {s['num_registered']} of {s['num_images']} images, {s['num_points']} points, "
-            f"{s['mean_reprojection_error_px']:.2f} px"
+            f"model {m}: {s.num_registered} of {s.num_images} images, {s.num_points} points, "
+            f"{s.mean_reprojection_error_px:.2f} px"
         )
     return "final " + "; ".join(texts)

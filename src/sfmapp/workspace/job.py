@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any
 
 import sfmapp
 from sfmapp.errors import InputError, is_full
 from sfmapp.events import Events
+from sfmapp.report.model import RunFacts
+from sfmapp.reporting import Usage
 from sfmapp.workspace.listeners import DecisionLog
 from sfmapp.workspace.manifest import recorded_versions
 from sfmapp.workspace.options import Options, options_to_dict
@@ -29,8 +30,7 @@ class Job:
     Attributes:
         source: what the user gave to work on.
         threads: workers.
-        usage: wall and CPU seconds and peak memory of each stage, by name.
-        stages: the report of each stage, by name.
+        usage: what each stage took, by name.
     """
 
     source: str
@@ -40,8 +40,7 @@ class Job:
     watch: Stopwatch
     log: DecisionLog
     threads: int
-    usage: dict[str, dict[str, Any]] = field(default_factory=dict)
-    stages: dict[str, Any] = field(default_factory=dict)
+    usage: dict[str, Usage] = field(default_factory=dict)
     started: datetime = field(default_factory=lambda: datetime.now(UTC))
 
     @contextmanager
@@ -81,17 +80,18 @@ class Job:
         self.events.warned("recording", f"{recording} is given up: the disk is full, and the rest matters more")
         return True
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> RunFacts:
         """What the report says of the run: how it was called, and what it has taken so far."""
-        return {
-            "source": self.source,
-            "seed": self.options.seed,
-            "threads": self.threads,
-            "options": options_to_dict(self.options),
-            "versions": self.workspace.manifest["versions"],
-            "started": self.started.isoformat(timespec="seconds"),
-            "is_up_to_date": False,
-        } | self.watch.read()
+        return RunFacts(
+            source=self.source,
+            seed=self.options.seed,
+            threads=self.threads,
+            options=options_to_dict(self.options),
+            versions=self.workspace.manifest["versions"],
+            started=self.started.isoformat(timespec="seconds"),
+            is_up_to_date=False,
+            **self.watch.read(),
+        )
 
     def note_inputs(self, inputs: dict[str, str]) -> None:
         """Write down what this run works on and how, before it begins; ``inputs``: digests by name."""

@@ -15,6 +15,7 @@ from typing import Any
 
 from sfmapp.errors import InterruptedRunError
 from sfmapp.events import Events
+from sfmapp.reporting import Usage
 
 STAGE = "kernels"
 # in the order in which a run needs them
@@ -36,7 +37,7 @@ INERTIAL_MODULES = ("sfmapp.odometry.inertial.gyroscope", "sfmapp.odometry.inert
 
 
 @contextmanager
-def kernels_compiling(events: Events, usage: dict[str, dict[str, Any]]) -> Iterator[None]:
+def kernels_compiling(events: Events, usage: dict[str, Usage]) -> Iterator[None]:
     """Compile those of a reconstruction in a thread beside the block; adds what it took to ``usage``."""
     thread = threading.Thread(
         target=lambda: usage.update({STAGE: _compile(events, MODULES)}), name=STAGE, daemon=True
@@ -48,7 +49,7 @@ def kernels_compiling(events: Events, usage: dict[str, dict[str, Any]]) -> Itera
         thread.join()
 
 
-def compile_odometry_kernels(events: Events, *, inertial: bool = False) -> dict[str, Any]:
+def compile_odometry_kernels(events: Events, *, inertial: bool = False) -> Usage:
     """Compile those of odometry, with or without those of inertial measurements; returns what it took.
 
     Raises:
@@ -59,7 +60,7 @@ def compile_odometry_kernels(events: Events, *, inertial: bool = False) -> dict[
     return took
 
 
-def compile_dense_kernels(events: Events) -> dict[str, Any]:
+def compile_dense_kernels(events: Events) -> Usage:
     """Compile those of densification; returns what it took.
 
     Raises:
@@ -70,7 +71,7 @@ def compile_dense_kernels(events: Events) -> dict[str, Any]:
     return took
 
 
-def _compile(events: Events, modules: tuple[str, ...]) -> dict[str, Any]:
+def _compile(events: Events, modules: tuple[str, ...]) -> Usage:
     from numba.core import event as numba_event
 
     wall, cpu = time.monotonic(), time.thread_time()
@@ -86,10 +87,13 @@ def _compile(events: Events, modules: tuple[str, ...]) -> dict[str, Any]:
         events.warned(STAGE, f"compiling ahead failed: {type(error).__name__}: {error}")
     finally:
         numba_event.unregister("numba:compile", listener)
-    took = {"wall_s": round(time.monotonic() - wall, 4), "cpu_s": round(time.thread_time() - cpu, 4)}
+    took = Usage(
+        wall_s=round(time.monotonic() - wall, 4), cpu_s=round(time.thread_time() - cpu, 4),
+        num_compiled=listener.num_compiled,
+    )  # fmt: skip
     if listener.num_compiled:
         events.finished(STAGE, f"{listener.num_compiled} kernels compiled, once", **took)
-    return took | {"num_compiled": listener.num_compiled}
+    return took
 
 
 def _listener(events: Events) -> Any:

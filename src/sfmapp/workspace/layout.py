@@ -13,6 +13,7 @@ __all__ = [
     "ODOMETRY",
     "RECONSTRUCT",
     "REFINE",
+    "REPORT",
     "UNDISTORT",
     "USUAL_FOLDERS",
 ]
@@ -20,7 +21,7 @@ __all__ = [
 FORMAT = f"{FORMAT_NAME} 1"
 # the commands that write workspaces; manifests of before the second one name none
 RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "refine", "dense", "undistort"
-LOCK = ".lock"
+LOCK, REPORT = ".lock", "report.json"
 # where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0
 USUAL_FOLDERS = ("images", "../images", "../../images")
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")

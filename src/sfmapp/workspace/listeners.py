@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,25 +10,23 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 from sfmapp.events import Event, Events
-from sfmapp.workspace.plain_json import plain_number
+from sfmapp.report.model import LogLine, ProgressLine
+from sfmapp.reporting import to_json
 
 # arrays for the recording travel under this key; they are no text
 ARRAYS_KEY = "snapshot"
 
 
-def event_to_dict(event: Event) -> dict[str, Any]:
-    """An event as plain values for JSON; empty fields are left out."""
-    plain: dict[str, Any] = {"time_s": round(event.time_s, 3), "kind": event.kind, "stage": event.stage}
-    if event.message:
-        plain["message"] = event.message
+def log_line(event: Event) -> LogLine:
+    """An event for the log; empty fields are left out."""
+    data = {key: value for key, value in event.data.items() if key != ARRAYS_KEY}
+    time_s, message = round(event.time_s, 3), event.message or None
     if event.kind in ("started", "advanced"):
-        plain |= {"done": event.done, "total": event.total}
-    data = without_arrays(event.data)
-    return plain | {"data": data} if data else plain
-
-
-def without_arrays(data: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in data.items() if key != ARRAYS_KEY}
+        return ProgressLine(
+            time_s=time_s, kind=event.kind, stage=event.stage, message=message, done=event.done, total=event.total,
+            data=data or None,
+        )  # fmt: skip
+    return LogLine(time_s=time_s, kind=event.kind, stage=event.stage, message=message, data=data or None)
 
 
 class EventLog:
@@ -48,7 +45,7 @@ class EventLog:
         self._write({"kind": "run", "at": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **facts})
 
     def __call__(self, event: Event) -> None:
-        self._write(event_to_dict(event))
+        self._write(log_line(event))
 
     def __enter__(self) -> EventLog:
         return self
@@ -66,10 +63,10 @@ class EventLog:
             self._file.close()
             self._file = None
 
-    def _write(self, line: dict[str, Any]) -> None:
+    def _write(self, line: Mapping[str, Any]) -> None:
         if self._file is None:
             return
-        data = (json.dumps(line, default=plain_number) + "\n").encode()
+        data = (to_json(line) + "\n").encode()
         try:
             while data:
                 data = data[self._file.write(data) :]
@@ -88,11 +85,11 @@ class DecisionLog:
     """Keeps what was decided and warned, for the report."""
 
     def __init__(self) -> None:
-        self.decisions: list[dict[str, Any]] = []
-        self.warnings: list[dict[str, Any]] = []
+        self.decisions: list[LogLine] = []
+        self.warnings: list[LogLine] = []
 
     def __call__(self, event: Event) -> None:
         if event.kind == "decided":
-            self.decisions.append(event_to_dict(event))
+            self.decisions.append(log_line(event))
         elif event.kind == "warned":
-            self.warnings.append(event_to_dict(event))
+            self.warnings.append(log_line(event))

@@ -9,11 +9,12 @@ import contextlib
 import json
 import os
 import platform
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from sfmapp import kernel_cache
-from sfmapp.errors import InputError, UsageError
+from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.images.products import FORMAT_NAME
 from sfmapp.workspace.layout import FORMAT, LOCK, MANIFEST, ODOMETRY, RECONSTRUCT
 
@@ -69,7 +70,25 @@ def check_command(folder: Path, manifest: dict[str, Any], command: str) -> None:
         )
 
 
-def image_root(manifest: dict[str, Any]) -> Path | None:
+class AsBeforeError(NoReconstructionError):
+    """An earlier run has ended so and written its report, and nothing has changed."""
+
+
+def raise_as_before(stage: Mapping[str, Any]) -> None:
+    """Raise what the run of a stage has ended with, where it came to nothing.
+
+    Args:
+        stage: its entry of the manifest.
+
+    Raises:
+        AsBeforeError: it did.
+    """
+    outcome = stage.get("outcome") or {}
+    if outcome.get("exit_code") == NoReconstructionError.exit_code:
+        raise AsBeforeError(f"{outcome['message']} (as before: nothing has changed)", outcome["advice"])
+
+
+def image_root(manifest: Mapping[str, Any]) -> Path | None:
     """The folder that the names of a workspace's images are relative to; None where it is not known, or gone.
 
     A reconstruction has noted it, as a pattern or a list names photographs, not their folder; all else is made of one.

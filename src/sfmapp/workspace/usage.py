@@ -6,6 +6,8 @@ import os
 import resource
 import time
 
+from sfmapp.reporting import Usage
+
 
 class Stopwatch:
     """Counts from its making. CPU seconds are user and system, of all threads and of children that have ended."""
@@ -15,14 +17,14 @@ class Stopwatch:
         self._wall = time.monotonic() - (_process_age_s() if whole_process else 0.0)
         self._cpu = 0.0 if whole_process else _cpu_s()
 
-    def read(self) -> dict[str, float]:
-        """``wall_s``, ``cpu_s`` and ``peak_memory_mb`` (1e6 bytes; largest resident set of the process, or of one of
-        its children where that is larger, since the process began)."""
-        return {
-            "wall_s": round(time.monotonic() - self._wall, 4),
-            "cpu_s": round(_cpu_s() - self._cpu, 4),
-            "peak_memory_mb": round(max(_peak_mb(resource.RUSAGE_SELF), _peak_mb(resource.RUSAGE_CHILDREN)), 1),
-        }
+    def read(self) -> Usage:
+        """What it has counted; the peak of memory is that of the process, or of one of its children where that is
+        larger, since the process began."""
+        return Usage(
+            wall_s=round(time.monotonic() - self._wall, 4),
+            cpu_s=round(_cpu_s() - self._cpu, 4),
+            peak_memory_mb=round(max(_peak_mb(resource.RUSAGE_SELF), _peak_mb(resource.RUSAGE_CHILDREN)), 1),
+        )
 
 
 def _process_age_s() -> float:

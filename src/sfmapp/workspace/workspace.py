@@ -9,7 +9,6 @@ may be cut off anywhere.
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.atomic import replaced_file
-from sfmapp.workspace.layout import LOCK, MANIFEST, MODEL_FILES, RECONSTRUCT
+from sfmapp.reporting import R, Usage, from_plain, to_json
+from sfmapp.workspace.layout import LOCK, MANIFEST, MODEL_FILES, RECONSTRUCT, REPORT
 from sfmapp.workspace.lock import locked
 from sfmapp.workspace.manifest import check_command, manifest_of, new_manifest, read_json
-from sfmapp.workspace.plain_json import plain_number
 
 if TYPE_CHECKING:
     import numpy as np
@@ -66,10 +65,10 @@ class Workspace:
         self.manifest["stages"][stage] = {"key": key, "is_done": False, **facts}
         self.save()
 
-    def finish(self, stage: str, usage: dict[str, float], **facts: Any) -> None:
+    def finish(self, stage: str, usage: Usage | None, **facts: Any) -> None:
         """Note that the stage has ended, with its time and memory. The caller saves."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        self.manifest["stages"][stage] |= {"is_done": True, "finished": now, **usage, **facts}
+        self.manifest["stages"][stage] |= {"is_done": True, "finished": now, **(usage or {}), **facts}
 
     def save(self) -> None:
         """Write ``run.json``, beside and renamed."""
@@ -77,7 +76,7 @@ class Workspace:
 
     def write_json(self, name: str, value: Any) -> None:
         """Write a JSON file of the workspace, beside and renamed."""
-        self.write_text(name, json.dumps(value, indent=1, default=plain_number) + "\n")
+        self.write_text(name, to_json(value, indent=1) + "\n")
 
     def write_text(self, name: str, text: str) -> None:
         """Write a text file of the workspace, beside and renamed."""
@@ -88,6 +87,13 @@ class Workspace:
     def read_json(self, name: str) -> Any:
         """A JSON file of the workspace; None if it is not there or damaged."""
         return read_json(self.folder / name)
+
+    def read_report(self, kind: type[R]) -> R | None:
+        """``report.json`` of an earlier run, to show it again; None if it is not there, damaged or of another kind."""
+        try:
+            return from_plain(kind, self.read_json(REPORT))
+        except ValueError:
+            return None
 
     def write_models(
         self, models: Sequence[Reconstruction], keypoints: list[NDArray[np.float64]] | None = None

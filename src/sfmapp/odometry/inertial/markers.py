@@ -55,6 +55,11 @@ class MarkerSightings:
     marker_id: NDArray[np.int64]
     corners: Array
 
+    @classmethod
+    def none(cls) -> MarkerSightings:
+        """No markers."""
+        return cls(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 2)))
+
 
 @dataclass(frozen=True)
 class MarkerOptions:

@@ -16,16 +16,32 @@ _AT = (8, 12, 18, 27, 40, 60)
 _STEPS, _TOLERANCE = 8, 1e-4
 
 
-def is_time_to_ask(local: LocalMap) -> bool:
-    """Whether a map has come to a number of keyframes at which it is questioned."""
-    return local.newest + 1 in _AT
+class EarlyCalibration:
+    """Asks the maps of a run about its calibration, until one of them has refined it.
+
+    Attributes:
+        is_open: it has not been refined, and may be.
+    """
+
+    def __init__(self, is_open: bool) -> None:
+        self.is_open = is_open
+        self._asked: set[tuple[int, int]] = set()
+
+    def refines(self, local: LocalMap) -> bool:
+        """Ask a map that has a new keyframe, if it is time to; returns whether it goes on with a refined calibration.
+
+        The map is then adjusted to it, in place; what else is under way is over. Otherwise nothing has changed.
+        """
+        asked = (local.map_idx, local.newest)
+        if not self.is_open or local.newest + 1 not in _AT or asked in self._asked:
+            return False
+        self._asked.add(asked)
+        is_refined = _refine(local)
+        self.is_open = not is_refined
+        return is_refined
 
 
-def refine_early(local: LocalMap) -> bool:
-    """Hold the calibration of a growing map against what it has seen; returns whether it was refined.
-
-    The map is then adjusted to it, in place, and goes on with it; what else is under way is over. Otherwise nothing has
-    changed."""
+def _refine(local: LocalMap) -> bool:
     keyframes = local.keyframes
     everything = np.arange(len(keyframes.keyframes))
     job = make_job(keyframes, everything, everything > 0)

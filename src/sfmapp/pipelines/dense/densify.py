@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,14 +18,17 @@ from sfmapp.dense.clusters import Cluster, in_core, make_clusters, merge_cluster
 from sfmapp.dense.densify import densify
 from sfmapp.dense.files import read_patches
 from sfmapp.dense.prepare import DensePlan, load_scene
+from sfmapp.dense.report import ClusterReport
 from sfmapp.dense.scene import Patches
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.pipelines.dense import results as dense_results
 from sfmapp.pipelines.dense.results import STAGE
 from sfmapp.pipelines.dense.source import DenseJob, dense_job, find_source, model_digest, plan_source
+from sfmapp.report.model import DenseReport, Outcome
 from sfmapp.workspace.kernels import compile_dense_kernels
 from sfmapp.workspace.keys import input_key, stage_key
+from sfmapp.workspace.manifest import AsBeforeError
 from sfmapp.workspace.options import Options, with_absolute_paths
 from sfmapp.workspace.usage import Stopwatch
 
@@ -37,7 +41,7 @@ class DenseResult(NamedTuple):
 
     patches: Patches
     image_names: tuple[str, ...]
-    report: dict[str, Any]
+    report: DenseReport
     output: Path
 
 
@@ -79,15 +83,16 @@ def dense(
 
 def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
     """The job: views, what still holds of an earlier run, patches, and the report of it all."""
-    report: dict[str, Any] = {}
+    report = DenseReport(outcome=Outcome.of(None), run=job.watch.read())
     key = ""
     try:
         with job.stage("views"):
-            plan, report["views"] = plan_source(job)
+            plan, views = plan_source(job)
+            report = replace(report, views=views)
         clusters = make_clusters(plan, job.options.dense.cell_px, job.options.dense.max_memory_mb)
         key = _key(job, plan, clusters)
         files = (dense_results.FUSED, dense_results.PATCHES)
-        if (earlier := dense_results.earlier_report(job, STAGE, key, files)) is not None:
+        if (earlier := dense_results.earlier_dense(job, key, files)) is not None:
             patches, _ = read_patches(job.workspace.folder / dense_results.PATCHES)
             dense_results.write_extras(job, plan, patches, None, maps=maps, record=record)
             return DenseResult(patches, plan.names, earlier, job.workspace.folder)
@@ -96,20 +101,22 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
         job.workspace.begin(STAGE, key, model=model_digest(job.known.model))
         with job.measured("kernels"):
             compile_dense_kernels(job.events)
-        patches = _densify(job, plan, clusters, report, is_resumed)
+        patches, report = _densify(job, plan, clusters, report, is_resumed)
         dense_results.write_cloud(job, plan, patches)
-        if warning := outcome.check(patches, report["shares"], plan, job.options.dense.min_views):
+        assert report.shares is not None
+        if warning := outcome.check(patches, report.shares, plan, job.options.dense.min_views):
             job.events.warned(STAGE, warning)
-    except dense_results.AsBeforeError:
+    except AsBeforeError:
         raise
     except NoReconstructionError as failure:
         job.note_source()
-        dense_results.finish(job, STAGE, key, report, failure=failure)
+        dense_results.finish(job, STAGE, key, replace(report, outcome=Outcome.of(failure), run=job.watch.read()))
         raise
     scene = dense_results.picture_scene(job, plan)
     dense_results.remove_extras(job)
     dense_results.write_extras(job, plan, patches, scene, maps=maps, record=record)
-    report = dense_results.finish(job, STAGE, key, report, (scene, patches, None))
+    report = replace(report, run=job.watch.read())
+    dense_results.finish(job, STAGE, key, report, (scene, patches, None))
     return DenseResult(patches, plan.names, report, job.workspace.folder)
 
 
@@ -122,9 +129,9 @@ def _key(job: DenseJob, plan: DensePlan, clusters: Sequence[Cluster]) -> str:
 
 
 def _densify(
-    job: DenseJob, plan: DensePlan, clusters: list[Cluster], report: dict[str, Any], is_resumed: bool
-) -> Patches:
-    """Patches of all clusters, within the region; what came of it goes into the report."""
+    job: DenseJob, plan: DensePlan, clusters: list[Cluster], report: DenseReport, is_resumed: bool
+) -> tuple[Patches, DenseReport]:
+    """Patches of all clusters, within the region, and the report with what came of it."""
     options = job.options.dense
     if len(clusters) > 1:
         sizes = [len(cluster.core) for cluster in clusters]
@@ -132,34 +139,37 @@ def _densify(
             STAGE, f"{len(plan.records)} views in {len(clusters)} clusters to stay below {options.max_memory_mb} MB",
             sizes=sizes, memory_mb=[round(cluster.memory_mb) for cluster in clusters],
         )  # fmt: skip
-    parts, texture, rows = [], [], []
-    report["clusters"] = []
+    parts: list[Patches] = []
+    rows: list[dense_results.PartReport] = []
+    told: list[ClusterReport] = []
     with job.stage(STAGE):
         for number, cluster in enumerate(clusters):
             known = dense_results.read_part(job, plan, number) if is_resumed else None
             part, row = known or _densify_cluster(job, plan, cluster)
             if known is None and len(clusters) > 1:
                 dense_results.write_part(job, plan, number, part, row)
-            texture += row.pop("texture")
-            report["clusters"].append(
-                {"views": [plan.names[m] for m in cluster.core], "num_patches": len(part), "is_resumed": bool(known)}
-            )
+            names = [plan.names[m] for m in cluster.core]
+            told.append(ClusterReport(views=names, num_patches=len(part), is_resumed=known is not None))
             parts.append(part)
             rows.append(row)
         patches = merge_clusters(plan, options.cell_px, parts) if len(parts) > 1 else parts[0]
         if plan.region is not None:
             patches = patches.subset(plan.region.holds(patches.xyz))
     dense_results.remove_parts(job)
-    report |= dense_results.summary(patches) | dense_results.summed(rows)
+    total = dense_results.summed(rows)
     # noise drowns points in the finest images; in one of the sizes they hold up if the poses are right
-    points = max(level["points"] for level in report["levels"]), rows[0]["num_points"]
+    points = max(level.points for level in total.levels), rows[0].num_points
     if len(rows) > 1:  # there they are not told from those of the views around
         points = 0, 0
-    report["shares"] = outcome.judge(patches, texture, points, options.cell_px)
-    return patches
+    texture = [counts for row in rows for counts in row.texture]
+    shares = outcome.judge(patches, texture, points, options.cell_px)
+    return patches, replace(
+        report, clusters=told, levels=total.levels, waves=total.waves, funnel=total.funnel, seeds=total.seeds,
+        shares=shares, **dense_results.summary(patches),
+    )  # fmt: skip
 
 
-def _densify_cluster(job: DenseJob, plan: DensePlan, cluster: Cluster) -> tuple[Patches, dict[str, Any]]:
+def _densify_cluster(job: DenseJob, plan: DensePlan, cluster: Cluster) -> tuple[Patches, dense_results.PartReport]:
     is_whole = len(cluster.core) == len(plan.records)
     scene = load_scene(
         plan, cluster.views, core=None if is_whole else cluster.core, threads=job.threads, events=job.events
@@ -168,4 +178,4 @@ def _densify_cluster(job: DenseJob, plan: DensePlan, cluster: Cluster) -> tuple[
     patches, row = densify(scene, job.options.dense, threads=job.threads, events=job.events)
     # all of them are of the core: hundreds of megabytes that need no copy
     mine = patches if is_whole else in_core(patches, cluster)
-    return mine, row | {"texture": texture, "num_points": len(scene.point_xyz)}
+    return mine, dense_results.PartReport(**row, texture=texture, num_points=len(scene.point_xyz))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +21,17 @@ from sfmapp.geometry.upright import up_direction
 from sfmapp.pipelines.dense import results as dense_results
 from sfmapp.pipelines.dense.source import DenseJob, dense_job, find_source, model_digest, plan_source
 from sfmapp.pipelines.stored_pixels import has_stored_pixels
+from sfmapp.report.model import FailedReport, MeshRunReport, Outcome
 from sfmapp.scene.mesh import Mesh
 from sfmapp.surface.mesh import make_mesh
+from sfmapp.surface.report import TextureReport
 from sfmapp.surface.texture import texture_mesh
 from sfmapp.workspace.keys import stage_key
 from sfmapp.workspace.manifest import read_manifest
 from sfmapp.workspace.options import Options, options_from_dict, with_absolute_paths
 from sfmapp.workspace.usage import Stopwatch
 
-STAGE = "mesh"
+STAGE: Literal["mesh"] = "mesh"
 MESH_PLY, MESH_GLB = "mesh/mesh.ply", "mesh/mesh.glb"
 # what a pixel measures at the points of a PLY, which does not say: so much of the way to the nearest ones
 _NUM_NEAREST = 4
@@ -41,7 +43,7 @@ class MeshResult(NamedTuple):
     """The mesh, None where that of an earlier run holds; and the report of it."""
 
     mesh: Mesh | None
-    report: dict[str, Any]
+    report: MeshRunReport
 
 
 def mesh_workspace(
@@ -73,7 +75,7 @@ def mesh_workspace(
     options = with_absolute_paths(options or Options())
     # the views are those that the patches were made of, whatever is said of them now
     earlier = options_from_dict({"dense": manifest.get("options", {}).get("dense", {})})
-    options = dataclasses.replace(options, dense=earlier.dense)
+    options = replace(options, dense=earlier.dense)
     with dense_job(find_source(folder, None, None, options), events or Events(), watch) as job:
         return _run(job, record)
 
@@ -82,7 +84,7 @@ def _run(job: DenseJob, record: bool) -> MeshResult:
     folder = job.workspace.folder
     digest = dense_results.file_digest(folder / dense_results.PATCHES)
     key = stage_key((__name__,), job.options.surface, digest)
-    if (earlier := dense_results.earlier_report(job, STAGE, key, (MESH_PLY, MESH_GLB))) is not None:
+    if (earlier := dense_results.earlier_mesh(job, key, (MESH_PLY, MESH_GLB))) is not None:
         return MeshResult(None, earlier)
     patches, names = read_patches(folder / dense_results.PATCHES)
     with job.stage("views"):
@@ -112,9 +114,11 @@ def _run(job: DenseJob, record: bool) -> MeshResult:
                 threads=job.threads, events=job.events,
             )  # fmt: skip
             if job.options.surface.texture:
-                mesh, report["texture"] = _textured(job, plan, mesh)
+                mesh, texture = _textured(job, plan, mesh)
+                report = replace(report, texture=texture)
     except NoReconstructionError as failure:
-        dense_results.finish(job, STAGE, key, {}, (scene, patches, None), failure)
+        failed = FailedReport(outcome=Outcome.of(failure), run=job.watch.read())
+        dense_results.finish(job, STAGE, key, failed, (scene, patches, None))
         raise
     is_z_up = bool(up_direction(scene.upright_cam_from_world)[2] > np.sqrt(0.5))
     with job.measured("output"):
@@ -123,10 +127,12 @@ def _run(job: DenseJob, record: bool) -> MeshResult:
     if record:
         with job.measured("recording"):
             dense_results.write_recording(job, scene, patches, mesh)
-    return MeshResult(mesh, dense_results.finish(job, STAGE, key, report, (scene, patches, mesh)))
+    section = MeshRunReport(**report, outcome=Outcome.of(None), run=job.watch.read())
+    dense_results.finish(job, STAGE, key, section, (scene, patches, mesh))
+    return MeshResult(mesh, section)
 
 
-def _textured(job: DenseJob, plan: DensePlan, mesh: Mesh) -> tuple[Mesh, dict[str, Any]]:
+def _textured(job: DenseJob, plan: DensePlan, mesh: Mesh) -> tuple[Mesh, TextureReport]:
     """With the photographs at working resolution, or as finely as fits into memory."""
     num_bytes = 3.0 * float(plan.num_pixels.sum())
     shrink = max(1.0, np.sqrt(num_bytes / (0.5e6 * job.options.dense.max_memory_mb)))
@@ -137,7 +143,7 @@ def _textured(job: DenseJob, plan: DensePlan, mesh: Mesh) -> tuple[Mesh, dict[st
 
 def mesh_cloud(
     cloud: str | os.PathLike[str], output: str | os.PathLike[str], options: Options | None = None, *,
-    events: Events | None = None,
+    events: Events | None = None, watch: Stopwatch | None = None,
 ) -> MeshResult:  # fmt: skip
     """Make a mesh of a cloud of oriented points: ``mesh/mesh.ply`` and ``mesh/mesh.glb`` in a folder.
 
@@ -146,6 +152,7 @@ def mesh_cloud(
         output: the folder; made if need be.
         options: ``surface`` and ``threads`` count here.
         events: listens in, and can ask the run to stop.
+        watch: started earlier, if more is to be counted in the report than this call.
 
     Raises:
         UsageError: a texture is asked for, which needs photographs.
@@ -156,7 +163,7 @@ def mesh_cloud(
     options = options or Options()
     if options.surface.texture:
         raise UsageError("a texture needs the photographs, which a PLY does not hold", "give the workspace instead")
-    events = events or Events()
+    events, watch = events or Events(), watch or Stopwatch()
     xyz, normal, rgb = _oriented_points(Path(cloud), events)
     threads = options.num_workers
     size = _sizes(xyz, threads)
@@ -165,7 +172,7 @@ def mesh_cloud(
     folder = Path(output)
     write_mesh_ply(folder / MESH_PLY, mesh)
     write_glb(folder / MESH_GLB, mesh)
-    return MeshResult(mesh, report)
+    return MeshResult(mesh, MeshRunReport(**report, outcome=Outcome.of(None), run=watch.read()))
 
 
 def _oriented_points(path: Path, events: Events) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.uint8]]:

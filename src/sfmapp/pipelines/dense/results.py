@@ -5,72 +5,106 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from sfmapp.dense.files import read_patches, write_fused_ply, write_patches
 from sfmapp.dense.maps import write_maps
 from sfmapp.dense.prepare import DensePlan, coarser_plan, load_scene
+from sfmapp.dense.report import CloudNumbers, DensifyReport
 from sfmapp.dense.scene import DenseScene, Patches
-from sfmapp.errors import InputError, NoReconstructionError
+from sfmapp.errors import InputError
 from sfmapp.formats.colmap import read_model
 from sfmapp.pipelines.dense.source import DenseJob
 from sfmapp.report.dense_document import dense_document
 from sfmapp.report.dense_html import render_dense_html
 from sfmapp.report.dense_pictures import PictureRow, dense_pictures
 from sfmapp.report.html import render_html
+from sfmapp.report.model import (
+    DensePart,
+    DenseReport,
+    DenseRunReport,
+    FailedReport,
+    LogLine,
+    MeshRunReport,
+    ReconstructionReport,
+    Stages,
+)
+from sfmapp.reporting import R, Step, document_text, from_plain
 from sfmapp.scene.mesh import Mesh
-from sfmapp.workspace.layout import DENSE
-from sfmapp.workspace.plain_json import report_text
+from sfmapp.surface.report import MeshReport
+from sfmapp.workspace.layout import DENSE, REPORT
+from sfmapp.workspace.manifest import raise_as_before
 
-STAGE = "dense"
-FORMAT = "sfmapp dense report 1"
+STAGE: Literal["dense"] = "dense"
+MESH = "mesh"
+FORMAT = "sfmapp dense report 2"
 FUSED, PATCHES, MAPS, PARTS = "dense/fused.ply", "dense/patches.npz", "dense/maps", "dense/clusters"
 RECORDING = "dense/recording.rrd"
 # photographs in the recording and on the page
 PICTURE_PX = 640
+Document: TypeAlias = ReconstructionReport | DenseRunReport
 # whose messages in the report of a workspace are ours to replace
 _OWN_STAGES = frozenset((STAGE, "views", "maps", "mesh", "texture", "recording"))
 
 
-def earlier_report(job: DenseJob, stage: str, key: str, files: Sequence[str]) -> dict[str, Any] | None:
-    """The report of an earlier run of a stage, if its files are there and still hold.
+def earlier_dense(job: DenseJob, key: str, files: Sequence[str]) -> DenseReport | None:
+    """What an earlier densification has said, if its files are there and still hold.
 
     Raises:
-        NoReconstructionError: the earlier run ended so, and nothing has changed.
+        AsBeforeError: it came to nothing, and nothing has changed.
     """
-    section = read_section(job, stage)
-    if not job.workspace.is_current(stage, key) or section is None:
+    document = _earlier_document(job, STAGE, key, files)
+    found = document.stages.dense if document is not None else None
+    return None if found is None else replace(found, is_up_to_date=True)
+
+
+def earlier_mesh(job: DenseJob, key: str, files: Sequence[str]) -> MeshRunReport | None:
+    """The same of meshing."""
+    document = _earlier_document(job, MESH, key, files)
+    found = document.stages.mesh if document is not None else None
+    return replace(found, is_up_to_date=True) if isinstance(found, MeshRunReport) else None
+
+
+def _earlier_document(job: DenseJob, stage: str, key: str, files: Sequence[str]) -> Document | None:
+    if not job.workspace.is_current(stage, key):
         return None
-    outcome = section["outcome"]
-    if outcome["exit_code"] == NoReconstructionError.exit_code:
-        raise AsBeforeError(f"{outcome['message']} (as before: nothing has changed)", outcome["advice"])
+    raise_as_before(job.workspace.manifest["stages"][stage])
     if not all((job.workspace.folder / name).is_file() for name in files):
         return None
-    return section | {"is_up_to_date": True}
+    return _document(job)
 
 
-class AsBeforeError(NoReconstructionError):
-    """An earlier run has ended so and written its report."""
+class PartReport(DensifyReport):
+    """What is told of a cluster of views.
+
+    Attributes:
+        texture: textured and open pixels of each of its views.
+        num_points: sparse points that were tried.
+    """
+
+    texture: Sequence[tuple[int, int]]
+    num_points: int
 
 
-def write_part(job: DenseJob, plan: DensePlan, number: int, patches: Patches, row: dict[str, Any]) -> None:
+def write_part(job: DenseJob, plan: DensePlan, number: int, patches: Patches, row: PartReport) -> None:
     """Keep the patches of a cluster, and what is told of it, until the others are done or the run is resumed."""
     write_patches(job.workspace.folder / PARTS / f"{number}.npz", patches, plan.names)
     job.workspace.write_json(f"{PARTS}/{number}.json", row)
 
 
-def read_part(job: DenseJob, plan: DensePlan, number: int) -> tuple[Patches, dict[str, Any]] | None:
+def read_part(job: DenseJob, plan: DensePlan, number: int) -> tuple[Patches, PartReport] | None:
     """What :func:`write_part` has kept; None if an earlier run has not come so far."""
-    row = job.workspace.read_json(f"{PARTS}/{number}.json")
     try:
+        row = from_plain(PartReport, job.workspace.read_json(f"{PARTS}/{number}.json"))
         patches, names = read_patches(job.workspace.folder / PARTS / f"{number}.npz")
-    except InputError:
+    except (InputError, ValueError):
         return None
-    return (patches, row) if names == plan.names and isinstance(row, dict) else None
+    return (patches, row) if names == plan.names else None
 
 
 def file_digest(path: Path) -> str:
@@ -134,115 +168,128 @@ def write_recording(job: DenseJob, scene: DenseScene, patches: Patches, mesh: Me
         job.events.warned("recording", f"no recording: {report.problem}")
 
 
-def summary(patches: Patches) -> dict[str, Any]:
+def summary(patches: Patches) -> CloudNumbers:
     """Numbers about a cloud, for the report."""
     if not len(patches):
-        return {"num_patches": 0}
-    return {
-        "num_patches": len(patches),
-        "mean_views": float(patches.num_views.mean()),
-        "median_score": float(np.median(patches.score)),
-        "median_sigma": float(np.median(patches.sigma)),
-        "median_size": float(np.median(patches.size)),
-    }
+        return CloudNumbers(num_patches=0)
+    return CloudNumbers(
+        num_patches=len(patches),
+        mean_views=float(patches.num_views.mean()),
+        median_score=float(np.median(patches.score)),
+        median_sigma=float(np.median(patches.sigma)),
+        median_size=float(np.median(patches.size)),
+    )
 
 
-def summed(reports: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def summed(reports: Sequence[DensifyReport]) -> DensifyReport:
     """The reports of :func:`densify` on several clusters as one: counts and times added up."""
-    levels: dict[int, dict[str, Any]] = {}
-    waves: dict[int, dict[str, Any]] = {}
-    for report in reports:
-        for key, rows, sums in (("level", report["levels"], levels), ("wave", report["waves"], waves)):
-            for row in rows:
-                into = sums.setdefault(row[key], {key: row[key]})
-                into.update({k: round(into.get(k, 0) + v, 3) for k, v in row.items() if k != key})
+    levels = [_added([row for r in reports for row in r.levels if row.level == n], "level") for n in _levels(reports)]
+    numbers = sorted({wave.wave for report in reports for wave in report.waves})
+    waves = [_added([row for r in reports for row in r.waves if row.wave == n], "wave") for n in numbers]
     funnel: dict[str, int] = {}
-    seeds: dict[str, int] = {}
-    for report in reports:
-        for entry in report["funnel"]:
-            funnel[entry["name"]] = funnel.get(entry["name"], 0) + entry["count"]
-        for name, count in report["seeds"].items():
-            seeds[name] = seeds.get(name, 0) + count
-    return {
-        "levels": [levels[level] for level in sorted(levels, reverse=True)],
-        "waves": [waves[wave] for wave in sorted(waves)],
-        "funnel": [{"name": name, "count": count} for name, count in funnel.items()],
-        "seeds": seeds,
-    }
+    for step in (step for report in reports for step in report.funnel):
+        funnel[step.name] = funnel.get(step.name, 0) + step.count
+    return DensifyReport(
+        num_patches=sum(report.num_patches for report in reports),
+        levels=levels,
+        waves=waves,
+        seeds=_added([report.seeds for report in reports]),
+        funnel=[Step(name=name, count=count) for name, count in funnel.items()],
+    )
 
 
-def read_section(job: DenseJob, stage: str) -> dict[str, Any] | None:
-    """What ``report.json`` tells of a stage; None without."""
-    document = job.workspace.read_json("report.json")
-    section = document.get("stages", {}).get(stage) if isinstance(document, dict) else None
-    return section if isinstance(section, dict) else None
+def _levels(reports: Sequence[DensifyReport]) -> list[int]:
+    """Their numbers, the coarsest first."""
+    return sorted({level.level for report in reports for level in report.levels}, reverse=True)
+
+
+def _added(rows: Sequence[R], key: str = "") -> R:
+    """The sums of the fields of reports, but for one that is the same in all."""
+    total, *others = rows
+    for row in others:
+        total = replace(total, **{k: round(total.get(k, 0) + v, 3) for k, v in row.items() if k != key})
+    return total
+
+
+def _document(job: DenseJob) -> Document | None:
+    """The report of the workspace as it stands; None if there is none that can be read."""
+    if job.known.command == DENSE:
+        return job.workspace.read_report(DenseRunReport)
+    return job.workspace.read_report(ReconstructionReport)
 
 
 def finish(
     job: DenseJob,
-    stage: str,
+    stage: Literal["dense", "mesh"],
     key: str,
-    section: dict[str, Any],
+    section: DenseReport | MeshRunReport | FailedReport,
     shown: tuple[DenseScene, Patches, Mesh | None] | None = None,
-    failure: NoReconstructionError | None = None,
-) -> dict[str, Any]:
-    """Write report and page, and mark the stage as done if it has begun; returns its section of the report.
+) -> None:
+    """Write report and page, and mark the stage as done if it has begun.
 
     Args:
         job: at its end.
-        stage: ``dense`` or ``mesh``.
+        stage: which.
         key: of it; empty if it has not begun.
         section: what is told of the stage.
         shown: views, patches and mesh, for the page; None if there are none.
-        failure: why there are none.
     """
-    outcome = {
-        "exit_code": failure.exit_code if failure else 0,
-        "message": str(failure) if failure else "",
-        "advice": failure.advice if failure else None,
-    }
-    section = {"outcome": outcome} | section | {"run": job.watch.read()}
-    _write_report(job, stage, section, outcome, shown)
+    _write_report(job, stage, section, shown)
     if key and job.workspace.has_key(stage, key):
-        job.workspace.finish(stage, job.usage.get(stage, {}))
+        job.workspace.finish(stage, job.usage.get(stage), outcome=section.outcome)
         job.workspace.save()
-    return section
 
 
 def _write_report(
-    job: DenseJob, stage: str, section: dict[str, Any], outcome: dict[str, Any],
+    job: DenseJob, stage: str, section: DenseReport | MeshRunReport | FailedReport,
     shown: tuple[DenseScene, Patches, Mesh | None] | None,
 ) -> None:  # fmt: skip
     """Add the stage to ``report.json``, beside what a reconstruction or an earlier stage has written, and the page."""
-    workspace = job.workspace
-    old = workspace.read_json("report.json")
-    document: dict[str, Any] = old if isinstance(old, dict) else {}
-    if job.known.command == DENSE:
-        document = {"format": FORMAT} | document | {"outcome": outcome, "run": job.facts()}
-    document["stages"] = document.get("stages", {}) | {stage: section}
-    document["usage"] = document.get("usage", {}) | job.usage
-    for kind, new in (("warnings", job.log.warnings), ("decisions", job.log.decisions)):
-        kept = [entry for entry in document.get(kind, []) if entry["stage"] not in _OWN_STAGES]
-        document[kind] = kept + new
+    workspace, old = job.workspace, _document(job)
+    if old is None or isinstance(old, DenseRunReport):
+        stages = Stages() if old is None else old.stages
+        old = DenseRunReport(
+            format=FORMAT, outcome=section.outcome, run=job.facts(), usage={} if old is None else old.usage,
+            warnings=[] if old is None else old.warnings, decisions=[] if old is None else old.decisions,
+            stages=stages, dense=None if old is None else old.dense,
+        )  # fmt: skip
+    document = replace(
+        old, stages=_with(old.stages, section), usage={**old.usage, **job.usage},
+        warnings=[*_of_others(old.warnings), *job.log.warnings],
+        decisions=[*_of_others(old.decisions), *job.log.decisions],
+    )  # fmt: skip
     pictures: list[PictureRow] = []
     if shown is not None:
-        document["dense"], pictures = _dense_part(job, document["stages"], *shown)
+        part, pictures = _dense_part(job, document.stages, *shown)
+        document = replace(document, dense=part)
     elif stage == STAGE:
-        document["dense"] = None
-    workspace.write_text("report.json", report_text(document))
-    if job.known.command == DENSE:
+        document = replace(document, dense=None)
+    workspace.write_text(REPORT, document_text(document))
+    if isinstance(document, DenseRunReport):
         workspace.write_text("report.html", render_dense_html(document, pictures))
-    elif "models" in document:
-        model = read_model(job.known.model)[0]
-        workspace.write_text("report.html", render_html(document, model, pictures))
+    else:
+        workspace.write_text("report.html", render_html(document, read_model(job.known.model)[0], pictures))
+
+
+def _with(stages: Stages, section: DenseReport | MeshRunReport | FailedReport) -> Stages:
+    return replace(stages, dense=section) if isinstance(section, DenseReport) else replace(stages, mesh=section)
+
+
+def _of_others(lines: Sequence[LogLine]) -> list[LogLine]:
+    """Those of stages that are not ours to replace."""
+    return [line for line in lines if line.stage not in _OWN_STAGES]
 
 
 def _dense_part(
-    job: DenseJob, stages: Mapping[str, Any], scene: DenseScene, patches: Patches, mesh: Mesh | None
-) -> tuple[dict[str, Any], list[PictureRow]]:
+    job: DenseJob, stages: Stages, scene: DenseScene, patches: Patches, mesh: Mesh | None
+) -> tuple[DensePart, list[PictureRow]]:
     options = job.options.dense
-    mesh_report = stages["mesh"] if mesh is not None else None
+    assert stages.dense is not None
+    mesh_report = None
+    if mesh is not None and isinstance(stages.mesh, MeshRunReport):
+        fields = MeshReport.__dataclass_fields__
+        mesh_report = MeshReport(**{name: value for name, value in stages.mesh.items() if name in fields})
     document = dense_document(
-        scene, patches, stages[STAGE], mesh_report, cell_px=options.cell_px, min_views=options.min_views
+        scene, patches, stages.dense, mesh_report, cell_px=options.cell_px, min_views=options.min_views
     )
     return document, dense_pictures(scene, patches, mesh, cell_px=options.cell_px)

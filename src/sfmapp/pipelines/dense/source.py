@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any
 import sfmapp
 from sfmapp.dense.photographs import find_photographs
 from sfmapp.dense.prepare import DensePlan, plan_views
+from sfmapp.dense.report import ViewsReport
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model
@@ -98,7 +99,7 @@ def dense_job(where: DenseSource, events: Events, watch: Stopwatch | None = None
         yield job
 
 
-def plan_source(job: DenseJob) -> tuple[DensePlan, dict[str, Any]]:
+def plan_source(job: DenseJob) -> tuple[DensePlan, ViewsReport]:
     """What is planned with the views of the model, and the report of it.
 
     Raises:
@@ -161,7 +162,12 @@ def _in_workspace(
     command = manifest.get("command", RECONSTRUCT)
     if command == ODOMETRY and asked_for == UNDISTORT and output is not None:
         return DenseSource(
-            folder / "sparse" / "0", _frame_folder(manifest, images), Path(output), DENSE, False, options
+            folder / "sparse" / "0",
+            _frame_folder(str(manifest.get("source") or ""), images),
+            Path(output),
+            DENSE,
+            False,
+            options,
         )
     if command not in (RECONSTRUCT, DENSE):
         raise UsageError(
@@ -187,7 +193,7 @@ def _in_workspace(
     return DenseSource(model, found, target, command if is_own else DENSE, is_upright, options)
 
 
-def _photograph_folder(folder: Path, manifest: dict[str, Any]) -> Path:
+def _photograph_folder(folder: Path, manifest: Mapping[str, Any]) -> Path:
     """The folder of a reconstruction's photographs. Raises InputError if they are gone."""
     found = image_root(manifest)
     if found is None:
@@ -196,9 +202,9 @@ def _photograph_folder(folder: Path, manifest: dict[str, Any]) -> Path:
     return found
 
 
-def _frame_folder(manifest: dict[str, Any], images: str | os.PathLike[str] | None) -> Path:
+def _frame_folder(source: str, images: str | os.PathLike[str] | None) -> Path:
     """The folder that the names of an odometry run's keyframes are relative to."""
-    folder = Path(str(manifest.get("source") or "")) if images is None else Path(images)
+    folder = Path(source) if images is None else Path(images)
     if not folder.is_dir():
         raise InputError(
             f"{folder}: expected the folder of the frames, found {'a file' if folder.is_file() else 'no folder'}",

@@ -7,7 +7,6 @@ from collections.abc import Sequence as Rows
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from sfmapp.mapping.tracks import build_tracks, track_colors
 from sfmapp.matching.pairs import select_pairs
 from sfmapp.matching.stage import match_images
 from sfmapp.odometry.result import OdometryResult
+from sfmapp.report.model import PhotoReport
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.features import Features
 from sfmapp.scene.reconstruction import Reconstruction
@@ -44,11 +44,11 @@ class PhotoResult:
     """What became of the photographs.
 
     Attributes:
-        rows: of each one its name, whether it was registered, and the reason why not; JSON-able.
+        rows: of each one.
         skipped: (name, reason) of files that could not be used.
     """
 
-    rows: list[dict[str, Any]]
+    rows: list[PhotoReport]
     skipped: tuple[tuple[str, str], ...]
 
 
@@ -101,7 +101,7 @@ def add_photos(
     mapper.finish()
     mapper.polish()
     rows = [_row(joined, len(model.image_names) + k, attempts) for k in range(len(found.images))]
-    events.finished(STAGE, f"{sum(row['is_registered'] for row in rows)} of {len(rows)} photographs registered")
+    events.finished(STAGE, f"{sum(row.is_registered for row in rows)} of {len(rows)} photographs registered")
     return joined, PhotoResult(rows, found.skipped)
 
 
@@ -196,12 +196,13 @@ def _num_features(tracks: Tracks) -> int:
     return int(tracks.obs_feature_idx.max(initial=-1)) + 1
 
 
-def _row(model: Reconstruction, image_idx: int, attempts: dict[int, Registration]) -> dict[str, Any]:
+def _row(model: Reconstruction, image_idx: int, attempts: dict[int, Registration]) -> PhotoReport:
     name = model.image_names[image_idx].removeprefix(PREFIX)
-    row: dict[str, Any] = {"name": name, "is_registered": bool(model.is_registered[image_idx]), "reason": ""}
-    attempt = attempts.get(image_idx)
-    if attempt is not None:
-        row |= {"num_correspondences": attempt.num_correspondences, "num_pose_inliers": attempt.num_inliers}
-    if not row["is_registered"]:
-        row["reason"] = attempt.reason if attempt is not None else "shares too few verified matches with the map"
-    return row
+    attempt, is_registered, reason = attempts.get(image_idx), bool(model.is_registered[image_idx]), ""
+    if not is_registered:
+        reason = attempt.reason if attempt is not None else "shares too few verified matches with the map"
+    return PhotoReport(
+        name=name, is_registered=is_registered, reason=reason,
+        num_correspondences=attempt.num_correspondences if attempt is not None else None,
+        num_pose_inliers=attempt.num_inliers if attempt is not None else None,
+    )  # fmt: skip

@@ -9,7 +9,6 @@ of the adjustment: fits of every second frame, and of both ends of the row, must
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from sfmapp.adjust.covariance import estimate_covariances
 from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
 from sfmapp.camera.camera import PARAM_NAMES, Camera
 from sfmapp.mapping.structure import residual_scale_px
+from sfmapp.report.model import LensEvidence
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -43,13 +43,13 @@ class LensFit:
     Attributes:
         camera: the fitted one. sigma: standard deviations of its parameters by name, those held left out.
         spread: how many times its own standard deviations the focal lengths of parts differ from the whole.
-        evidence: numbers for the report, JSON-able.
+        evidence: for the report.
     """
 
     camera: Camera
     sigma: dict[str, float]
     spread: float
-    evidence: dict[str, Any]
+    evidence: LensEvidence
 
     @property
     def focal_sigma_relative(self) -> float:
@@ -76,18 +76,18 @@ def fit_lens(model: Reconstruction) -> LensFit:
     names = PARAM_NAMES[camera.model]
     bends = [n for n, name in enumerate(names) if name[0] in "kp"]
     clear = [abs(fit.whole.params[n]) > _MIN_DISTORTION_SIGMAS * fit.sigma[n] for n in bends]
-    evidence: dict[str, Any] = {"distortion": {names[n]: float(fit.whole.params[n]) for n in bends}}
+    distortion = {names[n]: float(fit.whole.params[n]) for n in bends}
     if bends and not any(clear):
         free = _focal(camera, fit.whole.params)
         fit = _with_parts(model, _flat(camera), False)
         # a distortion too small to be clear may still be there: what it would change is part of the uncertainty
         is_focal = np.array([name[0] == "f" for name in names])
         fit.sigma[is_focal] = np.hypot(fit.sigma[is_focal], _focal(camera, fit.whole.params) - free)
-    evidence |= {
-        "is_at_rest": fit.whole.is_at_rest, "spread": fit.spread, "has_distortion": any(clear),
-        "parts": [float(_focal(camera, part.params)) for part in fit.parts],
-        "independent_sigma": float(fit.whole.sigma[0]),
-    }  # fmt: skip
+    evidence = LensEvidence(
+        distortion=distortion, is_at_rest=fit.whole.is_at_rest, spread=fit.spread, has_distortion=any(clear),
+        parts=[float(_focal(camera, part.params)) for part in fit.parts],
+        independent_sigma=float(fit.whole.sigma[0]),
+    )  # fmt: skip
     found = replace(camera, params=fit.whole.params)
     sigma = {name: float(value) for name, value in zip(names, fit.sigma, strict=True) if value > 0}
     return LensFit(found, sigma, fit.spread, evidence)

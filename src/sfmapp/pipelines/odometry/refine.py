@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from collections.abc import Sequence as Rows
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
@@ -26,8 +28,19 @@ from sfmapp.mapping.options import MappingOptions
 from sfmapp.odometry.result import MapResult, OdometryResult
 from sfmapp.pipelines.odometry.add_photos import PhotoResult, add_photos
 from sfmapp.pipelines.odometry.results import read_odometry, write_trajectories
-from sfmapp.report.odometry_document import fit_to_ground_truth, ground_truth_row, map_row
+from sfmapp.report.model import (
+    CamerasBeforeAfter,
+    GroundTruthBeforeAfter,
+    GroundTruthReport,
+    MapReport,
+    MapsBeforeAfter,
+    Outcome,
+    RefinedCamera,
+    RefineReport,
+)
+from sfmapp.report.odometry_document import GroundTruthFit, fit_to_ground_truth, ground_truth_row, map_row
 from sfmapp.report.refine_html import REFINE_FORMAT, render_refine_html
+from sfmapp.reporting import NamedReason, document_text
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.sequences.open import open_sequence
 from sfmapp.workspace.job import Job
@@ -36,7 +49,6 @@ from sfmapp.workspace.layout import ODOMETRY, REFINE
 from sfmapp.workspace.listeners import DecisionLog, EventLog
 from sfmapp.workspace.manifest import read_manifest
 from sfmapp.workspace.options import Options, options_from_dict, with_absolute_paths
-from sfmapp.workspace.plain_json import report_text
 from sfmapp.workspace.usage import Stopwatch
 from sfmapp.workspace.workspace import open_workspace
 
@@ -57,7 +69,7 @@ class RefineResult(NamedTuple):
     """The refined maps and trajectory, and the report of it as in ``report.json``."""
 
     odometry: OdometryResult
-    report: dict[str, Any]
+    report: RefineReport
 
 
 def refine(
@@ -110,7 +122,7 @@ def refine(
         return RefineResult(after, _write(job, before, after, sequence, added))
 
 
-def _open_sequence(manifest: dict[str, Any], job: Job, *, required: bool) -> Sequence | None:
+def _open_sequence(manifest: Mapping[str, Any], job: Job, *, required: bool) -> Sequence | None:
     """The sequence of the run, for its ground truth and its images; None if it is gone and only the ground truth was
     wanted."""
     wanted = options_from_dict({"sequence": manifest["options"]["sequence"]}).sequence
@@ -177,7 +189,7 @@ def adjusted(
         structure.triangulate(model, np.flatnonzero(~model.is_triangulated), mapping, pool, limit_px)
         changed = int((used != model.obs_is_inlier).sum())
         summary = model.summary()
-        text = f"{summary['num_points']} points, {summary['mean_reprojection_error_px']:.3f} px"
+        text = f"{summary.num_points} points, {summary.mean_reprojection_error_px:.3f} px"
         events.decided(STAGE, f"adjusted: {changed} observations changed sides; {text}", **summary)
         events.raise_if_cancelled()
         if changed <= 1e-3 * used.sum():
@@ -227,23 +239,14 @@ def moved_frames(before: OdometryResult, entries: list[MapResult]) -> OdometryRe
             rigid3.compose(rigid3.compose(poses[mine], rigid3.inverse(was[kept[k]])), now[kept[k]])
             for k in (ahead, after)
         ]
-        poses[mine] = between(moved[0], moved[1], np.clip(weight, 0.0, 1.0))
+        poses[mine] = rigid3.interpolate(moved[0], moved[1], np.clip(weight, 0.0, 1.0))
     poses = poses[before.twin_rows]
     return replace(before, cam_from_world=poses, live_cam_from_world=before.live_cam_from_world, maps=entries)
 
 
-def between(first: Array, second: Array, weight: Array) -> Array:
-    """Poses (N, 7) a share (N,) of the way from the first to the second: centres and rotations apart."""
-    start, end = rigid3.rotation_matrix(first), rigid3.rotation_matrix(second)
-    turn = rigid3.log_so3(end @ start.swapaxes(-1, -2))
-    rotation = rigid3.exp_so3(weight[:, None] * turn) @ start
-    center = (1 - weight[:, None]) * rigid3.center(first) + weight[:, None] * rigid3.center(second)
-    return rigid3.from_matrix(rotation, -np.einsum("nij,nj->ni", rotation, center))
-
-
 def _write(
     job: Job, before: OdometryResult, after: OdometryResult, sequence: Sequence | None, added: PhotoResult | None
-) -> dict[str, Any]:
+) -> RefineReport:
     """Models, trajectories and the report, which is returned."""
     workspace, ground_truth = job.workspace, sequence.ground_truth if sequence is not None else None
     with job.measured("output"):
@@ -255,34 +258,37 @@ def _write(
         else []
         for name, result in (("before", before), ("after", after))
     }
-    report = {
-        "format": REFINE_FORMAT,
-        "outcome": {"exit_code": 0, "message": "", "advice": None},
-        "run": job.facts(),
-        "maps": {
-            name: [map_row(result, m) for m in range(len(result.maps))]
-            for name, result in (("before", before), ("after", after))
-        },
-        "cameras": {
-            name: [
-                {"model": camera.model.name, "params": camera.params.tolist()}
-                for camera in result.maps[0].reconstruction.cameras
-            ]
-            for name, result in (("before", before), ("after", after))
-        },
-        "ground_truth": {
-            name: [{"map": m, **ground_truth_row(fit)} for m, fit in enumerate(found) if fit is not None]
-            for name, found in fits.items()
-        },
-        "orientation": sequence.orientation if sequence is not None else 1,
-        "photographs": added.rows if added is not None else [],
-        "skipped": [{"name": name, "reason": reason} for name, reason in added.skipped] if added is not None else [],
-        "usage": job.usage,
-        "warnings": job.log.warnings,
-        "decisions": job.log.decisions,
-    }
+    report = RefineReport(
+        format=REFINE_FORMAT,
+        outcome=Outcome.of(None),
+        run=job.facts(),
+        maps=MapsBeforeAfter(before=_map_rows(before), after=_map_rows(after)),
+        cameras=CamerasBeforeAfter(before=_cameras(before), after=_cameras(after)),
+        ground_truth=GroundTruthBeforeAfter(**{name: _errors(found) for name, found in fits.items()}),
+        orientation=sequence.orientation if sequence is not None else 1,
+        photographs=added.rows if added is not None else [],
+        skipped=[
+            NamedReason(name=name, reason=reason) for name, reason in (added.skipped if added is not None else ())
+        ],
+        usage=job.usage,
+        warnings=job.log.warnings,
+        decisions=job.log.decisions,
+    )
     workspace.write_text("report.html", render_refine_html(report, after, ground_truth, fits["after"]))
-    workspace.write_text("report.json", report_text(report))
+    workspace.write_text("report.json", document_text(report))
     workspace.manifest["usage"] = job.usage
     workspace.save()
     return report
+
+
+def _map_rows(result: OdometryResult) -> list[MapReport]:
+    return [map_row(result, m) for m in range(len(result.maps))]
+
+
+def _cameras(result: OdometryResult) -> list[RefinedCamera]:
+    cameras = result.maps[0].reconstruction.cameras
+    return [RefinedCamera(model=camera.model.name, params=camera.params.tolist()) for camera in cameras]
+
+
+def _errors(fits: Rows[GroundTruthFit | None]) -> list[GroundTruthReport]:
+    return [ground_truth_row(fit, m) for m, fit in enumerate(fits) if fit is not None]

@@ -4,21 +4,30 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera
-from sfmapp.contradictions import Contradiction
-from sfmapp.errors import InputError, NoReconstructionError
+from sfmapp.camera.camera import Camera
+from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError
 from sfmapp.formats.colmap import read_model
 from sfmapp.formats.trajectory import read_tum, write_tum
+from sfmapp.odometry.report import MapFacts
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.pipelines.odometry.live import numbered
 from sfmapp.pipelines.odometry.timing import frame_statistics
+from sfmapp.report.document import named_params
+from sfmapp.report.model import (
+    CameraParams,
+    GroundTruthReport,
+    OdometryRunReport,
+    Outcome,
+    SequenceCamera,
+    SequenceReport,
+)
 from sfmapp.report.odometry_document import (
     FORMAT,
     FrameTable,
@@ -32,8 +41,9 @@ from sfmapp.report.odometry_document import (
     map_row,
 )
 from sfmapp.report.odometry_html import render_odometry_html
-from sfmapp.workspace.layout import ODOMETRY
-from sfmapp.workspace.plain_json import report_text
+from sfmapp.reporting import document_text, from_plain
+from sfmapp.workspace.layout import ODOMETRY, REPORT
+from sfmapp.workspace.manifest import read_manifest
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -50,7 +60,7 @@ COVARIANCE_COLUMNS = (
 )  # fmt: skip
 
 
-def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstructionError | None) -> dict[str, Any]:
+def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstructionError | None) -> OdometryRunReport:
     """Write everything, the report last; returns it."""
     assert run.sequence is not None
     workspace, ground_truth = run.workspace, run.sequence.ground_truth
@@ -72,10 +82,11 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
     report = make_report(run, result, facts, against, failure)
     page = render_odometry_html(report, result, facts, ground_truth, against)
     run.save_first(lambda: workspace.write_text("report.html", page))
-    report["run"] |= run.watch.read()  # the last measurement that can still be written down
-    run.save_first(lambda: workspace.write_text("report.json", report_text(report)))
+    # the last measurement that can still be written down
+    report = replace(report, run=replace(report.run, **run.watch.read()))
+    run.save_first(lambda: workspace.write_text(REPORT, document_text(report)))
     workspace.manifest["usage"] = run.usage
-    workspace.finish(ODOMETRY, run.usage["odometry"])
+    workspace.finish(ODOMETRY, run.usage["odometry"], maps=[_map_facts(entry) for entry in result.maps])
     run.save_first(workspace.save)
     return report
 
@@ -107,6 +118,10 @@ def write_trajectories(workspace: Workspace, result: OdometryResult, facts: Fram
         write_kitti(folder / "trajectory.kitti", poses_of_map(result, 0), result.frame_idx)
 
 
+def _map_facts(entry: MapResult) -> MapFacts:
+    return MapFacts(scale_source=entry.scale_source, scale_sigma=entry.scale_sigma, contradictions=entry.contradictions)
+
+
 def poses_of_map(result: OdometryResult, map_idx: int) -> Any:
     """(F, 7) final poses of the frames of one map, NaN for all others."""
     return np.where((result.frame_map == map_idx)[:, None], result.cam_from_world, np.nan)
@@ -126,7 +141,7 @@ def read_odometry(folder: Path) -> OdometryResult:
         indices = np.array([int(row["index"]) for row in rows], np.int64)
         times = np.array([float(row["timestamp_s"]) for row in rows])
         names = [row["name"] for row in rows]
-        known = json.loads((folder / "report.json").read_text(encoding="utf-8"))["maps"]
+        known = [from_plain(MapFacts, entry) for entry in read_manifest(folder, ODOMETRY)["stages"][ODOMETRY]["maps"]]
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{folder}: not the results of sfmapp odometry: {error}", "run it again") from error
     poses = np.full((len(rows), 7), np.nan)
@@ -143,13 +158,7 @@ def read_odometry(folder: Path) -> OdometryResult:
         images = np.array([k for k, name in enumerate(model.image_names) if name in position], np.int64)
         frames = np.array([indices[position[model.image_names[k]]] for k in images], np.int64)
         order = np.argsort(frames, kind="stable")
-        source, sigma = row["scale_source"], row["scale_sigma"]
-        against = [Contradiction(**entry) for entry in row.get("contradictions", ())]
-        maps.append(
-            MapResult(
-                model, frames[order], images[order], scale_source=source, scale_sigma=sigma, contradictions=against
-            )
-        )
+        maps.append(MapResult(model, frames[order], images[order], **{**row, "contradictions": [*row.contradictions]}))
     return OdometryResult(indices, names, times, poses, np.full_like(poses, np.nan), frame_map, states, maps)
 
 
@@ -219,75 +228,77 @@ def _finish_recording(run: Tracking, result: OdometryResult, against: Sequence[G
 def make_report(
     run: Tracking, result: OdometryResult, facts: FrameTable, against: Sequence[GroundTruthFit | None],
     failure: NoReconstructionError | None,
-) -> dict[str, Any]:  # fmt: skip
+) -> OdometryRunReport:  # fmt: skip
     """The report as in ``report.json``."""
     assert run.sequence is not None
     frames = frame_summary(result)
     maps = [map_row(result, m) for m in range(len(result.maps))]
-    timing = run.threads_cpu.timing(len(result.frame_idx), run.frames.tracking_s, run.sequence.frames_per_second)
-    if timing:
-        timing["tracking_ms"] = frame_statistics(facts.time_ms)
-    return {
-        "format": FORMAT,
-        "outcome": _outcome(run, failure),
-        "run": run.facts(),
-        "sequence": describe_sequence(run.sequence, result),
-        "frames": frames,
-        "maps": maps,
-        "ground_truth": _ground_truth_rows(run, result, facts, against),
-        "timing": timing,
-        "checks": make_checks(frames, maps, timing, facts) if maps else [],
-        "usage": run.usage,
-        "warnings": run.log.warnings,
-        "decisions": run.log.decisions,
-        "stages": run.stages,
-    }
+    timing = run.threads_cpu.timing(
+        len(result.frame_idx), run.frames.tracking_s, run.sequence.frames_per_second, frame_statistics(facts.time_ms)
+    )
+    return OdometryRunReport(
+        format=FORMAT,
+        outcome=_outcome(run, failure),
+        run=run.facts(),
+        sequence=describe_sequence(run.sequence, result),
+        frames=frames,
+        maps=maps,
+        ground_truth=_ground_truth_rows(run, result, facts, against),
+        timing=timing,
+        checks=make_checks(frames, maps, timing, facts) if maps else [],
+        usage=run.usage,
+        warnings=run.log.warnings,
+        decisions=run.log.decisions,
+        stages=run.stages,
+    )
 
 
-def _outcome(run: Tracking, failure: NoReconstructionError | None) -> dict[str, Any]:
+def _outcome(run: Tracking, failure: NoReconstructionError | None) -> Outcome:
     if run.events.is_cancelled:
         message = "stopped on request: this is what was tracked until then"
-        return {"exit_code": 130, "message": message, "advice": "the same command begins again"}
-    if failure is not None:
-        return {"exit_code": failure.exit_code, "message": str(failure), "advice": failure.advice}
-    return {"exit_code": 0, "message": "", "advice": None}
+        return Outcome(exit_code=InterruptedRunError.exit_code, message=message, advice="the same command begins again")
+    return Outcome.of(failure)
 
 
 def _ground_truth_rows(
     run: Tracking, result: OdometryResult, facts: FrameTable, against: Sequence[GroundTruthFit | None]
-) -> list[dict[str, Any]]:
+) -> list[GroundTruthReport]:
     """The error of each map, and of the live poses of the longest live map."""
     assert run.sequence is not None
-    rows = [{"map": m, "poses": "final", **ground_truth_row(fit)} for m, fit in enumerate(against) if fit is not None]
+    rows = [ground_truth_row(fit, m) for m, fit in enumerate(against) if fit is not None]
     if (
         run.sequence.ground_truth is not None
         and (live := fit_live_to_ground_truth(result, run.sequence.ground_truth, facts)) is not None
     ):
-        rows.insert(1, {"map": 0, "poses": "live", **ground_truth_row(live)})
+        rows.insert(1, ground_truth_row(live, 0, "live"))
     return rows
 
 
-def describe_sequence(sequence: sequences.Sequence, result: OdometryResult) -> Mapping[str, Any]:
-    """What was played, in plain values, and how its cameras were changed in the end."""
+def describe_sequence(sequence: sequences.Sequence, result: OdometryResult) -> SequenceReport:
+    """What was played, and how its cameras were changed in the end."""
     cameras = []
     for k, camera in enumerate(sequence.rig.cameras):
-        row: dict[str, Any] = {"width": camera.width, "height": camera.height, **_camera_row(camera)}
-        row |= {"focal_sigma_px": camera.focal_sigma, "source": camera.focal_source, "refined": None}
-        if result.maps and _camera_row(last := result.maps[0].reconstruction.cameras[k]) != _camera_row(camera):
-            row["refined"] = _camera_row(last)
-        cameras.append(row)
-    return {
-        "kind": sequence.kind,
-        "num_frames": sequence.num_frames,
-        "frames_per_second": sequence.frames_per_second,
-        "stereo": sequence.rig.is_stereo,
-        "imu": sequence.imu is not None,
-        "ground_truth": sequence.ground_truth is not None,
-        "orientation": sequence.orientation,
-        "cameras": cameras,
-    }
+        given, refined = camera_params(camera), None
+        if result.maps and (last := camera_params(result.maps[0].reconstruction.cameras[k])) != given:
+            refined = last
+        cameras.append(
+            SequenceCamera(
+                **given, width=camera.width, height=camera.height, focal_sigma_px=camera.focal_sigma,
+                source=camera.focal_source, refined=refined,
+            )
+        )  # fmt: skip
+    return SequenceReport(
+        kind=sequence.kind,
+        num_frames=sequence.num_frames,
+        frames_per_second=sequence.frames_per_second,
+        stereo=sequence.rig.is_stereo,
+        imu=sequence.imu is not None,
+        ground_truth=sequence.ground_truth is not None,
+        orientation=sequence.orientation,
+        cameras=cameras,
+    )
 
 
-def _camera_row(camera: Camera) -> dict[str, Any]:
-    params = dict(zip(PARAM_NAMES[camera.model], map(float, camera.params), strict=True))
-    return {"model": camera.model.name, "params": params}
+def camera_params(camera: Camera) -> CameraParams:
+    """Model and parameters of a camera."""
+    return CameraParams(model=camera.model.name, params=named_params(camera))

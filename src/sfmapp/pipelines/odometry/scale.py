@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,8 +29,8 @@ from sfmapp.odometry.inertial.scale import (
     scale_from_distance,
     scale_from_path,
 )
+from sfmapp.odometry.report import ScaleReport
 from sfmapp.odometry.result import MapResult, OdometryResult
-from sfmapp.pipelines.odometry.keyframes import KeyframeWatch
 
 STAGE = "scale"
 # Clocks that differ by less are as good as one: exposures alone shift them by so much.
@@ -104,22 +105,22 @@ def resolve_scale_request(scale_request: ScaleRequest | None, is_auto: bool, seq
 
 
 def scale_maps(
-    result: OdometryResult, scale_request: ScaleRequest, watch: KeyframeWatch, imu: Imu | None, events: Events
-) -> list[dict[str, Any]]:
-    """Put each map in metres that the wish can be had for, in place; returns a row for each, with the evidence."""
+    result: OdometryResult, scale_request: ScaleRequest, imu: Imu | None, events: Events
+) -> list[ScaleReport]:
+    """Put each map in metres that the request can be met for, in place; returns a row for each, with the evidence."""
     rows = []
     for m in range(len(result.maps)):
-        found = _estimate(result, m, scale_request, watch, imu)
-        row: dict[str, Any] = {"map": m, "source": found.source, "evidence": found.evidence}
+        found = _estimate(result, m, scale_request, imu)
+        row = ScaleReport(map=m, source=found.source, evidence=found.evidence)
         if isinstance(found, ScaleEstimate):
             rescale(result, m, found)
-            row |= {"metres_per_unit": found.scale, "sigma_relative": found.sigma_relative}
+            row = replace(row, metres_per_unit=found.scale, sigma_relative=found.sigma_relative)
             text = f"map {m} is in metres, from {found.source.replace('_', ' ')}, to {100 * found.sigma_relative:.2g} %"
             events.decided(STAGE, text, **row)
             if apart := _clocks_apart(found.evidence):
                 events.warned(STAGE, f"map {m}: {apart}")
         else:
-            row["reason"] = found.reason
+            row = replace(row, reason=found.reason)
             if found.contradiction is not None:
                 entry = result.maps[m]
                 result.maps[m] = replace(entry, contradictions=[*entry.contradictions, found.contradiction])
@@ -128,7 +129,7 @@ def scale_maps(
     return rows
 
 
-def _clocks_apart(evidence: dict[str, Any]) -> str:
+def _clocks_apart(evidence: Mapping[str, Any]) -> str:
     """What the offset between the clocks is, where it is one; empty elsewhere."""
     offset, sigma = evidence.get("clock_offset_s", 0.0), evidence.get("clock_sigma_s", np.inf)
     if not abs(offset) > max(_WORTH_SAYING_S, 3 * sigma):
@@ -157,11 +158,11 @@ def rescale(result: OdometryResult, map_idx: int, found: ScaleEstimate) -> None:
 
 
 def _estimate(
-    result: OdometryResult, m: int, scale_request: ScaleRequest, watch: KeyframeWatch, imu: Imu | None
+    result: OdometryResult, m: int, scale_request: ScaleRequest, imu: Imu | None
 ) -> ScaleEstimate | ScaleRefusal:
     entry = result.maps[m]
     if scale_request.marker is not None:
-        return scale_from_markers(entry.reconstruction, watch.sightings(entry), scale_request.marker.side)
+        return scale_from_markers(entry.reconstruction, entry.sightings, scale_request.marker.side)
     if scale_request.camera_height is not None:
         return scale_from_camera_height(entry.reconstruction, entry.keyframe_image_idx, scale_request.camera_height)
     if scale_request.distance is not None:

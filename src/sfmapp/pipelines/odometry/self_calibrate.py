@@ -5,12 +5,11 @@ from __future__ import annotations
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import PARAM_NAMES, CameraModel
+from sfmapp.camera.camera import CameraModel
 from sfmapp.contradictions import Contradiction, widened
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
@@ -20,6 +19,8 @@ from sfmapp.images.sequence import Frame, Sequence
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.pipelines.odometry.lens_fit import LensFit, fit_lens
 from sfmapp.pipelines.sparse.reconstruct import RunResult, reconstruct
+from sfmapp.report.document import named_params
+from sfmapp.report.model import CalibrationReport, ReconstructionReport
 from sfmapp.sequences.open import HOW_TO_CALIBRATE, open_sequence
 from sfmapp.workspace.options import Options
 
@@ -43,7 +44,7 @@ _MIN_GAIN = 0.05
 ADVICE = HOW_TO_CALIBRATE.partition("; or let ")[0]
 
 
-def self_calibrated(source: str, options: Options, events: Events) -> tuple[Options, dict[str, Any]]:
+def self_calibrated(source: str, options: Options, events: Events) -> tuple[Options, CalibrationReport]:
     """The same options with a camera, and how it was found.
 
     The first camera of the sequence is calibrated, and used alone. What the sequence itself says of its camera is not
@@ -65,10 +66,10 @@ def self_calibrated(source: str, options: Options, events: Events) -> tuple[Opti
         )
     run = _reconstruct(source, frames, options, events)
     found = _verdict(source, run.report, fit_lens(run.reconstruction), [frame.name for frame in frames])
-    text = ",".join([found["model"], *(f"{value!r}" for value in found["params"].values())])
-    events.finished(STAGE, found["text"])
-    if not found["is_settled"]:
-        events.warned(STAGE, f"the calibration is not settled: {found['text']}")
+    text = ",".join([found.model, *(f"{value!r}" for value in found.params.values())])
+    events.finished(STAGE, found.text)
+    if not found.is_settled:
+        events.warned(STAGE, f"the calibration is not settled: {found.text}")
     return replace(options, sequence=replace(wanted, camera=text)), found
 
 
@@ -172,17 +173,17 @@ def _reconstruct(source: str, frames: list[Frame], options: Options, events: Eve
                     f"{source}: no calibration from its first minute: {failure}",
                     f"begin where the camera moves sideways past something near (--start), or {ADVICE}",
                 ) from failure
-    errors = [run.report["models"][0]["mean_reprojection_error_px"] for run in runs]
+    errors = [run.report.models[0].mean_reprojection_error_px for run in runs]
     return runs[1] if len(errors) > 1 and errors[1] < (1 - _MIN_GAIN) * errors[0] else runs[0]
 
 
-def _verdict(source: str, report: dict[str, Any], lens: LensFit, names: list[str]) -> dict[str, Any]:
+def _verdict(source: str, report: ReconstructionReport, lens: LensFit, names: list[str]) -> CalibrationReport:
     """The camera of a good reconstruction and how good it is."""
-    model, camera = report["models"][0], lens.camera
+    model, camera = report.models[0], lens.camera
     relative = lens.focal_sigma_relative
     problem = ""
-    if model["num_registered"] < max(MIN_FRAMES, MIN_SHARE * len(names)):
-        problem = f"only {model['num_registered']} of {len(names)} frames could be joined"
+    if model.num_registered < max(MIN_FRAMES, MIN_SHARE * len(names)):
+        problem = f"only {model.num_registered} of {len(names)} frames could be joined"
     elif not relative <= MAX_FOCAL_SIGMA:
         known = f"to {100 * relative:.1f} % only" if np.isfinite(relative) else "not at all"
         problem = f"they tell the focal length {known}, {100 * MAX_FOCAL_SIGMA:g} % are needed"
@@ -193,26 +194,25 @@ def _verdict(source: str, report: dict[str, Any], lens: LensFit, names: list[str
         )
     text = (
         f"{camera.model.name}, f {camera.focal:.1f} px \N{PLUS-MINUS SIGN}{relative * camera.focal:.1f}, from "
-        f"{model['num_registered']} frames, reprojection error {model['mean_reprojection_error_px']:.2f} px"
+        f"{model.num_registered} frames, reprojection error {model.mean_reprojection_error_px:.2f} px"
     )
-    params = dict(zip(PARAM_NAMES[camera.model], map(float, camera.params), strict=True))
-    return {
-        "model": camera.model.name, "params": params, "sigma": lens.sigma, "focal_sigma_relative": float(relative),
-        "is_settled": relative <= SETTLED_SIGMA, "fit": lens.evidence, "frames": names,
-        "num_registered": model["num_registered"], "num_points": model["num_points"],
-        "mean_reprojection_error_px": model["mean_reprojection_error_px"], "text": text,
-    }  # fmt: skip
+    return CalibrationReport(
+        model=camera.model.name, params=named_params(camera), sigma=lens.sigma, focal_sigma_relative=float(relative),
+        is_settled=bool(relative <= SETTLED_SIGMA), fit=lens.evidence, frames=names,
+        num_registered=model.num_registered, num_points=model.num_points,
+        mean_reprojection_error_px=model.mean_reprojection_error_px, text=text,
+    )  # fmt: skip
 
 
-def widen(result: OdometryResult, calibration: dict[str, Any]) -> None:
+def widen(result: OdometryResult, calibration: CalibrationReport) -> None:
     """Add to the covariances of every map, in place, what the calibration leaves open; where its focal length is not
     settled, note that as well."""
-    relative = calibration["focal_sigma_relative"]
+    relative = calibration.focal_sigma_relative
     found = Contradiction(
         "self-calibration",
         f"the focal length is known to {100 * relative:.1f} % only: parts of the first minute contradict each other",
         f"begin where the camera moves sideways and turns (--start), or {ADVICE}",
-        {"focal_sigma_relative": relative, "settled": SETTLED_SIGMA, "parts": calibration["fit"]["parts"]},
+        {"focal_sigma_relative": relative, "settled": SETTLED_SIGMA, "parts": calibration.fit.parts},
         # a turn of 90 degrees is seen wrong by the same share, and so is what follows it
         rotation_sigma_deg=90.0 * relative, position_sigma_share=np.pi / 2 * relative, scale_sigma=relative,
     )  # fmt: skip
@@ -223,5 +223,5 @@ def widen(result: OdometryResult, calibration: dict[str, Any]) -> None:
             covariance = widened(covariance, spread, [found])
         if result.covariance is not None:
             result.covariance[mine] = widened(result.covariance[mine], spread, [found])
-        noted = [] if calibration["is_settled"] else [found]
+        noted = [] if calibration.is_settled else [found]
         result.maps[m] = replace(entry, covariance=covariance, contradictions=[*entry.contradictions, *noted])

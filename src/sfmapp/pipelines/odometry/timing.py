@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +11,7 @@ from numpy.typing import NDArray
 from sfmapp.events import Event
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.snapshot import FrameSnapshot
+from sfmapp.report.model import FrameTimes, TimingReport
 from sfmapp.report.odometry_document import FrameTable
 
 # the threads of a run by the beginning of their names, and what the report calls them
@@ -80,11 +79,13 @@ class ThreadTimes:
         """CPU seconds of all threads of a name."""
         return sum(seconds for (found, _), seconds in self._by_thread.items() if found == name)
 
-    def timing(self, num_frames: int, tracking_s: float, rate: float | None) -> dict[str, Any]:
+    def timing(
+        self, num_frames: int, tracking_s: float, rate: float | None, tracking_ms: FrameTimes | None = None
+    ) -> TimingReport | None:
         """Time of a frame: CPU milliseconds in all and of each part, and how that compares with the camera's rate;
-        empty without a frame."""
+        None without a frame."""
         if num_frames == 0 or self._begin is None:
-            return {}
+            return None
         cpu_s = self._end[0] - self._begin[0] - self.total(DRAWING)
         wall_s = self._end[1] - self._begin[1]
         parts = {"tracking": tracking_s, **{part: self.total(name) for name, part in _PART_OF.items()}}
@@ -93,20 +94,21 @@ class ThreadTimes:
         # what the listeners do, and all else that no clock of its own was read for
         parts["rest"] = max(0.0, cpu_s - sum(parts.values()))
         per_second = num_frames / wall_s if wall_s > 0 else 0.0
-        return {
-            "num_frames": num_frames,
-            "wall_s": round(wall_s, 3),
-            "frames_per_second": round(per_second, 2),
-            "times_real_time": round(per_second / rate, 3) if rate else None,
-            "cpu_s": round(cpu_s, 3),
-            "cpu_ms_per_frame": round(1e3 * cpu_s / num_frames, 3),
-            "parts_cpu_ms": {part: round(1e3 * value / num_frames, 3) for part, value in parts.items() if value > 0},
-        }
+        return TimingReport(
+            num_frames=num_frames,
+            wall_s=round(wall_s, 3),
+            frames_per_second=round(per_second, 2),
+            times_real_time=round(per_second / rate, 3) if rate else None,
+            cpu_s=round(cpu_s, 3),
+            cpu_ms_per_frame=round(1e3 * cpu_s / num_frames, 3),
+            parts_cpu_ms={part: round(1e3 * value / num_frames, 3) for part, value in parts.items() if value > 0},
+            tracking_ms=tracking_ms,
+        )
 
 
-def frame_statistics(values: NDArray[np.float64]) -> Mapping[str, float] | None:
+def frame_statistics(values: NDArray[np.float64]) -> FrameTimes | None:
     """Median, 95th percentile and worst of what was measured."""
     known = values[np.isfinite(values)]
     if not len(known):
         return None
-    return {"median": float(np.median(known)), "p95": float(np.percentile(known, 95)), "max": float(known.max())}
+    return FrameTimes(median=float(np.median(known)), p95=float(np.percentile(known, 95)), max=float(known.max()))

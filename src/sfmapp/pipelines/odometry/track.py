@@ -8,9 +8,9 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,11 @@ from sfmapp.images.sequence import Frame, GroundTruth, Imu, Sequence, SequenceKi
 from sfmapp.images.video import VideoSequence
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
-from sfmapp.pipelines.odometry.keyframes import KeyframeWatch
 from sfmapp.pipelines.odometry.live import GrowingTrajectories
 from sfmapp.pipelines.odometry.results import write_odometry
 from sfmapp.pipelines.odometry.scale import ScaleRequest, parse_scale, resolve_scale_request, scale_maps
 from sfmapp.pipelines.odometry.timing import FrameLog, ThreadTimes
+from sfmapp.report.model import OdometryRunReport, OdometryStages
 from sfmapp.sequences.open import open_sequence
 from sfmapp.viewer.live import LiveView, Screen
 from sfmapp.workspace.job import Job
@@ -53,7 +53,7 @@ class TrackResult(NamedTuple):
     """What the run found, and the report of it as in ``report.json``."""
 
     odometry: OdometryResult
-    report: dict[str, Any]
+    report: OdometryRunReport
 
 
 @dataclass(kw_only=True)
@@ -64,17 +64,17 @@ class Tracking(Job):
         frames: what was told of each frame.
         threads_cpu: CPU time by thread.
         live: draws what happens; None if nobody looks.
-        keyframes: looks at the images of keyframes.
-        wish: what the unit of length is to come from; None: an arbitrary one will do.
+        scale_request: what the unit of length is to come from; None: an arbitrary one will do.
         sequence: once it is open.
+        stages: what each part has said.
     """
 
     frames: FrameLog
     threads_cpu: ThreadTimes
     live: LiveView | None
-    keyframes: KeyframeWatch
     scale_request: ScaleRequest | None
     sequence: Sequence | None = None
+    stages: OdometryStages = field(default_factory=OdometryStages)
 
     def make_room(self) -> bool:
         """See :meth:`Job.make_room`; a recording under way is one as well, and its end will be told as such."""
@@ -132,11 +132,10 @@ def track_sequence(
         run = Tracking(
             source, workspace, options, events, watch or Stopwatch(), DecisionLog(), threads,
             frames=FrameLog(), threads_cpu=ThreadTimes(), live=live,
-            keyframes=KeyframeWatch(scale_request.detector() if scale_request else None), scale_request=scale_request,
-            sequence=sequence,
+            scale_request=scale_request, sequence=sequence,
         )  # fmt: skip
         growing = stack.enter_context(closing(GrowingTrajectories(workspace.folder, events, run.make_room)))
-        for listener in (growing, event_log, run.log, run.frames, run.keyframes, live):
+        for listener in (growing, event_log, run.log, run.frames, live):
             if listener is not None:
                 events.subscribe(listener)
         return _run(run, self_calibrate)
@@ -150,33 +149,38 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         if self_calibrate:
             from sfmapp.pipelines.odometry.self_calibrate import self_calibrated
 
-            options, run.stages["self_calibration"] = self_calibrated(run.source, options, events)
+            options, calibration = self_calibrated(run.source, options, events)
+            run.stages = replace(run.stages, self_calibration=calibration)
         if run.sequence is None:
             run.sequence = open_sequence(run.source, options.sequence, events)
         run.scale_request = resolve_scale_request(run.scale_request, options.scale.source is None, run.sequence)
     if run.live is not None:
         run.live.begin(run.sequence)
     with run.stage("kernels"):
-        run.stages["kernels"] = compile_odometry_kernels(events, inertial=run.sequence.imu is not None)
+        compiled = compile_odometry_kernels(events, inertial=run.sequence.imu is not None)
+        run.stages = replace(run.stages, kernels=compiled)
     run.save_first(lambda: run.workspace.begin(ODOMETRY, ""))
     watched = Watched(run.sequence, run)
     with run.measured("odometry"):
         result = run_odometry(
-            watched, options.odometry, seed=options.seed, threads=run.threads, events=events.without_cancellation()
+            watched,
+            options.odometry,
+            seed=options.seed,
+            threads=run.threads,
+            events=events.without_cancellation(),
+            markers=None if run.scale_request is None else run.scale_request.detector(),
         )
         run.threads_cpu.sample()
-    run.stages["odometry"] = result.report
-    if self_calibrate:
+    run.stages = replace(run.stages, odometry=result.report)
+    if run.stages.self_calibration is not None:
         from sfmapp.pipelines.odometry.self_calibrate import widen
 
-        widen(result, run.stages["self_calibration"])
+        widen(result, run.stages.self_calibration)
     with run.measured("scale"):
-        run.keyframes.colour(result)
         if run.scale_request is not None:
             without_cancellation = events.without_cancellation()
-            run.stages["scale"] = scale_maps(
-                result, run.scale_request, run.keyframes, watched.imu, without_cancellation
-            )
+            scaled = scale_maps(result, run.scale_request, watched.imu, without_cancellation)
+            run.stages = replace(run.stages, scale=scaled)
     result = replace(result, timestamps_s=watched.times_as_given(result))
     if isinstance(run.sequence, FileSequence | VideoSequence):  # frames in memory are all there
         result = result.with_repeated(run.sequence.repeated)
@@ -200,12 +204,13 @@ def no_map(run: Tracking, result: OdometryResult) -> NoReconstructionError:
     if num_repeated == seen - 1:
         return NoReconstructionError(f"{run.source}: all {seen} frames show the same picture", NO_MAP_ADVICE)
     text = f"{run.source}: {seen} frames were read, but no map could be begun"
-    for against in result.report.get("pairs", []):
-        return NoReconstructionError(f"{text}: {against['message']}", against["advice"])
-    looked = {name: result.report.get(f"looked_{name}", 0) for name in ("still", "turned")}
-    if looked["still"] >= _MOST_FRAMES * (seen - num_repeated):
+    if (report := result.report) is None:
+        return NoReconstructionError(text, NO_MAP_ADVICE)
+    for against in report.pairs:
+        return NoReconstructionError(f"{text}: {against.message}", against.advice)
+    if report.looked_still >= _MOST_FRAMES * (seen - num_repeated):
         text += ": the camera stands still, the picture hardly moves"
-    elif looked["turned"] >= _MOST_FRAMES * (seen - num_repeated):
+    elif report.looked_turned >= _MOST_FRAMES * (seen - num_repeated):
         text += ": the camera turns on the spot, or everything is too far away for how far it moves"
     return NoReconstructionError(text, NO_MAP_ADVICE)
 

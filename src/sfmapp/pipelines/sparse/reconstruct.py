@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import sfmapp
 from sfmapp.errors import NoReconstructionError, TooFewImagesError
@@ -30,6 +31,7 @@ from sfmapp.workspace.workspace import open_workspace
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet
+    from sfmapp.report.model import ReconstructionReport
     from sfmapp.scene.reconstruction import Reconstruction
 
 
@@ -37,7 +39,7 @@ class RunResult(NamedTuple):
     """The largest model, and the report of the run as in ``report.json``."""
 
     reconstruction: Reconstruction
-    report: dict[str, Any]
+    report: ReconstructionReport
 
 
 def reconstruct(
@@ -88,7 +90,7 @@ def reconstruct(
         run = Run(source, workspace, options, events, watch or Stopwatch(), decisions, threads, recorder=recorder)
         report = _run(run)
         model, _ = read_model(workspace.model())
-    found = report["models"][0]["num_registered"]
+    found = report.models[0].num_registered
     if options.min_registered is not None and found < options.min_registered:
         raise TooFewImagesError(
             f"{found} images are registered, {options.min_registered} were asked for",
@@ -97,12 +99,11 @@ def reconstruct(
     return RunResult(model, report)
 
 
-def _run(run: Run) -> dict[str, Any]:
+def _run(run: Run) -> ReconstructionReport:
     """The job: photographs, what still holds of an earlier run, models, and the report of it all."""
     with run.stage("images"):
-        run.image_set, run.stages["images"] = load_images(
-            run.source, run.options.images, run.events, threads=run.threads
-        )
+        run.image_set, images = load_images(run.source, run.options.images, run.events, threads=run.threads)
+        run.stages = replace(run.stages, images=images)
     keys = stage_keys(run.options, run.image_set)
     if report := results.earlier_report(run, keys):
         return report
@@ -129,25 +130,29 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
         Store(run.workspace.database, image_set, feature_keys, keys.matching) as store,
     ):
         with run.stage("features", keys.features):
-            run.features, run.stages["features"] = extract_features(
+            run.features, extracted = extract_features(
                 image_set, options.features, threads=threads, events=events,
                 known=store.known_features(), on_features=store.put_features,
             )  # fmt: skip
+            run.stages = replace(run.stages, features=extracted)
         with run.stage("pairs", keys.pairs):
-            pairs, run.stages["pairs"] = select_pairs(
+            pairs, selected = select_pairs(
                 image_set, run.features, options.pairs, seed=options.seed, threads=threads, events=events
             )
+            run.stages = replace(run.stages, pairs=selected)
         with run.stage("matching", keys.matching):
-            run.correspondences, run.stages["matching"] = match_images(
+            run.correspondences, matched = match_images(
                 image_set, run.features, pairs, options.matching, seed=options.seed, threads=threads, events=events,
                 known=store.known_pairs(pairs), on_pair=store.put_pair,
             )  # fmt: skip
             store.flush()
+            run.stages = replace(run.stages, matching=matched)
     with run.stage("mapping"):
-        models, run.stages["mapping"] = map_images(
+        models, mapped = map_images(
             image_set, run.features, run.correspondences, options.mapping,
             adjust_options=options.adjust, threads=threads, events=events,
         )  # fmt: skip
+        run.stages = replace(run.stages, mapping=mapped)
     return models
 
 

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sfmapp.errors import NoReconstructionError
 from sfmapp.geometry.orientation import MIRRORED
-from sfmapp.pipelines.stored_pixels import STORED
+from sfmapp.mapping.report import MappingReport, ModelEntry, Uncertainty
+from sfmapp.pipelines.stored_pixels import STORED, noted_orientations
 from sfmapp.report.document import FORMAT, camera_rows, funnel_of_images, funnel_without_matches, make_checks
 from sfmapp.report.html import render_html
+from sfmapp.report.model import ImageReport, Outcome, ReconstructionReport
+from sfmapp.reporting import NamedReason, document_text
 from sfmapp.workspace.job import FAILED, NO_MODEL, NOT_WANTED, WRITTEN
-from sfmapp.workspace.plain_json import report_text
+from sfmapp.workspace.layout import REPORT
+from sfmapp.workspace.manifest import raise_as_before
 
 if TYPE_CHECKING:
     from sfmapp.pipelines.sparse.keys import StageKeys
@@ -24,38 +29,39 @@ if TYPE_CHECKING:
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 
 
-def earlier_report(run: Run, keys: StageKeys) -> dict[str, Any] | None:
+def earlier_report(run: Run, keys: StageKeys) -> ReconstructionReport | None:
     """The report of an earlier run, if all that this run would write is there and still holds.
 
     Raises:
         NoReconstructionError: the earlier run ended so, and nothing has changed.
     """
     workspace = run.workspace
-    report = workspace.read_json("report.json")
-    if not workspace.is_current("mapping", keys.mapping) or not report or report.get("format") != FORMAT:
+    if not workspace.is_current("mapping", keys.mapping):
         return None
     has_recording = workspace.recording.is_file() or workspace.manifest.get("recording") in (NO_MODEL, FAILED)
     if (run.recorder is not None and not has_recording) or not (workspace.folder / "report.html").is_file():
         return None
-    outcome = report["outcome"]
-    if outcome["exit_code"] == NoReconstructionError.exit_code:
-        raise NoReconstructionError(f"{outcome['message']} (as before: nothing has changed)", outcome["advice"])
-    models = [workspace.model(idx) for idx in range(len(report["models"]))]
+    entry = workspace.manifest["stages"]["mapping"]
+    raise_as_before(entry)
+    models = [workspace.model(idx) for idx in range(entry["num_models"])]
     if not all((model / name).is_file() for model in models for name in MODEL_FILES):
         return None
-    report["run"] |= {"is_up_to_date": True, **run.watch.read()}
-    return report
+    report = workspace.read_report(ReconstructionReport)
+    if report is None:
+        return None
+    return replace(report, run=replace(report.run, is_up_to_date=True, **run.watch.read()))
 
 
 def write_results(
     run: Run, keys: StageKeys, models: Sequence[Reconstruction], failure: NoReconstructionError | None = None
-) -> dict[str, Any]:
+) -> ReconstructionReport:
     """Write the models, the recording and the report, in this order; returns the report."""
     workspace, manifest = run.workspace, run.workspace.manifest
-    if failure is not None and failure.report is not None:
-        run.stages["mapping"] = failure.report
+    if failure is not None and isinstance(failure.report, MappingReport):
+        run.stages = replace(run.stages, mapping=failure.report)
     keypoints = [features.keypoints[:, :2].astype(np.float64) for features in run.features]
-    run.save_first(lambda: workspace.begin("mapping", keys.mapping, pixels=STORED))
+    facts = {"pixels": STORED, "orientations": noted_orientations(run.image_set.images)} if run.image_set else {}
+    run.save_first(lambda: workspace.begin("mapping", keys.mapping, **facts))
     with run.stage("output"):
         run.save_first(lambda: workspace.write_models(models, keypoints))
     with run.stage("recording"):
@@ -63,9 +69,11 @@ def write_results(
     report = _make_report(run, models, failure)
     page = render_html(report, models[0] if models else None)
     run.save_first(lambda: workspace.write_text("report.html", page))
-    report["run"] |= run.watch.read()  # the last measurement that can still be written down
-    run.save_first(lambda: workspace.write_text("report.json", report_text(report)))
-    workspace.finish("mapping", run.usage.get("mapping", {}))
+    took = run.watch.read()  # the last measurement that can still be written down
+    report = replace(report, run=replace(report.run, **took))
+    run.save_first(lambda: workspace.write_text(REPORT, document_text(report)))
+    outcome = Outcome.of(failure)
+    workspace.finish("mapping", run.usage.get("mapping"), outcome=outcome, num_models=len(models), run=took)
     manifest["usage"] = run.usage
     run.save_first(workspace.save)
     return report
@@ -94,46 +102,53 @@ def _record(run: Run, models: Sequence[Reconstruction]) -> str:
     return FAILED
 
 
-def _make_report(run: Run, models: Sequence[Reconstruction], failure: NoReconstructionError | None) -> dict[str, Any]:
+def _make_report(
+    run: Run, models: Sequence[Reconstruction], failure: NoReconstructionError | None
+) -> ReconstructionReport:
     assert run.image_set is not None
-    mapped = run.stages.get("mapping", {}).get("models") or []
-    summaries = [
-        model.summary() | {"contradictions": row["contradictions"], "apart": row["apart"]}
+    mapped = run.stages.mapping.models if run.stages.mapping is not None else []
+    entries = [
+        ModelEntry(**model.summary(), contradictions=row.contradictions, apart=row.apart)
         for model, row in zip(models, mapped, strict=True)
     ]
-    uncertainty = mapped[0]["uncertainty"] if mapped else {}
     images = _image_rows(run, failure)
-    cameras = camera_rows(run.image_set, models[0] if models else None, uncertainty)
-    return {
-        "format": FORMAT,
-        "outcome": {
-            "exit_code": failure.exit_code if failure else 0,
-            "message": str(failure) if failure else "",
-            "advice": failure.advice if failure else None,
-        },
-        "run": run.facts(),
-        "models": summaries,
-        "checks": make_checks(summaries, images, cameras) if models else [],
-        "images": images,
-        "skipped": [{"name": name, "reason": reason} for name, reason in run.image_set.skipped],
-        "cameras": cameras,
-        "usage": run.usage,
-        "warnings": run.log.warnings,
-        "decisions": run.log.decisions,
-        "stages": run.stages,
-    }
+    cameras = camera_rows(
+        run.image_set, models[0] if models else None, mapped[0].uncertainty if mapped else Uncertainty()
+    )
+    return ReconstructionReport(
+        format=FORMAT,
+        outcome=Outcome.of(failure),
+        run=run.facts(),
+        models=entries,
+        checks=make_checks(entries, images, cameras) if models else [],
+        images=images,
+        skipped=[NamedReason(name=name, reason=reason) for name, reason in run.image_set.skipped],
+        cameras=cameras,
+        usage=run.usage,
+        warnings=run.log.warnings,
+        decisions=run.log.decisions,
+        stages=run.stages,
+    )
 
 
-def _image_rows(run: Run, failure: NoReconstructionError | None) -> list[dict[str, Any]]:
+def _image_rows(run: Run, failure: NoReconstructionError | None) -> list[ImageReport]:
     assert run.image_set is not None
     names = [record.name for record in run.image_set.images]
     if run.correspondences is None:
         return funnel_without_matches(names, str(failure))
-    mapping = run.stages.get("mapping") or {}
-    rows = funnel_of_images(names, run.features, run.correspondences, mapping.get("images", []), run.options.mapping)
+    mapped = run.stages.mapping.images if run.stages.mapping is not None else []
+    rows = funnel_of_images(names, run.features, run.correspondences, mapped, run.options.mapping)
     is_mirrored = [record.orientation in MIRRORED for record in run.image_set.images]
-    for row, is_mirror in zip(rows, is_mirrored, strict=True):
-        if row.get("failed_at") == "pairs" and (not is_mirror) in is_mirrored:
-            row["reason"] = "by EXIF's orientation it is stored as a mirror image of what others show, or they of it"
-            row["remedy"] = "Write the mirrored files anew, upright: exiftran -ai, mogrify -auto-orient."
-    return rows
+    return [
+        _mirrored(row) if row.failed_at == "pairs" and (not is_mirror) in is_mirrored else row
+        for row, is_mirror in zip(rows, is_mirrored, strict=True)
+    ]
+
+
+def _mirrored(row: ImageReport) -> ImageReport:
+    """An image that has no pair, where others are stored as mirror images of it."""
+    return replace(
+        row,
+        reason="by EXIF's orientation it is stored as a mirror image of what others show, or they of it",
+        remedy="Write the mirrored files anew, upright: exiftran -ai, mogrify -auto-orient.",
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from sfmapp.report.model import Stages
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.job import Job
 
@@ -21,9 +22,11 @@ class Run(Job):
     Attributes:
         recorder: watches the run for a recording; None if none is wanted.
         image_set, features, correspondences: results so far.
+        stages: what each stage has said.
     """
 
     recorder: RecordingListener | None = None
     image_set: ImageSet | None = None
     features: list[Features] = field(default_factory=list)
     correspondences: Correspondences | None = None
+    stages: Stages = field(default_factory=Stages)
