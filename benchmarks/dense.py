@@ -31,6 +31,7 @@ from machine import RESULTS, ROOT, describe_machine
 from sfmapp.evaluation.clouds import score_cloud
 from sfmapp.evaluation.measured import run_measured
 from sfmapp.formats.ply_reader import read_ply_geometry
+from sfmapp.reporting import plain
 
 DATA = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))
 PROTOTYPE = ROOT.parent / "shared" / "research" / "prototypes"
@@ -157,7 +158,7 @@ def scores(case: Case, xyz: NDArray[np.float64]) -> dict[str, Any]:
     if case.ground_truth is None:
         return {}
     score = score_cloud(xyz, read_ply_geometry(case.ground_truth).xyz, case.distances, box=case.box, threads=2)
-    found: dict[str, Any] = {"score": score.summary()}
+    found: dict[str, Any] = {"score": plain(score.summary())}
     labels = ground_truth_labels(case.ground_truth)
     if labels is not None:
         is_scored = ~np.isnan(score.ground_truth_distance)

@@ -29,6 +29,7 @@ from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.evaluation.second_opinion import SecondOpinionOptions, ask_second_opinion
 from sfmapp.formats.colmap import has_model, read_model
 from sfmapp.formats.ground_truth import read_ground_truth
+from sfmapp.reporting import plain
 
 DATA = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))
 DEFAULT_SETS = ("fountain-P11", "herz-jesus-P8", "lund-door", "temple-sparse-ring")
@@ -111,12 +112,13 @@ def costs(usage: ProcessUsage) -> dict[str, Any]:
 def results(data: DataSet, model_folder: Path) -> dict[str, Any]:
     """Counts, and errors against the ground truth, of a model; both programs are judged by the same code."""
     model = read_model(model_folder)[0] if has_model(model_folder) else None
-    summary: dict[str, Any] = model.summary() if model is not None else {"num_registered": 0}
+    summary: dict[str, Any] = plain(model.summary()) if model is not None else {"num_registered": 0}
     values: dict[str, Any] = {"model": summary | {"num_images": len(data.image_names)}}
     if data.ground_truth is not None:
         ground_truth = read_ground_truth(data.ground_truth).for_images(data.image_names)
         names, poses = (model.image_names, model.cam_from_world) if model is not None else ([], [])
-        values["ground_truth"] = evaluate_poses(names, poses, ground_truth.names, ground_truth.cam_from_world).summary()
+        errors = evaluate_poses(names, poses, ground_truth.names, ground_truth.cam_from_world)
+        values["ground_truth"] = plain(errors.summary())
     return values
 
 

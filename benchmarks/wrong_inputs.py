@@ -40,6 +40,7 @@ from sfmapp.evaluation.trajectory import Trajectory, absolute_error, associate
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.pipelines.odometry.track import track_sequence
+from sfmapp.report.model import OdometryRunReport
 from sfmapp.workspace.options import load_options
 
 Array = NDArray[np.float64]
@@ -227,11 +228,11 @@ def run(case: Case, seed: int, args: argparse.Namespace) -> dict[str, Any]:
     return row | judged(result, report, sequence)
 
 
-def judged(result: OdometryResult, report: dict[str, Any], sequence: Recorded) -> dict[str, Any]:
+def judged(result: OdometryResult, report: OdometryRunReport, sequence: Recorded) -> dict[str, Any]:
     """The error of the largest map in metres and in what it states."""
     entry = result.maps[0]
     # how fast the machine was says nothing about the result
-    red = [c["name"] for c in report["checks"] if c["light"] == "red" and not c["name"].startswith("speed")]
+    red = [check.name for check in report.checks if check.light == "red" and not check.name.startswith("speed")]
     frames = np.searchsorted(result.frame_idx, entry.keyframe_frame_idx)
     poses = entry.reconstruction.cam_from_world[entry.keyframe_image_idx]
     pairs = associate(

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfmapp.adjust import kernels, solver
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying, pose_rows
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, project
 from sfmapp.camera.lens import ROW, distort
 from sfmapp.errors import InterruptedRunError

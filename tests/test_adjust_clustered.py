@@ -7,7 +7,8 @@ import pytest
 
 from sfmapp.adjust.clustered import ClusteredCovariances, clustered_covariances
 from sfmapp.adjust.covariance import errors_in_gauge, estimate_covariances
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera
 

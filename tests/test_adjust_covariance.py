@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from sfmapp.adjust.covariance import errors_in_gauge, estimate_covariances
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import CameraModel
 from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera
 

@@ -10,8 +10,9 @@ import pytest
 from gtsam.symbol_shorthand import K, X
 
 from sfmapp.adjust.factors import gtsam_pose
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import CameraModel
 from sfmapp.errors import UsageError
 from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera

@@ -11,8 +11,9 @@ import pytest
 from sfmapp.adjust import solver
 from sfmapp.adjust.covariance import errors_in_gauge, estimate_covariances
 from sfmapp.adjust.factors import gtsam_pose
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying, make_problem
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import CameraModel
 from sfmapp.geometry import rigid3
 from sfmapp.scene.rig import Rig, RigImages

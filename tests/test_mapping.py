@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events

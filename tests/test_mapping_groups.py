@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from photo_groups import Place, make_place, thinned
-from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3, similarity

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nadir_block import nadir_block
-from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.camera.camera import Camera, CameraModel, simple_camera
 from sfmapp.events import Events
 from sfmapp.mapping.incremental import map_images

@@ -10,7 +10,7 @@ import pytest
 
 from rendered_worlds.rendering import Optics, Renderer
 from rendered_worlds.worlds import look_alike_world
-from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.events import Events
 from sfmapp.features.extract import FeatureOptions, extract_features

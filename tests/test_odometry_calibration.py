@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from sfmapp.adjust.calibration import RAW, reduce_to_calibration
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity

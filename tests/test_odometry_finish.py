@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import odometry_sequences as played
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.errors import InterruptedRunError
 from sfmapp.events import Events

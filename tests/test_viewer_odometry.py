@@ -20,8 +20,9 @@ from sfmapp.geometry import rigid3, similarity
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.viewer import live as live_module
-from sfmapp.viewer.live import LiveView, SendQueue, read_message, thinned_stride, write_message
+from sfmapp.viewer.live import LiveView, SendQueue, thinned_stride
 from sfmapp.viewer.live_scene import POINT_BLOCK, LiveMap, frustum_lines, unbroken
+from sfmapp.viewer.messages import read_message, write_message
 from sfmapp.viewer.view import open_live_viewer, server_command, window_command
 
 CAMERA = simple_camera(CameraModel.PINHOLE, WIDTH, HEIGHT, 120.0)

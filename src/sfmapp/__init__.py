@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from sfmapp.kernel_cache import provide_kernel_cache
 
 if TYPE_CHECKING:
-    from sfmapp.adjust.solver import AdjustOptions
+    from sfmapp.adjust.options import AdjustOptions
     from sfmapp.api.geometry import adjust_bundle, estimate_pose, triangulate, verify_pair
     from sfmapp.api.images import load_images
     from sfmapp.api.jobs import (
@@ -111,7 +111,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "AdjustOptions": "adjust.solver",
+    "AdjustOptions": "adjust.options",
     "ArraySequence": "images.array_sequence",
     "Camera": "camera.camera",
     "CameraModel": "camera.camera",

@@ -54,10 +54,17 @@ class Events:
         self._progress: dict[str, tuple[int, int | None]] = {}
         self._start = time.monotonic()
 
-    def subscribe(self, listener: Listener) -> None:
-        """Add a listener. It is called under a lock, in the thread that reports: it must be quick."""
+    def subscribe(self, listener: Listener, *, first: bool = False) -> None:
+        """Add a listener, behind the others or before them. It is called under a lock, in the thread that reports: it
+        must be quick."""
         with self._lock:
-            self._listeners.append(listener)
+            self._listeners.insert(0 if first else len(self._listeners), listener)
+
+    def unsubscribe(self, listener: Listener) -> None:
+        """Take away a listener that was added; one that was not is no error."""
+        with self._lock:
+            # a new list would not reach the copies without cancellation
+            self._listeners[:] = [other for other in self._listeners if other is not listener]
 
     def started(self, stage: str, message: str = "", total: int | None = None, **data: Any) -> None:
         """A stage begins; total is its number of steps, None where it cannot be known."""

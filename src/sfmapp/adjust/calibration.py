@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.kernels import CANON, LOSS_IDS, POINT, POSE, SCRATCH, RobustLoss, linearize
+from sfmapp.adjust.options import Loss
 from sfmapp.adjust.problem import pose_rows
-from sfmapp.adjust.solver import Loss
 from sfmapp.camera.lens import ROW
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction

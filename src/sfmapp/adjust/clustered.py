@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import constrained_inverse, gauge_of, pose_covariances, reduced_matrix
 from sfmapp.adjust.kernels import POINT, SCRATCH, ImageArrays, LensArrays, PointArrays, RobustLoss, linearize
-from sfmapp.adjust.solver import AdjustOptions, Engine, make_engine
+from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.solver import Engine, make_engine
 from sfmapp.camera.lens import ROW
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction

@@ -31,8 +31,9 @@ from sfmapp.adjust.kernels import (
     linearize,
     robust_weight,
 )
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import EVERYTHING, Problem, Varying
-from sfmapp.adjust.solver import AdjustOptions, Engine, make_engine
+from sfmapp.adjust.solver import Engine, make_engine
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import ROW
 from sfmapp.errors import InputError

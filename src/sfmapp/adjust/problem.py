@@ -354,3 +354,17 @@ def _gather(
         num_kept += 1
         ptr[num_kept] = n
     return kept[:num_kept].copy(), ptr[: num_kept + 1].copy(), image[:n].copy(), xy[:n].copy(), used
+
+
+def write_back(problem: Problem, reconstruction: Reconstruction) -> None:
+    """Put the state of a problem into its reconstruction; what was constant is not touched."""
+    moved = np.flatnonzero(problem.image_block >= 0)
+    reconstruction.move_images(problem.image_idx[moved], problem.poses[problem.image_pose[moved]])
+    free = ~problem.is_constant
+    reconstruction.point_xyz[problem.track_idx[free]] = problem.xyz[free]
+    for c, camera_idx in enumerate(problem.camera_idx):
+        if problem.camera_block[c] >= 0:
+            camera = reconstruction.cameras[camera_idx]
+            params = np.array(camera.params)
+            params[problem.free.params[c]] = free_values(problem, problem.canonical, c)
+            reconstruction.cameras[camera_idx] = camera.with_params(params)

@@ -17,8 +17,9 @@ from gtsam.symbol_shorthand import C, K, L, V, X
 from numpy.typing import NDArray
 
 from sfmapp.adjust.factors import ExtraFactors, gtsam_pose
-from sfmapp.adjust.problem import Problem, Varying, free_values, make_problem
-from sfmapp.adjust.solver import AdjustOptions, AdjustReport, IntrinsicPriors, write_back
+from sfmapp.adjust.options import AdjustOptions, AdjustReport
+from sfmapp.adjust.priors import IntrinsicPriors
+from sfmapp.adjust.problem import Problem, Varying, free_values, make_problem, write_back
 from sfmapp.camera.camera import PARAM_NAMES, Camera, canonical_from_params
 from sfmapp.errors import UsageError
 from sfmapp.events import Events

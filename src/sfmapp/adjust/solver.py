@@ -6,8 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,88 +14,20 @@ from numpy.typing import NDArray
 from sfmapp.adjust import kernels
 from sfmapp.adjust.kernels import BlockArrays, RobustLoss, Scratch, State, Sums, find_slot
 from sfmapp.adjust.linear import aligned_zeros, assemble, factorize_tiles, mark_pairs, number_keys, solve_tiles
-from sfmapp.adjust.problem import EVERYTHING, Problem, Varying, free_values, make_problem
-from sfmapp.camera.camera import PARAM_NAMES, Camera
+from sfmapp.adjust.options import AdjustOptions, AdjustReport
+from sfmapp.adjust.priors import IntrinsicPriors
+from sfmapp.adjust.problem import EVERYTHING, Problem, Varying, make_problem, write_back
+from sfmapp.camera.camera import Camera
 from sfmapp.events import Events
-from sfmapp.option_checks import Range, check_options, positive
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Loss = Literal["trivial", "huber", "cauchy"]
 
-# Where the loss begins to bend, in standard deviations: at 2.4 it is 95 % efficient, and a little lower it sheds tails.
-_LOSS_SIGMAS = 2.0
 # Up to this many blocks, and above if this share of all pairs meets, the dense tile factor beats gtsam's sparse one.
 _MAX_DENSE_BLOCKS, _DENSE_SHARE = 160, 0.3
 # Work worth a chunk of its own, and the most memory that the chunks' private sums may take together.
 _CHUNK_OBSERVATIONS, _MAX_CHUNKS, _CHUNK_BYTES = 16384, 8, 1 << 26
-_RANGES = {
-    "loss_scale_px": positive(),
-    "max_iterations": Range(1, 100_000),
-    "relative_cost_tolerance": Range(0.0, 1.0),
-    "initial_damping": positive(),
-    "principal_point_sigma_px": positive(),
-    "distortion_sigma": positive(),
-}
-
-
-@dataclass(frozen=True)
-class AdjustOptions:
-    """How a bundle adjustment is done. Lengths are in pixels; the noise of an observation counts as one pixel."""
-
-    loss: Loss = "trivial"  # robust loss on the length of each residual; huber and cauchy as in Ceres and gtsam
-    loss_scale_px: float = 1.0  # residual length at which the loss begins to bend
-    max_iterations: int = 50  # Levenberg-Marquardt steps, rejected ones included
-    relative_cost_tolerance: float = 1e-6  # stop when an accepted step lowers the cost by less than this share
-    initial_damping: float = 1e-4  # first share of the diagonal that is added to it; Ceres' 1 / trust region radius
-    refine_focal: bool = True  # focal lengths may change
-    refine_distortion: bool = True  # distortion coefficients may change
-    refine_principal_point: bool = False  # principal points may change
-    principal_point_sigma_px: float | None = None  # prior around the a priori principal point; None for no prior
-    distortion_sigma: float | None = None  # prior of each coefficient around its a priori value; None for no prior
-    backend: Literal["schur", "gtsam"] = "schur"  # schur: our kernels; gtsam: one factor per observation, the reference
-
-    def __post_init__(self) -> None:
-        check_options("adjust", self, _RANGES)
-
-    @property
-    def refine(self) -> tuple[bool, bool, bool]:
-        """Focal lengths, distortion, principal points."""
-        return self.refine_focal, self.refine_distortion, self.refine_principal_point
-
-    def robust(self, sigma_px: float) -> AdjustOptions:
-        """With a loss that lets go of what is far off the noise, unless another one was asked for."""
-        if self.loss != AdjustOptions().loss:
-            return self
-        return replace(self, loss="cauchy", loss_scale_px=_LOSS_SIGMAS * sigma_px)
-
-
-@dataclass(frozen=True)
-class AdjustReport:
-    """What an adjustment did.
-
-    Attributes:
-        termination: ``converged``, ``iterations`` (limit reached), ``stalled`` (no damping gives a better state) or
-            ``nothing`` (no unknowns or no observations).
-        num_iterations, num_rejected: steps tried, and those of them that were refused.
-        initial_cost, final_cost: half the sum of the losses, priors and extra factors included; square pixels.
-        num_images, num_cameras, num_points, num_observations: what took part; images and cameras only if they vary.
-        solver: ``dense``, ``sparse`` or ``gtsam``.
-        time_s: wall clock.
-    """
-
-    termination: str
-    num_iterations: int = 0
-    num_rejected: int = 0
-    initial_cost: float = 0.0
-    final_cost: float = 0.0
-    num_images: int = 0
-    num_cameras: int = 0
-    num_points: int = 0
-    num_observations: int = 0
-    solver: str = "dense"
-    time_s: float = 0.0
 
 
 def adjust_bundle(
@@ -172,76 +103,6 @@ def make_engine(
     if extras is not None:
         extras.attach(problem)
     return Engine(problem, options, IntrinsicPriors(problem, prior_cameras, options), extras)
-
-
-def compile_kernels() -> None:
-    """Compile, or load from the cache, every kernel of this package, by running each on next to nothing."""
-    from sfmapp.adjust.clustered import clustered_covariances
-    from sfmapp.adjust.covariance import estimate_covariances
-    from sfmapp.adjust.pose import refine_pose
-    from sfmapp.scene.synthetic import make_scene
-
-    scene = make_scene(0, 3, 8)
-    model = scene.observed.copy()
-    adjust_bundle(model, AdjustOptions(max_iterations=2), varying=Varying(images=np.array([True, True, False])))
-    fixed = AdjustOptions(refine_focal=False, refine_distortion=False)
-    estimate_covariances(model, fixed)
-    clustered_covariances(make_scene(0, 3, 40).observed, fixed)
-    camera, tracks = model.cameras[0], model.tracks
-    refine_pose(camera.canonical, model.cam_from_world[0], model.point_xyz, tracks.obs_xy[:8])
-    no_images = np.zeros(0, np.int32)
-    mark_pairs(np.zeros(1, np.int64), no_images, no_images, no_images, no_images, np.eye(1, dtype=bool))
-    find_slot(*number_keys(np.arange(3)), 0)
-
-
-def write_back(problem: Problem, reconstruction: Reconstruction) -> None:
-    """Put the state of a problem into its reconstruction; what was constant is not touched."""
-    moved = np.flatnonzero(problem.image_block >= 0)
-    reconstruction.move_images(problem.image_idx[moved], problem.poses[problem.image_pose[moved]])
-    free = ~problem.is_constant
-    reconstruction.point_xyz[problem.track_idx[free]] = problem.xyz[free]
-    for c, camera_idx in enumerate(problem.camera_idx):
-        if problem.camera_block[c] >= 0:
-            camera = reconstruction.cameras[camera_idx]
-            params = np.array(camera.params)
-            params[problem.free.params[c]] = free_values(problem, problem.canonical, c)
-            reconstruction.cameras[camera_idx] = camera.with_params(params)
-
-
-class IntrinsicPriors:
-    """Independent Gaussians on free intrinsics: what gtsam's PriorFactorVector would add, without its import."""
-
-    def __init__(self, problem: Problem, cameras: Sequence[Camera] | None, options: AdjustOptions) -> None:
-        rows = []
-        for c, camera_idx in enumerate(problem.camera_idx if cameras is not None else ()):
-            assert cameras is not None
-            camera = cameras[camera_idx]
-            first = 6 if problem.camera_block[c] < problem.num_pose_blocks else 0
-            for n, param in enumerate(problem.free.params[c]):
-                sigma = self._sigma(PARAM_NAMES[camera.model][param], camera, options)
-                if sigma is not None:
-                    slots = problem.free.slot[problem.free.ptr[c] : problem.free.ptr[c + 1]]
-                    columns = problem.free.column[problem.free.ptr[c] : problem.free.ptr[c + 1]]
-                    slot = slots[np.flatnonzero(columns == first + n)[0]]
-                    rows.append((c, slot, problem.camera_block[c] * 8 + first + n, camera.params[param], sigma))
-        table = np.array(rows, np.float64).reshape(-1, 5)
-        self.camera, self.slot, self.index = (table[:, k].astype(np.int64) for k in range(3))
-        self.mean, self.weight = table[:, 3], 1.0 / table[:, 4] ** 2
-
-    @staticmethod
-    def _sigma(name: str, camera: Camera, options: AdjustOptions) -> float | None:
-        if name[0] == "f":
-            return camera.focal_sigma
-        return options.principal_point_sigma_px if name[0] == "c" else options.distortion_sigma
-
-    def cost(self, canonical: Array) -> float:
-        error = canonical[self.camera, self.slot] - self.mean
-        return float(0.5 * (self.weight * error * error).sum())
-
-    def add(self, canonical: Array, own: Array, gradient: Array) -> None:
-        """Add weight and gradient to the blocks' own tiles (B * 64,) and to the gradient (B * 8,)."""
-        own[self.index // 8 * 64 + self.index % 8 * 9] += self.weight
-        gradient[self.index] += self.weight * (canonical[self.camera, self.slot] - self.mean)
 
 
 class Engine:

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.adjust import solver
+from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.pose import refine_pose
 from sfmapp.adjust.problem import Varying
-from sfmapp.adjust.solver import AdjustOptions, AdjustReport
 from sfmapp.api.reconstruction import Reconstruction
 from sfmapp.api.stages import num_threads
 from sfmapp.camera.camera import Camera, pixels_to_normalized, project

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from sfmapp.api.images import Images, load_images
 from sfmapp.api.reconstruction import Reconstruction
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sfmapp.pipelines.evaluate import EvaluateOptions, Evaluation
     from sfmapp.pipelines.undistort import UndistortResult
     from sfmapp.pipelines.validate import Validation
+    from sfmapp.report.model import ExportReport, OdometryRunReport, ReconstructionReport, RefineReport
 
 FilePath = str | os.PathLike[str]
 
@@ -38,7 +39,7 @@ class RunResult(NamedTuple):
     """
 
     reconstruction: Reconstruction
-    report: Any
+    report: ReconstructionReport | None
 
 
 class TrackResult(NamedTuple):
@@ -51,7 +52,7 @@ class TrackResult(NamedTuple):
     """
 
     odometry: OdometryResult
-    report: Any
+    report: OdometryRunReport | RefineReport | None
 
 
 def reconstruct(
@@ -409,7 +410,9 @@ def undistort(
     )  # fmt: skip
 
 
-def export(source: FilePath | Reconstruction, target: str, path: FilePath, *, images: FilePath | None = None) -> Any:
+def export(
+    source: FilePath | Reconstruction, target: str, path: FilePath, *, images: FilePath | None = None
+) -> ExportReport:
     """Write a model in another program's format, read it back, and compare every reprojection.
 
     Args:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import Covariances, estimate_covariances
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying
-from sfmapp.adjust.solver import AdjustOptions
 from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
 from sfmapp.events import Events

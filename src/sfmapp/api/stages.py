@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.api.images import Images, load_images
 from sfmapp.api.reconstruction import Reconstruction
 from sfmapp.errors import InputError

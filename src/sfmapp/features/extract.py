@@ -43,22 +43,27 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class FeatureOptions:
-    """Options of the stage ``features``."""
+    """Options of the stage ``features``.
+
+    Attributes:
+        kind: Detector and descriptor; orb is some ten times faster and less exact.
+        max_num_features: Keypoints per image, at most; the strongest are kept.
+        max_size_px: Larger images are scaled down to this longer side for detection; coordinates stay those of the full
+            image.
+        contrast_threshold: SIFT: least difference of Gaussians, grey levels in [0, 1]; a third of COLMAP's, so that the
+            budget fills.
+        edge_threshold: SIFT: largest ratio of principal curvatures; larger keeps more keypoints along edges.
+        max_num_orientations: SIFT: descriptors at one place, at most; more than one only where the budget has room.
+        memory_mb: Memory that all workers together may take; None for half of what is free at the start.
+    """
 
     kind: Literal["sift", "orb"] = "sift"
-    """Detector and descriptor; orb is some ten times faster and less exact."""
     max_num_features: int = 8192
-    """Keypoints per image, at most; the strongest are kept."""
     max_size_px: int = 3200
-    """Larger images are scaled down to this longer side for detection; coordinates stay those of the full image."""
     contrast_threshold: float = 0.02 / 9
-    """SIFT: least difference of Gaussians, grey levels in [0, 1]; a third of COLMAP's, so that the budget fills."""
     edge_threshold: float = 10.0
-    """SIFT: largest ratio of principal curvatures; larger keeps more keypoints along edges."""
     max_num_orientations: int = 2
-    """SIFT: descriptors at one place, at most; more than one only where the budget has room."""
     memory_mb: int | None = field(default=None, metadata=RESOURCE)
-    """Memory that all workers together may take; None for half of what is free at the start."""
 
     def __post_init__(self) -> None:
         check_options("features", self, _RANGES)

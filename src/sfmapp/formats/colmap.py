@@ -21,6 +21,8 @@ from sfmapp.formats.colmap_text import read_text, read_text_cameras, read_text_i
 from sfmapp.scene.reconstruction import Reconstruction
 
 _STEMS = ("cameras", "images", "points3D", "rigs", "frames")
+# of a binary model, which is what we write
+MODEL_FILES = tuple(f"{stem}.bin" for stem in _STEMS)
 _FILES = frozenset(f"{stem}.{ending}" for stem in _STEMS for ending in ("bin", "txt"))
 
 
@@ -58,6 +60,11 @@ def write_model_text(folder: str | Path, reconstruction: Reconstruction, keypoin
     model = model_from_reconstruction(reconstruction, keypoints)
     with replaced_folder(Path(folder), _FILES) as beside:
         write_text(beside, model)
+
+
+def is_model_file(path: Path) -> bool:
+    """Whether a file is by its name one of a model, binary or text."""
+    return path.name in _FILES
 
 
 def has_model(folder: str | Path) -> bool:

@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.camera.camera import Camera
 from sfmapp.contradictions import Contradiction
 from sfmapp.errors import NoReconstructionError
@@ -429,7 +429,7 @@ def _image_reports(
 
 def compile_kernels() -> None:
     """Compile the kernels of mapping and adjustment, or load them from numba's cache: one round on a tiny scene."""
-    from sfmapp.adjust import solver
+    from sfmapp.adjust.compile import compile_kernels as compile_adjustment
     from sfmapp.scene.synthetic import make_scene, true_correspondences
 
     scene = make_scene(0, 3, 24)
@@ -447,4 +447,4 @@ def compile_kernels() -> None:
     join.compile_kernels()
     near_views.compile_kernels()
     repair.compile_kernels()
-    solver.compile_kernels()
+    compile_adjustment()

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import PARAM_NAMES, Camera, simple_camera
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import estimate_covariances
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import PARAM_NAMES, Camera
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3

@@ -24,24 +24,29 @@ class MatchingOptions:
 
     Distances between descriptors are Euclidean with SIFT descriptors scaled to unit norm (0 to sqrt 2), and a share of
     the bits for ORB.
+
+    Attributes:
+        max_ratio: Best distance over second best, in both directions (Lowe, IJCV 2004).
+        max_distance: Largest distance of a match.
+        coarse_features: Features of each image, largest first, whose matches guide those of all others along the
+            epipolar lines. Images with fewer than twice as many, and pairs on which these do not agree, are matched in
+            full.
+        max_error_px: Inlier threshold on pixels in the full-size image. None: 0.2 % of the image diagonal, within 2 to
+            8 px.
+        min_inliers: Fewest verified matches of a pair that counts.
+        min_e_f_ratio: An essential matrix is believed if it explains this share of what the fundamental matrix
+            explains.
+        max_h_ratio: A pair is planar or panoramic if a homography explains more than this share of the inliers.
+        max_ransac_trials: Most RANSAC hypotheses for each model.
     """
 
-    # Best distance over second best, in both directions (Lowe, IJCV 2004).
     max_ratio: float = 0.8
-    # Largest distance of a match.
     max_distance: float = 0.7
-    # Features of each image, largest first, whose matches guide those of all others along the epipolar lines. Images
-    # with fewer than twice as many, and pairs on which these do not agree, are matched in full.
     coarse_features: int = 1536
-    # Inlier threshold on pixels in the full-size image. None: 0.2 % of the image diagonal, within 2 to 8 px.
     max_error_px: float | None = None
-    # Fewest verified matches of a pair that counts.
     min_inliers: int = 15
-    # An essential matrix is believed if it explains this share of what the fundamental matrix explains.
     min_e_f_ratio: float = 0.95
-    # A pair is planar or panoramic if a homography explains more than this share of the inliers.
     max_h_ratio: float = 0.8
-    # Most RANSAC hypotheses for each model.
     max_ransac_trials: int = 5000
 
     def __post_init__(self) -> None:

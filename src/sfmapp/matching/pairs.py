@@ -52,24 +52,27 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class PairOptions:
-    """Options of the stage ``pairs``."""
+    """Options of the stage ``pairs``.
+
+    Attributes:
+        method: auto: exhaustive for small sets, else the union of retrieval, sequence and GPS.
+        exhaustive_limit: auto: sets of at most this many images are matched exhaustively.
+        num_neighbors: Retrieval: images that look most alike, per image.
+        num_words: Retrieval: size of the vocabulary; more words tell finer differences and cost more memory.
+        num_query_features: Retrieval: keypoints per image that are looked at, the largest first.
+        sequence_overlap: Sequence: each image is paired with so many next ones.
+        sequence_quadratic: Sequence: also with those 2, 4, 8, ... images further, up to 2 to the power of the overlap.
+        num_gps_neighbors: GPS: nearest images, per image.
+    """
 
     method: Literal["auto", "exhaustive", "retrieval", "sequential"] = "auto"
-    """auto: exhaustive for small sets, else the union of retrieval, sequence and GPS."""
     exhaustive_limit: int = 60
-    """auto: sets of at most this many images are matched exhaustively."""
     num_neighbors: int = 30
-    """Retrieval: images that look most alike, per image."""
     num_words: int = 64
-    """Retrieval: size of the vocabulary; more words tell finer differences and cost more memory."""
     num_query_features: int = 1500
-    """Retrieval: keypoints per image that are looked at, the largest first."""
     sequence_overlap: int = 10
-    """Sequence: each image is paired with so many next ones."""
     sequence_quadratic: bool = True
-    """Sequence: also with those 2, 4, 8, ... images further, up to 2 to the power of the overlap."""
     num_gps_neighbors: int = 20
-    """GPS: nearest images, per image."""
 
     def __post_init__(self) -> None:
         check_options("pairs", self, _RANGES)

@@ -22,22 +22,39 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class OdometryOptions:
-    """How a camera is followed through a sequence. Shares and angles where possible, so that no size is assumed."""
+    """How a camera is followed through a sequence. Shares and angles where possible, so that no size is assumed.
 
-    max_tracks: int = 600  # corners followed at a time, spread over the image
-    keyframe_parallax: float = 0.02  # median shift beyond rotation since the last keyframe, share of the image width
-    keyframe_loss: float = 0.65  # a keyframe is due when fewer than this share of its mapped points is still tracked
-    cull_seen: float = 0.95  # a keyframe is dropped once this share of its points is seen by three others; 1 for never
-    window: int = 10  # keyframes whose poses the local adjustment may change
-    window_anchors: int = 10  # earlier keyframes that take part unchanged, those that share the most points
-    min_triangulation_deg: float = 1.0  # smallest angle between the rays of a new point of one moving camera
-    min_stereo_deg: float = 0.2  # the same with a rig, whose baseline is known: a depth to a tenth or so
-    max_lost_s: float = 1.0  # seconds without relocalisation after which a new map is begun
-    motion: Literal["free", "planar"] = "free"  # planar: a wheeled robot on level ground, for the first two views
-    loops: bool = True  # look for places seen before, close loops and join maps
-    refine_camera: bool = True  # there, refine the calibration where the images clearly contradict it
-    smooth: bool = False  # also give the trajectory through an error-state filter: steadier, short gaps bridged
-    covariance: bool = True  # covariances of the keyframes, at the end
+    Attributes:
+        max_tracks: corners followed at a time, spread over the image
+        keyframe_parallax: median shift beyond rotation since the last keyframe, share of the image width
+        keyframe_loss: a keyframe is due when fewer than this share of its mapped points is still tracked
+        cull_seen: a keyframe is dropped once this share of its points is seen by three others; 1 for never
+        window: keyframes whose poses the local adjustment may change
+        window_anchors: earlier keyframes that take part unchanged, those that share the most points
+        min_triangulation_deg: smallest angle between the rays of a new point of one moving camera
+        min_stereo_deg: the same with a rig, whose baseline is known: a depth to a tenth or so
+        max_lost_s: seconds without relocalisation after which a new map is begun
+        motion: planar: a wheeled robot on level ground, for the first two views
+        loops: look for places seen before, close loops and join maps
+        refine_camera: there, refine the calibration where the images clearly contradict it
+        smooth: also give the trajectory through an error-state filter: steadier, short gaps bridged
+        covariance: covariances of the keyframes, at the end
+    """
+
+    max_tracks: int = 600
+    keyframe_parallax: float = 0.02
+    keyframe_loss: float = 0.65
+    cull_seen: float = 0.95
+    window: int = 10
+    window_anchors: int = 10
+    min_triangulation_deg: float = 1.0
+    min_stereo_deg: float = 0.2
+    max_lost_s: float = 1.0
+    motion: Literal["free", "planar"] = "free"
+    loops: bool = True
+    refine_camera: bool = True
+    smooth: bool = False
+    covariance: bool = True
 
     def __post_init__(self) -> None:
         check_options("odometry", self, _RANGES)
@@ -45,8 +62,11 @@ class OdometryOptions:
 
 @dataclass(frozen=True)
 class ScaleOptions:
-    """Where metres come from when there is one camera."""
+    """Where metres come from when there is one camera.
 
-    # marker:DICT:METRES, distance:FRAME:FRAME:METRES, distance:path:METRES, camera_height:METRES, imu or arbitrary;
-    # auto: the IMU where there is one
+    Attributes:
+        source: marker:DICT:METRES, distance:FRAME:FRAME:METRES, distance:path:METRES, camera_height:METRES, imu or
+            arbitrary; auto: the IMU where there is one
+    """
+
     source: str | None = None

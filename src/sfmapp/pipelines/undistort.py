@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -25,7 +24,7 @@ from sfmapp.dense.undistort import resample
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.atomic import replaced_file
-from sfmapp.formats.colmap import read_model
+from sfmapp.formats.colmap import MODEL_FILES, read_model
 from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import decode_file, read_file, read_mask_file
 from sfmapp.images.rewrite import encode, encode_mask, without_turn
@@ -34,13 +33,12 @@ from sfmapp.report.model import UndistortedCamera, UndistortNumbers, UndistortRe
 from sfmapp.reporting import NamedReason, from_plain
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.undistortion import Undistortion, has_distortion, plan_undistortion, undistort_reconstruction
+from sfmapp.workspace.job import Job
 from sfmapp.workspace.keys import input_key, stage_key
-from sfmapp.workspace.layout import MODEL_FILES, UNDISTORT
-from sfmapp.workspace.listeners import EventLog
+from sfmapp.workspace.layout import UNDISTORT
 from sfmapp.workspace.manifest import recorded_versions
 from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
-from sfmapp.workspace.workspace import Workspace, open_workspace
 
 STAGE = UNDISTORT
 IMAGES, MASKS = "images", "masks"
@@ -60,21 +58,18 @@ class UndistortResult:
     report: UndistortReport
 
 
-@dataclass
-class _Job:
+@dataclass(kw_only=True)
+class _Job(Job):
     """An undistortion under way.
 
     Attributes:
-        workspace: the folder.
         photographs: that are there.
         undistortions: one for each.
         lost: (name, reason) of photographs that could not be read.
     """
 
-    workspace: Workspace
-    photographs: Photographs
-    undistortions: list[Undistortion]
-    events: Events
+    photographs: Photographs = field(init=False)
+    undistortions: list[Undistortion] = field(init=False)
     lost: list[tuple[str, str]] = field(default_factory=list)
 
 
@@ -113,33 +108,32 @@ def undistort(
         raise UsageError(f"blank_pixels is {blank_pixels:g}, expected a share from 0 to 1")
     if max_size is not None and max_size < 1:
         raise UsageError(f"max_size is {max_size}, expected 1 pixel or more")
-    options, events, watch = options or Options(), events or Events(), watch or Stopwatch()
-    where = find_source(source, output, images, options, UNDISTORT)
+    where = find_source(source, output, images, options or Options(), UNDISTORT)
     _check_target(where)
     model, keypoints = read_model(where.model, events)
     if not len(model.registered_idx):
         raise NoReconstructionError(f"{where.model}: expected images with a pose, found none")
-    with _opened(where, events) as workspace:
-        photographs = find_photographs(
-            model, where.images, where.options.images,
-            is_upright=where.is_upright, with_copies=True, threads=options.num_workers, events=events,
+    with _Job.opened(UNDISTORT, where.images, where.output, where.options, events=events, watch=watch) as job:
+        _note_source(job, where)
+        job.photographs = find_photographs(
+            model, where.images, job.options.images,
+            is_upright=where.is_upright, with_copies=True, threads=job.threads, events=job.events,
         )  # fmt: skip
-        planned = [plan_undistortion(camera, blank_pixels, max_size) for camera in photographs.cameras]
-        job = _Job(workspace, photographs, planned, events)
+        job.undistortions = [plan_undistortion(camera, blank_pixels, max_size) for camera in job.photographs.cameras]
         key = stage_key(
-            (__name__,), None, [blank_pixels, max_size, where.is_upright],
-            model_digest(where.model), [input_key(record) for record in photographs.records], photographs.missing,
+            (__name__,), None, [blank_pixels, max_size, where.is_upright], model_digest(where.model),
+            [input_key(record) for record in job.photographs.records], job.photographs.missing,
         )  # fmt: skip
         known = _known_numbers(job, key)
         numbers = known
         if numbers is None:
             _begin(job, key)
-            _write_photographs(job, options.num_workers)
+            _write_photographs(job)
             numbers = _write_model(job, model, keypoints)
-            workspace.finish(STAGE, watch.read(), report=numbers)
-            workspace.save()
-        report = UndistortReport(**numbers, is_up_to_date=known is not None, run=watch.read())
-        return UndistortResult(workspace.folder, report)
+            job.workspace.finish(STAGE, job.watch.read(), report=numbers)
+            job.workspace.save()
+        report = UndistortReport(**numbers, is_up_to_date=known is not None, run=job.watch.read())
+        return UndistortResult(job.workspace.folder, report)
 
 
 def _check_target(where: DenseSource) -> None:
@@ -151,21 +145,14 @@ def _check_target(where: DenseSource) -> None:
             raise UsageError(f"{path}: {role} is in {where.output}, where the results go", "choose another folder: -o")
 
 
-@contextmanager
-def _opened(where: DenseSource, events: Events) -> Iterator[Workspace]:
-    with (
-        open_workspace(where.output, UNDISTORT) as workspace,
-        EventLog(workspace.log, events, source=str(where.images), version=sfmapp.__version__) as event_log,
-    ):
-        events.subscribe(event_log)
-        workspace.manifest |= {
-            # what the model belongs to, for the commands that take this workspace; and what that was made of
-            "source": os.path.abspath(where.output / IMAGES),
-            "photographs": os.path.abspath(where.images),
-            "model": os.path.abspath(where.model),
-            "versions": {"sfmapp": sfmapp.__version__, **recorded_versions()},
-        }
-        yield workspace
+def _note_source(job: _Job, where: DenseSource) -> None:
+    job.workspace.manifest |= {
+        # what the model belongs to, for the commands that take this workspace; and what that was made of
+        "source": os.path.abspath(where.output / IMAGES),
+        "photographs": os.path.abspath(where.images),
+        "model": os.path.abspath(where.model),
+        "versions": {"sfmapp": sfmapp.__version__, **recorded_versions()},
+    }
 
 
 def _target(job: _Job, folder: str, name: str) -> Path:
@@ -209,7 +196,7 @@ def _known_numbers(job: _Job, key: str) -> UndistortNumbers | None:
         return None
 
 
-def _write_photographs(job: _Job, threads: int) -> None:
+def _write_photographs(job: _Job) -> None:
     """Write them all. One that cannot be read is noted in ``job.lost``, and costs the others nothing."""
     records, events = job.photographs.records, job.events
     events.started(STAGE, f"{len(records)} photographs", total=len(records))
@@ -231,7 +218,7 @@ def _write_photographs(job: _Job, threads: int) -> None:
         events.advanced(STAGE)
         return reason
 
-    pool = ThreadPoolExecutor(threads)
+    pool = ThreadPoolExecutor(job.threads)
     try:
         job.lost += [found for found in pool.map(write, range(len(records))) if found is not None]
     finally:

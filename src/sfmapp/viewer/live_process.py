@@ -14,8 +14,8 @@ from pathlib import Path
 def main(recording: str, url: str) -> None:
     """Draw messages until there are no more."""
     os.nice(5)  # tracking goes first where cores are few
-    from sfmapp.viewer.live import read_message
     from sfmapp.viewer.live_rrd import LiveDrawing
+    from sfmapp.viewer.messages import read_message
 
     path = Path(recording) if recording else None
     beside = path.with_name(f".{path.name}.{os.getpid()}.part") if path else None

@@ -1,23 +1,34 @@
-"""What the steps of one run share."""
+"""The shell that every command runs in which writes a workspace: lock, log, thread limits, listeners, usage, outcome.
+
+A command opens it with :meth:`Job.opened` and does its work in the block, step by step with :meth:`Job.stage`::
+
+    with Job.opened(CALIBRATE, source, output, options, events=events, watch=watch) as job:
+        job.note_inputs({})
+        with job.stage("corners", stage_key((__name__,), job.options.images, digest)):
+            ...
+        job.workspace.save()
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Self
 
 import sfmapp
 from sfmapp.errors import InputError, is_full
-from sfmapp.events import Events
+from sfmapp.events import Events, Listener
 from sfmapp.report.model import RunFacts
 from sfmapp.reporting import Usage
-from sfmapp.workspace.listeners import DecisionLog
+from sfmapp.workspace.listeners import DecisionLog, EventLog
 from sfmapp.workspace.manifest import recorded_versions
-from sfmapp.workspace.options import Options, options_to_dict
+from sfmapp.workspace.options import Options, options_to_dict, with_absolute_paths
 from sfmapp.workspace.usage import Stopwatch
-from sfmapp.workspace.workspace import Workspace
+from sfmapp.workspace.workspace import Workspace, open_workspace
 
 # what the manifest says of a recording
 WRITTEN, FAILED, NO_MODEL, NOT_WANTED = "written", "failed", "no model", "not wanted"
@@ -29,7 +40,11 @@ class Job:
 
     Attributes:
         source: what the user gave to work on.
-        threads: workers.
+        workspace: the results, locked.
+        options: with absolute paths.
+        events: what happens is told here; subscribe with :meth:`listen`, so that it ends with the job.
+        watch: since the run began.
+        log: the decisions and warnings so far.
         usage: what each stage took, by name.
     """
 
@@ -39,9 +54,58 @@ class Job:
     events: Events
     watch: Stopwatch
     log: DecisionLog
-    threads: int
+    until_end: ExitStack
     usage: dict[str, Usage] = field(default_factory=dict)
     started: datetime = field(default_factory=lambda: datetime.now(UTC))
+
+    @classmethod
+    @contextmanager
+    def opened(
+        cls, command: str, source: str | os.PathLike[str], output: str | os.PathLike[str], options: Options | None, *,
+        events: Events | None = None, watch: Stopwatch | None = None, **own: Any,
+    ) -> Iterator[Self]:  # fmt: skip
+        """Lock and open the workspace of a command until the block ends, log what happens in it, and limit the threads
+        of the linear algebra.
+
+        Args:
+            command: that writes the workspace, as in :mod:`sfmapp.workspace.layout`.
+            source: what the command works on.
+            output: folder of the workspace: new, empty, or of an earlier run of the same command.
+            options: of all stages; None for the defaults.
+            events: told by the stages and asked whether to stop; None: nobody listens from outside.
+            watch: started earlier, if more is to be counted than the block.
+            own: what a kind of job has beside; see its attributes.
+
+        Raises:
+            UsageError: the folder holds something else, or another run is at work in it.
+            InputError: it cannot be written.
+        """
+        from threadpoolctl import threadpool_limits
+
+        source, events = os.fspath(source), events or Events()
+        with ExitStack() as stack:
+            workspace = stack.enter_context(open_workspace(Path(output), command))
+            log = DecisionLog()
+            events.subscribe(log)
+            stack.callback(events.unsubscribe, log)
+            lines = stack.enter_context(EventLog(workspace.log, events, source=source, version=sfmapp.__version__))
+            # our workers use the cores; sums must not depend on how many the linear algebra beneath them would use
+            stack.enter_context(threadpool_limits(1, "blas"))
+            options = with_absolute_paths(options or Options())
+            job = cls(source, workspace, options, events, watch or Stopwatch(), log, stack, **own)
+            job.listen(lines)
+            yield job
+
+    @property
+    def threads(self) -> int:
+        """Workers."""
+        return self.options.num_workers
+
+    def listen(self, listener: Listener | None, *, first: bool = False) -> None:
+        """Let a listener hear what happens until the end of the job; None is no listener. ``first``: before others."""
+        if listener is not None:
+            self.events.subscribe(listener, first=first)
+            self.until_end.callback(self.events.unsubscribe, listener)
 
     @contextmanager
     def stage(self, name: str, key: str | None = None) -> Iterator[None]:

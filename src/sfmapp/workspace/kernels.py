@@ -27,7 +27,7 @@ ODOMETRY_MODULES = (
     "sfmapp.odometry.frontend.epipolar_search",
     "sfmapp.geometry.epipolar",
     "sfmapp.mapping.structure",
-    "sfmapp.adjust.solver",
+    "sfmapp.adjust.compile",
     "sfmapp.adjust.calibration",
     "sfmapp.odometry.loops.relocalize",
     "sfmapp.odometry.loops.pose_graph",

@@ -9,7 +9,6 @@ __all__ = [
     "FORMAT",
     "LOCK",
     "MANIFEST",
-    "MODEL_FILES",
     "ODOMETRY",
     "RECONSTRUCT",
     "REFINE",
@@ -24,4 +23,3 @@ RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "re
 LOCK, REPORT = ".lock", "report.json"
 # where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0
 USUAL_FOLDERS = ("images", "../images", "../../images")
-MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import difflib
 import enum
 import inspect
-import itertools
 import math
 import os
 import textwrap
@@ -19,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import SfmError, UsageError
 from sfmapp.features.extract import FeatureOptions
@@ -169,30 +167,12 @@ def _rows(options: Any) -> list[tuple[str, Any, Any, str]]:
 
 
 def field_comments(options_class: type) -> dict[str, str]:
-    """What is said about each field: in the string under it, a comment above or beside it, or ``Attributes:``."""
+    """What ``Attributes:`` in the docstring of a class says about each of its fields; empty for nothing."""
     comments = {f.name: "" for f in dataclasses.fields(options_class)}
-    source = textwrap.dedent(inspect.getsource(options_class))
-    lines = [line.strip() for line in source.splitlines()]
-    body = ast.parse(source).body[0]
-    assert isinstance(body, ast.ClassDef)
-    for statement, following in itertools.zip_longest(body.body, body.body[1:]):
-        if not isinstance(statement, ast.AnnAssign) or not isinstance(statement.target, ast.Name):
-            continue
-        match following:
-            case ast.Expr(value=ast.Constant(value=str(text))):
-                comments[statement.target.id] = " ".join(text.split())
-            case _:
-                _, beside, text = lines[(statement.end_lineno or 1) - 1].partition("  # ")
-                above = itertools.takewhile(lambda line: line.startswith("#"), lines[statement.lineno - 2 :: -1])
-                comments[statement.target.id] = (
-                    text if beside else " ".join(line[1:].strip() for line in [*above][::-1])
-                )
     _, _, section = inspect.cleandoc(options_class.__doc__ or "").partition("Attributes:\n")
-    for entry in textwrap.dedent(section).split("\n\n")[0].replace("\n    ", " ").splitlines():
+    for entry in textwrap.dedent(section.split("\n\n")[0]).replace("\n    ", " ").splitlines():
         names, _, text = entry.partition(":")
-        for name in names.split(","):
-            if name.strip() in comments:
-                comments[name.strip()] = comments[name.strip()] or text.strip()
+        comments |= {name: text.strip() for name in map(str.strip, names.split(",")) if name in comments}
     return comments
 
 

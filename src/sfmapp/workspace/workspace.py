@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.reporting import R, Usage, from_plain, to_json
-from sfmapp.workspace.layout import LOCK, MANIFEST, MODEL_FILES, RECONSTRUCT, REPORT
+from sfmapp.workspace.layout import LOCK, MANIFEST, RECONSTRUCT, REPORT
 from sfmapp.workspace.lock import locked
 from sfmapp.workspace.manifest import check_command, manifest_of, new_manifest, read_json
 
@@ -109,6 +109,8 @@ class Workspace:
         self._remove_models(len(models))
 
     def _remove_models(self, first: int) -> None:
+        from sfmapp.formats.colmap import MODEL_FILES
+
         for folder in self.folder.glob("sparse/*"):
             if folder.name.isdigit() and int(folder.name) >= first:
                 for name in MODEL_FILES:

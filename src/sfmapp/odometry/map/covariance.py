@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.clustered import clustered_covariances
 from sfmapp.adjust.covariance import pose_errors_in_gauge
-from sfmapp.adjust.solver import AdjustOptions
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 

@@ -22,8 +22,9 @@ from scipy.special import chdtri
 
 from sfmapp.adjust.calibration import RAW, CalibrationSystem, reduce_to_calibration
 from sfmapp.adjust.covariance import similarity_basis
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import CameraModel
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3, similarity

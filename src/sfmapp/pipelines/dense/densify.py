@@ -77,7 +77,7 @@ def dense(
         InterruptedRunError: ``events`` was asked to stop; the same call resumes.
     """
     where = find_source(source, output, images, with_absolute_paths(options or Options()))
-    with dense_job(where, events or Events(), watch) as job:
+    with dense_job(where, events, watch) as job:
         return _run(job, maps=maps, record=record)
 
 

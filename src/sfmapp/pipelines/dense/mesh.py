@@ -76,7 +76,7 @@ def mesh_workspace(
     # the views are those that the patches were made of, whatever is said of them now
     earlier = options_from_dict({"dense": manifest.get("options", {}).get("dense", {})})
     options = replace(options, dense=earlier.dense)
-    with dense_job(find_source(folder, None, None, options), events or Events(), watch) as job:
+    with dense_job(find_source(folder, None, None, options), events, watch) as job:
         return _run(job, record)
 
 

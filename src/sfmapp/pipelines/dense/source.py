@@ -5,27 +5,24 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import sfmapp
 from sfmapp.dense.photographs import find_photographs
 from sfmapp.dense.prepare import DensePlan, plan_views
 from sfmapp.dense.report import ViewsReport
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
-from sfmapp.formats.colmap import has_model, read_model
+from sfmapp.formats.colmap import has_model, is_model_file, read_model
 from sfmapp.pipelines.stored_pixels import has_stored_pixels
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.layout import DENSE, ODOMETRY, RECONSTRUCT, UNDISTORT, USUAL_FOLDERS
-from sfmapp.workspace.listeners import DecisionLog, EventLog
 from sfmapp.workspace.manifest import image_root, read_manifest
 from sfmapp.workspace.options import Options, options_from_dict, options_to_dict
 from sfmapp.workspace.usage import Stopwatch
-from sfmapp.workspace.workspace import open_workspace
 
 # the workspace in the folder of a COLMAP model, if no other place is named
 INSIDE = "sfmapp"
@@ -80,23 +77,13 @@ class DenseJob(Job):
         self.workspace.save()
 
 
-@contextmanager
-def dense_job(where: DenseSource, events: Events, watch: Stopwatch | None = None) -> Iterator[DenseJob]:
-    """Open the workspace of a dense run or of its mesh, and listen in."""
-    from threadpoolctl import threadpool_limits
-
-    options, source = where.options, str(where.images)
-    threads = options.num_workers
-    with (
-        open_workspace(where.output, where.command) as workspace,
-        EventLog(workspace.log, events, source=source, version=sfmapp.__version__) as event_log,
-        # our workers use the cores; sums must not depend on how many the linear algebra beneath them would use
-        threadpool_limits(1, "blas"),
-    ):
-        job = DenseJob(source, workspace, options, events, watch or Stopwatch(), DecisionLog(), threads, where=where)
-        for listener in (event_log, job.log):
-            events.subscribe(listener)
-        yield job
+def dense_job(
+    where: DenseSource, events: Events | None, watch: Stopwatch | None = None
+) -> AbstractContextManager[DenseJob]:
+    """Open the workspace of a dense run or of its mesh."""
+    return DenseJob.opened(
+        where.command, where.images, where.output, where.options, events=events, watch=watch, where=where
+    )
 
 
 def plan_source(job: DenseJob) -> tuple[DensePlan, ViewsReport]:
@@ -229,6 +216,6 @@ def model_digest(model: Path) -> str:
     """Hash of the files of a model."""
     digest = hashlib.blake2b(digest_size=16)
     for path in sorted(model.iterdir()):
-        if path.suffix in (".bin", ".txt") and path.stem in ("cameras", "images", "points3D", "rigs", "frames"):
+        if is_model_file(path):
             digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()

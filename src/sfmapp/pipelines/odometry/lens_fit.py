@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import estimate_covariances
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import PARAM_NAMES, Camera
 from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.report.model import LensEvidence

@@ -9,7 +9,6 @@ import os
 from collections.abc import Mapping
 from collections.abc import Sequence as Rows
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-import sfmapp
-from sfmapp.adjust.solver import AdjustOptions, adjust_bundle
+from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
@@ -46,11 +45,9 @@ from sfmapp.sequences.open import open_sequence
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.kernels import kernels_compiling
 from sfmapp.workspace.layout import ODOMETRY, REFINE
-from sfmapp.workspace.listeners import DecisionLog, EventLog
 from sfmapp.workspace.manifest import read_manifest
-from sfmapp.workspace.options import Options, options_from_dict, with_absolute_paths
+from sfmapp.workspace.options import Options, options_from_dict
 from sfmapp.workspace.usage import Stopwatch
-from sfmapp.workspace.workspace import open_workspace
 
 Array = NDArray[np.float64]
 
@@ -99,24 +96,16 @@ def refine(
         NoReconstructionError: there is no map in it.
         InterruptedRunError: ``events`` was asked to stop.
     """
-    from threadpoolctl import threadpool_limits
-
-    source, options, events = Path(output), with_absolute_paths(options or Options()), events or Events()
+    source = Path(output)
     manifest = read_manifest(source, ODOMETRY)
     before = read_odometry(source)
     if not before.maps:
         raise NoReconstructionError(f"{source} holds no map to refine", "run sfmapp odometry first")
-    threads = options.num_workers
-    with ExitStack() as stack:
-        workspace = stack.enter_context(open_workspace(Path(refined or source / FOLDER), REFINE))
-        event_log = stack.enter_context(EventLog(workspace.log, events, source=str(source), version=sfmapp.__version__))
-        stack.enter_context(threadpool_limits(1, "blas"))
-        job = Job(str(source), workspace, options, events, watch or Stopwatch(), DecisionLog(), threads)
-        for listener in (event_log, job.log):
-            events.subscribe(listener)
+    target = refined or source / FOLDER
+    with Job.opened(REFINE, source, target, options, events=events, watch=watch) as job:
         job.note_inputs({})
-        stack.enter_context(kernels_compiling(events, job.usage))
-        pool = stack.enter_context(ThreadPoolExecutor(threads))
+        job.until_end.enter_context(kernels_compiling(job.events, job.usage))
+        pool = job.until_end.enter_context(ThreadPoolExecutor(job.threads))
         sequence = _open_sequence(manifest, job, required=photos is not None)
         after, added = _refined(job, before, sequence, photos, free_intrinsics, pool)
         return RefineResult(after, _write(job, before, after, sequence, added))

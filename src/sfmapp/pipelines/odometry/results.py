@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from sfmapp.images import sequence as sequences
-    from sfmapp.pipelines.odometry.track import Tracking
+    from sfmapp.pipelines.odometry.tracking import Tracking
     from sfmapp.workspace.workspace import Workspace
 
 _OUR_TRAJECTORY = re.compile(r"trajectory(_live)?(-\d+)?\.tum|trajectory_smooth\.tum|trajectory\.kitti(\.frames)?")

@@ -7,15 +7,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-import sfmapp
 from sfmapp.errors import InterruptedRunError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.images.frame_reader import FileSequence
@@ -23,20 +20,16 @@ from sfmapp.images.sequence import Frame, GroundTruth, Imu, Sequence, SequenceKi
 from sfmapp.images.video import VideoSequence
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
-from sfmapp.pipelines.odometry.live import GrowingTrajectories
 from sfmapp.pipelines.odometry.results import write_odometry
-from sfmapp.pipelines.odometry.scale import ScaleRequest, parse_scale, resolve_scale_request, scale_maps
-from sfmapp.pipelines.odometry.timing import FrameLog, ThreadTimes
-from sfmapp.report.model import OdometryRunReport, OdometryStages
+from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps
+from sfmapp.pipelines.odometry.tracking import Tracking
+from sfmapp.report.model import OdometryRunReport
 from sfmapp.sequences.open import open_sequence
-from sfmapp.viewer.live import LiveView, Screen
-from sfmapp.workspace.job import Job
+from sfmapp.viewer.live import Screen
 from sfmapp.workspace.kernels import compile_odometry_kernels
 from sfmapp.workspace.layout import ODOMETRY
-from sfmapp.workspace.listeners import DecisionLog, EventLog
-from sfmapp.workspace.options import Options, with_absolute_paths
+from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
-from sfmapp.workspace.workspace import open_workspace
 
 if TYPE_CHECKING:
     from sfmapp.scene.rig import Rig
@@ -46,7 +39,6 @@ NO_MAP_ADVICE = (
 )
 # What held for this share of the frames is why there is no map.
 _MOST_FRAMES = 0.5
-GIVEN_UP = "given up, for the disk is full, and the rest matters more"
 
 
 class TrackResult(NamedTuple):
@@ -54,32 +46,6 @@ class TrackResult(NamedTuple):
 
     odometry: OdometryResult
     report: OdometryRunReport
-
-
-@dataclass(kw_only=True)
-class Tracking(Job):
-    """State of an odometry run under way.
-
-    Attributes:
-        frames: what was told of each frame.
-        threads_cpu: CPU time by thread.
-        live: draws what happens; None if nobody looks.
-        scale_request: what the unit of length is to come from; None: an arbitrary one will do.
-        sequence: once it is open.
-        stages: what each part has said.
-    """
-
-    frames: FrameLog
-    threads_cpu: ThreadTimes
-    live: LiveView | None
-    scale_request: ScaleRequest | None
-    sequence: Sequence | None = None
-    stages: OdometryStages = field(default_factory=OdometryStages)
-
-    def make_room(self) -> bool:
-        """See :meth:`Job.make_room`; a recording under way is one as well, and its end will be told as such."""
-        is_under_way = self.live is not None and self.live.is_recording and self.live.give_up(GIVEN_UP)
-        return super().make_room() or is_under_way
 
 
 def track_sequence(
@@ -112,32 +78,15 @@ def track_sequence(
         NoReconstructionError: no map could be made; the report is written.
         InterruptedRunError: ``events`` was asked to stop.
     """
-    from threadpoolctl import threadpool_limits
-
-    options, events = with_absolute_paths(options or Options()), events or Events()
     sequence = None if isinstance(source, str | os.PathLike) else source
-    source = os.fspath(source) if isinstance(source, str | os.PathLike) else source.source
+    name = os.fspath(source) if isinstance(source, str | os.PathLike) else source.source
     if sequence is not None and self_calibrate:
         raise UsageError("frames in memory come with their camera, and cannot be looked at twice to calibrate it")
-    scale_request = parse_scale(options.scale.source) if options.scale.source is not None else None
-    threads = options.num_workers
-    with ExitStack() as stack:
-        workspace = stack.enter_context(open_workspace(Path(output), ODOMETRY))
-        event_log = stack.enter_context(EventLog(workspace.log, events, source=source, version=sfmapp.__version__))
-        # sums must not depend on how many threads the linear algebra would use
-        stack.enter_context(threadpool_limits(1, "blas"))
-        live = LiveView(workspace.recording if record else None, screen) if record or screen else None
-        if live is not None:
-            stack.enter_context(live)
-        run = Tracking(
-            source, workspace, options, events, watch or Stopwatch(), DecisionLog(), threads,
-            frames=FrameLog(), threads_cpu=ThreadTimes(), live=live,
-            scale_request=scale_request, sequence=sequence,
-        )  # fmt: skip
-        growing = stack.enter_context(closing(GrowingTrajectories(workspace.folder, events, run.make_room)))
-        for listener in (growing, event_log, run.log, run.frames, live):
-            if listener is not None:
-                events.subscribe(listener)
+    request = parse_scale(options.scale.source) if options is not None and options.scale.source is not None else None
+    with Tracking.opened(
+        ODOMETRY, name, output, options, events=events, watch=watch, scale_request=request, sequence=sequence
+    ) as run:
+        run.listen_in(record, screen)
         return _run(run, self_calibrate)
 
 

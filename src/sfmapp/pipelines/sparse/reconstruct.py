@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import sfmapp
 from sfmapp.errors import NoReconstructionError, TooFewImagesError
 from sfmapp.events import Events
 from sfmapp.features.extract import extract_features
@@ -23,11 +21,10 @@ from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
 from sfmapp.pipelines.sparse.run import Run
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.kernels import kernels_compiling
-from sfmapp.workspace.listeners import DecisionLog, EventLog
-from sfmapp.workspace.options import Options, with_absolute_paths
+from sfmapp.workspace.layout import RECONSTRUCT
+from sfmapp.workspace.options import Options
 from sfmapp.workspace.store import Store
 from sfmapp.workspace.usage import Stopwatch
-from sfmapp.workspace.workspace import open_workspace
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet
@@ -73,23 +70,12 @@ def reconstruct(
         TooFewImagesError: fewer images than ``options.min_registered``; everything is written.
         InterruptedRunError: ``events`` was asked to stop; the same call resumes.
     """
-    from threadpoolctl import threadpool_limits
-
-    source, options, events = os.fspath(images), with_absolute_paths(options or Options()), events or Events()
-    threads = options.num_workers
-    with (
-        open_workspace(Path(output)) as workspace,
-        EventLog(workspace.log, events, source=source, version=sfmapp.__version__) as event_log,
-        # our workers use the cores; sums must not depend on how many the linear algebra beneath them would use
-        threadpool_limits(1, "blas"),
-    ):
-        decisions, recorder = DecisionLog(), RecordingListener() if record else None
-        for listener in (event_log, decisions, recorder):
-            if listener is not None:
-                events.subscribe(listener)
-        run = Run(source, workspace, options, events, watch or Stopwatch(), decisions, threads, recorder=recorder)
+    recorder = RecordingListener() if record else None
+    with Run.opened(RECONSTRUCT, images, output, options, events=events, watch=watch, recorder=recorder) as run:
+        run.listen(recorder)
         report = _run(run)
-        model, _ = read_model(workspace.model())
+        model, _ = read_model(run.workspace.model())
+    options = run.options
     found = report.models[0].num_registered
     if options.min_registered is not None and found < options.min_registered:
         raise TooFewImagesError(

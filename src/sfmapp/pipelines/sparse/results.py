@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sfmapp.errors import NoReconstructionError
+from sfmapp.formats.colmap import MODEL_FILES
 from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.mapping.report import MappingReport, ModelEntry, Uncertainty
 from sfmapp.pipelines.stored_pixels import STORED, noted_orientations
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
     from sfmapp.pipelines.sparse.keys import StageKeys
     from sfmapp.pipelines.sparse.run import Run
     from sfmapp.scene.reconstruction import Reconstruction
-
-MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 
 
 def earlier_report(run: Run, keys: StageKeys) -> ReconstructionReport | None:

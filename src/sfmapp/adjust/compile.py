@@ -1,0 +1,31 @@
+"""Compile the kernels of this package ahead of their use."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sfmapp.adjust.clustered import clustered_covariances
+from sfmapp.adjust.covariance import estimate_covariances
+from sfmapp.adjust.kernels import find_slot
+from sfmapp.adjust.linear import mark_pairs, number_keys
+from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.pose import refine_pose
+from sfmapp.adjust.problem import Varying
+from sfmapp.adjust.solver import adjust_bundle
+
+
+def compile_kernels() -> None:
+    """Compile, or load from the cache, every kernel of this package, by running each on next to nothing."""
+    from sfmapp.scene.synthetic import make_scene
+
+    scene = make_scene(0, 3, 8)
+    model = scene.observed.copy()
+    adjust_bundle(model, AdjustOptions(max_iterations=2), varying=Varying(images=np.array([True, True, False])))
+    fixed = AdjustOptions(refine_focal=False, refine_distortion=False)
+    estimate_covariances(model, fixed)
+    clustered_covariances(make_scene(0, 3, 40).observed, fixed)
+    camera, tracks = model.cameras[0], model.tracks
+    refine_pose(camera.canonical, model.cam_from_world[0], model.point_xyz, tracks.obs_xy[:8])
+    no_images = np.zeros(0, np.int32)
+    mark_pairs(np.zeros(1, np.int64), no_images, no_images, no_images, no_images, np.eye(1, dtype=bool))
+    find_slot(*number_keys(np.arange(3)), 0)

@@ -1,0 +1,93 @@
+"""Options and report of a bundle adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from sfmapp.option_checks import Range, check_options, positive
+
+Loss = Literal["trivial", "huber", "cauchy"]
+
+# Where the loss begins to bend, in standard deviations: at 2.4 it is 95 % efficient, and a little lower it sheds tails.
+_LOSS_SIGMAS = 2.0
+_RANGES = {
+    "loss_scale_px": positive(),
+    "max_iterations": Range(1, 100_000),
+    "relative_cost_tolerance": Range(0.0, 1.0),
+    "initial_damping": positive(),
+    "principal_point_sigma_px": positive(),
+    "distortion_sigma": positive(),
+}
+
+
+@dataclass(frozen=True)
+class AdjustOptions:
+    """How a bundle adjustment is done. Lengths are in pixels; the noise of an observation counts as one pixel.
+
+    Attributes:
+        loss: robust loss on the length of each residual; huber and cauchy as in Ceres and gtsam
+        loss_scale_px: residual length at which the loss begins to bend
+        max_iterations: Levenberg-Marquardt steps, rejected ones included
+        relative_cost_tolerance: stop when an accepted step lowers the cost by less than this share
+        initial_damping: first share of the diagonal that is added to it; Ceres' 1 / trust region radius
+        refine_focal: focal lengths may change
+        refine_distortion: distortion coefficients may change
+        refine_principal_point: principal points may change
+        principal_point_sigma_px: prior around the a priori principal point; None for no prior
+        distortion_sigma: prior of each coefficient around its a priori value; None for no prior
+        backend: schur: our kernels; gtsam: one factor per observation, the reference
+    """
+
+    loss: Loss = "trivial"
+    loss_scale_px: float = 1.0
+    max_iterations: int = 50
+    relative_cost_tolerance: float = 1e-6
+    initial_damping: float = 1e-4
+    refine_focal: bool = True
+    refine_distortion: bool = True
+    refine_principal_point: bool = False
+    principal_point_sigma_px: float | None = None
+    distortion_sigma: float | None = None
+    backend: Literal["schur", "gtsam"] = "schur"
+
+    def __post_init__(self) -> None:
+        check_options("adjust", self, _RANGES)
+
+    @property
+    def refine(self) -> tuple[bool, bool, bool]:
+        """Focal lengths, distortion, principal points."""
+        return self.refine_focal, self.refine_distortion, self.refine_principal_point
+
+    def robust(self, sigma_px: float) -> AdjustOptions:
+        """With a loss that lets go of what is far off the noise, unless another one was asked for."""
+        if self.loss != AdjustOptions().loss:
+            return self
+        return replace(self, loss="cauchy", loss_scale_px=_LOSS_SIGMAS * sigma_px)
+
+
+@dataclass(frozen=True)
+class AdjustReport:
+    """What an adjustment did.
+
+    Attributes:
+        termination: ``converged``, ``iterations`` (limit reached), ``stalled`` (no damping gives a better state) or
+            ``nothing`` (no unknowns or no observations).
+        num_iterations, num_rejected: steps tried, and those of them that were refused.
+        initial_cost, final_cost: half the sum of the losses, priors and extra factors included; square pixels.
+        num_images, num_cameras, num_points, num_observations: what took part; images and cameras only if they vary.
+        solver: ``dense``, ``sparse`` or ``gtsam``.
+        time_s: wall clock.
+    """
+
+    termination: str
+    num_iterations: int = 0
+    num_rejected: int = 0
+    initial_cost: float = 0.0
+    final_cost: float = 0.0
+    num_images: int = 0
+    num_cameras: int = 0
+    num_points: int = 0
+    num_observations: int = 0
+    solver: str = "dense"
+    time_s: float = 0.0
