@@ -28,6 +28,7 @@ FLOORS = (
     ("odometry",),
     ("surface",),
     ("dense",),
+    ("georeference",),
     ("mapping",),
     ("adjust",),
     ("matching",),
@@ -73,8 +74,9 @@ INNER_FLOORS = {
 LEVEL = {room: level for level, floor in enumerate(FLOORS) for room in floor}
 ALLOWED = {
     "rerun": {"viewer"},
-    "gtsam": {"adjust", "odometry"},
+    "gtsam": {"adjust", "georeference", "odometry"},
     "pycolmap": {"formats", "evaluation"},
+    "pyproj": {"georeference"},
     "open3d": {"surface"},
     "xatlas": {"surface"},
     "av": {"images"},
@@ -82,7 +84,7 @@ ALLOWED = {
     "argparse": {"cli", "evaluation", "viewer"},
 }
 # modules that "sfmapp --help" may not load
-HEAVY = ("numpy", "numba", "cv2", "av", "gtsam", "pycolmap", "rerun", "scipy", "PIL", "rich")
+HEAVY = ("numpy", "numba", "cv2", "av", "gtsam", "pycolmap", "rerun", "scipy", "PIL", "pyproj", "rich")
 
 
 @cache

@@ -13,6 +13,7 @@ _DISTRIBUTIONS = {
     "gtsam": ("gtsam", "adjusting with further factors"),
     "libusb_package": ("libusb-package", "making meshes"),
     "open3d": ("open3d-cpu", "making meshes"),
+    "pyproj": ("pyproj", "coordinate systems by EPSG code"),
     "pycolmap": ("pycolmap", "a second opinion by pycolmap"),
     "rerun": ("rerun-sdk", "recordings and live views"),
     "xatlas": ("xatlas", "packing textures"),
