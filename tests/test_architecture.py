@@ -66,6 +66,7 @@ INNER_FLOORS = {
     ),
     "pipelines": (
         ("demo", "evaluate", "export", "undistort", "validate", "validate_cloud"),
+        ("export_world",),
         ("dense", "odometry"),
         ("sparse",),
         ("stored_pixels",),
