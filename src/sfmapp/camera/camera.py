@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numba
 import numpy as np
@@ -59,6 +60,10 @@ class Camera:
     @property
     def canonical(self) -> Array:
         """(17,) float64 ``fx, fy, cx, cy``, twelve of distortion and the family: the row that the kernels take."""
+        return self._canonical.copy()
+
+    @cached_property
+    def _canonical(self) -> Array:
         row = np.zeros(ROW)
         row[:FAMILY] = canonical_from_params(self.model) @ self.params
         row[FAMILY] = family_of(self.model)
@@ -89,7 +94,7 @@ class Camera:
         """Number of the family of lenses in :mod:`sfmapp.camera.lens`."""
         return family_of(self.model)
 
-    @property
+    @cached_property
     def is_wide(self) -> bool:
         """Whether the picture shows what lies more than 88 degrees off the axis, where there is no normalised plane."""
         if self.family in (lens.BROWN, lens.RATIONAL, lens.SKEW):
