@@ -179,7 +179,8 @@ class Engine:
             self.extras.linearize(own, gradient)
         every = Sums(self.tiles, self.own, self.cross, self.gradient)
         assemble(every, images, lenses, blocks, own, gradient, self.diagonal)
-        return cost + self.other_cost(p.poses, p.canonical)
+        total: float = cost + self.other_cost(p.poses, p.canonical)
+        return total
 
     def other_cost(self, poses: Array, canonical: Array) -> float:
         """Cost of priors and extra factors."""

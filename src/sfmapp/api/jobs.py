@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from sfmapp.pipelines.dense.mesh import MeshResult
     from sfmapp.pipelines.evaluate import EvaluateOptions, Evaluation
     from sfmapp.pipelines.undistort import UndistortResult
-    from sfmapp.pipelines.validate import Validation
     from sfmapp.report.model import ExportReport, OdometryRunReport, ReconstructionReport, RefineReport
+    from sfmapp.report.validation import Validation
 
 FilePath = str | os.PathLike[str]
 

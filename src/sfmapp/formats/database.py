@@ -390,12 +390,16 @@ class Database:
         metric = DescriptorMetric.ROOT_SIFT if descriptors.shape[1] == _SIFT_LENGTH else DescriptorMetric.HAMMING
         return Features(keypoints, descriptors, rgb, metric)
 
-    def _one(self, table: str, column: str, columns: str, value: int) -> tuple | None:
+    def _one(self, table: str, column: str, columns: str, value: int) -> tuple[Any, ...] | None:
         if table not in self._tables:
             return None
-        return self._db.execute(f"SELECT {columns} FROM {table} WHERE {column} = ?", (value,)).fetchone()
+        query = f"SELECT {columns} FROM {table} WHERE {column} = ?"
+        row: tuple[Any, ...] | None = self._db.execute(query, (value,)).fetchone()
+        return row
 
-    def _table(self, what: str, dtype: str, allowed_cols: tuple[int, ...], rows: Any, cols: Any, data: Any) -> NDArray:
+    def _table(
+        self, what: str, dtype: str, allowed_cols: tuple[int, ...], rows: Any, cols: Any, data: Any
+    ) -> NDArray[Any]:
         """A copy (rows, cols) of a blob, after checking its size."""
         if rows == 0 and not data:
             return np.zeros((0, cols if cols in allowed_cols else allowed_cols[0]), dtype)
@@ -503,7 +507,7 @@ class Database:
         return self._correspondences(wanted, [by_pair[pair] for pair in wanted], counts)
 
     def _correspondences(
-        self, pairs: list[tuple[int, int]], rows: list[tuple], num_keypoints: NDArray[np.int64]
+        self, pairs: list[tuple[int, int]], rows: list[tuple[Any, ...]], num_keypoints: NDArray[np.int64]
     ) -> Correspondences:
         num = len(pairs)
         matches, config = [], np.zeros(num, np.int8)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.contradictions import Contradiction
 from sfmapp.mapping.report import FocalEvidence, MappedImage, ModelEntry, Uncertainty
 from sfmapp.report.model import CameraReport, Check, Failure, Funnel, ImageReport, Light
