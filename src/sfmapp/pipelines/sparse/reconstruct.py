@@ -13,6 +13,7 @@ from sfmapp.errors import NoReconstructionError, TooFewImagesError
 from sfmapp.events import Events
 from sfmapp.features.extract import extract_features
 from sfmapp.formats.colmap import read_model
+from sfmapp.georeference.sources import with_positions
 from sfmapp.images.folder import load_images
 from sfmapp.matching.pairs import select_pairs
 from sfmapp.matching.stage import match_images
@@ -28,6 +29,7 @@ from sfmapp.workspace.usage import Stopwatch
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet
+    from sfmapp.mapping.mapper import Mapper
     from sfmapp.report.model import ReconstructionReport
     from sfmapp.scene.reconstruction import Reconstruction
 
@@ -89,6 +91,7 @@ def _run(run: Run) -> ReconstructionReport:
     """The job: photographs, what still holds of an earlier run, models, and the report of it all."""
     with run.stage("images"):
         run.image_set, images = load_images(run.source, run.options.images, run.events, threads=run.threads)
+        run.image_set = with_positions(run.image_set, run.options.gps)
         run.stages = replace(run.stages, images=images)
     keys = stage_keys(run.options, run.image_set)
     if report := results.earlier_report(run, keys):
@@ -133,10 +136,19 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
             )  # fmt: skip
             store.flush()
             run.stages = replace(run.stages, matching=matched)
+
+    def closing(mappers: list[Mapper]) -> None:
+        from sfmapp.georeference.stage import georeference_models
+
+        placed = georeference_models(mappers, image_set, options.gps, events)
+        run.georeference = placed.georeference
+        run.stages = replace(run.stages, georeference=placed.report)
+
+    has_positions = any(record.position is not None for record in image_set.images)
     with run.stage("mapping"):
         models, mapped = map_images(
             image_set, run.features, run.correspondences, options.mapping,
-            adjust_options=options.adjust, threads=threads, events=events,
+            adjust_options=options.adjust, threads=threads, events=events, closing=closing if has_positions else None,
         )  # fmt: skip
         run.stages = replace(run.stages, mapping=mapped)
     return models
