@@ -1,15 +1,38 @@
-"""The reduced system, once the points are gone: dense tiles here, sparse in gtsam."""
+"""The reduced system, once the points are gone: its tiles, and their Cholesky factor."""
 
 from __future__ import annotations
+
+from typing import Literal, Protocol
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.kernels import find_slot
+from sfmapp.adjust.kernels import BlockArrays, ImageArrays, LensArrays, PointArrays, Sums, find_slot
 from sfmapp.simd.f64x8 import assign8, subtract8
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+SolverName = Literal["tiles", "gtsam", "lapack"]
+
+# Measured by benchmarks/reduced_systems.py; fill is the share of pairs of blocks that meet. A closing adjustment goes
+# to gtsam up to the fill at which LAPACK begins to be quicker, of whatever size. The quick rounds keep the tiles up to
+# the size at which nothing beats them by much, and beyond that in the range of fill in which they are quickest.
+_GTSAM_FILL, _FEW_BLOCKS, _TILES_FILL = 0.15, 160, (0.3, 0.5)
+# What rounding leaves of a zero pivot, against the diagonal before.
+_NO_PIVOT = 1e-14
+
+
+def choose_solver(num_blocks: int, fill: float, *, is_closing: bool) -> SolverName:
+    """What solves a reduced system best."""
+    if is_closing:
+        return "gtsam" if fill <= _GTSAM_FILL else "lapack"
+    if num_blocks <= _FEW_BLOCKS:
+        return "tiles"
+    if fill <= _TILES_FILL[0]:
+        return "gtsam"
+    return "tiles" if fill <= _TILES_FILL[1] else "lapack"
 
 
 def aligned_zeros(*shape: int) -> Array:
@@ -21,15 +44,19 @@ def aligned_zeros(*shape: int) -> Array:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def assemble(  # type: ignore[no-untyped-def]
-    tiles, own, cross, gradient, image_block, image_camera, camera_block, second_block, block_dim, hash_keys,
-    hash_values, extra_own, extra_gradient, diagonal,
-):  # fmt: skip
-    """Sum the chunks, in order, into the first: tiles (K, N * 64) and own, cross, gradient likewise.
+def assemble(
+    sums: Sums, images: ImageArrays, lenses: LensArrays, blocks: BlockArrays, extra_own: Array, extra_gradient: Array,
+    diagonal: Array,
+) -> None:  # fmt: skip
+    """Add up the sums of all chunks (K, ...), in order, in the first.
 
     Adds extra_own (B * 64,) and extra_gradient (B * 8,), what priors say about single blocks; fills diagonal (B * 8,)
     with the diagonal before elimination, on which the damping is based, and puts ``own`` and ``cross`` into the tiles.
     """
+    tiles, own, cross, gradient = sums
+    block_dim, hash_keys, hash_values = blocks
+    image_block, image_camera = images.block, images.camera
+    camera_block, second_block = lenses.block, lenses.second
     num_blocks = block_dim.shape[0]
     for k in range(1, tiles.shape[0]):
         tiles[0] += tiles[k]
@@ -49,31 +76,30 @@ def assemble(  # type: ignore[no-untyped-def]
             diagonal[a * 8 + x] = d if d > 0.0 and x < block_dim[a] else 1.0
             if x >= block_dim[a]:
                 tiles[0, tile * 64 + 9 * x] = 1.0
-    images = image_block.shape[0]
-    for i in range(images):
+    num_images = image_block.shape[0]
+    for i in range(num_images):
         a, b, second = image_block[i], camera_block[image_camera[i]], second_block[image_camera[i]]
         if a >= 0 and b >= 0 and a != b:
-            _add_tile(tiles, cross, i, a * num_blocks + b, hash_keys, hash_values)
+            _add_tile(sums, i, a * num_blocks + b, blocks)
             if second >= 0:
-                _add_tile(tiles, cross, images + i, a * num_blocks + second, hash_keys, hash_values)
+                _add_tile(sums, num_images + i, a * num_blocks + second, blocks)
     for c in range(camera_block.shape[0]):
         if second_block[c] >= 0:
-            tile = camera_block[c] * num_blocks + second_block[c]
-            _add_tile(tiles, cross, 2 * images + c, tile, hash_keys, hash_values)
+            _add_tile(sums, 2 * num_images + c, camera_block[c] * num_blocks + second_block[c], blocks)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_tile(tiles, cross, source, tile, hash_keys, hash_values):  # type: ignore[no-untyped-def]
-    """Add a tile of ``cross`` to that of a pair of blocks, if there is one."""
-    if hash_keys.shape[0] > 0:
-        tile = find_slot(hash_keys, hash_values, tile)
+def _add_tile(sums: Sums, source: int, tile: int, blocks: BlockArrays) -> None:
+    """Add a tile of ``cross`` to that of a pair of blocks, a B + b, if there is one."""
+    if blocks.hash_keys.shape[0] > 0:
+        tile = find_slot(blocks.hash_keys, blocks.hash_values, tile)
     if tile >= 0:
         for n in range(64):
-            tiles[0, tile * 64 + n] += cross[0, source * 64 + n]
+            sums.tiles[0, tile * 64 + n] += sums.cross[0, source * 64 + n]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def factorize_tiles(tiles, num_blocks, inverse):  # type: ignore[no-untyped-def]
+def factorize_tiles(tiles: Array, num_blocks: int, inverse: Array) -> bool:
     """Cholesky factor U^T U of the upper tiles (B * B * 64,), in place; inverse (B * 64,) gets the U_kk^-1.
 
     Returns False, with the tiles spoilt, where a pivot is not clearly positive. Tiles of zeros are skipped, so that a
@@ -99,8 +125,7 @@ def factorize_tiles(tiles, num_blocks, inverse):  # type: ignore[no-untyped-def]
                 for y in range(x, 8):
                     tiles[d + 8 * x + y] -= tiles[d + 8 * m + x] * tiles[d + 8 * m + y]
             pivot = tiles[d + 9 * x]
-            # what rounding leaves of a zero pivot
-            if not pivot > 1e-14 * first_diagonal[k * 8 + x]:
+            if not pivot > _NO_PIVOT * first_diagonal[k * 8 + x]:
                 return False
             root = 1.0 / np.sqrt(pivot)
             for y in range(x, 8):
@@ -136,7 +161,7 @@ def factorize_tiles(tiles, num_blocks, inverse):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def solve_tiles(tiles, num_blocks, inverse, x):  # type: ignore[no-untyped-def]
+def solve_tiles(tiles: Array, num_blocks: int, inverse: Array, x: Array) -> None:
     """Solve U^T U x = x in place (B * 8,) with the factor of :func:`factorize_tiles`."""
     y = np.empty(8)
     for k in range(num_blocks):
@@ -170,8 +195,10 @@ def solve_tiles(tiles, num_blocks, inverse, x):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def mark_pairs(point_ptr, obs_image, image_camera, image_block, camera_block, second_block, pairs):  # type: ignore[no-untyped-def]
+def mark_pairs(points: PointArrays, images: ImageArrays, lenses: LensArrays, pairs: NDArray[np.bool_]) -> None:
     """Set pairs[a, b], (B, B) bool, for all blocks a <= b that meet in a point."""
+    point_ptr, obs_image = points.ptr, points.image
+    image_camera, image_block, camera_block, second_block = images.camera, images.block, lenses.block, lenses.second
     longest = 1
     for p in range(point_ptr.shape[0] - 1):
         longest = max(longest, point_ptr[p + 1] - point_ptr[p])
@@ -191,13 +218,17 @@ def mark_pairs(point_ptr, obs_image, image_camera, image_block, camera_block, se
                 if second >= 0:
                     blocks[found] = second
                     found += 1
+        if points.block[p] >= 0:
+            pairs[points.block[p], points.block[p]] = True
+            for n in range(found):
+                pairs[blocks[n], points.block[p]] = True
         for n in range(found):
             for m in range(n, found):
                 pairs[min(blocks[n], blocks[m]), max(blocks[n], blocks[m])] = True
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def number_keys(keys):  # type: ignore[no-untyped-def]
+def number_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """An open hash table, half full at most, that gives each of the different keys (N,) its position."""
     size = 16
     while size < 2 * keys.shape[0] + 1:
@@ -210,3 +241,64 @@ def number_keys(keys):  # type: ignore[no-untyped-def]
         table[h] = keys[n]
         values[h] = n
     return table, values
+
+
+class ReducedSystem(Protocol):
+    """What solves the reduced system."""
+
+    def solve(self, tiles: Array, rhs: Array) -> Array | None:
+        """Solution (B * 8,) of the damped system in tiles (N * 64,), None where it is not positive definite."""
+
+
+class TileSystem:
+    """The Cholesky factor in tiles (B * B * 64,)."""
+
+    def __init__(self, num_blocks: int) -> None:
+        self._num_blocks, self._inverse = num_blocks, aligned_zeros(num_blocks * 64)
+
+    def solve(self, tiles: Array, rhs: Array) -> Array | None:
+        """Solution (B * 8,), None where the system is not positive definite. Tiles and right-hand side are spoilt."""
+        if not factorize_tiles(tiles, self._num_blocks, self._inverse):
+            return None
+        solve_tiles(tiles, self._num_blocks, self._inverse, rhs)
+        return rhs
+
+
+class LapackSystem:
+    """LAPACK's dense Cholesky factor, without the rows that the blocks do not use. Its bytes are those of one thread:
+    the caller sees to it that there is no more.
+
+    Args of solve as of :class:`TileSystem`; keys (N,) a B + b and numbers (N,) say which tiles there are.
+    """
+
+    def __init__(self, block_dim: Ints, keys: Ints, numbers: Ints) -> None:
+        self._pairs = np.stack([*np.divmod(keys, len(block_dim)), numbers], 1)
+        self._first = np.cumsum(block_dim) - block_dim
+        self._dim, self._used = block_dim, np.arange(8) < block_dim[:, None]
+        size = int(block_dim.sum())
+        self._matrix = np.zeros((size, size))
+
+    def solve(self, tiles: Array, rhs: Array) -> Array | None:
+        from scipy.linalg.lapack import dpotrf, dpotrs
+
+        _gather_upper(tiles, self._pairs, self._first, self._dim, self._matrix)
+        diagonal = self._matrix.diagonal().copy()
+        # the upper triangle by rows is the lower one by columns, which LAPACK works on in place
+        factor, info = dpotrf(self._matrix.T, lower=1, clean=0, overwrite_a=1)
+        if info != 0 or not (factor.diagonal() ** 2 > _NO_PIVOT * diagonal).all():
+            return None
+        found, _ = dpotrs(factor, rhs.reshape(-1, 8)[self._used], lower=1)
+        step = np.zeros((len(self._dim), 8))
+        step[self._used] = found
+        return step.ravel()
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _gather_upper(tiles: Array, pairs: Ints, first: Ints, block_dim: Ints, matrix: Array) -> None:
+    """Fill the upper triangle of matrix (N, N) from tiles; pairs (M, 3) are block a <= b and number of the tile."""
+    matrix[:] = 0.0
+    for n in range(pairs.shape[0]):
+        a, b, tile = pairs[n]
+        for j in range(block_dim[a]):
+            for k in range(block_dim[b]):
+                matrix[first[a] + j, first[b] + k] = tiles[tile * 64 + 8 * j + k]

@@ -6,23 +6,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Literal
 
 from sfmapp.children import with_parent
 from sfmapp.packages import MissingPackageError, require
 from sfmapp.viewer.listener import Message, RecordingListener, Step
-from sfmapp.viewer.replay import make_replay
-
-if TYPE_CHECKING:
-    from sfmapp.images.image_set import ImageSet
-    from sfmapp.scene.features import Features
-    from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.viewer.replay import Replay
 
 Kind = Literal["run", "dense"]
 
@@ -46,27 +37,19 @@ class RecordingReport:
     problem: str
 
 
-def write_recording(
-    path: Path, image_set: ImageSet, features: Sequence[Features], reconstructions: Sequence[Reconstruction],
-    steps: Sequence[Step] = (), messages: Sequence[Message] = (), *, title: str = "",
-    up: NDArray[np.float64] | None = None, threads: int = 1, timeout_s: float = 600.0,
-) -> RecordingReport:  # fmt: skip
+def write_recording(path: Path, replay: Replay, *, threads: int = 1, timeout_s: float = 600.0) -> RecordingReport:
     """Write a recording that replays a run, in a child process; never raises for what happens there.
 
     Args:
         path: the file, replaced when the new one is whole.
-        image_set, features: the I photographs and their keypoints.
-        reconstructions: final models, largest first; may be empty.
-        steps, messages: of the :class:`RecordingListener` that watched; without them the final model appears at once.
-        title: shown in the viewer, such as the name of the image folder.
-        up: (3,) direction in the world that is up (aligned worlds: z); None: judged from the cameras.
+        replay: what it shows, see :func:`~sfmapp.viewer.replay.make_replay`.
         threads: photographs read at a time.
         timeout_s: the child is stopped after this long.
     """
     start = time.monotonic()
     try:
         with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
-            make_replay(image_set, features, reconstructions, steps, messages, title=title, up=up).save(Path(name))
+            replay.save(Path(name))
             problem = draw_in_child("run", Path(name), path, threads, timeout_s)
     except OSError as error:
         problem = error.strerror or str(error)
