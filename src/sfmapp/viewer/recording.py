@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -15,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.children import with_parent
+from sfmapp.errors import InputError
 from sfmapp.packages import MissingPackageError, require
 from sfmapp.viewer.listener import Message, RecordingListener, Step
+from sfmapp.viewer.photos import SCREEN_QUALITY, screen_side_px, shrunk_jpeg
 from sfmapp.viewer.replay import make_replay
 
 if TYPE_CHECKING:
@@ -66,12 +69,28 @@ def write_recording(
     start = time.monotonic()
     try:
         with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
-            make_replay(image_set, features, reconstructions, steps, messages, title=title, up=up).save(Path(name))
+            shown = _as_files(image_set, Path(name))
+            make_replay(shown, features, reconstructions, steps, messages, title=title, up=up).save(Path(name))
             problem = draw_in_child("run", Path(name), path, threads, timeout_s)
     except OSError as error:
         problem = error.strerror or str(error)
     size = path.stat().st_size if not problem else 0
     return RecordingReport(None if problem else path, size, time.monotonic() - start, problem)
+
+
+def _as_files(image_set: ImageSet, folder: Path) -> ImageSet:
+    """Photographs in memory as small files, for a child that cannot look into ours; one that fails is not shown."""
+    from sfmapp.images.pixels import read_rgb
+
+    side, records = screen_side_px(len(image_set.images)), list(image_set.images)
+    for i, record in enumerate(records):
+        if record.source is not None:
+            with contextlib.suppress(InputError):
+                data, _ = shrunk_jpeg(read_rgb(record)[:, :, ::-1], side, SCREEN_QUALITY)
+                path = folder / f"{i:06d}.jpg"
+                path.write_bytes(data)
+                records[i] = replace(record, path=path)
+    return replace(image_set, images=tuple(records))
 
 
 def draw_in_child(kind: Kind, folder: Path, path: Path, threads: int, timeout_s: float) -> str:
