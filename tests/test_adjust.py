@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from sfmapp.adjust import kernels, solver
 from sfmapp.adjust.options import AdjustOptions
-from sfmapp.adjust.problem import pose_rows
+from sfmapp.adjust.problem import Varying, pose_rows
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, project
 from sfmapp.camera.lens import ROW, distort
@@ -55,11 +55,11 @@ def squares(model):
 
 
 @numba.njit
-def observe(pose, mounted, mount, canonical, x, y, z, u, v, loss, scale2, scratch):
+def observe(pose, mounted, mount, canonical, point, pixel, loss, scratch):
     """Linearise, and check the squared residual by the kernel that computes nothing else."""
     p, m, c, J = pointer(pose), pointer(mount), pointer(canonical), pointer(scratch)
-    s = kernels.linearize(p, mounted, m, c, x, y, z, u, v, loss, scale2, 0.0, True, J)
-    if abs(s - kernels.squared_residual(p, c, x, y, z, u, v, 0.0)) > 1e-9 * s:
+    s = kernels.linearize(p, mounted, m, c, point, pixel, loss, 0.0, True, J)
+    if abs(s - kernels.squared_residual(p, c, point, pixel, 0.0)) > 1e-9 * s:
         return np.nan
     return s
 
@@ -93,8 +93,8 @@ def test_jacobians_equal_central_differences(model, rotation, point, translation
     kernels.fill_rows(rigid3.from_matrix(turn, t)[None], np.zeros(1, np.int32), of_image, mounts, pose)
     scratch = np.zeros(kernels.SCRATCH)
     observed = pixel(np.zeros(25)) - [3.0, -4.0]
-    args = (pose[0], mounting is not None, mounts[0], camera.canonical, *world, *observed)
-    s = observe(*args, 0, 1.0, scratch)
+    args = (pose[0], mounting is not None, mounts[0], camera.canonical, tuple(world), tuple(observed))
+    s = observe(*args, kernels.RobustLoss(0, 1.0), scratch)
     assert s == pytest.approx(25.0, rel=1e-9)
     rows = scratch.reshape(-1, 2, 8)
     ours = np.hstack([rows[0][:, :6], rows[5][:, :3], scratch[16:48].reshape(16, 2).T])
@@ -106,7 +106,7 @@ def test_jacobians_equal_central_differences(model, rotation, point, translation
     np.testing.assert_allclose(rows[5][:, 3], [3.0, -4.0], atol=1e-9)
     # a robust weight scales residual and Jacobians by the root of rho'
     weighted = np.zeros(kernels.SCRATCH)
-    observe(*args, 2, 4.0, weighted)
+    observe(*args, kernels.RobustLoss(2, 4.0), weighted)
     np.testing.assert_allclose(weighted, scratch * math.sqrt(4.0 / 29.0), rtol=1e-9, atol=1e-9)
 
 
@@ -123,13 +123,13 @@ def test_losses_are_the_textbook_ones(loss):
             return np.where(s <= scale2, s, 2 * np.sqrt(s * scale2) - scale2)
         return scale2 * np.log1p(s / scale2)
 
-    state = (0.0, 1.0)
+    robust, state = kernels.RobustLoss(loss, scale2), (0.0, 1.0)
     for s in values:
-        state = kernels.add_loss(loss, scale2, s, *state)
+        state = kernels.add_loss(robust, s, *state)
         h = 1e-6 * s
         slope = (rho(s + h) - rho(s - h)) / (2 * h)
-        assert kernels.robust_weight(loss, scale2, s) == pytest.approx(slope, rel=1e-4)
-    assert kernels.total_loss(scale2, *state) == pytest.approx(0.5 * rho(values).sum(), rel=1e-12)
+        assert kernels.robust_weight(robust, s) == pytest.approx(slope, rel=1e-4)
+    assert kernels.total_loss(robust, *state) == pytest.approx(0.5 * rho(values).sum(), rel=1e-12)
 
 
 # --- the minimum ------------------------------------------------------------------------------------------------------
@@ -230,7 +230,7 @@ def test_constant_things_keep_their_bits():
     rng = np.random.default_rng(0)
     images, points = rng.random(10) < 0.5, rng.random(600) < 0.3
     report = adjust_bundle(
-        found, variable_images=images, variable_cameras=np.array([True, False]), constant_points=points
+        found, varying=Varying(images=images, cameras=np.array([True, False]), constant_points=points)
     )
     assert report.final_cost < report.initial_cost
     np.testing.assert_array_equal(found.cam_from_world[~images], start.cam_from_world[~images])
@@ -248,7 +248,7 @@ def test_only_chosen_points_and_inliers_take_part():
     chosen = np.zeros(300, bool)
     chosen[:100] = True
     found = start.copy()
-    report = adjust_bundle(found, points=chosen)
+    report = adjust_bundle(found, varying=Varying(points=chosen))
     assert report.num_points == 99  # the first point is left with one observation
     np.testing.assert_array_equal(found.point_xyz[100:], start.point_xyz[100:])
     np.testing.assert_array_equal(found.point_xyz[0], start.point_xyz[0])
@@ -307,7 +307,7 @@ def focal_only(sigma):
     weight = 1 / sigma**2
     expected = (design @ (xy - [504.0, 372.0]).ravel() + weight * 950.0) / (design @ design + weight)
     every = np.ones(100, bool)
-    return model, prior, expected, {"variable_images": np.zeros(3, bool), "points": every, "constant_points": every}
+    return model, prior, expected, {"varying": Varying(images=np.zeros(3, bool), points=every, constant_points=every)}
 
 
 @pytest.mark.parametrize("sigma", [1e-3, 0.1, 1.0, 100.0])

@@ -7,6 +7,7 @@ import pytest
 
 from sfmapp.adjust.covariance import errors_in_gauge, estimate_covariances
 from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import CameraModel
 from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera
@@ -57,7 +58,7 @@ def test_nees_with_constant_images():
     """Two constant images hold the whole gauge."""
     images = np.arange(6) >= 2
     covariances, (poses, intrinsics, points) = nees(
-        range(120), layout="forward", cameras=synthetic_camera(), variable_images=images
+        range(120), layout="forward", cameras=synthetic_camera(), varying=Varying(images=images)
     )
     assert covariances.num_gauge == 0
     assert 0.8 < poses < 1.25
@@ -69,8 +70,8 @@ def test_one_constant_image_leaves_the_scale_open():
     scene = make_scene(0, 6, 200)
     found = scene.observed.copy()
     images = np.arange(6) >= 1
-    adjust_bundle(found, OPTIONS, variable_images=images)
-    assert estimate_covariances(found, OPTIONS, variable_images=images).num_gauge == 1
+    adjust_bundle(found, OPTIONS, varying=Varying(images=images))
+    assert estimate_covariances(found, OPTIONS, varying=Varying(images=images)).num_gauge == 1
 
 
 def test_pose_prior_holds_the_gauge_and_counts_in_its_own_units():
@@ -136,4 +137,4 @@ def test_undetermined_is_said():
     keep = np.flatnonzero(np.bincount(found.tracks.obs_track_idx[found.obs_is_inlier], minlength=100) >= 2)[:2]
     every[:] = False
     every[keep] = True
-    assert not estimate_covariances(found, sigma_px=1.0, points=every).is_determined
+    assert not estimate_covariances(found, sigma_px=1.0, varying=Varying(points=every)).is_determined

@@ -38,8 +38,7 @@ def test_noise_free_pose_is_recovered(model, refine_focal):
     if refine_focal:
         canonical[:2] += 20.0
     found = refine_pose(
-        canonical, start, xyz, xy, refine_focal=refine_focal, relative_cost_tolerance=1e-14,
-        max_iterations=100,
+        canonical, start, xyz, xy, focal_sigma_px=np.inf if refine_focal else 0.0, relative_cost_tolerance=1e-14
     )  # fmt: skip
     assert np.abs(tangent(found.cam_from_world, ground_truth)).max() < 1e-6
     np.testing.assert_allclose(found.canonical, camera.canonical, atol=1e-3)
@@ -53,7 +52,7 @@ def test_covariance_is_honest():
         ground_truth, xyz, xy = view(scene, 1)
         camera = scene.ground_truth.cameras[0]
         found = refine_pose(
-            camera.canonical, ground_truth, xyz, xy, loss="trivial", inlier_px=10.0, refine_focal=True,
+            camera.canonical, ground_truth, xyz, xy, scale_px=None, inlier_px=10.0, focal_sigma_px=np.inf,
             relative_cost_tolerance=1e-12,
         )  # fmt: skip
         error = np.append(tangent(found.cam_from_world, ground_truth), found.canonical[0] - camera.focal)
@@ -77,8 +76,8 @@ def test_focal_prior_holds_and_degenerate_input_survives():
     scene = make_scene(4, 5, 300)
     ground_truth, xyz, xy = view(scene)
     canonical = scene.ground_truth.cameras[0].canonical
-    free = refine_pose(canonical, ground_truth, xyz, xy, refine_focal=True)
-    held = refine_pose(canonical, ground_truth, xyz, xy, refine_focal=True, focal_sigma_px=1e-3)
+    free = refine_pose(canonical, ground_truth, xyz, xy, focal_sigma_px=np.inf)
+    held = refine_pose(canonical, ground_truth, xyz, xy, focal_sigma_px=1e-3)
     assert abs(held.canonical[0] - canonical[0]) < 0.05 * abs(free.canonical[0] - canonical[0])
     empty = refine_pose(canonical, ground_truth, np.zeros((0, 3)), np.zeros((0, 2)))
     np.testing.assert_allclose(empty.cam_from_world, ground_truth, atol=1e-15)

@@ -11,6 +11,7 @@ from gtsam.symbol_shorthand import K, X
 
 from sfmapp.adjust.factors import gtsam_pose
 from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import CameraModel
 from sfmapp.errors import UsageError
@@ -78,7 +79,7 @@ def test_same_with_constants_and_factors_on_intrinsics():
         gtsam.BetweenFactorPose3(X(2), X(4), where[2].between(where[4]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-2))
     )
     images, points = np.array([False, False, True, True, True, True]), np.arange(200) < 20
-    start, ours, theirs = both(scene, variable_images=images, constant_points=points, extra_factors=graph)
+    start, ours, theirs = both(scene, varying=Varying(images=images, constant_points=points), extra_factors=graph)
     for model in (ours, theirs):
         np.testing.assert_array_equal(model.cam_from_world[:2], start.cam_from_world[:2])
         np.testing.assert_array_equal(model.point_xyz[:20], start.point_xyz[:20])

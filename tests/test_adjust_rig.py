@@ -12,7 +12,7 @@ from sfmapp.adjust import solver
 from sfmapp.adjust.covariance import errors_in_gauge, estimate_covariances
 from sfmapp.adjust.factors import gtsam_pose
 from sfmapp.adjust.options import AdjustOptions
-from sfmapp.adjust.problem import make_problem
+from sfmapp.adjust.problem import Varying, make_problem
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import CameraModel
 from sfmapp.geometry import rigid3
@@ -109,7 +109,7 @@ def test_noise_free_scene_is_recovered_to_scale():
     found = start_of(scene)
     images = np.arange(12) >= 2
     found.cam_from_world[:2] = scene.ground_truth.cam_from_world[:2]
-    report = adjust_bundle(found, TIGHT, variable_images=images)
+    report = adjust_bundle(found, TIGHT, varying=Varying(images=images))
     assert report.final_cost < 1e-10 * report.initial_cost
     np.testing.assert_allclose(found.cam_from_world, scene.ground_truth.cam_from_world, atol=1e-5)
 
@@ -144,8 +144,8 @@ def test_either_camera_may_carry_the_rig():
     images = np.arange(10) >= 2
     covariances = []
     for model in (left, right):
-        adjust_bundle(model, KNOWN, variable_images=images)
-        covariances.append(estimate_covariances(model, KNOWN, sigma_px=0.5, variable_images=images))
+        adjust_bundle(model, KNOWN, varying=Varying(images=images))
+        covariances.append(estimate_covariances(model, KNOWN, sigma_px=0.5, varying=Varying(images=images)))
     np.testing.assert_allclose(left.cam_from_world, right.cam_from_world, atol=1e-6)
     np.testing.assert_array_equal(covariances[0].image_idx, np.arange(2, 10))
     # and the adjoint takes the covariance of one camera to that of the other
@@ -191,16 +191,16 @@ def test_frames_vary_as_a_whole():
     start = start_of(scene)
     images = np.arange(10) >= 4
     found = start.copy()
-    adjust_bundle(found, KNOWN, variable_images=images)
+    adjust_bundle(found, KNOWN, varying=Varying(images=images))
     np.testing.assert_array_equal(found.cam_from_world[:4], start.cam_from_world[:4])
     assert (found.cam_from_world[4:] != start.cam_from_world[4:]).any(1).all()
     images[5] = False
     with pytest.raises(ValueError, match="both in one frame"):
-        adjust_bundle(found, KNOWN, variable_images=images)
+        adjust_bundle(found, KNOWN, varying=Varying(images=images))
     # an image that takes no part has no say, but moves with its frame
     found = start.copy()
     found.obs_is_inlier[found.tracks.observations_of_image(5)] = False
-    adjust_bundle(found, KNOWN, variable_images=images)
+    adjust_bundle(found, KNOWN, varying=Varying(images=images))
     assert (found.cam_from_world[5] != start.cam_from_world[5]).any()
     assert_on_rig(found)
 
@@ -212,7 +212,7 @@ def test_frames_with_one_registered_image():
     gone = [5, 8]  # a right image, and a left one: the right one then carries its frame
     found.cam_from_world[gone] = np.nan
     found.obs_is_inlier[np.isin(found.tracks.obs_image_idx, gone)] = False
-    adjust_bundle(found, TIGHT, variable_images=np.arange(12) >= 4)
+    adjust_bundle(found, TIGHT, varying=Varying(images=np.arange(12) >= 4))
     assert np.isnan(found.cam_from_world[gone]).all()
     rest = np.setdiff1d(np.arange(12), gone)
     np.testing.assert_allclose(found.cam_from_world[rest], scene.ground_truth.cam_from_world[rest], atol=1e-5)
@@ -252,8 +252,8 @@ def test_nees(held, num_gauge):
     for seed in range(200):
         scene = make_scene(seed, 10, 100, rig=synthetic_rig(0.5), sigma_px=0.3, layout="forward")
         found = scene.observed.copy()
-        adjust_bundle(found, KNOWN, variable_images=images)
-        covariances = estimate_covariances(found, KNOWN, sigma_px=0.3, variable_images=images)
+        adjust_bundle(found, KNOWN, varying=Varying(images=images))
+        covariances = estimate_covariances(found, KNOWN, sigma_px=0.3, varying=Varying(images=images))
         assert covariances.is_determined
         assert covariances.num_gauge == num_gauge
         error, _, point_error = errors_in_gauge(found, scene.ground_truth, covariances)
@@ -269,7 +269,7 @@ def test_an_image_that_takes_no_part_has_the_covariance_of_its_frame():
     model.cam_from_world[9] = np.nan
     model.obs_is_inlier[model.tracks.obs_image_idx == 9] = False
     adjust_bundle(model, KNOWN)
-    covariances = estimate_covariances(model, KNOWN, sigma_px=0.5, variable_images=np.arange(10) >= 2)
+    covariances = estimate_covariances(model, KNOWN, sigma_px=0.5, varying=Varying(images=np.arange(10) >= 2))
     assert covariances.image_idx.tolist() == [2, 3, 4, 5, 6, 7, 8]
     assert model.rig is not None
     mount = model.rig.cam_from_rig[1]
@@ -310,6 +310,6 @@ def test_cameras_at_one_place_measure_no_length():
     # only points that are seen from several frames have a depth
     frame = np.split(model.tracks.obs_image_idx // 2, model.tracks.track_ptr[1:-1])
     several = np.array([len(np.unique(f)) > 1 for f in frame])
-    covariances = estimate_covariances(model, KNOWN, sigma_px=0.5, points=several)
+    covariances = estimate_covariances(model, KNOWN, sigma_px=0.5, varying=Varying(points=several))
     assert covariances.is_determined
     assert covariances.num_gauge == 7

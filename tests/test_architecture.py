@@ -28,6 +28,7 @@ FLOORS = (
     ("odometry",),
     ("surface",),
     ("dense",),
+    ("georeference",),
     ("mapping",),
     ("adjust",),
     ("matching",),
@@ -65,6 +66,7 @@ INNER_FLOORS = {
     ),
     "pipelines": (
         ("demo", "evaluate", "export", "undistort", "validate", "validate_cloud"),
+        ("export_world",),
         ("dense", "odometry"),
         ("sparse",),
         ("stored_pixels",),
@@ -73,8 +75,9 @@ INNER_FLOORS = {
 LEVEL = {room: level for level, floor in enumerate(FLOORS) for room in floor}
 ALLOWED = {
     "rerun": {"viewer"},
-    "gtsam": {"adjust", "odometry"},
+    "gtsam": {"adjust", "georeference", "odometry"},
     "pycolmap": {"formats", "evaluation"},
+    "pyproj": {"georeference"},
     "open3d": {"surface"},
     "xatlas": {"surface"},
     "av": {"images"},
@@ -82,7 +85,7 @@ ALLOWED = {
     "argparse": {"cli", "evaluation", "viewer"},
 }
 # modules that "sfmapp --help" may not load
-HEAVY = ("numpy", "numba", "cv2", "av", "gtsam", "pycolmap", "rerun", "scipy", "PIL", "rich")
+HEAVY = ("numpy", "numba", "cv2", "av", "gtsam", "pycolmap", "rerun", "scipy", "PIL", "pyproj", "rich")
 
 
 @cache
@@ -233,3 +236,54 @@ def test_help_is_light() -> None:
     assert loaded.strip() == "[]"
     shown = subprocess.run([sys.executable, "-m", "sfmapp", "--help"], capture_output=True, text=True, check=True)
     assert "reconstruct" in shown.stdout
+
+
+# ---- argument lists: what belongs together goes by one name, a dataclass of options or state, a NamedTuple of arrays
+
+MOST_PARAMETERS, MOST_OF_KERNELS = 8, 12
+# what users call with keywords, each of which stands for itself
+LONG_LISTS = {
+    "api/jobs.py track_sequence",
+    "api/stages.py match_images",
+    "matching/stage.py match_images",
+    "scene/synthetic.py make_scene",
+}
+
+
+def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
+    a = function.args
+    every = [*a.posonlyargs, *a.args, *a.kwonlyargs]
+    return [arg.arg for arg in every if arg.arg not in ("self", "cls", "typingctx")]
+
+
+def is_kernel(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    decorators = " ".join(ast.unparse(decorator) for decorator in function.decorator_list)
+    return "njit" in decorators or "intrinsic" in decorators
+
+
+def functions(path: Path) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            yield node
+
+
+def test_argument_lists_are_short() -> None:
+    benchmarks = Path(__file__).resolve().parent.parent / "benchmarks"
+    long_lists, long_kernels = set(), set()
+    for folder in (SOURCE, benchmarks):
+        for path in folder.rglob("*.py"):
+            for function in functions(path):
+                name, num = f"{path.relative_to(folder)} {function.name}", len(parameters(function))
+                if is_kernel(function) and num > MOST_OF_KERNELS:
+                    long_kernels.add(name)
+                elif not is_kernel(function) and num > MOST_PARAMETERS:
+                    long_lists.add(name)
+    assert long_kernels == set()
+    assert long_lists == LONG_LISTS
+
+
+def test_code_for_the_compiler_stays_in_one_room() -> None:
+    for path in modules():
+        if room_of(path) != "simd":
+            written = [name for name in imports(path) if name.startswith(("llvmlite", "numba.extending"))]
+            assert written == [], f"{path} writes LLVM code, which belongs into simd"

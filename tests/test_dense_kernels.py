@@ -16,7 +16,7 @@ from scipy.ndimage import map_coordinates
 from dense_scenes import FOCAL, HEIGHT, WIDTH, scene_of, wall_with_box_and_bars
 from rendered_worlds import textures
 from sfmapp.dense.arrays import Images, Limits, image_pointers
-from sfmapp.dense.patch_kernels import measure, plane_in_view, refine
+from sfmapp.dense.patch_kernels import Trial, measure, plane_in_view, refine
 from sfmapp.dense.pyramid import frame_of, gray_pyramids, make_images, noise_deviation
 from sfmapp.dense.scene import DenseScene, DenseView
 from sfmapp.dense.window import (
@@ -233,10 +233,8 @@ def _refine(images, m, u, v, plane, num, limits, contrast, work):  # type: ignor
     scratch = pointer(work)
     slot_array = np.arange(num)
     read_reference(offset(pointers.quads, pointers.start[m]), pointers.width[m], u, v, contrast, scratch)
-    n, sigma = refine(
-        pointers, m, np.float32(u), np.float32(v), pointer(plane), pointer(slot_array), offset(scratch, RHOS), num,
-        limits, scratch,
-    )  # fmt: skip
+    trial = Trial(pointer(plane), pointer(slot_array), offset(scratch, RHOS), scratch)
+    n, sigma = refine(pointers, m, np.float32(u), np.float32(v), trial, num, limits)
     slot_array[0] = 0
     return n, sigma
 

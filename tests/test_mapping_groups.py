@@ -59,6 +59,15 @@ def halves(place: Place, pool: ThreadPoolExecutor, world: np.ndarray = WORLD) ->
     return out
 
 
+def mapper_with(model: Reconstruction, found, options: MappingOptions, pool: ThreadPoolExecutor, **more) -> Mapper:
+    none = np.zeros(len(model.image_names), bool)
+    more = {"prior_cameras": list(model.cameras), "locked": none} | more
+    return Mapper(
+        reconstruction=model, correspondences=found, options=options, adjust_options=AdjustOptions(), events=Events(),
+        pool=pool, **more,
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_points_that_two_models_see_tell_how_they_lie_to_each_other(seed):
     place = make_place(seed, 2, points=300, overlap=0.2)
@@ -164,7 +173,7 @@ def test_a_part_that_hangs_loosely_on_a_model_is_found_and_joined_again():
 
         def mapper_of(model: Reconstruction) -> Mapper:
             cameras = list(place.scene.ground_truth.cameras)
-            return Mapper(model, found, options, AdjustOptions(), Events(), pool, cameras, np.zeros(10, bool), {})
+            return mapper_with(model, found, options, pool, prior_cameras=cameras)
 
         mapper_of(right).adjust_globally()
         assert repair.loose_parts(right, options.min_pose_inliers) == []
@@ -189,10 +198,7 @@ def test_an_image_that_its_own_pairs_contradict_is_taken_back():
     model.cam_from_world[2, 4:] += [1.0, 2.0, 0.5]
     with ThreadPoolExecutor(1) as pool:
         attempts: dict = {}
-        mapper = Mapper(
-            model, place.correspondences, MappingOptions(), AdjustOptions(), Events(), pool, list(model.cameras),
-            np.zeros(6, bool), attempts,
-        )  # fmt: skip
+        mapper = mapper_with(model, place.correspondences, MappingOptions(), pool, attempts=attempts)
         structure.filter_observations(model, MappingOptions(), pool)
         assert mapper._drop_contradicted_images()
     assert model.is_registered.tolist() == [True, True, False, True, True, True]
@@ -214,9 +220,7 @@ def test_many_matches_under_a_small_angle_start_before_few_under_a_wide_one():
         scene.observed.tracks,
     )
     with ThreadPoolExecutor(1) as pool:
-        mapper = Mapper(
-            model, found, MappingOptions(), AdjustOptions(), Events(), pool, list(model.cameras), np.zeros(8, bool), {}
-        )
+        mapper = mapper_with(model, found, MappingOptions(), pool)
         mapper.start(np.ones(8, bool))
     started = model.registered_idx.tolist()
     assert len(started) == 2

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.calibration import RAW, reduce_to_calibration
 from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.events import Events
@@ -106,14 +107,14 @@ def test_the_reduced_cost_is_that_of_adjusting_again() -> None:
     model, _ = keyframes.reconstruction(np.arange(8))
     variable = np.arange(16) > 1
     options = AdjustOptions(refine_focal=False, refine_distortion=False, relative_cost_tolerance=1e-12)
-    before = adjust_bundle(model, options, variable_images=variable).final_cost
+    before = adjust_bundle(model, options, varying=Varying(images=variable)).final_cost
     unknowns = Unknowns.of(model)
     system = reduce_to_calibration(model, unknowns.directions(model), 1.0, lambda tracks: tracks % 7, "trivial")
     assert system.gradient.shape == (7, len(unknowns.names))
     for name, size in (("focal", 2e-3), ("distortion_1_0", 2e-3), ("turn_y", 1e-4), ("turn_z", 1e-4)):
         step = np.where([n == name for n in unknowns.names], size, 0.0)
         changed = _changed(model, unknowns.directions(model) @ step)
-        after = adjust_bundle(changed, options, variable_images=variable).final_cost
+        after = adjust_bundle(changed, options, varying=Varying(images=variable)).final_cost
         predicted = step @ system.gradient.sum(0) + 0.5 * step @ system.information.sum(0) @ step
         assert after - before == pytest.approx(predicted, rel=0.05), name
         ratio = np.linalg.norm(changed.centers[::2] - changed.centers[::2].mean(0))

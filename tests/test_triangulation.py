@@ -7,19 +7,17 @@ import math
 import numpy as np
 import pytest
 
-from sfmapp.geometry import rigid3, triangulation
+from sfmapp.geometry import triangulation
+from sfmapp.geometry.triangulation import Observed
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene
 
 
 def run(kernel, model: Reconstruction, max_error_px: float = 4.0, min_angle_deg: float = 1.5) -> int:
-    canonical = model.canonical_cameras()
     tracks = model.tracks
     return kernel(
-        np.arange(tracks.num_tracks), tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy,
-        rigid3.rotation_matrix(model.cam_from_world), np.ascontiguousarray(model.cam_from_world[:, 4:]),
-        model.image_camera_idx, canonical, max_error_px, math.radians(min_angle_deg),
-        model.point_xyz, model.obs_is_inlier,
+        np.arange(tracks.num_tracks), Observed(tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy), model.views(),
+        max_error_px, math.radians(min_angle_deg), model.point_xyz, model.obs_is_inlier,
     )  # fmt: skip
 
 

@@ -289,7 +289,9 @@ def test_recording_holds_the_run(job: tuple[ImageSet, list[Features], Reconstruc
     image_set, features, model = job
     listener = replayed(model)
     path = tmp_path / "recording.rrd"
-    report = write_recording(path, image_set, features, [model], listener.steps, listener.messages, title="seven")
+    report = write_recording(
+        path, make_replay(image_set, features, [model], listener.steps, listener.messages, title="seven")
+    )
     assert report.problem == ""
     assert report.path == path
     assert report.num_bytes == path.stat().st_size
@@ -317,7 +319,8 @@ def test_photographs_in_memory_are_shown_as_well(
     image_set, _ = load_images(arrays, ImageOptions(), Events())
     assert not any(record.path.exists() for record in image_set.images)
     path = tmp_path / "recording.rrd"
-    assert write_recording(path, image_set, features, [model]).problem == ""
+    replay = make_replay(image_set, features, [model], [])
+    assert write_recording(path, replay, image_set.images).problem == ""
     found = entities_of(path)
     cameras = [name for name in found if name.startswith("/world/model0/cameras/")]
     assert cameras
@@ -333,7 +336,7 @@ def test_recording_of_nothing_is_still_a_recording(
     image_set.images[0].path.unlink()  # gone since
     image_set.images[1].path.write_bytes(b"\xff\xd8\xff")  # and broken
     path = tmp_path / "recording.rrd"
-    assert write_recording(path, image_set, features, []).problem == ""
+    assert write_recording(path, make_replay(image_set, features, [], [])).problem == ""
     assert "EncodedImage:blob" in entities_of(path)["/photo"]
 
 
@@ -344,12 +347,12 @@ def test_a_crash_of_the_other_process_is_a_report_not_an_error(
     path = tmp_path / "recording.rrd"
     path.write_text("older")
     monkeypatch.setattr(sys, "executable", "/bin/false")
-    report = write_recording(path, image_set, features, [model])
+    report = write_recording(path, make_replay(image_set, features, [model], []))
     assert report.path is None
     assert "exit code 1" in report.problem
     assert path.read_text() == "older"
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
-    assert "did not start" in write_recording(path, image_set, features, [model]).problem
+    assert "did not start" in write_recording(path, make_replay(image_set, features, [model], [])).problem
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

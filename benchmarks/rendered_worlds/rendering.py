@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -207,14 +207,14 @@ class Renderer:
         paint[:, :6] = (
             paint[:, 14:16, None] * inverse[order, 2, None] + paint[:, 10:12, None] * inverse[order, :2]
         ).reshape(-1, 6)
-        quads = (inverse[order], nearest[order], paint, skins[order])
-        starts, entries = _fill_tiles(quads[0], box[order], bounds, spans)
+        quads = _Quads(inverse[order], nearest[order], paint, skins[order])
+        starts, entries = _fill_tiles(quads.inverse, box[order], bounds, spans)
         shape = rays.shape[:2]
         grey, found, depth = np.zeros(shape, np.float32), np.empty(shape, np.int32), np.empty(shape, np.float32)
-        atlas = (world.atlas.pixels, world.atlas.sizes, world.atlas.offsets)
-        _trace_centres(rays, slopes, starts, entries, *quads, *atlas, grey, found, depth)
+        atlas = _Atlas(world.atlas.pixels, world.atlas.sizes, world.atlas.offsets)
+        _trace_centres(rays, slopes, starts, entries, quads, atlas, grey, found, depth)
         if edge_samples:
-            _trace_edges(rays, slopes, starts, entries, *quads, *atlas, ROOKS, found, grey)
+            _trace_edges(rays, slopes, starts, entries, quads, atlas, ROOKS, found, grey)
         surface = np.where(found >= 0, order.astype(np.int32)[found] if len(order) else -1, -1).astype(np.int32)
         return View(grey, surface, depth)
 
@@ -438,13 +438,32 @@ def _trilinear(pixels: Any, sizes: Ints, offsets: Ints, texture: int, s: float, 
     return value
 
 
+class _Quads(NamedTuple):
+    """Rectangles (Q) in sight, the nearest first: what leads from a ray to a place on them, their depth, how they are
+    painted, and their two textures."""
+
+    inverse: Array
+    nearest: Array
+    paint: Array
+    skins: Ints
+
+
+class _Atlas(NamedTuple):
+    """All textures with their pyramids in one row of pixels; sizes and offsets of their levels."""
+
+    pixels: Any
+    sizes: Ints
+    offsets: Ints
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _colour(
-    x: float, y: float, w: float, slopes: Array, i: int, j: int, scale: float, probes: int, q: int, inverse: Array,
-    paint: Array, skins: Ints, pixels: Any, sizes: Ints, offsets: Ints,
+    ray: tuple[float, float, float], slope: tuple[float, float, float, float], scale: float, probes: int, q: int,
+    inverse: Array, paint: Array, skins: Ints, pixels: Any, sizes: Ints, offsets: Ints,
 ) -> float:  # fmt: skip
-    """Grey value that rectangle q shows at inverse depth w on the ray (x, y, 1) near pixel (i, j), over a footprint of
-    ``scale`` pixels."""
+    """Grey value that rectangle q shows at inverse depth w on the ray (x, y, 1), ``ray`` being (x, y, w), over a
+    footprint of ``scale`` pixels; ``slope``: how x and y change along a row and down a column of pixels."""
+    x, y, w = ray
     z = 1.0 / w
     s = (paint[q, 0] * x + paint[q, 1] * y + paint[q, 2]) * z
     t = (paint[q, 3] * x + paint[q, 4] * y + paint[q, 5]) * z
@@ -453,7 +472,7 @@ def _colour(
     wx, wy = inverse[q, 2, 0], inverse[q, 2, 1]
     sx, sy = (paint[q, 0] - s * wx) * z, (paint[q, 1] - s * wy) * z
     tx, ty = (paint[q, 3] - t * wx) * z, (paint[q, 4] - t * wy) * z
-    x0, y0, x1, y1 = slopes[i, j, 0], slopes[i, j, 1], slopes[i, j, 2], slopes[i, j, 3]
+    x0, y0, x1, y1 = slope
     j00, j01 = sx * x0 + sy * y0, sx * x1 + sy * y1
     j10, j11 = tx * x0 + ty * y0, tx * x1 + ty * y1
     # axes of the ellipse that a unit circle of the image becomes: eigenvalues of J J^T
@@ -488,10 +507,12 @@ def _colour(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _trace_centres(
-    rays: Array, slopes: Array, starts: Ints, entries: Any, inverse: Array, nearest: Array, paint: Array, skins: Ints,
-    pixels: Any, sizes: Ints, offsets: Ints, grey: Any, found: Any, depth: Any,
+    rays: Array, slopes: Array, starts: Ints, entries: Any, quads: _Quads, atlas: _Atlas, grey: Any, found: Any,
+    depth: Any,
 ) -> None:  # fmt: skip
     """One ray through every pixel's centre."""
+    inverse, nearest, paint, skins = quads
+    pixels, sizes, offsets = atlas
     columns = -(-rays.shape[1] // TILE_PX)
     for i in range(rays.shape[0]):
         for j in range(rays.shape[1]):
@@ -502,17 +523,20 @@ def _trace_centres(
             depth[i, j] = np.inf
             if q >= 0:
                 depth[i, j] = 1.0 / w
+                slope = (slopes[i, j, 0], slopes[i, j, 1], slopes[i, j, 2], slopes[i, j, 3])
                 grey[i, j] = _colour(
-                    x, y, w, slopes, i, j, 1.0, MAX_PROBES, q, inverse, paint, skins, pixels, sizes, offsets
-                )
+                    (x, y, w), slope, 1.0, MAX_PROBES, q, inverse, paint, skins, pixels, sizes, offsets
+                )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _trace_edges(
-    rays: Array, slopes: Array, starts: Ints, entries: Any, inverse: Array, nearest: Array, paint: Array, skins: Ints,
-    pixels: Any, sizes: Ints, offsets: Ints, samples: Array, found: Any, grey: Any,
+    rays: Array, slopes: Array, starts: Ints, entries: Any, quads: _Quads, atlas: _Atlas, samples: Array, found: Any,
+    grey: Any,
 ) -> None:  # fmt: skip
     """Several rays through every pixel whose neighbour shows another rectangle in another grey."""
+    inverse, nearest, paint, skins = quads
+    pixels, sizes, offsets = atlas
     height, width = found.shape
     columns = -(-width // TILE_PX)
     for i in range(height):
@@ -526,11 +550,12 @@ def _trace_edges(
                 continue
             tile = (i // TILE_PX) * columns + j // TILE_PX
             total = 0.0
+            slope = (slopes[i, j, 0], slopes[i, j, 1], slopes[i, j, 2], slopes[i, j, 3])
             for k in range(samples.shape[0]):
                 dx, dy = samples[k, 0], samples[k, 1]
-                x = rays[i, j, 0] + slopes[i, j, 0] * dx + slopes[i, j, 2] * dy
-                y = rays[i, j, 1] + slopes[i, j, 1] * dx + slopes[i, j, 3] * dy
+                x = rays[i, j, 0] + slope[0] * dx + slope[2] * dy
+                y = rays[i, j, 1] + slope[1] * dx + slope[3] * dy
                 hit, w = _hit(x, y, starts[tile], starts[tile + 1], entries, inverse, nearest)
                 if hit >= 0:
-                    total += _colour(x, y, w, slopes, i, j, 0.5, 2, hit, inverse, paint, skins, pixels, sizes, offsets)
+                    total += _colour((x, y, w), slope, 0.5, 2, hit, inverse, paint, skins, pixels, sizes, offsets)
             grey[i, j] = total / samples.shape[0]

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.kernels import CANON, LOSS_IDS, POINT, POSE, SCRATCH, linearize
+from sfmapp.adjust.kernels import CANON, LOSS_IDS, POINT, POSE, SCRATCH, RobustLoss, linearize
 from sfmapp.adjust.options import Loss
 from sfmapp.adjust.problem import pose_rows
 from sfmapp.camera.lens import FAMILY, LAST_ON_PLANE, ROW
@@ -81,15 +82,16 @@ def reduce_to_calibration(
     num = directions.shape[2] + 2 * len(model.cameras) * basis.shape[1]
     padded = np.zeros((*directions.shape[:2], num))
     padded[:, :, : directions.shape[2]] = directions
-    arguments = (
-        tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy, model.obs_is_inlier, model.point_xyz,
-        pose_rows(model.cam_from_world), num_sensors, _adjoints(mounts), np.ascontiguousarray(canonical),
-        penalty, padded, basis, LOSS_IDS[loss], (loss_sigmas * sigma_px) ** 2, 1.0 / sigma_px,
-        int(np.diff(tracks.track_ptr).max(initial=1)),
-    )  # fmt: skip
+    seen = _Seen(tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy, model.obs_is_inlier, model.point_xyz)
+    cameras = _Cameras(
+        pose_rows(model.cam_from_world), num_sensors, _adjoints(mounts), np.ascontiguousarray(canonical), penalty
+    )
+    unknowns = _Unknowns(padded, basis)
+    noise = _Noise(RobustLoss(LOSS_IDS[loss], (loss_sigmas * sigma_px) ** 2), 1.0 / sigma_px)
+    rows = _Rows.of_tracks(tracks.track_ptr, num)
     size = 6 * num_frames
     system, cross, said = np.zeros((size, size)), np.zeros((size, num)), np.zeros(tracks.num_tracks, bool)
-    _reduce(*arguments, system, cross, said)
+    _reduce(seen, cameras, unknowns, noise, rows, system, cross, said)
     poses = (np.triu(system) + np.triu(system, 1).T)[6:, 6:]
     poses[np.diag_indices(len(poses))] *= 1 + _DAMPING
     poses[np.diag_indices(len(poses))] += 1e-12 * np.trace(poses) / max(len(poses), 1)
@@ -101,7 +103,7 @@ def reduce_to_calibration(
     cluster[said] = clusters(np.flatnonzero(said))
     gradient = np.zeros((int(cluster.max(initial=-1)) + 1, num))
     information = np.zeros((*gradient.shape, num))
-    _by_cluster(*arguments, response, cluster, gradient, information)
+    _by_cluster(seen, cameras, unknowns, noise, rows, response, cluster, gradient, information)
     return CalibrationSystem(
         gradient, information, response.reshape(num_frames, 6, -1), along @ response,
         float(along[6:] @ solved[:, -1]) if num_sensors > 1 else np.inf,
@@ -126,16 +128,75 @@ def _stretch(model: Reconstruction, num_sensors: int) -> Array:
     return out.ravel()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _rows(  # type: ignore[no-untyped-def]
-    t, track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, penalty,
-    directions, fields, loss, scale2, weight, J, frames, pose_part, lens_part, point_part, residual,
-):  # fmt: skip
-    """Fill the rows of a track's inliers; returns their number, 0 if there are too few for a point.
+class _Seen(NamedTuple):
+    """Tracks (T), their observations (O) by images, and their points, NaN where there is none."""
 
-    Frames (n,), derivatives by rig pose (2n, 6), unknowns (2n, Q) and point (2n, 3), the latter made orthonormal, and
-    residuals (2n,). Each row is that of a residual in units of the noise.
+    track_ptr: NDArray[np.int64]
+    obs_image: NDArray[np.int32]
+    obs_xy: Array
+    is_inlier: NDArray[np.bool_]
+    xyz: Array
+
+
+class _Cameras(NamedTuple):
+    """Images (I, 12) as rows of their poses, frame by frame; the adjoints (S, 6, 6), canonical rows (S, ROW) and
+    squared residuals (S,) behind of the sensors."""
+
+    poses: Array
+    num_sensors: int
+    adjoints: Array
+    canonical: Array
+    penalty: Array
+
+
+class _Unknowns(NamedTuple):
+    """Directions (S, RAW, Q) and fields (O, N), see :func:`reduce_to_calibration`."""
+
+    directions: Array
+    fields: Array
+
+
+class _Noise(NamedTuple):
+    """The loss in pixels, and how many of a residual's units make a pixel."""
+
+    loss: RobustLoss
+    weight: float
+
+
+class _Rows(NamedTuple):
+    """Room for the rows of one track: two for each of its observations.
+
+    Attributes:
+        frame: (n,) int64 of each observation.
+        pose_part, lens_part, point_part: (2n, 6), (2n, Q), (2n, 3) derivatives by the rig's pose, the unknowns and the
+            point, the latter made orthonormal. residual: (2n,). All in units of the noise.
+        scratch: (SCRATCH,) of an observation.
     """
+
+    frame: NDArray[np.int64]
+    pose_part: Array
+    lens_part: Array
+    point_part: Array
+    residual: Array
+    scratch: Array
+
+    @staticmethod
+    def of_tracks(track_ptr: NDArray[np.int64], num_unknowns: int) -> _Rows:
+        longest = int(np.diff(track_ptr).max(initial=1))
+        return _Rows(
+            np.zeros(longest, np.int64), np.zeros((2 * longest, 6)), np.zeros((2 * longest, num_unknowns)),
+            np.zeros((2 * longest, 3)), np.zeros(2 * longest), np.zeros(SCRATCH),
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fill_rows(t: int, seen: _Seen, cameras: _Cameras, unknowns: _Unknowns, noise: _Noise, rows: _Rows) -> int:
+    """Fill the rows of a track's inliers; returns their number, 0 if there are too few for a point."""
+    track_ptr, obs_image, obs_xy, is_inlier, xyz = seen
+    poses, num_sensors, adjoints, canonical, penalty = cameras
+    directions, fields = unknowns
+    loss, weight = noise
+    frames, pose_part, lens_part, point_part, residual, J = rows
     scratch, pose, lens = pointer(J), pointer(poses), pointer(canonical)
     n, num = 0, directions.shape[2]
     if not np.isfinite(xyz[t, 0] + xyz[t, 1] + xyz[t, 2]):
@@ -146,8 +207,8 @@ def _rows(  # type: ignore[no-untyped-def]
         i = obs_image[o]
         s = i % num_sensors
         linearize(
-            offset(pose, 12 * i), False, offset(pose, 0), offset(lens, ROW * s), xyz[t, 0], xyz[t, 1],
-            xyz[t, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[s], True, scratch,
+            offset(pose, 12 * i), False, offset(pose, 0), offset(lens, ROW * s), (xyz[t, 0], xyz[t, 1], xyz[t, 2]),
+            (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[s], True, scratch,
         )  # fmt: skip
         used = 8 if canonical[s, FAMILY] <= LAST_ON_PLANE else FAMILY  # the numbers in the row that mean something
         frames[n] = i // num_sensors
@@ -178,7 +239,7 @@ def _rows(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _orthonormalize(columns, rows):  # type: ignore[no-untyped-def]
+def _orthonormalize(columns: Array, rows: int) -> bool:
     """Gram and Schmidt over three columns, in place; False where one hangs on the others."""
     for k in range(3):
         before = 0.0
@@ -201,7 +262,7 @@ def _orthonormalize(columns, rows):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _project(point_part, rows, columns):  # type: ignore[no-untyped-def]
+def _project(point_part: Array, rows: int, columns: Array) -> None:
     """Take out of columns (rows, N) what a move of the point does, whose derivatives are orthonormal; in place."""
     moved = np.zeros(columns.shape[1])
     for m in range(3):
@@ -215,23 +276,18 @@ def _project(point_part, rows, columns):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _reduce(  # type: ignore[no-untyped-def]
-    track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, penalty, directions,
-    fields, loss, scale2, weight, longest, system, cross, said,
-):  # fmt: skip
+def _reduce(
+    seen: _Seen, cameras: _Cameras, unknowns: _Unknowns, noise: _Noise, rows: _Rows, system: Array, cross: Array,
+    said: NDArray[np.bool_],
+) -> None:  # fmt: skip
     """Add the tracks, points eliminated, to the upper half of a system over poses (F * 6), and to cross (F * 6, Q).
 
     ``said`` (T,) tells which tracks have a point that enough observations hold."""
-    num = directions.shape[2]
-    J, frames = np.zeros(SCRATCH), np.zeros(longest, np.int64)
-    pose_part, lens_part = np.zeros((2 * longest, 6)), np.zeros((2 * longest, num))
-    point_part, residual = np.zeros((2 * longest, 3)), np.zeros(2 * longest)
+    num, longest = unknowns.directions.shape[2], rows.frame.shape[0]
+    frames, pose_part, lens_part, point_part, _, _ = rows
     place, W = np.zeros(longest, np.int64), np.zeros((3, 6 * longest))
-    for t in range(track_ptr.shape[0] - 1):
-        n = _rows(
-            t, track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, penalty,
-            directions, fields, loss, scale2, weight, J, frames, pose_part, lens_part, point_part, residual,
-        )  # fmt: skip
+    for t in range(seen.track_ptr.shape[0] - 1):
+        n = _fill_rows(t, seen, cameras, unknowns, noise, rows)
         said[t] = n > 0
         _project(point_part, 2 * n, lens_part)
         count, frame = 0, -1
@@ -260,23 +316,18 @@ def _reduce(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _by_cluster(  # type: ignore[no-untyped-def]
-    track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, penalty, directions,
-    fields, loss, scale2, weight, longest, response, cluster, gradient, information,
-):  # fmt: skip
+def _by_cluster(
+    seen: _Seen, cameras: _Cameras, unknowns: _Unknowns, noise: _Noise, rows: _Rows, response: Array,
+    cluster: NDArray[np.int64], gradient: Array, information: Array,
+) -> None:  # fmt: skip
     """Gradient (C, Q) and information (C, Q, Q) of clusters of tracks, the poses following with response (F * 6, Q)."""
-    num = directions.shape[2]
-    J, frames = np.zeros(SCRATCH), np.zeros(longest, np.int64)
-    pose_part, lens_part = np.zeros((2 * longest, 6)), np.zeros((2 * longest, num))
-    point_part, residual = np.zeros((2 * longest, 3)), np.zeros(2 * longest)
-    for t in range(track_ptr.shape[0] - 1):
+    num = unknowns.directions.shape[2]
+    frames, pose_part, lens_part, point_part, residual, _ = rows
+    for t in range(seen.track_ptr.shape[0] - 1):
         c = cluster[t]
         if c < 0:
             continue
-        n = _rows(
-            t, track_ptr, obs_image, obs_xy, is_inlier, xyz, poses, num_sensors, adjoints, canonical, penalty,
-            directions, fields, loss, scale2, weight, J, frames, pose_part, lens_part, point_part, residual,
-        )  # fmt: skip
+        n = _fill_rows(t, seen, cameras, unknowns, noise, rows)
         for r in range(2 * n):
             for k in range(6):
                 value, at = pose_part[r, k], 6 * frames[r // 2] + k

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import constrained_inverse, gauge_of, pose_covariances, reduced_matrix
-from sfmapp.adjust.kernels import POINT, SCRATCH, linearize
+from sfmapp.adjust.kernels import POINT, SCRATCH, ImageArrays, LensArrays, PointArrays, RobustLoss, linearize
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.solver import Engine, make_engine
 from sfmapp.camera.lens import ROW
@@ -55,10 +55,7 @@ def clustered_covariances(reconstruction: Reconstruction, options: AdjustOptions
     """
     if any(options.refine):
         raise ValueError("intrinsics must be constant")
-    engine = make_engine(
-        reconstruction, options, variable_images=None, variable_cameras=None, points=None, constant_points=None,
-        prior_cameras=None, extra_factors=None,
-    )  # fmt: skip
+    engine = make_engine(reconstruction, options)
     problem = engine.problem
     engine.linearize(0.0, map)
     used = (np.arange(8) < problem.block_dim[:, None]).ravel()
@@ -93,21 +90,20 @@ def _scatter(engine: Engine, num: int) -> tuple[Array, Array, float, float]:
     the track's own noise would give them; sums of the observations' weights and of the slopes of their influence."""
     p = engine.problem
     clustered, independent, sums = np.zeros((num, num)), np.zeros((num, num)), np.zeros(2)
-    _add_tracks(
-        p.point_ptr, p.obs_image, p.obs_xy, p.xyz, engine.rows, p.image_mount, p.mounts, p.image_camera, p.image_block,
-        p.canonical, p.penalty, engine.loss, engine.scale2, engine.factor, np.zeros(SCRATCH), clustered,
-        independent, sums,
-    )  # fmt: skip
+    _add_tracks(p.points, p.images(engine.rows), p.lenses, engine.loss, engine.factor, clustered, independent, sums)
     return clustered, independent, float(sums[0]), float(sums[1])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_tracks(  # type: ignore[no-untyped-def]
-    point_ptr, obs_image, obs_xy, xyz, poses, image_mount, mounts, image_camera, image_block, canonical,
-    penalty, loss, scale2, factor, J, clustered, independent, sums,
-):  # fmt: skip
+def _add_tracks(
+    points: PointArrays, images: ImageArrays, lenses: LensArrays, loss: RobustLoss, factor: Array, clustered: Array,
+    independent: Array, sums: Array,
+) -> None:  # fmt: skip
     """See :func:`_scatter`. The point is eliminated with ``V^-1 = L^-T L^-1`` from the factor."""
-    scratch, pose, mount, lens = pointer(J), pointer(poses), pointer(mounts), pointer(canonical)
+    point_ptr, obs_image, obs_xy, xyz, _ = points
+    poses, image_mount, mounts, image_camera, image_block = images
+    penalty, J = lenses.penalty, np.zeros(SCRATCH)
+    scratch, pose, mount, lens = pointer(J), pointer(poses), pointer(mounts), pointer(lenses.canonical)
     num_blocks = clustered.shape[0] // 6
     mark, touched = np.full(num_blocks, -1, np.int64), np.zeros(num_blocks, np.int64)
     U, Z, g = np.zeros((num_blocks, 6, 6)), np.zeros((num_blocks, 6, 3)), np.zeros((num_blocks, 6))
@@ -124,15 +120,14 @@ def _add_tracks(  # type: ignore[no-untyped-def]
             c = image_camera[i]
             s = linearize(
                 offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, ROW * c),
-                xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
-                False, scratch,
+                (xyz[p, 0], xyz[p, 1], xyz[p, 2]), (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[c], False, scratch,
             )  # fmt: skip
             squared = J[POINT + 3] * J[POINT + 3] + J[POINT + 11] * J[POINT + 11]
             weight = squared / s if s > 0.0 else 1.0
             squares += squared
             sums[0] += weight
             # of Cauchy's loss, on average over directions
-            sums[1] += weight - weight * squared / scale2 if loss == 2 else weight
+            sums[1] += weight - weight * squared / loss.scale2 if loss.kind == 2 else weight
             k = image_block[i]
             if mark[k] != p:
                 mark[k] = p

@@ -10,7 +10,8 @@ from sfmapp.adjust.kernels import find_slot
 from sfmapp.adjust.linear import mark_pairs, number_keys
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.pose import refine_pose
-from sfmapp.adjust.solver import adjust_bundle
+from sfmapp.adjust.problem import Varying
+from sfmapp.adjust.solver import adjust_bundle, make_engine
 
 
 def compile_kernels() -> None:
@@ -19,12 +20,13 @@ def compile_kernels() -> None:
 
     scene = make_scene(0, 3, 8)
     model = scene.observed.copy()
-    adjust_bundle(model, AdjustOptions(max_iterations=2), variable_images=np.array([True, True, False]))
+    adjust_bundle(model, AdjustOptions(max_iterations=2), varying=Varying(images=np.array([True, True, False])))
     fixed = AdjustOptions(refine_focal=False, refine_distortion=False)
     estimate_covariances(model, fixed)
     clustered_covariances(make_scene(0, 3, 40).observed, fixed)
     camera, tracks = model.cameras[0], model.tracks
     refine_pose(camera.canonical, model.cam_from_world[0], model.point_xyz, tracks.obs_xy[:8])
-    no_images = np.zeros(0, np.int32)
-    mark_pairs(np.zeros(1, np.int64), no_images, no_images, no_images, no_images, no_images, np.eye(1, dtype=bool))
+    engine = make_engine(model, fixed)
+    problem = engine.problem
+    mark_pairs(problem.points, problem.images(engine.rows), problem.lenses, np.eye(problem.num_blocks, dtype=bool))
     find_slot(*number_keys(np.arange(3)), 0)

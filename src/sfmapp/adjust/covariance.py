@@ -20,9 +20,19 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.kernels import CANON, POINT, SCRATCH, linearize, robust_weight
+from sfmapp.adjust.kernels import (
+    CANON,
+    POINT,
+    SCRATCH,
+    ImageArrays,
+    LensArrays,
+    PointArrays,
+    RobustLoss,
+    linearize,
+    robust_weight,
+)
 from sfmapp.adjust.options import AdjustOptions
-from sfmapp.adjust.problem import Problem
+from sfmapp.adjust.problem import EVERYTHING, Problem, Varying
 from sfmapp.adjust.solver import Engine, make_engine
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import ROW
@@ -92,10 +102,7 @@ def estimate_covariances(
     options: AdjustOptions = _DEFAULTS,
     *,
     sigma_px: float | None = None,
-    variable_images: Mask | None = None,
-    variable_cameras: Mask | None = None,
-    points: Mask | None = None,
-    constant_points: Mask | None = None,
+    varying: Varying = EVERYTHING,
     prior_cameras: Sequence[Camera] | None = None,
     extra_factors: Any = None,
 ) -> Covariances:
@@ -106,10 +113,7 @@ def estimate_covariances(
 
     Memory is that of two dense matrices over all unknowns of cameras and poses.
     """
-    engine = make_engine(
-        reconstruction, options, variable_images=variable_images, variable_cameras=variable_cameras, points=points,
-        constant_points=constant_points, prior_cameras=prior_cameras, extra_factors=extra_factors,
-    )  # fmt: skip
+    engine = make_engine(reconstruction, options, varying, prior_cameras=prior_cameras, extra_factors=extra_factors)
     problem, extras = engine.problem, engine.extras
     used = (np.arange(8) < problem.block_dim[:, None]).ravel()
     variance = sigma_px**2 if sigma_px is not None else _variance(engine, int(used.sum()))
@@ -131,10 +135,7 @@ def estimate_covariances(
 def _variance(engine: Engine, num_unknowns: int) -> float:
     """Variance of a pixel coordinate from weighted residuals and degrees of freedom."""
     p = engine.problem
-    total = _weighted_squares(
-        p.point_ptr, p.obs_image, p.obs_xy, p.xyz, engine.rows, p.image_mount, p.mounts, p.image_camera, p.canonical,
-        p.penalty, engine.loss, engine.scale2, np.zeros(SCRATCH),
-    )  # fmt: skip
+    total = _weighted_squares(p.points, p.images(engine.rows), p.lenses, engine.loss)
     is_free = (p.pose_block >= 0).all() and not p.is_constant.any() and engine.extras is None
     free_gauge = 0 if not is_free else 6 if p.has_baseline else 7
     dof = 2 * p.num_observations - 3 * int((~p.is_constant).sum()) - num_unknowns + free_gauge
@@ -236,10 +237,8 @@ def _collect(
     points = np.full((len(p.xyz), 3, 3), np.inf)
     if determined:
         _point_covariances(
-            p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, engine.rows, p.image_mount, p.mounts,
-            p.image_camera, p.image_block, p.canonical, p.penalty, p.camera_block, p.free.ptr, p.free.slot,
-            p.free.column, p.block_dim, engine.loss, engine.scale2, engine.factor, covariance, variance,
-            np.zeros(SCRATCH), points,
+            p.points, p.images(engine.rows), p.lenses, p.block_dim, engine.loss, engine.factor, covariance, variance,
+            points,
         )  # fmt: skip
     return Covariances(
         image_idx=image_idx,
@@ -348,12 +347,12 @@ def _apply_similarity(model: Reconstruction, poses: Array, move: Array) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _weighted_squares(  # type: ignore[no-untyped-def]
-    point_ptr, obs_image, obs_xy, xyz, poses, image_mount, mounts, image_camera, canonical, penalty, loss,
-    scale2, J,
-):  # fmt: skip
+def _weighted_squares(points: PointArrays, images: ImageArrays, lenses: LensArrays, loss: RobustLoss) -> float:
     """Sum of rho'(s) s over all observations."""
-    scratch, pose, mount, lens = pointer(J), pointer(poses), pointer(mounts), pointer(canonical)
+    point_ptr, obs_image, obs_xy, xyz, _ = points
+    poses, image_mount, mounts, image_camera, _ = images
+    penalty, J = lenses.penalty, np.zeros(SCRATCH)
+    scratch, pose, mount, lens = pointer(J), pointer(poses), pointer(mounts), pointer(lenses.canonical)
     total = 0.0
     for p in range(xyz.shape[0]):
         for o in range(point_ptr[p], point_ptr[p + 1]):
@@ -361,20 +360,22 @@ def _weighted_squares(  # type: ignore[no-untyped-def]
             c = image_camera[i]
             s = linearize(
                 offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, ROW * c),
-                xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
-                False, scratch,
+                (xyz[p, 0], xyz[p, 1], xyz[p, 2]), (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[c], False, scratch,
             )  # fmt: skip
-            total += robust_weight(loss, scale2, s) * s
+            total += robust_weight(loss, s) * s
     return total
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _point_covariances(  # type: ignore[no-untyped-def]
-    point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_mount, mounts, image_camera, image_block, canonical,
-    penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, factor, covariance,
-    variance, J, out,
-):  # fmt: skip
+def _point_covariances(
+    points: PointArrays, images: ImageArrays, lenses: LensArrays, block_dim: NDArray[np.int64], loss: RobustLoss,
+    factor: Array, covariance: Array, variance: float, out: Array,
+) -> None:  # fmt: skip
     """``V^-1 (variance V + W^T C W) V^-1`` of each point, with V^-1 = L^-T L^-1 from the factor; C in full blocks."""
+    point_ptr, obs_image, obs_xy, xyz, is_constant = points
+    poses, image_mount, mounts, image_camera, image_block = images
+    canonical, penalty, camera_block, second_block, free_ptr, free_slot, free_column = lenses
+    J = np.zeros(SCRATCH)
     scratch, pose, mount, lens = pointer(J), pointer(poses), pointer(mounts), pointer(canonical)
     num_blocks = block_dim.shape[0]
     mark = np.full(num_blocks, -1, np.int64)
@@ -394,12 +395,9 @@ def _point_covariances(  # type: ignore[no-untyped-def]
             c = image_camera[i]
             linearize(
                 offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, ROW * c),
-                xyz[p, 0], xyz[p, 1], xyz[p, 2], obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
-                True, scratch,
+                (xyz[p, 0], xyz[p, 1], xyz[p, 2]), (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[c], True, scratch,
             )  # fmt: skip
-            is_wide = free_ptr[c] < free_ptr[c + 1] and free_column[free_ptr[c + 1] - 1] >= 8
-            second = np.int64(camera_block[c]) + 1 if is_wide and camera_block[c] >= 0 else np.int64(-1)
-            for block in (np.int64(image_block[i]), np.int64(camera_block[c]), second):
+            for block in (image_block[i], camera_block[c], second_block[c]):
                 if block >= 0 and mark[block] != p:
                     mark[block] = p
                     touched[count] = block

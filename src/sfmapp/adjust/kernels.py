@@ -17,8 +17,11 @@ sums, which are added in order, so the result does not depend on the number of t
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
+import numpy as np
+from numpy.typing import NDArray
 
 from sfmapp.camera import brown, radial_fisheye
 from sfmapp.camera.lens import (
@@ -32,7 +35,11 @@ from sfmapp.camera.lens import (
     project_jacobian,
 )
 from sfmapp.simd.f64x8 import add2, assign3, spread, store8, subtract3
-from sfmapp.simd.pointers import offset, pointer
+from sfmapp.simd.pointers import Pointer, offset, pointer
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Int32s = NDArray[np.int32]
 
 # The numbers by which kernels know the losses.
 LOSS_IDS: dict[str, int] = {"trivial": 0, "huber": 1, "cauchy": 2}
@@ -48,28 +55,132 @@ _NORMAL, _SMALL, _ZEROS, _FIXED = 96, 120, 144, 160
 _MIN_COS = 1e-6
 
 
+class RobustLoss(NamedTuple):
+    """A loss on squared residuals: its number among LOSS_IDS, and the squared residual at which it begins to bend."""
+
+    kind: int
+    scale2: float
+
+
+class PointArrays(NamedTuple):
+    """Points (P) and their observations (O), those of point p at ``ptr[p] : ptr[p + 1]``.
+
+    Attributes:
+        ptr: (P + 1,) int64. image: (O,) int32 positions among the images. xy: (O, 2) pixels.
+        xyz: (P, 3). is_constant: (P,) bool, points that do not move.
+    """
+
+    ptr: Ints
+    image: Int32s
+    xy: Array
+    xyz: Array
+    is_constant: NDArray[np.bool_]
+
+
+class ImageArrays(NamedTuple):
+    """Images (I).
+
+    Attributes:
+        rows: (I, 12) rotation row by row and translation of cam_from_world.
+        mount: (I,) int32 row in mounts (M, 12), cam_from_rig; -1 where the image's pose is that of its block.
+        mounts: (M, 12). camera: (I,) int32. block: (I,) int32 block of its pose, -1 where that is constant.
+    """
+
+    rows: Array
+    mount: Int32s
+    mounts: Array
+    camera: Int32s
+    block: Int32s
+
+
+class LensArrays(NamedTuple):
+    """Cameras (C).
+
+    Attributes:
+        canonical: (C, ROW), see ``Camera.canonical``. penalty: (C,) squared residual of what is behind.
+        block: (C,) int32 block that holds the free intrinsics, -1 where constant. second: (C,) int32 the one with those
+            beyond the eighth, right behind it, -1 where there are none.
+        free_ptr, free_slot, free_column: for camera c in ``free_ptr[c] : free_ptr[c + 1]`` canonical slot and column
+            in the block, from 8 on that of the second one.
+    """
+
+    canonical: Array
+    penalty: Array
+    block: Int32s
+    second: Int32s
+    free_ptr: Ints
+    free_slot: Ints
+    free_column: Ints
+
+
+class BlockArrays(NamedTuple):
+    """Blocks of unknowns (B).
+
+    Attributes:
+        dim: (B,) int64 rows in use of each.
+        hash_keys, hash_values: tile of block pair a <= b under key a B + b; empty if that number is the tile's as well.
+    """
+
+    dim: Ints
+    hash_keys: Ints
+    hash_values: Ints
+
+
+class Sums(NamedTuple):
+    """What the points of a chunk add up to.
+
+    Attributes:
+        tiles: (N * 64,) sum of -Z_a Z_b^T. own: (B * 64,) J^T J of each block with itself, not eliminated.
+        cross: (I * 64,) J_pose^T J_intrinsics of images whose camera has a block of its own. Where a camera has a
+            second one ((2 I + C) * 64,): behind it the same of that, and J_first^T J_second of each camera.
+        gradient: (2 * B * 8,) J^T r before elimination, and what elimination adds to it.
+    """
+
+    tiles: Array
+    own: Array
+    cross: Array
+    gradient: Array
+
+
+class State(NamedTuple):
+    """What may change: rows (I, 12) of the images, canonical rows (C, ROW) of the cameras, and points (P, 3)."""
+
+    rows: Array
+    canonical: Array
+    xyz: Array
+
+
+class Scratch(NamedTuple):
+    """Room of :func:`scratch_size`, of any content."""
+
+    doubles: Array
+    integers: Ints
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def robust_weight(loss: int, scale2: float, s: float) -> float:
+def robust_weight(loss: RobustLoss, s: float) -> float:
     """rho'(s), the weight of a squared residual s (Holland and Welsch 1977).
 
     Triggs's second-order term is left out, as in Ceres for these losses: measured, it costs more steps than it saves.
     """
-    if loss == 0:
+    kind, scale2 = loss
+    if kind == 0:
         return 1.0
-    if loss == 1:
+    if kind == 1:
         return 1.0 if s <= scale2 else math.sqrt(scale2 / s)
     return scale2 / (scale2 + s)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def add_loss(loss, scale2, s, total, product):  # type: ignore[no-untyped-def]
+def add_loss(loss: RobustLoss, s: float, total: float, product: float) -> tuple[float, float]:
     """Add rho(s) to a sum that starts as (0, 1); returns the new (total, product), see :func:`total_loss`.
 
     A sum of logarithms is the logarithm of a product: Cauchy's loss costs a multiplication.
     """
-    if loss == 0:
+    kind, scale2 = loss
+    if kind == 0:
         return total + s, product
-    if loss == 1:
+    if kind == 1:
         return total + (s if s <= scale2 else 2.0 * math.sqrt(s * scale2) - scale2), product
     product *= 1.0 + s / scale2
     if product > 1e200:
@@ -78,32 +189,36 @@ def add_loss(loss, scale2, s, total, product):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def total_loss(scale2: float, total: float, product: float) -> float:
+def total_loss(loss: RobustLoss, total: float, product: float) -> float:
     """The cost, half of the sum of rho, of a sum by :func:`add_loss`."""
-    return 0.5 * (total + scale2 * math.log(product))
+    return 0.5 * (total + loss.scale2 * math.log(product))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _linearize_ray(c, px, py, pz, xo, yo, loss, scale2, penalty, J):  # type: ignore[no-untyped-def]
+def _linearize_ray(
+    c: Pointer, ray: tuple[float, float, float], pixel: tuple[float, float], loss: RobustLoss, penalty: float,
+    J: Pointer,
+) -> tuple[bool, float, float, float, float, float, float, float, float, float]:  # fmt: skip
     """What the lens says in :func:`linearize`, for any family and in every direction: whether it looks there, the
     squared residual, the weighted residual and the weighted derivatives of u and of v by the point in the camera."""
     # the row of the lens is laid out so that its derivatives by the parameters come to lie where ours do
     row = offset(J, CANON - 8)
-    project_jacobian(c, px, py, pz, row)
+    project_jacobian(c, ray[0], ray[1], ray[2], row)
     if math.isnan(row[0]):
         return False, penalty, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    e0, e1 = across_seam(c, row[0] - xo), row[1] - yo
+    e0, e1 = across_seam(c, row[0] - pixel[0]), row[1] - pixel[1]
     s2 = e0 * e0 + e1 * e1
-    w = math.sqrt(robust_weight(loss, scale2, s2))
+    w = math.sqrt(robust_weight(loss, s2))
     for n in range(2 * FAMILY):
         J[CANON + n] *= w
     return True, s2, w * e0, w * e1, w * row[2], w * row[3], w * row[4], w * row[5], w * row[6], w * row[7]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def linearize(  # type: ignore[no-untyped-def]
-    pose, mounted, mount, c, x0, x1, x2, xo, yo, loss, scale2, penalty, intrinsics, J
-):
+def linearize(
+    pose: Pointer, mounted: bool, mount: Pointer, c: Pointer, point: tuple[float, float, float],
+    pixel: tuple[float, float], loss: RobustLoss, penalty: float, intrinsics: bool, J: Pointer,
+) -> float:  # fmt: skip
     """Weighted Jacobians and residual of one observation into the scratch row J; returns the squared residual.
 
     pose, mount, c and J are pointers: to 12 numbers, R row by row and t, of cam_from_world and, if ``mounted``, of
@@ -111,6 +226,8 @@ def linearize(  # type: ignore[no-untyped-def]
     derivatives are wanted if ``intrinsics``; and to the scratch row. Behind the camera the Jacobians are zero and the
     squared residual is ``penalty``, so that a point gains nothing by slipping there.
     """
+    x0, x1, x2 = point
+    xo, yo = pixel
     px = pose[0] * x0 + pose[1] * x1 + pose[2] * x2 + pose[9]
     py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]
     pz = pose[6] * x0 + pose[7] * x1 + pose[8] * x2 + pose[11]
@@ -118,7 +235,7 @@ def linearize(  # type: ignore[no-untyped-def]
     family = c[FAMILY]
     seen = pz > _MIN_COS * (abs(px) + abs(py))
     if family > LAST_ON_PLANE or (family == RADIAL_FISHEYE and not seen):
-        seen, s2, e0, e1, g00, g01, g02, g10, g11, g12 = _linearize_ray(c, px, py, pz, xo, yo, loss, scale2, penalty, J)
+        seen, s2, e0, e1, g00, g01, g02, g10, g11, g12 = _linearize_ray(c, (px, py, pz), pixel, loss, penalty, J)
     elif seen:
         iz = 1.0 / pz
         u = px * iz
@@ -131,7 +248,7 @@ def linearize(  # type: ignore[no-untyped-def]
         e0 = fx * ud + c[2] - xo
         e1 = fy * vd + c[3] - yo
         s2 = e0 * e0 + e1 * e1
-        w = math.sqrt(robust_weight(loss, scale2, s2))
+        w = math.sqrt(robust_weight(loss, s2))
         fx *= w
         fy *= w
         g00, g01, g10, g11 = fx * a * iz, fx * b * iz, fy * b * iz, fy * d * iz
@@ -181,8 +298,12 @@ def linearize(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def squared_residual(pose, c, x0, x1, x2, xo, yo, penalty):  # type: ignore[no-untyped-def]
+def squared_residual(
+    pose: Pointer, c: Pointer, point: tuple[float, float, float], pixel: tuple[float, float], penalty: float
+) -> float:
     """The squared residual of one observation, ``penalty`` behind the camera; arguments as in :func:`linearize`."""
+    x0, x1, x2 = point
+    xo, yo = pixel
     px = pose[0] * x0 + pose[1] * x1 + pose[2] * x2 + pose[9]
     py = pose[3] * x0 + pose[4] * x1 + pose[5] * x2 + pose[10]
     pz = pose[6] * x0 + pose[7] * x1 + pose[8] * x2 + pose[11]
@@ -205,7 +326,7 @@ def squared_residual(pose, c, x0, x1, x2, xo, yo, penalty):  # type: ignore[no-u
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def find_slot(keys, values, key):  # type: ignore[no-untyped-def]
+def find_slot(keys: Ints, values: Ints, key: int) -> int:
     """Value of a key in an open hash table of power-of-two size with -1 for empty; -1 where absent."""
     mask = keys.shape[0] - 1
     h = ((key * 0x9E3779B97F4A7C) >> 20) & mask
@@ -217,7 +338,7 @@ def find_slot(keys, values, key):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def scratch_size(first, last, point_ptr, num_blocks, num_free):  # type: ignore[no-untyped-def]
+def scratch_size(first: int, last: int, point_ptr: Ints, num_blocks: int, num_free: int) -> tuple[int, int]:
     """(doubles, integers) of scratch for points first..last."""
     longest = 1
     for p in range(first, last):
@@ -227,7 +348,7 @@ def scratch_size(first, last, point_ptr, num_blocks, num_free):  # type: ignore[
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _place(W, where, mark, blocks, p, block, count):  # type: ignore[no-untyped-def]
+def _place(W: Pointer, where: Pointer, mark: Pointer, blocks: Pointer, p: int, block: int, count: int) -> int:
     """Give a block its three rows among those of point p, zeroed at first sight; returns how many there are."""
     if mark[block] != p + 1:
         mark[block] = p + 1
@@ -240,7 +361,7 @@ def _place(W, where, mark, blocks, p, block, count):  # type: ignore[no-untyped-
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _split(free_column, first, last):  # type: ignore[no-untyped-def]
+def _split(free_column: Ints, first: int, last: int) -> int:
     """Where the derivatives first..last of a camera pass from its block to the second one."""
     while last > first and free_column[last - 1] >= 8:
         last -= 1
@@ -248,7 +369,7 @@ def _split(free_column, first, last):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _factor_point(normal, damping, factor, small):  # type: ignore[no-untyped-def]
+def _factor_point(normal: Pointer, damping: float, factor: Pointer, small: Pointer) -> bool:
     """Factor the damped normal equations (3, 8), gradient in the fourth column, of a point.
 
     Fills its row of ``point_factor`` and the eliminator: L^-T, with L^-1 g in the fourth column. False without depth.
@@ -286,43 +407,35 @@ def _factor_point(normal, damping, factor, small):  # type: ignore[no-untyped-de
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def reduce_points(  # type: ignore[no-untyped-def]
-    first, last, point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_mount, mounts, image_camera, image_block,
-    intrinsics, penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, damping,
-    hash_keys, hash_values, tiles, own, cross, gradient, point_factor, scratch, integers,
-):  # fmt: skip
-    """Linearise points first..last and eliminate them; returns the cost of their observations.
+def reduce_points(
+    part: tuple[int, int], points: PointArrays, images: ImageArrays, lenses: LensArrays, blocks: BlockArrays,
+    loss: RobustLoss, damping: float, sums: Sums, point_factor: Array, scratch: Scratch,
+) -> float:  # fmt: skip
+    """Linearise points ``part[0]`` to ``part[1]`` and eliminate them; returns the cost of their observations.
 
     Args:
-        point_ptr, obs_image, obs_xy, xyz: observations sorted by point; images are positions in ``poses``.
-        is_constant: (P,) points that do not move.
-        poses: (I, 12); image_camera: (I,); image_block: (I,) block of its pose, -1 where that is constant.
-        image_mount: (I,) row in mounts (M, 12), cam_from_rig; -1 where the image's pose is that of its block.
-        intrinsics: (C, 17) canonical rows; penalty: (C,) squared residual of what is behind.
-        camera_block: (C,) block that holds the free intrinsics, -1 where constant; free_ptr, free_slot, free_column:
-            for camera c, canonical slot and column in the block.
-        block_dim: (B,) rows in use of each block.
-        hash_keys, hash_values: tile of block pair a <= b under key a B + b; empty if that number is the tile's as well.
-        tiles: (N * 64,) out: sum of -Z_a Z_b^T. own: (B * 64,) out: J^T J of each block with itself, not eliminated.
-        cross: (I * 64,) out: J_pose^T J_intrinsics of images whose camera has a block of its own. Where a camera has a
-            second one ((2 I + C) * 64,): behind it the same of that, and J_first^T J_second of each camera.
-        gradient: (2 * B * 8,) out: J^T r before elimination, and what elimination adds to it.
+        sums: filled.
         point_factor: (P, 12) out: L^-1 (l00 l10 l11 l20 l21 l22), gradient, damped diagonal increment; all zero for a
             point that has no depth at all.
-        scratch, integers: of :func:`scratch_size`, of any content.
     """
+    point_ptr, obs_image, obs_xy, xyz, is_constant = points
+    poses, image_mount, mounts, image_camera, image_block = images
+    intrinsics, penalty, camera_block, _, free_ptr, free_slot, free_column = lenses
+    block_dim, hash_keys, hash_values = blocks
+    tiles, own, cross, gradient = sums
+    doubles, integers = scratch
     num_blocks = block_dim.shape[0]
-    tiles[:], own[:], cross[:], gradient[:], scratch[:], integers[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0
-    pose, lens, J = pointer(poses), pointer(intrinsics), pointer(scratch)
+    tiles[:], own[:], cross[:], gradient[:], doubles[:], integers[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0
+    pose, lens, J = pointer(poses), pointer(intrinsics), pointer(doubles)
     mount = pointer(mounts)
     tile, mark = pointer(tiles), pointer(integers)
-    where, blocks = offset(mark, num_blocks), offset(mark, 2 * num_blocks)
+    where, met = offset(mark, num_blocks), offset(mark, 2 * num_blocks)
     normal, small, zeros, units = offset(J, _NORMAL), offset(J, _SMALL), offset(J, _ZEROS), offset(J, _FIXED)
     W = offset(units, 8 * free_slot.shape[0])
     for n in range(free_slot.shape[0]):
         units[n * 8 + free_column[n] % 8] = 1.0
     cost, product = 0.0, 1.0
-    for p in range(first, last):
+    for p in range(part[0], part[1]):
         x0, x1, x2 = xyz[p, 0], xyz[p, 1], xyz[p, 2]
         moves = not is_constant[p]
         count = 0
@@ -334,9 +447,9 @@ def reduce_points(  # type: ignore[no-untyped-def]
             block, other = image_block[i], camera_block[c]
             s2 = linearize(
                 offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]),
-                offset(lens, ROW * c), x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c], other >= 0, J,
+                offset(lens, ROW * c), (x0, x1, x2), (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[c], other >= 0, J,
             )  # fmt: skip
-            cost, product = add_loss(loss, scale2, s2, cost, product)
+            cost, product = add_loss(loss, s2, cost, product)
             if moves:
                 add2(normal, 0, J, POINT, J, POINT, 3)
             if block >= 0:
@@ -345,7 +458,7 @@ def reduce_points(  # type: ignore[no-untyped-def]
                 add2(own, block * 64, J, POSE, J, POSE, block_dim[block])
                 add2(gradient, block * 8, J, POINT + 3, J, POSE, 1)
                 if moves:
-                    count = _place(W, where, mark, blocks, p, block, count)
+                    count = _place(W, where, mark, met, p, block, count)
                     add2(W, where[block] * 24, J, POINT, J, POSE, 3)
             if other >= 0 and other != block:
                 split = _split(free_column, free_ptr[c], free_ptr[c + 1])
@@ -355,54 +468,58 @@ def reduce_points(  # type: ignore[no-untyped-def]
                 if block >= 0:
                     add2(cross, i * 64, J, POSE, J, INTR, 6)
                 if moves:
-                    count = _place(W, where, mark, blocks, p, other, count)
+                    count = _place(W, where, mark, met, p, other, count)
                     add2(W, where[other] * 24, J, POINT, J, INTR, 3)
                 if split < free_ptr[c + 1]:
-                    second, images = other + 1, image_block.shape[0]
+                    second, num_images = other + 1, image_block.shape[0]
                     spread(J, _SECOND, zeros, J, CANON, free_slot, units, split, free_ptr[c + 1])
                     add2(own, second * 64, J, _SECOND, J, _SECOND, block_dim[second])
                     add2(gradient, second * 8, J, POINT + 3, J, _SECOND, 1)
-                    add2(cross, (2 * images + c) * 64, J, INTR, J, _SECOND, 8)
+                    add2(cross, (2 * num_images + c) * 64, J, INTR, J, _SECOND, 8)
                     if block >= 0:
-                        add2(cross, (images + i) * 64, J, POSE, J, _SECOND, 6)
+                        add2(cross, (num_images + i) * 64, J, POSE, J, _SECOND, 6)
                     if moves:
-                        count = _place(W, where, mark, blocks, p, second, count)
+                        count = _place(W, where, mark, met, p, second, count)
                         add2(W, where[second] * 24, J, POINT, J, _SECOND, 3)
         if not moves or not _factor_point(normal, damping, offset(pointer(point_factor), 12 * p), small):
             continue
         for n in range(count):
             # Z = W L^-T in place
             assign3(W, n * 24, small, 0, W, n * 24, 3)
-            subtract3(gradient, (num_blocks + blocks[n]) * 8, small, 3, W, n * 24, 1)
+            subtract3(gradient, (num_blocks + met[n]) * 8, small, 3, W, n * 24, 1)
         for n in range(count):
             for m in range(n, count):
                 # tiles are kept for a <= b only
-                low, high = (n, m) if blocks[n] <= blocks[m] else (m, n)
-                key = blocks[low] * num_blocks + blocks[high]
+                low, high = (n, m) if met[n] <= met[m] else (m, n)
+                key = met[low] * num_blocks + met[high]
                 if hash_keys.shape[0] > 0:
                     key = find_slot(hash_keys, hash_values, key)
-                subtract3(tile, key * 64, W, low * 24, W, high * 24, block_dim[blocks[low]])
-    return total_loss(scale2, cost, product)
+                subtract3(tile, key * 64, W, low * 24, W, high * 24, block_dim[met[low]])
+    return total_loss(loss, cost, product)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def substitute_points(  # type: ignore[no-untyped-def]
-    first, last, point_ptr, obs_image, obs_xy, xyz, is_constant, poses, image_mount, mounts, image_camera, image_block,
-    intrinsics, penalty, camera_block, free_ptr, free_slot, free_column, block_dim, loss, scale2, point_factor,
-    step, new_poses, new_intrinsics, new_xyz, sums, scratch,
-):  # fmt: skip
-    """Steps of points first..last after those of the blocks, and the cost of the state that results.
+def substitute_points(
+    part: tuple[int, int], points: PointArrays, images: ImageArrays, lenses: LensArrays, loss: RobustLoss,
+    point_factor: Array, step: Array, new: State, outcome: Array, scratch: Array,
+) -> None:  # fmt: skip
+    """Steps of points ``part[0]`` to ``part[1]`` after those of the blocks, and the cost of the state that results.
 
     Args (beyond those of :func:`reduce_points`):
-        step: (B * 8,) solution of the reduced system. new_poses, new_intrinsics: the state after it.
-        new_xyz: (P, 3) out.
-        sums: (2,) out: cost, and the points' share of the predicted decrease.
+        step: (B * 8,) solution of the reduced system.
+        new: the state after it; its points are filled.
+        outcome: (2,) out: cost, and the points' share of the predicted decrease.
+        scratch: (SCRATCH,) at least.
     """
+    point_ptr, obs_image, obs_xy, xyz, is_constant = points
+    poses, image_mount, mounts, image_camera, image_block = images
+    intrinsics, penalty, camera_block, _, free_ptr, free_slot, free_column = lenses
+    new_poses, new_intrinsics, new_xyz = new
     J, pose, mount, lens = pointer(scratch), pointer(poses), pointer(mounts), pointer(intrinsics)
     new_pose, new_lens = pointer(new_poses), pointer(new_intrinsics)
     cost, product = 0.0, 1.0
     decrease = 0.0
-    for p in range(first, last):
+    for p in range(part[0], part[1]):
         x0, x1, x2 = xyz[p, 0], xyz[p, 1], xyz[p, 2]
         if not is_constant[p] and point_factor[p, 0] > 0.0:
             h0, h1, h2 = point_factor[p, 6], point_factor[p, 7], point_factor[p, 8]
@@ -415,7 +532,7 @@ def substitute_points(  # type: ignore[no-untyped-def]
                     continue
                 linearize(
                     offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]),
-                    offset(lens, ROW * c), x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1], loss, scale2, penalty[c],
+                    offset(lens, ROW * c), (x0, x1, x2), (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[c],
                     other >= 0, J,
                 )  # fmt: skip
                 e0 = e1 = 0.0
@@ -450,15 +567,15 @@ def substitute_points(  # type: ignore[no-untyped-def]
             i = obs_image[o]
             c = image_camera[i]
             s2 = squared_residual(
-                offset(new_pose, 12 * i), offset(new_lens, ROW * c), x0, x1, x2, obs_xy[o, 0], obs_xy[o, 1],
+                offset(new_pose, 12 * i), offset(new_lens, ROW * c), (x0, x1, x2), (obs_xy[o, 0], obs_xy[o, 1]),
                 penalty[c],
             )  # fmt: skip
-            cost, product = add_loss(loss, scale2, s2, cost, product)
-    sums[0], sums[1] = total_loss(scale2, cost, product), 0.5 * decrease
+            cost, product = add_loss(loss, s2, cost, product)
+    outcome[0], outcome[1] = total_loss(loss, cost, product), 0.5 * decrease
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def fill_rows(poses, image_pose, image_mount, mounts, rows):  # type: ignore[no-untyped-def]
+def fill_rows(poses: Array, image_pose: Int32s, image_mount: Int32s, mounts: Array, rows: Array) -> None:
     """Fill rows (I, 12), rotation row by row and translation of every image, from poses (Q, 7) and mounts (M, 12)."""
     for i in range(rows.shape[0]):
         x, y, z, w = poses[image_pose[i], 0], poses[image_pose[i], 1], poses[image_pose[i], 2], poses[image_pose[i], 3]
@@ -486,13 +603,13 @@ def fill_rows(poses, image_pose, image_mount, mounts, rows):  # type: ignore[no-
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def retract(  # type: ignore[no-untyped-def]
-    poses, pose_block, image_pose, image_mount, mounts, canonical, camera_block, free_ptr, free_slot, free_column, step,
-    new_poses, new_rows, new_canonical,
-):  # fmt: skip
+def retract(
+    poses: Array, pose_block: Int32s, image_pose: Int32s, images: ImageArrays, lenses: LensArrays, step: Array,
+    new_poses: Array, new: State,
+) -> None:  # fmt: skip
     """Apply a step of the blocks: ``x_cam <- exp(w) x_cam + v`` on poses (Q, 7), sums on canonical rows (C, 17).
 
-    Constant poses and cameras keep their bits. Also fills new_rows (I, 12) by :func:`fill_rows`.
+    Constant poses and cameras keep their bits. Fills new_poses (Q, 7), and of the new state all but the points.
     """
     for i in range(poses.shape[0]):
         block = pose_block[i]
@@ -526,8 +643,9 @@ def retract(  # type: ignore[no-untyped-def]
             )
         new_poses[i, 0], new_poses[i, 1], new_poses[i, 2], new_poses[i, 3] = x, y, z, w
         new_poses[i, 4], new_poses[i, 5], new_poses[i, 6] = t0, t1, t2
-    fill_rows(new_poses, image_pose, image_mount, mounts, new_rows)
-    new_canonical[:] = canonical
+    fill_rows(new_poses, image_pose, images.mount, images.mounts, new.rows)
+    canonical, _, camera_block, _, free_ptr, free_slot, free_column = lenses
+    new.canonical[:] = canonical
     for k in range(canonical.shape[0]):
         for n in range(free_ptr[k], free_ptr[k + 1]):
-            new_canonical[k, free_slot[n]] += step[camera_block[k] * 8 + free_column[n]]
+            new.canonical[k, free_slot[n]] += step[camera_block[k] * 8 + free_column[n]]

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.kernels import find_slot
+from sfmapp.adjust.kernels import BlockArrays, ImageArrays, LensArrays, PointArrays, Sums, find_slot
 from sfmapp.simd.f64x8 import assign8, subtract8
 
 Array = NDArray[np.float64]
@@ -21,15 +21,19 @@ def aligned_zeros(*shape: int) -> Array:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def assemble(  # type: ignore[no-untyped-def]
-    tiles, own, cross, gradient, image_block, image_camera, camera_block, second_block, block_dim, hash_keys,
-    hash_values, extra_own, extra_gradient, diagonal,
-):  # fmt: skip
-    """Sum the chunks, in order, into the first: tiles (K, N * 64) and own, cross, gradient likewise.
+def assemble(
+    sums: Sums, images: ImageArrays, lenses: LensArrays, blocks: BlockArrays, extra_own: Array, extra_gradient: Array,
+    diagonal: Array,
+) -> None:  # fmt: skip
+    """Add up the sums of all chunks (K, ...), in order, in the first.
 
     Adds extra_own (B * 64,) and extra_gradient (B * 8,), what priors say about single blocks; fills diagonal (B * 8,)
     with the diagonal before elimination, on which the damping is based, and puts ``own`` and ``cross`` into the tiles.
     """
+    tiles, own, cross, gradient = sums
+    block_dim, hash_keys, hash_values = blocks
+    image_block, image_camera = images.block, images.camera
+    camera_block, second_block = lenses.block, lenses.second
     num_blocks = block_dim.shape[0]
     for k in range(1, tiles.shape[0]):
         tiles[0] += tiles[k]
@@ -49,31 +53,30 @@ def assemble(  # type: ignore[no-untyped-def]
             diagonal[a * 8 + x] = d if d > 0.0 and x < block_dim[a] else 1.0
             if x >= block_dim[a]:
                 tiles[0, tile * 64 + 9 * x] = 1.0
-    images = image_block.shape[0]
-    for i in range(images):
+    num_images = image_block.shape[0]
+    for i in range(num_images):
         a, b, second = image_block[i], camera_block[image_camera[i]], second_block[image_camera[i]]
         if a >= 0 and b >= 0 and a != b:
-            _add_tile(tiles, cross, i, a * num_blocks + b, hash_keys, hash_values)
+            _add_tile(sums, i, a * num_blocks + b, blocks)
             if second >= 0:
-                _add_tile(tiles, cross, images + i, a * num_blocks + second, hash_keys, hash_values)
+                _add_tile(sums, num_images + i, a * num_blocks + second, blocks)
     for c in range(camera_block.shape[0]):
         if second_block[c] >= 0:
-            tile = camera_block[c] * num_blocks + second_block[c]
-            _add_tile(tiles, cross, 2 * images + c, tile, hash_keys, hash_values)
+            _add_tile(sums, 2 * num_images + c, camera_block[c] * num_blocks + second_block[c], blocks)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_tile(tiles, cross, source, tile, hash_keys, hash_values):  # type: ignore[no-untyped-def]
-    """Add a tile of ``cross`` to that of a pair of blocks, if there is one."""
-    if hash_keys.shape[0] > 0:
-        tile = find_slot(hash_keys, hash_values, tile)
+def _add_tile(sums: Sums, source: int, tile: int, blocks: BlockArrays) -> None:
+    """Add a tile of ``cross`` to that of a pair of blocks, a B + b, if there is one."""
+    if blocks.hash_keys.shape[0] > 0:
+        tile = find_slot(blocks.hash_keys, blocks.hash_values, tile)
     if tile >= 0:
         for n in range(64):
-            tiles[0, tile * 64 + n] += cross[0, source * 64 + n]
+            sums.tiles[0, tile * 64 + n] += sums.cross[0, source * 64 + n]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def factorize_tiles(tiles, num_blocks, inverse):  # type: ignore[no-untyped-def]
+def factorize_tiles(tiles: Array, num_blocks: int, inverse: Array) -> bool:
     """Cholesky factor U^T U of the upper tiles (B * B * 64,), in place; inverse (B * 64,) gets the U_kk^-1.
 
     Returns False, with the tiles spoilt, where a pivot is not clearly positive. Tiles of zeros are skipped, so that a
@@ -136,7 +139,7 @@ def factorize_tiles(tiles, num_blocks, inverse):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def solve_tiles(tiles, num_blocks, inverse, x):  # type: ignore[no-untyped-def]
+def solve_tiles(tiles: Array, num_blocks: int, inverse: Array, x: Array) -> None:
     """Solve U^T U x = x in place (B * 8,) with the factor of :func:`factorize_tiles`."""
     y = np.empty(8)
     for k in range(num_blocks):
@@ -170,8 +173,10 @@ def solve_tiles(tiles, num_blocks, inverse, x):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def mark_pairs(point_ptr, obs_image, image_camera, image_block, camera_block, second_block, pairs):  # type: ignore[no-untyped-def]
+def mark_pairs(points: PointArrays, images: ImageArrays, lenses: LensArrays, pairs: NDArray[np.bool_]) -> None:
     """Set pairs[a, b], (B, B) bool, for all blocks a <= b that meet in a point."""
+    point_ptr, obs_image = points.ptr, points.image
+    image_camera, image_block, camera_block, second_block = images.camera, images.block, lenses.block, lenses.second
     longest = 1
     for p in range(point_ptr.shape[0] - 1):
         longest = max(longest, point_ptr[p + 1] - point_ptr[p])
@@ -197,7 +202,7 @@ def mark_pairs(point_ptr, obs_image, image_camera, image_block, camera_block, se
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def number_keys(keys):  # type: ignore[no-untyped-def]
+def number_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """An open hash table, half full at most, that gives each of the different keys (N,) its position."""
     size = 16
     while size < 2 * keys.shape[0] + 1:

@@ -9,12 +9,28 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfmapp.adjust.kernels import CANON, LOSS_IDS, POINT, SCRATCH, add_loss, fill_rows, linearize, retract, total_loss
+from sfmapp.adjust.kernels import (
+    CANON,
+    LOSS_IDS,
+    POINT,
+    SCRATCH,
+    ImageArrays,
+    LensArrays,
+    RobustLoss,
+    State,
+    add_loss,
+    fill_rows,
+    linearize,
+    retract,
+    total_loss,
+)
 from sfmapp.camera.lens import ROW
 from sfmapp.simd.f64x8 import add2
 from sfmapp.simd.pointers import pointer
 
 Array = NDArray[np.float64]
+
+_MAX_ITERATIONS = 30
 
 
 @dataclass(frozen=True)
@@ -45,12 +61,9 @@ def refine_pose(
     xyz: ArrayLike,
     xy: ArrayLike,
     *,
-    loss: str = "cauchy",
-    scale_px: float = 1.0,
+    scale_px: float | None = 1.0,
     inlier_px: float = 4.0,
-    refine_focal: bool = False,
-    focal_sigma_px: float | None = None,
-    max_iterations: int = 30,
+    focal_sigma_px: float = 0.0,
     relative_cost_tolerance: float = 1e-6,
 ) -> RefinedPose:
     """Minimise the robust reprojection error of known points over one pose, from a start such as PnP gives.
@@ -59,21 +72,20 @@ def refine_pose(
         canonical: (17,) intrinsics, see ``Camera.canonical``.
         cam_from_world: (7,) start.
         xyz: (N, 3) world. xy: (N, 2) pixels.
-        loss, scale_px: as in ``AdjustOptions``.
+        scale_px: residual length at which Cauchy's loss begins to bend; None for least squares.
         inlier_px: longest residual of an inlier.
-        refine_focal: the focal lengths are free, with a common change; focal_sigma_px: Gaussian prior around the
-            start, None for none.
+        focal_sigma_px: Gaussian prior of a common change of the focal lengths; 0: they are constant, inf: free.
+        relative_cost_tolerance: as in ``AdjustOptions``.
     """
     state = np.array(cam_from_world, np.float64)
     row = np.array(canonical, np.float64)
     points, pixels = np.ascontiguousarray(xyz, np.float64), np.ascontiguousarray(xy, np.float64)
     information, residuals2 = np.zeros((8, 8)), np.empty(len(points))
-    weight = 0.0 if focal_sigma_px is None else 1.0 / focal_sigma_px**2
-    size = 7 if refine_focal else 6
+    size, weight = (7, 1.0 / focal_sigma_px**2) if focal_sigma_px > 0.0 else (6, 0.0)
+    loss = RobustLoss(LOSS_IDS["cauchy"] if scale_px else LOSS_IDS["trivial"], (scale_px or 1.0) ** 2)
     cost, iterations = _refine(
-        row, state, points, pixels, LOSS_IDS[loss], scale_px**2, size, weight, max_iterations,
-        relative_cost_tolerance, information, residuals2,
-    )  # fmt: skip
+        row, state, points, pixels, loss, size, weight, relative_cost_tolerance, information, residuals2
+    )
     is_inlier = residuals2 <= inlier_px**2
     dof = 2 * int(is_inlier.sum()) - size
     covariance = np.full((size, size), np.inf)
@@ -87,33 +99,34 @@ def refine_pose(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _normal_equations(  # type: ignore[no-untyped-def]
-    canonical, rows, xyz, xy, loss, scale2, size, penalty, J, information, gradient, residuals2
-):
+def _normal_equations(
+    canonical: Array, rows: Array, xyz: Array, xy: Array, loss: RobustLoss, size: int, penalty: float, J: Array,
+    information: Array, gradient: Array, residuals2: Array,
+) -> float:  # fmt: skip
     """Fill information (64,), gradient (8,) and the squared residuals (N,), infinite behind; returns the cost."""
     information[:] = 0.0
     gradient[:] = 0.0
     total, product = 0.0, 1.0
     for n in range(xyz.shape[0]):
         s2 = linearize(
-            pointer(rows), False, pointer(rows), pointer(canonical), xyz[n, 0], xyz[n, 1], xyz[n, 2],
-            xy[n, 0], xy[n, 1], loss, scale2, -1.0, size > 6, pointer(J),
+            pointer(rows), False, pointer(rows), pointer(canonical), (xyz[n, 0], xyz[n, 1], xyz[n, 2]),
+            (xy[n, 0], xy[n, 1]), loss, -1.0, size > 6, pointer(J),
         )  # fmt: skip
         residuals2[n] = s2
         if s2 < 0.0:
             residuals2[n] = math.inf
             s2 = penalty
-        total, product = add_loss(loss, scale2, s2, total, product)
+        total, product = add_loss(loss, s2, total, product)
         J[7] = J[15] = 0.0
         J[6] = J[CANON] + J[CANON + 2] if size > 6 else 0.0
         J[14] = J[CANON + 1] + J[CANON + 3] if size > 6 else 0.0
         add2(information, 0, J, 0, J, 0, 8)
         add2(gradient, 0, J, POINT + 3, J, 0, 1)
-    return total_loss(scale2, total, product)
+    return total_loss(loss, total, product)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _damped_step(information, gradient, damping, size, step):  # type: ignore[no-untyped-def]
+def _damped_step(information: Array, gradient: Array, damping: float, size: int, step: Array) -> bool:
     """Solve (H + damping diag H) step = -gradient by Cholesky; False where that is not positive definite."""
     L = np.zeros((8, 8))
     for i in range(size):
@@ -143,9 +156,11 @@ def _damped_step(information, gradient, damping, size, step):  # type: ignore[no
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _refine(  # type: ignore[no-untyped-def]
-    c, state, xyz, xy, loss, scale2, size, prior_weight, max_iterations, tolerance, information, residuals2
-):
+def _refine(
+    c: Array, state: Array, xyz: Array, xy: Array, loss: RobustLoss, size: int, prior_weight: float, tolerance: float,
+    information: Array, residuals2: Array,
+) -> tuple[float, int]:  # fmt: skip
+    """Move the state (7,), and the focal lengths of the row c if size is 7; returns cost and number of iterations."""
     J = np.zeros(SCRATCH)
     block, camera_block = np.zeros(1, np.int32), np.full(1, 0 if size > 6 else -1, np.int32)
     none, no_mounts = np.full(1, -1, np.int32), np.zeros((0, 12))
@@ -154,39 +169,28 @@ def _refine(  # type: ignore[no-untyped-def]
     poses, new_poses = state.reshape(1, 7), np.empty((1, 7))
     rows, new_rows = np.empty((1, 12)), np.empty((1, 12))
     canonical, new_canonical = c.reshape(1, ROW), np.empty((1, ROW))
+    images = ImageArrays(rows, none, no_mounts, block, block)
+    lenses = LensArrays(canonical, np.zeros(1), camera_block, none, free_ptr, free_slot, free_column)
+    new = State(new_rows, new_canonical, xyz)
     step = np.zeros(8)
     fill_rows(poses, block, none, no_mounts, rows)
     focal = c[0]
     penalty = 8.0 * focal * focal  # gtsam's choice for points behind the camera
     H, g, new_H, new_g = np.zeros(64), np.zeros(8), np.zeros(64), np.zeros(8)
     new_residuals2 = np.empty(xyz.shape[0])
-    cost = _normal_equations(canonical, rows, xyz, xy, loss, scale2, size, penalty, J, H, g, residuals2)
+    cost = _normal_equations(canonical, rows, xyz, xy, loss, size, penalty, J, H, g, residuals2)
     H[54] += prior_weight
     damping, growth, iterations = 1e-4, 2.0, 0
-    while iterations < max_iterations and damping < 1e12:
+    while iterations < _MAX_ITERATIONS and damping < 1e12:
         iterations += 1
         if not _damped_step(H, g, damping, size, step):
             damping *= growth
             growth *= 2.0
             continue
-        retract(
-            poses, block, block, none, no_mounts, canonical, camera_block, free_ptr, free_slot, free_column, step,
-            new_poses, new_rows, new_canonical,
-        )  # fmt: skip
+        retract(poses, block, block, images, lenses, step, new_poses, new)
         new_cost = _normal_equations(
-            new_canonical,
-            new_rows,
-            xyz,
-            xy,
-            loss,
-            scale2,
-            size,
-            penalty,
-            J,
-            new_H,
-            new_g,
-            new_residuals2,
-        )
+            new_canonical, new_rows, xyz, xy, loss, size, penalty, J, new_H, new_g, new_residuals2
+        )  # fmt: skip
         away = new_canonical[0, 0] - focal
         new_cost += 0.5 * prior_weight * away * away
         new_g[6] += prior_weight * away

@@ -9,6 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.adjust.kernels import ImageArrays, LensArrays, PointArrays
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import ROW
 from sfmapp.camera.models import PARAM_NAMES, canonical_from_params, kind_of
@@ -18,6 +19,31 @@ from sfmapp.scene.rig import RigImages
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Varying:
+    """What of a reconstruction takes part in an adjustment, and what of that may change.
+
+    Attributes:
+        images: (I,) bool, which poses may change; None for all registered ones. Images that share a rig's pose
+            (``reconstruction.rig``) move together: those that take part must all be marked or none.
+        cameras: (C,) bool, which intrinsics may change, beside ``options.refine_*``; cameras with ``is_fixed`` never
+            do. None for all.
+        centers: (C,) bool, of which cameras the principal points may change where the options let them; None for all.
+            In a rig, that of another camera than the first stands for how it is turned.
+        points: (T,) bool, which points take part and vary; None for those that a variable image observes.
+        constant_points: (T,) bool, which of the points take part without moving; None for none.
+    """
+
+    images: Mask | None = None
+    cameras: Mask | None = None
+    centers: Mask | None = None
+    points: Mask | None = None
+    constant_points: Mask | None = None
+
+
+EVERYTHING = Varying()
 
 
 @dataclass(frozen=True)
@@ -74,6 +100,20 @@ class Problem:
         return np.where(is_wide & (self.camera_block >= 0), self.camera_block + 1, -1).astype(np.int32)
 
     @property
+    def points(self) -> PointArrays:
+        """For the kernels, at the current state; so are the two below."""
+        return PointArrays(self.point_ptr, self.obs_image, self.obs_xy, self.xyz, self.is_constant)
+
+    def images(self, rows: Array) -> ImageArrays:
+        """Images with rows (I, 12) of their poses."""
+        return ImageArrays(rows, self.image_mount, self.mounts, self.image_camera, self.image_block)
+
+    @property
+    def lenses(self) -> LensArrays:
+        free, block = self.free, self.camera_block
+        return LensArrays(self.canonical, self.penalty, block, self.second_block, free.ptr, free.slot, free.column)
+
+    @property
     def num_blocks(self) -> int:
         return len(self.block_dim)
 
@@ -115,16 +155,12 @@ def make_problem(
     reconstruction: Reconstruction,
     *,
     refine: tuple[bool, bool, bool],
-    variable_images: Mask | None = None,
-    variable_cameras: Mask | None = None,
-    variable_centers: Mask | None = None,
-    points: Mask | None = None,
-    constant_points: Mask | None = None,
+    varying: Varying = EVERYTHING,
     extra_images: Sequence[int] = (),
     extra_cameras: Sequence[int] = (),
     merge: bool = True,
 ) -> Problem:
-    """Gather the observations of the points that take part; see ``adjust_bundle`` for the masks.
+    """Gather the observations of the points that take part.
 
     Args:
         refine: may focal lengths, distortion, principal points change.
@@ -137,16 +173,18 @@ def make_problem(
     """
     tracks = reconstruction.tracks
     registered = reconstruction.is_registered
-    varies = registered if variable_images is None else registered & np.asarray(variable_images, bool)
-    if points is None:
-        if variable_images is None:
+    varies = registered if varying.images is None else registered & np.asarray(varying.images, bool)
+    if varying.points is None:
+        if varying.images is None:
             selected = np.flatnonzero(reconstruction.is_triangulated)
         else:
             selected = _tracks_of_images(np.flatnonzero(varies), tracks.image_ptr, tracks.image_obs,
                                          tracks.obs_track_idx, tracks.num_tracks)  # fmt: skip
     else:
-        selected = np.flatnonzero(points)
-    is_constant = np.zeros(len(selected), bool) if constant_points is None else np.asarray(constant_points)[selected]
+        selected = np.flatnonzero(varying.points)
+    is_constant = np.zeros(len(selected), bool)
+    if varying.constant_points is not None:
+        is_constant = np.asarray(varying.constant_points)[selected]
     kept, point_ptr, obs_image, obs_xy, image_used = _gather(
         selected, is_constant, tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy, reconstruction.obs_is_inlier,
         np.isfinite(reconstruction.cam_from_world[:, 0]), reconstruction.point_xyz,
@@ -160,10 +198,10 @@ def make_problem(
     image_camera = np.searchsorted(camera_idx, reconstruction.image_camera_idx[image_idx]).astype(np.int32)
     cameras = [reconstruction.cameras[c] for c in camera_idx]
     focal, distortion, center = refine
-    moves = np.full(len(reconstruction.cameras), center) if variable_centers is None else variable_centers & center
+    moves = np.full(len(reconstruction.cameras), center) if varying.centers is None else varying.centers & center
     params = [free_params(reconstruction.cameras[c], focal, distortion, bool(moves[c])) for c in camera_idx]
-    if variable_cameras is not None:
-        params = [p if variable_cameras[c] else p[:0] for p, c in zip(params, camera_idx, strict=True)]
+    if varying.cameras is not None:
+        params = [p if varying.cameras[c] else p[:0] for p, c in zip(params, camera_idx, strict=True)]
     poses, pose_of_image = reconstruction.distinct_poses(image_idx)
     image_pose = pose_of_image.astype(np.int32)
     image_mount, mounts = _mounts(reconstruction.rig, image_idx)
@@ -271,7 +309,10 @@ def _free_columns(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _tracks_of_images(images, image_ptr, image_obs, obs_track_idx, num_tracks):  # type: ignore[no-untyped-def]
+def _tracks_of_images(
+    images: NDArray[np.int64], image_ptr: NDArray[np.int64], image_obs: NDArray[np.int64],
+    obs_track_idx: NDArray[np.int32], num_tracks: int,
+) -> NDArray[np.int64]:  # fmt: skip
     """Ascending tracks that some of the images observe."""
     seen = np.zeros(num_tracks, np.bool_)
     for i in images:
@@ -281,7 +322,10 @@ def _tracks_of_images(images, image_ptr, image_obs, obs_track_idx, num_tracks): 
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _gather(selected, is_constant, track_ptr, obs_image_idx, obs_xy, is_inlier, registered, xyz):  # type: ignore[no-untyped-def]
+def _gather(
+    selected: NDArray[np.int64], is_constant: Mask, track_ptr: NDArray[np.int64], obs_image_idx: NDArray[np.int32],
+    obs_xy: Array, is_inlier: Mask, registered: Mask, xyz: Array,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32], Array, Mask]:  # fmt: skip
     """Points that are kept, as positions in ``selected``, and their observations.
 
     An observation counts if it is an inlier of a registered image with finite pixels, a point if it is triangulated and

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sfmapp.adjust.factors import ExtraFactors, gtsam_pose
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.priors import IntrinsicPriors
-from sfmapp.adjust.problem import Problem, free_values, make_problem, write_back
+from sfmapp.adjust.problem import Problem, Varying, free_values, make_problem, write_back
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import BROWN, RADIAL_FISHEYE
 from sfmapp.camera.models import PARAM_NAMES, canonical_from_params
@@ -42,12 +42,8 @@ _HELD = 1e-7
 def adjust_with_gtsam(
     reconstruction: Reconstruction,
     options: AdjustOptions,
+    varying: Varying,
     *,
-    variable_images: Mask | None = None,
-    variable_cameras: Mask | None = None,
-    variable_centers: Mask | None = None,
-    points: Mask | None = None,
-    constant_points: Mask | None = None,
     prior_cameras: Sequence[Camera] | None = None,
     extra_factors: Any = None,
     events: Events | None = None,
@@ -58,8 +54,7 @@ def adjust_with_gtsam(
         events.raise_if_cancelled()
     extras = ExtraFactors(extra_factors) if extra_factors is not None else None
     problem = make_problem(
-        reconstruction, refine=options.refine, variable_images=variable_images, variable_cameras=variable_cameras,
-        variable_centers=variable_centers, points=points, constant_points=constant_points,
+        reconstruction, refine=options.refine, varying=varying,
         extra_images=extras.images if extras else (), extra_cameras=extras.cameras if extras else (),
     )  # fmt: skip
     if problem.num_observations == 0:

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust import kernels
-from sfmapp.adjust.kernels import find_slot
+from sfmapp.adjust.kernels import BlockArrays, RobustLoss, Scratch, State, Sums, find_slot
 from sfmapp.adjust.linear import aligned_zeros, assemble, factorize_tiles, mark_pairs, number_keys, solve_tiles
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.priors import IntrinsicPriors
-from sfmapp.adjust.problem import Problem, make_problem, write_back
+from sfmapp.adjust.problem import EVERYTHING, Problem, Varying, make_problem, write_back
 from sfmapp.camera.camera import Camera
 from sfmapp.events import Events
 from sfmapp.scene.reconstruction import Reconstruction
@@ -34,11 +34,7 @@ def adjust_bundle(
     reconstruction: Reconstruction,
     options: AdjustOptions = AdjustOptions(),
     *,
-    variable_images: Mask | None = None,
-    variable_cameras: Mask | None = None,
-    variable_centers: Mask | None = None,
-    points: Mask | None = None,
-    constant_points: Mask | None = None,
+    varying: Varying = EVERYTHING,
     prior_cameras: Sequence[Camera] | None = None,
     extra_factors: Any = None,
     threads: int = 1,
@@ -51,14 +47,7 @@ def adjust_bundle(
 
     Args:
         reconstruction: poses, points and cameras are replaced; whatever is constant keeps its bits.
-        variable_images: (I,) bool, which poses may change; None for all registered ones. Images that share a rig's
-            pose (``reconstruction.rig``) move together: those that take part must all be marked or none.
-        variable_cameras: (C,) bool, which intrinsics may change, beside ``options.refine_*``; cameras with ``is_fixed``
-            never do. None for all.
-        variable_centers: (C,) bool, of which cameras the principal points may change where the options let them; None
-            for all. In a rig, that of another camera than the first stands for how it is turned.
-        points: (T,) bool, which points take part and vary; None for those that a variable image observes.
-        constant_points: (T,) bool, which of the points take part without moving.
+        varying: which poses, intrinsics and points take part and may change; all by default.
         prior_cameras: (C,) cameras as they were known beforehand: Gaussian priors around their parameters, with
             ``focal_sigma`` for focal lengths and the options' sigmas for the rest. None for no priors.
         extra_factors: gtsam.NonlinearFactorGraph over ``X(i)`` (Pose3 world_from_cam of image i; for a rig's pose,
@@ -76,15 +65,9 @@ def adjust_bundle(
         from sfmapp.adjust.reference import adjust_with_gtsam
 
         return adjust_with_gtsam(
-            reconstruction, options, variable_images=variable_images, variable_cameras=variable_cameras,
-            variable_centers=variable_centers, points=points, constant_points=constant_points,
-            prior_cameras=prior_cameras, extra_factors=extra_factors, events=events,
-        )  # fmt: skip
-    engine = make_engine(
-        reconstruction, options, variable_images=variable_images, variable_cameras=variable_cameras,
-        variable_centers=variable_centers, points=points, constant_points=constant_points,
-        prior_cameras=prior_cameras, extra_factors=extra_factors,
-    )  # fmt: skip
+            reconstruction, options, varying, prior_cameras=prior_cameras, extra_factors=extra_factors, events=events
+        )
+    engine = make_engine(reconstruction, options, varying, prior_cameras=prior_cameras, extra_factors=extra_factors)
     problem = engine.problem
     workers = min(threads, engine.num_chunks)
     with ThreadPoolExecutor(workers) if workers > 1 else nullcontext() as pool:
@@ -102,14 +85,10 @@ def adjust_bundle(
 def make_engine(
     reconstruction: Reconstruction,
     options: AdjustOptions,
+    varying: Varying = EVERYTHING,
     *,
-    variable_images: Mask | None,
-    variable_cameras: Mask | None,
-    variable_centers: Mask | None = None,
-    points: Mask | None,
-    constant_points: Mask | None,
-    prior_cameras: Sequence[Camera] | None,
-    extra_factors: Any,
+    prior_cameras: Sequence[Camera] | None = None,
+    extra_factors: Any = None,
 ) -> Engine:
     """The engine over a reconstruction's problem, priors and extra factors; arguments as of :func:`adjust_bundle`."""
     extras = None
@@ -118,8 +97,7 @@ def make_engine(
 
         extras = ExtraFactors(extra_factors)
     problem = make_problem(
-        reconstruction, refine=options.refine, variable_images=variable_images, variable_cameras=variable_cameras,
-        variable_centers=variable_centers, points=points, constant_points=constant_points,
+        reconstruction, refine=options.refine, varying=varying,
         extra_images=extras.images if extras else (), extra_cameras=extras.cameras if extras else (),
     )  # fmt: skip
     if extras is not None:
@@ -133,10 +111,12 @@ class Engine:
     def __init__(self, problem: Problem, options: AdjustOptions, priors: IntrinsicPriors, extras: Any = None) -> None:
         p = problem
         self.problem, self.priors, self.extras = p, priors, extras
-        self.loss, self.scale2 = kernels.LOSS_IDS[options.loss], options.loss_scale_px**2
+        self.loss = RobustLoss(kernels.LOSS_IDS[options.loss], options.loss_scale_px**2)
         blocks, images = p.num_blocks, len(p.image_idx)
         empty = np.zeros(0, np.int64)
         self.solver, self.hash_keys, self.hash_values, self.num_tiles = "dense", empty, empty, blocks * blocks
+        self.rows = np.empty((images, 12))
+        kernels.fill_rows(p.poses, p.image_pose, p.image_mount, p.mounts, self.rows)
         if blocks > _MAX_DENSE_BLOCKS:
             self._choose_sparse()
         fitting = max(1, _CHUNK_BYTES // max(1, self.num_tiles * 512))
@@ -157,9 +137,7 @@ class Engine:
             kernels.scratch_size(self.limits[k], self.limits[k + 1], p.point_ptr, blocks, len(p.free.slot))
             for k in range(chunks)
         ]
-        self.scratch = [(aligned_zeros(doubles), np.zeros(integers, np.int64)) for doubles, integers in sizes]
-        self.rows = np.empty((images, 12))
-        kernels.fill_rows(p.poses, p.image_pose, p.image_mount, p.mounts, self.rows)
+        self.scratch = [Scratch(aligned_zeros(doubles), np.zeros(integers, np.int64)) for doubles, integers in sizes]
         self.new_poses, self.new_rows = np.empty_like(p.poses), np.empty_like(self.rows)
         self.new_canonical, self.new_xyz = np.empty_like(p.canonical), np.empty_like(p.xyz)
         self.damping = 0.0
@@ -170,7 +148,7 @@ class Engine:
 
         p, blocks = self.problem, self.problem.num_blocks
         met = np.eye(blocks, dtype=bool)
-        mark_pairs(p.point_ptr, p.obs_image, p.image_camera, p.image_block, p.camera_block, p.second_block, met)
+        mark_pairs(p.points, p.images(self.rows), p.lenses, met)
         if self.extras is not None:
             met.reshape(-1)[self.extras.pairs] = True
         keys = np.flatnonzero(met)
@@ -183,14 +161,14 @@ class Engine:
     def linearize(self, damping: float, run: Callable[..., Any]) -> float:
         """Reduced system at the current state with damped points; returns the cost of the state."""
         p, self.damping = self.problem, damping
+        points, images, lenses = p.points, p.images(self.rows), p.lenses
+        blocks = BlockArrays(p.block_dim, self.hash_keys, self.hash_values)
 
         def chunk(k: int) -> float:
+            sums = Sums(self.tiles[k], self.own[k], self.cross[k], self.gradient[k])
             cost: float = kernels.reduce_points(
-                self.limits[k], self.limits[k + 1], p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, self.rows,
-                p.image_mount, p.mounts, p.image_camera, p.image_block, p.canonical, p.penalty,
-                p.camera_block, p.free.ptr, p.free.slot, p.free.column, p.block_dim, self.loss, self.scale2, damping,
-                self.hash_keys, self.hash_values, self.tiles[k], self.own[k], self.cross[k], self.gradient[k],
-                self.factor, *self.scratch[k],
+                (self.limits[k], self.limits[k + 1]), points, images, lenses, blocks, self.loss, damping, sums,
+                self.factor, self.scratch[k],
             )  # fmt: skip
             return cost
 
@@ -199,10 +177,8 @@ class Engine:
         self.priors.add(p.canonical, own, gradient)
         if self.extras is not None:
             self.extras.linearize(own, gradient)
-        assemble(
-            self.tiles, self.own, self.cross, self.gradient, p.image_block, p.image_camera, p.camera_block,
-            p.second_block, p.block_dim, self.hash_keys, self.hash_values, own, gradient, self.diagonal,
-        )  # fmt: skip
+        every = Sums(self.tiles, self.own, self.cross, self.gradient)
+        assemble(every, images, lenses, blocks, own, gradient, self.diagonal)
         return cost + self.other_cost(p.poses, p.canonical)
 
     def other_cost(self, poses: Array, canonical: Array) -> float:
@@ -235,17 +211,14 @@ class Engine:
     def attempt(self, step: Array, run: Callable[..., Any]) -> tuple[float, float]:
         """Try a step: cost of the new state, and the decrease that the quadratic model predicts."""
         p = self.problem
-        kernels.retract(
-            p.poses, p.pose_block, p.image_pose, p.image_mount, p.mounts, p.canonical, p.camera_block, p.free.ptr,
-            p.free.slot, p.free.column, step, self.new_poses, self.new_rows, self.new_canonical,
-        )  # fmt: skip
+        points, images, lenses = p.points, p.images(self.rows), p.lenses
+        new = State(self.new_rows, self.new_canonical, self.new_xyz)
+        kernels.retract(p.poses, p.pose_block, p.image_pose, images, lenses, step, self.new_poses, new)
 
         def chunk(k: int) -> None:
             kernels.substitute_points(
-                self.limits[k], self.limits[k + 1], p.point_ptr, p.obs_image, p.obs_xy, p.xyz, p.is_constant, self.rows,
-                p.image_mount, p.mounts, p.image_camera, p.image_block, p.canonical, p.penalty,
-                p.camera_block, p.free.ptr, p.free.slot, p.free.column, p.block_dim, self.loss, self.scale2,
-                self.factor, step, self.new_rows, self.new_canonical, self.new_xyz, self.sums[k], self.scratch[k][0],
+                (self.limits[k], self.limits[k + 1]), points, images, lenses, self.loss, self.factor, step, new,
+                self.sums[k], self.scratch[k].doubles,
             )  # fmt: skip
 
         list(run(chunk, range(self.num_chunks)))

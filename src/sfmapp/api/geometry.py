@@ -12,13 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from sfmapp.adjust import solver
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.pose import refine_pose
+from sfmapp.adjust.problem import Varying
 from sfmapp.api.reconstruction import Reconstruction
 from sfmapp.camera.camera import Camera, pixels_to_normalized, project
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.geometry import resection, rigid3
 from sfmapp.geometry.rigid3 import Rigid3
-from sfmapp.geometry.triangulation import triangulate_tracks
+from sfmapp.geometry.triangulation import Observed, triangulate_tracks
 from sfmapp.matching import two_view
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.search import Ransac
@@ -101,13 +102,13 @@ def adjust_bundle(
         >>> report.initial_cost, report.final_cost  # square pixels
     """
     named = Reconstruction.of(reconstruction)
-    variable_images = reconstruction.is_registered
-    variable_images[[named.image_position(name) for name in constant_images]] = False
-    variable_cameras = ~_mask(constant_cameras, len(reconstruction.cameras), "camera")
+    images = reconstruction.is_registered
+    images[[named.image_position(name) for name in constant_images]] = False
+    cameras = ~_mask(constant_cameras, len(reconstruction.cameras), "camera")
     held = None if constant_points is None else _mask(constant_points, reconstruction.tracks.num_tracks, "point")
     return solver.adjust_bundle(
-        reconstruction, options or AdjustOptions(), variable_images=variable_images, variable_cameras=variable_cameras,
-        constant_points=held, prior_cameras=prior_cameras, threads=num_threads(threads), events=events,
+        reconstruction, options or AdjustOptions(), varying=Varying(images, cameras, constant_points=held),
+        prior_cameras=prior_cameras, threads=num_threads(threads), events=events,
     )  # fmt: skip
 
 
@@ -153,9 +154,9 @@ def triangulate(
     empty = arrays.Reconstruction.empty(
         lenses, [str(i) for i in range(len(poses))], np.arange(len(poses), dtype=np.int32), tracks
     )
+    empty.cam_from_world[:] = poses
     triangulate_tracks(
-        np.arange(tracks.num_tracks), tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy,
-        rigid3.rotation_matrix(poses), poses[:, 4:].copy(), empty.image_camera_idx, empty.canonical_cameras(),
+        np.arange(tracks.num_tracks), Observed(tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy), empty.views(),
         max_error_px, math.radians(min_angle_deg), empty.point_xyz, empty.obs_is_inlier,
     )  # fmt: skip
     is_inlier = np.zeros(pixels.shape[:2], bool)

@@ -406,33 +406,45 @@ def undistort(
 
 
 def export(
-    source: FilePath | Reconstruction, target: str, path: FilePath, *, images: FilePath | None = None
+    source: FilePath | Reconstruction,
+    target: str,
+    path: FilePath,
+    *,
+    images: FilePath | None = None,
+    crs: str | None = None,
+    is_dense: bool = False,
 ) -> ExportReport:
     """Write a model in another program's format, read it back, and compare every reprojection.
 
     Args:
         source: the workspace of a run, of which the largest model is taken, the folder of a COLMAP model, or a
             reconstruction in memory.
-        target: ``colmap-bin``, ``colmap-text``, ``ply``, ``bundler`` or ``nerfstudio``.
+        target: ``colmap-bin``, ``colmap-text``, ``ply``, ``las``, ``laz``, ``bundler``, ``nerfstudio``, and for maps of
+            the photographs ``geojson`` or ``kml``.
         path: where to write: a folder for COLMAP's formats, a file or folder for the others.
         images: folder of the photographs, for formats that name them; None: as noted in the workspace, or where COLMAP
             has them.
+        crs: coordinate system of the points of PLY, LAS and LAZ, in metres, such as ``EPSG:25833``; None: of PLY the
+            frame of the model, of the others its UTM zone.
+        is_dense: of PLY, LAS and LAZ: the dense points of the run, not the sparse ones.
 
     Returns:
         ``files`` that were written, the worst differences, and notes for whoever uses them.
 
     Raises:
-        UsageError: an unknown format, a camera or name that it cannot hold, or the model's own folder as the target.
+        UsageError: an unknown format, a camera or name that it cannot hold, the model's own folder as the target, or a
+            coordinate system or dense points that the format or the model has no place for.
         NoReconstructionError: the workspace holds no model.
         InputError: there is no model, nothing can be written, or what was read back is not what was written.
 
     Example:
         >>> sfmapp.export("out/", "nerfstudio", "nerf/")
+        >>> sfmapp.export("out/", "laz", "site.laz", crs="EPSG:25833", is_dense=True)
     """
     from sfmapp.pipelines.export import export_model
 
     keypoints = source.keypoints if isinstance(source, Reconstruction) else None
-    return export_model(source, target, path, images=images, keypoints=keypoints)
+    return export_model(source, target, path, images=images, keypoints=keypoints, crs=crs, is_dense=is_dense)
 
 
 def _with(options: Options | None, threads: int | None, seed: int | None = None) -> Options:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import Covariances, estimate_covariances
 from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.problem import Varying
 from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
 from sfmapp.events import Events
@@ -163,7 +164,8 @@ class Reconstruction(arrays.Reconstruction):
         """
         variable = self.is_registered
         variable[[self.image_position(name) for name in constant_images]] = False
-        return estimate_covariances(self, options or AdjustOptions(), sigma_px=sigma_px, variable_images=variable)
+        varying = Varying(images=variable)
+        return estimate_covariances(self, options or AdjustOptions(), sigma_px=sigma_px, varying=varying)
 
 
 @dataclass(frozen=True)

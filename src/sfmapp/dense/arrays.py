@@ -179,7 +179,7 @@ class StorePointers(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def image_pointers(images):  # type: ignore[no-untyped-def]
+def image_pointers(images: Images) -> ImagePointers:
     """Pointers to the arrays of images, which the caller keeps alive."""
     return ImagePointers(
         pointer(images.quads), pointer(images.start), pointer(images.width), pointer(images.height),
@@ -191,7 +191,7 @@ def image_pointers(images):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def store_pointers(store):  # type: ignore[no-untyped-def]
+def store_pointers(store: Store) -> StorePointers:
     """Pointers to the arrays of a store, which the caller keeps alive."""
     return StorePointers(
         pointer(store.xyz), pointer(store.normal), pointer(store.score), pointer(store.sigma), pointer(store.size),
@@ -207,13 +207,13 @@ class CellPointers(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def cell_pointers(cells):  # type: ignore[no-untyped-def]
+def cell_pointers(cells: Cells) -> CellPointers:
     """Pointers to the arrays of cells, which the caller keeps alive."""
     return CellPointers(pointer(cells.patch), pointer(cells.tried))
 
 
 @numba.njit(cache=True, nogil=True)
-def copy_patch(store, source, target):  # type: ignore[no-untyped-def]
+def copy_patch(store: Store, source: int, target: int) -> None:
     """Enter a patch of a store at another position of it as well."""
     store.xyz[target], store.normal[target] = store.xyz[source], store.normal[source]
     store.score[target], store.sigma[target] = store.score[source], store.sigma[source]

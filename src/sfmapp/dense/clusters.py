@@ -138,7 +138,10 @@ def _all_views(
 
 
 @numba.njit(cache=True, nogil=True)
-def _find_new_views(ptr, views, asked, patch, view, is_new):  # type: ignore[no-untyped-def]
+def _find_new_views(
+    ptr: NDArray[np.int64], views: NDArray[np.int32], asked: NDArray[np.bool_], patch: NDArray[np.int64],
+    view: NDArray[np.int32], is_new: NDArray[np.bool_],
+) -> None:  # fmt: skip
     """Where it is asked whether a view is not yet among those of a patch, say so."""
     for n in range(patch.shape[0]):
         if asked[n]:

@@ -7,13 +7,29 @@ the cells: threads share the work, and the result does not depend on how many th
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
 from numba import float32 as f32
+from numpy.typing import NDArray
 
-from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
+from sfmapp.dense.arrays import (
+    LAYERS,
+    CellPointers,
+    Cells,
+    ImagePointers,
+    Images,
+    Limits,
+    Store,
+    StorePointers,
+    cell_pointers,
+    image_pointers,
+    store_pointers,
+)
 from sfmapp.dense.patch_kernels import (
     APART,
+    Trial,
     cell_of,
     cell_size,
     holds_window,
@@ -27,7 +43,7 @@ from sfmapp.dense.patch_kernels import (
 )
 from sfmapp.dense.visibility import are_excused
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
-from sfmapp.simd.pointers import offset, pointer
+from sfmapp.simd.pointers import Pointer, offset, pointer
 
 CANDIDATES = 3
 # a cell that has failed so often is left alone until the next round
@@ -52,7 +68,10 @@ CLEAR_DEVIATION = 2.5
 
 
 @numba.njit(cache=True, nogil=True)
-def frontier(image_arrays, store_arrays, cell_arrays, m, fresh, num_fresh, places, candidates):  # type: ignore[no-untyped-def]
+def frontier(
+    image_arrays: Images, store_arrays: Store, cell_arrays: Cells, m: int, fresh: NDArray[np.int32], num_fresh: int,
+    places: NDArray[np.int32], candidates: NDArray[np.int32],
+) -> int:  # fmt: skip
     """Cells of view m to try next to cells that were filled: pixels to ``places``, patches to grow to ``candidates``.
 
     ``fresh[:num_fresh]``: filled cells, counted within the view; num_fresh < 0: all cells with filled neighbours are
@@ -88,7 +107,7 @@ def frontier(image_arrays, store_arrays, cell_arrays, m, fresh, num_fresh, place
 
 
 @numba.njit(cache=True, nogil=True)
-def _may_be_tried(images, cells, m, x, y):  # type: ignore[no-untyped-def]
+def _may_be_tried(images: ImagePointers, cells: CellPointers, m: int, x: int, y: int) -> bool:
     """The cell has room for a patch, its window lies in the image, and it has not failed too often."""
     g = images.cell_start[m] + y * images.columns[m] + x
     if images.closed[g] != 0 or cells.patch[LAYERS * g + LAYERS - 1] >= 0 or (cells.tried[g] & TRIES) >= MOST_TRIES:
@@ -98,7 +117,10 @@ def _may_be_tried(images, cells, m, x, y):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _offer(images, store, cells, m, x, y, place, row):  # type: ignore[no-untyped-def]
+def _offer(
+    images: ImagePointers, store: StorePointers, cells: CellPointers, m: int, x: Any, y: Any, place: Pointer,
+    row: Pointer,
+) -> int:  # fmt: skip
     """Enter a cell as one to be tried if a patch beside it can grow into it: the best-scored candidates first."""
     start, columns, rows = images.cell_start[m], np.int64(images.columns[m]), np.int64(images.rows[m])
     g = start + y * columns + x
@@ -126,7 +148,7 @@ def _offer(images, store, cells, m, x, y, place, row):  # type: ignore[no-untype
 
 
 @numba.njit(cache=True, nogil=True)
-def _insert(store, row, count, p):  # type: ignore[no-untyped-def]
+def _insert(store: StorePointers, row: Pointer, count: int, p: int) -> int:
     """Keep the best CANDIDATES patches of a row sorted by score; their new number."""
     for j in range(count):
         if row[j] == p:
@@ -142,32 +164,22 @@ def _insert(store, row, count, p):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def try_cells(  # type: ignore[no-untyped-def]
-    image_arrays,
-    store_arrays,
-    own_arrays,
-    cell_arrays,
-    m,
-    places,
-    candidates,
-    first,
-    last,
-    limits,
-    wave,
-    scratch,
-    found_arrays,
-):
-    """Grow patches into cells ``first`` to ``last`` of view m; results at the same positions of what is found.
+def try_cells(
+    image_arrays: Images, store_arrays: Store, own_arrays: Store, cell_arrays: Cells, m: int, places: NDArray[np.int32],
+    candidates: NDArray[np.int32], part: tuple[int, int], limits: Limits, wave: int, scratch: NDArray[np.float32],
+    found_arrays: Store,
+) -> None:  # fmt: skip
+    """Grow patches into cells ``part[0]`` to ``part[1]`` of view m; results at the same positions of what is found.
 
     With a negative wave the patches are those of a coarser level, and their own waves are passed on.
     """
     images, store, found = image_pointers(image_arrays), store_pointers(store_arrays), store_pointers(found_arrays)
     cells, own = cell_pointers(cell_arrays), store_pointers(own_arrays)
     slot_array, work = np.empty(MOST_SLOTS, np.int64), pointer(scratch)
-    slots, rhos, best = pointer(slot_array), offset(work, RHOS), offset(work, BEST)
+    trial = Trial(offset(work, BEST), pointer(slot_array), offset(work, RHOS), work)
     quads, width = offset(images.quads, images.start[m]), images.width[m]
     contrast = f32(CONTRAST) * images.noise[m] + f32(LEAST_CONTRAST)
-    for i in range(first, last):
+    for i in range(part[0], part[1]):
         found.num_views[i] = 0
         u, v = places[i, 0], places[i, 1]
         deviation = read_reference(quads, width, u, v, contrast, work)
@@ -182,12 +194,12 @@ def try_cells(  # type: ignore[no-untyped-def]
         parent = choose(images, store, m, uf, vf, candidate, work)
         if parent < 0:
             continue
-        n = slots_of(images, store, m, parent, slots, limits.max_refined)
+        n = slots_of(images, store, m, parent, trial.slots, limits.max_refined)
         if n < limits.min_views - 1:
             continue
-        n, sigma = refine(images, m, uf, vf, best, slots, rhos, n, limits, work)
-        if n <= 0 or not judge(images, m, uf, vf, best, slots, rhos, n, sigma, limits, work, found, i):
-            if is_one_short(n, rhos, limits):
+        n, sigma = refine(images, m, uf, vf, trial, n, limits)
+        if n <= 0 or not judge(images, m, uf, vf, trial, n, sigma, limits, found, i):
+            if is_one_short(n, trial.rhos, limits):
                 cells.tried[cell_of(images, m, u, v)] |= SHORT
             if wave < 0 and n > 0 and deviation < f32(CLEAR_DEVIATION) * images.noise[m]:
                 inherit(images, store, m, uf, vf, parent, found, i)
@@ -202,7 +214,9 @@ def try_cells(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def is_second_layer(images, store, there, known, found, i):  # type: ignore[no-untyped-def]
+def is_second_layer(
+    images: ImagePointers, store: StorePointers, there: int, known: float, found: StorePointers, i: int
+) -> bool:
     """Whether what was found explains the pixel better than patch ``there`` does, whose NCC is ``known``, and has not
     slid back onto it."""
     reach = f32(APART) * cell_size(images, found, i)
@@ -210,14 +224,14 @@ def is_second_layer(images, store, there, known, found, i):  # type: ignore[no-u
 
 
 @numba.njit(cache=True, nogil=True)
-def is_one_short(n, rhos, limits):  # type: ignore[no-untyped-def]
+def is_one_short(n: int, rhos: Pointer, limits: Limits) -> bool:
     """Whether a patch was refused, by refinement (n < 0) or the verdict (n > 0), that one image fewer would trust."""
     left = limits.min_views - 2
     return left > 0 and (n == -left or (n > 0 and rhos[left - 1] >= f32(limits.trusted)))
 
 
 @numba.njit(cache=True, nogil=True)
-def retry(cell_arrays):  # type: ignore[no-untyped-def]
+def retry(cell_arrays: Cells) -> None:
     """Let cells be tried again in which a patch was one image short, and no others that were tried."""
     cells = cell_pointers(cell_arrays)
     for g in range(cell_arrays.tried.shape[0]):
@@ -228,7 +242,9 @@ def retry(cell_arrays):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def inherit(images, store, m, u, v, p, found, i):  # type: ignore[no-untyped-def]
+def inherit(
+    images: ImagePointers, store: StorePointers, m: int, u: float, v: float, p: int, found: StorePointers, i: int
+) -> None:
     """Enter the patch of a coarser level as it is at ``found[i]``, where pixel (u, v) of view m looks at its plane."""
     row, num = p * store.row, np.int64(store.num_views[p])
     is_trusted = False
@@ -257,7 +273,7 @@ def inherit(images, store, m, u, v, p, found, i):  # type: ignore[no-untyped-def
 
 
 @numba.njit(cache=True, nogil=True)
-def slots_of(images, store, m, p, slots, most):  # type: ignore[no-untyped-def]
+def slots_of(images: ImagePointers, store: StorePointers, m: int, p: int, slots: Pointer, most: int) -> int:
     """Slots of view m that trust patch p, best first, filled up with its best neighbours; their number."""
     n = 0
     for j in range(store.num_views[p]):
@@ -278,7 +294,7 @@ def slots_of(images, store, m, p, slots, most):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def choose(images, store, m, u, v, row, work):  # type: ignore[no-untyped-def]
+def choose(images: ImagePointers, store: StorePointers, m: int, u: float, v: float, row: Pointer, work: Pointer) -> int:
     """The candidate whose plane, carried on to (u, v), the images like best; its plane at BEST; -1 for none."""
     chosen, liking = -1, f32(-2.0)
     best = offset(work, BEST)
@@ -309,7 +325,9 @@ def choose(images, store, m, u, v, row, work):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def zncc_with_patch(images, store, m, u, v, p, work):  # type: ignore[no-untyped-def]
+def zncc_with_patch(
+    images: ImagePointers, store: StorePointers, m: int, u: float, v: float, p: int, work: Pointer
+) -> float:
     """Mean NCC of a patch, seen from view m at (u, v), with the first images that trust it."""
     wu, wv, w = plane_in_view(images, m, offset(store.xyz, 3 * p), offset(store.normal, 3 * p))
     w0 = f32(wu * u + wv * v + w)
@@ -317,7 +335,10 @@ def zncc_with_patch(images, store, m, u, v, p, work):  # type: ignore[no-untyped
 
 
 @numba.njit(cache=True, nogil=True)
-def _liking(images, store, m, u, v, p, w0, wx, wy, work):  # type: ignore[no-untyped-def]
+def _liking(
+    images: ImagePointers, store: StorePointers, m: int, u: float, v: float, p: int, w0: float, wx: float, wy: float,
+    work: Pointer,
+) -> float:  # fmt: skip
     """Mean NCC of a plane with the first images that trust its patch; -1 if none is a neighbour of view m."""
     total, asked = f32(0.0), 0
     for i in range(store.num_views[p]):
@@ -332,7 +353,10 @@ def _liking(images, store, m, u, v, p, w0, wx, wy, work):  # type: ignore[no-unt
 
 
 @numba.njit(cache=True, nogil=True)
-def enter(image_arrays, store_arrays, cell_arrays, count, found, num_found, fresh, num_fresh):  # type: ignore[no-untyped-def]
+def enter(
+    image_arrays: Images, store_arrays: Store, cell_arrays: Cells, count: int, found: Store, num_found: int,
+    fresh: NDArray[np.int32], num_fresh: NDArray[np.int64],
+) -> int:  # fmt: skip
     """Append what was found to the store, and to the cells of all images that trust it; returns the new count.
 
     Newly filled cells are noted in ``fresh`` (V, room), ``num_fresh`` (V,): -1 there means that there was no room.
@@ -354,7 +378,10 @@ def enter(image_arrays, store_arrays, cell_arrays, count, found, num_found, fres
 
 
 @numba.njit(cache=True, nogil=True)
-def place(images, store, cells, p, fresh, num_fresh):  # type: ignore[no-untyped-def]
+def place(
+    images: ImagePointers, store: StorePointers, cells: CellPointers, p: int, fresh: NDArray[np.int32],
+    num_fresh: NDArray[np.int64],
+) -> None:  # fmt: skip
     """Put a patch into the cells of the images that trust it, where none of its surface is."""
     reach = f32(APART) * cell_size(images, store, p)
     for j in range(store.num_views[p]):

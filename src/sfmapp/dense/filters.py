@@ -5,8 +5,21 @@ from __future__ import annotations
 import numba
 import numpy as np
 from numba import float32 as f32
+from numpy.typing import NDArray
 
-from sfmapp.dense.arrays import LAYERS, cell_pointers, copy_patch, image_pointers, store_pointers
+from sfmapp.dense.arrays import (
+    LAYERS,
+    CellPointers,
+    Cells,
+    ImagePointers,
+    Images,
+    Store,
+    StorePointers,
+    cell_pointers,
+    copy_patch,
+    image_pointers,
+    store_pointers,
+)
 from sfmapp.dense.expand import place
 from sfmapp.dense.patch_kernels import NEAR, cell_of, cell_size, off_planes, project
 from sfmapp.simd.pointers import offset
@@ -19,7 +32,10 @@ SMALLEST_GROUP = 24
 
 
 @numba.njit(cache=True, nogil=True)
-def refill(image_arrays, store_arrays, cell_arrays, order, fresh, num_fresh):  # type: ignore[no-untyped-def]
+def refill(
+    image_arrays: Images, store_arrays: Store, cell_arrays: Cells, order: NDArray[np.int64], fresh: NDArray[np.int32],
+    num_fresh: NDArray[np.int64],
+) -> None:  # fmt: skip
     """Empty the cells and put the patches of ``order`` back, the first of a surface in a cell stays."""
     cell_arrays.patch[:] = -1
     images, store, cells = image_pointers(image_arrays), store_pointers(store_arrays), cell_pointers(cell_arrays)
@@ -28,7 +44,7 @@ def refill(image_arrays, store_arrays, cell_arrays, order, fresh, num_fresh):  #
 
 
 @numba.njit(cache=True, nogil=True)
-def compact(store, kept):  # type: ignore[no-untyped-def]
+def compact(store: Store, kept: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Move the patches that are ``kept`` (N,) bool to the front; (N,) int32 their new positions, -1 for the others."""
     new_idx = np.full(kept.shape[0], -1, np.int32)
     count = 0
@@ -42,7 +58,7 @@ def compact(store, kept):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def renumber(cell_arrays, new_idx):  # type: ignore[no-untyped-def]
+def renumber(cell_arrays: Cells, new_idx: NDArray[np.int32]) -> None:
     """Give the patches in the cells their new positions; -1 takes a patch out, and what is behind it moves up."""
     cells = cell_pointers(cell_arrays)
     for g in range(cell_arrays.patch.shape[0]):
@@ -58,7 +74,10 @@ def renumber(cell_arrays, new_idx):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def judge_patches(image_arrays, store_arrays, cell_arrays, least_views, first, last, keep):  # type: ignore[no-untyped-def]
+def judge_patches(
+    image_arrays: Images, store_arrays: Store, cell_arrays: Cells, least_views: int, first: int, last: int,
+    keep: NDArray[np.uint8],
+) -> None:  # fmt: skip
     """Fill ``keep[first:last]``: 0 kept, 1 contradicted by what images see, 2 without neighbours of its surface."""
     images, store, cells = image_pointers(image_arrays), store_pointers(store_arrays), cell_pointers(cell_arrays)
     for p in range(first, last):
@@ -81,7 +100,9 @@ def judge_patches(image_arrays, store_arrays, cell_arrays, least_views, first, l
 
 
 @numba.njit(cache=True, nogil=True)
-def _contradiction(images, store, cells, p, m, reach):  # type: ignore[no-untyped-def]
+def _contradiction(
+    images: ImagePointers, store: StorePointers, cells: CellPointers, p: int, m: int, reach: float
+) -> float:
     """Scores of the patches in p's cell of view m that p would hide, or that would hide p although m trusts it."""
     u, v, z = project(images, m, offset(store.xyz, 3 * p))
     g = cell_of(images, m, u, v) if z > 0.0 else np.int64(-1)
@@ -104,7 +125,7 @@ def _contradiction(images, store, cells, p, m, reach):  # type: ignore[no-untype
 
 
 @numba.njit(cache=True, nogil=True)
-def _support(images, store, cells, p, r, reach):  # type: ignore[no-untyped-def]
+def _support(images: ImagePointers, store: StorePointers, cells: CellPointers, p: int, r: int, reach: float) -> int:
     """Cells around p in its reference image that hold a patch of its surface."""
     u, v, _ = project(images, r, offset(store.xyz, 3 * p))
     g = cell_of(images, r, u, v)
@@ -127,7 +148,9 @@ def _support(images, store, cells, p, r, reach):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def group_sizes(image_arrays, store_arrays, cell_arrays, count, min_views):  # type: ignore[no-untyped-def]
+def group_sizes(
+    image_arrays: Images, store_arrays: Store, cell_arrays: Cells, count: int, min_views: int
+) -> NDArray[np.int32]:
     """(N,) int32 size of the group of each patch: patches in adjacent cells of one surface hang together, and those
     that ``min_views`` images trust count."""
     images, store, cells = image_pointers(image_arrays), store_pointers(store_arrays), cell_pointers(cell_arrays)
@@ -161,7 +184,9 @@ def group_sizes(image_arrays, store_arrays, cell_arrays, count, min_views):  # t
 
 
 @numba.njit(cache=True, nogil=True)
-def _join(images, store, cells, parent, p, g):  # type: ignore[no-untyped-def]
+def _join(
+    images: ImagePointers, store: StorePointers, cells: CellPointers, parent: NDArray[np.int32], p: int, g: int
+) -> None:
     for layer in range(LAYERS):
         q = cells.patch[LAYERS * g + layer]
         if q < 0:
@@ -174,7 +199,7 @@ def _join(images, store, cells, parent, p, g):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _root(parent, p):  # type: ignore[no-untyped-def]
+def _root(parent: NDArray[np.int32], p: int) -> int:
     while parent[p] != p:
         parent[p] = parent[parent[p]]
         p = parent[p]

@@ -104,7 +104,6 @@ class Growth:
         ``everywhere``: not just with other corners.
         """
         images, before = self.images, self.count
-        num_searched = SEARCHED_EVERYWHERE if everywhere else SEARCHED_IN_GAPS
         has_corner = np.full(len(images.closed), everywhere)
         cell_of = []
         for m, xy in enumerate(corners):
@@ -112,11 +111,12 @@ class Growth:
             cell = np.minimum(cell, [images.columns[m] - 1, images.rows[m] - 1])
             cell_of.append(images.cell_start[m] + cell[:, 1] * images.columns[m] + cell[:, 0])
             has_corner[cell_of[m]] = True
+        search = seeds.CornerSearch(
+            SEARCHED_EVERYWHERE if everywhere else SEARCHED_IN_GAPS, has_corner, depth_range
+        )  # fmt: skip
         for m, xy in enumerate(corners):
             is_open = (self.cells.patch[cell_of[m], LAYERS - 1] < 0) & (images.closed[cell_of[m]] == 0)
-            self._batch(
-                m, xy[is_open], seeds.match_corners, self.store, self.cells, num_searched, has_corner, depth_range
-            )
+            self._batch(m, xy[is_open], seeds.match_corners, self.store, self.cells, search)
         return self.count - before
 
     def depth_ranges(self, otherwise: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -193,8 +193,8 @@ class Growth:
 
         def work(first: int, last: int, number: int) -> None:
             try_cells(
-                self.images, parents, self.store, self.cells, m, places, candidates, first, last, self.limits, wave,
-                self._work[number], self._found,
+                self.images, parents, self.store, self.cells, m, places, candidates, (first, last), self.limits,
+                wave, self._work[number], self._found,
             )  # fmt: skip
 
         self._in_chunks(n, work)
@@ -210,7 +210,7 @@ class Growth:
         def work(first: int, last: int, number: int) -> None:
             more = (spare[number],) if kernel is seeds.match_corners else ()
             kernel(
-                self.images, m, places, *arguments, first, last, self.limits, self._work[number], self._found, *more
+                self.images, m, places, *arguments, (first, last), self.limits, self._work[number], self._found, *more
             )  # fmt: skip
 
         self._in_chunks(n, work)

@@ -11,8 +11,9 @@ import math
 import numba
 import numpy as np
 from numba import float32 as f32
+from numpy.typing import NDArray
 
-from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
+from sfmapp.dense.arrays import LAYERS, Cells, Images, Store, cell_pointers, image_pointers, store_pointers
 from sfmapp.dense.expand import BETTER, CONTRAST, LEAST_CONTRAST, LEAST_DEVIATION, zncc_with_patch
 from sfmapp.dense.patch_kernels import holds_window, project
 from sfmapp.dense.window import read_reference
@@ -20,7 +21,10 @@ from sfmapp.simd.pointers import offset, pointer
 
 
 @numba.njit(cache=True, nogil=True)
-def weigh_layers(image_arrays, store_arrays, cell_arrays, m, cell_idx, first, last, scratch, loser):  # type: ignore[no-untyped-def]
+def weigh_layers(
+    image_arrays: Images, store_arrays: Store, cell_arrays: Cells, m: int, cell_idx: NDArray[np.int64], first: int,
+    last: int, scratch: NDArray[np.float32], loser: NDArray[np.int32],
+) -> None:  # fmt: skip
     """Of two patches in one cell of view m, which its image contradicts: patches to ``loser[first:last]``, -1 for none.
 
     ``cell_idx``: cells with two layers. Each patch is asked about its own pixel: which of the two planes explains it?
@@ -48,7 +52,9 @@ def weigh_layers(image_arrays, store_arrays, cell_arrays, m, cell_idx, first, la
 
 
 @numba.njit(cache=True, nogil=True)
-def take_trust(store_arrays, cell_arrays, m, cell_idx, loser):  # type: ignore[no-untyped-def]
+def take_trust(
+    store_arrays: Store, cell_arrays: Cells, m: int, cell_idx: NDArray[np.int64], loser: NDArray[np.int32]
+) -> None:
     """View m no longer trusts the patches of ``loser``; those that have it as their reference image lose all views."""
     store, cells = store_pointers(store_arrays), cell_pointers(cell_arrays)
     for i in range(cell_idx.shape[0]):

@@ -50,7 +50,10 @@ def splat_view(
 
 
 @numba.njit(cache=True, nogil=True)
-def _splat(seen, normal, k, reach, depth, normals, gap):  # type: ignore[no-untyped-def]
+def _splat(
+    seen: NDArray[np.float64], normal: NDArray[np.float64], k: NDArray[np.float64], reach: float,
+    depth: NDArray[np.float32], normals: NDArray[np.float32], gap: NDArray[np.float32],
+) -> None:  # fmt: skip
     height, width = depth.shape
     for p in range(seen.shape[0]):
         z = seen[p, 2]

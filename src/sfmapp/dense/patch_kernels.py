@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numba import float32 as f32
 
+from sfmapp.dense.arrays import ImagePointers, Limits, StorePointers
 from sfmapp.dense.window import (
     HALF,
     KEPT,
@@ -20,7 +22,7 @@ from sfmapp.dense.window import (
     solve3,
     warp,
 )
-from sfmapp.simd.pointers import offset
+from sfmapp.simd.pointers import Pointer, offset
 
 # how far two patches may lie off each other's planes to be of one surface, in cells
 NEAR = 1.5
@@ -43,7 +45,7 @@ LARGEST_COSINE_OF_ANGLE = math.cos(math.radians(2.5))
 
 
 @numba.njit(cache=True, nogil=True)
-def plane_in_view(images, m, xyz, normal):  # type: ignore[no-untyped-def]
+def plane_in_view(images: ImagePointers, m: int, xyz: Pointer, normal: Pointer) -> tuple[float, float, float]:
     """Plane through a place with a normal, seen by view m: inverse depth ``wu u + wv v + w`` as (wu, wv, w)."""
     r, t, k = offset(images.rotation, 9 * m), offset(images.translation, 3 * m), offset(images.k, 4 * m)
     n0 = r[0] * normal[0] + r[1] * normal[1] + r[2] * normal[2]
@@ -60,7 +62,7 @@ def plane_in_view(images, m, xyz, normal):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def project(images, m, xyz):  # type: ignore[no-untyped-def]
+def project(images: ImagePointers, m: int, xyz: Pointer) -> tuple[float, float, float]:
     """Pixel and depth (u, v, z) of a place in view m; z <= 0 behind it."""
     r, t, k = offset(images.rotation, 9 * m), offset(images.translation, 3 * m), offset(images.k, 4 * m)
     z = r[6] * xyz[0] + r[7] * xyz[1] + r[8] * xyz[2] + t[2]
@@ -72,7 +74,7 @@ def project(images, m, xyz):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def unproject(images, m, u, v, z, xyz):  # type: ignore[no-untyped-def]
+def unproject(images: ImagePointers, m: int, u: float, v: float, z: float, xyz: Pointer) -> float:
     """The place at depth z that view m sees at pixel (u, v), to ``xyz``; the length of the ray to depth one."""
     k, r, t = offset(images.k, 4 * m), offset(images.rotation, 9 * m), offset(images.translation, 3 * m)
     rx, ry = (u - k[2]) / k[0], (v - k[3]) / k[1]
@@ -83,7 +85,9 @@ def unproject(images, m, u, v, z, xyz):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def normal_of_plane(images, m, u, v, w, wu, wv, normal):  # type: ignore[no-untyped-def]
+def normal_of_plane(
+    images: ImagePointers, m: int, u: float, v: float, w: float, wu: float, wv: float, normal: Pointer
+) -> float:
     """Unit normal of a plane of view m, inverse depth w at pixel (u, v) with slopes wu, wv, to ``normal``; returns one
     over the distance of the plane from the camera."""
     k, r = offset(images.k, 4 * m), offset(images.rotation, 9 * m)
@@ -97,7 +101,7 @@ def normal_of_plane(images, m, u, v, w, wu, wv, normal):  # type: ignore[no-unty
 
 
 @numba.njit(cache=True, nogil=True)
-def cell_of(images, m, u, v):  # type: ignore[no-untyped-def]
+def cell_of(images: ImagePointers, m: int, u: float, v: float) -> int:
     """Cell of a pixel in view m; -1 outside of the grid."""
     side = images.cell_px
     x, y = math.floor((u + 0.5) / side), math.floor((v + 0.5) / side)
@@ -107,7 +111,7 @@ def cell_of(images, m, u, v):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def off_planes(store, p, other, q):  # type: ignore[no-untyped-def]
+def off_planes(store: StorePointers, p: int, other: StorePointers, q: int) -> float:
     """How far patch p of one store and q of another lie off each other's planes, in all (Furukawa and Ponce, eq. 6)."""
     x, n = offset(store.xyz, 3 * p), offset(store.normal, 3 * p)
     y, o = offset(other.xyz, 3 * q), offset(other.normal, 3 * q)
@@ -116,19 +120,21 @@ def off_planes(store, p, other, q):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def cell_size(images, store, p):  # type: ignore[no-untyped-def]
+def cell_size(images: ImagePointers, store: StorePointers, p: int) -> float:
     """What a cell measures at a patch."""
     return store.size[p] * f32(images.cell_px)
 
 
 @numba.njit(cache=True, nogil=True)
-def holds_window(images, m, u, v):  # type: ignore[no-untyped-def]
+def holds_window(images: ImagePointers, m: int, u: float, v: float) -> bool:
     """Whether the window about pixel (u, v) lies in view m, with the pixel beyond that bilinear samples need."""
     return u >= HALF and v >= HALF and u < images.width[m] - HALF - 1 and v < images.height[m] - HALF - 1
 
 
 @numba.njit(cache=True, nogil=True)
-def measure(images, m, slot, u, v, w0, wx, wy, work):  # type: ignore[no-untyped-def]
+def measure(
+    images: ImagePointers, m: int, slot: int, u: float, v: float, w0: float, wx: float, wy: float, work: Pointer
+) -> float:
     """NCC of the reference in the scratch, of view m about (u, v), with the neighbour in a slot; -1 where unseen."""
     pair = np.int64(m) * images.num_slots + slot
     s = images.neighbors[pair]
@@ -141,7 +147,9 @@ def measure(images, m, slot, u, v, w0, wx, wy, work):  # type: ignore[no-untyped
 
 
 @numba.njit(cache=True, nogil=True)
-def _terms(images, m, slot, u, v, w0, wx, wy, work):  # type: ignore[no-untyped-def]
+def _terms(
+    images: ImagePointers, m: int, slot: int, u: float, v: float, w0: float, wx: float, wy: float, work: Pointer
+) -> tuple[float, float]:
     """As :func:`measure`, adding to the sums of the scratch; also the pixels that the image moves per inverse depth."""
     pair = np.int64(m) * images.num_slots + slot
     s = images.neighbors[pair]
@@ -155,7 +163,7 @@ def _terms(images, m, slot, u, v, w0, wx, wy, work):  # type: ignore[no-untyped-
 
 
 @numba.njit(cache=True, nogil=True)
-def _step(work, shift1, shift2):  # type: ignore[no-untyped-def]
+def _step(work: Pointer, shift1: float, shift2: float) -> tuple[float, float, float, bool]:
     """Step of Gauss-Newton from the sums; the shifts are how far the slopes lie from where they began."""
     pull = SLOPE_PRIOR * work[SUMS]
     more = f32(1.0) + DAMPING
@@ -166,14 +174,31 @@ def _step(work, shift1, shift2):  # type: ignore[no-untyped-def]
     return solve3(n, work[SUMS + 6], work[SUMS + 7] + pull * shift1, work[SUMS + 8] + pull * shift2)
 
 
+class Trial(NamedTuple):
+    """Pointers to what is known of the patch that is being tried at a pixel.
+
+    Attributes:
+        plane: (3,) float32 w0, wx, wy.
+        slots: (MOST_SLOTS,) int64 neighbours of the view. rhos: float32 their NCC.
+        work: the scratch, which holds the window.
+    """
+
+    plane: Any
+    slots: Any
+    rhos: Any
+    work: Any
+
+
 @numba.njit(cache=True, nogil=True)
-def refine(images, m, u, v, plane, slots, rhos, n, limits, work):  # type: ignore[no-untyped-def]
+def refine(
+    images: ImagePointers, m: int, u: float, v: float, trial: Trial, n: int, limits: Limits
+) -> tuple[int, float]:
     """Gauss-Newton on the mean NCC over neighbours ``slots[:n]``, which are sifted by what they see at the start.
 
-    ``plane``: (3,) float32 w0, wx, wy, in place. Returns the number of slots left, with their NCC in ``rhos``, and the
-    standard deviation of w0; 0 if that came to nothing, and their number below zero if fewer than
-    ``limits.min_views - 1`` are promising.
+    The plane changes in place. Returns the number of slots left, with their NCC in ``rhos``, and the standard deviation
+    of w0; 0 if that came to nothing, and their number below zero if fewer than ``limits.min_views - 1`` are promising.
     """
+    plane, slots, rhos, work = trial
     s0, s1, s2 = plane[0], plane[1], plane[2]
     step0, step1, step2 = f32(0.0), f32(0.0), f32(0.0)
     first1, first2 = plane[1], plane[2]
@@ -228,7 +253,7 @@ def refine(images, m, u, v, plane, slots, rhos, n, limits, work):  # type: ignor
 
 
 @numba.njit(cache=True, nogil=True)
-def _sigma(work, mean, num):  # type: ignore[no-untyped-def]
+def _sigma(work: Pointer, mean: float, num: int) -> float:
     """Standard deviation of w0 from the sums over so many images.
 
     A residual, the difference of two normalised windows, has the mean square 2 (1 - NCC), half of it from each. The
@@ -247,11 +272,15 @@ def _sigma(work, mean, num):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def judge(images, m, u, v, plane, slots, rhos, n, sigma, limits, work, found, i):  # type: ignore[no-untyped-def]
+def judge(
+    images: ImagePointers, m: int, u: float, v: float, trial: Trial, n: int, sigma: float, limits: Limits,
+    found: StorePointers, i: int,
+) -> bool:  # fmt: skip
     """Ask the images that took no part, and enter the patch at ``found[i]`` if enough trust it; says whether it was.
 
     ``slots[:n]`` are those that did take part, with their ``rhos``.
     """
+    plane, slots, rhos, work = trial
     found.num_views[i] = 0
     num_asked = n
     for slot in range(images.num_slots):
@@ -274,12 +303,16 @@ def judge(images, m, u, v, plane, slots, rhos, n, sigma, limits, work, found, i)
         slots[k + 1], rhos[k + 1] = slot, rho
     if num_asked < limits.min_views - 1 or not rhos[limits.min_views - 2] >= f32(limits.trusted):
         return False
-    return _enter(images, m, u, v, plane, slots, rhos, num_asked, sigma, limits, found, i)
+    return _enter(images, m, u, v, trial, num_asked, sigma, limits, found, i)
 
 
 @numba.njit(cache=True, nogil=True)
-def _enter(images, m, u, v, plane, slots, rhos, num_asked, sigma, limits, found, i):  # type: ignore[no-untyped-def]
+def _enter(
+    images: ImagePointers, m: int, u: float, v: float, trial: Trial, num_asked: int, sigma: float, limits: Limits,
+    found: StorePointers, i: int,
+) -> bool:  # fmt: skip
     """Check the geometry of a patch that enough images trust, and write it down."""
+    plane, slots, rhos, _ = trial
     k, center = offset(images.k, 4 * m), offset(images.center, 3 * m)
     w0 = np.float64(plane[0])
     z = 1.0 / w0

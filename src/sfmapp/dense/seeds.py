@@ -7,13 +7,25 @@ has a corner as well. Places that correlate there and in a second image are refi
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from numba import float32 as f32
 from numpy.typing import NDArray
 
-from sfmapp.dense.arrays import LAYERS, cell_pointers, copy_patch, image_pointers, store_pointers
+from sfmapp.dense.arrays import (
+    LAYERS,
+    Cells,
+    ImagePointers,
+    Images,
+    Limits,
+    Store,
+    cell_pointers,
+    copy_patch,
+    image_pointers,
+    store_pointers,
+)
 from sfmapp.dense.expand import (
     CANDIDATES,
     CONTENT,
@@ -23,9 +35,9 @@ from sfmapp.dense.expand import (
     slots_of,
     zncc_with_patch,
 )
-from sfmapp.dense.patch_kernels import cell_of, holds_window, judge, measure, project, refine
+from sfmapp.dense.patch_kernels import Trial, cell_of, holds_window, judge, measure, project, refine
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
-from sfmapp.simd.pointers import offset, pointer
+from sfmapp.simd.pointers import Pointer, offset, pointer
 
 # NCC of a fronto-parallel window with one image, and on average with two, from which a place is worth refining
 LEAST_LIKENESS, LEAST_SUPPORT = f32(0.55), f32(0.5)
@@ -53,37 +65,39 @@ def corners(gray: NDArray[np.uint8], block_px: int, noise: float) -> NDArray[np.
     return places[blocks.max(axis=1) > floor].astype(np.int32)
 
 
-@numba.njit(cache=True, nogil=True)
-def match_corners(  # type: ignore[no-untyped-def]
-    image_arrays,
-    m,
-    places,
-    store_arrays,
-    cell_arrays,
-    num_searched,
-    has_corner,
-    depth_range,
-    first,
-    last,
-    limits,
-    scratch,
-    found_arrays,
-    spare,
-):
-    """Look for corners ``first`` to ``last`` of view m in its neighbours; patches at the same positions of ``found``.
+class CornerSearch(NamedTuple):
+    """Where matches of a corner are looked for.
 
-    ``num_searched``: in so many of them. ``has_corner``: (G,) bool, the cells of all views where a match may lie.
-    ``depth_range``: (V, 2) float64 smallest and largest inverse depth. ``spare``: a position of ``found`` that nobody
-    else uses. What is in a cell already stays; a second layer has to explain the corner better.
+    Attributes:
+        num_neighbors: in so many of the best neighbours.
+        has_corner: (G,) bool, the cells of all views where a match may lie.
+        depth_range: (V, 2) float64 smallest and largest inverse depth.
+    """
+
+    num_neighbors: int
+    has_corner: NDArray[np.bool_]
+    depth_range: NDArray[np.float64]
+
+
+@numba.njit(cache=True, nogil=True)
+def match_corners(
+    image_arrays: Images, m: int, places: NDArray[np.int32], store_arrays: Store, cell_arrays: Cells,
+    search: CornerSearch, part: tuple[int, int], limits: Limits, scratch: NDArray[np.float32], found_arrays: Store,
+    spare: int,
+) -> None:  # fmt: skip
+    """Look for corners ``part[0]`` to ``part[1]`` of view m in its neighbours; patches at the same positions of found.
+
+    ``spare``: a position of ``found`` that nobody else uses. What is in a cell already stays; a second layer has to
+    explain the corner better.
     """
     images, found = image_pointers(image_arrays), store_pointers(found_arrays)
     store, cells = store_pointers(store_arrays), cell_pointers(cell_arrays)
     slot_array, work = np.empty(MOST_SLOTS, np.int64), pointer(scratch)
-    slots, rhos, plane = pointer(slot_array), offset(work, RHOS), offset(work, BEST)
+    trial = Trial(offset(work, BEST), pointer(slot_array), offset(work, RHOS), work)
     quads, width = offset(images.quads, images.start[m]), images.width[m]
     likes, depths = np.empty(NUM_KEPT, np.float32), np.empty(NUM_KEPT, np.float32)
     contrast = f32(CONTRAST) * images.noise[m] + f32(LEAST_CONTRAST)
-    for i in range(first, last):
+    for i in range(part[0], part[1]):
         found.num_views[i] = 0
         u, v = places[i, 0], places[i, 1]
         if not holds_window(images, m, u, v):
@@ -98,20 +112,23 @@ def match_corners(  # type: ignore[no-untyped-def]
             continue
         likes[:] = LEAST_SUPPORT
         depths[:] = f32(-1.0)
-        for slot in range(min(images.num_slots, num_searched)):
+        for slot in range(min(images.num_slots, search.num_neighbors)):
             if images.neighbors[m * images.num_slots + slot] < 0:
                 break
-            _search(images, m, slot, f32(u), f32(v), has_corner, depth_range[m], likes, depths, work)
-        _refine_best(images, m, f32(u), f32(v), depths, limits, slots, rhos, plane, work, found_arrays, spare, i)
+            _search(images, m, slot, f32(u), f32(v), search, likes, depths, work)
+        _refine_best(images, m, f32(u), f32(v), depths, limits, trial, found_arrays, spare, i)
         if there >= 0 and not is_second_layer(images, store, there, known, found, i):
             found.num_views[i] = 0
     slot_array[0] = 0
 
 
 @numba.njit(cache=True, nogil=True)
-def _refine_best(images, m, u, v, depths, limits, slots, rhos, plane, work, found_arrays, spare, i):  # type: ignore[no-untyped-def]
+def _refine_best(
+    images: ImagePointers, m: int, u: float, v: float, depths: NDArray[np.float32], limits: Limits, trial: Trial,
+    found_arrays: Store, spare: int, i: int,
+) -> None:  # fmt: skip
     """Refine what the search has left of pixel (u, v), and enter the best at position i of ``found``."""
-    found = store_pointers(found_arrays)
+    found, plane, slots = store_pointers(found_arrays), trial.plane, trial.slots
     best = f32(-1.0)
     for j in range(NUM_KEPT):
         if depths[j] <= f32(0.0):
@@ -122,8 +139,8 @@ def _refine_best(images, m, u, v, depths, limits, slots, rhos, plane, work, foun
             if images.neighbors[m * images.num_slots + slot] >= 0 and n < limits.max_refined:
                 slots[n] = slot
                 n += 1
-        n, sigma = refine(images, m, u, v, plane, slots, rhos, n, limits, work)
-        if n > 0 and judge(images, m, u, v, plane, slots, rhos, n, sigma, limits, work, found, spare):
+        n, sigma = refine(images, m, u, v, trial, n, limits)
+        if n > 0 and judge(images, m, u, v, trial, n, sigma, limits, found, spare):
             quality = found.score[spare] * f32(found.num_views[spare])
             if quality > best:
                 best = quality
@@ -132,15 +149,19 @@ def _refine_best(images, m, u, v, depths, limits, slots, rhos, plane, work, foun
 
 
 @numba.njit(cache=True, nogil=True)
-def _search(images, m, slot, u, v, has_corner, depth_range, likes, depths, work):  # type: ignore[no-untyped-def]
+def _search(
+    images: ImagePointers, m: int, slot: int, u: float, v: float, search: CornerSearch, likes: NDArray[np.float32],
+    depths: NDArray[np.float32], work: Pointer,
+) -> None:  # fmt: skip
     """Walk the epipolar line of (u, v) in one neighbour, and keep the best places in ``likes`` and ``depths``."""
     pair = m * images.num_slots + slot
     a, b, s = offset(images.a, 9 * pair), offset(images.b, 3 * pair), images.neighbors[pair]
     q0, q1, q2 = a[0] * u + a[1] * v + a[2], a[3] * u + a[4] * v + a[5], a[6] * u + a[7] * v + a[8]
-    low, high = _visible_range(q0, q1, q2, b, depth_range[0], depth_range[1], images.width[s], images.height[s])
+    nearest, farthest = search.depth_range[m, 1], search.depth_range[m, 0]
+    low, high = _visible_range(q0, q1, q2, b, farthest, nearest, images.width[s], images.height[s])
     if not low < high:
         return
-    w, side = low, images.cell_px
+    w, side, has_corner = low, images.cell_px, search.has_corner
     while w < high:
         scale = q2 + b[2] * w
         x, y = (q0 + b[0] * w) / scale, (q1 + b[1] * w) / scale
@@ -165,7 +186,9 @@ def _search(images, m, slot, u, v, has_corner, depth_range, likes, depths, work)
 
 
 @numba.njit(cache=True, nogil=True)
-def _visible_range(q0, q1, q2, b, low, high, width, height):  # type: ignore[no-untyped-def]
+def _visible_range(
+    q0: float, q1: float, q2: float, b: Pointer, low: float, high: float, width: int, height: int
+) -> tuple[float, float]:
     """The part of a range of inverse depth in which ``q + b w`` lies in front of the camera and inside its image."""
     # q2 + b2 w > 0, q0 + b0 w > 0, (W - 1) (q2 + b2 w) - (q0 + b0 w) > 0 and so on: each cuts off one side
     for n in range(5):
@@ -189,7 +212,7 @@ def _visible_range(q0, q1, q2, b, low, high, width, height):  # type: ignore[no-
 
 
 @numba.njit(cache=True, nogil=True)
-def _keep(like, depth, likes, depths):  # type: ignore[no-untyped-def]
+def _keep(like: float, depth: float, likes: NDArray[np.float32], depths: NDArray[np.float32]) -> None:
     """Insert a place among the best few, sorted."""
     for j in range(likes.shape[0]):
         if like > likes[j]:
@@ -200,15 +223,18 @@ def _keep(like, depth, likes, depths):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def try_points(image_arrays, m, places, point_arrays, first, last, limits, scratch, found_arrays):  # type: ignore[no-untyped-def]
-    """Patches at sparse points ``first`` to ``last``, given as a store, in the pixels of view m where they are seen."""
+def try_points(
+    image_arrays: Images, m: int, places: NDArray[np.int32], point_arrays: Store, part: tuple[int, int], limits: Limits,
+    scratch: NDArray[np.float32], found_arrays: Store,
+) -> None:  # fmt: skip
+    """Patches at sparse points ``part[0]`` to ``part[1]``, given as a store, in the pixels of view m that show them."""
     images, found = image_pointers(image_arrays), store_pointers(found_arrays)
     slot_array, work = np.empty(MOST_SLOTS, np.int64), pointer(scratch)
-    slots, rhos, plane = pointer(slot_array), offset(work, RHOS), offset(work, BEST)
+    trial = Trial(offset(work, BEST), pointer(slot_array), offset(work, RHOS), work)
     quads, width = offset(images.quads, images.start[m]), images.width[m]
     points = store_pointers(point_arrays)
     contrast = f32(CONTRAST) * images.noise[m] + f32(LEAST_CONTRAST)
-    for i in range(first, last):
+    for i in range(part[0], part[1]):
         found.num_views[i] = 0
         u, v = places[i, 0], places[i, 1]
         if not holds_window(images, m, u, v):
@@ -217,18 +243,22 @@ def try_points(image_arrays, m, places, point_arrays, first, last, limits, scrat
         if deviation < f32(2.0) * images.noise[m]:
             continue
         _, _, z = project(images, m, offset(points.xyz, 3 * i))
-        n = slots_of(images, points, m, i, slots, limits.max_refined)
+        n = slots_of(images, points, m, i, trial.slots, limits.max_refined)
         if z <= 0.0 or n < limits.min_views - 1:
             continue
+        plane = trial.plane
         plane[0], plane[1], plane[2] = f32(1.0 / z), f32(0.0), f32(0.0)
-        n, sigma = refine(images, m, f32(u), f32(v), plane, slots, rhos, n, limits, work)
-        if n > 0 and judge(images, m, f32(u), f32(v), plane, slots, rhos, n, sigma, limits, work, found, i):
+        n, sigma = refine(images, m, f32(u), f32(v), trial, n, limits)
+        if n > 0 and judge(images, m, f32(u), f32(v), trial, n, sigma, limits, found, i):
             found.wave[i] = 0
     slot_array[0] = 0
 
 
 @numba.njit(cache=True, nogil=True)
-def finer_cells(images, cells, m, coarse_images, coarse_cells, places, candidates):  # type: ignore[no-untyped-def]
+def finer_cells(
+    images: Images, cells: Cells, m: int, coarse_images: Images, coarse_cells: Cells, places: NDArray[np.int32],
+    candidates: NDArray[np.int32],
+) -> int:  # fmt: skip
     """Empty cells of view m where the coarser level has patches: pixels to ``places``, patches to ``candidates``."""
     start, columns, rows, side = images.cell_start[m], images.columns[m], images.rows[m], images.cell_px[0]
     coarse_start, coarse_columns, coarse_rows = (

@@ -81,7 +81,11 @@ def select_neighbors(
 
 
 @numba.njit(cache=True, nogil=True)
-def _score_points(point_xyz, point_ptr, point_view_idx, center, axis, focal, score, angle, shared):  # type: ignore[no-untyped-def]
+def _score_points(
+    point_xyz: NDArray[np.float64], point_ptr: NDArray[np.int64], point_view_idx: NDArray[np.int32],
+    center: NDArray[np.float64], axis: NDArray[np.float64], focal: NDArray[np.float64], score: NDArray[np.float64],
+    angle: NDArray[np.float64], shared: NDArray[np.float64],
+) -> None:  # fmt: skip
     """Add to (V, V) sums over common points: weights, angles in degrees, counts."""
     for p in range(point_xyz.shape[0]):
         for a in range(point_ptr[p], point_ptr[p + 1]):

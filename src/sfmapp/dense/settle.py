@@ -12,8 +12,20 @@ import math
 import numba
 import numpy as np
 from numba import float32 as f32
+from numpy.typing import NDArray
 
-from sfmapp.dense.arrays import LAYERS, cell_pointers, image_pointers, store_pointers
+from sfmapp.dense.arrays import (
+    LAYERS,
+    CellPointers,
+    Cells,
+    ImagePointers,
+    Images,
+    Store,
+    StorePointers,
+    cell_pointers,
+    image_pointers,
+    store_pointers,
+)
 from sfmapp.dense.patch_kernels import (
     NEAR,
     cell_of,
@@ -37,7 +49,10 @@ SLOPE_BASE_PX = 1.5
 
 
 @numba.njit(cache=True, nogil=True)
-def settle(image_arrays, store_arrays, cell_arrays, first, last, xyz, normal, sigma):  # type: ignore[no-untyped-def]
+def settle(
+    image_arrays: Images, store_arrays: Store, cell_arrays: Cells, first: int, last: int, xyz: NDArray[np.float32],
+    normal: NDArray[np.float32], sigma: NDArray[np.float32],
+) -> None:  # fmt: skip
     """New places, normals (N, 3) and deviations (N,) of patches ``first`` to ``last``, all from the old ones."""
     images, store, cells = image_pointers(image_arrays), store_pointers(store_arrays), cell_pointers(cell_arrays)
     for p in range(first, last):
@@ -59,7 +74,7 @@ def settle(image_arrays, store_arrays, cell_arrays, first, last, xyz, normal, si
 
 
 @numba.njit(cache=True, nogil=True)
-def _length_per_inverse_depth(images, r, u, v, w):  # type: ignore[no-untyped-def]
+def _length_per_inverse_depth(images: ImagePointers, r: int, u: float, v: float, w: float) -> float:
     """Length along the ray of pixel (u, v) for a change of inverse depth by one."""
     k = offset(images.k, 4 * r)
     x, y = (u - k[2]) / k[0], (v - k[3]) / k[1]
@@ -67,7 +82,10 @@ def _length_per_inverse_depth(images, r, u, v, w):  # type: ignore[no-untyped-de
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit(images, store, cells, p, r, g, u, v, z, wu, wv):  # type: ignore[no-untyped-def]
+def _fit(
+    images: ImagePointers, store: StorePointers, cells: CellPointers, p: int, r: int, g: int, u: float, v: float,
+    z: float, wu: float, wv: float,
+) -> tuple[float, float, float, float, bool]:  # fmt: skip
     """Plane (w, dw/du, dw/dv at the patch) through its neighbours in view r, the deviation of w, whether it is one."""
     columns, start = np.int64(images.columns[r]), images.cell_start[r]
     cy = (g - start) // columns
@@ -125,6 +143,6 @@ def _fit(images, store, cells, p, r, g, u, v, z, wu, wv):  # type: ignore[no-unt
 
 
 @numba.njit(cache=True, nogil=True)
-def _deviation(images, store, q, r, u, v, w):  # type: ignore[no-untyped-def]
+def _deviation(images: ImagePointers, store: StorePointers, q: int, r: int, u: float, v: float, w: float) -> float:
     """Standard deviation of a patch in inverse depth of view r, taken along its line of sight."""
     return np.float64(store.sigma[q]) / _length_per_inverse_depth(images, r, u, v, w)

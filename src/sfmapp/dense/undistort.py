@@ -170,7 +170,7 @@ def _reach(camera: Camera) -> float:
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _cubic_weights(t):  # type: ignore[no-untyped-def]
+def _cubic_weights(t: float) -> tuple[float, float, float, float]:
     """Of four pixels in a row, for a place that is t beyond the second.
 
     Keys, IEEE ASSP 1981, with a = -1/2, which is exact for parabolas. OpenCV's, with a = -3/4 and on a grid of 1/32
@@ -185,7 +185,10 @@ def _cubic_weights(t):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _resample(pixels, row, reach, k, white, out, shown):  # type: ignore[no-untyped-def]
+def _resample(
+    pixels: NDArray[Any], row: NDArray[np.float64], reach: float, k: NDArray[np.float64], white: NDArray[np.float64],
+    out: NDArray[Any], shown: NDArray[np.uint8],
+) -> None:  # fmt: skip
     """Fill out (h, w, C) of the plane of k from a photograph (H, W, C); shown (h, w): 255 where it shows any of it.
 
     The border of the photograph is carried on, so that pixels at the edge have company of their kind.

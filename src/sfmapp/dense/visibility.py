@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numba import float32 as f32
 
-from sfmapp.dense.arrays import LAYERS
+from sfmapp.dense.arrays import LAYERS, CellPointers, ImagePointers, StorePointers
 from sfmapp.dense.patch_kernels import APART, LEAST_COSINE, cell_of, cell_size, off_planes, project
 from sfmapp.dense.window import HALF
 from sfmapp.simd.pointers import offset
@@ -18,7 +18,7 @@ BORDER = float(HALF + 1)
 
 
 @numba.njit(cache=True, nogil=True)
-def are_excused(images, store, cells, found, i):  # type: ignore[no-untyped-def]
+def are_excused(images: ImagePointers, store: StorePointers, cells: CellPointers, found: StorePointers, i: int) -> bool:
     """Whether the neighbours of the reference image that do not trust patch i have a reason: they cannot see it."""
     m = np.int64(found.views[i * found.row])
     for slot in range(images.num_slots):
@@ -34,7 +34,9 @@ def are_excused(images, store, cells, found, i):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def can_see(images, store, cells, s, found, i):  # type: ignore[no-untyped-def]
+def can_see(
+    images: ImagePointers, store: StorePointers, cells: CellPointers, s: int, found: StorePointers, i: int
+) -> bool:
     """Whether the window of patch i lies in the image and mask of view s, faces it, and no patch of it hides it."""
     xyz, normal, eye = offset(found.xyz, 3 * i), offset(found.normal, 3 * i), offset(images.center, 3 * s)
     u, v, z = project(images, s, xyz)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from sfmapp.simd.bilinear import quad_pixels, sample_quads, sample_quads_with_slopes
 from sfmapp.simd.f32x16 import add, divide, fma, load, multiply, splat, store, subtract, total
-from sfmapp.simd.pointers import offset
+from sfmapp.simd.pointers import Pointer, offset
 
 HALF = 3
 SIZE = 32
@@ -70,7 +70,7 @@ def make_scratch() -> NDArray[np.float32]:
 
 
 @numba.njit(cache=True, nogil=True)
-def read_reference(quads, width, u, v, contrast, work):  # type: ignore[no-untyped-def]
+def read_reference(quads: Pointer, width: int, u: int, v: int, contrast: float, work: Pointer) -> float:
     """Fill weights and reference of the scratch from the window about pixel (u, v); its standard deviation in grey.
 
     ``contrast``: the difference in grey at which a pixel's weight has fallen to one quarter. Zero if it is flat.
@@ -109,7 +109,9 @@ def read_reference(quads, width, u, v, contrast, work):  # type: ignore[no-untyp
 
 
 @numba.njit(cache=True, nogil=True)
-def warp(a, b, u, v, w0, wx, wy, width, height):  # type: ignore[no-untyped-def]
+def warp(
+    a: Pointer, b: Pointer, u: float, v: float, w0: float, wx: float, wy: float, width: int, height: int
+) -> tuple[bool, float, float, float, float, float, float, float, float]:
     """Where the window of a plane lies in a source image: (is inside, x, y, dx/du, dy/du, dx/dv, dy/dv, dx/dw, dy/dw).
 
     ``a``, ``b``: pointers to the nine and three numbers of the pair. Not inside: partly out of the image, behind the
@@ -135,7 +137,9 @@ def warp(a, b, u, v, w0, wx, wy, width, height):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def correlate(quads, width, x, y, xu, yu, xv, yv, work):  # type: ignore[no-untyped-def]
+def correlate(
+    quads: Pointer, width: int, x: float, y: float, xu: float, yu: float, xv: float, yv: float, work: Pointer
+) -> float:
     """Weighted NCC, -1 to 1, of the reference in the scratch with the source window; 0 if that is flat."""
     x0, y0, xu_, yu_, xv_, yv_ = splat(x), splat(y), splat(xu), splat(yu), splat(xv), splat(yv)
     mean = square = product = splat(f32(0.0))
@@ -155,7 +159,10 @@ def correlate(quads, width, x, y, xu, yu, xv, yv, work):  # type: ignore[no-unty
 
 
 @numba.njit(cache=True, nogil=True)
-def correlate_with_terms(quads, width, x, y, xu, yu, xv, yv, ex, ey, work):  # type: ignore[no-untyped-def]
+def correlate_with_terms(
+    quads: Pointer, width: int, x: float, y: float, xu: float, yu: float, xv: float, yv: float, ex: float, ey: float,
+    work: Pointer,
+) -> float:  # fmt: skip
     """As :func:`correlate`; adds the terms of Gauss-Newton on (w0, wx, wy) to the sums of the scratch.
 
     The residual is the normalised reference minus the normalised source window. Its normal matrix (00 01 02 11 12 22)
@@ -206,7 +213,9 @@ def correlate_with_terms(quads, width, x, y, xu, yu, xv, yv, ex, ey, work):  # t
 
 
 @numba.njit(cache=True, nogil=True)
-def solve3(n, g0, g1, g2):  # type: ignore[no-untyped-def]
+def solve3(
+    n: tuple[float, float, float, float, float, float], g0: float, g1: float, g2: float
+) -> tuple[float, float, float, bool]:
     """x of the symmetric system N x = g, N as (00, 01, 02, 11, 12, 22); zeros and False where it is singular."""
     n00, n01, n02, n11, n12, n22 = n
     c00, c01, c02 = n11 * n22 - n12 * n12, n02 * n12 - n01 * n22, n01 * n12 - n02 * n11

@@ -9,6 +9,7 @@ reweighted by depth: for the small residuals that are left this is the reproject
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -23,6 +24,33 @@ Bools = NDArray[np.bool_]
 
 # A track of 10 observations has 45 pairs; longer ones are sampled with about as many.
 MAX_HYPOTHESES = 45
+
+
+class Views(NamedTuple):
+    """Where images (I) stand and through which lenses (C) they look.
+
+    Attributes:
+        rotation, translation: (I, 3, 3), (I, 3) cam_from_world, NaN where unregistered.
+        camera_idx: (I,) int32 which lens each has.
+        canonical: (C, ROW) their parameters, see ``Camera.canonical``.
+    """
+
+    rotation: Array
+    translation: Array
+    camera_idx: Int32s
+    canonical: Array
+
+
+class Observed(NamedTuple):
+    """Tracks (T) and their observations (O): those of track t are ``track_ptr[t] : track_ptr[t + 1]``.
+
+    Attributes:
+        track_ptr: (T + 1,) int64. image_idx: (O,) int32. xy: (O, 2) pixels.
+    """
+
+    track_ptr: Ints
+    image_idx: Int32s
+    xy: Array
 
 
 @numba.njit(cache=True, nogil=True)
@@ -196,30 +224,19 @@ def _mark_inliers(
 
 @numba.njit(cache=True, nogil=True)
 def triangulate_tracks(
-    tracks: Ints,
-    track_ptr: Ints,
-    obs_image_idx: Int32s,
-    obs_xy: Array,
-    rotation: Array,
-    translation: Array,
-    image_camera_idx: Int32s,
-    canonical: Array,
-    max_error_px: float,
-    min_angle_rad: float,
-    point_xyz: Array,
+    tracks: Ints, observed: Observed, views: Views, max_error_px: float, min_angle_rad: float, point_xyz: Array,
     obs_is_inlier: Bools,
-) -> int:
+) -> int:  # fmt: skip
     """Triangulate tracks robustly from the registered images; returns how many succeeded.
 
     Args:
         tracks: (K,) int64, the tracks to try.
-        track_ptr, obs_image_idx, obs_xy: as in Tracks.
-        rotation, translation: (I, 3, 3), (I, 3) cam_from_world, NaN where unregistered.
-        image_camera_idx, canonical: intrinsics as in Reconstruction.
         max_error_px: largest reprojection error of an inlier.
         min_angle_rad: smallest angle between two rays of an accepted point.
         point_xyz, obs_is_inlier: written for the given tracks only; NaN and False where triangulation fails.
     """
+    track_ptr, obs_image_idx, obs_xy = observed
+    rotation, translation, image_camera_idx, canonical = views
     longest = _longest(tracks, track_ptr)
     obs = np.empty(longest, np.int64)
     centers, rays = np.empty((longest, 3)), np.empty((longest, 3))
@@ -267,24 +284,16 @@ def triangulate_tracks(
 
 @numba.njit(cache=True, nogil=True)
 def classify_observations(
-    tracks: Ints,
-    track_ptr: Ints,
-    obs_image_idx: Int32s,
-    obs_xy: Array,
-    rotation: Array,
-    translation: Array,
-    image_camera_idx: Int32s,
-    canonical: Array,
-    max_error_px: float,
-    min_angle_rad: float,
-    point_xyz: Array,
+    tracks: Ints, observed: Observed, views: Views, max_error_px: float, min_angle_rad: float, point_xyz: Array,
     obs_is_inlier: Bools,
-) -> int:
+) -> int:  # fmt: skip
     """Decide afresh which observations support the given triangulated tracks; returns how many points were dropped.
 
     Arguments as in :func:`triangulate_tracks`. An observation is an inlier if its image is registered and its
     reprojection error small enough; a point with fewer than two inliers or too small an angle becomes NaN.
     """
+    track_ptr, obs_image_idx, obs_xy = observed
+    rotation, translation, image_camera_idx, canonical = views
     longest = _longest(tracks, track_ptr)
     centers = np.empty((longest, 3))
     used = np.empty(longest, np.bool_)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.events import Events
@@ -238,7 +239,9 @@ def _with_richer_lens(mapper: Mapper) -> Reconstruction:
     options = replace(mapper.adjust_options, initial_damping=1e-7, relative_cost_tolerance=1e-7)
     # priors hold the principal points, not the focal lengths
     priors = [replace(camera, focal_sigma=None) for camera in trial.cameras]
-    adjust_bundle(trial, mapper.with_free_centers(options, is_free), variable_cameras=is_free, prior_cameras=priors)
+    adjust_bundle(
+        trial, mapper.with_free_centers(options, is_free), varying=Varying(cameras=is_free), prior_cameras=priors
+    )
     return trial
 
 

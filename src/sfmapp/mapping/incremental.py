@@ -147,8 +147,10 @@ class _Task:
         def mapper_of(model: Reconstruction, locked: NDArray[np.bool_] | None = None) -> Mapper:
             locked = np.zeros(len(names), bool) if locked is None else locked
             return Mapper(
-                model, correspondences, options, self.adjust_options, events, self.pool, list(cameras), locked, attempts
-            )
+                reconstruction=model, correspondences=correspondences, options=options,
+                adjust_options=self.adjust_options, events=events, pool=self.pool, prior_cameras=list(cameras),
+                locked=locked, attempts=attempts,
+            )  # fmt: skip
 
         empty = Reconstruction.empty(cameras, names, self.image_camera_idx, tracks)
         models, initial_reports = _grow_models(empty, mapper_of, options, events)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import PARAM_NAMES, Camera, simple_camera
 from sfmapp.camera.models import kind_of
@@ -79,9 +80,9 @@ def hold_out(
         return HeldOut(1.0, 0.0, model)
     lengths = []
     for trial, options, priors in ((model.copy(), held, None), (freed, free, list(freed.cameras))):
-        adjust_bundle(trial, options, points=fit, prior_cameras=priors)
+        adjust_bundle(trial, options, varying=Varying(points=fit), prior_cameras=priors)
         nothing = np.zeros(len(trial.image_names), bool), np.zeros(len(trial.cameras), bool)
-        adjust_bundle(trial, held, points=judge, variable_images=nothing[0], variable_cameras=nothing[1])
+        adjust_bundle(trial, held, varying=Varying(points=judge, images=nothing[0], cameras=nothing[1]))
         lengths.append(np.linalg.norm(trial.residuals_px(), axis=1))
     tracks = model.tracks
     # a point that two images see follows nearly any pose

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -66,8 +67,7 @@ class Joint:
     reason: str = ""
 
 
-@dataclass(frozen=True)
-class _Checks:
+class _Checks(NamedTuple):
     """Points of one model beside the pixels of images of the other, in groups: one link in one direction.
 
     Attributes:
@@ -385,12 +385,9 @@ def _voted_scale(checks: _Checks, chosen: Bools, center: Array, to_other: Array,
 def _scores(sims: Array, checks: _Checks, tolerance_px: float) -> tuple[Array, Ints]:
     """(H,) truncated squared error, summed over the links, and (H,) links that agree with each similarity."""
     cost, agreeing = np.empty(len(sims)), np.empty(len(sims), np.int64)
-    _score_all(
-        rigid3.rotation_matrix(sims), np.ascontiguousarray(sims[:, 4:7]), np.ascontiguousarray(sims[:, 7]),
-        checks.group_ptr, checks.group_link, checks.group_is_forward, checks.xyz, checks.xy, checks.rotation,
-        checks.translation, checks.canonical, tolerance_px**2, np.empty(checks.num_links), cost,
-        agreeing,
-    )  # fmt: skip
+    rotation, translation = rigid3.rotation_matrix(sims), np.ascontiguousarray(sims[:, 4:7])
+    scale = np.ascontiguousarray(sims[:, 7])
+    _score_all(rotation, translation, scale, checks, tolerance_px**2, cost, agreeing)
     return cost, agreeing
 
 
@@ -442,17 +439,15 @@ def _moved(sim: Array, step: Array) -> Array:
 def _residuals(sim: Array, checks: _Checks) -> Array:
     """(C, 2) projected minus observed pixels, NaN behind a camera."""
     out = np.empty_like(checks.xy)
-    _residuals_of(
-        rigid3.rotation_matrix(sim), sim[4:7].copy(), float(sim[7]), checks.is_forward, checks.xyz, checks.xy,
-        checks.rotation, checks.translation, checks.canonical, out,
-    )  # fmt: skip
+    _residuals_of(rigid3.rotation_matrix(sim), sim[4:7].copy(), float(sim[7]), checks.is_forward, checks, out)
     return out
 
 
 @numba.njit(cache=True, nogil=True)
-def _residual(  # type: ignore[no-untyped-def]
-    r, t, s, forward, xyz, xy, rotation, translation, canonical
-) -> tuple[float, float]:
+def _residual(
+    r: Array, t: Array, s: float, forward: bool, xyz: Array, xy: Array, rotation: Array, translation: Array,
+    canonical: Array,
+) -> tuple[float, float]:  # fmt: skip
     """Projected minus observed pixel of a point that the similarity (r, t, s), or its inverse, carries over."""
     if forward:
         x = s * (r[0, 0] * xyz[0] + r[0, 1] * xyz[1] + r[0, 2] * xyz[2]) + t[0]
@@ -471,23 +466,26 @@ def _residual(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _residuals_of(  # type: ignore[no-untyped-def]
-    r, t, s, is_forward, xyz, xy, rotation, translation, canonical, out
-) -> None:
+def _residuals_of(r: Array, t: Array, s: float, is_forward: Bools, checks: _Checks, out: Array) -> None:
+    """Fill out (C, 2)."""
+    xyz, xy, rotation, translation = checks.xyz, checks.xy, checks.rotation, checks.translation
+    canonical = checks.canonical
     for c in range(len(xyz)):
         out[c, 0], out[c, 1] = _residual(
             r, t, s, is_forward[c], xyz[c], xy[c], rotation[c], translation[c], canonical[c]
-        )
+        )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)
-def _score_all(  # type: ignore[no-untyped-def]
-    rs, ts, scales, group_ptr, group_link, group_is_forward, xyz, xy, rotation, translation, canonical,
-    tolerance2, link_cost, cost, agreeing,
-) -> None:  # fmt: skip
+def _score_all(
+    rs: Array, ts: Array, scales: Array, checks: _Checks, tolerance2: float, cost: Array, agreeing: Ints
+) -> None:
     """Fill cost (H,) and agreeing (H,). A link costs the mean over its images, in the direction where that is less: a
     point that its own model holds badly in depth is still right where the other model has it.
     """
+    group_ptr, group_link, group_is_forward = checks.group_ptr, checks.group_link, checks.group_is_forward
+    xyz, xy, rotation, translation = checks.xyz, checks.xy, checks.rotation, checks.translation
+    canonical, link_cost = checks.canonical, np.empty(checks.num_links)
     for h in range(len(scales)):
         link_cost[:] = 1.0
         for g in range(len(group_link)):

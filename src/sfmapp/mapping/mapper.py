@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import estimate_covariances
 from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import PARAM_NAMES, Camera
 from sfmapp.events import Events
@@ -42,12 +43,14 @@ MIN_NOISE_PX = 0.02
 MAX_UNCERTAINTY_IMAGES = 200
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Mapper:
     """Grows one model. Every method is a step of the method and changes ``reconstruction`` in place.
 
-    ``locked`` (I,) bool are images that this model must not register. ``waits``: weak images whose strongest pairs are
-    with images outside of the model are left to another one, which may grow from there.
+    ``prior_cameras`` are what the cameras of the model, in their order, were before anything was seen with them.
+    ``locked`` (I,) bool are images that this model must not register. ``attempts``: the last one for each image.
+    ``waits``: weak images whose strongest pairs are with images outside of the model are left to another one, which
+    may grow from there.
     """
 
     reconstruction: Reconstruction
@@ -58,7 +61,7 @@ class Mapper:
     pool: Executor
     prior_cameras: list[Camera]
     locked: NDArray[np.bool_]
-    attempts: dict[int, Registration]
+    attempts: dict[int, Registration] = field(default_factory=dict)
     failed_with: dict[int, int] = field(default_factory=dict)
     times_dropped: dict[int, int] = field(default_factory=dict)
     size_at_global: tuple[int, int] = (0, 0)
@@ -269,10 +272,9 @@ class Mapper:
         seen = seen[reconstruction.is_triangulated[seen]].astype(np.int64)
         points = np.zeros(tracks.num_tracks, bool)
         points[seen] = True
-        adjust_bundle(
-            reconstruction, replace(self.adjust_options, max_iterations=15, relative_cost_tolerance=1e-4),
-            variable_images=variable, variable_cameras=cameras, points=points, prior_cameras=self.prior_cameras,
-        )  # fmt: skip
+        options = replace(self.adjust_options, max_iterations=15, relative_cost_tolerance=1e-4)
+        varying = Varying(images=variable, cameras=cameras, points=points)
+        adjust_bundle(reconstruction, options, varying=varying, prior_cameras=self.prior_cameras)
         structure.filter_observations(reconstruction, self.options, self.pool, seen, self.max_error_px)
 
     def adjust_to_cameras(self, cameras: list[Camera]) -> None:
@@ -281,7 +283,7 @@ class Mapper:
         reconstruction.cameras[:] = cameras
         options = replace(self.adjust_options, max_iterations=25, relative_cost_tolerance=1e-4)
         fixed = np.zeros(len(cameras), bool)
-        adjust_bundle(reconstruction, options, variable_cameras=fixed, prior_cameras=self.prior_cameras)
+        adjust_bundle(reconstruction, options, varying=Varying(cameras=fixed), prior_cameras=self.prior_cameras)
 
     def adjust_globally(self) -> None:
         """Adjust everything, filter, and triangulate again what was lost or has become possible."""
@@ -324,7 +326,7 @@ class Mapper:
             options = replace(options, max_iterations=100, initial_damping=1e-8, relative_cost_tolerance=1e-5)
             if chosen.any():
                 options = self.with_free_centers(options, chosen)
-            adjust_bundle(reconstruction, options, variable_centers=chosen, prior_cameras=self.prior_cameras)
+            adjust_bundle(reconstruction, options, varying=Varying(centers=chosen), prior_cameras=self.prior_cameras)
             self._settle_points()
             changed = int((before != reconstruction.obs_is_inlier).sum())
             summary = reconstruction.summary()
@@ -342,7 +344,9 @@ class Mapper:
         chosen = self._free_principal_points()
         if chosen.any():
             options = self.with_free_centers(options, chosen)
-            adjust_bundle(self.reconstruction, options, variable_cameras=chosen, prior_cameras=self.prior_cameras)
+            adjust_bundle(
+                self.reconstruction, options, varying=Varying(cameras=chosen), prior_cameras=self.prior_cameras
+            )
 
     def _free_principal_points(self) -> NDArray[np.bool_]:
         """(C,) bool: cameras whose principal point is refined. None by gtsam's backend, whose calibrations with one

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.lens import EQUIRECTANGULAR, FAMILY, project
 from sfmapp.contradictions import Contradiction
-from sfmapp.geometry import rigid3
+from sfmapp.geometry.triangulation import Views
 from sfmapp.mapping.report import NearPair
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
@@ -29,6 +30,7 @@ Bools = NDArray[np.bool_]
 # Views are near for a point if its rays enclose no more than this, and neither has it larger by more: descriptors stand
 # twice as much. Pairs as far apart still share half of their points, the worst of 400 of ten sets of photographs 0.35.
 MAX_ANGLE_DEG, MAX_ZOOM = 15.0, 1.5
+_MIN_COS = math.cos(math.radians(MAX_ANGLE_DEG))
 # Fewer points in view prove nothing.
 MIN_VISIBLE = 50
 # Pairs that share less of their points do not show the same: of 22 pairs of a model with four images at a wrong place
@@ -63,15 +65,10 @@ def near_views(model: Reconstruction, correspondences: Correspondences) -> NearV
     registered = model.is_registered
     tried = np.flatnonzero(registered[correspondences.pair_image_idx].all(axis=1))
     images = correspondences.pair_image_idx[tried].astype(np.int64)
-    canonical = model.canonical_cameras()
     sizes = np.array([(c.width, c.height) for c in model.cameras], np.float64)
     tracks, counts = model.tracks, np.zeros((len(images), 3), np.int64)
-    _count_in_view(
-        images, tracks.image_ptr, tracks.image_obs, tracks.obs_track_idx, model.obs_is_inlier, model.point_xyz,
-        rigid3.rotation_matrix(model.cam_from_world), np.ascontiguousarray(model.cam_from_world[:, 4:]), model.centers,
-        model.image_camera_idx, canonical, sizes, math.cos(math.radians(MAX_ANGLE_DEG)), MAX_ZOOM,
-        np.full(tracks.num_tracks, -1), counts,
-    )  # fmt: skip
+    points = _Points(tracks.image_ptr, tracks.image_obs, tracks.obs_track_idx, model.obs_is_inlier, model.point_xyz)
+    _count_in_view(images, points, model.views(), model.centers, sizes, counts)
     visible = counts[:, :2].min(axis=1)
     shared = np.maximum(counts[:, 2], correspondences.num_inliers[tried])
     enough = visible >= MIN_VISIBLE
@@ -125,14 +122,33 @@ def contradiction_of(model: Reconstruction, correspondences: Correspondences) ->
     ]  # fmt: skip
 
 
+class _Points(NamedTuple):
+    """Points (T) and which images see them: ``image_obs[image_ptr[i] : image_ptr[i + 1]]`` are observations (O).
+
+    Attributes:
+        image_ptr: (I + 1,). image_obs: (O,). obs_track: (O,) int32. is_inlier: (O,) bool.
+        xyz: (T, 3), NaN where not triangulated.
+    """
+
+    image_ptr: NDArray[np.int64]
+    image_obs: NDArray[np.int64]
+    obs_track: NDArray[np.int32]
+    is_inlier: NDArray[np.bool_]
+    xyz: NDArray[np.float64]
+
+
 @numba.njit(cache=True, nogil=True)
-def _count_in_view(  # type: ignore[no-untyped-def]
-    images, image_ptr, image_obs, obs_track, is_inlier, xyz, rotation, translation, centers, camera_of, canonical,
-    sizes, min_cos, max_zoom, mark, counts,
+def _count_in_view(
+    images: NDArray[np.int64], points: _Points, views: Views, centers: NDArray[np.float64],
+    sizes: NDArray[np.float64], counts: NDArray[np.int64],
 ) -> None:  # fmt: skip
     """Fill counts (K, 3): points of the first image in view of the second, of the second in that of the first, both's.
 
-    ``mark`` (T,) is scratch, all -1."""
+    sizes: (C, 2) pixels.
+    """
+    image_ptr, image_obs, obs_track, is_inlier, xyz = points
+    rotation, translation, camera_of, canonical = views
+    mark = np.full(xyz.shape[0], -1)
     for p in range(len(images)):
         for side in range(2):
             i, j = images[p, side], images[p, 1 - side]
@@ -147,9 +163,9 @@ def _count_in_view(  # type: ignore[no-untyped-def]
                 a0, a1, a2 = x - centers[i, 0], y - centers[i, 1], z - centers[i, 2]
                 b0, b1, b2 = x - centers[j, 0], y - centers[j, 1], z - centers[j, 2]
                 a, b = math.sqrt(a0 * a0 + a1 * a1 + a2 * a2), math.sqrt(b0 * b0 + b1 * b1 + b2 * b2)
-                if not (zoom * a <= max_zoom * b and b <= max_zoom * zoom * a):
+                if not (zoom * a <= MAX_ZOOM * b and b <= MAX_ZOOM * zoom * a):
                     continue
-                if a0 * b0 + a1 * b1 + a2 * b2 < min_cos * a * b:
+                if a0 * b0 + a1 * b1 + a2 * b2 < _MIN_COS * a * b:
                     continue
                 r, s = rotation[j], translation[j]
                 depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + s[2]

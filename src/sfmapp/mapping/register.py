@@ -140,7 +140,8 @@ def register_image(
         return Registration(image_idx, len(obs), num_inliers, None, reason=reason)
     refined = refine_pose(
         camera.with_focal(camera.focal * found.focal_scale).canonical, found.cam_from_world, xyz,
-        tracks.obs_xy[obs], scale_px=0.5 * max_error_px, inlier_px=max_error_px, refine_focal=search_focal,
+        tracks.obs_xy[obs], scale_px=0.5 * max_error_px, inlier_px=max_error_px,
+        focal_sigma_px=math.inf if search_focal else 0.0,
     )  # fmt: skip
     focal_px = float(refined.canonical[:2].mean()) if search_focal else None
     return Registration(

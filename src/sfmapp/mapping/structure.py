@@ -9,8 +9,9 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.geometry import rigid3, triangulation
+from sfmapp.geometry import triangulation
 from sfmapp.geometry.noise import sigma_of_lengths
+from sfmapp.geometry.triangulation import Observed
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.scene.reconstruction import Reconstruction
 
@@ -77,11 +78,9 @@ def _over_chunks(
     pool: Executor,
     max_error_px: float | None = None,
 ) -> int:
-    canonical = reconstruction.canonical_cameras()
     t = reconstruction.tracks
     arguments = (
-        t.track_ptr, t.obs_image_idx, t.obs_xy, rigid3.rotation_matrix(reconstruction.cam_from_world),
-        np.ascontiguousarray(reconstruction.cam_from_world[:, 4:]), reconstruction.image_camera_idx, canonical,
+        Observed(t.track_ptr, t.obs_image_idx, t.obs_xy), reconstruction.views(),
         max_error_px or options.max_reprojection_error_px, math.radians(options.min_triangulation_angle_deg),
         reconstruction.point_xyz, reconstruction.obs_is_inlier,
     )  # fmt: skip

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -117,15 +118,14 @@ def pair_agreement(reconstruction: Reconstruction, correspondences: Corresponden
         diagonal = np.array([math.hypot(c.width, c.height) for c in reconstruction.cameras])[camera_of[image_idx]]
         tolerance_px = np.clip(TOLERANCE_SHARE * diagonal.max(axis=1), *TOLERANCE_PX)
         tracks = reconstruction.tracks
-        first, obs_of_feature = _obs_of_features(tracks, correspondences)
         rays = np.empty((tracks.num_observations, 2))
         _undistort_observations(
             tracks.obs_xy, camera_of[tracks.obs_image_idx], canonical, registered[tracks.obs_image_idx], rays
         )
         _count_matches(
-            pair_idx, image_idx, correspondences.pair_ptr, correspondences.matches, first, obs_of_feature, rays,
-            tracks.obs_track_idx, reconstruction.obs_is_inlier, rigid3.rotation_matrix(relative),
-            np.ascontiguousarray(relative[:, 4:]), tolerance_px / focal, counts,
+            pair_idx, image_idx, _matches_of(tracks, correspondences), rays, tracks.obs_track_idx,
+            reconstruction.obs_is_inlier, rigid3.rotation_matrix(relative), np.ascontiguousarray(relative[:, 4:]),
+            tolerance_px / focal, counts,
         )  # fmt: skip
     return PairAgreement(pair_idx, image_idx, *np.ascontiguousarray(counts.T))
 
@@ -140,7 +140,6 @@ def pair_strengths(reconstruction: Reconstruction, correspondences: Corresponden
     however well. Only the tracks and cameras of ``reconstruction`` are used, no pose.
     """
     tracks = reconstruction.tracks
-    first, obs_of_feature = _obs_of_features(tracks, correspondences)
     sizes = np.array([(c.width, c.height) for c in reconstruction.cameras], np.float64)
     size = sizes[reconstruction.image_camera_idx[tracks.obs_image_idx]]
     column_row = np.clip((CELLS * tracks.obs_xy / size).astype(np.int64), 0, CELLS - 1)
@@ -149,7 +148,7 @@ def pair_strengths(reconstruction: Reconstruction, correspondences: Corresponden
     out = np.zeros(correspondences.num_pairs)
     _measure_strengths(
         np.flatnonzero(_is_useful(correspondences)), correspondences.pair_image_idx.astype(np.int64),
-        correspondences.pair_ptr, correspondences.matches, first, obs_of_feature, cell % CELLS**2, matchable, out,
+        _matches_of(tracks, correspondences), cell % CELLS**2, matchable, out,
     )  # fmt: skip
     return out
 
@@ -375,8 +374,22 @@ def _is_useful(correspondences: Correspondences) -> Bools:
     return (correspondences.num_inliers > 0) & ~np.isin(correspondences.config, USELESS_CONFIGS)
 
 
-def _obs_of_features(tracks: Tracks, correspondences: Correspondences) -> tuple[Ints, Ints]:
-    """(I + 1,) where the keypoints of each image begin, and for every keypoint its observation or -1."""
+class _Matches(NamedTuple):
+    """Verified matches (M) of pairs (P), those of pair p at ``pair_ptr[p] : pair_ptr[p + 1]``, and their observations.
+
+    Attributes:
+        pair_ptr: (P + 1,) int64. matches: (M, 2) int32 positions among the keypoints of either image.
+        first: (I + 1,) where the keypoints of each image begin in ``obs_of_feature``.
+        obs_of_feature: for every keypoint its observation or -1.
+    """
+
+    pair_ptr: Ints
+    matches: NDArray[np.int32]
+    first: Ints
+    obs_of_feature: Ints
+
+
+def _matches_of(tracks: Tracks, correspondences: Correspondences) -> _Matches:
     sizes = np.zeros(tracks.num_images, np.int64)
     _num_features(tracks.obs_image_idx, tracks.obs_feature_idx, sizes)
     for side in range(2):
@@ -385,7 +398,7 @@ def _obs_of_features(tracks: Tracks, correspondences: Correspondences) -> tuple[
     first = np.concatenate([[0], np.cumsum(sizes)])
     obs_of_feature = np.full(first[-1], -1, np.int64)
     obs_of_feature[first[tracks.obs_image_idx] + tracks.obs_feature_idx] = np.arange(tracks.num_observations)
-    return first, obs_of_feature
+    return _Matches(correspondences.pair_ptr, correspondences.matches, first, obs_of_feature)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -454,10 +467,7 @@ def _undistort_observations(
 def _count_matches(
     pair_idx: Ints,
     image_idx: Ints,
-    pair_ptr: Ints,
-    matches: NDArray[np.int32],
-    first: Ints,
-    obs_of_feature: Ints,
+    found: _Matches,
     rays: Array,
     obs_track_idx: NDArray[np.int32],
     obs_is_inlier: Bools,
@@ -467,6 +477,7 @@ def _count_matches(
     counts: Ints,
 ) -> None:
     """Fill counts (K, 3): matches, those that agree with relative poses, those that support one point."""
+    pair_ptr, matches, first, obs_of_feature = found
     for n in range(len(pair_idx)):
         r, t = rotation[n], translation[n]
         for m in range(pair_ptr[pair_idx[n]], pair_ptr[pair_idx[n] + 1]):
@@ -512,15 +523,13 @@ def _rays_meet(r: Array, t: Array, x: float, y: float, u: float, v: float, toler
 def _measure_strengths(
     pair_idx: Ints,
     image_idx: Ints,
-    pair_ptr: Ints,
-    matches: NDArray[np.int32],
-    first: Ints,
-    obs_of_feature: Ints,
+    found: _Matches,
     obs_cell: Ints,
     matchable: Ints,
     out: Array,
 ) -> None:
     """Fill out (P,) with :func:`pair_strengths`; matchable is (I, cells)."""
+    pair_ptr, matches, first, obs_of_feature = found
     num_cells = matchable.shape[1]
     matched = np.empty((2, num_cells), np.int64)
     for p in pair_idx:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.matching.products import largest_products
+from sfmapp.matching.products import Best, largest_products
 
 # RootSIFT times 512 has a squared norm of 512^2, up to rounding
 _SIFT_NORM2 = 512 * 512
@@ -26,17 +26,21 @@ def match_sift(
     Returns:
         (K, 2) int32 positions in both, ascending; no position occurs twice.
     """
-    best1, second1, arg1, best2, second2, arg2 = largest_products(descriptors1, descriptors2)
-    good1 = (arg1 >= 0) & passes_ratio(best1, second1, max_ratio, max_distance)
-    good2 = (arg2 >= 0) & passes_ratio(best2, second2, max_ratio, max_distance)
+    return mutual_neighbors(*largest_products(descriptors1, descriptors2), max_ratio, max_distance)
+
+
+def mutual_neighbors(best1: Best, best2: Best, max_ratio: float, max_distance: float) -> Indices:
+    """(K, 2) int32 positions, ascending in the first, of those that are each other's best and pass the ratio test."""
+    good1 = (best1.partner >= 0) & _passes_ratio(best1, max_ratio, max_distance)
+    good2 = (best2.partner >= 0) & _passes_ratio(best2, max_ratio, max_distance)
     rows = np.flatnonzero(good1)
-    columns = arg1[rows]
-    keep = good2[columns] & (arg2[columns] == rows)
+    columns = best1.partner[rows]
+    keep = good2[columns] & (best2.partner[columns] == rows)
     return np.stack([rows[keep], columns[keep]], 1).astype(np.int32)
 
 
-def passes_ratio(best: Indices, second: Indices, max_ratio: float, max_distance: float) -> NDArray[np.bool_]:
+def _passes_ratio(best: Best, max_ratio: float, max_distance: float) -> NDArray[np.bool_]:
     """Whether best matches, given as inner products like the second best, pass Lowe's ratio and the distance."""
-    d_best = np.sqrt(np.maximum(2.0 - best * (2.0 / _SIFT_NORM2), 0.0))
-    d_second = np.sqrt(np.maximum(2.0 - second * (2.0 / _SIFT_NORM2), 0.0))
+    d_best = np.sqrt(np.maximum(2.0 - best.first * (2.0 / _SIFT_NORM2), 0.0))
+    d_second = np.sqrt(np.maximum(2.0 - best.second * (2.0 / _SIFT_NORM2), 0.0))
     return (d_best < max_ratio * d_second) & (d_best <= max_distance)

@@ -9,20 +9,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.matching.descriptors import passes_ratio
+from sfmapp.matching.descriptors import mutual_neighbors
 from sfmapp.matching.products import (
+    Best,
     Ints,
+    TileRoom,
     background_products,
     keep_two_largest,
     largest_products,
     pack_groups,
     pack_rows,
-    scratch,
 )
 from sfmapp.scene.features import Features
 from sfmapp.simd.i16x32 import DIMS, GROUPS, LANES, ROWS, tile
@@ -106,23 +108,23 @@ def match_guided(
     """
     rows, columns = _sort_into_pencil(image1, image2, fundamental, band_px)
     row_of, column_of = rows.order, columns.order
-    a, packed = pack_rows(image1.descriptors, row_of), pack_groups(image2.descriptors, column_of)
-    best1, best2 = np.zeros(len(a), np.int32), np.zeros(len(packed) * LANES, np.int32)
-    best1[: len(row_of)], best2[: len(column_of)] = image1.background[row_of], image2.background[column_of]
-    second1, arg1 = best1.copy(), np.full(len(best1), -1, np.int32)
-    second2, arg2 = best2.copy(), np.full(len(best2), -1, np.int32)
-    _scan_band(
-        a, packed, rows.lines, image1.shape[row_of], image2.shape[column_of], band_px, change,
-        rows.low, rows.high, columns.angle,
-        best1, second1, arg1, best2, second2, arg2, *scratch(),
+    lines = _Lines(
+        pack_rows(image1.descriptors, row_of), rows.lines, image1.shape[row_of], rows.low, rows.high
     )  # fmt: skip
-    good1 = (arg1 >= 0) & passes_ratio(best1, second1, max_ratio, max_distance)
-    good2 = (arg2 >= 0) & passes_ratio(best2, second2, max_ratio, max_distance)
-    r = np.flatnonzero(good1)
-    c = arg1[r]
-    keep = good2[c] & (arg2[c] == r)
-    matches = np.stack([row_of[r[keep]], column_of[c[keep]]], 1).astype(np.int32)
+    points = _Points(pack_groups(image2.descriptors, column_of), image2.shape[column_of], columns.angle)
+    best1 = _none_but_background(image1.background[row_of], len(lines.packed))
+    best2 = _none_but_background(image2.background[column_of], len(points.packed) * LANES)
+    _scan_band(lines, points, _Gate(float(band_px), change), best1, best2, TileRoom.make())
+    found = mutual_neighbors(best1, best2, max_ratio, max_distance)
+    matches = np.stack([row_of[found[:, 0]], column_of[found[:, 1]]], 1).astype(np.int32)
     return matches[np.argsort(matches[:, 0])]
+
+
+def _none_but_background(background: Ints, num: int) -> Best:
+    """No partner yet; what a feature looks like elsewhere in its own image bounds both products."""
+    bound = np.zeros(num, np.int32)
+    bound[: len(background)] = background
+    return Best(bound, bound.copy(), np.full(num, -1, np.int32))
 
 
 @dataclass(frozen=True)
@@ -206,14 +208,48 @@ def _point_angles(shape2: Array, center: Array, size: float, p: Array, q: Array,
         r[i] = math.sqrt(along_p * along_p + along_q * along_q)
 
 
+class _Lines(NamedTuple):
+    """The features of image 1 in the order of their angles.
+
+    Attributes:
+        packed: (N', 128) int16 descriptors, see ``pack_rows``.
+        lines: (N, 3) in image 2. shape: (N, 4). low, high: (N,) angles, see :class:`_Rows`.
+    """
+
+    packed: NDArray[np.int16]
+    lines: Array
+    shape: Array
+    low: Array
+    high: Array
+
+
+class _Points(NamedTuple):
+    """Those of image 2: packed descriptors, see ``pack_groups``, shape (M, 4) and angle (F,), see :class:`_Columns`."""
+
+    packed: NDArray[np.int16]
+    shape: Array
+    angle: Array
+
+
+class _Gate(NamedTuple):
+    """What a match has to fit: pixels from the line, and change of shape (4,)."""
+
+    band: float
+    change: Array
+
+
 @numba.njit(cache=True, nogil=True)
 def _scan_run(
-    a: NDArray[np.int16], packed: NDArray[np.int16], lines: Array, shape1: Array, shape2: Array, band: float,
-    change: Array, row: int, first: int, last: int, best1: Ints, second1: Ints, arg1: Ints,
-    best2: Ints, second2: Ints, arg2: Ints, sums: Ints, masks: NDArray[np.uint32],
+    image1: _Lines, image2: _Points, gate: _Gate, row: int, run: tuple[int, int], best1: Best, best2: Best,
+    room: TileRoom,
 ) -> None:  # fmt: skip
-    """Products of ROWS rows with the columns first to last; what lies outside the band is dropped afterwards."""
-    width = LANES * GROUPS
+    """Products of ROWS rows with a run of columns; what lies outside the band is dropped afterwards."""
+    width, (first, last) = LANES * GROUPS, run
+    a, packed, lines, shape1, shape2 = image1.packed, image2.packed, image1.lines, image1.shape, image2.shape
+    band, change = gate
+    first1, second1, partner1 = best1
+    first2, second2, partner2 = best2
+    sums, masks = room
     for group in range(first // width * GROUPS, (last + width - 1) // width * GROUPS, GROUPS):
         tile(a, packed, sums, masks, second1, second2, row, group)
         for r in range(ROWS):
@@ -232,8 +268,8 @@ def _scan_run(
                 turn = shape2[j, 3] - shape1[i, 3] - change[2]
                 if abs(turn - 2.0 * math.pi * math.floor(turn / (2.0 * math.pi) + 0.5)) > change[3]:
                     continue
-                keep_two_largest(best1, second1, arg1, i, j, sums[r, q])
-                keep_two_largest(best2, second2, arg2, j, i, sums[r, q])
+                keep_two_largest(first1, second1, partner1, i, j, sums[r, q])
+                keep_two_largest(first2, second2, partner2, j, i, sums[r, q])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -249,12 +285,9 @@ def _first_above(ascending: Array, value: float) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def _scan_band(
-    a: NDArray[np.int16], packed: NDArray[np.int16], lines: Array, shape1: Array, shape2: Array, band: float,
-    change: Array, low: Array, high: Array, angle2: Array, best1: Ints, second1: Ints, arg1: Ints,
-    best2: Ints, second2: Ints, arg2: Ints, sums: Ints, masks: NDArray[np.uint32],
-) -> None:  # fmt: skip
-    num_rows, num_far, num_all = low.shape[0], angle2.shape[0], shape2.shape[0]
+def _scan_band(image1: _Lines, image2: _Points, gate: _Gate, best1: Best, best2: Best, room: TileRoom) -> None:
+    low, high, angle2 = image1.low, image1.high, image2.angle
+    num_rows, num_far, num_all = low.shape[0], angle2.shape[0], image2.shape.shape[0]
     for row in range(0, num_rows, ROWS):
         smallest, largest = low[row], high[row]
         for i in range(row + 1, min(row + ROWS, num_rows)):
@@ -269,8 +302,7 @@ def _scan_band(
             starts, ends = (0, 0, 0, num_far), (num_far, 0, 0, num_all)
         for run in range(4):
             if starts[run] < ends[run]:
-                _scan_run(a, packed, lines, shape1, shape2, band, change, row, starts[run], ends[run],
-                          best1, second1, arg1, best2, second2, arg2, sums, masks)  # fmt: skip
+                _scan_run(image1, image2, gate, row, (starts[run], ends[run]), best1, best2, room)
 
 
 def compile_kernels() -> None:

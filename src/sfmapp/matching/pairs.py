@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Events
+from sfmapp.geometry.geodesy import ecef_from_geodetic
 from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.matching.report import PairsReport
 from sfmapp.option_checks import Range, check_options
@@ -38,7 +39,6 @@ _KMEANS_ROUNDS = 12
 # length of an image vector in whole numbers: its square must stay below 2^24
 _VLAD_LENGTH = 4000
 _BLOCK_BYTES = 64 << 20
-_EARTH_RADIUS_M = 6_371_000.0
 
 _RANGES = {
     "exhaustive_limit": Range(0),
@@ -367,7 +367,8 @@ def gps_pairs(records: Sequence[ImageRecord], num_neighbors: int) -> NDArray[np.
     k = min(num_neighbors, len(with_gps) - 1)
     if k < 1:
         return np.zeros((0, 2), np.int64)
-    xyz = _earth_xyz(np.array([records[i].gps for i in with_gps], np.float64))
+    # a height that is unknown is taken as that of the sea
+    xyz = ecef_from_geodetic(np.nan_to_num(np.array([records[i].gps for i in with_gps], np.float64)))
     pairs = np.empty((len(with_gps), k, 2), np.int64)
     for row, place in enumerate(xyz):
         distance = ((xyz - place) ** 2).sum(axis=1)
@@ -375,11 +376,3 @@ def gps_pairs(records: Sequence[ImageRecord], num_neighbors: int) -> NDArray[np.
         pairs[row, :, 0] = with_gps[row]
         pairs[row, :, 1] = with_gps[np.argsort(distance, kind="stable")[:k]]
     return _unique_pairs(pairs)
-
-
-def _earth_xyz(gps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 3) metres of latitude, longitude (degrees) and altitude (metres, unknown is NaN and read as 0) on a ball."""
-    latitude, longitude = np.deg2rad(gps[:, 0]), np.deg2rad(gps[:, 1])
-    radius = _EARTH_RADIUS_M + np.nan_to_num(gps[:, 2])
-    flat = radius * np.cos(latitude)
-    return np.column_stack([flat * np.cos(longitude), flat * np.sin(longitude), radius * np.sin(latitude)])

@@ -8,6 +8,7 @@ written to memory.
 from __future__ import annotations
 
 import threading
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -20,11 +21,39 @@ Ints = NDArray[np.int32]
 _GROUPS_IN_CACHE = 16  # 256 descriptors of image 2, 64 kB, stay in the cache while image 1 passes by
 
 
+class Best(NamedTuple):
+    """The two largest products of each descriptor of an image (N) so far.
+
+    Attributes:
+        first, second: (N,) int32.
+        partner: (N,) int32 position of the first, -1 where there is none.
+    """
+
+    first: Ints
+    second: Ints
+    partner: Ints
+
+    @staticmethod
+    def of_none(num: int) -> Best:
+        return Best(*(np.full(num, fill, np.int32) for fill in (0, 0, -1)))
+
+
+class TileRoom(NamedTuple):
+    """What a tile writes to: sums (ROWS, GROUPS * LANES) int32, masks (ROWS,) uint32."""
+
+    sums: Ints
+    masks: NDArray[np.uint32]
+
+    @staticmethod
+    def make() -> TileRoom:
+        return TileRoom(np.empty((ROWS, GROUPS * LANES), np.int32), np.empty(ROWS, np.uint32))
+
+
 @numba.njit(cache=True, nogil=True)
-def _scan(
-    a: NDArray[np.int16], packed: NDArray[np.int16], best1: Ints, second1: Ints, arg1: Ints,
-    best2: Ints, second2: Ints, arg2: Ints, sums: Ints, masks: NDArray[np.uint32],
-) -> None:  # fmt: skip
+def _scan(a: NDArray[np.int16], packed: NDArray[np.int16], rows: Best, columns: Best, room: TileRoom) -> None:
+    best1, second1, arg1 = rows
+    best2, second2, arg2 = columns
+    sums, masks = room
     for block in range(0, packed.shape[0], _GROUPS_IN_CACHE):
         for row in range(0, a.shape[0], ROWS):
             for group in range(block, min(block + _GROUPS_IN_CACHE, packed.shape[0]), GROUPS):
@@ -110,37 +139,28 @@ def pack_groups(descriptors: NDArray[np.uint8], order: NDArray[np.int64]) -> NDA
     return out
 
 
-def scratch() -> tuple[Ints, NDArray[np.uint32]]:
-    """The arrays that a tile writes its sums and masks to."""
-    return np.empty((ROWS, GROUPS * LANES), np.int32), np.empty(ROWS, np.uint32)
-
-
-def largest_products(
-    descriptors1: NDArray[np.uint8], descriptors2: NDArray[np.uint8]
-) -> tuple[Ints, Ints, Ints, Ints, Ints, Ints]:
-    """Best partner by dot product, in both directions; the first of equals wins.
+def largest_products(descriptors1: NDArray[np.uint8], descriptors2: NDArray[np.uint8]) -> tuple[Best, Best]:
+    """The best partner by dot product of each descriptor, in both directions; the first of equals wins.
 
     Args:
         descriptors1, descriptors2: (N, 128) and (M, 128) uint8.
 
     Returns:
-        best, second, arg: (N,) int32 largest and second largest product of each row with the rows of the other image
-        (0 if there is none) and the position of the best (-1 if no product is positive); then the same (M,) the other
-        way.
+        Of (N,) and of (M,); products are 0 where there is none, and no partner has a product that is not positive.
     """
     n, m = len(descriptors1), len(descriptors2)
     a, packed = pack_rows(descriptors1, np.arange(n)), pack_groups(descriptors2, np.arange(m))
-    best1, second1, arg1 = (np.full(len(a), fill, np.int32) for fill in (0, 0, -1))
-    best2, second2, arg2 = (np.full(len(packed) * LANES, fill, np.int32) for fill in (0, 0, -1))
-    _scan(a, packed, best1, second1, arg1, best2, second2, arg2, *scratch())
-    return best1[:n], second1[:n], arg1[:n], best2[:m], second2[:m], arg2[:m]
+    rows, columns = Best.of_none(len(a)), Best.of_none(len(packed) * LANES)
+    _scan(a, packed, rows, columns, TileRoom.make())
+    return Best(*(array[:n] for array in rows)), Best(*(array[:m] for array in columns))
 
 
 @numba.njit(cache=True, nogil=True)
 def _scan_background(
     a: NDArray[np.int16], packed: NDArray[np.int16], xy: NDArray[np.float64], sample: NDArray[np.int64],
-    radius: NDArray[np.float64], best: Ints, unbounded: Ints, sums: Ints, masks: NDArray[np.uint32],
+    radius: NDArray[np.float64], best: Ints, unbounded: Ints, room: TileRoom,
 ) -> None:  # fmt: skip
+    sums, masks = room
     for row in range(0, a.shape[0], ROWS):
         for group in range(0, packed.shape[0], GROUPS):
             tile(a, packed, sums, masks, best, unbounded, row, group)
@@ -172,5 +192,5 @@ def background_products(
     a, packed = pack_rows(descriptors, np.arange(n)), pack_groups(descriptors, sample)
     best = np.zeros(len(a), np.int32)
     unbounded = np.full(len(packed) * LANES, np.iinfo(np.int32).max, np.int32)
-    _scan_background(a, packed, xy, sample, radius, best, unbounded, *scratch())
+    _scan_background(a, packed, xy, sample, radius, best, unbounded, TileRoom.make())
     return best[:n]

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import project
 from sfmapp.geometry import rigid3
@@ -157,4 +158,4 @@ def _adjusted(
         loss="cauchy", loss_scale_px=2 * sigma, max_iterations=steps, relative_cost_tolerance=1e-5,
         refine_focal=False, refine_distortion=False,
     )  # fmt: skip
-    return 2 * adjust_bundle(model, options, variable_images=job.is_variable).final_cost / sigma**2, model
+    return 2 * adjust_bundle(model, options, varying=Varying(images=job.is_variable)).final_cost / sigma**2, model

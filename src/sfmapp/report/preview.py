@@ -145,7 +145,10 @@ def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _splat(xyz, normal, radius, k, depth, idx):  # type: ignore[no-untyped-def]
+def _splat(
+    xyz: NDArray[np.float64], normal: NDArray[np.float64], radius: NDArray[np.float64], k: NDArray[np.float64],
+    depth: NDArray[np.float32], idx: NDArray[np.int32],
+) -> None:  # fmt: skip
     """Draw discs, all in the camera's axes."""
     height, width = depth.shape
     fx, fy, cx, cy = k
@@ -179,7 +182,10 @@ def _splat(xyz, normal, radius, k, depth, idx):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(xyz, faces, k, depth, idx, weight):  # type: ignore[no-untyped-def]
+def _fill(
+    xyz: NDArray[np.float64], faces: NDArray[np.integer], k: NDArray[np.float64], depth: NDArray[np.float32],
+    idx: NDArray[np.int32], weight: NDArray[np.float32],
+) -> None:  # fmt: skip
     """Draw triangles of vertices in the camera's axes; inverse depth is linear on the screen."""
     height, width = depth.shape
     fx, fy, cx, cy = k

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Union
 
+from sfmapp.georeference.world_frame import Georeference
 from sfmapp.report.evaluation import EvaluationReport
 from sfmapp.report.model import (
     DenseRunReport,
@@ -26,7 +27,8 @@ from sfmapp.report.validation import CloudValidation, Validation
 from sfmapp.reporting import Report, field_types
 
 # by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry and refine;
-# validation/report.json and validation/cloud.json; and what evaluate, undistort and export print with --json
+# validation/report.json and validation/cloud.json; what evaluate, undistort and export print with --json; and
+# georeference.json
 KINDS: Mapping[str, type[Report]] = {
     "reconstruct": ReconstructionReport,
     "dense": DenseRunReport,
@@ -37,6 +39,7 @@ KINDS: Mapping[str, type[Report]] = {
     "evaluate": EvaluationReport,
     "undistort": UndistortReport,
     "export": ExportReport,
+    "georeference": Georeference,
 }
 _SIMPLE = {bool: "boolean", int: "integer", float: "number", str: "string", type(None): "null"}
 

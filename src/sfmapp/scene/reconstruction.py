@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import ROW, across_seam, project
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.triangulation import Views
 from sfmapp.reporting import Report
 from sfmapp.scene.rig import RigImages
 from sfmapp.scene.tracks import Tracks
@@ -113,6 +114,11 @@ class Reconstruction:
         """(C, 17) canonical intrinsics for the kernels, see ``Camera.canonical``."""
         return np.array([camera.canonical for camera in self.cameras]).reshape(-1, ROW)
 
+    def views(self) -> Views:
+        """Poses and lenses of all images, for the kernels."""
+        rotation, translation = rigid3.rotation_matrix(self.cam_from_world), self.cam_from_world[:, 4:].copy()
+        return Views(rotation, translation, self.image_camera_idx, self.canonical_cameras())
+
     def distinct_poses(self, image_idx: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Poses (Q, 7) that registered images (N,) do not share, in the order of their first image, and (N,) whose is
         which: for images on a rig its pose, rig_from_world, for others their own.
@@ -146,13 +152,11 @@ class Reconstruction:
 
     def residuals_px(self) -> NDArray[np.float64]:
         """(O, 2) projected minus observed pixel; NaN where the image or the point is missing, or behind the camera."""
-        canonical = self.canonical_cameras()
         out = np.empty((self.tracks.num_observations, 2))
+        tracks = self.tracks
         reprojection_residuals(
-            rigid3.rotation_matrix(self.cam_from_world), self.cam_from_world[:, 4:].copy(), self.image_camera_idx,
-            canonical, self.point_xyz, self.tracks.obs_image_idx, self.tracks.obs_track_idx,
-            self.tracks.obs_xy, out,
-        )  # fmt: skip
+            self.views(), self.point_xyz, tracks.obs_image_idx, tracks.obs_track_idx, tracks.obs_xy, out
+        )
         return out
 
     def summary(self) -> ModelSummary:
@@ -175,10 +179,7 @@ class Reconstruction:
 
 @numba.njit(cache=True, nogil=True)
 def reprojection_residuals(
-    rotation: NDArray[np.float64],
-    translation: NDArray[np.float64],
-    image_camera_idx: NDArray[np.int32],
-    canonical: NDArray[np.float64],
+    views: Views,
     point_xyz: NDArray[np.float64],
     obs_image_idx: NDArray[np.int32],
     obs_track_idx: NDArray[np.int32],
@@ -186,6 +187,7 @@ def reprojection_residuals(
     out: NDArray[np.float64],
 ) -> None:
     """Fill out (O, 2) with projected minus observed pixels; NaN for missing images and points and behind the camera."""
+    rotation, translation, image_camera_idx, canonical = views
     for o in range(obs_image_idx.shape[0]):
         i = obs_image_idx[o]
         p = obs_track_idx[o]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,17 +114,27 @@ def make_scene(
     else:
         frames = _poses(layout, int(mounted.frame_idx[-1]) + 1, rng)
         poses = mounted.cam_from_world(np.arange(num_images), frames[mounted.frame_idx])
-    xyz, visible = _points_and_visibility(layout, num_points, poses, camera_list, image_camera_idx, detection, rng)
-    scene = _observe(seed, camera_list, image_camera_idx, poses, xyz, visible, sigma_px, outlier_ratio, rng)
+    views = _Views(camera_list, image_camera_idx, poses)
+    xyz, visible = _points_and_visibility(layout, num_points, views, detection, rng)
+    scene = _observe(seed, views, xyz, visible, rng, sigma_px=sigma_px, outlier_ratio=outlier_ratio)
     scene.ground_truth.rig = scene.observed.rig = mounted
     return scene
 
 
+class _Views(NamedTuple):
+    """Images (I) before they see anything: cameras, the position (I,) of each image's own, and poses (I, 7)."""
+
+    cameras: list[Camera]
+    camera_idx: NDArray[np.int32]
+    poses: Array
+
+
 def _observe(
-    seed: int, camera_list: list[Camera], image_camera_idx: NDArray[np.int32], poses: Array, xyz: Array,
-    visible: NDArray[np.bool_], sigma_px: float, outlier_ratio: float, rng: np.random.Generator,
+    seed: int, views: _Views, xyz: Array, visible: NDArray[np.bool_], rng: np.random.Generator, *, sigma_px: float,
+    outlier_ratio: float = 0.0,
 ) -> SyntheticScene:  # fmt: skip
     """The scene of points (N, 3) that images see as ``visible`` (N, I) tells, with pixel noise and outliers."""
+    camera_list, image_camera_idx, poses = views
     num_images, num_points = len(poses), len(xyz)
     point_idx, image_idx = np.nonzero(visible)
     exact = np.empty((len(point_idx), 2))
@@ -267,7 +277,7 @@ def make_look_alike(
     kept = visible.sum(1) >= 2
     xyz, visible, looks_like = xyz[kept], visible[kept], looks_like[kept]
     side = np.where(kept, np.minimum(np.arange(len(kept)) // max(num_alike, 1), sides), 0)[kept]
-    scene = _observe(seed, [camera], np.zeros(num_images, np.int32), poses, xyz, visible, 0.5, 0.0, rng)
+    scene = _observe(seed, _Views([camera], np.zeros(num_images, np.int32), poses), xyz, visible, rng, sigma_px=0.5)
     return scene, _alike_correspondences(scene, looks_like, side, turns, rng)
 
 
@@ -371,10 +381,10 @@ def _surface(layout: Layout, num: int, poses: Array, rng: np.random.Generator) -
 
 
 def _points_and_visibility(
-    layout: Layout, num: int, poses: Array, cameras: list[Camera], camera_idx: NDArray[np.int32], detection: float,
-    rng: np.random.Generator,
-) -> tuple[Array, NDArray[np.bool_]]:  # fmt: skip
+    layout: Layout, num: int, views: _Views, detection: float, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.bool_]]:
     """Points that at least two images see, and (num, I) bool which do."""
+    cameras, camera_idx, poses = views
     kept: list[tuple[Array, NDArray[np.bool_]]] = []
     missing = num
     for _ in range(100):

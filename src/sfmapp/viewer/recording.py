@@ -12,20 +12,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sfmapp.children import with_parent
 from sfmapp.errors import InputError
 from sfmapp.packages import MissingPackageError, require
 from sfmapp.viewer.listener import Message, RecordingListener, Step
 from sfmapp.viewer.photos import SCREEN_QUALITY, screen_side_px, shrunk_jpeg
-from sfmapp.viewer.replay import make_replay
+from sfmapp.viewer.replay import Replay
 
 if TYPE_CHECKING:
-    from sfmapp.images.image_set import ImageSet
-    from sfmapp.scene.features import Features
-    from sfmapp.scene.reconstruction import Reconstruction
+    from sfmapp.images.image_set import ImageRecord
 
 Kind = Literal["run", "dense"]
 
@@ -50,27 +45,21 @@ class RecordingReport:
 
 
 def write_recording(
-    path: Path, image_set: ImageSet, features: Sequence[Features], reconstructions: Sequence[Reconstruction],
-    steps: Sequence[Step] = (), messages: Sequence[Message] = (), *, title: str = "",
-    up: NDArray[np.float64] | None = None, threads: int = 1, timeout_s: float = 600.0,
-) -> RecordingReport:  # fmt: skip
+    path: Path, replay: Replay, photographs: Sequence[ImageRecord] = (), *, threads: int = 1, timeout_s: float = 600.0
+) -> RecordingReport:
     """Write a recording that replays a run, in a child process; never raises for what happens there.
 
     Args:
         path: the file, replaced when the new one is whole.
-        image_set, features: the I photographs and their keypoints.
-        reconstructions: final models, largest first; may be empty.
-        steps, messages: of the :class:`RecordingListener` that watched; without them the final model appears at once.
-        title: shown in the viewer, such as the name of the image folder.
-        up: (3,) direction in the world that is up (aligned worlds: z); None: judged from the cameras.
+        replay: what it shows, see :func:`~sfmapp.viewer.replay.make_replay`.
+        photographs: I of them, in the order of the replay, if some are no files; none if all are.
         threads: photographs read at a time.
         timeout_s: the child is stopped after this long.
     """
     start = time.monotonic()
     try:
         with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
-            shown = _as_files(image_set, Path(name))
-            make_replay(shown, features, reconstructions, steps, messages, title=title, up=up).save(Path(name))
+            _with_files(replay, photographs, Path(name)).save(Path(name))
             problem = draw_in_child("run", Path(name), path, threads, timeout_s)
     except OSError as error:
         problem = error.strerror or str(error)
@@ -78,19 +67,19 @@ def write_recording(
     return RecordingReport(None if problem else path, size, time.monotonic() - start, problem)
 
 
-def _as_files(image_set: ImageSet, folder: Path) -> ImageSet:
+def _with_files(replay: Replay, photographs: Sequence[ImageRecord], folder: Path) -> Replay:
     """Photographs in memory as small files, for a child that cannot look into ours; one that fails is not shown."""
     from sfmapp.images.pixels import read_rgb
 
-    side, records = screen_side_px(len(image_set.images)), list(image_set.images)
-    for i, record in enumerate(records):
+    side, paths = screen_side_px(len(photographs)), list(replay.image_paths)
+    for i, record in enumerate(photographs):
         if record.source is not None:
             with contextlib.suppress(InputError):
                 data, _ = shrunk_jpeg(read_rgb(record)[:, :, ::-1], side, SCREEN_QUALITY)
                 path = folder / f"{i:06d}.jpg"
                 path.write_bytes(data)
-                records[i] = replace(record, path=path)
-    return replace(image_set, images=tuple(records))
+                paths[i] = str(path)
+    return replace(replay, image_paths=paths)
 
 
 def draw_in_child(kind: Kind, folder: Path, path: Path, threads: int, timeout_s: float) -> str:

@@ -120,6 +120,17 @@ class _Interval:
         return self.delta[15 + 9 * n : 24 + 9 * n].reshape(3, 3)
 
 
+@dataclass(frozen=True)
+class _MapPath:
+    """What the map says: poses (K, 7) at times (K,), their covariances (K, 6, 6) if they have any, and whether its
+    unit is the metre."""
+
+    times: Array
+    poses: Array
+    covariance: Array | None
+    is_metric: bool
+
+
 def align_imu(
     timestamps_s: ArrayLike,
     cam_from_world: ArrayLike,
@@ -156,7 +167,7 @@ def align_imu(
     if np.isfinite(clock.offset_sigma_s):
         imu = replace(imu, timestamps_s=imu.timestamps_s - clock.offset_s)
         intervals = _intervals(times, chosen, imu, options.max_interval_s)
-    found = _fit(times, poses, imu, intervals, is_metric, covariance, options, evidence)
+    found = _fit(_MapPath(times, poses, covariance, is_metric), imu, intervals, options, evidence)
     if isinstance(found, ScaleRefusal):
         return found
     offset = found.clock_offset_s + (clock.offset_s if np.isfinite(clock.offset_sigma_s) else 0.0)
@@ -180,11 +191,10 @@ def _too_few(intervals: list[_Interval], times: Array, imu: Imu, options: Inerti
 
 
 def _fit(
-    times: Array, poses: Array, imu: Imu, intervals: list[_Interval], is_metric: bool, covariance: Array | None,
-    options: InertialOptions, evidence: dict[str, Any],
-) -> InertialAlignment | ScaleRefusal:  # fmt: skip
+    path: _MapPath, imu: Imu, intervals: list[_Interval], options: InertialOptions, evidence: dict[str, Any]
+) -> InertialAlignment | ScaleRefusal:
     """The alignment with measurements as they are, accepted or not."""
-    map_from_imu = _map_from_imu_rotation(poses, imu)
+    map_from_imu = _map_from_imu_rotation(path.poses, imu)
     gyro_bias, rotation_residual, rotation = _gyro_bias(intervals, map_from_imu)
     evidence |= {
         "rotation_residual_deg": float(np.degrees(rotation_residual)),
@@ -197,13 +207,11 @@ def _fit(
         )
         return contradicted(reason, "", evidence)
     intervals = [_reintegrate(interval, gyro_bias) for interval in intervals]
-    start = _solve_linear(intervals, gyro_bias, rigid3.center(poses), map_from_imu, poses, imu, is_metric)
+    start = _solve_linear(intervals, gyro_bias, map_from_imu, path, imu)
     evidence |= {"condition": start.condition, "position_sigma_map_units": start.position_sigma}
     if not start.inverse_scale > 0:
         return ScaleRefusal("imu", "the motion does not tell the scale: accelerations and positions disagree", evidence)
-    graph = _Graph(
-        times, poses, imu, intervals, start, gyro_bias, rotation_residual / np.sqrt(2.0), is_metric, covariance
-    )
+    graph = _Graph(path, imu, intervals, start, gyro_bias, rotation_residual / np.sqrt(2.0))
     return graph.solve(evidence)
 
 
@@ -351,14 +359,13 @@ class LinearStart:
 
 
 def _solve_linear(
-    intervals: list[_Interval], gyro_bias: Array, centers: Array, map_from_imu: Array, poses: Array, imu: Imu,
-    is_metric: bool,
-) -> LinearStart:  # fmt: skip
+    intervals: list[_Interval], gyro_bias: Array, map_from_imu: Array, path: _MapPath, imu: Imu
+) -> LinearStart:
     """Scale, gravity and accelerometer bias from mean velocities over neighbouring intervals."""
-    system = _linear_system(intervals, gyro_bias, centers, map_from_imu, poses, imu)
-    return (
-        LinearStart(0.0, np.zeros(3), np.zeros(3), np.nan, np.inf) if system is None else constrain(*system, is_metric)
-    )
+    system = _linear_system(intervals, gyro_bias, rigid3.center(path.poses), map_from_imu, path.poses, imu)
+    if system is None:
+        return LinearStart(0.0, np.zeros(3), np.zeros(3), np.nan, np.inf)
+    return constrain(*system, path.is_metric)
 
 
 def _linear_system(
@@ -484,14 +491,14 @@ class _Graph:
     seconds after its time at which a pose of the map was taken."""
 
     def __init__(
-        self, times: Array, poses: Array, imu: Imu, intervals: list[_Interval], start: LinearStart, gyro_bias: Array,
-        rotation_sigma: float, is_metric: bool, covariance: Array | None,
+        self, path: _MapPath, imu: Imu, intervals: list[_Interval], start: LinearStart, gyro_bias: Array,
+        rotation_sigma: float,
     ) -> None:  # fmt: skip
-        self._poses, self._imu, self._intervals, self._is_metric = poses, imu, intervals, is_metric
-        self._covariance = covariance
+        self._poses, self._imu, self._intervals, self._is_metric = path.poses, imu, intervals, path.is_metric
+        self._covariance = path.covariance
         self._start, self._gyro_bias = start, gyro_bias
         self._index = sorted({k for interval in intervals for k in (interval.first, interval.second)})
-        rates = np.stack([np.interp(times, imu.timestamps_s, column) for column in imu.gyro.T], 1)
+        rates = np.stack([np.interp(path.times, imu.timestamps_s, column) for column in imu.gyro.T], 1)
         self._rates = rates - gyro_bias
         # rounding alone leaves less than this; zero noise would make the graph singular
         self._sigmas = np.r_[np.full(3, max(rotation_sigma, 1e-7)), np.full(3, max(start.position_sigma, self._tiny()))]

@@ -23,8 +23,8 @@ from sfmapp.adjust.pose import refine_pose
 from sfmapp.camera.camera import Camera, pixels_to_normalized, project
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.resection import estimate_pose
-from sfmapp.matching.descriptors import passes_ratio
-from sfmapp.matching.products import largest_products
+from sfmapp.matching.descriptors import mutual_neighbors
+from sfmapp.matching.products import Best, largest_products
 from sfmapp.odometry.loops.place_recognition import QUERY_SCALES, SIGMA_PX, Bytes, Candidate, Ids, PlaceIndex, View
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 
@@ -236,24 +236,19 @@ def match_points(descriptors: Bytes, view: View, roll: float, options: Relocaliz
         (K,) positions of the points, ascending, and (K,) of the corners.
     """
     scans = [largest_products(descriptors, view.descriptors(scale, roll)) for scale in QUERY_SCALES]
-    best1, second1, arg1 = _over_scales([scan[:3] for scan in scans])
-    best2, second2, arg2 = _over_scales([scan[3:] for scan in scans])
-    good1 = (arg1 >= 0) & passes_ratio(best1, second1, options.max_ratio, options.max_distance)
-    good2 = (arg2 >= 0) & passes_ratio(best2, second2, options.max_ratio, options.max_distance)
-    rows = np.flatnonzero(good1)
-    columns = arg1[rows]
-    keep = good2[columns] & (arg2[columns] == rows)
-    return rows[keep], columns[keep].astype(np.int64)
+    best1, best2 = (_over_scales([scan[side] for scan in scans]) for side in (0, 1))
+    found = mutual_neighbors(best1, best2, options.max_ratio, options.max_distance)
+    return found[:, 0].astype(np.int64), found[:, 1].astype(np.int64)
 
 
-def _over_scales(scans: list[tuple[NDArray[np.int32], ...]]) -> tuple[NDArray[np.int32], ...]:
+def _over_scales(scans: list[Best]) -> Best:
     """Best partner at any scale, and the best product with any other partner."""
     best, second, arg = (np.stack(parts) for parts in zip(*scans, strict=True))
     winner = best.argmax(0)
     column = np.arange(best.shape[1])
     partner = arg[winner, column]
     others = np.where(arg == partner, second, best)
-    return best[winner, column], others.max(0), partner
+    return Best(best[winner, column], others.max(0), partner)
 
 
 def is_beyond_chance(num_inliers: int, num_matches: int, limit_px: float, camera: Camera) -> bool:
@@ -332,9 +327,10 @@ def roll_step(roll: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def _nearest_within(  # type: ignore[no-untyped-def]
-    expected, scale_idx, descriptors, xy, described, radius, corner, product
-):
+def _nearest_within(
+    expected: Array, scale_idx: Ids, descriptors: Bytes, xy: Array, described: Bytes, radius: float, corner: Ids,
+    product: Ids,
+) -> None:  # fmt: skip
     """For every point the corner within a radius with the largest product, beyond the bound that product holds.
 
     Args:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.geometry.noise import sigma_of_lengths
 from sfmapp.mapping.structure import residual_scale_px
@@ -93,7 +94,7 @@ def run_job(job: Job) -> Job:
         loss="cauchy", loss_scale_px=_LOSS_SIGMAS * residual_scale_px(model, _MIN_LOSS_PX / _LOSS_SIGMAS),
         max_iterations=_WINDOW_STEPS, relative_cost_tolerance=1e-4, refine_focal=False, refine_distortion=False,
     )  # fmt: skip
-    adjust_bundle(model, options, variable_images=np.repeat(job.is_variable, num_sensors))
+    adjust_bundle(model, options, varying=Varying(images=np.repeat(job.is_variable, num_sensors)))
     classify(model, job.num_elsewhere)
     job.cpu_s = time.thread_time() - start
     return job

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, pixels_to_normalized, project
 from sfmapp.geometry import rigid3
-from sfmapp.geometry.triangulation import triangulate_tracks
+from sfmapp.geometry.triangulation import Observed, triangulate_tracks
 from sfmapp.odometry.frontend.active_tracks import ActiveTracks, References, align_to_references, patch_warp
 from sfmapp.odometry.frontend.corners import find_corners
 from sfmapp.odometry.frontend.pyramid import Pyramid
@@ -174,11 +174,9 @@ class LocalMap:
         """Triangulate those of the wanted points (ids) that are not in the map, from the views of a job."""
         model, tracks = job.model, job.model.tracks
         new = np.flatnonzero(np.isnan(model.point_xyz[:, 0]) & np.isin(job.point_id, wanted, assume_unique=True))
-        canonical = model.canonical_cameras()
         smallest = self.options.min_stereo_deg if self.rig.is_stereo else self.options.min_triangulation_deg
         triangulate_tracks(
-            new, tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy, rigid3.rotation_matrix(model.cam_from_world),
-            model.cam_from_world[:, 4:].copy(), model.image_camera_idx, canonical, _TRIANGULATION_PX,
+            new, Observed(tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy), model.views(), _TRIANGULATION_PX,
             math.radians(smallest), model.point_xyz, model.obs_is_inlier,
         )  # fmt: skip
         self.keyframes.point_xyz[job.point_id[new]] = model.point_xyz[new]

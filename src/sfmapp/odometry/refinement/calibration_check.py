@@ -23,13 +23,14 @@ from scipy.special import chdtri
 from sfmapp.adjust.calibration import RAW, CalibrationSystem, reduce_to_calibration
 from sfmapp.adjust.covariance import similarity_basis
 from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import BROWN, FAMILY, RADIAL_FISHEYE
 from sfmapp.camera.models import PARAM_NAMES, CameraModel, canonical_from_params, kind_of
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.geometry.triangulation import triangulate_tracks
+from sfmapp.geometry.triangulation import Observed, triangulate_tracks
 from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.map.backend import classify
 from sfmapp.scene.reconstruction import Reconstruction
@@ -282,7 +283,7 @@ def adjust_poses(model: Reconstruction, sigma: float, max_steps: int, tolerance:
         loss="cauchy", loss_scale_px=LOSS_SIGMAS * sigma, max_iterations=max_steps, relative_cost_tolerance=tolerance,
         refine_focal=False, refine_distortion=False,
     )  # fmt: skip
-    return 2 * adjust_bundle(model, options, variable_images=variable).final_cost / sigma**2
+    return 2 * adjust_bundle(model, options, varying=Varying(images=variable)).final_cost / sigma**2
 
 
 def _look(model: Reconstruction, x: Array, cost: float, sigma: float, unknowns: Unknowns) -> _Look | None:
@@ -453,11 +454,9 @@ def _start_afresh(look: _Look, sigma: float, unknowns: Unknowns) -> _Look:
     and settle once more."""
     model = look.model.copy()
     tracks = model.tracks
-    canonical = model.canonical_cameras()
     lost = np.flatnonzero(~model.is_triangulated)
     triangulate_tracks(
-        lost, tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy, rigid3.rotation_matrix(model.cam_from_world),
-        model.cam_from_world[:, 4:].copy(), model.image_camera_idx, canonical, _TRIANGULATION_PX,
+        lost, Observed(tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy), model.views(), _TRIANGULATION_PX,
         math.radians(_TRIANGULATION_DEG), model.point_xyz, model.obs_is_inlier,
     )  # fmt: skip
     classify(model, np.zeros(tracks.num_tracks, np.int64))

@@ -18,7 +18,6 @@ from sfmapp.images.image_set import ImageRecord, ImageSet
 from sfmapp.images.sequence import Sequence
 from sfmapp.images.sequence_source import SequenceSource
 from sfmapp.mapping.mapper import Mapper
-from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration
 from sfmapp.mapping.tracks import build_tracks, track_colors
 from sfmapp.matching.pairs import select_pairs
@@ -54,8 +53,8 @@ class PhotoResult:
 
 
 def add_photos(
-    model: Reconstruction, odometry: OdometryResult, sequence: Sequence, photos: str, options: Options,
-    mapping: MappingOptions, *, threads: int, pool: Executor, events: Events,
+    model: Reconstruction, odometry: OdometryResult, sequence: Sequence, photos: str, options: Options, *,
+    threads: int, pool: Executor, events: Events,
 ) -> tuple[Reconstruction, PhotoResult]:  # fmt: skip
     """The largest map of an odometry run with photographs registered in it.
 
@@ -68,7 +67,7 @@ def add_photos(
         odometry: whose largest map it is.
         sequence: whose frames the keyframes are.
         photos: a folder, a glob or a list.
-        mapping: what is accepted.
+        options: of images, features, pairs, matching, mapping and adjustment.
 
     Raises:
         InputError: there is no usable photograph, or the frames of the sequence are gone.
@@ -95,8 +94,9 @@ def add_photos(
     joined = join(model, images, features, matches, idx_of_image)
     attempts: dict[int, Registration] = {}
     mapper = Mapper(
-        joined, _as_joined(matches, model.tracks, idx_of_image), mapping, options.adjust, events, pool,
-        list(joined.cameras), np.zeros(len(joined.image_names), bool), attempts,
+        reconstruction=joined, correspondences=_as_joined(matches, model.tracks, idx_of_image),
+        options=options.mapping, adjust_options=options.adjust, events=events, pool=pool,
+        prior_cameras=list(joined.cameras), locked=np.zeros(len(joined.image_names), bool), attempts=attempts,
     )  # fmt: skip
     events.started(STAGE, f"adding {len(found.images)} photographs", total=None)
     mapper.triangulate_images([idx for idx, _ in keyframes])

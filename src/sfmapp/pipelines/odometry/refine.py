@@ -144,8 +144,9 @@ def _refined(
         with job.stage("photographs"):
             # what the map was adjusted to stays: the photographs must not bend a calibration that was not to be freed
             map_with_photos, added = add_photos(
-                maps[0], before, sequence, os.fspath(photos), options, lenient(options.mapping, maps[0]),
-                threads=job.threads, pool=pool, events=job.events,
+                maps[0], before, sequence, os.fspath(photos),
+                replace(options, mapping=lenient(options.mapping, maps[0])), threads=job.threads, pool=pool,
+                events=job.events,
             )  # fmt: skip
             maps[0] = map_with_photos
     entries = [in_previous_gauge(entry, model) for entry, model in zip(before.maps, maps, strict=True)]

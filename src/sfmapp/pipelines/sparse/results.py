@@ -85,12 +85,14 @@ def _record(run: Run, models: Sequence[Reconstruction]) -> str:
         path.unlink(missing_ok=True)
         return NO_MODEL if run.recorder is not None else NOT_WANTED
     from sfmapp.viewer.recording import write_recording
+    from sfmapp.viewer.replay import make_replay
 
     seen = run.recorder
-    outcome = write_recording(
-        path, run.image_set, run.features, models, seen.steps, seen.messages,
-        title=os.path.basename(os.path.abspath(run.source)), threads=run.threads,
+    replay = make_replay(
+        run.image_set, run.features, models, seen.steps, seen.messages,
+        title=os.path.basename(os.path.abspath(run.source)),
     )  # fmt: skip
+    outcome = write_recording(path, replay, run.image_set.images, threads=run.threads)
     if not outcome.problem:
         return WRITTEN
     path.unlink(missing_ok=True)

@@ -1,0 +1,1 @@
+"""Reconstructions in the world: coordinate systems, positions of photographs, and models brought to metres."""
