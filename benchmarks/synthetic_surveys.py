@@ -49,7 +49,9 @@ def make_survey(seed: int, layout: Layout, num_control: int = 5, num_points: int
     rng = np.random.default_rng([seed, 0x5A7E, layout == "orbit"])
     poses = _grid(rng) if layout == "grid" else _orbit(rng)
     xyz, normals = _ground(rng, poses, num_points) if layout == "grid" else _thing(rng, num_points)
-    places, control_normals = _spread_out(rng, *(_ground(rng, poses, 400) if layout == "grid" else _thing(rng, 400)), num_control, poses)
+    places, control_normals = _spread_out(
+        rng, *(_ground(rng, poses, 400) if layout == "grid" else _thing(rng, 400)), num_control, poses
+    )
     truth = _observed(poses, xyz, normals, rng, 0.0)
     model = _observed(poses, xyz, normals, rng, SIGMA_PX)
     start = rigid3.from_matrix(rigid3.exp_so3(rng.normal(size=3)), rng.normal(size=3))
@@ -110,9 +112,7 @@ def _seen(poses: Array, xyz: Array, normals: Array) -> tuple[NDArray[np.bool_], 
     return inside & facing & ahead, pixels
 
 
-def _spread_out(
-    rng: np.random.Generator, xyz: Array, normals: Array, num: int, poses: Array
-) -> tuple[Array, Array]:
+def _spread_out(rng: np.random.Generator, xyz: Array, normals: Array, num: int, poses: Array) -> tuple[Array, Array]:
     """Points far from each other that three photographs see, as surveyors put them: one more, where it is farthest."""
     good = _seen(poses, xyz, normals)[0].sum(1) >= 3
     xyz, normals = xyz[good], normals[good]

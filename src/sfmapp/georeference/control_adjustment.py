@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sfmapp.adjust.graph import FactorGraph
 from sfmapp.formats.control_points import ControlPoints
 from sfmapp.georeference.control import LeftOut, Survey, leave_out, left_out_already
 from sfmapp.georeference.landmarks import LandmarkFactor, Marks, Surveyed
@@ -37,21 +36,18 @@ _MEDIAN_CHI2 = 2.366
 
 
 @dataclass(frozen=True)
-class Solver:
-    """How the caller adjusts its model, in place.
+class Adjusting:
+    """How the caller adjusts its model.
 
     Attributes:
-        adjust: with gtsam factors over ``X(i)`` and ``K(c)`` whose sigmas are in units of ``unit_px``.
-        joint: of factors with true sigmas, images (M,) and cameras: their joint covariance (N, N), six rows an image
-            in gtsam's tangent of world_from_cam, then the free parameters of each camera; None where it is not known.
-        free: for each camera, positions of the parameters that ``adjust`` changes.
-        unit_px: noise of its observations.
+        to_optimize: makes the graph that is optimised, in place; to_judge: one of the same variables whose covariances
+            hold: without a robust loss, which takes the good observations for less than they are.
+        free: for each camera, positions of the parameters that may change.
     """
 
-    adjust: Callable[[Any], None]
-    joint: Callable[[Any, Sequence[int], Sequence[int]], Array | None]
+    to_optimize: Callable[[], FactorGraph]
+    to_judge: Callable[[], FactorGraph]
     free: Sequence[NDArray[np.int64]]
-    unit_px: float
 
 
 @dataclass(frozen=True)
@@ -77,15 +73,15 @@ def adjust_to_control(
     marked: MarkedPoints,
     survey: Survey,
     is_used: Mask,
-    solver: Solver,
+    adjusting: Adjusting,
 ) -> ControlSolution:
     """Adjust a model that lies near the survey with those control points that agree.
 
     Args:
-        model: in the frame of the survey; moved by ``solver``.
+        model: in the frame of the survey; moved.
         is_used: (P,) bool, points to begin with.
     """
-    points = _Points(model, control, marked, survey, solver)
+    points = _Points(model, control, marked, survey, adjusting)
     start, is_used = is_used.copy(), is_used & marked.is_placed
     most_wrong = int(_MAX_WRONG * marked.is_placed.sum())
     spread, seen = 1.0, {is_used.tobytes()}
@@ -116,9 +112,9 @@ class _Points:
     """Control points as factors of one model."""
 
     def __init__(
-        self, model: Reconstruction, control: ControlPoints, marked: MarkedPoints, survey: Survey, solver: Solver
+        self, model: Reconstruction, control: ControlPoints, marked: MarkedPoints, survey: Survey, adjusting: Adjusting
     ) -> None:
-        self._model, self._survey, self._solver = model, survey, solver
+        self._model, self._survey, self._adjusting = model, survey, adjusting
         self._placed = np.flatnonzero(marked.is_placed)
         self._marks = []
         for p in self._placed:
@@ -130,44 +126,52 @@ class _Points:
     def solve(self, is_used: Mask, spread: float) -> ControlSolution:
         """Adjust the model with the surveys of some points, their sigmas multiplied, and leave each out in turn."""
         surveyed = [
-            Surveyed(place, spread**2 * s) for place, s in zip(self._survey.place, self._survey.covariance, strict=True)
+            Surveyed(place, spread**2 * own)
+            for place, own in zip(self._survey.place, self._survey.covariance, strict=True)
         ]
+        free = self._adjusting.free
         factors = [
-            LandmarkFactor(
-                self._model, self._solver.free, marks, surveyed[p] if is_used[p] else None, surveyed[p].place
-            )
+            LandmarkFactor(self._model, free, marks, surveyed[p] if is_used[p] else None, surveyed[p].place)
             for p, marks in zip(self._placed, self._marks, strict=True)
         ]
-        self._solver.adjust(_graph(factors, self._solver.unit_px))
-        num = len(is_used)
-        place, left_out = np.full((num, 3), np.nan), [None] * num  # type: list[LeftOut | None]
+        optimized = self._adjusting.to_optimize()
+        for factor in factors:
+            optimized.add(factor.gtsam_factor())
+        optimized.optimize()
+        return self._judge(is_used, spread, surveyed, factors)
+
+    def _judge(
+        self, is_used: Mask, spread: float, surveyed: Sequence[Surveyed], factors: Sequence[LandmarkFactor]
+    ) -> ControlSolution:
+        """Where an adjusted model puts its points, and where it would if each of them had taken no part."""
+        judged = self._adjusting.to_judge()
+        for factor in factors:
+            judged.add(factor.gtsam_factor())
         images = sorted({int(i) for factor in factors for i in factor.marks.image_idx})
         cameras = sorted({c for factor in factors for c in factor.cameras})
-        joint = self._solver.joint(_graph(factors, 1.0), images, cameras)
+        joint = judged.marginal_covariance(images=images, cameras=cameras)
+        # gtsam's tangent of world_from_cam is the negative of ours
+        sign = np.where(np.arange(len(joint.matrix)) < 6 * len(images), -1.0, 1.0)
+        matrix = joint.matrix * np.outer(sign, sign)
+        place: Array = np.full((len(is_used), 3), np.nan)
+        left_out: list[LeftOut | None] = [None] * len(is_used)
         for p, factor in zip(self._placed, factors, strict=True):
             found = factor.at(self._model)
             if found is None:
                 continue
             place[p] = found.place
-            if joint is None:
+            if not joint.is_determined:
                 continue
             rows = self._rows(factor, images, cameras)
-            covariance = factor.covariance(found, joint[np.ix_(rows, rows)])
+            covariance = factor.covariance(found, matrix[np.ix_(rows, rows)])
             how = leave_out if is_used[p] else left_out_already
             left_out[p] = how(found.place, covariance, surveyed[p].place, surveyed[p].covariance)
         return ControlSolution(is_used, place, left_out, spread)
 
     def _rows(self, factor: LandmarkFactor, images: list[int], cameras: list[int]) -> NDArray[np.int64]:
         """Where the variables of a factor are among those of all images and cameras."""
-        sizes = [len(self._solver.free[c]) for c in cameras]
+        sizes = [len(self._adjusting.free[c]) for c in cameras]
         first = 6 * len(images) + np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
         poses = [6 * images.index(int(i)) + np.arange(6) for i in factor.marks.image_idx]
         lenses = [np.arange(first[n], first[n + 1]) for n in (cameras.index(c) for c in factor.cameras)]
         return np.concatenate([*poses, *lenses]).astype(np.int64)
-
-
-def _graph(factors: Sequence[LandmarkFactor], unit_px: float) -> Any:
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in factors:
-        graph.push_back(factor.gtsam_factor(unit_px))
-    return graph

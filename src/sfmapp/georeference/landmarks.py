@@ -163,13 +163,8 @@ class LandmarkFactor:
         self._images = [X(int(i)) for i in marks.image_idx]
         self.cameras = [c for c in sorted(set(self._camera_idx)) if len(free[c])]
 
-    def gtsam_factor(self, unit_px: float = 1.0) -> Any:
-        """As gtsam has it.
-
-        Args:
-            unit_px: what the adjustment counts as one standard deviation: the noise of its observations in pixels,
-                where their residuals go in as they are.
-        """
+    def gtsam_factor(self) -> Any:
+        """As gtsam has it."""
         rows = 2 * len(self._images) + 3 * (self.surveyed is not None)
 
         def error(_: Any, values: Any, jacobians: list[Array] | None) -> Array:
@@ -182,7 +177,7 @@ class LandmarkFactor:
             return found.residual
 
         keys = [*self._images, *(K(c) for c in self.cameras)]
-        return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(rows, 1.0 / unit_px), keys, error)
+        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), keys, error)
 
     def at(self, reconstruction: Reconstruction) -> Linearized | None:
         """The point where a reconstruction sees it; None where a photograph does not look there."""
