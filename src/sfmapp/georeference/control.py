@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.formats.control_points import LOCAL, ControlPoints
-from sfmapp.geometry import similarity
+from sfmapp.geometry import rigid3, similarity
 from sfmapp.geometry.geodesy import LocalFrame
 from sfmapp.georeference.coordinate_systems import HeightReference, coordinate_system
 
@@ -127,6 +127,15 @@ def align_to_survey(place: Array, surveyed: Array) -> Alignment:
         return Alignment(None, none, "the control points lie as good as on a line: the turn about it is open")
     none[known[inlier]] = True
     return Alignment(kept, none, "")
+
+
+def similarity_covariance(place: Array, covariance: Array) -> Array:
+    """(7, 7) of the similarity that points (P, 3) with covariances (P, 3, 3) hold: the turn about their middle (radians
+    about east, north, up), the logarithm of the scale, and the shift of the middle."""
+    arm = place - place.mean(0)
+    slope = np.concatenate([-rigid3.skew(arm), arm[:, :, None], np.broadcast_to(np.eye(3), (len(arm), 3, 3))], 2)
+    inverse: Array = np.linalg.inv(np.einsum("pia,pij,pjb->ab", slope, np.linalg.inv(covariance), slope))
+    return inverse
 
 
 def _triples(num: int) -> NDArray[np.int64]:

@@ -115,10 +115,10 @@ class _Points:
         self, model: Reconstruction, control: ControlPoints, marked: MarkedPoints, survey: Survey, adjusting: Adjusting
     ) -> None:
         self._model, self._survey, self._adjusting = model, survey, adjusting
-        self._placed = np.flatnonzero(marked.is_placed)
+        self._placed: list[int] = np.flatnonzero(marked.is_placed).tolist()
         self._marks = []
         for p in self._placed:
-            own = control.observations_of(int(p))
+            own = control.observations_of(p)
             own = own[marked.is_used[own]]
             sigma = marked.spread * control.obs_sigma_px[own]
             self._marks.append(Marks(control.obs_image_idx[own], control.obs_xy[own], sigma))

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 from sfmapp.reporting import Report
+
+Role = Literal["control", "refuted", "unplaced"]
 
 
 class MarkSlip(Report):
@@ -29,7 +32,8 @@ class ControlPointRow(Report):
     """A control point: how far the adjustment without it puts it from where the survey does, and how far it may.
 
     Attributes:
-        role: ``control`` took part; ``refuted`` did not, as the others speak against it; ``unplaced`` has no place.
+        role: ``control`` took part; ``refuted`` did not, as the others speak against it; ``unplaced`` has no place in
+            the model.
         reason: why it took no part; empty if it did.
         num_marks: that took part.
         xyz_m: (3,) by the survey, in the world frame.
@@ -40,7 +44,7 @@ class ControlPointRow(Report):
     """
 
     name: str
-    role: str
+    role: Role
     reason: str
     num_marks: int
     xyz_m: tuple[float, float, float]
@@ -63,19 +67,38 @@ class LeftOutSummary(Report):
     share_within_95_vertical: float
 
 
+class ControlledModel(Report):
+    """How a model lies on ground control, or why it does not.
+
+    Attributes:
+        reason: why control points have not moved it; empty if they have.
+        mark_spread: how many of their sigmas the marks scatter, one at least; survey_spread: the same of the survey.
+        points: a row for each control point.
+        slips: marks that others refute.
+        findings: what is wrong, a sentence each.
+        summary: of points left out in turn; absent where none could be.
+    """
+
+    model: int
+    reason: str
+    mark_spread: float
+    survey_spread: float | None = None
+    points: Sequence[ControlPointRow]
+    slips: Sequence[MarkSlip]
+    findings: Sequence[str]
+    summary: LeftOutSummary | None = None
+
+
 class ControlReport(Report):
-    """Ground control of a model.
+    """What the stage ``control`` did.
 
     Attributes:
         path: of the file; crs: of its coordinates.
-        mark_spread: how many of their sigmas the marks scatter, one at least.
-        points: a row for each; summary: absent where no point could be left out.
-        slips: marks that others refute.
+        num_points: in the file.
+        models: as in the report, the largest first.
     """
 
     path: str
     crs: str
-    mark_spread: float
-    points: Sequence[ControlPointRow]
-    slips: Sequence[MarkSlip]
-    summary: LeftOutSummary | None = None
+    num_points: int
+    models: Sequence[ControlledModel]

@@ -207,7 +207,7 @@ class LandmarkFactor:
             out.append(matrix)
         for c in self.cameras:
             matrix = np.zeros((rows, len(self._free[c])))
-            for n in np.flatnonzero(np.array(self._camera_idx) == c):
+            for n in np.flatnonzero(np.array(self._camera_idx) == c).tolist():
                 matrix[2 * n : 2 * n + 2] = found.by_params[n][:, self._free[c]]
             out.append(matrix)
         return out

@@ -22,6 +22,7 @@ from sfmapp.dense.report import (
 from sfmapp.errors import SfmError
 from sfmapp.evaluation.report import Statistics
 from sfmapp.features.report import FeaturesReport
+from sfmapp.georeference.control_report import ControlReport
 from sfmapp.images.report import ImagesReport
 from sfmapp.mapping.report import FocalEvidence, MappingReport, ModelEntry
 from sfmapp.matching.report import MatchingReport, PairsReport
@@ -263,6 +264,7 @@ class Stages(Report):
     pairs: PairsReport | None = None
     matching: MatchingReport | None = None
     mapping: MappingReport | None = None
+    control: ControlReport | None = None
     dense: DenseReport | None = None
     mesh: MeshRunReport | FailedReport | None = None
 

@@ -21,6 +21,7 @@ from sfmapp.adjust.options import AdjustOptions
 from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import SfmError, UsageError
 from sfmapp.features.extract import FeatureOptions
+from sfmapp.georeference.control_options import ControlOptions
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.images.sequence import SequenceOptions
 from sfmapp.mapping.options import MappingOptions
@@ -40,6 +41,7 @@ class Options:
 
     Attributes:
         images, features, pairs, matching, mapping, adjust: the options of the stages of a reconstruction.
+        control: ground control points of a reconstruction.
         dense, surface: those of patches and of the mesh that is made of them.
         sequence, odometry, scale: those of odometry.
         seed: where every random choice starts; the same seed gives the same bytes.
@@ -53,6 +55,7 @@ class Options:
     matching: MatchingOptions = field(default_factory=MatchingOptions)
     mapping: MappingOptions = field(default_factory=MappingOptions)
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
+    control: ControlOptions = field(default_factory=ControlOptions)
     dense: DenseOptions = field(default_factory=DenseOptions)
     surface: SurfaceOptions = field(default_factory=SurfaceOptions)
     sequence: SequenceOptions = field(default_factory=SequenceOptions)
@@ -108,8 +111,9 @@ def options_from_dict(values: Mapping[str, Any]) -> Options:
 def with_absolute_paths(options: Options) -> Options:
     """The same options, good in any working directory."""
     images = _with_absolute_paths(options.images, "camera", "mask_path")
+    control = _with_absolute_paths(options.control, "file")
     sequence = _with_absolute_paths(options.sequence, "camera", "imu", "ground_truth")
-    return dataclasses.replace(options, images=images, sequence=sequence)
+    return dataclasses.replace(options, images=images, control=control, sequence=sequence)
 
 
 def _with_absolute_paths(stage: Any, *names: str) -> Any:

@@ -17,6 +17,7 @@ from sfmapp.images.folder import load_images
 from sfmapp.matching.pairs import select_pairs
 from sfmapp.matching.stage import match_images
 from sfmapp.pipelines.sparse import results
+from sfmapp.pipelines.sparse.control import bring_control, read_control
 from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
 from sfmapp.pipelines.sparse.run import Run
 from sfmapp.viewer.listener import RecordingListener
@@ -90,7 +91,8 @@ def _run(run: Run) -> ReconstructionReport:
     with run.stage("images"):
         run.image_set, images = load_images(run.source, run.options.images, run.events, threads=run.threads)
         run.stages = replace(run.stages, images=images)
-    keys = stage_keys(run.options, run.image_set)
+    run.control = read_control(run, run.image_set)
+    keys = stage_keys(run.options, run.image_set, run.control)
     if report := results.earlier_report(run, keys):
         return report
     run.workspace.manifest["image_root"] = os.fspath(run.image_set.root or "")
@@ -136,7 +138,7 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
     with run.stage("mapping"):
         models, mapped = map_images(
             image_set, run.features, run.correspondences, options.mapping,
-            adjust_options=options.adjust, threads=threads, events=events,
+            adjust_options=options.adjust, threads=threads, events=events, closing=bring_control(run, None),
         )  # fmt: skip
         run.stages = replace(run.stages, mapping=mapped)
     return models
