@@ -87,6 +87,11 @@ def _add_option_flags(parser: argparse.ArgumentParser) -> None:
     cameras.add_argument("--camera-model", metavar="MODEL", help=", ".join(MODEL_NAMES))
     group.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black pixels are ignored")
     group.add_argument(
+        "--gps", metavar="FILE|exif|none",
+        help="positions of the photographs: what cameras wrote into the files (the default), none, or a file: geo.txt "
+        "of OpenDroneMap, a CSV of image, latitude, longitude, height, or a track with times (GPX, CSV)",
+    )  # fmt: skip
+    group.add_argument(
         "--gcp", metavar="FILE",
         help="ground control points: gcp_list.txt of OpenDroneMap, or a CSV of name, x, y, z, image, px, py, sigmas",
     )  # fmt: skip
@@ -105,6 +110,7 @@ def _options(args: argparse.Namespace) -> Options:
         "images.camera": args.camera,
         "images.camera_model": args.camera_model,
         "images.mask_path": args.mask_path,
+        "gps.source": args.gps,
         "control.file": args.gcp,
         "min_registered": args.min_registered,
     }
@@ -198,6 +204,29 @@ def _result(output: Path, report: ReconstructionReport) -> dict[str, object]:
     return {"output": str(output), **paths, **report.models[0], "not_registered": missing, "run": report.run}
 
 
+def _print_world(report: ReconstructionReport) -> None:
+    """Where models lie, by positions of photographs, and which of these were left aside."""
+    placed = report.stages.georeference
+    if placed is None:
+        return
+    for model in placed.models:
+        if model.reason:
+            print(f"  model {model.model} is in arbitrary units: {model.reason}")
+            continue
+        assert model.rms_residual_m is not None
+        assert model.scale_sigma_share is not None
+        assert model.rotation_sigma_deg is not None
+        flat, up = model.rms_residual_m
+        height = "" if up is None else f", {up:.2g} m in height"
+        print(
+            f"  model {model.model} is in metres, z up, by {model.num_used} of {model.num_positions} positions: "
+            f"residuals {flat:.2g} m horizontally{height}; scale to {100 * model.scale_sigma_share:.2g} %, "
+            f"north to {model.rotation_sigma_deg[2]:.2g} degrees"
+        )
+    for finding in placed.findings:
+        print(f"  positions: {', '.join([*finding.images[:3], ''])}{finding.message}")
+
+
 def _print_control(report: ReconstructionReport) -> None:
     """Control points left out in turn, and what is wrong with them."""
     found = report.stages.control
@@ -239,6 +268,7 @@ def _print_summary(output: Path, report: ReconstructionReport) -> None:
         for m, other in enumerate(report.models[1:], 1):
             if other.apart:
                 print(f"  model {m} is {other.apart}")
+    _print_world(report)
     _print_control(report)
     print_contradictions(found for one in report.models for found in one.contradictions)
     if run.is_up_to_date:

@@ -22,6 +22,7 @@ from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import SfmError, UsageError
 from sfmapp.features.extract import FeatureOptions
 from sfmapp.georeference.control_options import ControlOptions
+from sfmapp.georeference.options import GpsOptions
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.images.sequence import SequenceOptions
 from sfmapp.mapping.options import MappingOptions
@@ -40,7 +41,7 @@ class Options:
     """Everything that a run obeys. The options of a stage live next to its code.
 
     Attributes:
-        images, features, pairs, matching, mapping, adjust: the options of the stages of a reconstruction.
+        images, features, pairs, matching, mapping, adjust, gps: the options of the stages of a reconstruction.
         control: ground control points of a reconstruction.
         dense, surface: those of patches and of the mesh that is made of them.
         sequence, odometry, scale: those of odometry.
@@ -56,6 +57,7 @@ class Options:
     mapping: MappingOptions = field(default_factory=MappingOptions)
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
     control: ControlOptions = field(default_factory=ControlOptions)
+    gps: GpsOptions = field(default_factory=GpsOptions)
     dense: DenseOptions = field(default_factory=DenseOptions)
     surface: SurfaceOptions = field(default_factory=SurfaceOptions)
     sequence: SequenceOptions = field(default_factory=SequenceOptions)
@@ -113,7 +115,8 @@ def with_absolute_paths(options: Options) -> Options:
     images = _with_absolute_paths(options.images, "camera", "mask_path")
     control = _with_absolute_paths(options.control, "file")
     sequence = _with_absolute_paths(options.sequence, "camera", "imu", "ground_truth")
-    return dataclasses.replace(options, images=images, control=control, sequence=sequence)
+    gps = options.gps if options.gps.source in ("exif", "none") else _with_absolute_paths(options.gps, "source")
+    return dataclasses.replace(options, images=images, control=control, sequence=sequence, gps=gps)
 
 
 def _with_absolute_paths(stage: Any, *names: str) -> Any:

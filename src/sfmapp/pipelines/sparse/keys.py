@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from sfmapp.workspace.keys import input_key, stage_key
@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 # where the stages begin; :mod:`sfmapp.workspace.code` finds what they import
 FEATURES, PAIRS, MATCHING = ("sfmapp.features.extract",), ("sfmapp.matching.pairs",), ("sfmapp.matching.stage",)
-MAPPING = ("sfmapp.mapping.incremental", "sfmapp.formats.colmap", "sfmapp.georeference.control_stage")
+MAPPING = (
+    "sfmapp.mapping.incremental", "sfmapp.formats.colmap", "sfmapp.georeference.stage",
+    "sfmapp.georeference.control_stage",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -49,9 +52,10 @@ def stage_keys(options: Options, image_set: ImageSet, control: ControlPoints | N
     places = [[record.timestamp, record.gps] for record in image_set.images]
     pairs = stage_key(PAIRS, options.pairs, images, places)
     matching = stage_key(MATCHING, options.matching, images, lenses, whose)
-    mapping = stage_key(
-        MAPPING, options.mapping, options_to_dict(options.adjust), pairs, matching, priors, _control_key(control)
-    )
+    measured = [record.position and asdict(record.position) for record in image_set.images]
+    adjust = options_to_dict(options.adjust)
+    world = [options_to_dict(options.gps), measured, _control_key(control)]
+    mapping = stage_key(MAPPING, options.mapping, adjust, pairs, matching, priors, world)
     return StageKeys(inputs, features, pairs, matching, mapping)
 
 

@@ -13,13 +13,14 @@ from sfmapp.errors import NoReconstructionError, TooFewImagesError
 from sfmapp.events import Events
 from sfmapp.features.extract import extract_features
 from sfmapp.formats.colmap import read_model
+from sfmapp.georeference.sources import with_positions
 from sfmapp.images.folder import load_images
 from sfmapp.matching.pairs import select_pairs
 from sfmapp.matching.stage import match_images
 from sfmapp.pipelines.sparse import results
-from sfmapp.pipelines.sparse.control import bring_control, read_control
 from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
 from sfmapp.pipelines.sparse.run import Run
+from sfmapp.pipelines.sparse.world import closing, read_control
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.kernels import kernels_compiling
 from sfmapp.workspace.layout import RECONSTRUCT
@@ -90,6 +91,7 @@ def _run(run: Run) -> ReconstructionReport:
     """The job: photographs, what still holds of an earlier run, models, and the report of it all."""
     with run.stage("images"):
         run.image_set, images = load_images(run.source, run.options.images, run.events, threads=run.threads)
+        run.image_set = with_positions(run.image_set, run.options.gps)
         run.stages = replace(run.stages, images=images)
     run.control = read_control(run, run.image_set)
     keys = stage_keys(run.options, run.image_set, run.control)
@@ -138,7 +140,7 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
     with run.stage("mapping"):
         models, mapped = map_images(
             image_set, run.features, run.correspondences, options.mapping,
-            adjust_options=options.adjust, threads=threads, events=events, closing=bring_control(run, None),
+            adjust_options=options.adjust, threads=threads, events=events, closing=closing(run, image_set),
         )  # fmt: skip
         run.stages = replace(run.stages, mapping=mapped)
     return models

@@ -1,4 +1,4 @@
-"""Ground control of a reconstruction: read before the work begins, and brought in when models are finished."""
+"""Finished models into the world: by positions of photographs, and by ground control, read before the work begins."""
 
 from __future__ import annotations
 
@@ -33,19 +33,24 @@ def read_control(run: Run, image_set: ImageSet) -> ControlPoints | None:
     return control
 
 
-def bring_control(run: Run, before: Callable[[list[Mapper]], None] | None) -> Callable[[list[Mapper]], None] | None:
-    """What is to be done with finished models: something else, and then control; None where there is nothing to do."""
-    if run.control is None:
-        return before
+def closing(run: Run, image_set: ImageSet) -> Callable[[list[Mapper]], None] | None:
+    """What is to be done with finished models; None where nothing is known of where they lie."""
+    has_positions = any(record.position is not None for record in image_set.images)
+    if run.control is None and not has_positions:
+        return None
 
-    def closing(mappers: list[Mapper]) -> None:
-        from sfmapp.georeference.control_stage import control_models
+    def bring_into_world(mappers: list[Mapper]) -> None:
+        if has_positions:
+            from sfmapp.georeference.stage import georeference_models
 
-        assert run.control is not None
-        if before is not None:
-            before(mappers)
-        found = control_models(mappers, run.control, run.georeference, run.events)
-        run.georeference = found.georeference
-        run.stages = replace(run.stages, control=found.report)
+            placed = georeference_models(mappers, image_set, run.options.gps, run.events)
+            run.georeference = placed.georeference
+            run.stages = replace(run.stages, georeference=placed.report)
+        if run.control is not None:
+            from sfmapp.georeference.control_stage import control_models
 
-    return closing
+            controlled = control_models(mappers, run.control, run.georeference, run.events)
+            run.georeference = controlled.georeference
+            run.stages = replace(run.stages, control=controlled.report)
+
+    return bring_into_world
