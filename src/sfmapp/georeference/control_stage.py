@@ -21,6 +21,7 @@ from sfmapp.georeference.control import LeftOut, Survey, align_to_survey, simila
 from sfmapp.georeference.control_adjustment import Adjusting, ControlSolution, adjust_to_control
 from sfmapp.georeference.control_report import ControlledModel, ControlPointRow, ControlReport, LeftOutSummary, Role
 from sfmapp.georeference.marks import MarkedPoints, check_marks
+from sfmapp.georeference.report import GeoreferenceReport
 from sfmapp.georeference.world_frame import Georeference, ModelPlace
 from sfmapp.mapping.mapper import Mapper
 
@@ -70,11 +71,32 @@ def control_models(
         if place is not None:
             places[number] = place
     report = ControlReport(path=str(control.path), crs=control.crs, num_points=control.num_points, models=models)
-    if survey.frame is None:
-        return Controlled(before, report)
+    if survey.frame is None:  # models that were moved have left the frame of the world for that of the site
+        is_moved = any(not row.reason for row in models)
+        return Controlled(None if is_moved else before, report)
     heights = before.heights if before is not None else survey.heights
     placed = [places[number] for number in sorted(places)]
     return Controlled(Georeference.about(survey.frame, heights, placed) if placed else None, report)
+
+
+def positions_after(
+    report: GeoreferenceReport, control: ControlReport, mappers: Sequence[Mapper]
+) -> GeoreferenceReport:
+    """What positions of photographs come to beside cameras that control has moved: they have no part in those."""
+    moved = {row.model for row in control.models if not row.reason}
+    rows = []
+    for row in report.images:
+        if row.model in moved and row.adjusted_m is not None:
+            mapper = mappers[row.model]
+            center = mapper.reconstruction.centers[mapper.reconstruction.image_names.index(row.name)]
+            east, north, up = center - row.measured_m
+            row = replace(
+                row, adjusted_m=_three(center), residual_sigma_m=None, ellipse=None, is_used=False,
+                residual_m=(float(east), float(north), None if row.height_m is None else float(up)),
+                reason="ground control tells the place",
+            )  # fmt: skip
+        rows.append(row)
+    return replace(report, images=rows)
 
 
 def _control_model(

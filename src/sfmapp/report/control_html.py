@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sfmapp.georeference.control_report import ControlledModel, ControlPointRow, ControlReport
 from sfmapp.report.page import table
 from sfmapp.report.top_view import HEIGHT, WIDTH, fit_page
+from sfmapp.report.world_map import nice_length, scale_bar
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -81,7 +82,7 @@ def _map(row: ControlledModel, model: Reconstruction) -> str:
     residual = np.array([point.left_out_m for point in shown])
     longest = max(float(np.linalg.norm(residual[:, :2], axis=1).max()), float(np.abs(residual[:, 2]).max()), 1e-9)
     # a round number of times the size of the ground
-    exaggeration = _round_down(_LONGEST * WIDTH / (longest * scale[0]))
+    exaggeration = nice_length(_LONGEST * WIDTH / (longest * scale[0]))
     parts = [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2" fill="#8888"/>' for x, y in centers * scale + offset]
     for point in row.points:
         x, y = np.array(point.xyz_m[:2]) * scale + offset
@@ -92,7 +93,7 @@ def _map(row: ControlledModel, model: Reconstruction) -> str:
             east, north, up = exaggeration * scale[0] * np.array(point.left_out_m)
             parts.append(_arrow(x, y, east, -north, color))
             parts.append(_bar(x - 9, y, -up, color))
-    parts.append(_scale_bar(float(scale[0])) + _north())
+    parts.append(scale_bar(float(scale[0])))
     note = (
         f"Control points and their residuals when left out, drawn {exaggeration:g} times as long as the ground: arrows "
         "horizontally, bars beside them in height (up the page: the others put the point higher). Dots are cameras."
@@ -113,22 +114,3 @@ def _arrow(x: float, y: float, dx: float, dy: float, color: str) -> str:
 
 def _bar(x: float, y: float, dy: float, color: str) -> str:
     return f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x:.1f}" y2="{y + dy:.1f}" stroke="{color}" stroke-width="4"/>'
-
-
-def _scale_bar(pixels_per_metre: float) -> str:
-    metres = _round_down(0.2 * WIDTH / pixels_per_metre)
-    end = 20 + metres * pixels_per_metre
-    line = f'<line x1="20" y1="{HEIGHT - 20:.0f}" x2="{end:.1f}" y2="{HEIGHT - 20:.0f}" stroke="currentColor"/>'
-    return line + f'<text x="20" y="{HEIGHT - 28:.0f}">{metres:g} m</text>'
-
-
-def _north() -> str:
-    x = WIDTH - 30
-    arrow = f'<path d="M{x:.0f} 50V20l-5 10m5-10l5 10" stroke="currentColor" fill="none"/>'
-    return arrow + f'<text x="{x - 5:.0f}" y="66">N</text>'
-
-
-def _round_down(value: float) -> float:
-    """The largest of 1, 2 and 5 times a power of ten below a value."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9)))

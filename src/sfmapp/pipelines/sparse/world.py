@@ -47,10 +47,13 @@ def closing(run: Run, image_set: ImageSet) -> Callable[[list[Mapper]], None] | N
             run.georeference = placed.georeference
             run.stages = replace(run.stages, georeference=placed.report)
         if run.control is not None:
-            from sfmapp.georeference.control_stage import control_models
+            from sfmapp.georeference.control_stage import control_models, positions_after
 
             controlled = control_models(mappers, run.control, run.georeference, run.events)
             run.georeference = controlled.georeference
-            run.stages = replace(run.stages, control=controlled.report)
+            positions = run.stages.georeference
+            if positions is not None and controlled.georeference is not None:
+                positions = positions_after(positions, controlled.report, mappers)
+            run.stages = replace(run.stages, control=controlled.report, georeference=positions)
 
     return bring_into_world
