@@ -91,6 +91,10 @@ def _add_option_flags(parser: argparse.ArgumentParser) -> None:
         help="positions of the photographs: what cameras wrote into the files (the default), none, or a file: geo.txt "
         "of OpenDroneMap, a CSV of image, latitude, longitude, height, or a track with times (GPX, CSV)",
     )  # fmt: skip
+    group.add_argument(
+        "--gcp", metavar="FILE",
+        help="ground control points: gcp_list.txt of OpenDroneMap, or a CSV of name, x, y, z, image, px, py, sigmas",
+    )  # fmt: skip
     group.add_argument("--min-registered", metavar="N", help="exit with code 5 if fewer images are registered")
     group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, the replay of the run")
 
@@ -107,6 +111,7 @@ def _options(args: argparse.Namespace) -> Options:
         "images.camera_model": args.camera_model,
         "images.mask_path": args.mask_path,
         "gps.source": args.gps,
+        "control.file": args.gcp,
         "min_registered": args.min_registered,
     }
     settings = [*args.set, *(f"{name}={value}" for name, value in flags.items() if value is not None)]
@@ -222,6 +227,32 @@ def _print_world(report: ReconstructionReport) -> None:
         print(f"  positions: {', '.join([*finding.images[:3], ''])}{finding.message}")
 
 
+def _print_control(report: ReconstructionReport) -> None:
+    """Control points left out in turn, and what is wrong with them."""
+    found = report.stages.control
+    for model in found.models if found is not None else ():
+        if model.reason:
+            print(f"  model {model.model} is not brought to ground control: {model.reason}")
+        elif model.summary is not None:
+            one = model.summary
+            print(
+                f"  model {model.model} lies on ground control; its points, left out in turn, in metres beside their"
+                " standard deviations:"
+            )
+            print(f"    {'point':<14}{'east':>16}{'north':>16}{'up':>16}")
+            for point in model.points:
+                if point.left_out_m is not None and point.left_out_sigma_m is not None:
+                    pairs = zip(point.left_out_m, point.left_out_sigma_m, strict=True)
+                    cells = "".join(f"{f'{value:+.3f} ({sigma:.3f})':>16}" for value, sigma in pairs)
+                    print(f"    {point.name:<14}{cells}{'  refuted' if point.role == 'refuted' else ''}")
+            print(
+                f"    rms {one.horizontal_rms_m:.3f} m horizontally, expected {one.expected_horizontal_m:.3f};"
+                f" {one.vertical_rms_m:.3f} m in height, expected {one.expected_vertical_m:.3f}"
+            )
+        for finding in model.findings:
+            print(f"  {finding}")
+
+
 def _print_summary(output: Path, report: ReconstructionReport) -> None:
     model, run = report.models[0], report.run
     print(
@@ -238,6 +269,7 @@ def _print_summary(output: Path, report: ReconstructionReport) -> None:
             if other.apart:
                 print(f"  model {m} is {other.apart}")
     _print_world(report)
+    _print_control(report)
     print_contradictions(found for one in report.models for found in one.contradictions)
     print(took(output, run))
     print(f"model {output / 'sparse' / '0'}, report {output / 'report.html'}; look at it: sfmapp view {output}")

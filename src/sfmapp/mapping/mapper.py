@@ -446,6 +446,21 @@ class Mapper:
             },
         )
 
+    def closing_options(self) -> tuple[AdjustOptions, Varying, float]:
+        """How the finished map is adjusted as a factor graph, what varies, and the noise of its keypoints in pixels, by
+        the residuals and what an adjustment leaves of them."""
+        reconstruction, chosen = self.reconstruction, self._free_principal_points()
+        options = replace(self.adjust_options, max_iterations=100, initial_damping=1e-6, relative_cost_tolerance=1e-7)
+        if chosen.any():
+            cameras = [c for c, is_chosen in zip(reconstruction.cameras, chosen, strict=True) if is_chosen]
+            sigma_px = self.options.principal_point_sigma * max(max(c.width, c.height) for c in cameras)
+            options = replace(options, refine_principal_point=True, principal_point_sigma_px=sigma_px)
+        numbers = 2 * int(reconstruction.obs_is_inlier.sum())
+        unknowns = 3 * int(reconstruction.is_triangulated.sum()) + 6 * int(reconstruction.is_registered.sum())
+        left = max(numbers - unknowns, 1)
+        noise_px = structure.residual_scale_px(reconstruction, MIN_NOISE_PX) * float(np.sqrt(numbers / left))
+        return options, Varying(centers=chosen), noise_px
+
     def _settle_points(self) -> None:
         """Measure the noise; filter accordingly, and triangulate again what was lost or has become possible."""
         scale = structure.residual_scale_px(self.reconstruction)

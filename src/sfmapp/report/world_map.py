@@ -60,7 +60,7 @@ def world_map_svg(images: Sequence[PositionedImage], model: Reconstruction | Non
     used = np.array([image.is_used for image in shown])
     scale, offset = fit_page(points, np.concatenate([adjusted, measured[used]]))
     zoom = abs(float(scale[0]))
-    times = _nice(_ARROW_SHARE * WIDTH / zoom / max(_median_length(measured - adjusted, used), 1e-9))
+    times = nice_length(_ARROW_SHARE * WIDTH / zoom / max(_median_length(measured - adjusted, used), 1e-9))
     parts = point_paths((points * scale + offset).round(1), rgb)
     for image, at, place in zip(shown, adjusted * scale + offset, measured, strict=True):
         parts.append(_camera(image, at, (place - np.array(image.adjusted_m)[:2]) * scale * times, times * zoom))
@@ -71,7 +71,7 @@ def world_map_svg(images: Sequence[PositionedImage], model: Reconstruction | Non
         "aside."
     )
     style = 'class="view" stroke-linecap="round" stroke-width="2.2" fill="none"'
-    body = "".join(parts) + _scale_bar(zoom)
+    body = "".join(parts) + scale_bar(zoom)
     return f'<svg viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}" {style}>{body}</svg><p class="dim">{note}</p>'
 
 
@@ -102,9 +102,9 @@ def _camera(image: PositionedImage, at: Array, arrow: Array, pixels_per_metre: f
     return "".join(parts)
 
 
-def _scale_bar(pixels_per_metre: float) -> str:
+def scale_bar(pixels_per_metre: float) -> str:
     """A bar of a round length at the lower left, and an arrow to the north at the upper right."""
-    metres = _nice(0.2 * WIDTH / pixels_per_metre)
+    metres = nice_length(0.2 * WIDTH / pixels_per_metre)
     left, bottom, length = 30.0, HEIGHT - 24.0, metres * pixels_per_metre
     ends = f"M{left} {bottom - 6}v12M{left} {bottom}h{length:.1f}M{left + length:.1f} {bottom - 6}v12"
     text = f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"
@@ -115,7 +115,7 @@ def _scale_bar(pixels_per_metre: float) -> str:
     )
 
 
-def _nice(value: float) -> float:
+def nice_length(value: float) -> float:
     """The largest of 1, 2, 5 and their tenfolds that is not above a value, and at least 1 of the smallest unit."""
     if not value > 0 or not math.isfinite(value):
         return 1.0

@@ -20,6 +20,7 @@ from sfmapp.matching.stage import match_images
 from sfmapp.pipelines.sparse import results
 from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
 from sfmapp.pipelines.sparse.run import Run
+from sfmapp.pipelines.sparse.world import closing, read_control
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.kernels import kernels_compiling
 from sfmapp.workspace.layout import RECONSTRUCT
@@ -29,7 +30,6 @@ from sfmapp.workspace.usage import Stopwatch
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet
-    from sfmapp.mapping.mapper import Mapper
     from sfmapp.report.model import ReconstructionReport
     from sfmapp.scene.reconstruction import Reconstruction
 
@@ -96,7 +96,8 @@ def _run(run: Run) -> ReconstructionReport:
         image_set, images = load_images(run.images, run.options.images, run.events, threads=run.threads)
         run.image_set = with_positions(image_set, run.options.gps)
         run.stages = replace(run.stages, images=images)
-    keys = stage_keys(run.options, run.image_set)
+    run.control = read_control(run, run.image_set)
+    keys = stage_keys(run.options, run.image_set, run.control)
     if report := results.earlier_report(run, keys):
         return report
     run.workspace.manifest["image_root"] = os.fspath(run.image_set.root or "")
@@ -139,19 +140,10 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
             )  # fmt: skip
             store.flush()
             run.stages = replace(run.stages, matching=matched)
-
-    def closing(mappers: list[Mapper]) -> None:
-        from sfmapp.georeference.stage import georeference_models
-
-        placed = georeference_models(mappers, image_set, options.gps, events)
-        run.georeference = placed.georeference
-        run.stages = replace(run.stages, georeference=placed.report)
-
-    has_positions = any(record.position is not None for record in image_set.images)
     with run.stage("mapping"):
         models, mapped = map_images(
             image_set, run.features, run.correspondences, options.mapping,
-            adjust_options=options.adjust, threads=threads, events=events, closing=closing if has_positions else None,
+            adjust_options=options.adjust, threads=threads, events=events, closing=closing(run, image_set),
         )  # fmt: skip
         run.stages = replace(run.stages, mapping=mapped)
     return models
