@@ -67,6 +67,7 @@ INNER_FLOORS = {
     ),
     "pipelines": (
         ("demo", "evaluate", "export", "undistort", "validate", "validate_cloud"),
+        ("export_world",),
         ("dense", "odometry"),
         ("sparse",),
         ("stored_pixels",),

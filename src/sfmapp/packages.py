@@ -11,6 +11,8 @@ _DISTRIBUTIONS = {
     "av": ("av", "reading videos"),
     "cv2": ("opencv-contrib-python-headless", "reading images"),
     "gtsam": ("gtsam", "adjusting with further factors"),
+    "laspy": ("laspy[lazrs]", "writing LAS"),
+    "lazrs": ("laspy[lazrs]", "writing LAZ"),
     "libusb_package": ("libusb-package", "making meshes"),
     "open3d": ("open3d-cpu", "making meshes"),
     "pyproj": ("pyproj", "coordinate systems by EPSG code"),

@@ -9,11 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from sfmapp.api.images import Images, load_images
+from sfmapp.api.images import load_images
 from sfmapp.api.reconstruction import Reconstruction
 from sfmapp.api.stages import extract_features, map_images, match_images, one_blas_thread
 from sfmapp.errors import UsageError
 from sfmapp.events import Event, Events
+from sfmapp.images.load import Images
 from sfmapp.workspace.options import Options
 
 if TYPE_CHECKING:
@@ -71,8 +72,9 @@ def reconstruct(
     With an output folder, what an earlier run in it has done is used where it still holds.
 
     Args:
-        images: a folder, a glob pattern or a ``.txt`` list of files; or, without an output folder, whatever
-            ``load_images`` takes: arrays by name, an :class:`ImageSource`, an :class:`ImageSet`.
+        images: whatever ``load_images`` takes: a folder, a glob pattern or a ``.txt`` list of files; arrays by name; an
+            :class:`ImageSource`; an :class:`ImageSet`. No pixels are kept of those that are no files: what looks at
+            them again (``densify``, ``undistort``, ``validate``) wants them as files, and says so.
         output: folder of the results: new, empty, or of an earlier run. None: nothing is written.
         options: of all stages; see ``load_options``.
         record: write ``recording.rrd``, which replays the run.
@@ -84,8 +86,7 @@ def reconstruct(
         The largest model (as it is read back from ``sparse/0``, if it was written), and the report.
 
     Raises:
-        UsageError: the output folder holds something else, or another run is at work in it; or it was given with
-            photographs that are no files.
+        UsageError: the output folder holds something else, or another run is at work in it.
         InputError: the photographs do not exist or cannot be read.
         NoReconstructionError: they hold no reconstruction; the report is written.
         TooFewImagesError: fewer images than ``options.min_registered``; everything is written.
@@ -99,11 +100,6 @@ def reconstruct(
     if output is not None:
         from sfmapp.pipelines.sparse import reconstruct as pipeline
 
-        if not isinstance(images, str | os.PathLike):
-            raise UsageError(
-                "a workspace needs photographs that are files, to look at them again",
-                "leave the output folder out, and save what is returned: reconstruction.save(folder)",
-            )
         found, report = pipeline.reconstruct(images, output, options, events=events, record=record)
         return RunResult(Reconstruction.of(found), report)
     workers, seed_used = options.num_workers, options.seed
@@ -411,33 +407,45 @@ def undistort(
 
 
 def export(
-    source: FilePath | Reconstruction, target: str, path: FilePath, *, images: FilePath | None = None
+    source: FilePath | Reconstruction,
+    target: str,
+    path: FilePath,
+    *,
+    images: FilePath | None = None,
+    crs: str | None = None,
+    is_dense: bool = False,
 ) -> ExportReport:
     """Write a model in another program's format, read it back, and compare every reprojection.
 
     Args:
         source: the workspace of a run, of which the largest model is taken, the folder of a COLMAP model, or a
             reconstruction in memory.
-        target: ``colmap-bin``, ``colmap-text``, ``ply``, ``bundler`` or ``nerfstudio``.
+        target: ``colmap-bin``, ``colmap-text``, ``ply``, ``las``, ``laz``, ``bundler``, ``nerfstudio``, and for maps of
+            the photographs ``geojson`` or ``kml``.
         path: where to write: a folder for COLMAP's formats, a file or folder for the others.
         images: folder of the photographs, for formats that name them; None: as noted in the workspace, or where COLMAP
             has them.
+        crs: coordinate system of the points of PLY, LAS and LAZ, in metres, such as ``EPSG:25833``; None: of PLY the
+            frame of the model, of the others its UTM zone.
+        is_dense: of PLY, LAS and LAZ: the dense points of the run, not the sparse ones.
 
     Returns:
         ``files`` that were written, the worst differences, and notes for whoever uses them.
 
     Raises:
-        UsageError: an unknown format, a camera or name that it cannot hold, or the model's own folder as the target.
+        UsageError: an unknown format, a camera or name that it cannot hold, the model's own folder as the target, or a
+            coordinate system or dense points that the format or the model has no place for.
         NoReconstructionError: the workspace holds no model.
         InputError: there is no model, nothing can be written, or what was read back is not what was written.
 
     Example:
         >>> sfmapp.export("out/", "nerfstudio", "nerf/")
+        >>> sfmapp.export("out/", "laz", "site.laz", crs="EPSG:25833", is_dense=True)
     """
     from sfmapp.pipelines.export import export_model
 
     keypoints = source.keypoints if isinstance(source, Reconstruction) else None
-    return export_model(source, target, path, images=images, keypoints=keypoints)
+    return export_model(source, target, path, images=images, keypoints=keypoints, crs=crs, is_dense=is_dense)
 
 
 def _with(options: Options | None, threads: int | None, seed: int | None = None) -> Options:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sfmapp.cli.common import add_output_flags, print_json
 
-FORMATS = ("colmap-bin", "colmap-text", "ply", "bundler", "nerfstudio")
+FORMATS = ("colmap-bin", "colmap-text", "ply", "las", "laz", "bundler", "nerfstudio", "geojson", "kml")
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -19,6 +19,13 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("output", metavar="OUT", type=Path, help="folder of a run")
     parser.add_argument("--to", metavar="FORMAT", required=True, choices=FORMATS, help=", ".join(FORMATS))
     parser.add_argument("-o", dest="path", metavar="PATH", type=Path, required=True, help="file or folder to write")
+    parser.add_argument(
+        "--crs", metavar="EPSG:CODE",
+        help="coordinate system of ply, las and laz, in metres; default: of ply the frame of the model, of others UTM",
+    )  # fmt: skip
+    parser.add_argument(
+        "--dense", action="store_true", help="of ply, las and laz: the dense points, not the sparse ones"
+    )
     add_output_flags(parser)
     parser.set_defaults(run=_export)
 
@@ -26,11 +33,14 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _export(args: argparse.Namespace) -> int:
     from sfmapp.pipelines.export import export_model
 
-    result = export_model(args.output, args.to, args.path)
+    result = export_model(args.output, args.to, args.path, crs=args.crs, is_dense=args.dense)
     if args.json:
         print_json({"exit_code": 0, **result})
     else:
-        print(f"wrote {args.path} ({args.to}), read it back: worst reprojection difference {result.max_px:.2g} px")
+        worst = (
+            f"worst difference {result.max_px:.2g} px of a reprojection, {result.max_coordinate:.2g} of a coordinate"
+        )
+        print(f"wrote {args.path} ({args.to}), read it back: {worst}")
         for note in result.notes:
             print(f"note: {note}")
     return 0

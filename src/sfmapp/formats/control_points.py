@@ -38,7 +38,7 @@ class ControlPoints:
 
     Attributes:
         path: the file that they come from, crs_line: the number of the line that names the coordinate system.
-        crs: coordinate system, as of pyproj: ``EPSG:25832`` or ``+proj=...``; or ``local``.
+        crs: coordinate system as the file names it, such as ``EPSG:25832`` or ``WGS84 UTM 32N``; or ``local``.
         names: P names, unique.
         xyz: (P, 3) float64 in that system, easting (or longitude) first, heights in its unit.
         sigma_m: (P, 3) float64 standard deviations of the coordinates, metres.
@@ -143,21 +143,18 @@ def _read_odm(
 
 
 def _system(path: Path, line: int, text: str) -> str:
-    """The coordinate system that a header names, in pyproj's words."""
+    """The coordinate system that a header names."""
     words = text.split()
-    if text.lower() == LOCAL:
-        return LOCAL
-    if text.upper() in ("WGS84", "WGS 84"):
-        return "EPSG:4326"
-    utm = re.fullmatch(r"WGS ?84 UTM (\d{1,2}) ?([NS]?)", text.upper())
-    if utm and 1 <= int(utm[1]) <= 60:
-        return f"EPSG:{(32700 if utm[2] == 'S' else 32600) + int(utm[1])}"
-    if epsg := re.fullmatch(r"EPSG:\s*(\d{4,6}(?:\+\d{4,6})?)", text.upper()):
-        return f"EPSG:{epsg[1]}"
-    if text.startswith("+proj=") or "+proj=" in words[0]:
-        return text
-    expected = "a coordinate system in the first line" if len(words) > 4 else "a coordinate system"
-    raise InputError(f"{path}, line {line}: expected {expected}, found {text[:80]!r}", f"write one of {_EXAMPLE}")
+    try:
+        is_data = len(plain_numbers(words[:5])) == 5
+    except ValueError:
+        is_data = False
+    if is_data:
+        raise InputError(
+            f"{path}, line {line}: expected a coordinate system in the first line, found {text[:80]!r}",
+            f"write one of {_EXAMPLE}",
+        )
+    return LOCAL if text.lower() == LOCAL else text
 
 
 def _numbers(path: Path, line: int, fields: Sequence[str], names: Sequence[str]) -> list[float]:

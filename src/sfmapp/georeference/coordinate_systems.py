@@ -64,6 +64,16 @@ class CoordinateSystem:
                 "choose a projected system in metres, such as the UTM zone of the place",
             )
 
+    @property
+    def wkt(self) -> str:
+        """The system in the words of OGC 01-009, as LAS wants it; of a three-dimensional one the horizontal part."""
+        require("pyproj")
+        import pyproj
+
+        found = pyproj.CRS.from_user_input(self.code)
+        text: str = (found if found.is_compound else found.to_2d()).to_wkt("WKT1_GDAL")
+        return text
+
     def geodetic(self, coordinates: ArrayLike, place: str = "coordinates") -> Array:
         """Geodetic positions (N, 3) on WGS84, latitude, longitude and height, of coordinates (N, 3).
 
@@ -138,6 +148,12 @@ def coordinate_system(text: str, place: str) -> CoordinateSystem:
         height_unit=axes[2].unit_name if is_3d else "metre",
         heights="orthometric" if found.is_compound else "ellipsoidal" if is_3d else "unknown",
     )
+
+
+def utm_code(latitude_deg: float, longitude_deg: float) -> str:
+    """EPSG code of the UTM zone of a place; zones are six degrees wide everywhere, Norway and Svalbard included."""
+    zone = int((longitude_deg + 180.0) // 6.0) % 60 + 1
+    return f"EPSG:{(32700 if latitude_deg < 0 else 32600) + zone}"
 
 
 def _transformer(source: str, target: str, heights: HeightReference) -> Any:

@@ -14,6 +14,18 @@ from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model, write_model, write_model_text
 from sfmapp.formats.colmap_model import model_from_reconstruction, reconstruction_from_model
+from sfmapp.pipelines.export_world import (
+    NO_WORLD,
+    Cloud,
+    CloudCopy,
+    World,
+    copy_georeference,
+    dense_cloud,
+    export_cloud_las,
+    export_cloud_ply,
+    export_map,
+    world_of,
+)
 from sfmapp.pipelines.stored_pixels import check_pixels
 from sfmapp.report.model import ExportReport
 from sfmapp.scene.reconstruction import Reconstruction
@@ -25,23 +37,31 @@ _NOTICEABLE_PX = 0.1  # below the noise of a keypoint
 
 @dataclass(frozen=True)
 class _Source:
-    """The model to export: where it lies, if it does, and where its images do, if that is known."""
+    """The model to export: where it and its images lie, if they do, and what world it is in."""
 
     folder: Path | None
     model: Reconstruction
     keypoints: list[NDArray[np.float64]]
     image_folder: Path | None
     notes: tuple[str, ...] = ()
+    run: Path | None = None
+    world: World = NO_WORLD
+    cloud: Cloud | None = None
 
 
 @dataclass(frozen=True)
 class _Copy:
-    """What was read back: the model with our images and points in our order, and the files it came from."""
+    """What was read back: the model with our images and points in our order, and the files it came from.
+
+    Attributes:
+        max_coordinate: worst difference of what was written and is no point of the model, in its frame.
+    """
 
     model: Reconstruction
     files: list[Path]
     reader: str
     notes: tuple[str, ...] = ()
+    max_coordinate: float = 0.0
 
 
 def export_model(
@@ -51,8 +71,13 @@ def export_model(
     *,
     images: str | os.PathLike[str] | None = None,
     keypoints: list[NDArray[np.float64]] | None = None,
+    crs: str | None = None,
+    is_dense: bool = False,
 ) -> ExportReport:
     """Write a model in another format, read it back and re-project every inlier with what was read.
+
+    A model that lies in a frame of the world is written in that frame, metres about its origin, with
+    ``georeference.json`` beside it; LAS and LAZ, and PLY if asked to, in a coordinate system; maps in degrees.
 
     Args:
         output: the workspace of a run, of which the largest model is taken, the folder of a COLMAP model, or a
@@ -61,24 +86,39 @@ def export_model(
         path: where to write: a folder for COLMAP's formats, a file or folder for the others.
         images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
         keypoints: of a reconstruction in memory, (N, 2) pixels for each image; None: the tracked ones.
+        crs: coordinate system of the points of PLY, LAS and LAZ, such as ``EPSG:25833``, in metres; None: of PLY the
+            frame of the model, of LAS and LAZ the UTM zone.
+        is_dense: of PLY, LAS and LAZ: the dense points of the run.
 
     Returns:
         What was written, and how well it was read back.
 
     Raises:
-        UsageError: an unknown format, a camera or name that it cannot hold, or the model's own folder as the target.
+        UsageError: an unknown format, a camera or name that it cannot hold, the model's own folder as the target, or a
+            coordinate system or dense points that the format or the model has no place for.
         NoReconstructionError: the workspace holds no model.
         InputError: there is no model, nothing can be written, or what was read back is not what was written.
+        MissingPackageError: the format, or the coordinate system, needs a package that is not installed.
     """
     if target not in EXPORTS:
         raise UsageError(f"unknown export format {target!r}, expected one of {', '.join(EXPORTS)}")
+    if (crs is not None or is_dense) and target not in CLOUDS:
+        what = f"--crs {crs}" if crs is not None else "--dense"
+        raise UsageError(f"{what} is of no use for {target}", f"it is for {', '.join(CLOUDS)}")
     if isinstance(output, Reconstruction):
         source = _in_memory(output, keypoints)
     else:
         source = _source(Path(output))
+    source = replace(source, world=world_of(source.run, crs))
+    if is_dense:
+        if source.run is None:
+            raise UsageError("--dense: there is no run that could have dense points", "give the folder of a run")
+        source = replace(source, cloud=dense_cloud(source.run))
     if images is not None:
         source = replace(source, image_folder=Path(images))
     copy = EXPORTS[target](source, Path(path))
+    if source.run is not None and source.world.georeference is not None and target in WITH_FRAME:
+        copy = replace(copy, files=[*copy.files, copy_georeference(source.run, copy.files[0].parent)])
     ours, theirs = source.model, copy.model
     same_names = len(theirs.image_names) == len(ours.image_names) and all(
         theirs_name.endswith(name) for theirs_name, name in zip(theirs.image_names, ours.image_names, strict=True)
@@ -93,10 +133,10 @@ def export_model(
         files=[os.fspath(file) for file in copy.files],
         reader=copy.reader,
         num_images=len(ours.image_names),
-        num_points=int(ours.is_triangulated.sum()),
+        num_points=int(ours.is_triangulated.sum()) if source.cloud is None else len(source.cloud.xyz),
         num_observations=int(ours.obs_is_inlier.sum()),
         max_px=_worst_px(ours, theirs),
-        max_coordinate=float(np.abs(theirs.point_xyz - ours.point_xyz).max(initial=0.0)),
+        max_coordinate=max(float(np.abs(theirs.point_xyz - ours.point_xyz).max(initial=0.0)), copy.max_coordinate),
         notes=[*source.notes, *copy.notes],
     )
 
@@ -109,8 +149,9 @@ def _in_memory(model: Reconstruction, keypoints: list[NDArray[np.float64]] | Non
 
 
 def _source(output: Path) -> _Source:
-    folder, image_folder = output, None
+    folder, image_folder, run = output, None, None
     if (output / "run.json").is_file():
+        run = output
         manifest = read_manifest(output)
         check_pixels(output, manifest)
         image_folder = image_root(manifest)
@@ -124,7 +165,7 @@ def _source(output: Path) -> _Source:
     events, notes = Events(), list[str]()
     events.subscribe(lambda event: notes.append(event.message))
     model, keypoints = read_model(folder, events)
-    return _Source(folder, model, keypoints, image_folder, tuple(notes))
+    return _Source(folder, model, keypoints, image_folder, tuple(notes), run)
 
 
 def _worst_px(ours: Reconstruction, theirs: Reconstruction) -> float:
@@ -176,19 +217,33 @@ def _export_colmap(
     return export
 
 
-def _export_ply(source: _Source, path: Path) -> _Copy:
-    from sfmapp.formats.ply import write_ply
-    from sfmapp.formats.ply_reader import read_ply_geometry
+def _export_points(
+    write: Callable[[Cloud, Path, World], CloudCopy], ending: str, name: str
+) -> Callable[[_Source, Path], _Copy]:
+    def export(source: _Source, path: Path) -> _Copy:
+        points = np.flatnonzero(source.model.is_triangulated)
+        copy = source.model.copy()
+        sparse = Cloud(source.model.point_xyz[points], source.model.point_rgb[points])
+        cloud = sparse if source.cloud is None else source.cloud
+        back = write(cloud, _file_in(path, ending, name), source.world)
+        if not np.array_equal(back.rgb, cloud.rgb):
+            raise InputError(f"{back.file}: expected to read back the colours that were written, found others")
+        if source.cloud is None:
+            copy.point_xyz[points] = back.xyz
+        worst = float(np.abs(back.xyz - cloud.xyz).max(initial=0.0))
+        return _Copy(copy, [back.file], back.reader, back.notes, worst)
 
-    file = _file_in(path, ".ply", "points.ply")
-    points = np.flatnonzero(source.model.is_triangulated)
-    write_ply(file, source.model.point_xyz[points], source.model.point_rgb[points])
-    copy = source.model.copy()
-    back = read_ply_geometry(file)
-    if back.rgb is None or len(back.xyz) != len(points):
-        raise InputError(f"{file}: expected to read back {len(points)} coloured points, found {len(back.xyz)}")
-    copy.point_xyz[points], copy.point_rgb[points] = back.xyz, back.rgb
-    return _Copy(copy, [file], "sfmapp")
+    return export
+
+
+def _export_places(ending: str, name: str) -> Callable[[_Source, Path], _Copy]:
+    def export(source: _Source, path: Path) -> _Copy:
+        back = export_map(source.model, _file_in(path, ending, name), source.world)
+        centers = source.model.centers[source.model.is_registered]
+        worst = float(np.abs(back.xyz - centers).max(initial=0.0))
+        return _Copy(source.model.copy(), [back.file], back.reader, back.notes, worst)
+
+    return export
 
 
 def _export_bundler(source: _Source, path: Path) -> _Copy:
@@ -234,7 +289,13 @@ def _file_in(path: Path, ending: str, name: str) -> Path:
 EXPORTS: dict[str, Callable[[_Source, Path], _Copy]] = {
     "colmap-bin": _export_colmap(write_model, "bin"),
     "colmap-text": _export_colmap(write_model_text, "txt"),
-    "ply": _export_ply,
+    "ply": _export_points(export_cloud_ply, ".ply", "points.ply"),
+    "las": _export_points(export_cloud_las, ".las", "points.las"),
+    "laz": _export_points(export_cloud_las, ".laz", "points.laz"),
     "bundler": _export_bundler,
     "nerfstudio": _export_nerfstudio,
+    "geojson": _export_places(".geojson", "cameras.geojson"),
+    "kml": _export_places(".kml", "cameras.kml"),
 }
+# of points alone, sparse or dense; and those in the frame of the model, which is written beside them
+CLOUDS, WITH_FRAME = ("ply", "las", "laz"), ("colmap-bin", "colmap-text", "ply", "bundler", "nerfstudio")
