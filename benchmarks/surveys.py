@@ -170,8 +170,9 @@ def mapper_of(survey: Survey, pool: ThreadPoolExecutor) -> Mapper:
     model = survey.observed.copy()
     pairs = true_correspondences(SyntheticScene(survey.truth, model, np.zeros(model.tracks.num_observations, bool)))
     return Mapper(
-        model, pairs, MappingOptions(), AdjustOptions(), Events(), pool, list(model.cameras),
-        np.zeros(len(model.image_names), bool), {},
+        reconstruction=model, correspondences=pairs, options=MappingOptions(), adjust_options=AdjustOptions(),
+        events=Events(), pool=pool, prior_cameras=list(model.cameras),
+        locked=np.zeros(len(model.image_names), bool), attempts={},
     )  # fmt: skip
 
 

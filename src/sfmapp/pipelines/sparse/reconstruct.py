@@ -94,8 +94,8 @@ def reconstruct(
 def _run(run: Run) -> ReconstructionReport:
     """The job: photographs, what still holds of an earlier run, models, and the report of it all."""
     with run.stage("images"):
-        run.image_set, images = load_images(run.images, run.options.images, run.events, threads=run.threads)
-        run.image_set = with_positions(run.image_set, run.options.gps)
+        image_set, images = load_images(run.images, run.options.images, run.events, threads=run.threads)
+        run.image_set = with_positions(image_set, run.options.gps)
         run.stages = replace(run.stages, images=images)
     run.control = read_control(run, run.image_set)
     run.known = parse_known_lengths(run.options.units.known, run.image_set.names)
