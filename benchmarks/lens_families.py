@@ -26,8 +26,9 @@ from machine import RESULTS, ROOT, describe_machine
 from rendered_worlds.all_round import AllRoundRenderer
 from rendered_worlds.rendering import Optics, Renderer, World
 from rendered_worlds.worlds import gallery_world
-from sfmapp.camera.camera import Camera, CameraModel, pixels_to_rays
+from sfmapp.camera.camera import Camera, pixels_to_rays
 from sfmapp.camera.models import PARAM_NAMES, kind_of
+from sfmapp.camera.names import CameraModel
 from sfmapp.evaluation.measured import run_measured
 from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.formats.colmap import has_model, read_model

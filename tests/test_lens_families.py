@@ -13,7 +13,8 @@ from lens_families import LENSES, Lens, behind_percent, lens_error_px, poses_of,
 from rendered_worlds.all_round import AllRoundRenderer
 from rendered_worlds.rendering import Optics, Renderer
 from rendered_worlds.worlds import gallery_world
-from sfmapp.camera.camera import Camera, CameraModel, pixels_to_rays
+from sfmapp.camera.camera import Camera, pixels_to_rays
+from sfmapp.camera.names import CameraModel
 from sfmapp.cli.main import main
 from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.formats.colmap import read_model

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sfmapp.adjust.solver import AdjustOptions
-from sfmapp.camera.camera import Camera, CameraModel
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.names import CameraModel
 from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import Camera, CameraModel, bearings, project, simple_camera
+from sfmapp.camera.camera import Camera, bearings, project, simple_camera
+from sfmapp.camera.names import CameraModel
 from sfmapp.geometry import epipolar, five_point, p3p, resection, rigid3
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.two_view import Ransac, verify_pair

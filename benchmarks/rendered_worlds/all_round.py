@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rendered_worlds.rendering import Optics, Renderer, World
-from sfmapp.camera.camera import Camera, CameraModel, pixels_to_rays
+from sfmapp.camera.camera import Camera, pixels_to_rays
+from sfmapp.camera.names import CameraModel
 from sfmapp.geometry import rigid3
 
 Array = NDArray[np.float64]

@@ -162,7 +162,7 @@ def _polish(distance: Array, cosines: Array, sides: Array) -> bool:
         + abs(x * x + z * z - 2.0 * x * z * cosines[1] - sides[1])
         + abs(x * x + y * y - 2.0 * x * y * cosines[2] - sides[2])
     )
-    return min(x, y, z) > 0.0 and off < 1e-6 * (sides[0] + sides[1] + sides[2])
+    return bool(min(x, y, z) > 0.0 and off < 1e-6 * (sides[0] + sides[1] + sides[2]))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -19,13 +19,14 @@ from pathlib import Path, PurePosixPath
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.geometry.orientation import MIRRORED
-from sfmapp.images.cameras import Shot, group_cameras
+from sfmapp.images.cameras import Shot, group_cameras, tell_cameras
 from sfmapp.images.exif import ExifFacts, read_exif
 from sfmapp.images.headers import Header, UnusableImage, read_header
 from sfmapp.images.image_set import ImageOptions, ImageRecord, ImageSet
 from sfmapp.images.pixels import mask_fit
 from sfmapp.images.report import CameraPrior, ImageFacts, ImageProblem, ImagesReport
 from sfmapp.images.sources import Found, find_images, natural_key, printable
+from sfmapp.images.xmp import with_xmp
 from sfmapp.reporting import NamedReason
 
 __all__ = ["ImageOptions", "ImageRecord", "ImageSet", "load_images"]
@@ -86,7 +87,7 @@ def load_images(
     skipped.sort(key=lambda item: natural_key(item[0]))
     image_set = ImageSet(images, tuple(cameras), tuple(skipped), found.root)
     problems = [(scan.record.name, problem) for scan in scans for problem in scan.problems] + focal_problems
-    duplicates = _duplicates(images)
+    duplicates = same_pixels(images)
     if found.results:
         message = f"{_some(found.results)}: results of sfmapp, whose pictures are no photographs"
         events.decided(STAGE, message, names=found.results)
@@ -170,6 +171,7 @@ def _scan(path: Path, root: Path, mask_root: Path | None, options: ImageOptions)
     except OSError as error:
         return name, f"cannot be read: {error.strerror or error}"
     facts = read_exif(header.exif)
+    problems = list(facts.problems)
     record = ImageRecord(
         name=name,
         path=path,
@@ -179,15 +181,14 @@ def _scan(path: Path, root: Path, mask_root: Path | None, options: ImageOptions)
         digest=hashlib.blake2b(data, digest_size=16).hexdigest(),
         has_alpha=header.has_alpha and options.use_alpha,
         timestamp=facts.timestamp,
-        gps=facts.gps,
+        position=with_xmp(facts.position, header.xmp, problems),
         make=facts.make,
         model=facts.model,
     )
-    problems = facts.problems
     if mask_root is not None:
         record, mask_problem = _with_mask(record, mask_root)
         problems += mask_problem
-    return _Scan(record, header, facts, len(data), problems)
+    return _Scan(record, header, facts, len(data), tuple(problems))
 
 
 def _read_file(path: Path, max_bytes: int) -> bytes:
@@ -238,7 +239,8 @@ def _with_mask(record: ImageRecord, mask_root: Path) -> tuple[ImageRecord, tuple
 # ------------------------------------------------------------------------------------------------- telling about it
 
 
-def _duplicates(images: Iterable[ImageRecord]) -> list[list[str]]:
+def same_pixels(images: Iterable[ImageRecord]) -> list[list[str]]:
+    """Names of images that are the same, byte for byte, set by set."""
     by_digest: defaultdict[str, list[str]] = defaultdict(list)
     for image in images:
         by_digest[image.digest].append(image.name)
@@ -271,13 +273,7 @@ def _tell(
     without = [image.name for image in image_set.images if image.mask_path is None]
     if 0 < len(without) < len(image_set.images):
         events.decided(STAGE, f"{len(without)} of {len(image_set.images)} images have no mask", names=without)
-    for entry in entries:
-        # a panorama has no focal length: its size says all
-        known = entry.focal_reason
-        if entry.focal_sigma_px is not None:
-            known = f"focal length {entry.focal_px:.0f} +- {entry.focal_sigma_px:.0f} px ({known})"
-        size = f"{entry.width}x{entry.height}"
-        events.decided(STAGE, f"camera {entry.camera_idx}: {entry.num_images} images, {size}, {known}", **entry)
+    tell_cameras(entries, STAGE, events)
 
 
 def _tell_orientation(events: Events, records: list[ImageRecord]) -> None:

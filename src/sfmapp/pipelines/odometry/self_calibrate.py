@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import CameraModel
+from sfmapp.camera.names import CameraModel
 from sfmapp.contradictions import Contradiction, widened
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
@@ -126,7 +126,8 @@ class _Follower:
         if is_kept.sum() < _LEFT * self._count:
             return True
         shift = np.linalg.norm(self._now - self._start, axis=2)
-        return float(np.median(shift)) > _MOTION * small.shape[1]
+        moved: bool = float(np.median(shift)) > _MOTION * small.shape[1]
+        return moved
 
     @property
     def worth(self) -> float:
@@ -149,25 +150,21 @@ class _Follower:
 
 
 def _reconstruct(source: str, frames: list[Frame], options: Options, events: Events) -> RunResult:
-    """A reconstruction of the frames, in a folder that is gone afterwards.
+    """A reconstruction of the frames; its files are gone afterwards.
 
     Unless the user has named a camera model, two are tried: the default, and one with another term of distortion.
     """
-    import cv2
-
     model = options.images.camera_model
     models = (model, CameraModel.RADIAL) if model == ImageOptions().camera_model else (model,)
+    # names that differ in their numbers alone, as files of one camera have
+    views = {f"{number:03d}": frame.images[0] for number, frame in enumerate(frames)}
     runs: list[RunResult] = []
     with tempfile.TemporaryDirectory(prefix="sfmapp-calibration-") as name:
-        folder = Path(name) / "frames"
-        folder.mkdir()
-        for number, frame in enumerate(frames):
-            cv2.imwrite(str(folder / f"{number:03d}.png"), frame.images[0])
         for model in models:
             images = replace(options.images, camera=None, camera_model=model, camera_sharing="all", mask_path=None)
             wanted = replace(options, images=images, min_registered=None)
             try:
-                runs.append(reconstruct(folder, Path(name) / "out", wanted, events=events, record=False))
+                runs.append(reconstruct(views, Path(name) / "out", wanted, events=events, record=False))
             except NoReconstructionError as failure:
                 raise InputError(
                     f"{source}: no calibration from its first minute: {failure}",
