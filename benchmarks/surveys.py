@@ -274,8 +274,8 @@ def write_results(rows: list[dict[str, Any]]) -> None:
         "",
         "Share of truth (per cent) inside 95 % intervals, `benchmarks/surveys.py`: places of cameras, scale, rotation "
         "about three axes, mean place. Phone: sigmas of 3 and 6 m that nobody states; RTK: 2 and 3 cm, stated. Half a "
-        "pixel of noise, a wrong lens to begin with. Cameras of a survey share errors: a row of so few surveys wavers by "
-        "some 3 %, in its scale by 5 %.",
+        "pixel of noise, a wrong lens to begin with. Cameras of a survey share errors: a row of so few surveys wavers "
+        "by some 3 %, in its scale by 5 %.",
         "",
         "| survey | receiver | wrong | placed | horizontal | height | scale | rotation | mean place | wrong ones found "
         "| right ones lost |",
