@@ -77,7 +77,7 @@ class AdjustReport:
         initial_cost, final_cost: half the sum of the losses, priors and extra factors included; square pixels.
         num_images, num_cameras, num_points, num_observations: what took part; images and cameras only if they vary.
         solver: ``dense``, ``sparse`` or ``gtsam``.
-        time_s: wall clock.
+        wall_s: seconds that went by.
     """
 
     termination: str
@@ -90,4 +90,4 @@ class AdjustReport:
     num_points: int = 0
     num_observations: int = 0
     solver: str = "dense"
-    time_s: float = 0.0
+    wall_s: float = 0.0

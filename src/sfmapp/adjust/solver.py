@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -75,10 +76,10 @@ def adjust_bundle(
             outcome = _minimize(engine, options, pool.map if pool is not None else map, events)
         finally:
             write_back(problem, reconstruction)
-    return AdjustReport(
-        **outcome, num_images=int((problem.image_block >= 0).sum()), num_cameras=int((problem.camera_block >= 0).sum()),
+    return replace(
+        outcome, num_images=int((problem.image_block >= 0).sum()), num_cameras=int((problem.camera_block >= 0).sum()),
         num_points=len(problem.track_idx), num_observations=problem.num_observations, solver=engine.solver,
-        time_s=time.perf_counter() - start,
+        wall_s=time.perf_counter() - start,
     )  # fmt: skip
 
 
@@ -235,16 +236,16 @@ class Engine:
         self.rows, self.new_rows = self.new_rows, self.rows
 
 
-def _minimize(engine: Engine, options: AdjustOptions, run: Callable[..., Any], events: Events | None) -> dict[str, Any]:
-    """Levenberg-Marquardt with the damping rule of Nielsen (1999), as Ceres has it. Returns fields of the report."""
+def _minimize(engine: Engine, options: AdjustOptions, run: Callable[..., Any], events: Events | None) -> AdjustReport:
+    """Levenberg-Marquardt with the damping rule of Nielsen (1999), as Ceres has it; what took part is not told."""
     problem = engine.problem
     if problem.num_observations == 0 and engine.extras is None:
-        return {"termination": "nothing"}
+        return AdjustReport("nothing")
     damping, growth, tolerance = options.initial_damping, 2.0, options.relative_cost_tolerance
     first = cost = engine.linearize(damping, run)
     termination, iterations, rejected = "iterations", 0, 0
     if not np.isfinite(cost):
-        return {"termination": "stalled", "initial_cost": cost, "final_cost": cost}
+        return AdjustReport("stalled", initial_cost=cost, final_cost=cost)
     while iterations < options.max_iterations:
         if events is not None:
             events.raise_if_cancelled()
@@ -281,7 +282,4 @@ def _minimize(engine: Engine, options: AdjustOptions, run: Callable[..., Any], e
             termination = "stalled"
             break
         engine.linearize(damping, run)
-    return {
-        "termination": termination, "num_iterations": iterations, "num_rejected": rejected, "initial_cost": first,
-        "final_cost": cost,
-    }  # fmt: skip
+    return AdjustReport(termination, iterations, rejected, first, cost)
