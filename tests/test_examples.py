@@ -38,9 +38,9 @@ def workspace(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_there_are_ten_and_each_is_short_and_says_how_to_run_it() -> None:
+def test_there_are_eleven_and_each_is_short_and_says_how_to_run_it() -> None:
     paths = sorted(EXAMPLES.glob("*.py"))
-    assert [int(path.name[:2]) for path in paths] == list(range(1, 11))
+    assert [int(path.name[:2]) for path in paths] == list(range(1, 12))
     for path in paths:
         text = path.read_text(encoding="utf-8")
         assert len(text.splitlines()) < 40, path.name
@@ -112,6 +112,19 @@ def test_covariance(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None
     sigmas = [float(value) for value in re.findall(r"\]: \+- (\S+), seen", out)]
     assert len(sigmas) == 3
     assert sigmas == sorted(sigmas)
+
+
+def test_factor_graph(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(11, workspace, "0.35", "0.002")
+    out = capsys.readouterr().out
+    model = sfmapp.load(workspace / "metric" / "0")
+    found = np.linalg.norm(model.images[-1].cam_from_world.center - model.images[0].cam_from_world.center)
+    assert found == pytest.approx(0.35, abs=1e-4)
+    (residual,) = numbers(out, r"\d+ reprojection: normalised residual ([\d.]+)")
+    assert 0.7 < residual < 1.5
+    # the distance is known to 2 mm, and the places of cameras not far better
+    (sigma,) = numbers(out, r"is (\S+) m sure")
+    assert 1e-4 < sigma < 5e-3
 
 
 def test_undistorted_for_splatting(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,7 +2,7 @@
 
 Three levels. One call: ``reconstruct``, ``track_sequence``, ``densify``, ``make_mesh``, and what is done with their
 results. The stages, in memory: ``load_images``, ``extract_features``, ``match_images``, ``map_images``. The parts:
-``adjust_bundle``, ``triangulate``, ``estimate_pose``, ``verify_pair``.
+``adjust_bundle``, ``FactorGraph``, ``triangulate``, ``estimate_pose``, ``verify_pair``.
 
 Conventions: a pose ``cam_from_world`` is a quaternion x, y, z, w and a translation, x_cam = R x_world + t, with camera
 axes x right, y down, z forward. The centre of the top-left pixel is (0.5, 0.5). ``events``, ``threads`` and ``seed``
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from sfmapp.kernel_cache import provide_kernel_cache
 
 if TYPE_CHECKING:
+    from sfmapp.adjust.graph import FactorGraph
     from sfmapp.adjust.options import AdjustOptions
     from sfmapp.api.geometry import adjust_bundle, estimate_pose, triangulate, verify_pair
     from sfmapp.api.images import load_images
@@ -67,6 +68,7 @@ __all__ = [
     "DescriptorMetric",
     "Event",
     "Events",
+    "FactorGraph",
     "FeatureOptions",
     "Features",
     "ImageOptions",
@@ -119,6 +121,7 @@ _HOMES = {
     "DescriptorMetric": "scene.features",
     "Event": "events",
     "Events": "events",
+    "FactorGraph": "adjust.graph",
     "FeatureOptions": "features.extract",
     "Features": "scene.features",
     "ImageOptions": "images.image_set",

@@ -100,7 +100,7 @@ def _add_tracks(
     independent: Array, sums: Array,
 ) -> None:  # fmt: skip
     """See :func:`_scatter`. The point is eliminated with ``V^-1 = L^-T L^-1`` from the factor."""
-    point_ptr, obs_image, obs_xy, xyz, _ = points
+    point_ptr, obs_image, obs_xy, xyz, _, _ = points
     poses, image_mount, mounts, image_camera, image_block = images
     penalty, J = lenses.penalty, np.zeros(SCRATCH)
     scratch, pose, mount, lens = pointer(J), pointer(poses), pointer(mounts), pointer(lenses.canonical)

@@ -29,7 +29,7 @@ from sfmapp.adjust.kernels import (
     PointArrays,
     RobustLoss,
     linearize,
-    robust_weight,
+    weigh_observations,
 )
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import EVERYTHING, Problem, Varying
@@ -135,10 +135,13 @@ def estimate_covariances(
 def _variance(engine: Engine, num_unknowns: int) -> float:
     """Variance of a pixel coordinate from weighted residuals and degrees of freedom."""
     p = engine.problem
-    total = _weighted_squares(p.points, p.images(engine.rows), p.lenses, engine.loss)
+    total, _, _ = weigh_observations(p.points, p.images(engine.rows), p.lenses, engine.loss, 0.0)
     is_free = (p.pose_block >= 0).all() and not p.is_constant.any() and engine.extras is None
     free_gauge = 0 if not is_free else 6 if p.has_baseline else 7
-    dof = 2 * p.num_observations - 3 * int((~p.is_constant).sum()) - num_unknowns + free_gauge
+    num_eliminated = int((~p.is_constant & (p.point_block < 0)).sum())
+    if engine.extras is not None:
+        num_unknowns -= engine.extras.num_own_dims
+    dof = 2 * p.num_observations - 3 * num_eliminated - num_unknowns + free_gauge
     return total / dof if dof > 0 else np.inf
 
 
@@ -147,7 +150,7 @@ def reduced_matrix(engine: Engine) -> Array:
     blocks, tiles = engine.problem.num_blocks, engine.tiles[0]
     if engine.extras is not None:
         engine.extras.add_pairs(tiles, engine.tile_numbers(engine.extras.pairs))
-    if engine.solver == "dense":
+    if len(engine.hash_keys) == 0:
         keys = np.arange(blocks * blocks)
         numbers = keys
     else:
@@ -192,12 +195,28 @@ def gauge_of(problem: Problem, used: Mask, information: Array, scale: Array) -> 
     # on a long way a short baseline says so little of the scale that it would pass for nothing
     freedoms = 6 if problem.has_baseline else 7
     basis, constraint = wide[:freedoms, used], constraint[:freedoms, used]
+    _add_point_motion(problem, used, basis)
     norm = np.sqrt((basis**2 * scale).sum(1))
     norm[norm == 0] = 1.0
     basis, constraint = basis / norm[:, None], constraint / norm[:, None]
     values, vectors = np.linalg.eigh(basis @ information @ basis.T)
     open_ = vectors[:, values < _NULL].T
     return open_ @ basis, open_ @ constraint
+
+
+def _add_point_motion(problem: Problem, used: Mask, basis: Array) -> None:
+    """Add to a basis (k, N) of similarities, in place, what they do to points that are blocks."""
+    kept = np.flatnonzero(problem.point_block >= 0)
+    if not len(kept):
+        return
+    centers = rigid3.center(problem.poses[problem.pose_block >= 0])
+    mean = centers.mean(0)
+    size = max(float(np.sqrt(((centers - mean) ** 2).sum(1).mean())), 1e-12)
+    away = problem.xyz[kept] - mean
+    motion = np.concatenate([rigid3.skew(away), np.broadcast_to(size * np.eye(3), (len(kept), 3, 3)), away[:, None]], 1)
+    column = np.cumsum(used) - 1
+    for n, p in enumerate(kept):
+        basis[:, column[problem.point_block[p] * 8 + np.arange(3)]] = motion[n, : len(basis)]
 
 
 def constrained_inverse(information: Array, scale: Array, basis: Array, constraint: Array) -> Array | None:
@@ -216,6 +235,31 @@ def constrained_inverse(information: Array, scale: Array, basis: Array, constrai
     except np.linalg.LinAlgError:
         return None
     return inverse * np.outer(root, root)
+
+
+def constrained_columns(
+    information: Array, scale: Array, basis: Array, constraint: Array, wanted: Array
+) -> Array | None:
+    """Product of the matrix of :func:`constrained_inverse` with wanted (N, M), by one Cholesky factor."""
+    from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+    root = 1.0 / np.sqrt(scale)
+    held = constraint * root
+    held /= np.linalg.norm(held, axis=1, keepdims=True) + 1e-300
+    matrix = information * np.outer(root, root) + held.T @ held
+    right = wanted * root[:, None]
+    try:
+        factor = cho_factor(matrix, lower=True, overwrite_a=True)
+        if len(basis) == 0:
+            return np.asarray(cho_solve(factor, right) * root[:, None], np.float64)
+        # P A^-1 P^T with P = 1 - open (held open)^-1 held
+        open_ = (basis / root).T
+        core = np.linalg.inv(held @ open_)
+        found = cho_solve(factor, right - held.T @ (core.T @ (open_.T @ right)))
+        found -= open_ @ (core @ (held @ found))
+    except LinAlgError:
+        return None
+    return np.asarray(found * root[:, None], np.float64)
 
 
 def _collect(
@@ -240,6 +284,9 @@ def _collect(
             p.points, p.images(engine.rows), p.lenses, p.block_dim, engine.loss, engine.factor, covariance, variance,
             points,
         )  # fmt: skip
+    for n in np.flatnonzero(p.point_block >= 0):
+        at = p.point_block[n] * 8 + np.arange(3)
+        points[n] = covariance[np.ix_(at, at)]
     return Covariances(
         image_idx=image_idx,
         poses=poses,
@@ -347,32 +394,12 @@ def _apply_similarity(model: Reconstruction, poses: Array, move: Array) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _weighted_squares(points: PointArrays, images: ImageArrays, lenses: LensArrays, loss: RobustLoss) -> float:
-    """Sum of rho'(s) s over all observations."""
-    point_ptr, obs_image, obs_xy, xyz, _ = points
-    poses, image_mount, mounts, image_camera, _ = images
-    penalty, J = lenses.penalty, np.zeros(SCRATCH)
-    scratch, pose, mount, lens = pointer(J), pointer(poses), pointer(mounts), pointer(lenses.canonical)
-    total = 0.0
-    for p in range(xyz.shape[0]):
-        for o in range(point_ptr[p], point_ptr[p + 1]):
-            i = obs_image[o]
-            c = image_camera[i]
-            s = linearize(
-                offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, ROW * c),
-                (xyz[p, 0], xyz[p, 1], xyz[p, 2]), (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[c], False, scratch,
-            )  # fmt: skip
-            total += robust_weight(loss, s) * s
-    return total
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _point_covariances(
     points: PointArrays, images: ImageArrays, lenses: LensArrays, block_dim: NDArray[np.int64], loss: RobustLoss,
     factor: Array, covariance: Array, variance: float, out: Array,
 ) -> None:  # fmt: skip
     """``V^-1 (variance V + W^T C W) V^-1`` of each point, with V^-1 = L^-T L^-1 from the factor; C in full blocks."""
-    point_ptr, obs_image, obs_xy, xyz, is_constant = points
+    point_ptr, obs_image, obs_xy, xyz, is_constant, _ = points
     poses, image_mount, mounts, image_camera, image_block = images
     canonical, penalty, camera_block, second_block, free_ptr, free_slot, free_column = lenses
     J = np.zeros(SCRATCH)

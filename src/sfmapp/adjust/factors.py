@@ -1,4 +1,4 @@
-"""Where gtsam comes in: factors of any kind over poses and intrinsics, and the sparse solution of large systems.
+"""Where gtsam comes in: factors of any kind beside the reprojections, and the elimination of sparse systems.
 
 gtsam's poses are world_from_cam and move on the right, ours are cam_from_world and move on the left: to first order the
 one tangent (rotation, translation) is the negative of the other.
@@ -6,17 +6,23 @@ one tangent (rotation, translation) is the negative of the other.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import K, X
+from gtsam.symbol_shorthand import K, L, X
 from numpy.typing import NDArray
 
-from sfmapp.adjust.problem import Problem, free_values
+from sfmapp.adjust.options import REJECTED_WEIGHT, FactorReport
+from sfmapp.adjust.problem import Mentioned, Problem, free_values
 from sfmapp.geometry import rigid3
 
 Array = NDArray[np.float64]
+Places = NDArray[np.int64]
+
+# The most rows that a block has.
+_MAX_DIM = 8
 
 
 def gtsam_pose(cam_from_world: Array) -> Any:
@@ -26,49 +32,100 @@ def gtsam_pose(cam_from_world: Array) -> Any:
 
 
 class ExtraFactors:
-    """A gtsam.NonlinearFactorGraph over ``X(i)`` and ``K(c)``, linearised by gtsam into the reduced system.
+    """A gtsam.NonlinearFactorGraph beside the reprojections, linearised by gtsam into the reduced system.
+
+    Its keys are ``X(i)``, Pose3 world_from_cam of image i; ``K(c)``, Vector of the free parameters of camera c in the
+    order of ``Camera.params``; ``L(t)``, Point3 of track t; and whatever ``values`` holds. ``points`` are further
+    tracks that are not to be eliminated.
 
     Attributes:
-        images, cameras: positions of all that the graph mentions.
+        mentioned: what of the reconstruction takes part for that reason, and the dimensions of its own variables.
+        values: of its own variables, at the state of the problem; new_values: after the step that is tried.
+        known: the factors that count. Those on unregistered images, points without a place and constant cameras do not.
+        num_left_out: how many do not.
         weight: factor on cost and information of the whole graph.
     """
 
     weight = 1.0
 
-    def __init__(self, graph: Any) -> None:
+    def __init__(self, graph: Any, values: Any = None, points: Sequence[int] = ()) -> None:
         self._graph = graph
-        symbols = [gtsam.Symbol(key) for key in sorted(graph.keyVector())]
-        kinds = {chr(s.chr()) for s in symbols}
-        if not kinds <= {"x", "k"}:
-            raise ValueError(f"extra factors may be over X(i) and K(c) only, found {sorted(kinds - {'x', 'k'})}")
-        self.images = [s.index() for s in symbols if chr(s.chr()) == "x"]
-        self.cameras = [s.index() for s in symbols if chr(s.chr()) == "k"]
+        self.values = self.new_values = gtsam.Values() if values is None else values
+        own = set(self.values.keys())
+        indices: dict[str, list[int]] = {"x": [], "k": [], "l": []}
+        for key in sorted(set(graph.keyVector()) - own):
+            symbol = gtsam.Symbol(key)
+            if chr(symbol.chr()) not in indices:
+                raise ValueError(
+                    "extra factors may be over X(i), K(c), L(t) and variables that have a value, found "
+                    f"{gtsam.DefaultKeyFormatter(key)}"
+                )
+            indices[chr(symbol.chr())].append(symbol.index())
+        self._check_noise()
+        self._own = sorted(own & set(graph.keyVector()))
+        dims = [self._dim(key) for key in self._own]
+        self.mentioned = Mentioned(indices["x"], indices["k"], sorted({*indices["l"], *points}), dims)
+
+    def _check_noise(self) -> None:
+        for n in range(self._graph.size()):
+            noise = getattr(self._graph.at(n), "noiseModel", lambda: None)()
+            if noise is not None and noise.isConstrained():
+                raise ValueError(
+                    f"extra factor {n} ({type(self._graph.at(n)).__name__}) is a hard constraint, which least squares "
+                    "cannot hold: give it a small sigma, or hold its variables constant"
+                )
+
+    def _dim(self, key: int) -> int:
+        dim = len(self._zero(key))
+        if dim > _MAX_DIM:
+            raise ValueError(
+                f"variables may have up to {_MAX_DIM} dimensions, found {dim} of {gtsam.DefaultKeyFormatter(key)}"
+            )
+        return dim
 
     def attach(self, problem: Problem) -> None:
-        """Fix the places of the unknowns. Factors on unregistered images and constant cameras drop out."""
+        """Fix the places of the unknowns."""
         self._problem = problem
-        self._place: dict[int, NDArray[np.int64]] = {}
+        self._place: dict[int, Places] = {}
         self._sign: dict[int, float] = {}
-        self._poses, self._cameras = [], []
-        for n in np.flatnonzero(np.isin(problem.image_idx, self.images)).tolist():
+        self._poses: list[tuple[int, int]] = []
+        self._cameras: list[tuple[int, int]] = []
+        self._points: list[tuple[int, int]] = []
+        self._place_images()
+        for c, camera in enumerate(problem.camera_idx.tolist()):
+            if camera in set(self.mentioned.cameras) and problem.camera_block[c] >= 0:
+                columns = np.unique(problem.free.column[problem.free.ptr[c] : problem.free.ptr[c + 1]])
+                self._put(K(int(camera)), problem.camera_block[c] * 8 + columns)
+                self._cameras.append((K(int(camera)), c))
+        for n in np.flatnonzero(np.isin(problem.track_idx, self.mentioned.points)).tolist():
+            key, block = L(int(problem.track_idx[n])), problem.point_block[n]
+            self._put(key, block * 8 + np.arange(3) if block >= 0 else np.full(3, -1))
+            self._points.append((key, n))
+        first = problem.num_blocks - len(self._own)
+        for n, (key, dim) in enumerate(zip(self._own, self.mentioned.dims, strict=True)):
+            self._put(key, (first + n) * 8 + np.arange(dim))
+        self._choose_known()
+
+    def _put(self, key: int, place: Places, sign: float = 1.0) -> None:
+        self._place[key], self._sign[key] = place.astype(np.int64), sign
+
+    def _place_images(self) -> None:
+        problem = self._problem
+        for n in np.flatnonzero(np.isin(problem.image_idx, self.mentioned.images)).tolist():
             key, block = X(int(problem.image_idx[n])), problem.image_block[n]
             if problem.image_mount[n] >= 0:
                 raise ValueError(
                     f"extra factors on a rig must name the image of sensor 0, found X({problem.image_idx[n]})"
                 )
-            self._place[key] = block * 8 + np.arange(6) if block >= 0 else np.full(6, -1)
+            self._put(key, block * 8 + np.arange(6) if block >= 0 else np.full(6, -1), -1.0)
             self._poses.append((key, int(problem.image_pose[n])))
-            self._sign[key] = -1.0
-        for c, camera in enumerate(problem.camera_idx.tolist()):
-            if camera in set(self.cameras) and problem.camera_block[c] >= 0:
-                columns = np.unique(problem.free.column[problem.free.ptr[c] : problem.free.ptr[c + 1]])
-                self._place[K(int(camera))] = problem.camera_block[c] * 8 + columns
-                self._cameras.append((K(int(camera)), c))
-                self._sign[K(int(camera))] = 1.0
+
+    def _choose_known(self) -> None:
         self.known = gtsam.NonlinearFactorGraph()
         for n in range(self._graph.size()):
             if set(self._graph.at(n).keys()) <= self._place.keys():
                 self.known.push_back(self._graph.at(n))
+        self.num_left_out = self._graph.size() - self.known.size()
         places = [self._indices(self.known.at(n).keys()) for n in range(self.known.size())]
         pairs = [np.stack(np.meshgrid(p, p, indexing="ij"), -1).reshape(-1, 2) for p in places]
         self._row, self._column = np.concatenate([*pairs, np.zeros((0, 2), np.int64)]).T
@@ -76,33 +133,62 @@ class ExtraFactors:
         # tiles are kept for a <= b only
         self._kept = (self._row >= 0) & (self._column >= 0) & (self._row // 8 <= self._column // 8)
         self._row, self._column = self._row[self._kept], self._column[self._kept]
+        self.pairs: Places = np.unique(self._row // 8 * self._problem.num_blocks + self._column // 8)
+        """Keys a B + b of the tiles that the factors touch."""
 
     @property
-    def pairs(self) -> NDArray[np.int64]:
-        """Keys a B + b of the tiles that the factors touch."""
-        return np.unique(self._row // 8 * self._problem.num_blocks + self._column // 8)
+    def num_own_dims(self) -> int:
+        """Unknowns that no reprojection knows."""
+        return sum(self.mentioned.dims)
 
-    def _indices(self, keys: Any) -> NDArray[np.int64]:
+    def block_keys(self) -> list[int]:
+        """gtsam's keys of the blocks of the variables of its own."""
+        return list(self._own)
+
+    def _indices(self, keys: Any) -> Places:
         return np.concatenate([self._place[key] for key in keys]).astype(np.int64)
 
-    def _values(self, poses: Array, canonical: Array) -> Any:
-        values = gtsam.Values()
+    def _values(self, poses: Array, canonical: Array, xyz: Array, own: Any) -> Any:
+        values = gtsam.Values(own)
         for key, n in self._poses:
             values.insert(key, gtsam_pose(poses[n]))
         for key, c in self._cameras:
             values.insert(key, free_values(self._problem, canonical, c))
+        for key, n in self._points:
+            values.insert(key, xyz[n])
         return values
 
-    def cost(self, poses: Array, canonical: Array) -> float:
+    def retract(self, step: Array) -> None:
+        """Fill ``new_values`` after a step (B * 8,) of the blocks."""
+        if self._own:
+            delta = gtsam.VectorValues()
+            for key in self.values.keys():  # noqa: SIM118
+                delta.insert(key, step[self._place[key]] if key in self._place else self._zero(key))
+            self.new_values = self.values.retract(delta)
+
+    def _zero(self, key: int) -> Array:
+        zero: Array = self.values.zeroVectors().at(key)
+        return zero
+
+    def accept(self) -> None:
+        """Make the values that were tried the current ones."""
+        self.values, self.new_values = self.new_values, self.values
+
+    def cost(self, poses: Array, canonical: Array, xyz: Array, own: Any) -> float:
         """gtsam's error, half the squared whitened residuals; infinite where a factor cannot be evaluated."""
         try:
-            return self.weight * float(self.known.error(self._values(poses, canonical)))
+            return self.weight * float(self.known.error(self._values(poses, canonical, xyz, own)))
         except RuntimeError:
             return float("inf")
 
+    def current(self) -> Any:
+        """gtsam.Values of all that the factors are over, at the state of the problem."""
+        p = self._problem
+        return self._values(p.poses, p.canonical, p.xyz, self.values)
+
     def linearize(self, own: Array, gradient: Array) -> None:
         """Linearise at the problem's state; adds what concerns single blocks to own (B * 64,) and gradient (B * 8,)."""
-        linear = self.known.linearize(self._values(self._problem.poses, self._problem.canonical))
+        linear = self.known.linearize(self.current())
         matrices, vectors = [], []
         for n in range(linear.size()):
             factor = linear.at(n)
@@ -124,40 +210,81 @@ class ExtraFactors:
         tile = tile_of[np.searchsorted(self.pairs, keys)]
         np.add.at(tiles, tile * 64 + self._row[other] % 8 * 8 + self._column[other] % 8, self._value[other])
 
+    def reports(self) -> list[FactorReport]:
+        """What the factors come to at the state of the problem, by kind."""
+        values = self.current()
+        found: dict[str, list[tuple[int, float, float, bool]]] = {}
+        for n in range(self.known.size()):
+            factor = self.known.at(n)
+            error, dim = factor.error(values), factor.dim()
+            square, weight = 2 * error, 1.0
+            noise = factor.noiseModel() if hasattr(factor, "noiseModel") else None
+            if isinstance(noise, gtsam.noiseModel.Robust):
+                distance = noise.noise().mahalanobisDistance(factor.unwhitenedError(values))
+                weight = noise.robust().weight(distance)
+                square = weight * distance**2
+            name = type(factor).__name__
+            found.setdefault(name, []).append((dim, error, square, weight < REJECTED_WEIGHT))
+        out = []
+        for name, rows in sorted(found.items()):
+            dims, errors, squares, rejected = (np.array(column) for column in zip(*rows, strict=True))
+            out.append(
+                FactorReport(
+                    kind=name, num_factors=len(rows), num_rows=int(dims.sum()), cost=float(errors.sum()),
+                    normalized_residual=float(np.sqrt(squares[~rejected].sum() / max(1, dims[~rejected].sum()))),
+                    num_rejected=int(rejected.sum()),
+                )
+            )  # fmt: skip
+        return out
+
 
 class SparseSystem:
-    """The reduced system as gtsam Hessian factors, one per tile (keys a B + b in order), eliminated in METIS order."""
+    """The reduced system as gtsam Hessian factors, one per pair of blocks that meet (keys a B + b in order, and numbers
+    of their tiles), eliminated by gtsam in COLAMD order: an approximate minimum degree. METIS takes as long, and fails
+    where a block meets no other. Unknowns are scaled to a unit diagonal, as gtsam compares pivots of different units.
+    """
 
-    def __init__(self, problem: Problem, keys: NDArray[np.int64]) -> None:
+    def __init__(self, problem: Problem, keys: Places, numbers: Places, own_keys: list[int]) -> None:
         blocks, first = problem.num_blocks, problem.num_pose_blocks
         images = problem.image_idx[problem.pose_images[problem.pose_block >= 0]]
         own = np.flatnonzero(problem.camera_block >= first)
         self._keys = [X(int(i)) for i in images]
         for c in own:
             number = int(problem.camera_idx[c])
-            self._keys += [K(number), *([gtsam.symbol("l", number)] if problem.second_block[c] >= 0 else [])]
-        self._pairs = list(zip(*(part.tolist() for part in np.divmod(keys, blocks)), range(len(keys)), strict=True))
+            self._keys += [K(number), *([gtsam.symbol("j", number)] if problem.second_block[c] >= 0 else [])]
+        self._keys += [L(int(t)) for t in problem.track_idx[problem.point_block >= 0]]
+        self._keys += own_keys
+        self._first, self._second = np.divmod(keys, blocks)
+        self._numbers, self._diagonal = numbers, numbers[self._first == self._second]
+        self._pairs = list(zip(self._first.tolist(), self._second.tolist(), strict=True))
         self._dims = problem.block_dim.tolist()
         self._ordering: Any = None
 
     def solve(self, tiles: Array, rhs: Array) -> Array | None:
-        """Solution (B * 8,) of the damped system in tiles (N, 8, 8), None where it is not positive definite."""
+        """Solution (B * 8,) of the damped system in tiles (N * 64,), None where it is not positive definite."""
         graph, factor, keys, dims = gtsam.GaussianFactorGraph(), gtsam.HessianFactor, self._keys, self._dims
-        right = rhs.reshape(-1, 8)
+        tiles = tiles.reshape(-1, 8, 8)
+        diagonal = tiles[self._diagonal][:, np.arange(8), np.arange(8)]
+        if not (diagonal > 0.0).all():
+            return None
+        root = 1.0 / np.sqrt(diagonal)
+        right = rhs.reshape(-1, 8) * root
+        scaled = tiles[self._numbers] * root[self._first][:, :, None] * root[self._second][:, None, :]
         nothing = [(np.zeros((d, d)), np.zeros(d)) for d in range(9)]
-        for a, b, tile in self._pairs:
+        for n, (a, b) in enumerate(self._pairs):
             p, q = dims[a], dims[b]
+            block = scaled[n, :p, :q]
             if a == b:
-                graph.push_back(factor(keys[a], tiles[tile, :p, :p], right[a, :p], 0.0))
+                graph.push_back(factor(keys[a], block, right[a, :p], 0.0))
             else:
                 (zero_a, none_a), (zero_b, none_b) = nothing[p], nothing[q]
-                graph.push_back(factor(keys[a], keys[b], zero_a, tiles[tile, :p, :q], none_a, zero_b, none_b, 0.0))
+                graph.push_back(factor(keys[a], keys[b], zero_a, block, none_a, zero_b, none_b, 0.0))
         if self._ordering is None:
-            self._ordering = gtsam.Ordering.MetisGaussianFactorGraph(graph)
+            self._ordering = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
         try:
             solution = graph.optimize(self._ordering)
         except RuntimeError:  # indeterminate: the caller raises the damping
             return None
         step = np.zeros((len(dims), 8))
         step[np.arange(8) < np.array(dims)[:, None]] = solution.vector(keys)
-        return step.ravel()
+        return (step * root).ravel()

@@ -3,9 +3,9 @@
 Layout. An unknown block is a row of up to eight numbers: the six of a pose (rotation, then translation, of
 ``x_cam <- exp(w) x_cam + v``), followed by at most two intrinsics where a camera takes part through one image only; or
 the free intrinsics of a camera that several images share; those beyond the eighth are a second block right behind it.
-Blocks meet in 8 x 8 tiles. Points are never blocks: they are eliminated one by one (Triggs et al., "Bundle Adjustment:
-A Modern Synthesis", 1999, section 6.1) from the factor ``L L^T`` of their damped 3 x 3 normal matrix: with Z = W L^-T
-the reduced system loses Z_a Z_b^T per pair of blocks.
+Blocks meet in 8 x 8 tiles. Points are eliminated one by one (Triggs et al., "Bundle Adjustment: A Modern Synthesis",
+1999, section 6.1) from the factor ``L L^T`` of their damped 3 x 3 normal matrix: with Z = W L^-T the reduced system
+loses Z_a Z_b^T per pair of blocks. Those that other factors mention are blocks of three instead, behind all others.
 
 A pose may be that of a rig which several images share: each has its own row of what the rig's pose and the constant
 mounting of its camera make together, and the derivatives are taken to the rig's frame.
@@ -68,6 +68,7 @@ class PointArrays(NamedTuple):
     Attributes:
         ptr: (P + 1,) int64. image: (O,) int32 positions among the images. xy: (O, 2) pixels.
         xyz: (P, 3). is_constant: (P,) bool, points that do not move.
+        block: (P,) int32 the block of a point that is not eliminated, -1 for all others.
     """
 
     ptr: Ints
@@ -75,6 +76,7 @@ class PointArrays(NamedTuple):
     xy: Array
     xyz: Array
     is_constant: NDArray[np.bool_]
+    block: Int32s
 
 
 class ImageArrays(NamedTuple):
@@ -407,6 +409,25 @@ def _factor_point(normal: Pointer, damping: float, factor: Pointer, small: Point
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _keep_point(
+    block: int, num_blocks: int, normal: Pointer, W: Pointer, met: Pointer, count: int, sums: Sums, blocks: BlockArrays
+) -> None:
+    """Add a point that is a block of its own: its normal equations, and W (count, 3, 8) of the blocks that it met."""
+    tile, own, gradient = pointer(sums.tiles), sums.own, sums.gradient
+    for j in range(3):
+        gradient[block * 8 + j] += normal[8 * j + 3]
+        for k in range(3):
+            own[block * 64 + 8 * j + k] += normal[8 * min(j, k) + max(j, k)]
+    for n in range(count):
+        key = met[n] * num_blocks + block
+        if blocks.hash_keys.shape[0] > 0:
+            key = find_slot(blocks.hash_keys, blocks.hash_values, key)
+        for j in range(8):
+            for k in range(3):
+                tile[key * 64 + 8 * j + k] += W[n * 24 + 8 * k + j]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def reduce_points(
     part: tuple[int, int], points: PointArrays, images: ImageArrays, lenses: LensArrays, blocks: BlockArrays,
     loss: RobustLoss, damping: float, sums: Sums, point_factor: Array, scratch: Scratch,
@@ -416,9 +437,9 @@ def reduce_points(
     Args:
         sums: filled.
         point_factor: (P, 12) out: L^-1 (l00 l10 l11 l20 l21 l22), gradient, damped diagonal increment; all zero for a
-            point that has no depth at all.
+            point that has no depth at all, or is a block.
     """
-    point_ptr, obs_image, obs_xy, xyz, is_constant = points
+    point_ptr, obs_image, obs_xy, xyz, is_constant, point_block = points
     poses, image_mount, mounts, image_camera, image_block = images
     intrinsics, penalty, camera_block, _, free_ptr, free_slot, free_column = lenses
     block_dim, hash_keys, hash_values = blocks
@@ -481,6 +502,9 @@ def reduce_points(
                     if moves:
                         count = _place(W, where, mark, met, p, second, count)
                         add2(W, where[second] * 24, J, POINT, J, _SECOND, 3)
+        if point_block[p] >= 0:
+            _keep_point(point_block[p], num_blocks, normal, W, met, count, sums, blocks)
+            continue
         if not moves or not _factor_point(normal, damping, offset(pointer(point_factor), 12 * p), small):
             continue
         for n in range(count):
@@ -511,7 +535,7 @@ def substitute_points(
         outcome: (2,) out: cost, and the points' share of the predicted decrease.
         scratch: (SCRATCH,) at least.
     """
-    point_ptr, obs_image, obs_xy, xyz, is_constant = points
+    point_ptr, obs_image, obs_xy, xyz, is_constant, point_block = points
     poses, image_mount, mounts, image_camera, image_block = images
     intrinsics, penalty, camera_block, _, free_ptr, free_slot, free_column = lenses
     new_poses, new_intrinsics, new_xyz = new
@@ -562,6 +586,11 @@ def substitute_points(
             x0 += s0
             x1 += s1
             x2 += s2
+        elif point_block[p] >= 0:
+            first = point_block[p] * 8
+            x0 += step[first]
+            x1 += step[first + 1]
+            x2 += step[first + 2]
         new_xyz[p, 0], new_xyz[p, 1], new_xyz[p, 2] = x0, x1, x2
         for o in range(point_ptr[p], point_ptr[p + 1]):
             i = obs_image[o]
@@ -572,6 +601,35 @@ def substitute_points(
             )  # fmt: skip
             cost, product = add_loss(loss, s2, cost, product)
     outcome[0], outcome[1] = total_loss(loss, cost, product), 0.5 * decrease
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def weigh_observations(
+    points: PointArrays, images: ImageArrays, lenses: LensArrays, loss: RobustLoss, least: float
+) -> tuple[float, int, float]:
+    """Of all observations the sum of rho'(s) s where the weight rho'(s) is not below the least, how many it is below,
+    and the cost.
+    """
+    point_ptr, obs_image, obs_xy, xyz, _, _ = points
+    poses, image_mount, mounts, image_camera, _ = images
+    penalty, J = lenses.penalty, np.zeros(SCRATCH)
+    scratch, pose, mount, lens = pointer(J), pointer(poses), pointer(mounts), pointer(lenses.canonical)
+    total, below, cost, product = 0.0, 0, 0.0, 1.0
+    for p in range(xyz.shape[0]):
+        for o in range(point_ptr[p], point_ptr[p + 1]):
+            i = obs_image[o]
+            c = image_camera[i]
+            s = linearize(
+                offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, ROW * c),
+                (xyz[p, 0], xyz[p, 1], xyz[p, 2]), (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[c], False, scratch,
+            )  # fmt: skip
+            weight = robust_weight(loss, s)
+            if weight < least:
+                below += 1
+            else:
+                total += weight * s
+            cost, product = add_loss(loss, s, cost, product)
+    return total, below, total_loss(loss, cost, product)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

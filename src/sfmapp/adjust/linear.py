@@ -1,6 +1,8 @@
-"""The reduced system, once the points are gone: dense tiles here, sparse in gtsam."""
+"""The reduced system, once the points are gone: its tiles, and their Cholesky factor."""
 
 from __future__ import annotations
+
+from typing import Literal, Protocol
 
 import numba
 import numpy as np
@@ -10,6 +12,27 @@ from sfmapp.adjust.kernels import BlockArrays, ImageArrays, LensArrays, PointArr
 from sfmapp.simd.f64x8 import assign8, subtract8
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+SolverName = Literal["tiles", "gtsam", "lapack"]
+
+# Measured by benchmarks/reduced_systems.py; fill is the share of pairs of blocks that meet. A closing adjustment goes
+# to gtsam up to the fill at which LAPACK begins to be quicker, of whatever size. The quick rounds keep the tiles up to
+# the size at which nothing beats them by much, and beyond that in the range of fill in which they are quickest.
+_GTSAM_FILL, _FEW_BLOCKS, _TILES_FILL = 0.15, 160, (0.3, 0.5)
+# What rounding leaves of a zero pivot, against the diagonal before.
+_NO_PIVOT = 1e-14
+
+
+def choose_solver(num_blocks: int, fill: float, *, is_closing: bool) -> SolverName:
+    """What solves a reduced system best."""
+    if is_closing:
+        return "gtsam" if fill <= _GTSAM_FILL else "lapack"
+    if num_blocks <= _FEW_BLOCKS:
+        return "tiles"
+    if fill <= _TILES_FILL[0]:
+        return "gtsam"
+    return "tiles" if fill <= _TILES_FILL[1] else "lapack"
 
 
 def aligned_zeros(*shape: int) -> Array:
@@ -102,8 +125,7 @@ def factorize_tiles(tiles: Array, num_blocks: int, inverse: Array) -> bool:
                 for y in range(x, 8):
                     tiles[d + 8 * x + y] -= tiles[d + 8 * m + x] * tiles[d + 8 * m + y]
             pivot = tiles[d + 9 * x]
-            # what rounding leaves of a zero pivot
-            if not pivot > 1e-14 * first_diagonal[k * 8 + x]:
+            if not pivot > _NO_PIVOT * first_diagonal[k * 8 + x]:
                 return False
             root = 1.0 / np.sqrt(pivot)
             for y in range(x, 8):
@@ -196,6 +218,10 @@ def mark_pairs(points: PointArrays, images: ImageArrays, lenses: LensArrays, pai
                 if second >= 0:
                     blocks[found] = second
                     found += 1
+        if points.block[p] >= 0:
+            pairs[points.block[p], points.block[p]] = True
+            for n in range(found):
+                pairs[blocks[n], points.block[p]] = True
         for n in range(found):
             for m in range(n, found):
                 pairs[min(blocks[n], blocks[m]), max(blocks[n], blocks[m])] = True
@@ -215,3 +241,64 @@ def number_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
         table[h] = keys[n]
         values[h] = n
     return table, values
+
+
+class ReducedSystem(Protocol):
+    """What solves the reduced system."""
+
+    def solve(self, tiles: Array, rhs: Array) -> Array | None:
+        """Solution (B * 8,) of the damped system in tiles (N * 64,), None where it is not positive definite."""
+
+
+class TileSystem:
+    """The Cholesky factor in tiles (B * B * 64,)."""
+
+    def __init__(self, num_blocks: int) -> None:
+        self._num_blocks, self._inverse = num_blocks, aligned_zeros(num_blocks * 64)
+
+    def solve(self, tiles: Array, rhs: Array) -> Array | None:
+        """Solution (B * 8,), None where the system is not positive definite. Tiles and right-hand side are spoilt."""
+        if not factorize_tiles(tiles, self._num_blocks, self._inverse):
+            return None
+        solve_tiles(tiles, self._num_blocks, self._inverse, rhs)
+        return rhs
+
+
+class LapackSystem:
+    """LAPACK's dense Cholesky factor, without the rows that the blocks do not use. Its bytes are those of one thread:
+    the caller sees to it that there is no more.
+
+    Args of solve as of :class:`TileSystem`; keys (N,) a B + b and numbers (N,) say which tiles there are.
+    """
+
+    def __init__(self, block_dim: Ints, keys: Ints, numbers: Ints) -> None:
+        self._pairs = np.stack([*np.divmod(keys, len(block_dim)), numbers], 1)
+        self._first = np.cumsum(block_dim) - block_dim
+        self._dim, self._used = block_dim, np.arange(8) < block_dim[:, None]
+        size = int(block_dim.sum())
+        self._matrix = np.zeros((size, size))
+
+    def solve(self, tiles: Array, rhs: Array) -> Array | None:
+        from scipy.linalg.lapack import dpotrf, dpotrs
+
+        _gather_upper(tiles, self._pairs, self._first, self._dim, self._matrix)
+        diagonal = self._matrix.diagonal().copy()
+        # the upper triangle by rows is the lower one by columns, which LAPACK works on in place
+        factor, info = dpotrf(self._matrix.T, lower=1, clean=0, overwrite_a=1)
+        if info != 0 or not (factor.diagonal() ** 2 > _NO_PIVOT * diagonal).all():
+            return None
+        found, _ = dpotrs(factor, rhs.reshape(-1, 8)[self._used], lower=1)
+        step = np.zeros((len(self._dim), 8))
+        step[self._used] = found
+        return step.ravel()
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _gather_upper(tiles: Array, pairs: Ints, first: Ints, block_dim: Ints, matrix: Array) -> None:
+    """Fill the upper triangle of matrix (N, N) from tiles; pairs (M, 3) are block a <= b and number of the tile."""
+    matrix[:] = 0.0
+    for n in range(pairs.shape[0]):
+        a, b, tile = pairs[n]
+        for j in range(block_dim[a]):
+            for k in range(block_dim[b]):
+                matrix[first[a] + j, first[b] + k] = tiles[tile * 64 + 8 * j + k]

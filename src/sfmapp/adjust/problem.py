@@ -68,8 +68,9 @@ class Problem:
 
     The state is ``poses``, ``canonical`` and ``xyz``. Poses (Q) are those of single images and of rigs, in the order of
     their first image: image i has the pose ``image_pose[i]``, and if ``image_mount[i] >= 0`` the constant cam_from_rig
-    ``mounts[image_mount[i]]`` (M, 12) on top. Blocks are numbered poses first, then cameras of their own;
-    ``image_block[i]`` is ``pose_block[image_pose[i]]``, -1 where constant.
+    ``mounts[image_mount[i]]`` (M, 12) on top. Blocks are numbered poses first, then cameras of their own, then points
+    that are not eliminated, then variables that only other factors know; ``image_block[i]`` is
+    ``pose_block[image_pose[i]]``, -1 where constant.
     """
 
     image_idx: NDArray[np.int64]
@@ -82,6 +83,7 @@ class Problem:
     canonical: Array
     xyz: Array
     is_constant: Mask
+    point_block: NDArray[np.int32]
     point_ptr: NDArray[np.int64]
     obs_image: NDArray[np.int32]
     obs_xy: Array
@@ -102,7 +104,7 @@ class Problem:
     @property
     def points(self) -> PointArrays:
         """For the kernels, at the current state; so are the two below."""
-        return PointArrays(self.point_ptr, self.obs_image, self.obs_xy, self.xyz, self.is_constant)
+        return PointArrays(self.point_ptr, self.obs_image, self.obs_xy, self.xyz, self.is_constant, self.point_block)
 
     def images(self, rows: Array) -> ImageArrays:
         """Images with rows (I, 12) of their poses."""
@@ -151,20 +153,34 @@ def free_params(camera: Camera, focal: bool, distortion: bool, principal_point: 
     return np.flatnonzero(wanted)
 
 
+@dataclass(frozen=True)
+class Mentioned:
+    """What factors beside the reprojections are over: positions of images, cameras and points, which take part even
+    where nothing else sees them (a point: one inlier is enough), and the dimensions of their own variables.
+    """
+
+    images: Sequence[int] = ()
+    cameras: Sequence[int] = ()
+    points: Sequence[int] = ()
+    dims: Sequence[int] = ()
+
+
+NOTHING = Mentioned()
+
+
 def make_problem(
     reconstruction: Reconstruction,
     *,
     refine: tuple[bool, bool, bool],
     varying: Varying = EVERYTHING,
-    extra_images: Sequence[int] = (),
-    extra_cameras: Sequence[int] = (),
+    mentioned: Mentioned = NOTHING,
     merge: bool = True,
 ) -> Problem:
     """Gather the observations of the points that take part.
 
     Args:
         refine: may focal lengths, distortion, principal points change.
-        extra_images, extra_cameras: take part even without observations (gtsam factors mention them).
+        mentioned: by other factors; these points are not eliminated.
         merge: give a camera with one image and at most two free parameters a place in the block of its image, unless
             other images share that.
 
@@ -182,16 +198,20 @@ def make_problem(
                                          tracks.obs_track_idx, tracks.num_tracks)  # fmt: skip
     else:
         selected = np.flatnonzero(varying.points)
+    is_mentioned = np.zeros(tracks.num_tracks, bool)
+    is_mentioned[[t for t in mentioned.points if t < tracks.num_tracks]] = True
+    if is_mentioned.any():
+        selected = np.union1d(selected, np.flatnonzero(is_mentioned))
     is_constant = np.zeros(len(selected), bool)
     if varying.constant_points is not None:
         is_constant = np.asarray(varying.constant_points)[selected]
     kept, point_ptr, obs_image, obs_xy, image_used = _gather(
-        selected, is_constant, tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy, reconstruction.obs_is_inlier,
-        np.isfinite(reconstruction.cam_from_world[:, 0]), reconstruction.point_xyz,
+        selected, is_constant | is_mentioned[selected], tracks.track_ptr, tracks.obs_image_idx, tracks.obs_xy,
+        reconstruction.obs_is_inlier, np.isfinite(reconstruction.cam_from_world[:, 0]), reconstruction.point_xyz,
     )  # fmt: skip
-    image_used[[i for i in extra_images if i < len(registered) and registered[i]]] = True
+    image_used[[i for i in mentioned.images if i < len(registered) and registered[i]]] = True
     image_idx = np.flatnonzero(image_used)
-    known_cameras = [c for c in extra_cameras if c < len(reconstruction.cameras)]
+    known_cameras = [c for c in mentioned.cameras if c < len(reconstruction.cameras)]
     image_of = np.full(len(registered), -1, np.int32)
     image_of[image_idx] = np.arange(len(image_idx))
     camera_idx = np.unique(np.concatenate([reconstruction.image_camera_idx[image_idx], known_cameras]).astype(np.int64))
@@ -207,17 +227,23 @@ def make_problem(
     image_mount, mounts = _mounts(reconstruction.rig, image_idx)
     pose_varies = _varying_poses(varies[image_idx], image_pose, len(poses))
     pose_block, camera_block, block_dim = _number_blocks(pose_varies, image_pose, image_camera, params, merge)
+    track_idx, is_constant = selected[kept], is_constant[kept]
+    point_block = np.full(len(track_idx), -1, np.int32)
+    is_block = is_mentioned[track_idx] & ~is_constant
+    point_block[is_block] = len(block_dim) + np.arange(is_block.sum())
+    block_dim = np.concatenate([block_dim, np.full(is_block.sum(), 3), np.array(mentioned.dims)]).astype(np.int64)
     return Problem(
         image_idx=image_idx,
         camera_idx=camera_idx,
-        track_idx=selected[kept],
+        track_idx=track_idx,
         poses=poses,
         image_pose=image_pose,
         image_mount=image_mount,
         mounts=mounts,
         canonical=np.array([camera.canonical for camera in cameras]).reshape(-1, ROW),
-        xyz=reconstruction.point_xyz[selected[kept]],
-        is_constant=is_constant[kept],
+        xyz=reconstruction.point_xyz[track_idx],
+        is_constant=is_constant,
+        point_block=point_block,
         point_ptr=point_ptr,
         obs_image=image_of[obs_image],
         obs_xy=obs_xy,

@@ -1,11 +1,11 @@
-"""Bundle adjustment: our kernels eliminate the points, dense tiles or gtsam solve for the cameras, damped steps."""
+"""Bundle adjustment: our kernels eliminate the points, a solver that suits the fill finds the cameras, damped steps."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -14,10 +14,20 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust import kernels
 from sfmapp.adjust.kernels import BlockArrays, RobustLoss, Scratch, State, Sums, find_slot
-from sfmapp.adjust.linear import aligned_zeros, assemble, factorize_tiles, mark_pairs, number_keys, solve_tiles
-from sfmapp.adjust.options import AdjustOptions, AdjustReport
+from sfmapp.adjust.linear import (
+    LapackSystem,
+    ReducedSystem,
+    SolverName,
+    TileSystem,
+    aligned_zeros,
+    assemble,
+    choose_solver,
+    mark_pairs,
+    number_keys,
+)
+from sfmapp.adjust.options import REJECTED_WEIGHT, AdjustOptions, AdjustReport, FactorReport
 from sfmapp.adjust.priors import IntrinsicPriors
-from sfmapp.adjust.problem import EVERYTHING, Problem, Varying, make_problem, write_back
+from sfmapp.adjust.problem import EVERYTHING, NOTHING, Problem, Varying, make_problem, write_back
 from sfmapp.camera.camera import Camera
 from sfmapp.events import Events
 from sfmapp.scene.reconstruction import Reconstruction
@@ -25,7 +35,7 @@ from sfmapp.scene.reconstruction import Reconstruction
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Up to this many blocks, and above if this share of all pairs meets, the dense tile factor beats gtsam's sparse one.
+# Beyond so many blocks only the tiles of pairs that meet are kept, if they are at most this share of all.
 _MAX_DENSE_BLOCKS, _DENSE_SHARE = 160, 0.3
 # Work worth a chunk of its own, and the most memory that the chunks' private sums may take together.
 _CHUNK_OBSERVATIONS, _MAX_CHUNKS, _CHUNK_BYTES = 16384, 8, 1 << 26
@@ -51,9 +61,13 @@ def adjust_bundle(
         varying: which poses, intrinsics and points take part and may change; all by default.
         prior_cameras: (C,) cameras as they were known beforehand: Gaussian priors around their parameters, with
             ``focal_sigma`` for focal lengths and the options' sigmas for the rest. None for no priors.
-        extra_factors: gtsam.NonlinearFactorGraph over ``X(i)`` (Pose3 world_from_cam of image i; for a rig's pose,
-            the image of its sensor 0) and ``K(c)`` (Vector of the free parameters of camera c, in the order of
-            ``Camera.params``), or None. Factors on constant images or cameras only add to the cost.
+        extra_factors: gtsam.NonlinearFactorGraph over ``X(i)`` (Pose3 world_from_cam of image i; for a rig's pose, the
+            image of its sensor 0), ``K(c)`` (Vector of the free parameters of camera c, in the order of
+            ``Camera.params``) and ``L(t)`` (Point3 of track t, which is then an unknown of the reduced system), or
+            None. Noise and robust kernels are theirs, in units in which a pixel coordinate has a standard deviation of
+            one: where it has another, :class:`~sfmapp.adjust.graph.FactorGraph` weighs them right. Factors on constant
+            images or points only add to the cost; those on constant cameras, unregistered images and points without a
+            place are left out.
         threads: at most this many; the result does not depend on it.
         events: asked for cancellation at every step.
 
@@ -61,24 +75,40 @@ def adjust_bundle(
         InterruptedRunError: on cancellation; the reconstruction then holds the best state so far.
         ValueError: a frame of a rig is marked in part, or a factor is over an image that has not the rig's pose.
     """
-    start = time.perf_counter()
     if options.backend == "gtsam":
         from sfmapp.adjust.reference import adjust_with_gtsam
 
         return adjust_with_gtsam(
             reconstruction, options, varying, prior_cameras=prior_cameras, extra_factors=extra_factors, events=events
         )
-    engine = make_engine(reconstruction, options, varying, prior_cameras=prior_cameras, extra_factors=extra_factors)
+    is_closing = extra_factors is not None and extra_factors.size() > 0
+    engine = make_engine(
+        reconstruction, options, varying, prior_cameras=prior_cameras, extra_factors=extra_factors,
+        is_closing=is_closing,
+    )  # fmt: skip
+    return run_engine(engine, reconstruction, options, threads=threads, events=events)
+
+
+def run_engine(
+    engine: Engine, reconstruction: Reconstruction, options: AdjustOptions, *, threads: int, events: Events | None
+) -> AdjustReport:
+    """Adjust, and put the state into the reconstruction."""
+    start = time.perf_counter()
     problem = engine.problem
     workers = min(threads, engine.num_chunks)
-    with ThreadPoolExecutor(workers) if workers > 1 else nullcontext() as pool:
+    with ThreadPoolExecutor(workers) if workers > 1 else nullcontext() as pool, engine.lone():
         try:
             outcome = _minimize(engine, options, pool.map if pool is not None else map, events)
         finally:
             write_back(problem, reconstruction)
+    variance = engine.noise_px**2
     return replace(
-        outcome, num_images=int((problem.image_block >= 0).sum()), num_cameras=int((problem.camera_block >= 0).sum()),
-        num_points=len(problem.track_idx), num_observations=problem.num_observations, solver=engine.solver,
+        outcome, initial_cost=outcome.initial_cost / variance, final_cost=outcome.final_cost / variance,
+        num_images=int((problem.image_block >= 0).sum()), num_cameras=int((problem.camera_block >= 0).sum()),
+        num_points=len(problem.track_idx), num_observations=problem.num_observations,
+        num_unknowns=int(problem.block_dim.sum()), solver=engine.solver, fill=engine.fill, noise_px=engine.noise_px,
+        factors=engine.factor_reports() if engine.is_closing else (),
+        num_left_out=engine.extras.num_left_out if engine.extras else 0,
         wall_s=time.perf_counter() - start,
     )  # fmt: skip
 
@@ -90,36 +120,60 @@ def make_engine(
     *,
     prior_cameras: Sequence[Camera] | None = None,
     extra_factors: Any = None,
+    is_closing: bool = False,
+    noise_px: float = 1.0,
 ) -> Engine:
-    """The engine over a reconstruction's problem, priors and extra factors; arguments as of :func:`adjust_bundle`."""
-    extras = None
-    if extra_factors is not None and extra_factors.size() > 0:
+    """The engine over a reconstruction's problem, priors and extra factors; arguments as of :func:`adjust_bundle`.
+
+    Args:
+        extra_factors: a gtsam graph, or what was made of one.
+        is_closing: the reduced system is left to gtsam or LAPACK.
+        noise_px: of a pixel coordinate, against which priors and extra factors are weighed.
+    """
+    extras = extra_factors
+    if extra_factors is not None and not hasattr(extra_factors, "attach"):
         from sfmapp.adjust.factors import ExtraFactors
 
-        extras = ExtraFactors(extra_factors)
+        extras = ExtraFactors(extra_factors) if extra_factors.size() > 0 else None
     problem = make_problem(
-        reconstruction, refine=options.refine, varying=varying,
-        extra_images=extras.images if extras else (), extra_cameras=extras.cameras if extras else (),
-    )  # fmt: skip
+        reconstruction, refine=options.refine, varying=varying, mentioned=extras.mentioned if extras else NOTHING
+    )
     if extras is not None:
         extras.attach(problem)
-    return Engine(problem, options, IntrinsicPriors(problem, prior_cameras, options), extras)
+    priors = IntrinsicPriors(problem, prior_cameras, options)
+    return Engine(problem, options, priors, extras, is_closing=is_closing, noise_px=noise_px)
 
 
 class Engine:
     """The arrays of one problem and the four things to do with them: linearise, solve, try, accept."""
 
-    def __init__(self, problem: Problem, options: AdjustOptions, priors: IntrinsicPriors, extras: Any = None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        options: AdjustOptions,
+        priors: IntrinsicPriors,
+        extras: Any = None,
+        *,
+        is_closing: bool = False,
+        noise_px: float = 1.0,
+    ) -> None:
         p = problem
         self.problem, self.priors, self.extras = p, priors, extras
         self.loss = RobustLoss(kernels.LOSS_IDS[options.loss], options.loss_scale_px**2)
+        self.noise_px, self.is_closing = noise_px, is_closing
+        priors.weight *= noise_px**2
+        if extras is not None:
+            extras.weight = noise_px**2
         blocks, images = p.num_blocks, len(p.image_idx)
         empty = np.zeros(0, np.int64)
-        self.solver, self.hash_keys, self.hash_values, self.num_tiles = "dense", empty, empty, blocks * blocks
+        self.hash_keys, self.hash_values, self.num_tiles = empty, empty, blocks * blocks
+        self.solver: SolverName = "tiles"
+        self.fill = 1.0
+        self.system: ReducedSystem | None = None
         self.rows = np.empty((images, 12))
         kernels.fill_rows(p.poses, p.image_pose, p.image_mount, p.mounts, self.rows)
-        if blocks > _MAX_DENSE_BLOCKS:
-            self._choose_sparse()
+        if is_closing or blocks > _MAX_DENSE_BLOCKS:
+            self._choose_system(is_closing)
         fitting = max(1, _CHUNK_BYTES // max(1, self.num_tiles * 512))
         self.num_chunks = int(np.clip(p.num_observations // _CHUNK_OBSERVATIONS, 1, min(_MAX_CHUNKS, fitting)))
         shares = np.linspace(0, p.num_observations, self.num_chunks + 1)
@@ -130,7 +184,6 @@ class Engine:
         self.tiles = aligned_zeros(chunks, self.num_tiles * 64)
         self.own, self.cross = aligned_zeros(chunks, blocks * 64), aligned_zeros(chunks, num_cross * 64)
         self.gradient = aligned_zeros(chunks, 2 * blocks * 8)
-        self.inverse = aligned_zeros(blocks * 64)
         self.diagonal = np.ones(blocks * 8)
         self.factor = np.zeros((len(p.track_idx), 12))
         self.sums = np.zeros((chunks, 2))
@@ -143,21 +196,34 @@ class Engine:
         self.new_canonical, self.new_xyz = np.empty_like(p.canonical), np.empty_like(p.xyz)
         self.damping = 0.0
 
-    def _choose_sparse(self) -> None:
-        """Keep only the tiles of blocks that meet, and leave their factor to gtsam, unless that is most of them."""
-        from sfmapp.adjust.factors import SparseSystem
-
+    def _choose_system(self, is_closing: bool) -> None:
+        """See which blocks meet, keep only their tiles unless that is most of them, and choose what solves."""
         p, blocks = self.problem, self.problem.num_blocks
         met = np.eye(blocks, dtype=bool)
         mark_pairs(p.points, p.images(self.rows), p.lenses, met)
         if self.extras is not None:
             met.reshape(-1)[self.extras.pairs] = True
         keys = np.flatnonzero(met)
-        if 2 * len(keys) > _DENSE_SHARE * blocks * blocks:
-            return
-        self.solver, self.num_tiles = "sparse", len(keys)
-        self.hash_keys, self.hash_values = number_keys(keys)
-        self.sparse = SparseSystem(p, keys)
+        self.fill = 2 * len(keys) / max(1, blocks * (blocks + 1))
+        self.solver = choose_solver(blocks, self.fill, is_closing=is_closing)
+        numbers = keys
+        if blocks > _MAX_DENSE_BLOCKS and self.fill <= _DENSE_SHARE:
+            self.num_tiles, numbers = len(keys), np.arange(len(keys))
+            self.hash_keys, self.hash_values = number_keys(keys)
+        if self.solver == "gtsam":
+            from sfmapp.adjust.factors import SparseSystem
+
+            self.system = SparseSystem(p, keys, numbers, self.extras.block_keys() if self.extras else [])
+        elif self.solver == "lapack":
+            self.system = LapackSystem(p.block_dim, keys, numbers)
+
+    def lone(self) -> AbstractContextManager[Any]:
+        """A context in which LAPACK has one thread, if it is asked: with more its bytes would depend on how many."""
+        if self.solver != "lapack":
+            return nullcontext()
+        from threadpoolctl import threadpool_limits
+
+        return threadpool_limits(1, "blas")
 
     def linearize(self, damping: float, run: Callable[..., Any]) -> float:
         """Reduced system at the current state with damped points; returns the cost of the state."""
@@ -180,12 +246,17 @@ class Engine:
             self.extras.linearize(own, gradient)
         every = Sums(self.tiles, self.own, self.cross, self.gradient)
         assemble(every, images, lenses, blocks, own, gradient, self.diagonal)
-        return cost + self.other_cost(p.poses, p.canonical)
+        return cost + self.other_cost()
 
-    def other_cost(self, poses: Array, canonical: Array) -> float:
-        """Cost of priors and extra factors."""
-        cost = self.priors.cost(canonical)
-        return cost + self.extras.cost(poses, canonical) if self.extras is not None else cost
+    def other_cost(self, *, is_new: bool = False) -> float:
+        """Cost of priors and extra factors at the current state, or at the new one."""
+        p, extras = self.problem, self.extras
+        if is_new:
+            cost = self.priors.cost(self.new_canonical)
+            state = (self.new_poses, self.new_canonical, self.new_xyz)
+            return cost + extras.cost(*state, extras.new_values) if extras is not None else cost
+        cost = self.priors.cost(p.canonical)
+        return cost + extras.cost(p.poses, p.canonical, p.xyz, extras.values) if extras is not None else cost
 
     def solve(self) -> Array | None:
         """Step of the blocks (B * 8,), or None where the damped system is not positive definite."""
@@ -196,16 +267,14 @@ class Engine:
         place = self.tile_numbers(np.arange(blocks) * (blocks + 1))[:, None] * 64 + np.arange(8) * 9
         used = np.arange(8) < p.block_dim[:, None]
         tiles[place[used]] += self.damping * self.diagonal.reshape(-1, 8)[used]
-        if self.solver == "sparse":
-            return self.sparse.solve(tiles.reshape(-1, 8, 8), step)
-        if not factorize_tiles(tiles, blocks, self.inverse):
-            return None
-        solve_tiles(tiles, blocks, self.inverse, step)
-        return step if np.isfinite(step).all() else None
+        if self.system is None:
+            self.system = TileSystem(blocks)
+        found = self.system.solve(tiles, step)
+        return found if found is not None and np.isfinite(found).all() else None
 
     def tile_numbers(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
         """Tiles of block pairs a B + b."""
-        if self.solver == "dense":
+        if len(self.hash_keys) == 0:
             return keys
         return np.array([find_slot(self.hash_keys, self.hash_values, key) for key in keys], np.int64)
 
@@ -215,6 +284,8 @@ class Engine:
         points, images, lenses = p.points, p.images(self.rows), p.lenses
         new = State(self.new_rows, self.new_canonical, self.new_xyz)
         kernels.retract(p.poses, p.pose_block, p.image_pose, images, lenses, step, self.new_poses, new)
+        if self.extras is not None:
+            self.extras.retract(step)
 
         def chunk(k: int) -> None:
             kernels.substitute_points(
@@ -225,7 +296,7 @@ class Engine:
         list(run(chunk, range(self.num_chunks)))
         cost, decrease = float(self.sums[:, 0].sum()), float(self.sums[:, 1].sum())
         decrease += 0.5 * float(step @ (self.damping * self.diagonal * step - self.gradient[0, : len(step)]))
-        return cost + self.other_cost(self.new_poses, self.new_canonical), decrease
+        return cost + self.other_cost(is_new=True), decrease
 
     def accept(self) -> None:
         """Make the state that was tried the current one."""
@@ -234,6 +305,31 @@ class Engine:
         p.canonical, self.new_canonical = self.new_canonical, p.canonical
         p.xyz, self.new_xyz = self.new_xyz, p.xyz
         self.rows, self.new_rows = self.new_rows, self.rows
+        if self.extras is not None:
+            self.extras.accept()
+
+    def factor_reports(self) -> list[FactorReport]:
+        """What each kind of factor comes to at the current state; costs in square standard deviations."""
+        p, variance = self.problem, self.noise_px**2
+        squares, rejected, cost = kernels.weigh_observations(
+            p.points, p.images(self.rows), p.lenses, self.loss, REJECTED_WEIGHT
+        )
+        rows, kept = 2 * p.num_observations, 2 * (p.num_observations - rejected)
+        out = [
+            FactorReport(
+                kind="reprojection", num_factors=p.num_observations, num_rows=rows, cost=cost / variance,
+                normalized_residual=float(np.sqrt(squares / variance / max(1, kept))), num_rejected=rejected,
+            )
+        ]  # fmt: skip
+        if len(self.priors.weight):
+            num, cost = len(self.priors.weight), self.priors.cost(p.canonical) / variance
+            residual = float(np.sqrt(2 * cost / num))
+            out.append(
+                FactorReport(
+                    kind="intrinsics prior", num_factors=num, num_rows=num, cost=cost, normalized_residual=residual
+                )
+            )
+        return [*out, *(self.extras.reports() if self.extras is not None else [])]
 
 
 def _minimize(engine: Engine, options: AdjustOptions, run: Callable[..., Any], events: Events | None) -> AdjustReport:
