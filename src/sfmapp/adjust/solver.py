@@ -336,12 +336,12 @@ def _minimize(engine: Engine, options: AdjustOptions, run: Callable[..., Any], e
     """Levenberg-Marquardt with the damping rule of Nielsen (1999), as Ceres has it; what took part is not told."""
     problem = engine.problem
     if problem.num_observations == 0 and engine.extras is None:
-        return AdjustReport("nothing")
+        return AdjustReport(termination="nothing")
     damping, growth, tolerance = options.initial_damping, 2.0, options.relative_cost_tolerance
     first = cost = engine.linearize(damping, run)
     termination, iterations, rejected = "iterations", 0, 0
     if not np.isfinite(cost):
-        return AdjustReport("stalled", initial_cost=cost, final_cost=cost)
+        return AdjustReport(termination="stalled", initial_cost=cost, final_cost=cost)
     while iterations < options.max_iterations:
         if events is not None:
             events.raise_if_cancelled()
@@ -378,4 +378,6 @@ def _minimize(engine: Engine, options: AdjustOptions, run: Callable[..., Any], e
             termination = "stalled"
             break
         engine.linearize(damping, run)
-    return AdjustReport(termination, iterations, rejected, first, cost)
+    return AdjustReport(
+        termination=termination, num_iterations=iterations, num_rejected=rejected, initial_cost=first, final_cost=cost
+    )
