@@ -22,6 +22,8 @@ from sfmapp.dense.report import (
 from sfmapp.errors import SfmError
 from sfmapp.evaluation.report import Statistics
 from sfmapp.features.report import FeaturesReport
+from sfmapp.georeference.control_report import ControlReport
+from sfmapp.georeference.report import GeoreferenceReport
 from sfmapp.images.report import ImagesReport
 from sfmapp.mapping.report import FocalEvidence, MappingReport, ModelEntry
 from sfmapp.matching.report import MatchingReport, PairsReport
@@ -265,6 +267,8 @@ class Stages(Report):
     pairs: PairsReport | None = None
     matching: MatchingReport | None = None
     mapping: MappingReport | None = None
+    control: ControlReport | None = None
+    georeference: GeoreferenceReport | None = None
     dense: DenseReport | None = None
     mesh: MeshRunReport | FailedReport | None = None
 
