@@ -116,7 +116,7 @@ def test_what_is_noted_comes_back_and_a_damaged_manifest_is_told(tmp_path: Path)
         (tmp_path / "run.json").write_text(json.dumps({**document, key: value}))
         with pytest.raises(InputError, match=message):
             read_manifest(tmp_path)
-        with pytest.raises(InputError, match="run[.]json"), open_workspace(tmp_path, "odometry"):
+        with pytest.raises(InputError, match=r"run\.json"), open_workspace(tmp_path, "odometry"):
             pass
 
 
