@@ -177,7 +177,7 @@ def _control(poses: Array, places: Array, normals: Array, rng: np.random.Generat
 # ---------------------------------------------------------------------------------------------------------- measurement
 
 RESULTS = Path(__file__).parent / "results"
-OPTIONS = AdjustOptions(relative_cost_tolerance=1e-10, initial_damping=1e-6, max_iterations=100)
+OPTIONS = AdjustOptions(relative_cost_tolerance=1e-7, initial_damping=1e-6, max_iterations=100)
 
 
 def solve(survey: SyntheticSurvey) -> tuple[Reconstruction, ControlSolution]:
@@ -213,7 +213,7 @@ class Row:
 
 def measure(seed: int, layout: Layout, is_wrong: bool) -> Row:
     """One survey; ``is_wrong``: the coordinate of one point in six is off by a metre."""
-    survey = make_survey(seed, layout, 6 if is_wrong else 5)
+    survey = make_survey(seed, layout, 6 if is_wrong else 5, num_points=300)
     wrong = seed % 6
     if is_wrong:
         xyz = survey.control.xyz.copy()

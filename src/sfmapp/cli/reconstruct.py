@@ -95,6 +95,11 @@ def _add_option_flags(parser: argparse.ArgumentParser) -> None:
         "--gcp", metavar="FILE",
         help="ground control points: gcp_list.txt of OpenDroneMap, or a CSV of name, x, y, z, image, px, py, sigmas",
     )  # fmt: skip
+    group.add_argument(
+        "--scale", metavar="WHAT", action="append", default=[],
+        help="a known length, repeatable: distance:IMAGE:IMAGE:METRES, marker:DICT:METRES, pair:DICT:ID:ID:METRES",
+    )  # fmt: skip
+    group.add_argument("--up", metavar="HOW", help="turn models upright: auto, markers, plane or exif (as held)")
     group.add_argument("--min-registered", metavar="N", help="exit with code 5 if fewer images are registered")
     group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, the replay of the run")
 
@@ -112,6 +117,8 @@ def _options(args: argparse.Namespace) -> Options:
         "images.mask_path": args.mask_path,
         "gps.source": args.gps,
         "control.file": args.gcp,
+        "units.known": ";".join(args.scale) or None,
+        "units.up": args.up,
         "min_registered": args.min_registered,
     }
     settings = [*args.set, *(f"{name}={value}" for name, value in flags.items() if value is not None)]
@@ -253,6 +260,25 @@ def _print_control(report: ReconstructionReport) -> None:
             print(f"  {finding}")
 
 
+def _print_units(report: ReconstructionReport) -> None:
+    """Metres by known lengths, each left out in turn, and what levelled models."""
+    found = report.stages.units
+    for scale in found.scales if found is not None else ():
+        if scale.reason:
+            print(f"  model {scale.model} has no metres: {scale.reason}")
+        elif scale.sigma_share is not None:
+            print(f"  model {scale.model} is in metres by known lengths, to {100 * scale.sigma_share:.2g} %")
+        for bar in scale.bars:
+            if bar.left_out_m is not None and bar.left_out_sigma_m is not None:
+                off = f"{bar.left_out_m:+.3g} m by the others ({bar.left_out_sigma_m:.2g})"
+                print(f"    {bar.name}: {off}{'' if bar.is_used else '  refuted'}")
+        for finding in scale.findings:
+            print(f"  {finding}")
+    for level in found.levels if found is not None else ():
+        text = level.reason or f"level by {level.source}, within {level.sigma_deg:.2g} degrees"
+        print(f"  model {level.model}: {text}")
+
+
 def _print_summary(output: Path, report: ReconstructionReport) -> None:
     model, run = report.models[0], report.run
     print(
@@ -270,6 +296,7 @@ def _print_summary(output: Path, report: ReconstructionReport) -> None:
                 print(f"  model {m} is {other.apart}")
     _print_world(report)
     _print_control(report)
+    _print_units(report)
     print_contradictions(found for one in report.models for found in one.contradictions)
     print(took(output, run))
     print(f"model {output / 'sparse' / '0'}, report {output / 'report.html'}; look at it: sfmapp view {output}")

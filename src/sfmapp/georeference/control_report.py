@@ -102,3 +102,66 @@ class ControlReport(Report):
     crs: str
     num_points: int
     models: Sequence[ControlledModel]
+
+
+class ScaleBarRow(Report):
+    """A known length.
+
+    Attributes:
+        metres, sigma_m: as it was measured.
+        model_m: in the model, by the scale that came of all.
+        left_out_m: by the others alone minus as it was measured; left_out_sigma_m: standard deviation of that; absent
+            where there are no others.
+        is_used: False if all others refute it.
+    """
+
+    name: str
+    metres: float
+    sigma_m: float
+    model_m: float
+    is_used: bool
+    left_out_m: float | None = None
+    left_out_sigma_m: float | None = None
+
+
+class ScaledModel(Report):
+    """How long the unit of a model was, by known lengths.
+
+    Attributes:
+        reason: why they have not told; empty if they have.
+        metres_per_unit, sigma_share: of the unit that photographs alone gave, and its standard deviation as a share.
+        spread: by how much sigmas of bars were multiplied, one at least.
+        bars: those that could be measured.
+        findings: what is wrong, a sentence each.
+    """
+
+    model: int
+    reason: str
+    metres_per_unit: float | None = None
+    sigma_share: float | None = None
+    spread: float | None = None
+    bars: Sequence[ScaleBarRow]
+    findings: Sequence[str]
+
+
+class LeveledModel(Report):
+    """Which way is up in a model that was turned for it.
+
+    Attributes:
+        source: what told it: ``photographs``, ``plane`` or ``markers``; reason: why nothing did, empty if something.
+        sigma_deg: standard deviation about each horizontal axis; absent where nothing told it.
+        from_photographs_deg: angle to what the roll of the photographs says.
+    """
+
+    model: int
+    source: str
+    reason: str
+    sigma_deg: float | None = None
+    from_photographs_deg: float | None = None
+
+
+class UnitsReport(Report):
+    """What known lengths and a vertical made of models that nothing else places."""
+
+    scales: Sequence[ScaledModel]
+    levels: Sequence[LeveledModel]

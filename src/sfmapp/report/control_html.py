@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.georeference.control_report import ControlledModel, ControlPointRow, ControlReport
+from sfmapp.georeference.control_report import ControlledModel, ControlPointRow, ControlReport, UnitsReport
 from sfmapp.report.page import table
 from sfmapp.report.top_view import HEIGHT, WIDTH, fit_page
 from sfmapp.report.world_map import nice_length, scale_bar
@@ -42,6 +42,31 @@ def control_section(report: ControlReport, model: Reconstruction | None) -> str:
             if row.model == 0 and model is not None:
                 parts.append(_map(row, model))
     return "".join(parts)
+
+
+def units_section(report: UnitsReport) -> str:
+    """Metres by known lengths, each left out in turn, and what told the vertical."""
+    lines = []
+    for scale in report.scales:
+        text = f"not in metres: {scale.reason}"
+        if scale.sigma_share is not None:
+            text = f"metres by known lengths, to {100 * scale.sigma_share:.2g} %"
+        lines += [f"model {scale.model}: {text}", *scale.findings]
+    for level in report.levels:
+        told = level.reason or f"level by {level.source}, within {level.sigma_deg:.2g} degrees"
+        lines.append(f"model {level.model}: {told}")
+    rows = [
+        [
+            ("t green" if bar.is_used else "t red", bar.name), ("", f"{bar.metres:g}"), ("", f"{bar.sigma_m:.2g}"),
+            ("", f"{bar.model_m:.4f}"), ("", None if bar.left_out_m is None else f"{bar.left_out_m:+.4f}"),
+            ("", None if bar.left_out_sigma_m is None else f"{bar.left_out_sigma_m:.4f}"),
+        ]
+        for scale in report.scales
+        for bar in scale.bars
+    ]  # fmt: skip
+    head = [("t", "known length"), ("", "m"), ("", "sigma"), ("", "in the model"), ("", "left out"), ("", "expected")]
+    texts = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    return f"<h2>Metres and up</h2><ul>{texts}</ul>" + (table(head, rows) if rows else "")
 
 
 def _points(points: Sequence[ControlPointRow]) -> str:

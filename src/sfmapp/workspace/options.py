@@ -23,6 +23,7 @@ from sfmapp.errors import SfmError, UsageError
 from sfmapp.features.extract import FeatureOptions
 from sfmapp.georeference.control_options import ControlOptions
 from sfmapp.georeference.options import GpsOptions
+from sfmapp.georeference.unit_options import UnitOptions
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.images.sequence import SequenceOptions
 from sfmapp.mapping.options import MappingOptions
@@ -42,7 +43,7 @@ class Options:
 
     Attributes:
         images, features, pairs, matching, mapping, adjust, gps: the options of the stages of a reconstruction.
-        control: ground control points of a reconstruction.
+        control, units: ground control points of a reconstruction, or known lengths and the vertical.
         dense, surface: those of patches and of the mesh that is made of them.
         sequence, odometry, scale: those of odometry.
         seed: where every random choice starts; the same seed gives the same bytes.
@@ -57,6 +58,7 @@ class Options:
     mapping: MappingOptions = field(default_factory=MappingOptions)
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
     control: ControlOptions = field(default_factory=ControlOptions)
+    units: UnitOptions = field(default_factory=UnitOptions)
     gps: GpsOptions = field(default_factory=GpsOptions)
     dense: DenseOptions = field(default_factory=DenseOptions)
     surface: SurfaceOptions = field(default_factory=SurfaceOptions)
@@ -107,7 +109,8 @@ def load_options(presets: Iterable[str] = (), settings: Iterable[str] = ()) -> O
 
 def options_from_dict(values: Mapping[str, Any]) -> Options:
     """Options of nested plain values, as in a TOML file or ``run.json``; what is not named keeps its default."""
-    return _build(Options, values, "")
+    options: Options = _build(Options, values, "")
+    return options
 
 
 def with_absolute_paths(options: Options) -> Options:

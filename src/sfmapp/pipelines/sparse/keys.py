@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 FEATURES, PAIRS, MATCHING = ("sfmapp.features.extract",), ("sfmapp.matching.pairs",), ("sfmapp.matching.stage",)
 MAPPING = (
     "sfmapp.mapping.incremental", "sfmapp.formats.colmap", "sfmapp.georeference.stage",
-    "sfmapp.georeference.control_stage",
+    "sfmapp.georeference.control_stage", "sfmapp.pipelines.sparse.units",
 )  # fmt: skip
 
 
@@ -54,7 +54,7 @@ def stage_keys(options: Options, image_set: ImageSet, control: ControlPoints | N
     matching = stage_key(MATCHING, options.matching, images, lenses, whose)
     measured = [record.position and asdict(record.position) for record in image_set.images]
     adjust = options_to_dict(options.adjust)
-    world = [options_to_dict(options.gps), measured, _control_key(control)]
+    world = [options_to_dict(options.gps), measured, _control_key(control), options_to_dict(options.units)]
     mapping = stage_key(MAPPING, options.mapping, adjust, pairs, matching, priors, world)
     return StageKeys(inputs, features, pairs, matching, mapping)
 

@@ -19,6 +19,7 @@ from sfmapp.matching.pairs import select_pairs
 from sfmapp.matching.stage import match_images
 from sfmapp.pipelines.sparse import results
 from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
+from sfmapp.pipelines.sparse.known_lengths import parse_known_lengths
 from sfmapp.pipelines.sparse.run import Run
 from sfmapp.pipelines.sparse.world import closing, read_control
 from sfmapp.viewer.listener import RecordingListener
@@ -97,6 +98,7 @@ def _run(run: Run) -> ReconstructionReport:
         run.image_set = with_positions(image_set, run.options.gps)
         run.stages = replace(run.stages, images=images)
     run.control = read_control(run, run.image_set)
+    run.known = parse_known_lengths(run.options.units.known, run.image_set.names)
     keys = stage_keys(run.options, run.image_set, run.control)
     if report := results.earlier_report(run, keys):
         return report

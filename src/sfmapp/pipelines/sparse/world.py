@@ -36,7 +36,8 @@ def read_control(run: Run, image_set: ImageSet) -> ControlPoints | None:
 def closing(run: Run, image_set: ImageSet) -> Callable[[list[Mapper]], None] | None:
     """What is to be done with finished models; None where nothing is known of where they lie."""
     has_positions = any(record.position is not None for record in image_set.images)
-    if run.control is None and not has_positions:
+    units = run.options.units
+    if run.control is None and not has_positions and not run.known and units.up == "none":
         return None
 
     def bring_into_world(mappers: list[Mapper]) -> None:
@@ -55,5 +56,15 @@ def closing(run: Run, image_set: ImageSet) -> Callable[[list[Mapper]], None] | N
             if positions is not None and controlled.georeference is not None:
                 positions = positions_after(positions, controlled.report, mappers)
             run.stages = replace(run.stages, control=controlled.report, georeference=positions)
+        if run.known or units.up != "none":
+            from sfmapp.pipelines.sparse.units import give_units
+
+            metric = {place.model for place in run.georeference.models} if run.georeference is not None else set()
+            if run.stages.control is not None:
+                metric |= {row.model for row in run.stages.control.models if not row.reason}
+            found = give_units(
+                mappers, image_set, run.known, units.up, metric, threads=run.threads, events=run.events
+            )  # fmt: skip
+            run.stages = replace(run.stages, units=found)
 
     return bring_into_world
