@@ -287,4 +287,5 @@ class SparseSystem:
             return None
         step = np.zeros((len(dims), 8))
         step[np.arange(8) < np.array(dims)[:, None]] = solution.vector(keys)
-        return (step * root).ravel()
+        found: Array = (step * root).ravel()
+        return found

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.camera import lens
 from sfmapp.camera.lens import FAMILY, ROW
-from sfmapp.camera.models import PARAM_NAMES, CameraModel, canonical_from_params, family_of, kind_of, plain_params
+from sfmapp.camera.models import PARAM_NAMES, canonical_from_params, family_of, kind_of, plain_params
+from sfmapp.camera.names import CameraModel
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,9 @@ from typing import Any, Literal, Protocol
 
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES
+from sfmapp.camera.names import CameraModel
 from sfmapp.errors import UsageError
 from sfmapp.images.position import Position
 from sfmapp.option_checks import Range, check_options, positive

@@ -13,7 +13,8 @@ from sfmapp.adjust.covariance import Covariances, estimate_covariances
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
-from sfmapp.camera.camera import PARAM_NAMES, Camera
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.mapping import structure
@@ -387,7 +388,8 @@ class Mapper:
         registered = reconstruction.image_camera_idx[reconstruction.is_registered]
         shared = np.bincount(registered, minlength=len(reconstruction.cameras)) >= 3
         unknown = np.array([mode == "always" or c.focal_source == "default" for c in reconstruction.cameras], bool)
-        return shared & unknown & (mode != "never" and self.adjust_options.backend == "schur")
+        free: NDArray[np.bool_] = shared & unknown & (mode != "never" and self.adjust_options.backend == "schur")
+        return free
 
     def with_free_centers(self, options: AdjustOptions, chosen: NDArray[np.bool_]) -> AdjustOptions:
         """The options with free principal points under the prior of MappingOptions, for cameras chosen (C,) bool."""

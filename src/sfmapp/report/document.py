@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.contradictions import Contradiction
+from sfmapp.features.report import FEW_FEATURES
 from sfmapp.georeference.control_report import ControlReport
 from sfmapp.mapping.report import FocalEvidence, MappedImage, ModelEntry, Uncertainty
 from sfmapp.report.model import CameraReport, Check, Failure, Funnel, ImageReport, Light
@@ -22,8 +24,6 @@ if TYPE_CHECKING:
     from sfmapp.scene.reconstruction import Reconstruction
 
 FORMAT = "sfmapp report 2"
-# fewer keypoints than this leave too few matches for any pair, whatever the other image holds
-FEW_FEATURES = 100
 _NOTHING = Funnel(**dict.fromkeys(Funnel.__dataclass_fields__))
 
 

@@ -109,7 +109,8 @@ def load_options(presets: Iterable[str] = (), settings: Iterable[str] = ()) -> O
 
 def options_from_dict(values: Mapping[str, Any]) -> Options:
     """Options of nested plain values, as in a TOML file or ``run.json``; what is not named keeps its default."""
-    return _build(Options, values, "")
+    options: Options = _build(Options, values, "")
+    return options
 
 
 def with_absolute_paths(options: Options) -> Options:
