@@ -14,12 +14,15 @@ import numpy as np
 import pytest
 
 from sfmapp.camera.camera import CameraModel, simple_camera
+from sfmapp.contradictions import Contradiction
 from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import InputError, UsageError
 from sfmapp.features.extract import FeatureOptions
 from sfmapp.images.image_set import ImageRecord, ImageSet
 from sfmapp.matching.options import MatchingOptions
+from sfmapp.odometry.report import MapFacts
 from sfmapp.pipelines.sparse.keys import stage_keys
+from sfmapp.reporting import Usage
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
 from sfmapp.workspace.keys import stage_key
@@ -50,7 +53,7 @@ def test_a_new_workspace_can_be_opened_again(tmp_path: Path) -> None:
         workspace.begin("features", "k1")
         assert workspace.has_key("features", "k1")
         assert not workspace.is_current("features", "k1")
-        workspace.finish("features", {"wall_s": 1.0})
+        workspace.finish("features", Usage(wall_s=1.0, cpu_s=2.0))
         workspace.save()
     with open_workspace(out) as workspace:
         assert workspace.is_current("features", "k1")
@@ -88,6 +91,33 @@ def test_another_format_is_refused(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text(json.dumps({"format": "sfmapp workspace 99"}))
     with pytest.raises(UsageError, match="another version"), open_workspace(tmp_path):
         pass
+
+
+def test_what_is_noted_comes_back_and_a_damaged_manifest_is_told(tmp_path: Path) -> None:
+    facts = MapFacts(scale_source="imu", scale_sigma=0.01, contradictions=[Contradiction("a", "b", evidence={"n": 3})])
+    with open_workspace(tmp_path, "odometry") as workspace:
+        workspace.note(source="/walk.mp4", seed=3, recording="written")
+        workspace.begin("odometry", "k")
+        workspace.finish("odometry", Usage(wall_s=2.0, cpu_s=3.0, peak_memory_mb=4.0), maps=[facts])
+        workspace.save()
+    found = read_manifest(tmp_path, "odometry")
+    assert found == workspace.manifest
+    assert (found.source, found.seed, found.recording, found.image_root) == ("/walk.mp4", 3, "written", None)
+    entry = found.stage("odometry")
+    assert entry.is_done
+    assert (entry.wall_s, entry.cpu_s, entry.peak_memory_mb) == (2.0, 3.0, 4.0)
+    assert entry.maps == [facts]
+    assert found.stage("mapping") == {}
+    document = json.loads((tmp_path / "run.json").read_text())
+    for key, value, message in (
+        ("seed", "three", "seed: expected int, found str"), ("stages", [], "stages: expected dict"),
+        ("stages", {"odometry": {"is_done": 1}}, "is_done: expected bool"), ("speed", 1, "'speed' is no field"),
+    ):  # fmt: skip
+        (tmp_path / "run.json").write_text(json.dumps({**document, key: value}))
+        with pytest.raises(InputError, match=message):
+            read_manifest(tmp_path)
+        with pytest.raises(InputError, match=r"run\.json"), open_workspace(tmp_path, "odometry"):
+            pass
 
 
 def test_looking_at_a_folder_that_is_no_workspace_is_bad_input(tmp_path: Path) -> None:

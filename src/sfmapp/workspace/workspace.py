@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from sfmapp.formats.atomic import replaced_file
 from sfmapp.reporting import R, Usage, from_plain, to_json
 from sfmapp.workspace.layout import LOCK, MANIFEST, RECONSTRUCT, REPORT
 from sfmapp.workspace.lock import locked
-from sfmapp.workspace.manifest import check_command, manifest_of, new_manifest, read_json
+from sfmapp.workspace.manifest import Manifest, StageEntry, check_command, manifest_of, new_manifest, read_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 class Workspace:
     """One output folder, locked by this process while it is open. Make it with :func:`open_workspace`."""
 
-    def __init__(self, folder: Path, manifest: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, manifest: Manifest) -> None:
         self.folder = folder
         self.manifest = manifest
 
@@ -53,22 +54,29 @@ class Workspace:
 
     def is_current(self, stage: str, key: str) -> bool:
         """The stage was run to its end with this key."""
-        entry = self.manifest["stages"].get(stage, {})
-        return bool(entry.get("key") == key and entry.get("is_done"))
+        return self.has_key(stage, key) and bool(self.manifest.stage(stage).is_done)
 
     def has_key(self, stage: str, key: str) -> bool:
         """The stage was begun with this key: what it has stored so far can be used."""
-        return bool(self.manifest["stages"].get(stage, {}).get("key") == key)
+        return self.manifest.stage(stage).key == key
+
+    def note(self, **facts: Any) -> None:
+        """Put facts, fields of the manifest, in the place of what it says of them. The caller saves."""
+        self.manifest = replace(self.manifest, **facts)
 
     def begin(self, stage: str, key: str, **facts: Any) -> None:
-        """Note, before anything is overwritten, that the stage now works under this key."""
-        self.manifest["stages"][stage] = {"key": key, "is_done": False, **facts}
+        """Note, before anything is overwritten, that the stage now works under this key, and facts of its entry."""
+        entry = StageEntry(key=key, is_done=False, **facts)
+        self.note(stages={**self.manifest.stages, stage: entry})
         self.save()
 
     def finish(self, stage: str, usage: Usage | None, **facts: Any) -> None:
         """Note that the stage has ended, with its time and memory. The caller saves."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        self.manifest["stages"][stage] |= {"is_done": True, "finished": now, **(usage or {}), **facts}
+        entry = replace(
+            self.manifest.stages[stage], is_done=True, finished=now, **(facts if usage is None else {**usage, **facts})
+        )
+        self.note(stages={**self.manifest.stages, stage: entry})
 
     def save(self) -> None:
         """Write ``run.json``, beside and renamed."""
