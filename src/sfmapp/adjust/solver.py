@@ -205,9 +205,9 @@ class Engine:
             met.reshape(-1)[self.extras.pairs] = True
         keys = np.flatnonzero(met)
         self.fill = 2 * len(keys) / max(1, blocks * (blocks + 1))
-        self.solver = choose_solver(blocks, self.fill, is_closing=is_closing)
+        self.solver = choose_solver(blocks, int(p.block_dim.sum()), self.fill, is_closing=is_closing)
         numbers = keys
-        if blocks > _MAX_DENSE_BLOCKS and self.fill <= _DENSE_SHARE:
+        if self.solver != "tiles" and blocks > _MAX_DENSE_BLOCKS and self.fill <= _DENSE_SHARE:
             self.num_tiles, numbers = len(keys), np.arange(len(keys))
             self.hash_keys, self.hash_values = number_keys(keys)
         if self.solver == "gtsam":
