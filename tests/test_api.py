@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -295,8 +296,47 @@ def test_one_call_gives_the_same_with_and_without_a_folder(photos: Path, tmp_pat
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         saved, ours = tmp_path / "saved" / name, tmp_path / "out" / "sparse" / "0" / name
         assert saved.read_bytes() == ours.read_bytes(), name
-    with pytest.raises(sfmapp.UsageError, match="photographs that are files"):
-        sfmapp.reconstruct({"a": np.zeros((20, 20), np.uint8)}, tmp_path / "none")
+    with pytest.raises(sfmapp.InputError, match="found list"):
+        sfmapp.reconstruct([np.zeros((20, 20), np.uint8)], tmp_path / "none")  # type: ignore[arg-type]
+
+
+def test_arrays_have_a_workspace_like_any_other(photos: Path, tmp_path: Path) -> None:
+    """Without a file of the photographs; what needs their pixels again says so, and takes them from files."""
+    from schemas import check_schema
+    from sfmapp.images.pixels import read_rgb
+    from sfmapp.pipelines.dense.source import find_source
+    from sfmapp.workspace.options import Options
+
+    options = sfmapp.load_options(settings=["features.max_num_features=800"])
+    arrays = {record.name: read_rgb(record) for record in sfmapp.load_images(photos).images}
+    sfmapp.reconstruct(photos, tmp_path / "files", options, record=False, threads=1)
+    out = tmp_path / "out"
+    model, report = sfmapp.reconstruct(arrays, out, options, record=False, threads=2)
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (out / "sparse/0" / name).read_bytes() == (tmp_path / "files/sparse/0" / name).read_bytes(), name
+    assert report is not None
+    check_schema("reconstruct", json.loads((out / "report.json").read_text()))
+    assert report.run.source == report.stages.images.source == "memory://photographs"
+    assert [row.name for row in report.images] == list(arrays)
+    assert not [path for path in out.rglob("*") if path.suffix in (".png", ".jpg")]
+    # the same arrays are done already, in a set as well; other pixels are not
+    again = sfmapp.reconstruct(sfmapp.load_images(arrays), out, options, record=False)
+    assert again.report is not None
+    assert again.report.run.is_up_to_date
+    assert again.reconstruction.point_xyz.tobytes() == model.point_xyz.tobytes()
+    first = next(iter(arrays))
+    changed = sfmapp.reconstruct({**arrays, first: arrays[first][::-1]}, out, options, record=False)
+    assert changed.report is not None
+    assert not changed.report.run.is_up_to_date
+    assert changed.report.stages.features.num_known == len(arrays) - 1
+    with pytest.raises(sfmapp.InputError, match="arrays in memory") as caught:
+        sfmapp.undistort(out, tmp_path / "flat")
+    assert "--images" in str(caught.value.advice)
+    with pytest.raises(sfmapp.InputError, match="pycolmap reads files"):
+        sfmapp.validate(out)
+    assert find_source(out, None, photos, Options()).images == photos
+    exported = sfmapp.export(out, "nerfstudio", tmp_path / "nerf")
+    assert any("put them there" in note for note in exported.notes)
 
 
 def test_a_reconstruction_of_ones_own_arrays(scene: SyntheticScene, tmp_path: Path) -> None:

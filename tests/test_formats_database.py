@@ -17,7 +17,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sfmapp.camera.camera import Camera, CameraModel
+from sfmapp.camera.camera import Camera, CameraModel, simple_camera
 from sfmapp.errors import InputError
 from sfmapp.formats.database import Database
 from sfmapp.scene.correspondences import Correspondences
@@ -130,6 +130,45 @@ def test_gps_and_binary_descriptors_reach_pycolmap(tmp_path: Path) -> None:
     assert prior.corr_data_id.id == 2
     assert theirs.read_descriptors(1).data.shape[1] == 32
     theirs.close()
+
+
+@pytest.mark.parametrize(("metric", "length"), [("l2", 256), ("l2", 0), ("hamming", 61), ("root_sift", 128)])
+def test_descriptors_of_any_metric_come_back(tmp_path: Path, metric: str, length: int) -> None:
+    """SuperPoint's 256 floats, none at all, AKAZE's 61 bytes: bit for bit here, and as bytes in COLMAP."""
+    rng = np.random.default_rng(1)
+    values = rng.normal(size=(7, length)) if metric == "l2" else rng.integers(0, 256, (7, length), np.uint8)
+    features = Features.from_arrays(rng.uniform(0, 99, (7, 2)), values, metric=metric)
+    path = tmp_path / "d.db"
+    with Database(path) as database:
+        database.set_images([simple_camera(CameraModel.PINHOLE, 99, 99, 90.0)], ["a.png", "b.png"], [0, 0])
+        database.write_features(0, Features.from_arrays(np.zeros((3, 2)), np.ones((3, 8)), metric="l2"))
+        database.write_features(0, features)
+        assert_equal(database.read_features(0), features)
+        # an image list in another order takes them along
+        database.set_images([simple_camera(CameraModel.PINHOLE, 99, 99, 90.0)], ["b.png", "a.png"], [0, 0])
+        assert_equal(database.read_features(1), features)
+    with Database(path, read_only=True) as database:
+        assert_equal(database.read_features(1), features)
+    if length:
+        theirs = pycolmap.Database.open(str(path))
+        assert theirs.read_descriptors(2).data.tobytes() == features.descriptors.tobytes()
+        theirs.close()
+
+
+def test_floats_of_colmap_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "d.db"
+    with Database(path) as database:
+        database.set_images([simple_camera(CameraModel.PINHOLE, 99, 99, 90.0)], ["a.png"], [0])
+    floats = np.random.default_rng(2).normal(size=(5, 128)).astype(np.float32)
+    theirs = pycolmap.Database.open(str(path))
+    kind = pycolmap.FeatureExtractorType.ALIKED_N32
+    theirs.write_keypoints(1, np.zeros((5, 2), np.float32))
+    theirs.write_descriptors(1, pycolmap.FeatureDescriptorsFloat(type=kind, data=floats).to_bytes())
+    theirs.close()
+    with Database(path, read_only=True) as database:
+        found = database.read_features(0)
+    assert found.metric == DescriptorMetric.L2
+    np.testing.assert_array_equal(found.descriptors, floats)
 
 
 def test_pycolmap_maps_from_ours(tmp_path: Path) -> None:
@@ -290,6 +329,11 @@ REFUSALS = [
     ("UPDATE keypoints SET rows = 1, data = zeroblob(16) WHERE image_id = 1", "keypoints|matches"),
     ("UPDATE descriptors SET rows = 1, data = zeroblob(128) WHERE image_id = 2", "a descriptor for each"),
     ("DELETE FROM descriptors WHERE image_id = 2", "found none"),
+    ("INSERT INTO sfmapp_descriptors VALUES (2, 'cosine')", "known metric, found 'cosine'"),
+    (
+        "INSERT INTO sfmapp_descriptors VALUES (2, 'l2'); UPDATE descriptors SET cols = 130 WHERE image_id = 2",
+        r"expected \(4,\) columns",
+    ),
     ("UPDATE sfmapp_features SET rgb = x'00' WHERE image_id = 2", "colours of image 2"),
     ("UPDATE two_view_geometries SET rows = rows + 1", "matches of pair"),
     ("UPDATE two_view_geometries SET rows = -5", "matches of pair"),
@@ -312,7 +356,7 @@ def test_malformed_rows_are_refused(tmp_path: Path, template: Path, statement: s
     path = tmp_path / "d.db"
     shutil.copy(template, path)
     db = sqlite3.connect(path)
-    db.execute(statement)
+    db.executescript(statement)
     db.commit()
     db.close()
     with pytest.raises(InputError, match=match):

@@ -24,7 +24,7 @@ def noise(*shape: int, dtype: type = np.uint8, seed: int = 0) -> np.ndarray:
 def test_arrays_give_what_files_give(photos: Path) -> None:
     from_files, _ = load_images(photos, ImageOptions(), Events())
     arrays = {record.name: read_picture(record).rgb for record in from_files.images}
-    in_memory = describe_source(ArraySource(arrays, {}))
+    in_memory, _ = describe_source(ArraySource(arrays, {}))
     assert in_memory.names == from_files.names
     assert in_memory.root is None
     assert from_files.root == photos
@@ -52,7 +52,7 @@ def test_masks_and_alpha_count() -> None:
     mask[:, :30] = 0
     rgba = noise(40, 60, 4)
     rgba[:20, :, 3], rgba[20:, :, 3] = 255, 0
-    images = describe_source(
+    images, _ = describe_source(
         ArraySource({"a": noise(40, 60), "b": rgba, "c": noise(40, 60, 3)}, {"a": mask, "b": mask})
     )
     pictures = [read_picture(record) for record in images.images]
@@ -67,7 +67,7 @@ def test_masks_and_alpha_count() -> None:
 def test_deep_pixels_are_scaled_as_those_of_files() -> None:
     deep = noise(40, 60, dtype=np.uint16) >> 4
     deep[0, 0] = 4095
-    picture = read_picture(describe_source(ArraySource({"a": deep}, {})).images[0])
+    picture = read_picture(describe_source(ArraySource({"a": deep}, {}))[0].images[0])
     np.testing.assert_allclose(picture.gray, deep / 4095 * 255, atol=0.5001)
 
 
@@ -97,7 +97,7 @@ def test_names_stay_in_their_folder(name: str) -> None:
 
 def test_a_source_that_changes_its_mind_is_found_out() -> None:
     images, masks = {"a": noise(40, 60)}, {"a": np.ones((40, 60), bool)}
-    record = describe_source(ArraySource(images, masks)).images[0]
+    record = describe_source(ArraySource(images, masks))[0].images[0]
     masks["a"] = np.ones((40, 59), bool)
     with pytest.raises(InputError, match="mask of a: expected an array of shape"):
         read_picture(record)

@@ -9,16 +9,16 @@ import jsonschema
 import pytest
 
 from schemas import FOLDER, check_schema
-from sfmapp.report.model import UndistortedCamera, UndistortReport
+from sfmapp.report.model import RunUsage, UndistortedCamera, UndistortReport
 from sfmapp.report.schema import KINDS, schema_of, schema_text
-from sfmapp.reporting import NamedReason, Usage, plain
+from sfmapp.reporting import NamedReason, plain
 
 
 def undistorted() -> UndistortReport:
     return UndistortReport(
         num_images=1, num_copied=0, num_masks=0, num_points=5, num_observations=9, num_dropped=1,
         cameras=[UndistortedCamera(width=4, height=3, params=[1.0, 1.0, 2.0, 1.5])],
-        missing=[NamedReason(name="a.jpg", reason="gone")], is_up_to_date=False, run=Usage(wall_s=1.0, cpu_s=2.0),
+        missing=[NamedReason(name="a.jpg", reason="gone")], run=RunUsage(wall_s=1.0, cpu_s=2.0),
     )  # fmt: skip
 
 

@@ -403,11 +403,11 @@ def test_a_run_that_was_cut_off_is_resumed_and_another_replaces_it(tmp_path: Pat
     write_scene(tmp_path, [BARREL] * 3)
     out = tmp_path / "out"
     sfmapp.undistort(tmp_path, out, ONE, blank_pixels=1.0)
-    assert sfmapp.undistort(tmp_path, out, ONE, blank_pixels=1.0).report["is_up_to_date"]
+    assert sfmapp.undistort(tmp_path, out, ONE, blank_pixels=1.0).report["run"]["is_up_to_date"]
     (out / "images" / "view_1.png").unlink()
     kept = (out / "images" / "view_0.png").stat().st_mtime_ns
     again = sfmapp.undistort(tmp_path, out, ONE, blank_pixels=1.0)
-    assert not again.report["is_up_to_date"]
+    assert not again.report["run"]["is_up_to_date"]
     assert again.report["num_masks"] == 3
     assert (out / "images" / "view_1.png").is_file()
     assert (out / "images" / "view_0.png").stat().st_mtime_ns == kept

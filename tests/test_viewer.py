@@ -17,7 +17,9 @@ from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.geometry.upright import up_direction
-from sfmapp.images.image_set import ImageRecord, ImageSet
+from sfmapp.images.image_set import ImageOptions, ImageRecord, ImageSet
+from sfmapp.images.load import load_images
+from sfmapp.images.pixels import read_rgb
 from sfmapp.scene.features import Features
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
@@ -306,6 +308,24 @@ def test_recording_holds_the_run(job: tuple[ImageSet, list[Features], Reconstruc
     assert "Arrows2D:vectors" in found["/photo/residuals"]
     assert all("Scalars:scalars" in found[f"/plots/{name}"] for name in ("registered", "points", "error"))
     assert "TextLog:text" in found["/log"]
+
+
+def test_photographs_in_memory_are_shown_as_well(
+    job: tuple[ImageSet, list[Features], Reconstruction], tmp_path: Path
+) -> None:
+    pytest.importorskip("rerun")
+    from_files, features, model = job
+    arrays = {record.name: read_rgb(record) for record in from_files.images}
+    image_set, _ = load_images(arrays, ImageOptions(), Events())
+    assert not any(record.path.exists() for record in image_set.images)
+    path = tmp_path / "recording.rrd"
+    replay = make_replay(image_set, features, [model], [])
+    assert write_recording(path, replay, image_set.images).problem == ""
+    found = entities_of(path)
+    cameras = [name for name in found if name.startswith("/world/model0/cameras/")]
+    assert cameras
+    assert all("EncodedImage:blob" in found[name] for name in cameras)
+    assert "EncodedImage:blob" in found["/photo"]
 
 
 def test_recording_of_nothing_is_still_a_recording(

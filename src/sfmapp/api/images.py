@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -12,12 +11,10 @@ from numpy.typing import NDArray
 from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
 from sfmapp.events import Events
-from sfmapp.images import folder
-from sfmapp.images.arrays import ArraySource, check_size, describe_source, known_camera
-from sfmapp.images.image_set import ImageOptions, ImageSet, ImageSource
-
-Images = str | os.PathLike[str] | ImageSet | ImageSource | Mapping[str, NDArray[Any]]
-"""What every function takes for photographs."""
+from sfmapp.images import load
+from sfmapp.images.arrays import check_size, known_camera
+from sfmapp.images.image_set import ImageOptions, ImageSet
+from sfmapp.images.load import Images
 
 
 def load_images(
@@ -55,11 +52,8 @@ def load_images(
         raise InputError("masks: expected images as arrays by name; of files, options.mask_path names the masks")
     if isinstance(images, ImageSet):
         found = images
-    elif isinstance(images, str | os.PathLike):
-        found, _ = folder.load_images(images, options or ImageOptions(), events or Events(), threads=threads)
     else:
-        source = ArraySource(images, masks or {}) if isinstance(images, Mapping) else images
-        found = describe_source(source, options)
+        found, _ = load.load_images(images, options or ImageOptions(), events or Events(), masks=masks, threads=threads)
     return found if camera is None else _taken_by(found, camera)
 
 

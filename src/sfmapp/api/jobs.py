@@ -71,8 +71,9 @@ def reconstruct(
     With an output folder, what an earlier run in it has done is used where it still holds.
 
     Args:
-        images: a folder, a glob pattern or a ``.txt`` list of files; or, without an output folder, whatever
-            ``load_images`` takes: arrays by name, an :class:`ImageSource`, an :class:`ImageSet`.
+        images: whatever ``load_images`` takes: a folder, a glob pattern or a ``.txt`` list of files; arrays by name; an
+            :class:`ImageSource`; an :class:`ImageSet`. No pixels are kept of those that are no files: what looks at
+            them again (``densify``, ``undistort``, ``validate``) wants them as files, and says so.
         output: folder of the results: new, empty, or of an earlier run. None: nothing is written.
         options: of all stages; see ``load_options``.
         record: write ``recording.rrd``, which replays the run.
@@ -84,8 +85,7 @@ def reconstruct(
         The largest model (as it is read back from ``sparse/0``, if it was written), and the report.
 
     Raises:
-        UsageError: the output folder holds something else, or another run is at work in it; or it was given with
-            photographs that are no files.
+        UsageError: the output folder holds something else, or another run is at work in it.
         InputError: the photographs do not exist or cannot be read.
         NoReconstructionError: they hold no reconstruction; the report is written.
         TooFewImagesError: fewer images than ``options.min_registered``; everything is written.
@@ -99,11 +99,6 @@ def reconstruct(
     if output is not None:
         from sfmapp.pipelines.sparse import reconstruct as pipeline
 
-        if not isinstance(images, str | os.PathLike):
-            raise UsageError(
-                "a workspace needs photographs that are files, to look at them again",
-                "leave the output folder out, and save what is returned: reconstruction.save(folder)",
-            )
         found, report = pipeline.reconstruct(images, output, options, events=events, record=record)
         return RunResult(Reconstruction.of(found), report)
     workers, seed_used = options.num_workers, options.seed

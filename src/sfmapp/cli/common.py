@@ -7,6 +7,7 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sfmapp.cli.progress import make_listener
@@ -15,7 +16,7 @@ from sfmapp.cli.signals import signals_stop
 if TYPE_CHECKING:
     from sfmapp.contradictions import Contradiction
     from sfmapp.events import Events
-    from sfmapp.reporting import Usage
+    from sfmapp.report.model import RunUsage
 
 
 def add_output_flags(parser: argparse.ArgumentParser, *, has_log: bool = False) -> None:
@@ -50,8 +51,10 @@ def print_json(value: Any) -> None:
     print(to_json(value), flush=True)
 
 
-def took(run: Usage) -> str:
-    """What a run took, in words."""
+def took(output: Path, run: RunUsage) -> str:
+    """What a run took, in words, or that there was nothing to do in its folder."""
+    if run.is_up_to_date:
+        return f"{output} is up to date: nothing to do"
     return f"took {run.wall_s:.1f} s, {run.cpu_s:.1f} CPU s, {run.peak_memory_mb or 0.0:.0f} MB"
 
 

@@ -217,4 +217,4 @@ def print_mesh(output: Path, report: MeshRunReport) -> None:
 
 
 def _print_end(output: Path, report: DenseReport | MeshRunReport) -> None:
-    print(f"{output} is up to date: nothing to do" if report.is_up_to_date else took(report.run))
+    print(took(output, report.run))

@@ -190,7 +190,7 @@ def _print_refined(output: Path, report: RefineReport) -> None:
             if not row.is_registered:
                 print(f"  not registered: {row.name}: {row.reason}")
     print_contradictions(row for found in report.maps.after for row in found.contradictions)
-    print(took(run))
+    print(took(output, run))
     print(f"model {output / 'sparse' / '0'}, trajectory {output / 'trajectory.tum'}, report {output / 'report.html'}")
 
 
@@ -240,6 +240,6 @@ def _print_summary(args: argparse.Namespace, report: OdometryRunReport) -> None:
     pace = ""
     if timing is not None:
         pace = f"; {timing.cpu_ms_per_frame:.1f} CPU ms a frame, {timing.frames_per_second:.1f} frames a second"
-    print(took(run) + pace)
+    print(took(output, run) + pace)
     looks = "" if args.no_recording else f"; look at it: sfmapp view {output}"
     print(f"trajectory {output / 'trajectory.tum'}, report {output / 'report.html'}{looks}")

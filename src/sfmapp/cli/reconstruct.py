@@ -209,8 +209,5 @@ def _print_summary(output: Path, report: ReconstructionReport) -> None:
             if other.apart:
                 print(f"  model {m} is {other.apart}")
     print_contradictions(found for one in report.models for found in one.contradictions)
-    if run.is_up_to_date:
-        print(f"{output} is up to date: nothing to do")
-    else:
-        print(took(run))
+    print(took(output, run))
     print(f"model {output / 'sparse' / '0'}, report {output / 'report.html'}; look at it: sfmapp view {output}")

@@ -92,5 +92,5 @@ def _print(output: Path, report: UndistortReport) -> None:
         f"{report.num_images} photographs without distortion ({shown}){copied}{masks},"
         f" {report.num_points} points, {report.num_observations} observations ({report.num_dropped} dropped)"
     )
-    print(f"{output} is up to date: nothing to do" if report.is_up_to_date else took(report.run))
+    print(took(output, report.run))
     print(f"photographs {output / 'images'}, model {output / 'sparse' / '0'}")

@@ -1,7 +1,11 @@
 """Features and matches in COLMAP 4.2's SQLite schema: COLMAP's own tools open what we write, and we what they write.
 
-Two tables of ours stand beside COLMAP's, which ignores them: ``sfmapp_features`` holds the colour under each keypoint,
-``sfmapp_pairs`` the counts of verification, and both the key under which a row was computed, for resuming.
+Three tables of ours stand beside COLMAP's, which ignores them: ``sfmapp_features`` holds the colour under each
+keypoint, ``sfmapp_pairs`` the counts of verification, and both the key under which a row was computed, for resuming;
+``sfmapp_descriptors`` holds the metric of descriptors that are not SIFT's.
+
+COLMAP's table of descriptors holds bytes. Floats stand in it as COLMAP writes those of ALIKED and LOMA: the bytes of
+little-endian float32, four columns each.
 """
 
 from __future__ import annotations
@@ -29,7 +33,8 @@ _VERSION = 4020100
 
 _MAX_IMAGES = 2**31 - 1
 _CAMERA_SENSOR = 0
-_SIFT, _UNDEFINED = 0, -1  # COLMAP's types of descriptors
+# COLMAP's types of descriptors: what has no type there, and those of ALIKED and LOMA, which are floats
+_SIFT, _UNDEFINED, _FLOATS = 0, -1, (1, 2, 3, 4)
 _SIFT_LENGTH, _ORB_LENGTH = 128, 32
 _WGS84 = 0
 _CALIBRATED_RIG = 9
@@ -118,12 +123,13 @@ CREATE TABLE two_view_geometries (
 _OWN_SCHEMA = """
 CREATE TABLE IF NOT EXISTS sfmapp_features (
     image_id INTEGER PRIMARY KEY NOT NULL, key TEXT NOT NULL, rgb BLOB NOT NULL);
+CREATE TABLE IF NOT EXISTS sfmapp_descriptors (image_id INTEGER PRIMARY KEY NOT NULL, metric TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS sfmapp_pairs (
     pair_id INTEGER PRIMARY KEY NOT NULL, key TEXT NOT NULL, num_putative INTEGER NOT NULL,
     num_inliers_f INTEGER NOT NULL, num_inliers_e INTEGER NOT NULL, num_inliers_h INTEGER NOT NULL,
     median_angle_deg REAL);
 """
-_IMAGE_TABLES = ("keypoints", "descriptors", "sfmapp_features")
+_IMAGE_TABLES = ("keypoints", "descriptors", "sfmapp_features", "sfmapp_descriptors")
 _PAIR_TABLES = ("matches", "two_view_geometries", "sfmapp_pairs")
 
 
@@ -157,6 +163,9 @@ class Database:
                 if not read_only:
                     self._prepare()
                 self._tables = {name for (name,) in self._db.execute("SELECT name FROM sqlite_master")}
+                columns = [row[1] for row in self._db.execute("PRAGMA table_info(descriptors)")]
+                # older versions of COLMAP say nothing about the type, and hold SIFT
+                self._type_column = "type" if "type" in columns else str(_SIFT)
                 if "images" not in self._tables:
                     raise InputError(f"{self.path}: expected a COLMAP database, found no table of images")
                 self._know([image_id for (image_id,) in self._db.execute("SELECT image_id FROM images ORDER BY 1")])
@@ -328,17 +337,20 @@ class Database:
     # features ----------------------------------------------------------------------------------------------------
 
     def write_features(self, image_idx: int, features: Features, key: str = "") -> None:
-        """Store the features of one image in place of what there was.
+        """Store the features of one image in place of what there was; they are read back as they are.
+
+        COLMAP knows descriptors of the metric ``root_sift`` as SIFT; others are of type UNDEFINED to it, and are bytes:
+        it can show and match keypoints that have verified pairs, but not compare such descriptors.
 
         Args:
             image_idx: position of the image.
             key: whatever identifies the inputs and options that they were computed from.
         """
         image_id = self._image_ids[image_idx]
-        keypoints, descriptors = features.keypoints, features.descriptors
-        if features.metric == DescriptorMetric.L2:
-            raise ValueError("a database holds RootSIFT and bits; descriptors of the metric l2 have no place in it")
-        kind = _SIFT if features.metric == DescriptorMetric.ROOT_SIFT else _UNDEFINED
+        keypoints, descriptors, metric = features.keypoints, features.descriptors, features.metric
+        is_sift, is_float = metric == DescriptorMetric.ROOT_SIFT, metric == DescriptorMetric.L2
+        size = 4 if is_float else 1
+        shape = (len(descriptors), descriptors.shape[1] * size)
         with self._writing() as db:
             db.execute(
                 "INSERT OR REPLACE INTO keypoints VALUES (?, ?, ?, ?)",
@@ -346,8 +358,11 @@ class Database:
             )
             db.execute(
                 "INSERT OR REPLACE INTO descriptors VALUES (?, ?, ?, ?, ?)",
-                (image_id, kind, *descriptors.shape, _blob(descriptors, "u1")),
+                (image_id, _SIFT if is_sift else _UNDEFINED, *shape, _blob(descriptors, "<f4" if is_float else "u1")),
             )
+            db.execute("DELETE FROM sfmapp_descriptors WHERE image_id = ?", (image_id,))
+            if not is_sift:
+                db.execute("INSERT INTO sfmapp_descriptors VALUES (?, ?)", (image_id, str(metric)))
             db.execute(
                 "INSERT OR REPLACE INTO sfmapp_features VALUES (?, ?, ?)", (image_id, key, _blob(features.rgb, "u1"))
             )
@@ -370,12 +385,13 @@ class Database:
         what = f"image {image_id}"
         with self._reading():
             keypoint_row = self._one("keypoints", "image_id", "rows, cols, data", image_id)
-            descriptor_row = self._one("descriptors", "image_id", "rows, cols, data", image_id)
+            descriptor_row = self._one("descriptors", "image_id", f"{self._type_column}, rows, cols, data", image_id)
+            metric_row = self._one("sfmapp_descriptors", "image_id", "metric", image_id)
             rgb_row = self._one("sfmapp_features", "image_id", "rgb", image_id)
         if keypoint_row is None or descriptor_row is None:
             raise InputError(f"{self.path}: expected keypoints and descriptors of {what}, found none")
         keypoints = _scale_and_orientation(self._table(f"keypoints of {what}", "<f4", (2, 4, 6), *keypoint_row))
-        descriptors = self._table(f"descriptors of {what}", "u1", (_ORB_LENGTH, _SIFT_LENGTH), *descriptor_row)
+        descriptors, metric = self._descriptors(f"descriptors of {what}", metric_row, *descriptor_row)
         if not np.isfinite(keypoints).all():
             raise InputError(f"{self.path}: keypoints of {what}: expected finite numbers, found NaN or infinity")
         if len(descriptors) != len(keypoints):
@@ -386,9 +402,29 @@ class Database:
         rgb = np.zeros((len(keypoints), 3), np.uint8)
         if rgb_row is not None:
             rgb = self._table(f"colours of {what}", "u1", (3,), len(keypoints), 3, *rgb_row)
-        # databases of older versions of COLMAP say nothing about the kind, and hold SIFT
-        metric = DescriptorMetric.ROOT_SIFT if descriptors.shape[1] == _SIFT_LENGTH else DescriptorMetric.HAMMING
         return Features(keypoints, descriptors, rgb, metric)
+
+    def _descriptors(
+        self, what: str, metric_row: tuple | None, kind: Any, rows: Any, cols: Any, data: Any
+    ) -> tuple[NDArray, DescriptorMetric]:
+        """Descriptors and their metric: as we have noted it, else by COLMAP's type, else by their length."""
+        if metric_row is not None:
+            if metric_row[0] not in tuple(DescriptorMetric):
+                raise InputError(f"{self.path}: {what}: expected a known metric, found {metric_row[0]!r}")
+            metric = DescriptorMetric(metric_row[0])
+        elif kind in _FLOATS:
+            metric = DescriptorMetric.L2
+        else:
+            metric = DescriptorMetric.ROOT_SIFT if cols == _SIFT_LENGTH else DescriptorMetric.HAMMING
+        if metric == DescriptorMetric.L2:
+            allowed = (cols,) if isinstance(cols, int) and cols >= 0 and cols % 4 == 0 else (4,)
+            floats = self._table(what, "u1", allowed, rows, cols, data).view("<f4")
+            if not np.isfinite(floats).all():
+                raise InputError(f"{self.path}: {what}: expected finite numbers, found NaN or infinity")
+            return floats.astype(np.float32), metric
+        if metric == DescriptorMetric.HAMMING and metric_row is not None and isinstance(cols, int) and cols >= 0:
+            return self._table(what, "u1", (cols,), rows, cols, data), metric
+        return self._table(what, "u1", (_ORB_LENGTH, _SIFT_LENGTH), rows, cols, data), metric
 
     def _one(self, table: str, column: str, columns: str, value: int) -> tuple | None:
         if table not in self._tables:

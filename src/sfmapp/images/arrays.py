@@ -17,6 +17,7 @@ from sfmapp.images.cameras import SIGMA_USER_PARAMS, Shot, group_cameras
 from sfmapp.images.exif import ExifFacts
 from sfmapp.images.image_set import ImageOptions, ImageRecord, ImageSet, ImageSource
 from sfmapp.images.pixels import checked_pixels
+from sfmapp.images.report import CameraPrior
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class ArraySource:
         return self.masks.get(name)
 
 
-def describe_source(source: ImageSource, options: ImageOptions | None = None) -> ImageSet:
+def describe_source(source: ImageSource, options: ImageOptions | None = None) -> tuple[ImageSet, Sequence[CameraPrior]]:
     """The images of a source in its own order, with their cameras.
 
     Args:
@@ -53,7 +54,7 @@ def describe_source(source: ImageSource, options: ImageOptions | None = None) ->
         options: what is known about the cameras; names and sizes count as they do for files without EXIF.
 
     Returns:
-        The set. Its ``root`` is None.
+        The set, whose ``root`` is None, and what is known of each camera.
 
     Raises:
         InputError: two images of one name, a name that leads out of its folder, or an array that is no picture.
@@ -64,9 +65,9 @@ def describe_source(source: ImageSource, options: ImageOptions | None = None) ->
         raise InputError(f"images: expected unique names, found {len(names) - len(set(names))} of them twice")
     records = [_described(source, name, options) for name in names]
     shots = [Shot(record.name, record.width, record.height, ExifFacts()) for record in records]
-    cameras, camera_idx, _, _ = group_cameras(shots, options)
+    cameras, camera_idx, entries, _ = group_cameras(shots, options)
     images = tuple(replace(record, camera_idx=idx) for record, idx in zip(records, camera_idx, strict=True))
-    return ImageSet(images, tuple(cameras))
+    return ImageSet(images, tuple(cameras)), entries
 
 
 def check_size(record: ImageRecord, camera: Camera) -> None:

@@ -13,6 +13,7 @@ from statistics import median, pstdev
 from sfmapp.calibration.photographs import GivenCamera, Photograph, read_given_cameras
 from sfmapp.camera.camera import Camera, CameraModel, simple_camera
 from sfmapp.errors import UsageError
+from sfmapp.events import Events
 from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.images.exif import ExifFacts, FocalPrior, focal_prior
 from sfmapp.images.image_set import ImageOptions
@@ -111,6 +112,18 @@ def group_cameras(
         )
         cameras.append(camera)
     return cameras, [index[key] for key in keys], entries, warnings
+
+
+def tell_cameras(entries: Sequence[CameraPrior], stage: str, events: Events) -> None:
+    """One event for each camera: which images share it, and where its focal length comes from."""
+    for entry in entries:
+        sigma = "" if entry.focal_sigma_px is None else f" +- {entry.focal_sigma_px:.0f}"
+        events.decided(
+            stage,
+            f"camera {entry.camera_idx}: {entry.num_images} images, {entry.width}x{entry.height}, focal "
+            f"length {entry.focal_px:.0f}{sigma} px ({entry.focal_reason})",
+            **entry,
+        )
 
 
 def _given_cameras(shots: Sequence[Shot], options: ImageOptions, root: str) -> Sequence[GivenCamera | None]:

@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.geometry.orientation import MIRRORED
-from sfmapp.images.cameras import Shot, group_cameras
+from sfmapp.images.cameras import Shot, group_cameras, tell_cameras
 from sfmapp.images.exif import ExifFacts, read_exif
 from sfmapp.images.headers import Header, UnusableImage, read_header
 from sfmapp.images.image_set import ImageOptions, ImageRecord, ImageSet
@@ -86,7 +86,7 @@ def load_images(
     skipped.sort(key=lambda item: natural_key(item[0]))
     image_set = ImageSet(images, tuple(cameras), tuple(skipped), found.root)
     problems = [(scan.record.name, problem) for scan in scans for problem in scan.problems] + focal_problems
-    duplicates = _duplicates(images)
+    duplicates = same_pixels(images)
     if found.results:
         message = f"{_some(found.results)}: results of sfmapp, whose pictures are no photographs"
         events.decided(STAGE, message, names=found.results)
@@ -238,7 +238,8 @@ def _with_mask(record: ImageRecord, mask_root: Path) -> tuple[ImageRecord, tuple
 # ------------------------------------------------------------------------------------------------- telling about it
 
 
-def _duplicates(images: Iterable[ImageRecord]) -> list[list[str]]:
+def same_pixels(images: Iterable[ImageRecord]) -> list[list[str]]:
+    """Names of images that are the same, byte for byte, set by set."""
     by_digest: defaultdict[str, list[str]] = defaultdict(list)
     for image in images:
         by_digest[image.digest].append(image.name)
@@ -271,13 +272,7 @@ def _tell(
     without = [image.name for image in image_set.images if image.mask_path is None]
     if 0 < len(without) < len(image_set.images):
         events.decided(STAGE, f"{len(without)} of {len(image_set.images)} images have no mask", names=without)
-    for entry in entries:
-        events.decided(
-            STAGE,
-            f"camera {entry.camera_idx}: {entry.num_images} images, {entry.width}x{entry.height}, focal "
-            f"length {entry.focal_px:.0f} +- {entry.focal_sigma_px:.0f} px ({entry.focal_reason})",
-            **entry,
-        )
+    tell_cameras(entries, STAGE, events)
 
 
 def _tell_orientation(events: Events, records: list[ImageRecord]) -> None:

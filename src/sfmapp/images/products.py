@@ -9,6 +9,8 @@ from pathlib import Path
 MANIFEST = "run.json"
 FORMAT_NAME = "sfmapp workspace"
 """What the format of a manifest begins with, in every version of it."""
+IN_MEMORY = "memory://photographs"
+"""What stands in reports and manifests for the place of photographs that have none."""
 
 # what commands put into a workspace, for one that is itself taken for a folder of photographs
 _RESULTS = frozenset({"dense", "mesh", "sparse", "validation"})

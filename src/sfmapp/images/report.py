@@ -46,9 +46,9 @@ class ImageFacts(Report):
 
     Attributes:
         orientation: EXIF's, 1 to 8.
-        digest: of the file.
+        digest: of the file, or of the pixels in memory.
         mask: path of its mask; None without.
-        format, kind, bits: of the file: ``jpeg``, ``rgb``, 8 and so on.
+        format, kind, bits: of the file: ``jpeg``, ``rgb``, 8 and so on; absent where only pixels were given.
         timestamp: seconds since 1970 by the camera's clock; None: not known.
         gps: latitude and longitude in degrees, height in metres or None; None: not known.
     """
@@ -60,9 +60,9 @@ class ImageFacts(Report):
     camera_idx: int
     digest: str
     mask: str | None
-    format: str
-    kind: str
-    bits: int
+    format: str | None = None
+    kind: str | None = None
+    bits: int | None = None
     timestamp: float | None
     gps: Sequence[float | None] | None
 
@@ -71,9 +71,10 @@ class ImagesReport(Report):
     """What the stage ``images`` found.
 
     Attributes:
-        source, root: what was given, and the folder that names are relative to.
+        source, root: what was given, and the folder that names are relative to; of photographs in memory, a name for
+            them, and nothing.
         results_passed_over: folders that hold results of sfmapp.
-        num_bytes: of the files that are used.
+        num_bytes: of the files that are used; 0 of photographs in memory.
         duplicates: names of files that are the same, byte for byte.
     """
 

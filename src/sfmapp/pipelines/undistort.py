@@ -132,7 +132,7 @@ def undistort(
             numbers = _write_model(job, model, keypoints)
             job.workspace.finish(STAGE, job.watch.read(), report=numbers)
             job.workspace.save()
-        report = UndistortReport(**numbers, is_up_to_date=known is not None, run=job.watch.read())
+        report = UndistortReport(**numbers, run=job.took(is_up_to_date=known is not None))
         return UndistortResult(job.workspace.folder, report)
 
 

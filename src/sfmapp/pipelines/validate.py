@@ -18,6 +18,7 @@ from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.colmap import has_model, read_model
 from sfmapp.formats.ground_truth import GroundTruth, read_ground_truth
 from sfmapp.images.folder import load_images
+from sfmapp.images.products import IN_MEMORY
 from sfmapp.pipelines.stored_pixels import check_pixels, ground_truth_in_stored_pixels
 from sfmapp.report.validation import PycolmapSide, Side, Validation
 from sfmapp.reporting import Usage, to_json
@@ -106,6 +107,11 @@ def _photographs(manifest: Mapping[str, Any], events: Events) -> tuple[ImageSet,
     image_options = options_from_dict({"images": manifest.get("options", {}).get("images", {})}).images
     if not manifest.get("source"):
         raise InputError("run.json does not name the photographs", "run sfmapp reconstruct again")
+    if manifest["source"] == IN_MEMORY:
+        raise InputError(
+            "the photographs of this run were arrays in memory, and pycolmap reads files",
+            "write them as files, and run sfmapp reconstruct on their folder",
+        )
     image_set = load_images(manifest["source"], image_options, events)[0]
     if not image_set.images:
         raise InputError(f"{manifest['source']}: the photographs of this run are gone")

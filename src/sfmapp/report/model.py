@@ -49,7 +49,17 @@ class Outcome(Report):
         return cls(exit_code=failure.exit_code, message=str(failure), advice=failure.advice)
 
 
-class RunFacts(Usage):
+class RunUsage(Usage):
+    """What a run took.
+
+    Attributes:
+        is_up_to_date: nothing had changed since an earlier run, whose results these are.
+    """
+
+    is_up_to_date: bool = False
+
+
+class RunFacts(RunUsage):
     """How a run was called, and what it took.
 
     Attributes:
@@ -57,7 +67,6 @@ class RunFacts(Usage):
         options: of all stages, as they were in effect.
         versions: of what a result depends on.
         started: date and time in UTC.
-        is_up_to_date: nothing had changed since an earlier run, whose results these are.
     """
 
     source: str
@@ -66,7 +75,6 @@ class RunFacts(Usage):
     options: Mapping[str, Plain]
     versions: Mapping[str, str]
     started: str
-    is_up_to_date: bool
 
 
 class Check(Report):
@@ -221,11 +229,7 @@ class DensePart(Report):
 
 
 class DenseReport(CloudNumbers):
-    """What densification did, as far as it came; ``run``: what it took.
-
-    Attributes:
-        is_up_to_date: True where nothing had changed since an earlier run, whose results these are; absent elsewhere.
-    """
+    """What densification did, as far as it came."""
 
     outcome: Outcome
     views: ViewsReport | None = None
@@ -236,23 +240,21 @@ class DenseReport(CloudNumbers):
     funnel: Sequence[Step] = ()
     seeds: SeedsReport | None = None
     shares: SharesReport | None = None
-    run: Usage
-    is_up_to_date: bool | None = None
+    run: RunUsage
 
 
 class MeshRunReport(MeshReport):
-    """What meshing did; see :class:`DenseReport`."""
+    """What meshing did."""
 
     outcome: Outcome
-    run: Usage
-    is_up_to_date: bool | None = None
+    run: RunUsage
 
 
 class FailedReport(Report):
     """A stage that came to nothing, and why."""
 
     outcome: Outcome
-    run: Usage
+    run: RunUsage
 
 
 class Stages(Report):
@@ -334,8 +336,7 @@ class UndistortNumbers(Report):
 class UndistortReport(UndistortNumbers):
     """The report of ``sfmapp undistort``."""
 
-    is_up_to_date: bool
-    run: Usage
+    run: RunUsage
 
 
 class ExportReport(Report):

@@ -12,10 +12,18 @@ from sfmapp.geometry.orientation import MIRRORED, upright_pixels
 from sfmapp.images.headers import UnusableImage, read_header
 from sfmapp.images.pixels import decode_bytes, to_8_bits
 
+# Photographs get smaller when there are many: about 40 MB for any number up to 1000, of about 100 KB at 1000 px.
+_SIDE_PX = (360, 1000)
+_BUDGET = 120
 # A JPEG this small goes in as it is: encoding it again would cost time and quality.
 _KEEP_BYTES = 400_000
-_QUALITY = 82
+SCREEN_QUALITY = 82
 _THUMBNAIL_QUALITY = 75
+
+
+def screen_side_px(count: int) -> int:
+    """Largest side of the photographs of a recording that holds so many of them."""
+    return int(np.clip(_SIDE_PX[1] * np.sqrt(_BUDGET / max(1, count)), *_SIDE_PX))
 
 
 @dataclass(frozen=True)
@@ -54,7 +62,7 @@ def load_screen_photo(path: Path, orientation: int, max_side_px: int, thumbnail_
     # a reduced decode may have made it fit: the file itself has not changed
     is_fit = is_fit and (header.height, header.width) == pixels.shape[:2]
     pixels = _shrink(pixels, max_side_px)
-    photo = data if is_fit else _jpeg(pixels, _QUALITY)
+    photo = data if is_fit else _jpeg(pixels, SCREEN_QUALITY)
     thumbnail = _shrink(pixels, thumbnail_px)
     if orientation in MIRRORED:
         thumbnail = np.ascontiguousarray(thumbnail[:, ::-1])

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from sfmapp.children import with_parent
+from sfmapp.errors import InputError
 from sfmapp.packages import MissingPackageError, require
 from sfmapp.viewer.listener import Message, RecordingListener, Step
+from sfmapp.viewer.photos import SCREEN_QUALITY, screen_side_px, shrunk_jpeg
 from sfmapp.viewer.replay import Replay
+
+if TYPE_CHECKING:
+    from sfmapp.images.image_set import ImageRecord
 
 Kind = Literal["run", "dense"]
 
@@ -37,24 +44,42 @@ class RecordingReport:
     problem: str
 
 
-def write_recording(path: Path, replay: Replay, *, threads: int = 1, timeout_s: float = 600.0) -> RecordingReport:
+def write_recording(
+    path: Path, replay: Replay, photographs: Sequence[ImageRecord] = (), *, threads: int = 1, timeout_s: float = 600.0
+) -> RecordingReport:
     """Write a recording that replays a run, in a child process; never raises for what happens there.
 
     Args:
         path: the file, replaced when the new one is whole.
         replay: what it shows, see :func:`~sfmapp.viewer.replay.make_replay`.
+        photographs: I of them, in the order of the replay, if some are no files; none if all are.
         threads: photographs read at a time.
         timeout_s: the child is stopped after this long.
     """
     start = time.monotonic()
     try:
         with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
-            replay.save(Path(name))
+            _with_files(replay, photographs, Path(name)).save(Path(name))
             problem = draw_in_child("run", Path(name), path, threads, timeout_s)
     except OSError as error:
         problem = error.strerror or str(error)
     size = path.stat().st_size if not problem else 0
     return RecordingReport(None if problem else path, size, time.monotonic() - start, problem)
+
+
+def _with_files(replay: Replay, photographs: Sequence[ImageRecord], folder: Path) -> Replay:
+    """Photographs in memory as small files, for a child that cannot look into ours; one that fails is not shown."""
+    from sfmapp.images.pixels import read_rgb
+
+    side, paths = screen_side_px(len(photographs)), list(replay.image_paths)
+    for i, record in enumerate(photographs):
+        if record.source is not None:
+            with contextlib.suppress(InputError):
+                data, _ = shrunk_jpeg(read_rgb(record)[:, :, ::-1], side, SCREEN_QUALITY)
+                path = folder / f"{i:06d}.jpg"
+                path.write_bytes(data)
+                paths[i] = str(path)
+    return replace(replay, image_paths=paths)
 
 
 def draw_in_child(kind: Kind, folder: Path, path: Path, threads: int, timeout_s: float) -> str:

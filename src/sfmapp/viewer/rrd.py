@@ -22,7 +22,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
-from sfmapp.viewer.photos import ScreenPhoto, load_screen_photo
+from sfmapp.viewer.photos import ScreenPhoto, load_screen_photo, screen_side_px
 from sfmapp.viewer.replay import Replay
 from sfmapp.viewer.rrd_file import recording_file
 from sfmapp.viewer.stage import Stage, set_stage
@@ -31,9 +31,6 @@ APPLICATION = "sfmapp"
 TIMELINE = "step"
 PHOTO_TIMELINE = "photo"
 
-# Photographs get smaller when there are many: about 40 MB for any number up to 1000, of about 100 KB at 1000 px.
-_PHOTO_SIDE_PX = (360, 1000)
-_PHOTO_BUDGET = 120
 _THUMBNAIL_PX = 240
 # Residuals are fractions of a pixel: they are drawn this much longer.
 RESIDUAL_SCALE = 20
@@ -140,8 +137,7 @@ def _camera_path(replay: Replay, m: int, image_idx: int) -> tuple[NDArray[np.int
 
 
 def _load_photos(replay: Replay, threads: int) -> list[ScreenPhoto | None]:
-    count = max(1, len(replay.image_names))
-    side = int(np.clip(_PHOTO_SIDE_PX[1] * np.sqrt(_PHOTO_BUDGET / count), *_PHOTO_SIDE_PX))
+    side = screen_side_px(len(replay.image_names))
     with ThreadPoolExecutor(max(1, threads)) as pool:
         return list(
             pool.map(

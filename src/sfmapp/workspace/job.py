@@ -22,7 +22,7 @@ from typing import Any, Self
 import sfmapp
 from sfmapp.errors import InputError, is_full
 from sfmapp.events import Events, Listener
-from sfmapp.report.model import RunFacts
+from sfmapp.report.model import RunFacts, RunUsage
 from sfmapp.reporting import Usage
 from sfmapp.workspace.listeners import DecisionLog, EventLog
 from sfmapp.workspace.manifest import recorded_versions
@@ -144,6 +144,10 @@ class Job:
         self.events.warned("recording", f"{recording} is given up: the disk is full, and the rest matters more")
         return True
 
+    def took(self, *, is_up_to_date: bool = False) -> RunUsage:
+        """What the run has taken so far; ``is_up_to_date``: it found the results of an earlier run to hold."""
+        return RunUsage(**self.watch.read(), is_up_to_date=is_up_to_date)
+
     def facts(self) -> RunFacts:
         """What the report says of the run: how it was called, and what it has taken so far."""
         return RunFacts(
@@ -153,7 +157,6 @@ class Job:
             options=options_to_dict(self.options),
             versions=self.workspace.manifest["versions"],
             started=self.started.isoformat(timespec="seconds"),
-            is_up_to_date=False,
             **self.watch.read(),
         )
 

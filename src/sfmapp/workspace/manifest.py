@@ -15,7 +15,7 @@ from typing import Any
 
 from sfmapp import kernel_cache
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
-from sfmapp.images.products import FORMAT_NAME
+from sfmapp.images.products import FORMAT_NAME, IN_MEMORY
 from sfmapp.workspace.layout import FORMAT, LOCK, MANIFEST, ODOMETRY, RECONSTRUCT
 
 _RECORDED_VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "gtsam", "scipy")
@@ -88,6 +88,17 @@ def raise_as_before(stage: Mapping[str, Any]) -> None:
     outcome = stage.get("outcome") or {}
     if outcome.get("exit_code") == NoReconstructionError.exit_code:
         raise AsBeforeError(f"{outcome['message']} (as before: nothing has changed)", outcome["advice"])
+
+
+def missing_photographs(folder: Path, manifest: Mapping[str, Any]) -> InputError:
+    """What to say where the photographs of a reconstruction are wanted and :func:`image_root` is None."""
+    if manifest.get("source") == IN_MEMORY:
+        return InputError(
+            f"{folder}: its photographs were arrays in memory, of which no pixels were kept",
+            "write them as files under the names that they have in the model, and give that folder: --images DIR",
+        )
+    place = manifest.get("image_root") or manifest.get("source") or "a folder that run.json does not name"
+    return InputError(f"{folder}: expected its photographs in {place}, found no such folder", "give --images DIR")
 
 
 def image_root(manifest: Mapping[str, Any]) -> Path | None:

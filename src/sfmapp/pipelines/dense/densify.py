@@ -83,7 +83,7 @@ def dense(
 
 def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
     """The job: views, what still holds of an earlier run, patches, and the report of it all."""
-    report = DenseReport(outcome=Outcome.of(None), run=job.watch.read())
+    report = DenseReport(outcome=Outcome.of(None), run=job.took())
     key = ""
     try:
         with job.stage("views"):
@@ -110,12 +110,12 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
         raise
     except NoReconstructionError as failure:
         job.note_source()
-        dense_results.finish(job, STAGE, key, replace(report, outcome=Outcome.of(failure), run=job.watch.read()))
+        dense_results.finish(job, STAGE, key, replace(report, outcome=Outcome.of(failure), run=job.took()))
         raise
     scene = dense_results.picture_scene(job, plan)
     dense_results.remove_extras(job)
     dense_results.write_extras(job, plan, patches, scene, maps=maps, record=record)
-    report = replace(report, run=job.watch.read())
+    report = replace(report, run=job.took())
     dense_results.finish(job, STAGE, key, report, (scene, patches, None))
     return DenseResult(patches, plan.names, report, job.workspace.folder)
 

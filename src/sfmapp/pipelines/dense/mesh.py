@@ -21,7 +21,7 @@ from sfmapp.geometry.upright import up_direction
 from sfmapp.pipelines.dense import results as dense_results
 from sfmapp.pipelines.dense.source import DenseJob, dense_job, find_source, model_digest, plan_source
 from sfmapp.pipelines.stored_pixels import has_stored_pixels
-from sfmapp.report.model import FailedReport, MeshRunReport, Outcome
+from sfmapp.report.model import FailedReport, MeshRunReport, Outcome, RunUsage
 from sfmapp.scene.mesh import Mesh
 from sfmapp.surface.mesh import make_mesh
 from sfmapp.surface.report import TextureReport
@@ -117,7 +117,7 @@ def _run(job: DenseJob, record: bool) -> MeshResult:
                 mesh, texture = _textured(job, plan, mesh)
                 report = replace(report, texture=texture)
     except NoReconstructionError as failure:
-        failed = FailedReport(outcome=Outcome.of(failure), run=job.watch.read())
+        failed = FailedReport(outcome=Outcome.of(failure), run=job.took())
         dense_results.finish(job, STAGE, key, failed, (scene, patches, None))
         raise
     is_z_up = bool(up_direction(scene.upright_cam_from_world)[2] > np.sqrt(0.5))
@@ -127,7 +127,7 @@ def _run(job: DenseJob, record: bool) -> MeshResult:
     if record:
         with job.measured("recording"):
             dense_results.write_recording(job, scene, patches, mesh)
-    section = MeshRunReport(**report, outcome=Outcome.of(None), run=job.watch.read())
+    section = MeshRunReport(**report, outcome=Outcome.of(None), run=job.took())
     dense_results.finish(job, STAGE, key, section, (scene, patches, mesh))
     return MeshResult(mesh, section)
 
@@ -172,7 +172,7 @@ def mesh_cloud(
     folder = Path(output)
     write_mesh_ply(folder / MESH_PLY, mesh)
     write_glb(folder / MESH_GLB, mesh)
-    return MeshResult(mesh, MeshRunReport(**report, outcome=Outcome.of(None), run=watch.read()))
+    return MeshResult(mesh, MeshRunReport(**report, outcome=Outcome.of(None), run=RunUsage(**watch.read())))
 
 
 def _oriented_points(path: Path, events: Events) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.uint8]]:

@@ -60,14 +60,14 @@ def earlier_dense(job: DenseJob, key: str, files: Sequence[str]) -> DenseReport 
     """
     document = _earlier_document(job, STAGE, key, files)
     found = document.stages.dense if document is not None else None
-    return None if found is None else replace(found, is_up_to_date=True)
+    return None if found is None else replace(found, run=job.took(is_up_to_date=True))
 
 
 def earlier_mesh(job: DenseJob, key: str, files: Sequence[str]) -> MeshRunReport | None:
     """The same of meshing."""
     document = _earlier_document(job, MESH, key, files)
     found = document.stages.mesh if document is not None else None
-    return replace(found, is_up_to_date=True) if isinstance(found, MeshRunReport) else None
+    return replace(found, run=job.took(is_up_to_date=True)) if isinstance(found, MeshRunReport) else None
 
 
 def _earlier_document(job: DenseJob, stage: str, key: str, files: Sequence[str]) -> Document | None:

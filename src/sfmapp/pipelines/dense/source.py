@@ -20,7 +20,7 @@ from sfmapp.formats.colmap import has_model, is_model_file, read_model
 from sfmapp.pipelines.stored_pixels import has_stored_pixels
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.layout import DENSE, ODOMETRY, RECONSTRUCT, UNDISTORT, USUAL_FOLDERS
-from sfmapp.workspace.manifest import image_root, read_manifest
+from sfmapp.workspace.manifest import image_root, missing_photographs, read_manifest
 from sfmapp.workspace.options import Options, options_from_dict, options_to_dict
 from sfmapp.workspace.usage import Stopwatch
 
@@ -184,8 +184,7 @@ def _photograph_folder(folder: Path, manifest: Mapping[str, Any]) -> Path:
     """The folder of a reconstruction's photographs. Raises InputError if they are gone."""
     found = image_root(manifest)
     if found is None:
-        place = manifest.get("image_root") or manifest.get("source") or "a folder that run.json does not name"
-        raise InputError(f"{folder}: expected its photographs in {place}, found no such folder", "give --images DIR")
+        raise missing_photographs(folder, manifest)
     return found
 
 

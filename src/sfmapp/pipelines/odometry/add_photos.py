@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence as Rows
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ from sfmapp.features.extract import extract_features
 from sfmapp.images.folder import load_images
 from sfmapp.images.image_set import ImageRecord, ImageSet
 from sfmapp.images.sequence import Sequence
+from sfmapp.images.sequence_source import SequenceSource
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.mapping.register import Registration
 from sfmapp.mapping.tracks import build_tracks, track_colors
@@ -75,10 +75,13 @@ def add_photos(
     found, _ = load_images(photos, options.images, events, threads=threads)
     if not found.images:
         raise InputError(f"{photos}: no usable photograph to add", "-v names the files and what is wrong with them")
-    with tempfile.TemporaryDirectory(prefix="sfmapp-keyframes-") as folder:
-        keyframes = _write_keyframes(odometry, sequence, Path(folder))
+    image_of_frame = _chosen_keyframes(odometry)
+    names = {frame: model.image_names[image] for frame, image in image_of_frame.items()}
+    with SequenceSource(sequence, names) as source:
+        keyframes = [(image, _keyframe(model, image, source)) for image in image_of_frame.values()]
         images = _joined_images(model, [record for _, record in keyframes], found)
         features, _ = extract_features(images, options.features, threads=threads, events=events)
+    _check_sequence(source, sequence.source)
     pairs, _ = select_pairs(images, features, options.pairs, seed=options.seed, threads=threads, events=events)
     # how the keyframes lie to each other is known: they need points that the photographs can see, no more
     pairs = pairs[(pairs[:, 1] >= len(keyframes)) | (np.diff(pairs, axis=1)[:, 0] <= KEYFRAME_OVERLAP)]
@@ -105,34 +108,29 @@ def add_photos(
     return joined, PhotoResult(rows, found.skipped)
 
 
-def _write_keyframes(odometry: OdometryResult, sequence: Sequence, folder: Path) -> list[tuple[int, ImageRecord]]:
-    """Images of up to MAX_KEYFRAMES keyframes of the largest map, and their positions in its reconstruction."""
-    import cv2
-
+def _chosen_keyframes(odometry: OdometryResult) -> dict[int, int]:
+    """Images in the largest map of up to MAX_KEYFRAMES of its keyframes, by frame, in the order of the frames."""
     entry = odometry.maps[0]
     chosen = np.arange(len(entry.keyframe_frame_idx))[:: -(-len(entry.keyframe_frame_idx) // MAX_KEYFRAMES)]
-    image_of_frame = {int(entry.keyframe_frame_idx[k]): int(entry.keyframe_image_idx[k]) for k in chosen}
-    last, written = max(image_of_frame), []
-    frames = sequence.frames()
-    for frame in frames:
-        if (image_idx := image_of_frame.get(frame.idx)) is not None:
-            name = entry.reconstruction.image_names[image_idx]
-            if name != frame.name:
-                raise InputError(
-                    f"{sequence.source}: frame {frame.idx} is {frame.name}, not {name} as in the odometry run",
-                    "the sequence has changed: run sfmapp odometry again",
-                )
-            path = folder / f"{frame.idx:06d}.png"
-            cv2.imwrite(str(path), frame.images[0])
-            camera_idx = int(entry.reconstruction.image_camera_idx[image_idx])
-            height, width = frame.images[0].shape
-            written.append((image_idx, ImageRecord(name, path, width, height, camera_idx=camera_idx)))
-        if frame.idx >= last:
-            break
-    frames.close()  # type: ignore[attr-defined]  # a generator: ends its thread
-    if not written:
-        raise InputError(f"{sequence.source}: the frames of the odometry run are gone")
-    return written
+    return dict(sorted((int(entry.keyframe_frame_idx[k]), int(entry.keyframe_image_idx[k])) for k in chosen))
+
+
+def _keyframe(model: Reconstruction, image_idx: int, source: SequenceSource) -> ImageRecord:
+    name, camera_idx = model.image_names[image_idx], int(model.image_camera_idx[image_idx])
+    camera = model.cameras[camera_idx]
+    return ImageRecord(name, Path(name), camera.width, camera.height, camera_idx=camera_idx, source=source)
+
+
+def _check_sequence(source: SequenceSource, place: str) -> None:
+    """Raises InputError if the frames are not those that the map was made of."""
+    if source.renamed is not None:
+        idx, expected, found = source.renamed
+        raise InputError(
+            f"{place}: frame {idx} is {found}, not {expected} as in the odometry run",
+            "the sequence has changed: run sfmapp odometry again",
+        )
+    if not source.num_found:
+        raise InputError(f"{place}: the frames of the odometry run are gone")
 
 
 def _joined_images(model: Reconstruction, keyframes: Rows[ImageRecord], photos: ImageSet) -> ImageSet:

@@ -149,25 +149,21 @@ class _Follower:
 
 
 def _reconstruct(source: str, frames: list[Frame], options: Options, events: Events) -> RunResult:
-    """A reconstruction of the frames, in a folder that is gone afterwards.
+    """A reconstruction of the frames; its files are gone afterwards.
 
     Unless the user has named a camera model, two are tried: the default, and one with another term of distortion.
     """
-    import cv2
-
     model = options.images.camera_model
     models = (model, CameraModel.RADIAL) if model == ImageOptions().camera_model else (model,)
+    # names that differ in their numbers alone, as files of one camera have
+    views = {f"{number:03d}": frame.images[0] for number, frame in enumerate(frames)}
     runs: list[RunResult] = []
     with tempfile.TemporaryDirectory(prefix="sfmapp-calibration-") as name:
-        folder = Path(name) / "frames"
-        folder.mkdir()
-        for number, frame in enumerate(frames):
-            cv2.imwrite(str(folder / f"{number:03d}.png"), frame.images[0])
         for model in models:
             images = replace(options.images, camera=None, camera_model=model, camera_sharing="all", mask_path=None)
             wanted = replace(options, images=images, min_registered=None)
             try:
-                runs.append(reconstruct(folder, Path(name) / "out", wanted, events=events, record=False))
+                runs.append(reconstruct(views, Path(name) / "out", wanted, events=events, record=False))
             except NoReconstructionError as failure:
                 raise InputError(
                     f"{source}: no calibration from its first minute: {failure}",

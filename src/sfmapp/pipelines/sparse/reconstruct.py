@@ -13,7 +13,7 @@ from sfmapp.errors import NoReconstructionError, TooFewImagesError
 from sfmapp.events import Events
 from sfmapp.features.extract import extract_features
 from sfmapp.formats.colmap import read_model
-from sfmapp.images.folder import load_images
+from sfmapp.images.load import Images, load_images, name_of
 from sfmapp.matching.pairs import select_pairs
 from sfmapp.matching.stage import match_images
 from sfmapp.pipelines.sparse import results
@@ -40,7 +40,7 @@ class RunResult(NamedTuple):
 
 
 def reconstruct(
-    images: str | os.PathLike[str],
+    images: Images,
     output: str | os.PathLike[str],
     options: Options | None = None,
     *,
@@ -53,7 +53,8 @@ def reconstruct(
     What an earlier run in the same output folder has done is used where it still holds.
 
     Args:
-        images: a folder, a glob pattern or a ``.txt`` list of files.
+        images: a folder, a glob pattern or a ``.txt`` list of files; or arrays by name, an :class:`ImageSource`, an
+            :class:`ImageSet`, whose pixels are not kept.
         output: folder of the results: new, empty, or of an earlier run.
         options: of all stages; see :func:`sfmapp.load_options`.
         events: listens in, and can ask the run to stop.
@@ -71,7 +72,9 @@ def reconstruct(
         InterruptedRunError: ``events`` was asked to stop; the same call resumes.
     """
     recorder = RecordingListener() if record else None
-    with Run.opened(RECONSTRUCT, images, output, options, events=events, watch=watch, recorder=recorder) as run:
+    with Run.opened(
+        RECONSTRUCT, name_of(images), output, options, events=events, watch=watch, recorder=recorder, images=images
+    ) as run:
         run.listen(recorder)
         report = _run(run)
         model, _ = read_model(run.workspace.model())
@@ -88,7 +91,7 @@ def reconstruct(
 def _run(run: Run) -> ReconstructionReport:
     """The job: photographs, what still holds of an earlier run, models, and the report of it all."""
     with run.stage("images"):
-        run.image_set, images = load_images(run.source, run.options.images, run.events, threads=run.threads)
+        run.image_set, images = load_images(run.images, run.options.images, run.events, threads=run.threads)
         run.stages = replace(run.stages, images=images)
     keys = stage_keys(run.options, run.image_set)
     if report := results.earlier_report(run, keys):

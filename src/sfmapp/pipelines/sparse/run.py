@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from sfmapp.images.load import Images
 from sfmapp.report.model import Stages
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.job import Job
@@ -15,16 +16,18 @@ if TYPE_CHECKING:
     from sfmapp.scene.features import Features
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Run(Job):
     """State of a reconstruction under way.
 
     Attributes:
+        images: what was given to reconstruct.
         recorder: watches the run for a recording; None if none is wanted.
         image_set, features, correspondences: results so far.
         stages: what each stage has said.
     """
 
+    images: Images
     recorder: RecordingListener | None = None
     image_set: ImageSet | None = None
     features: list[Features] = field(default_factory=list)
