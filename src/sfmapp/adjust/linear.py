@@ -42,7 +42,7 @@ def choose_solver(num_blocks: int, num_unknowns: int, fill: float, *, is_closing
 
 
 def group_blocks(near: NDArray[np.bool_], num_poses: int) -> list[Ints]:
-    """Blocks in groups of poses that meet much the same blocks, ascending, all others alone; near (B, B): which meet."""
+    """Blocks, ascending, in groups of poses that meet much the same blocks, others alone; near (B, B): which meet."""
     out, is_free = [], np.ones(len(near), bool)
     is_free[num_poses:] = False
     for seed in range(num_poses):
