@@ -24,6 +24,9 @@ Places = NDArray[np.int64]
 
 # The most rows that a block has.
 _MAX_DIM = 8
+# gtsam refuses a pivot that is 2^24 times smaller than the one before, as those are that only the damping of a free
+# gauge holds. With this share of the diagonal added none is; rounds until the residual is this share of what it was.
+_ENOUGH, _SOLVED, _MAX_ROUNDS = 2.0**-21, 1e-12, 50
 
 
 def gtsam_pose(cam_from_world: Array) -> Any:
@@ -284,6 +287,7 @@ class SparseSystem:
         self._keys = [names[group[0]] for group in groups]
         self._empty = [(np.zeros((size, size)), np.zeros(size)) for size in sizes]
         self._ordering: Any = None
+        self._is_weak = False
 
     def solve(self, tiles: Array, rhs: Array) -> Array | None:
         """Solution (B * 8,) of the damped system in tiles (N * 64,), None where it is not positive definite."""
@@ -302,12 +306,60 @@ class SparseSystem:
         if self._ordering is None:
             self._ordering = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
         try:
-            solution = graph.optimize(self._ordering)
-        except RuntimeError:  # indeterminate: the caller raises the damping
+            if not self._is_weak:
+                return self._unpacked(graph.optimize(self._ordering)) * root.ravel()
+        except RuntimeError:  # pivots of what only the damping holds are too small for it
+            self._is_weak = True
+        found = self._solve_weak(graph, right)
+        return None if found is None else found * root.ravel()
+
+    def _solve_weak(self, graph: Any, right: Array) -> Array | None:
+        """The same by conjugate gradients, with gtsam's factor of the system with a little more on its diagonal."""
+        for key, (square, nothing) in zip(self._keys, self._empty, strict=True):
+            graph.push_back(gtsam.HessianFactor(key, _ENOUGH * np.eye(len(square)), nothing, 0.0))
+        try:
+            net = graph.eliminateSequential(self._ordering)
+        except RuntimeError:  # not positive definite: the caller raises the damping
             return None
-        step = np.zeros(len(rhs))
-        step[np.concatenate(self._rows)] = solution.vector(keys)
-        return step * root.ravel()
+        found, rest = np.zeros(len(right)), right.copy()
+        better = direction = self._unpacked(net.backSubstitute(net.backSubstituteTranspose(self._packed(rest))))
+        gain = rest @ better
+        for _ in range(_MAX_ROUNDS):
+            image = self._product(direction)
+            curvature = direction @ image
+            if not curvature > 0.0:
+                break
+            found += gain / curvature * direction
+            rest -= gain / curvature * image
+            if np.abs(rest).max() <= _SOLVED * np.abs(right).max():
+                break
+            better = self._unpacked(net.backSubstitute(net.backSubstituteTranspose(self._packed(rest))))
+            before, gain = gain, rest @ better
+            direction = better + gain / before * direction
+        return found
+
+    def _product(self, x: Array) -> Array:
+        """The scaled system times x (B * 8,)."""
+        out = np.zeros(len(x))
+        for (i, j), matrix in zip(self._group_pairs.tolist(), self._matrices, strict=True):
+            if i == j:
+                upper = np.triu(matrix)
+                out[self._rows[i]] += upper @ x[self._rows[i]] + np.triu(matrix, 1).T @ x[self._rows[i]]
+            else:
+                out[self._rows[i]] += matrix @ x[self._rows[j]]
+                out[self._rows[j]] += matrix.T @ x[self._rows[i]]
+        return out
+
+    def _packed(self, x: Array) -> Any:
+        out = gtsam.VectorValues()
+        for key, rows in zip(self._keys, self._rows, strict=True):
+            out.insert(key, x[rows])
+        return out
+
+    def _unpacked(self, values: Any) -> Array:
+        out = np.zeros(8 * len(self._dims))
+        out[np.concatenate(self._rows)] = values.vector(self._keys)
+        return out
 
 
 def _block_keys(problem: Problem, own_keys: list[int]) -> list[int]:

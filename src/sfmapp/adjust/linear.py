@@ -294,6 +294,10 @@ class LapackSystem:
     """
 
     def __init__(self, block_dim: Ints, keys: Ints, numbers: Ints) -> None:
+        # loaded here, so that the caller finds the library that it is to hold to one thread
+        from scipy.linalg import lapack
+
+        self._lapack = lapack
         self._pairs = np.stack([*np.divmod(keys, len(block_dim)), numbers], 1)
         self._first = np.cumsum(block_dim) - block_dim
         self._dim, self._used = block_dim, np.arange(8) < block_dim[:, None]
@@ -301,15 +305,13 @@ class LapackSystem:
         self._matrix = np.zeros((size, size))
 
     def solve(self, tiles: Array, rhs: Array) -> Array | None:
-        from scipy.linalg.lapack import dpotrf, dpotrs
-
         _gather_upper(tiles, self._pairs, self._first, self._dim, self._matrix)
         diagonal = self._matrix.diagonal().copy()
         # the upper triangle by rows is the lower one by columns, which LAPACK works on in place
-        factor, info = dpotrf(self._matrix.T, lower=1, clean=0, overwrite_a=1)
+        factor, info = self._lapack.dpotrf(self._matrix.T, lower=1, clean=0, overwrite_a=1)
         if info != 0 or not (factor.diagonal() ** 2 > _NO_PIVOT * diagonal).all():
             return None
-        found, _ = dpotrs(factor, rhs.reshape(-1, 8)[self._used], lower=1)
+        found, _ = self._lapack.dpotrs(factor, rhs.reshape(-1, 8)[self._used], lower=1)
         step = np.zeros((len(self._dim), 8))
         step[self._used] = found
         return step.ravel()

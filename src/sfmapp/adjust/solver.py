@@ -48,7 +48,7 @@ _CHUNK_OBSERVATIONS, _MAX_CHUNKS, _CHUNK_BYTES = 16384, 8, 1 << 26
 def import_ahead(num_images: int) -> None:
     """Begin to import gtsam in a thread, which takes 0.7 s, if closing adjustments may ask it."""
     if num_images > _FEW_IMAGES and "gtsam" not in sys.modules:
-        Thread(target=import_module, args=("sfmapp.adjust.factors",), name="import-gtsam").start()
+        Thread(target=import_module, args=("gtsam",), name="import-gtsam").start()
 
 
 def adjust_bundle(

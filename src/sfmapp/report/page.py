@@ -84,7 +84,7 @@ def adjustment_table(entries: Iterable[tuple[str, AdjustReport | None]]) -> str:
         ("t", ""),
         ("t", "factors"),
         ("", "count"),
-        ("", "residual, sigmas"),
+        ("", "residual"),
         ("", "rejected"),
         ("", "cost"),
         ("t", ""),
@@ -98,7 +98,7 @@ def adjustment_table(entries: Iterable[tuple[str, AdjustReport | None]]) -> str:
         for n, factors in enumerate(report.factors):
             numbers = [
                 ("", factors.num_factors),
-                ("", f"{factors.normalized_residual:.2f}"),
+                ("", report.residual_text(factors)),
                 ("", factors.num_rejected),
             ]
             note = notes[n] if n < len(notes) else ""
