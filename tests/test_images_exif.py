@@ -62,7 +62,7 @@ def test_all_facts_as_pillow_writes_them() -> None:
     assert facts.camera_size == (5616, 3744)
     assert facts.focal_plane_px_per_mm == pytest.approx(3848.0 / 25.4)
     assert facts.timestamp == 1275121822.25  # 08:30:22 UTC
-    assert facts.gps == pytest.approx((-33.51, -70.25, -12.5))
+    assert facts.position.gps == pytest.approx((-33.51, -70.25, -12.5))
     assert facts.problems == ()
 
 
@@ -99,12 +99,12 @@ def test_timestamps(date: str, zone: str, expected: float | None) -> None:
     ],
 )
 def test_positions_that_are_none(gps: dict[int, Any]) -> None:
-    assert read_exif(exif_bytes(gps=gps)).gps is None
+    assert read_exif(exif_bytes(gps=gps)).position is None
 
 
 def test_position_without_altitude() -> None:
     facts = read_exif(exif_bytes(gps={1: "N", 2: (45.0, 30.0, 0.0), 3: "E", 4: (9.0, 0.0, 0.0)}))
-    assert facts.gps == (45.5, 9.0, None)
+    assert facts.position.gps == (45.5, 9.0, None)
 
 
 # --------------------------------------------------------------------------------------------------- focal length
@@ -289,3 +289,21 @@ def test_any_bytes_are_read_without_complaint(data: st.DataObject) -> None:
     focal_prior(read_exif(bytes(block)), 4000, 3000)
     read_exif(bytes(block[: data.draw(st.integers(0, len(block)))]))
     read_exif(data.draw(st.sampled_from([b"", b"II*\0", b"MM\0*"])) + data.draw(st.binary(max_size=200)))
+
+
+@pytest.mark.parametrize(
+    ("tags", "height", "kind", "sigma", "is_stated"),
+    [
+        ({5: b"\x01", 6: 12.5, 31: 7.55}, -12.5, "unknown", 5.0, True),
+        ({5: b"\x02", 6: 12.5}, 12.5, "orthometric", None, False),
+        ({5: b"\x03", 6: 12.5, 11: 10.0}, -12.5, "orthometric", 10.0, False),
+        ({11: 1.2}, None, "unknown", 3.0, False),
+    ],
+)
+def test_errors_and_the_reference_of_heights(
+    tags: dict, height: float | None, kind: str, sigma: float | None, is_stated: bool
+) -> None:
+    position = read_exif(exif_bytes(gps={1: "N", 2: (45.0, 30.0, 0.0), 3: "E", 4: (9.0, 0.0, 0.0)} | tags)).position
+    assert position is not None
+    assert (position.height_m, position.heights, position.is_stated) == (height, kind, is_stated)
+    assert position.sigma_m == (None if sigma is None else pytest.approx(sigma))

@@ -66,9 +66,14 @@ def test_every_image_is_registered_and_errors_have_the_size_of_the_noise(layout)
     assert models[0].is_registered.all()
     error = center_errors(models[0], scene.ground_truth)
     # half a pixel over a focal of 900 is 5.6e-4; hundreds of points average it, the free intrinsics take some back
-    assert 1e-5 < np.median(error) < 3e-3
+    assert 2e-4 < np.median(error) < 2e-3
+    assert error.max() < 4e-3
+    assert models[0].is_triangulated.mean() > 0.99
+    assert models[0].obs_is_inlier.mean() > 0.95
+    # noise, less what the fitted points, poses, focal length and distortion take of it; the gauge of 7 is free
+    num_values, num_fitted = 2 * models[0].obs_is_inlier.sum(), 3 * models[0].is_triangulated.sum() + 6 * 14 + 2 - 7
     rms = models[0].summary()["rms_reprojection_error_px"]
-    assert 0.5 < rms < 0.5 * np.sqrt(2) * 1.03  # fitted parameters can only take away
+    assert rms == pytest.approx(0.5 * np.sqrt(2 * (1 - num_fitted / num_values)), rel=0.03)
     assert [entry["model"] for entry in report["images"]] == [0] * 14
 
 
@@ -76,6 +81,7 @@ def test_exact_observations_give_the_exact_scene():
     scene = make_scene(2, 10, 800, sigma_px=0.0)
     models, _ = reconstruct(scene, focal_ratio=None)
     assert models[0].is_registered.all()
+    assert models[0].obs_is_inlier.mean() > 0.95
     assert center_errors(models[0], scene.ground_truth).max() < 1e-5
     assert models[0].summary()["rms_reprojection_error_px"] < 1e-4
 
@@ -113,6 +119,7 @@ def test_same_bytes_on_any_number_of_threads():
     assert one.cam_from_world.tobytes() == two.cam_from_world.tobytes()
     assert one.point_xyz.tobytes() == two.point_xyz.tobytes()
     assert one.obs_is_inlier.tobytes() == two.obs_is_inlier.tobytes()
+    assert one.cameras[0].params.tobytes() == two.cameras[0].params.tobytes()
 
 
 @pytest.mark.parametrize("ratio", [0.7, 2.0])
@@ -121,8 +128,10 @@ def test_unknown_focal_length_is_found(ratio):
     scene = make_scene(5, 10, 1500, camera, layout="grid" if ratio < 1 else "ring", sigma_px=0.5)
     models, report = reconstruct(scene)
     assert models[0].is_registered.all()
-    assert models[0].cameras[0].focal == pytest.approx(ratio * 1000, rel=0.03)
-    assert report["focal"]["num_pairs"] > 0
+    assert models[0].cameras[0].focal == pytest.approx(ratio * 1000, rel=0.01)
+    # what the pairs tell beforehand is a step of a grid, and far better than the default of 1.2
+    assert report["focal"]["ratio"] == pytest.approx(ratio, rel=0.06)
+    assert report["focal"]["loss"] < 0.6 * report["focal"]["loss_at_default"]
 
 
 def test_one_camera_per_image():
@@ -131,7 +140,7 @@ def test_one_camera_per_image():
     models, _ = reconstruct(scene)
     assert models[0].is_registered.all()
     focal = np.array([c.focal for c in models[0].cameras])
-    np.testing.assert_allclose(focal, np.linspace(700, 1500, 12), rtol=0.05)
+    np.testing.assert_allclose(focal, np.linspace(700, 1500, 12), rtol=0.025)
 
 
 def test_a_scene_in_two_parts_makes_two_models():
@@ -153,6 +162,8 @@ def test_a_scene_in_two_parts_makes_two_models():
     )
     assert [int(m.is_registered.sum()) for m in models] == [9, 7]
     assert [entry["model"] for entry in report["images"]] == [0] * 9 + [1] * 7
+    for model in models:
+        assert np.median(center_errors(model, scene.ground_truth)) < 2e-3
 
 
 @pytest.mark.parametrize(
@@ -166,8 +177,9 @@ def test_pairs_without_depth_start_nothing(config):
         map_images(
             image_set, features, found, MappingOptions(), adjust_options=AdjustOptions(), threads=1, events=Events()
         )
-    assert caught.value.report["images"][0]["reason"]
-    assert caught.value.advice
+    assert [entry["model"] for entry in caught.value.report["images"]] == [None] * 5
+    assert all("too few verified matches" in entry["reason"] for entry in caught.value.report["images"])
+    assert "moving sideways" in caught.value.advice
 
 
 def test_no_matches_is_a_clear_answer():
@@ -189,20 +201,21 @@ def test_an_image_that_cannot_be_registered_is_explained():
     models, report = map_images(
         image_set, features, found, MappingOptions(), adjust_options=AdjustOptions(), threads=1, events=Events()
     )
-    assert int(models[0].is_registered.sum()) == 7
-    assert "verified matches" in report["images"][7]["reason"] or "points of the map" in report["images"][7]["reason"]
-    angle = rigid3.rotation_angle_deg(rigid3.rotation_matrix(models[0].cam_from_world[:7]))
-    assert np.isfinite(angle).all()
+    assert models[0].is_registered.tolist() == [True] * 7 + [False]
+    assert "too few verified matches" in report["images"][7]["reason"]
+    assert [entry["model"] for entry in report["images"]] == [0] * 7 + [None]
+    assert np.median(center_errors(models[0], scene.ground_truth)) < 2e-3
 
 
 def test_residual_scale_leaves_out_points_behind_their_camera() -> None:
-    model = make_scene(0, 6, 80).observed.copy()
+    # cameras that all look one way, so that a point can be behind all of them
+    model = make_scene(0, 6, 300, layout="grid", sigma_px=0.5).observed.copy()
     model.obs_is_inlier[:] = True
     before = residual_scale_px(model)
-    assert 0.0 < before < np.inf
-    center = rigid3.center(model.cam_from_world[model.tracks.obs_image_idx[0]])
-    point = model.tracks.obs_track_idx[0]
-    model.point_xyz[point] = center - 0.1 * (model.point_xyz[point] - center)
+    assert before == pytest.approx(0.5, rel=0.1)
+    behind = np.arange(300) % 5 < 2
+    model.point_xyz[behind] = 2 * rigid3.center(model.cam_from_world).mean(0) - model.point_xyz[behind]
+    # of so many, anything that they have to say would move the median
     assert residual_scale_px(model) == pytest.approx(before, rel=0.1)
     assert residual_scale_px(model, 2 * before) == 2 * before
     model.obs_is_inlier[:] = False

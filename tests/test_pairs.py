@@ -15,6 +15,7 @@ from sfmapp.features.extract import FeatureOptions, features_from_picture
 from sfmapp.images.headers import read_header
 from sfmapp.images.image_set import ImageRecord, ImageSet
 from sfmapp.images.pixels import read_picture
+from sfmapp.images.position import Position
 from sfmapp.matching.pairs import PairOptions, find_sequences, image_vector, learn_vocabulary, select_pairs
 from sfmapp.scene.features import Features
 
@@ -208,7 +209,8 @@ def test_time_stamps_order_what_names_do_not() -> None:
 def test_gps_joins_what_looks_different() -> None:
     """On a line of 70 photographs 11 m apart, without altitude, the next ones are paired."""
     images = tuple(
-        ImageRecord(f"{crc32(bytes([i]))}.jpg", Path("x"), 9, 9, gps=(47.0 + i * 1e-4, 8.0, None)) for i in range(70)
+        ImageRecord(f"{crc32(bytes([i]))}.jpg", Path("x"), 9, 9, position=Position(47.0 + i * 1e-4, 8.0, None))
+        for i in range(70)
     )
     rng = np.random.default_rng(0)
     features = [features_of(rng.integers(0, 90, (50, 128), np.uint8)) for _ in range(70)]

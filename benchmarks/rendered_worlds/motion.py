@@ -148,7 +148,8 @@ def measure_inertia(
     root = np.sqrt(options.rate_hz)
 
     def bias(start: tuple[float, float, float], walk: float) -> Array:
-        return np.asarray(start) + np.cumsum(walk / root * rng.standard_normal((len(times), 3)), 0)
+        drift: Array = np.asarray(start) + np.cumsum(walk / root * rng.standard_normal((len(times), 3)), 0)
+        return drift
 
     gyro_bias, accel_bias = bias(options.gyro_bias, options.gyro_walk), bias(options.accel_bias, options.accel_walk)
     gyro = motion.angular_velocity(times) @ turn.T + gyro_bias

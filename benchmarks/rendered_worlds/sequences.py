@@ -29,7 +29,8 @@ from rendered_worlds.motion import (
 )
 from rendered_worlds.rendering import Optics, Renderer, World
 from rendered_worlds.worlds import STREETS, hall_world, room_world, street_world
-from sfmapp.camera.camera import Camera, CameraModel
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.names import CameraModel
 from sfmapp.geometry import rigid3
 from sfmapp.scene.rig import Rig
 
@@ -89,7 +90,7 @@ class RenderedSequence:
         cam_from_rig = self.rig.cam_from_rig[sensor]
         motion = self.motion[frame].copy()
         motion[:3] = rigid3.rotation_matrix(cam_from_rig) @ motion[:3]
-        return self._renderers[self.place[frame]][sensor].photograph(
+        picture: NDArray[np.uint8] = self._renderers[self.place[frame]][sensor].photograph(
             rigid3.compose(cam_from_rig, self.cam_from_world[frame]),
             self.optics,
             [self.seed, int(self.noise_key[frame]), sensor],
@@ -97,6 +98,7 @@ class RenderedSequence:
             gain=float(self.gain[frame]) * (1.0 + 0.02 * sensor),  # no two sensors are equally sensitive
             motion=motion,
         )
+        return picture
 
     def _take(self, idx: NDArray[np.int64]) -> RenderedSequence:
         """Frames in another order, evenly in time; inertial samples no longer fit and are left out."""

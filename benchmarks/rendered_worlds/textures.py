@@ -31,7 +31,8 @@ def noise(rng: Rng, size: int, cells: int, octaves: int = 4, roughness: float = 
         large = cv2.resize(grid, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         start = round(2 * scale)
         total += np.float32(roughness**octave) * large[start : start + size, start : start + size]
-    return (total - total.mean()) / total.std()
+    even: Floats = (total - total.mean()) / total.std()
+    return even
 
 
 def dirt(rng: Rng, size: int = 512) -> Grey:

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     )
     from sfmapp.api.reconstruction import Reconstruction, load
     from sfmapp.api.stages import Matcher, extract_features, map_images, match_images
-    from sfmapp.camera.camera import Camera, CameraModel
+    from sfmapp.camera.camera import Camera
+    from sfmapp.camera.names import CameraModel
     from sfmapp.errors import (
         InputError,
         InterruptedRunError,
@@ -116,7 +117,7 @@ _HOMES = {
     "AdjustOptions": "adjust.options",
     "ArraySequence": "images.array_sequence",
     "Camera": "camera.camera",
-    "CameraModel": "camera.camera",
+    "CameraModel": "camera.names",
     "Correspondences": "scene.correspondences",
     "DescriptorMetric": "scene.features",
     "Event": "events",

@@ -79,11 +79,13 @@ class Covariances:
 
     def of_point(self, track_idx: int) -> Array:
         """(3, 3) of a point, in the world. Raises InputError if it had no part, for want of a place or of inliers."""
-        return self.points[_place(self.track_idx, track_idx, "point")]
+        covariance: Array = self.points[_place(self.track_idx, track_idx, "point")]
+        return covariance
 
     def of_image(self, image_idx: int) -> Array:
         """(6, 6) of an image's pose, as ``poses``. Raises InputError if it did not vary."""
-        return self.poses[_place(self.image_idx, image_idx, "image")]
+        covariance: Array = self.poses[_place(self.image_idx, image_idx, "image")]
+        return covariance
 
     def of_camera(self, camera_idx: int) -> Array:
         """(Q, Q) of a camera's free parameters. Raises InputError if none of them varied."""

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Problem
-from sfmapp.camera.camera import PARAM_NAMES, Camera
-from sfmapp.camera.models import kind_of
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES, kind_of
 
 Array = NDArray[np.float64]
 

@@ -234,7 +234,8 @@ class Engine:
             return nullcontext()
         from threadpoolctl import threadpool_limits
 
-        return threadpool_limits(1, "blas")
+        limited: AbstractContextManager[Any] = threadpool_limits(1, "blas")
+        return limited
 
     def linearize(self, damping: float, run: Callable[..., Any]) -> float:
         """Reduced system at the current state with damped points; returns the cost of the state."""
@@ -257,7 +258,8 @@ class Engine:
             self.extras.linearize(own, gradient)
         every = Sums(self.tiles, self.own, self.cross, self.gradient)
         assemble(every, images, lenses, blocks, own, gradient, self.diagonal)
-        return cost + self.other_cost()
+        total: float = cost + self.other_cost()
+        return total
 
     def other_cost(self, *, is_new: bool = False) -> float:
         """Cost of priors and extra factors at the current state, or at the new one."""

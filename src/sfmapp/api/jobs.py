@@ -9,11 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from sfmapp.api.images import Images, load_images
+from sfmapp.api.images import load_images
 from sfmapp.api.reconstruction import Reconstruction
 from sfmapp.api.stages import extract_features, map_images, match_images, one_blas_thread
 from sfmapp.errors import UsageError
 from sfmapp.events import Event, Events
+from sfmapp.images.load import Images
 from sfmapp.workspace.options import Options
 
 if TYPE_CHECKING:
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
     from sfmapp.pipelines.dense.mesh import MeshResult
     from sfmapp.pipelines.evaluate import EvaluateOptions, Evaluation
     from sfmapp.pipelines.undistort import UndistortResult
-    from sfmapp.pipelines.validate import Validation
     from sfmapp.report.model import ExportReport, OdometryRunReport, ReconstructionReport, RefineReport
+    from sfmapp.report.validation import Validation
 
 FilePath = str | os.PathLike[str]
 

@@ -98,7 +98,8 @@ class Reconstruction(arrays.Reconstruction):
             InputError: there is none.
         """
         if isinstance(of, str):
-            return self.cameras[self.image_camera_idx[self.image_position(of)]]
+            camera: Camera = self.cameras[self.image_camera_idx[self.image_position(of)]]
+            return camera
         if not 0 <= of < len(self.cameras):
             raise InputError(
                 f"camera {of}: expected a position from 0 to {len(self.cameras) - 1}, or a name of an image"
@@ -188,7 +189,8 @@ class ImageView:
     @property
     def camera(self) -> Camera:
         """What took it."""
-        return self.reconstruction.cameras[self.reconstruction.image_camera_idx[self.idx]]
+        camera: Camera = self.reconstruction.cameras[self.reconstruction.image_camera_idx[self.idx]]
+        return camera
 
     @property
     def is_registered(self) -> bool:

@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.adjust.options import AdjustOptions
-from sfmapp.api.images import Images, load_images
+from sfmapp.api.images import load_images
 from sfmapp.api.reconstruction import Reconstruction
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.features import extract
 from sfmapp.features.extract import FeatureOptions
 from sfmapp.images.image_set import ImageSet
+from sfmapp.images.load import Images
 from sfmapp.mapping import incremental
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.matching import pairs as pair_selection

@@ -33,8 +33,9 @@ from sfmapp.calibration.opencv_lens import (
     camera_from_opencv,
 )
 from sfmapp.calibration.slam_settings import orb_slam_fields, vins_fields
-from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, simple_camera
-from sfmapp.camera.models import kind_of
+from sfmapp.camera.camera import Camera, simple_camera
+from sfmapp.camera.models import PARAM_NAMES, kind_of
+from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.text_input import nearest_rotation
 from sfmapp.geometry import rigid3
@@ -174,7 +175,8 @@ def rectified_projection(place: str, fields: Fields, name: str) -> Array:
 
 def rectified_intrinsics(place: str, fields: Fields, name: str) -> list[float]:
     """fx, fy, cx, cy of :func:`rectified_projection`."""
-    return rectified_projection(place, fields, name)[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    values: list[float] = rectified_projection(place, fields, name)[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    return values
 
 
 # --------------------------------------------------------------------------------------------- a camera of its fields

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, pixels_to_normalized
-from sfmapp.camera.models import kind_of
+from sfmapp.camera.camera import Camera, pixels_to_normalized
+from sfmapp.camera.models import PARAM_NAMES, kind_of
+from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_model import checked_camera
 
@@ -50,7 +51,8 @@ class FullLens:
 
         points = np.concatenate([rays, np.ones((len(rays), 1))], 1)
         zero = np.zeros(3)
-        return cv2.projectPoints(points, zero, zero, self.k_matrix, self.coefficients)[0].reshape(-1, 2)
+        pixels: Array = cv2.projectPoints(points, zero, zero, self.k_matrix, self.coefficients)[0].reshape(-1, 2)
+        return pixels
 
     def rays(self, pixels: Array) -> Array:
         """Normalised image points (N, 2) of pixels (N, 2), centres at whole numbers; wrong without an inverse."""
@@ -58,7 +60,8 @@ class FullLens:
 
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
         pixels = np.ascontiguousarray(pixels[:, None])
-        return cv2.undistortPoints(pixels, self.k_matrix, self.coefficients, criteria=criteria).reshape(-1, 2)
+        found: Array = cv2.undistortPoints(pixels, self.k_matrix, self.coefficients, criteria=criteria).reshape(-1, 2)
+        return found
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.camera import lens
 from sfmapp.camera.lens import FAMILY, ROW
-from sfmapp.camera.models import PARAM_NAMES, CameraModel, canonical_from_params, family_of, kind_of, plain_params
+from sfmapp.camera.models import PARAM_NAMES, canonical_from_params, family_of, kind_of, plain_params
+from sfmapp.camera.names import CameraModel
 
 Array = NDArray[np.float64]
 
@@ -117,6 +118,12 @@ def _unproject_all(c: Array, xy: Array, out: Array) -> None:
         out[i, 0], out[i, 1], out[i, 2] = lens.unproject(c, xy[i, 0], xy[i, 1])
 
 
+@numba.njit(cache=True, nogil=True)
+def _project_jacobians(c: Array, xyz: Array, out: Array) -> None:
+    for i in range(xyz.shape[0]):
+        lens.project_jacobian(c, xyz[i, 0], xyz[i, 1], xyz[i, 2], out[i])
+
+
 def pixels_to_normalized(camera: Camera, xy: ArrayLike) -> Array:
     """Normalised image points (N, 2) float64, ``(X/Z, Y/Z)``, of pixels (N, 2).
 
@@ -142,3 +149,13 @@ def project(camera: Camera, xyz_cam: ArrayLike) -> Array:
     out = np.empty((len(xyz), 2))
     _project_all(camera.canonical, xyz, out)
     return out
+
+
+def project_jacobian(camera: Camera, xyz_cam: ArrayLike) -> tuple[Array, Array, Array]:
+    """Pixels (N, 2) of points (N, 3) in the camera's frame, their derivatives by the points (N, 2, 3), and by the
+    parameters of the camera (N, 2, P); NaN where the lens does not look."""
+    xyz = np.ascontiguousarray(xyz_cam, np.float64)
+    out = np.empty((len(xyz), lens.JACOBIAN))
+    _project_jacobians(camera.canonical, xyz, out)
+    by_slots = out[:, 8:].reshape(len(xyz), FAMILY, 2).swapaxes(1, 2)
+    return out[:, :2], out[:, 2:8].reshape(-1, 2, 3), by_slots @ canonical_from_params(camera.model)

@@ -86,6 +86,20 @@ def _add_option_flags(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     cameras.add_argument("--camera-model", metavar="MODEL", help=", ".join(MODEL_NAMES))
     group.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black pixels are ignored")
+    group.add_argument(
+        "--gps", metavar="FILE|exif|none",
+        help="positions of the photographs: what cameras wrote into the files (the default), none, or a file: geo.txt "
+        "of OpenDroneMap, a CSV of image, latitude, longitude, height, or a track with times (GPX, CSV)",
+    )  # fmt: skip
+    group.add_argument(
+        "--gcp", metavar="FILE",
+        help="ground control points: gcp_list.txt of OpenDroneMap, or a CSV of name, x, y, z, image, px, py, sigmas",
+    )  # fmt: skip
+    group.add_argument(
+        "--scale", metavar="WHAT", action="append", default=[],
+        help="a known length, repeatable: distance:IMAGE:IMAGE:METRES, marker:DICT:METRES, pair:DICT:ID:ID:METRES",
+    )  # fmt: skip
+    group.add_argument("--up", metavar="HOW", help="turn models upright: auto, markers, plane or exif (as held)")
     group.add_argument("--min-registered", metavar="N", help="exit with code 5 if fewer images are registered")
     group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, the replay of the run")
 
@@ -101,6 +115,10 @@ def _options(args: argparse.Namespace) -> Options:
         "images.camera": args.camera,
         "images.camera_model": args.camera_model,
         "images.mask_path": args.mask_path,
+        "gps.source": args.gps,
+        "control.file": args.gcp,
+        "units.known": ";".join(args.scale) or None,
+        "units.up": args.up,
         "min_registered": args.min_registered,
     }
     settings = [*args.set, *(f"{name}={value}" for name, value in flags.items() if value is not None)]
@@ -193,6 +211,74 @@ def _result(output: Path, report: ReconstructionReport) -> dict[str, object]:
     return {"output": str(output), **paths, **report.models[0], "not_registered": missing, "run": report.run}
 
 
+def _print_world(report: ReconstructionReport) -> None:
+    """Where models lie, by positions of photographs, and which of these were left aside."""
+    placed = report.stages.georeference
+    if placed is None:
+        return
+    for model in placed.models:
+        if model.reason:
+            print(f"  model {model.model} is in arbitrary units: {model.reason}")
+            continue
+        assert model.rms_residual_m is not None
+        assert model.scale_sigma_share is not None
+        assert model.rotation_sigma_deg is not None
+        flat, up = model.rms_residual_m
+        height = "" if up is None else f", {up:.2g} m in height"
+        print(
+            f"  model {model.model} is in metres, z up, by {model.num_used} of {model.num_positions} positions: "
+            f"residuals {flat:.2g} m horizontally{height}; scale to {100 * model.scale_sigma_share:.2g} %, "
+            f"north to {model.rotation_sigma_deg[2]:.2g} degrees"
+        )
+    for finding in placed.findings:
+        print(f"  positions: {', '.join([*finding.images[:3], ''])}{finding.message}")
+
+
+def _print_control(report: ReconstructionReport) -> None:
+    """Control points left out in turn, and what is wrong with them."""
+    found = report.stages.control
+    for model in found.models if found is not None else ():
+        if model.reason:
+            print(f"  model {model.model} is not brought to ground control: {model.reason}")
+        elif model.summary is not None:
+            one = model.summary
+            print(
+                f"  model {model.model} lies on ground control; its points, left out in turn, in metres beside their"
+                " standard deviations:"
+            )
+            print(f"    {'point':<14}{'east':>16}{'north':>16}{'up':>16}")
+            for point in model.points:
+                if point.left_out_m is not None and point.left_out_sigma_m is not None:
+                    pairs = zip(point.left_out_m, point.left_out_sigma_m, strict=True)
+                    cells = "".join(f"{f'{value:+.3f} ({sigma:.3f})':>16}" for value, sigma in pairs)
+                    print(f"    {point.name:<14}{cells}{'  refuted' if point.role == 'refuted' else ''}")
+            print(
+                f"    rms {one.horizontal_rms_m:.3f} m horizontally, expected {one.expected_horizontal_m:.3f};"
+                f" {one.vertical_rms_m:.3f} m in height, expected {one.expected_vertical_m:.3f}"
+            )
+        for finding in model.findings:
+            print(f"  {finding}")
+
+
+def _print_units(report: ReconstructionReport) -> None:
+    """Metres by known lengths, each left out in turn, and what levelled models."""
+    found = report.stages.units
+    for scale in found.scales if found is not None else ():
+        if scale.reason:
+            print(f"  model {scale.model} has no metres: {scale.reason}")
+        elif scale.sigma_share is not None:
+            print(f"  model {scale.model} is in metres by known lengths, to {100 * scale.sigma_share:.2g} %")
+        for bar in scale.bars:
+            if bar.left_out_m is not None and bar.left_out_sigma_m is not None:
+                off = f"{bar.left_out_m:+.3g} m by the others ({bar.left_out_sigma_m:.2g})"
+                print(f"    {bar.name}: {off}{'' if bar.is_used else '  refuted'}")
+        for finding in scale.findings:
+            print(f"  {finding}")
+    for level in found.levels if found is not None else ():
+        text = level.reason or f"level by {level.source}, within {level.sigma_deg:.2g} degrees"
+        print(f"  model {level.model}: {text}")
+
+
 def _print_summary(output: Path, report: ReconstructionReport) -> None:
     model, run = report.models[0], report.run
     print(
@@ -208,6 +294,9 @@ def _print_summary(output: Path, report: ReconstructionReport) -> None:
         for m, other in enumerate(report.models[1:], 1):
             if other.apart:
                 print(f"  model {m} is {other.apart}")
+    _print_world(report)
+    _print_control(report)
+    _print_units(report)
     print_contradictions(found for one in report.models for found in one.contradictions)
     print(took(output, run))
     print(f"model {output / 'sparse' / '0'}, report {output / 'report.html'}; look at it: sfmapp view {output}")

@@ -43,7 +43,7 @@ from sfmapp.dense.patch_kernels import (
 )
 from sfmapp.dense.visibility import are_excused
 from sfmapp.dense.window import BEST, HALF, MOST_SLOTS, RHOS, read_reference
-from sfmapp.simd.pointers import Pointer, offset, pointer
+from sfmapp.simd.pointers import Index, Pointer, offset, pointer
 
 CANDIDATES = 3
 # a cell that has failed so often is left alone until the next round
@@ -215,7 +215,7 @@ def try_cells(
 
 @numba.njit(cache=True, nogil=True)
 def is_second_layer(
-    images: ImagePointers, store: StorePointers, there: int, known: float, found: StorePointers, i: int
+    images: ImagePointers, store: StorePointers, there: Index, known: float, found: StorePointers, i: int
 ) -> bool:
     """Whether what was found explains the pixel better than patch ``there`` does, whose NCC is ``known``, and has not
     slid back onto it."""
@@ -326,7 +326,7 @@ def choose(images: ImagePointers, store: StorePointers, m: int, u: float, v: flo
 
 @numba.njit(cache=True, nogil=True)
 def zncc_with_patch(
-    images: ImagePointers, store: StorePointers, m: int, u: float, v: float, p: int, work: Pointer
+    images: ImagePointers, store: StorePointers, m: int, u: float, v: float, p: Index, work: Pointer
 ) -> float:
     """Mean NCC of a patch, seen from view m at (u, v), with the first images that trust it."""
     wu, wv, w = plane_in_view(images, m, offset(store.xyz, 3 * p), offset(store.normal, 3 * p))
@@ -336,7 +336,7 @@ def zncc_with_patch(
 
 @numba.njit(cache=True, nogil=True)
 def _liking(
-    images: ImagePointers, store: StorePointers, m: int, u: float, v: float, p: int, w0: float, wx: float, wy: float,
+    images: ImagePointers, store: StorePointers, m: int, u: float, v: float, p: Index, w0: float, wx: float, wy: float,
     work: Pointer,
 ) -> float:  # fmt: skip
     """Mean NCC of a plane with the first images that trust its patch; -1 if none is a neighbour of view m."""

@@ -22,7 +22,7 @@ from sfmapp.dense.arrays import (
 )
 from sfmapp.dense.expand import place
 from sfmapp.dense.patch_kernels import NEAR, cell_of, cell_size, off_planes, project
-from sfmapp.simd.pointers import offset
+from sfmapp.simd.pointers import Index, offset
 
 # cells to each side that are asked for patches of the same surface, and how many of them have to have one
 ASKED_CELLS = 2
@@ -101,7 +101,7 @@ def judge_patches(
 
 @numba.njit(cache=True, nogil=True)
 def _contradiction(
-    images: ImagePointers, store: StorePointers, cells: CellPointers, p: int, m: int, reach: float
+    images: ImagePointers, store: StorePointers, cells: CellPointers, p: int, m: Index, reach: float
 ) -> float:
     """Scores of the patches in p's cell of view m that p would hide, or that would hide p although m trusts it."""
     u, v, z = project(images, m, offset(store.xyz, 3 * p))
@@ -125,7 +125,7 @@ def _contradiction(
 
 
 @numba.njit(cache=True, nogil=True)
-def _support(images: ImagePointers, store: StorePointers, cells: CellPointers, p: int, r: int, reach: float) -> int:
+def _support(images: ImagePointers, store: StorePointers, cells: CellPointers, p: int, r: Index, reach: float) -> int:
     """Cells around p in its reference image that hold a patch of its surface."""
     u, v, _ = project(images, r, offset(store.xyz, 3 * p))
     g = cell_of(images, r, u, v)

@@ -125,7 +125,8 @@ def depth_picture(depth: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 def normal_picture(normals: NDArray[np.float32]) -> NDArray[np.uint8]:
     """(H, W, 3) RGB: x right, y up and z towards the camera, from -1 to 1, as red, green and blue; black for none."""
-    shown = np.rint((normals * np.array([1.0, -1.0, -1.0], np.float32) + 1.0) * 127.5).astype(np.uint8)
+    turned = normals * np.array([1.0, -1.0, -1.0], np.float32)
+    shown: NDArray[np.uint8] = np.rint((turned + 1.0) * 127.5).astype(np.uint8)
     shown[(normals == 0.0).all(axis=2)] = 0
     return shown
 

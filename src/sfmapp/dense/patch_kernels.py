@@ -22,7 +22,7 @@ from sfmapp.dense.window import (
     solve3,
     warp,
 )
-from sfmapp.simd.pointers import Pointer, offset
+from sfmapp.simd.pointers import Index, Pointer, offset
 
 # how far two patches may lie off each other's planes to be of one surface, in cells
 NEAR = 1.5
@@ -45,7 +45,7 @@ LARGEST_COSINE_OF_ANGLE = math.cos(math.radians(2.5))
 
 
 @numba.njit(cache=True, nogil=True)
-def plane_in_view(images: ImagePointers, m: int, xyz: Pointer, normal: Pointer) -> tuple[float, float, float]:
+def plane_in_view(images: ImagePointers, m: Index, xyz: Pointer, normal: Pointer) -> tuple[float, float, float]:
     """Plane through a place with a normal, seen by view m: inverse depth ``wu u + wv v + w`` as (wu, wv, w)."""
     r, t, k = offset(images.rotation, 9 * m), offset(images.translation, 3 * m), offset(images.k, 4 * m)
     n0 = r[0] * normal[0] + r[1] * normal[1] + r[2] * normal[2]
@@ -62,7 +62,7 @@ def plane_in_view(images: ImagePointers, m: int, xyz: Pointer, normal: Pointer) 
 
 
 @numba.njit(cache=True, nogil=True)
-def project(images: ImagePointers, m: int, xyz: Pointer) -> tuple[float, float, float]:
+def project(images: ImagePointers, m: Index, xyz: Pointer) -> tuple[float, float, float]:
     """Pixel and depth (u, v, z) of a place in view m; z <= 0 behind it."""
     r, t, k = offset(images.rotation, 9 * m), offset(images.translation, 3 * m), offset(images.k, 4 * m)
     z = r[6] * xyz[0] + r[7] * xyz[1] + r[8] * xyz[2] + t[2]
@@ -74,7 +74,7 @@ def project(images: ImagePointers, m: int, xyz: Pointer) -> tuple[float, float, 
 
 
 @numba.njit(cache=True, nogil=True)
-def unproject(images: ImagePointers, m: int, u: float, v: float, z: float, xyz: Pointer) -> float:
+def unproject(images: ImagePointers, m: Index, u: float, v: float, z: float, xyz: Pointer) -> float:
     """The place at depth z that view m sees at pixel (u, v), to ``xyz``; the length of the ray to depth one."""
     k, r, t = offset(images.k, 4 * m), offset(images.rotation, 9 * m), offset(images.translation, 3 * m)
     rx, ry = (u - k[2]) / k[0], (v - k[3]) / k[1]
@@ -86,7 +86,7 @@ def unproject(images: ImagePointers, m: int, u: float, v: float, z: float, xyz: 
 
 @numba.njit(cache=True, nogil=True)
 def normal_of_plane(
-    images: ImagePointers, m: int, u: float, v: float, w: float, wu: float, wv: float, normal: Pointer
+    images: ImagePointers, m: Index, u: float, v: float, w: float, wu: float, wv: float, normal: Pointer
 ) -> float:
     """Unit normal of a plane of view m, inverse depth w at pixel (u, v) with slopes wu, wv, to ``normal``; returns one
     over the distance of the plane from the camera."""
@@ -101,7 +101,7 @@ def normal_of_plane(
 
 
 @numba.njit(cache=True, nogil=True)
-def cell_of(images: ImagePointers, m: int, u: float, v: float) -> int:
+def cell_of(images: ImagePointers, m: Index, u: float, v: float) -> int:
     """Cell of a pixel in view m; -1 outside of the grid."""
     side = images.cell_px
     x, y = math.floor((u + 0.5) / side), math.floor((v + 0.5) / side)
@@ -111,7 +111,7 @@ def cell_of(images: ImagePointers, m: int, u: float, v: float) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def off_planes(store: StorePointers, p: int, other: StorePointers, q: int) -> float:
+def off_planes(store: StorePointers, p: int, other: StorePointers, q: Index) -> float:
     """How far patch p of one store and q of another lie off each other's planes, in all (Furukawa and Ponce, eq. 6)."""
     x, n = offset(store.xyz, 3 * p), offset(store.normal, 3 * p)
     y, o = offset(other.xyz, 3 * q), offset(other.normal, 3 * q)
@@ -126,14 +126,14 @@ def cell_size(images: ImagePointers, store: StorePointers, p: int) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def holds_window(images: ImagePointers, m: int, u: float, v: float) -> bool:
+def holds_window(images: ImagePointers, m: int, u: Index | float, v: Index | float) -> bool:
     """Whether the window about pixel (u, v) lies in view m, with the pixel beyond that bilinear samples need."""
-    return u >= HALF and v >= HALF and u < images.width[m] - HALF - 1 and v < images.height[m] - HALF - 1
+    return bool(u >= HALF and v >= HALF and u < images.width[m] - HALF - 1 and v < images.height[m] - HALF - 1)
 
 
 @numba.njit(cache=True, nogil=True)
 def measure(
-    images: ImagePointers, m: int, slot: int, u: float, v: float, w0: float, wx: float, wy: float, work: Pointer
+    images: ImagePointers, m: int, slot: Index, u: float, v: float, w0: float, wx: float, wy: float, work: Pointer
 ) -> float:
     """NCC of the reference in the scratch, of view m about (u, v), with the neighbour in a slot; -1 where unseen."""
     pair = np.int64(m) * images.num_slots + slot

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3

@@ -211,7 +211,7 @@ def _median_depths(
     rotation, center = rigid3.rotation_matrix(poses), rigid3.center(poses)
     point_idx = np.repeat(np.arange(len(xyz)), np.diff(ptr))
     target = meeting_point(center, rotation[:, 2])
-    depth = np.abs(((target - center) * rotation[:, 2]).sum(axis=1))
+    depth: NDArray[np.float64] = np.abs(((target - center) * rotation[:, 2]).sum(axis=1))
     for m in range(len(poses)):
         z = (xyz[point_idx[view_idx == m]] - center[m]) @ rotation[m, 2]
         if (z > 0.0).sum() >= MIN_SHARED:

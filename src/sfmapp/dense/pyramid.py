@@ -44,7 +44,8 @@ def halve(gray: Gray) -> Gray:
     import cv2
 
     height, width = gray.shape
-    return cv2.resize(gray, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
+    half_size: Gray = cv2.resize(gray, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
+    return half_size
 
 
 def gray_pyramids(views: Sequence[DenseView], num_levels: int, threads: int) -> list[list[Gray]]:

@@ -33,11 +33,13 @@ class DenseView:
 
     @property
     def width(self) -> int:
-        return self.rgb.shape[1]
+        width: int = self.rgb.shape[1]
+        return width
 
     @property
     def height(self) -> int:
-        return self.rgb.shape[0]
+        height: int = self.rgb.shape[0]
+        return height
 
     def project(self, xyz: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(N, 2) pixels and (N,) depth at which the view sees places (N, 3) of the world; pixels are NaN behind it."""

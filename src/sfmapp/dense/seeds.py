@@ -62,7 +62,8 @@ def corners(gray: NDArray[np.uint8], block_px: int, noise: float) -> NDArray[np.
     places = np.stack([x * block_px + best % block_px, y * block_px + best // block_px], 1)
     # what the noise alone would make of the smaller eigenvalue; Sobel's mask of OpenCV divides by its sum of weights
     floor = (noise / 12.0) ** 2
-    return places[blocks.max(axis=1) > floor].astype(np.int32)
+    strong: NDArray[np.int32] = places[blocks.max(axis=1) > floor].astype(np.int32)
+    return strong
 
 
 class CornerSearch(NamedTuple):

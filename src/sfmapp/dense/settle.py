@@ -36,7 +36,7 @@ from sfmapp.dense.patch_kernels import (
     project,
     unproject,
 )
-from sfmapp.simd.pointers import offset, pointer
+from sfmapp.simd.pointers import Index, offset, pointer
 
 # cells to each side that take part, and the pixels over which their weight falls off
 RADIUS_CELLS, FALL_OFF_PX = 3, 2.2
@@ -74,7 +74,7 @@ def settle(
 
 
 @numba.njit(cache=True, nogil=True)
-def _length_per_inverse_depth(images: ImagePointers, r: int, u: float, v: float, w: float) -> float:
+def _length_per_inverse_depth(images: ImagePointers, r: Index, u: float, v: float, w: float) -> float:
     """Length along the ray of pixel (u, v) for a change of inverse depth by one."""
     k = offset(images.k, 4 * r)
     x, y = (u - k[2]) / k[0], (v - k[3]) / k[1]
@@ -83,7 +83,7 @@ def _length_per_inverse_depth(images: ImagePointers, r: int, u: float, v: float,
 
 @numba.njit(cache=True, nogil=True)
 def _fit(
-    images: ImagePointers, store: StorePointers, cells: CellPointers, p: int, r: int, g: int, u: float, v: float,
+    images: ImagePointers, store: StorePointers, cells: CellPointers, p: int, r: Index, g: int, u: float, v: float,
     z: float, wu: float, wv: float,
 ) -> tuple[float, float, float, float, bool]:  # fmt: skip
     """Plane (w, dw/du, dw/dv at the patch) through its neighbours in view r, the deviation of w, whether it is one."""
@@ -143,6 +143,6 @@ def _fit(
 
 
 @numba.njit(cache=True, nogil=True)
-def _deviation(images: ImagePointers, store: StorePointers, q: int, r: int, u: float, v: float, w: float) -> float:
+def _deviation(images: ImagePointers, store: StorePointers, q: Index, r: Index, u: float, v: float, w: float) -> float:
     """Standard deviation of a patch in inverse depth of view r, taken along its line of sight."""
     return np.float64(store.sigma[q]) / _length_per_inverse_depth(images, r, u, v, w)

@@ -11,7 +11,7 @@ from numba import float32 as f32
 from sfmapp.dense.arrays import LAYERS, CellPointers, ImagePointers, StorePointers
 from sfmapp.dense.patch_kernels import APART, LEAST_COSINE, cell_of, cell_size, off_planes, project
 from sfmapp.dense.window import HALF
-from sfmapp.simd.pointers import offset
+from sfmapp.simd.pointers import Index, offset
 
 # of an image: where a window about as large as that of the reference image reaches out of it
 BORDER = float(HALF + 1)
@@ -35,7 +35,7 @@ def are_excused(images: ImagePointers, store: StorePointers, cells: CellPointers
 
 @numba.njit(cache=True, nogil=True)
 def can_see(
-    images: ImagePointers, store: StorePointers, cells: CellPointers, s: int, found: StorePointers, i: int
+    images: ImagePointers, store: StorePointers, cells: CellPointers, s: Index, found: StorePointers, i: int
 ) -> bool:
     """Whether the window of patch i lies in the image and mask of view s, faces it, and no patch of it hides it."""
     xyz, normal, eye = offset(found.xyz, 3 * i), offset(found.normal, 3 * i), offset(images.center, 3 * s)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from sfmapp.simd.bilinear import quad_pixels, sample_quads, sample_quads_with_slopes
 from sfmapp.simd.f32x16 import add, divide, fma, load, multiply, splat, store, subtract, total
-from sfmapp.simd.pointers import Pointer, offset
+from sfmapp.simd.pointers import Index, Pointer, offset
 
 HALF = 3
 SIZE = 32
@@ -70,7 +70,7 @@ def make_scratch() -> NDArray[np.float32]:
 
 
 @numba.njit(cache=True, nogil=True)
-def read_reference(quads: Pointer, width: int, u: int, v: int, contrast: float, work: Pointer) -> float:
+def read_reference(quads: Pointer, width: int, u: Index, v: Index, contrast: float, work: Pointer) -> float:
     """Fill weights and reference of the scratch from the window about pixel (u, v); its standard deviation in grey.
 
     ``contrast``: the difference in grey at which a pixel's weight has fallen to one quarter. Zero if it is flat.

@@ -139,7 +139,8 @@ def sample_triangles(vertices: ArrayLike, triangles: ArrayLike, count: int, seed
     u, v = rng.random((2, count))
     root = np.sqrt(u)  # Osada et al., "Shape distributions", 2002, equation 1
     a, b, c = corners[face].transpose(1, 0, 2)
-    return (1 - root)[:, None] * a + (root * (1 - v))[:, None] * b + (root * v)[:, None] * c
+    samples: Array = (1 - root)[:, None] * a + (root * (1 - v))[:, None] * b + (root * v)[:, None] * c
+    return samples
 
 
 def triangle_areas(corners: Array) -> Array:

@@ -275,7 +275,8 @@ def _angle_between_deg(a: Array, b: Array) -> Array:
     half_sine = np.linalg.norm(a - b, axis=(-2, -1)) / np.sqrt(8.0)
     cosine = (np.einsum("...ij,...ij->...", a, b) - 1.0) / 2.0
     half = np.degrees(2.0 * np.arcsin(np.minimum(half_sine, 1.0)))
-    return np.where(half < 90.0, half, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    angle: Array = np.where(half < 90.0, half, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    return angle
 
 
 def _statistics(values: Array) -> PoseStatistics | None:

@@ -15,7 +15,7 @@ import numpy as np
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.features.orb import extract_orb
-from sfmapp.features.report import FeaturesReport, ImageFeatures
+from sfmapp.features.report import FEW_FEATURES, FeaturesReport, ImageFeatures
 from sfmapp.features.sift import Scratch, compile_kernels, extract_sift
 from sfmapp.option_checks import RESOURCE, Range, check_options, positive
 from sfmapp.scene.features import DescriptorMetric, Features
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 __all__ = ["FeatureOptions", "compile_kernels", "extract_features", "extract_image", "features_from_picture"]
 
 STAGE = "features"
-# fewer keypoints than this and an image will hardly be registered: the report says so
-FEW_FEATURES = 100
 _METRICS = {"sift": DescriptorMetric.ROOT_SIFT, "orb": DescriptorMetric.HAMMING}
 
 _RANGES = {

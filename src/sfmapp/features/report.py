@@ -6,6 +6,9 @@ from collections.abc import Sequence
 
 from sfmapp.reporting import Report
 
+# fewer keypoints than this leave too few matches for any pair, whatever the other image holds
+FEW_FEATURES = 100
+
 
 class ImageFeatures(Report):
     """The keypoints of one image.

@@ -97,7 +97,7 @@ def _extremes_of_three(row: Floats, most: Floats, least: Floats, num: int) -> No
 
 @numba.njit(cache=True, nogil=True)
 def _flag_extremes(
-    row: Floats, most: Floats, least: Floats, threshold: float, flags: NDArray[np.uint8], num: int
+    row: Floats, most: Floats, least: Floats, threshold: np.float32, flags: NDArray[np.uint8], num: int
 ) -> None:
     """Flag the values of a row that are the extremes of their 3 x 3 pixels and far enough from zero."""
     for c in range(num):

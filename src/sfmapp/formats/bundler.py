@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import Camera, CameraModel
+from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import BROWN
+from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.text_input import nearest_rotation, plain_numbers, read_limited_text
@@ -191,7 +192,7 @@ def _read_cameras(
 ) -> tuple[list[Camera], NDArray[np.int32], Array]:
     """Cameras, the camera of each image, and poses (I, 7), NaN where unregistered."""
     cameras: list[Camera] = []
-    known: dict[tuple, int] = {}
+    known: dict[tuple[float, ...], int] = {}
     camera_idx = np.empty(len(rows), np.int32)
     poses = np.full((len(rows), 7), np.nan)
     for i, row in enumerate(rows):

@@ -5,11 +5,14 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES
+from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_model import (
     NO_POINTS_NOTE,
@@ -161,7 +164,7 @@ class _Reader:
         if num_bytes > left:
             raise InputError(f"{self.path}: truncated: expected {num_bytes} bytes of {what}, found {left}")
 
-    def unpack(self, form: str, what: str) -> tuple:
+    def unpack(self, form: str, what: str) -> tuple[Any, ...]:
         """The values of a struct format at the position."""
         size = struct.calcsize(form)
         self.need(size, what)
@@ -171,6 +174,7 @@ class _Reader:
 
     def count(self, what: str, smallest_bytes: int, form: str = "<Q") -> int:
         """A count at the position; refused if so many entries of the smallest size do not fit in the file."""
+        count: int
         (count,) = self.unpack(form, f"the number of {what}")
         left = len(self.data) - self.pos
         if count * smallest_bytes > left:
@@ -179,7 +183,7 @@ class _Reader:
             )
         return count
 
-    def array(self, dtype: np.dtype, count: int, what: str) -> NDArray:
+    def array(self, dtype: np.dtype[Any], count: int, what: str) -> NDArray[Any]:
         """A copy of that many entries at the position."""
         self.need(count * dtype.itemsize, what)
         values = np.frombuffer(self.data, dtype, count, self.pos).copy()
@@ -243,7 +247,7 @@ def _read_images(
     return ids, camera_ids, names, checked_poses(reader.path, "image", ids, table[:, 1:8]), xy, point_ids
 
 
-def _read_points(reader: _Reader) -> tuple[NDArray, NDArray[np.int64], NDArray]:
+def _read_points(reader: _Reader) -> tuple[NDArray[Any], NDArray[np.int64], NDArray[Any]]:
     """Heads (P,) of _POINT3D, track_ptr (P + 1,), elements (O,) of _TRACK."""
     count = reader.count("points", _POINT3D.itemsize)
     start, data, end = reader.pos, reader.data, len(reader.data)

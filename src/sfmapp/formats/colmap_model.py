@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera
-from sfmapp.camera.models import PARAM_NAMES, CameraModel, kind_of
+from sfmapp.camera.models import PARAM_NAMES, kind_of
+from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.colmap_rigs import Frame, Rig, mount_images, rig_images
 from sfmapp.scene.reconstruction import Reconstruction

@@ -102,7 +102,8 @@ def mount_images(reconstruction: Reconstruction, registered: NDArray[np.int64]) 
 def _between(cam_from_rig: NDArray[np.float64], sensor: int, origin: int) -> NDArray[np.float64]:
     """Pose of a sensor from another one; the bits of the table where that is the rig's own frame."""
     if np.array_equal(cam_from_rig[origin], rigid3.IDENTITY):
-        return cam_from_rig[sensor]
+        as_given: NDArray[np.float64] = cam_from_rig[sensor]
+        return as_given
     return rigid3.compose(cam_from_rig[sensor], rigid3.inverse(cam_from_rig[origin]))
 
 

@@ -405,8 +405,8 @@ class Database:
         return Features(keypoints, descriptors, rgb, metric)
 
     def _descriptors(
-        self, what: str, metric_row: tuple | None, kind: Any, rows: Any, cols: Any, data: Any
-    ) -> tuple[NDArray, DescriptorMetric]:
+        self, what: str, metric_row: tuple[Any, ...] | None, kind: Any, rows: Any, cols: Any, data: Any
+    ) -> tuple[NDArray[Any], DescriptorMetric]:
         """Descriptors and their metric: as we have noted it, else by COLMAP's type, else by their length."""
         if metric_row is not None:
             if metric_row[0] not in tuple(DescriptorMetric):
@@ -426,12 +426,16 @@ class Database:
             return self._table(what, "u1", (cols,), rows, cols, data), metric
         return self._table(what, "u1", (_ORB_LENGTH, _SIFT_LENGTH), rows, cols, data), metric
 
-    def _one(self, table: str, column: str, columns: str, value: int) -> tuple | None:
+    def _one(self, table: str, column: str, columns: str, value: int) -> tuple[Any, ...] | None:
         if table not in self._tables:
             return None
-        return self._db.execute(f"SELECT {columns} FROM {table} WHERE {column} = ?", (value,)).fetchone()
+        query = f"SELECT {columns} FROM {table} WHERE {column} = ?"
+        row: tuple[Any, ...] | None = self._db.execute(query, (value,)).fetchone()
+        return row
 
-    def _table(self, what: str, dtype: str, allowed_cols: tuple[int, ...], rows: Any, cols: Any, data: Any) -> NDArray:
+    def _table(
+        self, what: str, dtype: str, allowed_cols: tuple[int, ...], rows: Any, cols: Any, data: Any
+    ) -> NDArray[Any]:
         """A copy (rows, cols) of a blob, after checking its size."""
         if rows == 0 and not data:
             return np.zeros((0, cols if cols in allowed_cols else allowed_cols[0]), dtype)
@@ -539,7 +543,7 @@ class Database:
         return self._correspondences(wanted, [by_pair[pair] for pair in wanted], counts)
 
     def _correspondences(
-        self, pairs: list[tuple[int, int]], rows: list[tuple], num_keypoints: NDArray[np.int64]
+        self, pairs: list[tuple[int, int]], rows: list[tuple[Any, ...]], num_keypoints: NDArray[np.int64]
     ) -> Correspondences:
         num = len(pairs)
         matches, config = [], np.zeros(num, np.int8)

@@ -93,7 +93,14 @@ class _Buffer:
         return len(self.views) - 1
 
     def accessor(
-        self, array: NDArray, component: int, kind: str, target: int, *, bounds: bool = False, normalized: bool = False
+        self,
+        array: NDArray[Any],
+        component: int,
+        kind: str,
+        target: int,
+        *,
+        bounds: bool = False,
+        normalized: bool = False,
     ) -> int:
         """Append rows; the number of their accessor."""
         entry: dict[str, Any] = {

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import Camera, CameraModel
+from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import BROWN, EQUIRECTANGULAR, RADIAL_FISHEYE
+from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.colmap_model import checked_camera
@@ -101,7 +102,7 @@ def read_nerfstudio(path: str | Path) -> Reconstruction:
     path = Path(path)
     document = read_json_object(path)
     names, poses = _poses(path, document)
-    cameras: dict[tuple, int] = {}
+    cameras: dict[tuple[float, ...], int] = {}
     camera_list: list[Camera] = []
     camera_idx = []
     for camera in _cameras(path, document):

@@ -167,7 +167,8 @@ def _as_bytes(channels: list[NDArray[Any]]) -> NDArray[np.uint8]:
         values *= 255.0
     elif highest > 255.0:
         values /= 257.0
-    return np.rint(values.clip(0.0, 255.0)).astype(np.uint8)
+    rounded: NDArray[np.uint8] = np.rint(values.clip(0.0, 255.0)).astype(np.uint8)
+    return rounded
 
 
 # ---------------------------------------------------------------- header
@@ -332,7 +333,8 @@ def _gather(
 
     def take(at: NDArray[np.int64], kind: str) -> NDArray[Any]:
         dtype = np.dtype(order + kind)
-        return data[at[:, None] + np.arange(dtype.itemsize)].reshape(-1).view(dtype)
+        values: NDArray[Any] = data[at[:, None] + np.arange(dtype.itemsize)].reshape(-1).view(dtype)
+        return values
 
     numbers, lists = {}, {}
     at, n = places[:, 0], 0

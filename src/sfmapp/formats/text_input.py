@@ -97,4 +97,5 @@ def nearest_rotation(place: str, matrix: NDArray[np.float64], tolerance: float =
     if not error < 6 * tolerance or np.linalg.det(matrix) < 0:  # each product sums three entries, twice
         raise InputError(f"{place}: expected a rotation matrix, found {matrix.tolist()}")
     u, _, vt = np.linalg.svd(matrix)
-    return u @ vt
+    rotation: NDArray[np.float64] = u @ vt
+    return rotation

@@ -52,7 +52,8 @@ def fundamental_from_points(xy1: Array, xy2: Array, weights: Array | None = None
     f = np.linalg.eigh(design.T @ weighted)[1][:, 0].reshape(3, 3)
     u, s, vt = np.linalg.svd(f)
     f = t2.T @ (u[:, :2] * s[:2]) @ vt[:2] @ t1
-    return f / np.linalg.norm(f)
+    unit: Array = f / np.linalg.norm(f)
+    return unit
 
 
 def essential_from_fundamental(fundamental: Array, k1: Array, k2: Array) -> Array:
@@ -63,13 +64,15 @@ def essential_from_fundamental(fundamental: Array, k1: Array, k2: Array) -> Arra
 def fundamental_from_essential(essential: Array, k1: Array, k2: Array) -> Array:
     """``K2^-T E K1^-1`` of unit norm (HZ 9.12)."""
     f = np.linalg.inv(k2).T @ essential @ np.linalg.inv(k1)
-    return f / np.linalg.norm(f)
+    unit: Array = f / np.linalg.norm(f)
+    return unit
 
 
 def nearest_essential(matrix: Array) -> Array:
     """The essential matrix nearest in the Frobenius norm up to scale, of unit norm."""
     u, _, vt = np.linalg.svd(matrix)
-    return (u[:, :2] @ vt[:2]) / math.sqrt(2.0)
+    essential: Array = (u[:, :2] @ vt[:2]) / math.sqrt(2.0)
+    return essential
 
 
 def essential_from_pose(cam2_from_cam1: ArrayLike) -> Array:
@@ -107,7 +110,7 @@ def _sampson_errors(f: Array, xy1: Array, xy2: Array, out: Array) -> None:
 def sampson_errors(matrix: Array, xy1: Array, xy2: Array) -> Array:
     """(N,) squared Sampson distances to the epipolar geometry, in the units of the points squared (HZ 11.9)."""
     out = np.empty(len(xy1))
-    _sampson_errors(*(np.ascontiguousarray(a, np.float64) for a in (matrix, xy1, xy2)), out)
+    _sampson_errors(np.ascontiguousarray(matrix, np.float64), *_contiguous(xy1, xy2), out)
     return out
 
 
@@ -117,7 +120,8 @@ def sampson_weights(fundamental: Array, xy1: Array, xy2: Array) -> Array:
     line1 = xy2 @ fundamental[:2, :2] + fundamental[2, :2]
     denominator = (line2**2).sum(1) + (line1**2).sum(1)
     weights = 1.0 / np.maximum(denominator, max(1e-12 * float(denominator.max()), 1e-300))
-    return weights / weights.max()
+    relative: Array = weights / weights.max()
+    return relative
 
 
 @numba.njit(cache=True, nogil=True)
@@ -351,8 +355,8 @@ def refine_relative_pose(
     return rigid3.from_matrix(rotations[best], ts[best])
 
 
-def _contiguous(*arrays: ArrayLike) -> tuple[Array, ...]:
-    return tuple(np.ascontiguousarray(a, np.float64) for a in arrays)
+def _contiguous(xy1: ArrayLike, xy2: ArrayLike) -> tuple[Array, Array]:
+    return np.ascontiguousarray(xy1, np.float64), np.ascontiguousarray(xy2, np.float64)
 
 
 def compile_kernels() -> None:

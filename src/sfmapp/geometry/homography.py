@@ -56,4 +56,5 @@ def rotation_from_rays(xn1: Array, xn2: Array, weights: Array) -> Array:
     a /= np.linalg.norm(a, axis=1, keepdims=True)
     b /= np.linalg.norm(b, axis=1, keepdims=True)
     u, _, vt = np.linalg.svd((b * weights[:, None]).T @ a)
-    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    rotation: Array = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return rotation

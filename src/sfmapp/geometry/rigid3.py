@@ -58,7 +58,8 @@ def quaternion(rotation: ArrayLike) -> Array:
     largest = np.argmax(np.diagonal(products, axis1=-2, axis2=-1), axis=-1)
     q = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., 3:] < 0, -q, q)
+    upper: Array = np.where(q[..., 3:] < 0, -q, q)
+    return upper
 
 
 def from_matrix(rotation: ArrayLike, translation: ArrayLike) -> Array:
@@ -84,7 +85,8 @@ def inverse(b_from_a: ArrayLike) -> Array:
 def apply(b_from_a: ArrayLike, x_a: ArrayLike) -> Array:
     """Points (..., 3) moved from frame a to frame b."""
     pose = np.asarray(b_from_a, np.float64)
-    return np.einsum("...ij,...j->...i", rotation_matrix(pose), np.asarray(x_a, np.float64)) + pose[..., 4:]
+    moved: Array = np.einsum("...ij,...j->...i", rotation_matrix(pose), np.asarray(x_a, np.float64)) + pose[..., 4:]
+    return moved
 
 
 def center(cam_from_world: ArrayLike) -> Array:
@@ -108,7 +110,8 @@ def exp_so3(w: ArrayLike) -> Array:
     a = np.where(small, 1 - angle2 / 6, np.sin(safe) / safe)
     b = np.where(small, 0.5 - angle2 / 24, (1 - np.cos(safe)) / safe**2)
     k = skew(w)
-    return np.eye(3) + a[..., None, None] * k + b[..., None, None] * (k @ k)
+    rotation: Array = np.eye(3) + a[..., None, None] * k + b[..., None, None] * (k @ k)
+    return rotation
 
 
 def log_so3(rotation: ArrayLike) -> Array:
@@ -134,7 +137,8 @@ def interpolate(first: ArrayLike, last: ArrayLike, share: ArrayLike) -> Array:
 
 def rotation_angle_deg(rotation: ArrayLike) -> Array:
     """Angles (...) in degrees, 0 to 180, of rotation matrices (..., 3, 3)."""
-    return np.degrees(np.linalg.norm(log_so3(rotation), axis=-1))
+    angle: Array = np.degrees(np.linalg.norm(log_so3(rotation), axis=-1))
+    return angle
 
 
 class Rigid3:

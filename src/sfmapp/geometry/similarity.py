@@ -53,7 +53,8 @@ def from_parts(rotation: ArrayLike, translation: ArrayLike, scale: float) -> Arr
 def apply(b_from_a: ArrayLike, x_a: ArrayLike) -> Array:
     """Points (..., 3) moved from frame a to frame b."""
     sim = np.asarray(b_from_a, np.float64)
-    return sim[7] * (np.asarray(x_a, np.float64) @ rigid3.rotation_matrix(sim).T) + sim[4:7]
+    moved: Array = sim[7] * (np.asarray(x_a, np.float64) @ rigid3.rotation_matrix(sim).T) + sim[4:7]
+    return moved
 
 
 def inverse(b_from_a: ArrayLike) -> Array:
@@ -160,7 +161,8 @@ class _Moments:
     @property
     def rotation(self) -> Array:
         sign = np.array([1.0, 1.0, np.sign(np.linalg.det(self.u) * np.linalg.det(self.vt))])
-        return (self.u * sign) @ self.vt
+        turn: Array = (self.u * sign) @ self.vt
+        return turn
 
 
 def _moments(x_a: Array, x_b: Array) -> _Moments:
@@ -202,7 +204,8 @@ class _Cameras:
         return _Cameras(self.center_a[index], self.center_b[index], self.b_from_a_rotation[index], self.extent_b)
 
     def residuals(self, b_from_a: Array) -> Array:
-        return np.linalg.norm(self.center_b - apply(b_from_a, self.center_a), axis=1)
+        lengths: Array = np.linalg.norm(self.center_b - apply(b_from_a, self.center_a), axis=1)
+        return lengths
 
 
 def _fit(cameras: _Cameras) -> tuple[Array, bool]:
@@ -221,7 +224,7 @@ def _fit(cameras: _Cameras) -> tuple[Array, bool]:
 
 def _thickness(centers: Array) -> float:
     """Standard deviation of points across their longest axis, in the wider of the two directions."""
-    return float(np.linalg.svd(centers - centers.mean(0), compute_uv=False)[1]) / np.sqrt(len(centers))
+    return float(np.linalg.svd(centers - centers.mean(0), compute_uv=False)[1] / np.sqrt(len(centers)))
 
 
 def _closest_about_axis(axis_a: Array, axis_b: Array, orientations: Array) -> Array:

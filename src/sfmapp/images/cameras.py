@@ -11,7 +11,8 @@ from pathlib import PurePosixPath
 from statistics import median, pstdev
 
 from sfmapp.calibration.photographs import GivenCamera, Photograph, read_given_cameras
-from sfmapp.camera.camera import Camera, CameraModel, simple_camera
+from sfmapp.camera.camera import Camera, simple_camera
+from sfmapp.camera.names import CameraModel
 from sfmapp.errors import UsageError
 from sfmapp.events import Events
 from sfmapp.geometry.orientation import MIRRORED

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,8 +121,7 @@ def _problem_of(container: InputContainer) -> str:
 
 def best_stream(container: InputContainer) -> VideoStream:
     """The stream of pictures that FFmpeg would play: no cover art, the largest of several."""
-    stream: Any = container.streams.best("video")
-    return stream
+    return cast("VideoStream", container.streams.best("video"))
 
 
 def read_container_facts(source: str, *, is_stream: bool) -> VideoFacts:
@@ -316,7 +315,8 @@ def _luma(frame: VideoFrame) -> Pixels:
 
     name = frame.format.name
     if _WITH_LUMA.fullmatch(name) is None:
-        return cv2.cvtColor(frame.to_ndarray(format="rgb24"), cv2.COLOR_RGB2GRAY)
+        luma_of_colors: Pixels = cv2.cvtColor(frame.to_ndarray(format="rgb24"), cv2.COLOR_RGB2GRAY)
+        return luma_of_colors
     bits, plane = max(component.bits for component in frame.format.components), frame.planes[0]
     stored: NDArray[Any] = np.frombuffer(memoryview(plane), np.uint8 if bits <= 8 else np.dtype("<u2"))
     luma = stored.reshape(-1, plane.line_size // stored.itemsize)[: frame.height, : frame.width]
@@ -329,4 +329,5 @@ def _luma(frame: VideoFrame) -> Pixels:
     low, high = (0, 256 * unit - 1) if is_full else (16 * unit, 235 * unit)
     values = (np.arange(256 * unit) - low) * (255.0 / (high - low))
     table = np.clip(np.rint(values), 0, 255).astype(np.uint8)
-    return cv2.LUT(luma, table) if bits <= 8 else table[luma]
+    stretched: Pixels = cv2.LUT(luma, table) if bits <= 8 else table[luma]
+    return stretched

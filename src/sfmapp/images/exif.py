@@ -11,6 +11,7 @@ import re
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 
+from sfmapp.images.position import Position
 from sfmapp.images.tags import EMPTY, Directory, first_directory, sub_directory
 
 # Diagonal of a 24 x 36 mm frame. CIPA DCG-001 defines the 35 mm equivalent by equal diagonals.
@@ -29,6 +30,10 @@ _FOCAL_MM = (0.1, 10_000.0)
 #   Default: fields of view of common lenses lie between 25 and 90 degrees, a factor of two around 1.2.
 _SIGMA_35MM, _SIGMA_SENSOR, _SIGMA_FRAME, _SIGMA_CROP = 0.05, 0.03, 0.10, 0.20
 DEFAULT_FOCAL, DEFAULT_FOCAL_SIGMA = 1.2, 0.50
+
+# GPSHPositioningError is the radius that holds 68 % of positions, in standard deviations along one axis:
+# sqrt(-2 ln 0.32). What is said of a dilution of precision is no better than a receiver without corrections.
+_RADIUS_68, _LEAST_SIGMA_M = 1.51, 3.0
 
 # Long side of the sensor in mm, for cameras that leave out the 35 mm equivalent. First match of "make model" counts.
 _SENSOR_WIDTH_MM: tuple[tuple[str, float], ...] = (
@@ -63,7 +68,7 @@ class ExifFacts:
         focal_plane_px_per_mm: pixels per mm on the sensor, horizontally, in the picture as the camera wrote it.
         camera_size: (width, height) in pixels of the picture as EXIF remembers it.
         timestamp: seconds since 1970; without a time zone the clock's face is taken as UTC.
-        gps: (latitude in degrees, longitude in degrees, altitude in m or None).
+        position: where it was taken.
         problems: values that were left out, one phrase each.
     """
 
@@ -77,7 +82,7 @@ class ExifFacts:
     focal_plane_px_per_mm: float | None = None
     camera_size: tuple[int, int] | None = None
     timestamp: float | None = None
-    gps: tuple[float, float, float | None] | None = None
+    position: Position | None = None
     problems: tuple[str, ...] = ()
 
 
@@ -126,7 +131,7 @@ def read_exif(exif: bytes) -> ExifFacts:
         focal_plane_px_per_mm=resolution / unit_mm if resolution and unit_mm else None,
         camera_size=(int(width or 0), int(height or 0)) if has_size else None,
         timestamp=_timestamp(photo),
-        gps=_position(gps, problems) if gps is not EMPTY else None,
+        position=_position(gps, problems) if gps is not EMPTY else None,
         problems=tuple(problems),
     )
 
@@ -167,7 +172,7 @@ def _timestamp(photo: Directory) -> float | None:
     return None
 
 
-def _position(gps: Directory, problems: list[str]) -> tuple[float, float, float | None] | None:
+def _position(gps: Directory, problems: list[str]) -> Position | None:
     latitude, longitude = _degrees(gps, 2, 1, "S"), _degrees(gps, 4, 3, "W")
     if latitude is None or longitude is None:
         return None
@@ -177,10 +182,24 @@ def _position(gps: Directory, problems: list[str]) -> tuple[float, float, float 
     if latitude == 0.0 and longitude == 0.0:  # what phones write before they have a fix
         return None
     altitude = gps.number(6)
-    if altitude is None or not math.isfinite(altitude) or abs(altitude) > 100_000:
-        return latitude, longitude, None
-    below = gps.values.get(5) in ((1,), b"\x01")
-    return latitude, longitude, -altitude if below else altitude
+    if altitude is not None and not abs(altitude) <= 100_000:  # nor is NaN
+        altitude = None
+    # 0 and 1: above and below sea level, by Exif 3.0 of the ellipsoid; 2 and 3: above and below sea level
+    kind = gps.values.get(5, (0,))
+    reference = kind[0] if kind and not isinstance(kind, str) else 0
+    if altitude is not None and reference in (1, 3):
+        altitude = -altitude
+    error, dilution = gps.number(31), gps.number(11)
+    sigma = None
+    if error is not None and 0 < error < 1e5:
+        sigma = error / _RADIUS_68
+    elif dilution is not None and 0 < dilution < 1e4:
+        # no error in metres by the standard, but phones have written theirs into it
+        sigma = max(dilution, _LEAST_SIGMA_M)
+    return Position(
+        latitude, longitude, altitude, "orthometric" if reference in (2, 3) else "unknown", sigma,
+        is_stated=error is not None and sigma is not None and error / _RADIUS_68 == sigma, source="EXIF",
+    )  # fmt: skip
 
 
 def _degrees(gps: Directory, tag: int, ref_tag: int, negative: str) -> float | None:

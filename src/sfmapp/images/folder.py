@@ -26,6 +26,7 @@ from sfmapp.images.image_set import ImageOptions, ImageRecord, ImageSet
 from sfmapp.images.pixels import mask_fit
 from sfmapp.images.report import CameraPrior, ImageFacts, ImageProblem, ImagesReport
 from sfmapp.images.sources import Found, find_images, natural_key, printable
+from sfmapp.images.xmp import with_xmp
 from sfmapp.reporting import NamedReason
 
 __all__ = ["ImageOptions", "ImageRecord", "ImageSet", "load_images"]
@@ -170,6 +171,7 @@ def _scan(path: Path, root: Path, mask_root: Path | None, options: ImageOptions)
     except OSError as error:
         return name, f"cannot be read: {error.strerror or error}"
     facts = read_exif(header.exif)
+    problems = list(facts.problems)
     record = ImageRecord(
         name=name,
         path=path,
@@ -179,15 +181,14 @@ def _scan(path: Path, root: Path, mask_root: Path | None, options: ImageOptions)
         digest=hashlib.blake2b(data, digest_size=16).hexdigest(),
         has_alpha=header.has_alpha and options.use_alpha,
         timestamp=facts.timestamp,
-        gps=facts.gps,
+        position=with_xmp(facts.position, header.xmp, problems),
         make=facts.make,
         model=facts.model,
     )
-    problems = facts.problems
     if mask_root is not None:
         record, mask_problem = _with_mask(record, mask_root)
         problems += mask_problem
-    return _Scan(record, header, facts, len(data), problems)
+    return _Scan(record, header, facts, len(data), tuple(problems))
 
 
 def _read_file(path: Path, max_bytes: int) -> bytes:

@@ -177,7 +177,8 @@ def resampled(gray: Pixels, sampling: NDArray[np.float32] | None) -> Pixels:
         return gray
     import cv2
 
-    return cv2.remap(gray, sampling, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    image: Pixels = cv2.remap(gray, sampling, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return image
 
 
 class _FileReader:

@@ -36,6 +36,7 @@ class Header:
         has_alpha: there is, or may be, an alpha channel.
         num_left_out: bands that are neither colour nor alpha, such as near infrared, and are not read.
         exif: the EXIF block, beginning with its TIFF header; empty if there is none. For TIFF the whole file.
+        xmp: the XMP packet of a JPEG or TIFF; empty if there is none.
     """
 
     format: str
@@ -46,6 +47,7 @@ class Header:
     has_alpha: bool = False
     exif: bytes = b""
     num_left_out: int = 0
+    xmp: bytes = b""
 
 
 def read_header(data: bytes) -> Header:
@@ -114,6 +116,7 @@ def _foreign_format(data: bytes) -> str:
     return "not an image in a known format"
 
 
+_XMP = b"http://ns.adobe.com/xap/1.0/\0"
 _SOF_BASELINE_TO_PROGRESSIVE = (0xC0, 0xC1, 0xC2)
 _SOF_ARITHMETIC = (0xC9, 0xCA)
 _SOF_OTHER = (0xC3, 0xC5, 0xC6, 0xC7, 0xCB, 0xCD, 0xCE, 0xCF)
@@ -121,7 +124,7 @@ _SOF_OTHER = (0xC3, 0xC5, 0xC6, 0xC7, 0xCB, 0xCD, 0xCE, 0xCF)
 
 def _read_jpeg(data: bytes) -> Header:
     """Walk the segments up to the first scan (ITU T.81, annex B)."""
-    exif, frame = b"", None
+    exif, xmp, frame = b"", b"", None
     position = 2
     while True:
         if position + 4 > len(data):
@@ -136,6 +139,8 @@ def _read_jpeg(data: bytes) -> Header:
         body = data[position + 4 : position + 2 + length]
         if marker == 0xE1 and body[:6] == b"Exif\0\0" and not exif:
             exif = body[6:]
+        elif marker == 0xE1 and body.startswith(_XMP) and not xmp:
+            xmp = body[len(_XMP) :]
         elif marker in _SOF_BASELINE_TO_PROGRESSIVE or marker in _SOF_ARITHMETIC:
             frame = struct.unpack_from(">BHHB", body)
         elif marker in _SOF_OTHER:
@@ -157,7 +162,7 @@ def _read_jpeg(data: bytes) -> Header:
     kind = {1: "gray", 3: "rgb", 4: "cmyk"}.get(num_channels)
     if kind is None:
         raise UnusableImage(f"a JPEG of {num_channels} channels, which is not read")
-    return Header("jpeg", width, height, 8, kind, exif=exif)
+    return Header("jpeg", width, height, 8, kind, exif=exif, xmp=xmp)
 
 
 def _read_png(data: bytes) -> Header:
@@ -204,7 +209,13 @@ def _read_tiff(data: bytes) -> Header:
     _check_single_page(data, layout.directory)
     has_alpha = layout.alpha is not None
     num_left_out = layout.num_samples - layout.num_colors - has_alpha
-    return Header("tiff", layout.width, layout.height, layout.bits, layout.kind, has_alpha, data, num_left_out)
+    packet = layout.directory.values.get(700, b"")
+    if isinstance(packet, tuple) and all(0 <= value < 256 for value in packet):
+        packet = bytes(map(int, packet))
+    return Header(
+        "tiff", layout.width, layout.height, layout.bits, layout.kind, has_alpha, data, num_left_out,
+        packet if isinstance(packet, bytes) else b"",
+    )  # fmt: skip
 
 
 def _check_tiff_data(data: bytes, first: Directory) -> None:

@@ -9,8 +9,11 @@ from typing import Any, Literal, Protocol
 
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES
+from sfmapp.camera.names import CameraModel
 from sfmapp.errors import UsageError
+from sfmapp.images.position import Position
 from sfmapp.option_checks import Range, check_options, positive
 
 CameraSharing = Literal["auto", "all", "per_folder", "per_image"]
@@ -140,7 +143,7 @@ class ImageRecord:
         has_alpha: the file has an alpha channel that may serve as a mask.
         mask_path: its mask, None for none.
         timestamp: when it was taken, seconds since 1970 (a clock without a zone is read as UTC), None where unknown.
-        gps: latitude and longitude in degrees and altitude in metres (None where unknown), None where unknown.
+        position: where it was taken, None where unknown.
         make, model: of the camera, empty where unknown.
         source: what gives its pixels where it is no file; None: the file does.
     """
@@ -156,10 +159,15 @@ class ImageRecord:
     has_alpha: bool = False
     mask_path: Path | None = None
     timestamp: float | None = None
-    gps: tuple[float, float, float | None] | None = None
+    position: Position | None = None
     make: str = ""
     model: str = ""
     source: ImageSource | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def gps(self) -> tuple[float, float, float | None] | None:
+        """Latitude and longitude in degrees and height in metres (None where unknown); None where unknown."""
+        return None if self.position is None else self.position.gps
 
 
 @dataclass(frozen=True)

@@ -160,7 +160,8 @@ def decode_file(record: ImageRecord, data: bytes, header: Header) -> NDArray[Any
         raise InputError(
             f"{record.name} cannot be decoded: its data are damaged", "copy it again from its source, or leave it out"
         )
-    return upright_pixels(raw, record.turn)
+    pixels: NDArray[Any] = upright_pixels(raw, record.turn)
+    return pixels
 
 
 def _read_bytes(record: ImageRecord) -> bytes:
@@ -183,16 +184,18 @@ def decode_bytes(data: bytes, header: Header) -> NDArray[Any] | None:
     is_plain = header.kind in ("rgb", "palette", "cmyk") and header.bits <= 8 and not header.has_alpha
     flags = cv2.IMREAD_COLOR_RGB if is_plain else cv2.IMREAD_UNCHANGED
     try:
-        raw = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+        raw: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except (cv2.error, MemoryError):
         return None
     if raw is None or raw.dtype not in (np.uint8, np.uint16):
         return None
     if is_plain or raw.ndim == 2:
         return raw
+    gray: NDArray[Any] = raw[..., 0]
     if raw.shape[2] == 1:
-        return raw[..., 0]
-    return cv2.cvtColor(raw, cv2.COLOR_BGRA2RGBA if raw.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+        return gray
+    color: NDArray[Any] = cv2.cvtColor(raw, cv2.COLOR_BGRA2RGBA if raw.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+    return color
 
 
 def without_orientation(data: bytes) -> bytes:
@@ -216,7 +219,7 @@ def to_8_bits(raw: NDArray[Any]) -> Pixels:
     largest = int(color.max(initial=0))
     white = next(value for bits in (8, 10, 12, 14, 16) if largest <= (value := (1 << bits) - 1))
     table = ((np.arange(65536, dtype=np.int64) * 510 + white) // (2 * white)).clip(0, 255).astype(np.uint8)
-    scaled = table[raw]
+    scaled: Pixels = table[raw]
     if raw.ndim == 3 and raw.shape[2] == 4:
         scaled[..., 3] = raw[..., 3] >> 8
     return scaled
@@ -270,7 +273,8 @@ def _given_mask(record: ImageRecord, source: ImageSource) -> NDArray[np.bool_] |
         raise InputError(
             f"mask of {record.name}: expected an array of shape ({record.height}, {record.width}), found {mask.shape}"
         )
-    return mask != 0
+    is_open: NDArray[np.bool_] = mask != 0
+    return is_open
 
 
 def mask_fit(header: Header, record: ImageRecord) -> str | None:

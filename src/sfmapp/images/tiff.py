@@ -165,7 +165,8 @@ def _divided(color: NDArray[Any], alpha: NDArray[Any]) -> NDArray[Any]:
     """Colours that were multiplied with alpha as they were before; black where nothing is left of them."""
     white = np.iinfo(color.dtype).max
     opaque = np.maximum(alpha, 1).astype(np.uint32)[..., None]
-    return np.minimum((color.astype(np.uint32) * white + opaque // 2) // opaque, white).astype(color.dtype)
+    divided: NDArray[Any] = np.minimum((color.astype(np.uint32) * white + opaque // 2) // opaque, white)
+    return divided.astype(color.dtype)
 
 
 # -------------------------------------------------------------------------------------------------------- unpacking

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
-from sfmapp.camera.camera import Camera, CameraModel
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.names import CameraModel
 from sfmapp.events import Events
 from sfmapp.images.exif import DEFAULT_FOCAL, DEFAULT_FOCAL_SIGMA
 from sfmapp.mapping import structure

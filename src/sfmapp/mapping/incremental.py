@@ -61,6 +61,7 @@ def map_images(
     adjust_options: AdjustOptions,
     threads: int,
     events: Events,
+    closing: Callable[[list[Mapper]], None] | None = None,
 ) -> tuple[list[Reconstruction], MappingReport]:
     """Reconstruct cameras and points from verified matches.
 
@@ -71,6 +72,7 @@ def map_images(
         options, adjust_options: what is accepted, and how it is adjusted.
         threads: workers; the result does not depend on it.
         events: told of every decision; ``decided`` events carry a ``snapshot`` of the map for a recording.
+        closing: called in the end with the finished models, the largest first, to move and adjust them further.
 
     Returns:
         The models, the one with most images first, and the report: per image what was tried and why it failed.
@@ -111,6 +113,8 @@ def map_images(
             replace(_model_report(mapped, model, found, apart, map_all, events), adjustment=adjustment)
             for model, found, apart, adjustment in zip(models, contradictions, mapped.apart, adjustments, strict=True)
         ]
+        if closing is not None:
+            closing([mapped.mapper_of(model) for model in models])
     report = MappingReport(
         tracks=track_report,
         focal=mapped.focal_report,

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
-from sfmapp.camera.camera import PARAM_NAMES, Camera, simple_camera
-from sfmapp.camera.models import kind_of
+from sfmapp.camera.camera import Camera, simple_camera
+from sfmapp.camera.models import PARAM_NAMES, kind_of
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.covariance import estimate_covariances
+from sfmapp.adjust.covariance import Covariances, estimate_covariances
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
-from sfmapp.camera.camera import PARAM_NAMES, Camera
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.mapping import structure
@@ -324,15 +326,12 @@ class Mapper:
         A pixel may be ten standard deviations of precise keypoints: with squares alone, the few observations near the
         limit decide what many others tell little of, such as the lens.
         """
-        chosen, reconstruction = self._free_principal_points(), self.reconstruction
-        if self._wanted_principal_points().any() and not chosen.any():
+        reconstruction = self.reconstruction
+        if self._wanted_principal_points().any() and not self._free_principal_points().any():
             self.events.warned(STAGE, _NO_CENTERS)
         for _ in range(MAX_POLISHED):
             before = reconstruction.obs_is_inlier.copy()
-            options = self.adjust_options.robust(structure.residual_scale_px(reconstruction, MIN_NOISE_PX))
-            options = replace(options, max_iterations=100, initial_damping=1e-8, relative_cost_tolerance=1e-5)
-            if chosen.any():
-                options = self.with_free_centers(options, chosen)
+            options, chosen = self._polishing()
             graph = FactorGraph(
                 reconstruction, options, varying=Varying(centers=chosen), prior_cameras=self.prior_cameras, noise_px=1.0
             )
@@ -345,6 +344,41 @@ class Mapper:
             if changed <= MAX_CHANGED * before.sum():
                 break
         return report
+
+    def adjust_with(self, extra_factors: Any) -> None:
+        """Adjust a finished map once more as :meth:`polish` does, with gtsam factors over ``X(i)`` beside the
+        reprojections, and settle its points."""
+        options, chosen = self._polishing()
+        options = replace(options, initial_damping=1e-6, relative_cost_tolerance=1e-6)
+        report = adjust_bundle(
+            self.reconstruction, options, varying=Varying(centers=chosen), prior_cameras=self.prior_cameras,
+            extra_factors=extra_factors,
+        )  # fmt: skip
+        self.events.decided(STAGE, f"closing adjustment: {report.text}", **report)
+        self._settle_points()
+
+    def covariances_with(self, extra_factors: Any) -> Covariances | None:
+        """Covariances at the minimum of :meth:`adjust_with`, with factors whose sigmas are true ones; None for large
+        models."""
+        if self.reconstruction.is_registered.sum() > MAX_UNCERTAINTY_IMAGES:
+            return None
+        chosen = self._free_principal_points()
+        options = self.with_free_centers(self.adjust_options, chosen) if chosen.any() else self.adjust_options
+        return estimate_covariances(
+            self.reconstruction, options, prior_cameras=self.prior_cameras, extra_factors=extra_factors
+        )
+
+    def _polishing(self) -> tuple[AdjustOptions, NDArray[np.bool_]]:
+        """Options of the last adjustment, and the cameras (C,) bool whose principal points are free in it."""
+        chosen = self._free_principal_points()
+        options = self.adjust_options.robust(self.noise_px)
+        options = replace(options, max_iterations=100, initial_damping=1e-8, relative_cost_tolerance=1e-5)
+        return self.with_free_centers(options, chosen) if chosen.any() else options, chosen
+
+    @property
+    def noise_px(self) -> float:
+        """Standard deviation of the keypoints by the residuals, pixels."""
+        return structure.residual_scale_px(self.reconstruction, MIN_NOISE_PX)
 
     def agreement(self) -> tuple[int, int]:
         """How many verified matches between registered images agree with their poses, and how many there are."""
@@ -371,7 +405,8 @@ class Mapper:
         registered = reconstruction.image_camera_idx[reconstruction.is_registered]
         shared = np.bincount(registered, minlength=len(reconstruction.cameras)) >= 3
         unknown = np.array([mode == "always" or c.focal_source == "default" for c in reconstruction.cameras], bool)
-        return shared & unknown & (mode != "never")
+        wanted: NDArray[np.bool_] = shared & unknown & (mode != "never")
+        return wanted
 
     def with_free_centers(self, options: AdjustOptions, chosen: NDArray[np.bool_]) -> AdjustOptions:
         """The options with free principal points under the prior of MappingOptions, for cameras chosen (C,) bool."""
@@ -429,6 +464,21 @@ class Mapper:
                 for i, c, a in zip(found.image_idx, center_sigma, angle_sigma, strict=True)
             },
         )
+
+    def closing_options(self) -> tuple[AdjustOptions, Varying, float]:
+        """How the finished map is adjusted as a factor graph, what varies, and the noise of its keypoints in pixels, by
+        the residuals and what an adjustment leaves of them."""
+        reconstruction, chosen = self.reconstruction, self._free_principal_points()
+        options = replace(self.adjust_options, max_iterations=100, initial_damping=1e-6, relative_cost_tolerance=1e-7)
+        if chosen.any():
+            cameras = [c for c, is_chosen in zip(reconstruction.cameras, chosen, strict=True) if is_chosen]
+            sigma_px = self.options.principal_point_sigma * max(max(c.width, c.height) for c in cameras)
+            options = replace(options, refine_principal_point=True, principal_point_sigma_px=sigma_px)
+        numbers = 2 * int(reconstruction.obs_is_inlier.sum())
+        unknowns = 3 * int(reconstruction.is_triangulated.sum()) + 6 * int(reconstruction.is_registered.sum())
+        left = max(numbers - unknowns, 1)
+        noise_px = structure.residual_scale_px(reconstruction, MIN_NOISE_PX) * float(np.sqrt(numbers / left))
+        return options, Varying(centers=chosen), noise_px
 
     def _settle_points(self) -> None:
         """Measure the noise; filter accordingly, and triangulate again what was lost or has become possible."""

@@ -43,4 +43,5 @@ def _passes_ratio(best: Best, max_ratio: float, max_distance: float) -> NDArray[
     """Whether best matches, given as inner products like the second best, pass Lowe's ratio and the distance."""
     d_best = np.sqrt(np.maximum(2.0 - best.first * (2.0 / _SIFT_NORM2), 0.0))
     d_second = np.sqrt(np.maximum(2.0 - best.second * (2.0 / _SIFT_NORM2), 0.0))
-    return (d_best < max_ratio * d_second) & (d_best <= max_distance)
+    passes: NDArray[np.bool_] = (d_best < max_ratio * d_second) & (d_best <= max_distance)
+    return passes

@@ -21,7 +21,8 @@ from sfmapp.matching.coarse_to_fine import Putative, is_guidable, match_features
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.products import Ints
 from sfmapp.matching.report import MatchingReport, PairReport
-from sfmapp.matching.two_view import Ransac, TwoViewGeometry, error_threshold_px, verify_pair
+from sfmapp.matching.search import Ransac
+from sfmapp.matching.two_view import TwoViewGeometry, error_threshold_px, verify_pair
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.features import Features
 

@@ -12,7 +12,8 @@ from sfmapp.camera.camera import Camera, pixels_to_normalized, project
 from sfmapp.geometry import epipolar, homography, rigid3
 from sfmapp.geometry.planar_motion import estimate_planar_motion
 from sfmapp.matching.options import MatchingOptions
-from sfmapp.matching.two_view import Ransac, TwoViewGeometry, verify_pair
+from sfmapp.matching.search import Ransac
+from sfmapp.matching.two_view import TwoViewGeometry, verify_pair
 from sfmapp.odometry.frontend.alignment import align_patches
 from sfmapp.odometry.frontend.corners import find_corners
 from sfmapp.odometry.frontend.pose_choice import RIVAL_SHARE, explaining_poses, is_way_known, tells_apart

@@ -169,7 +169,8 @@ def _near_epipolar_lines(local: LocalMap, tracks: ActiveTracks, pose: Array) -> 
     other = np.einsum("nji,nj->ni", rotation[k], np.cross(here, translation[k]))
     gradient2 = (line[:, :2] ** 2).sum(1) + (other[:, :2] ** 2).sum(1)
     limit = (_MAX_EPIPOLAR_PX / local.camera.focal) ** 2
-    return (line * here).sum(1) ** 2 <= limit * gradient2
+    is_near: Mask = (line * here).sum(1) ** 2 <= limit * gradient2
+    return is_near
 
 
 def keyframe_reason(local: LocalMap, tracked: Tracked, num_mapped_before: int, options: OdometryOptions) -> str | None:

@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.contradictions import Contradiction
+from sfmapp.features.report import FEW_FEATURES
+from sfmapp.georeference.control_report import ControlReport
 from sfmapp.mapping.report import FocalEvidence, MappedImage, ModelEntry, Uncertainty
 from sfmapp.report.model import CameraReport, Check, Failure, Funnel, ImageReport, Light
 
@@ -21,8 +24,6 @@ if TYPE_CHECKING:
     from sfmapp.scene.reconstruction import Reconstruction
 
 FORMAT = "sfmapp report 2"
-# fewer keypoints than this leave too few matches for any pair, whatever the other image holds
-FEW_FEATURES = 100
 _NOTHING = Funnel(**dict.fromkeys(Funnel.__dataclass_fields__))
 
 
@@ -172,6 +173,24 @@ def make_checks(
         if camera.refined and camera.focal_sigma_px:
             checks.append(_check_focal(camera, camera.refined, camera.focal_sigma_px))
     return checks + check_contradictions(found for model in models for found in model.contradictions)
+
+
+def check_control(control: ControlReport | None) -> list[Check]:
+    """A light over ground control: amber where something is wrong with points, red where no model could be moved."""
+    if control is None:
+        return []
+    largest = control.models[0]
+    value = largest.reason or "no point could be left out: the others do not hold the model"
+    if largest.summary is not None:
+        one = largest.summary
+        value = (
+            f"left out in turn, {one.horizontal_rms_m:.3f} m horizontally and {one.vertical_rms_m:.3f} m in height; "
+            f"expected {one.expected_horizontal_m:.3f} and {one.expected_vertical_m:.3f}"
+        )
+    wrong = largest.findings or largest.summary is None
+    light: Light = "red" if largest.reason else "amber" if wrong else "green"
+    thresholds = "green: every point agrees with what the others expect of it; amber: see Ground control"
+    return [Check(name="ground control", value=value, light=light, thresholds=thresholds)]
 
 
 def _apart(models: Sequence[ModelEntry]) -> list[str]:

@@ -113,7 +113,8 @@ class Drawing:
     def _fixed(self, points: Array | Sequence[Sequence[float]]) -> NDArray[np.int32]:
         # the pixel (0, 0) of OpenCV has its centre there, ours its corner
         xy = np.asarray(points, np.float64) * _OVERSAMPLING - 0.5
-        return np.clip(np.rint(xy * 2**_SHIFT), -(2**30), 2**30).astype(np.int32)
+        fixed: NDArray[np.int32] = np.clip(np.rint(xy * 2**_SHIFT), -(2**30), 2**30).astype(np.int32)
+        return fixed
 
     @staticmethod
     def _thick(width: float) -> int:

@@ -6,10 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
+from sfmapp.report.control_html import control_section, units_section
 from sfmapp.report.dense_html import dense_section
 from sfmapp.report.model import CameraReport, ImageReport, ReconstructionReport
 from sfmapp.report.page import adjustment_table, check_table, failure_box, log_table, render_page, table, usage_table
 from sfmapp.report.top_view import top_view_svg
+from sfmapp.report.world_map import world_section
 from sfmapp.reporting import NamedReason
 
 if TYPE_CHECKING:
@@ -42,6 +44,14 @@ def render_html(
     if model is not None:
         note = "Points and cameras of the largest model; each triangle opens where its camera looks."
         body.append(f'<h2>From above</h2>{top_view_svg(model, _orientation(report, model))}<p class="dim">{note}</p>')
+    placed = report.stages.georeference
+    if placed is not None:
+        is_in_world = any(one.model == 0 and not one.reason for one in placed.models)
+        body.append(world_section(placed, model if is_in_world else None))
+    if report.stages.control is not None:
+        body.append(control_section(report.stages.control, model))
+    if report.stages.units is not None:
+        body.append(units_section(report.stages.units))
     if report.dense is not None:
         body.append(dense_section(report.dense, dense_pictures))
     body.append(_failed(report.images) + _skipped(report.skipped))

@@ -23,6 +23,8 @@ from sfmapp.dense.report import (
 from sfmapp.errors import SfmError
 from sfmapp.evaluation.report import Statistics
 from sfmapp.features.report import FeaturesReport
+from sfmapp.georeference.control_report import ControlReport, UnitsReport
+from sfmapp.georeference.report import GeoreferenceReport
 from sfmapp.images.report import ImagesReport
 from sfmapp.mapping.report import FocalEvidence, MappingReport, ModelEntry
 from sfmapp.matching.report import MatchingReport, PairsReport
@@ -266,6 +268,9 @@ class Stages(Report):
     pairs: PairsReport | None = None
     matching: MatchingReport | None = None
     mapping: MappingReport | None = None
+    control: ControlReport | None = None
+    units: UnitsReport | None = None
+    georeference: GeoreferenceReport | None = None
     dense: DenseReport | None = None
     mesh: MeshRunReport | FailedReport | None = None
 

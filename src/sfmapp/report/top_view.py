@@ -40,7 +40,10 @@ def top_view_svg(model: Reconstruction, orientation: Sequence[int] | None = None
     points_idx = points_idx[:: max(1, len(points_idx) // MAX_POINTS)]
     points = model.point_xyz[points_idx] @ axes.T
     scale, offset = fit_page(points, centers)
-    to_page = lambda xy: (xy * scale + offset).round(1)  # noqa: E731
+
+    def to_page(xy: Array) -> Array:
+        return np.round(xy * scale + offset, 1)
+
     parts = point_paths(to_page(points), model.point_rgb[points_idx])
     # 2.5 % of the width: visible, and still apart in a ring of fifty cameras
     size = 0.025 * WIDTH / abs(scale[0])

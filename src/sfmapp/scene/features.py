@@ -108,7 +108,8 @@ class Features:
         if self.metric == DescriptorMetric.HAMMING:  # ORB's 256 bits reach that length when a bit counts 32
             return np.unpackbits(descriptors, axis=1).astype(np.float32) * np.float32(32)
         lengths = np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-12)
-        return np.rint(descriptors * (512 / lengths)).astype(np.float32)
+        whole: NDArray[np.float32] = np.rint(descriptors * (512 / lengths)).astype(np.float32)
+        return whole
 
 
 def _checked(descriptors: NDArray[Any], count: int, metric: DescriptorMetric) -> NDArray[Any]:

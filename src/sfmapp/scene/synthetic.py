@@ -13,8 +13,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera, CameraModel, pixels_to_normalized, project, simple_camera
-from sfmapp.camera.models import kind_of
+from sfmapp.camera.camera import Camera, pixels_to_normalized, project, simple_camera
+from sfmapp.camera.models import PARAM_NAMES, kind_of
+from sfmapp.camera.names import CameraModel
 from sfmapp.geometry import rigid3
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.reconstruction import Reconstruction
@@ -331,7 +332,8 @@ def _rig_images(rig: Rig, num_images: int) -> RigImages:
 
 
 def _unit(v: Array) -> Array:
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+    unit: Array = v / np.linalg.norm(v, axis=-1, keepdims=True)
+    return unit
 
 
 def _look_at(centers: Array, targets: Array, down: Array) -> Array:

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfmapp.camera.camera import PARAM_NAMES, Camera
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.errors import UsageError
 from sfmapp.geometry.orientation import INVERSE, MIRRORED, is_sideways, upright_size, upright_vectors, upright_xy
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import Camera, CameraModel, pixels_to_normalized
+from sfmapp.camera.camera import Camera, pixels_to_normalized
+from sfmapp.camera.names import CameraModel
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
 

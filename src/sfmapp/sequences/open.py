@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from sfmapp.calibration.fields import camera_from_text, is_calibration_path, oddity
 from sfmapp.calibration.opencv_lens import sampling_map
 from sfmapp.calibration.reading import Calibration, read_calibration
-from sfmapp.camera.camera import Camera, CameraModel, simple_camera
+from sfmapp.camera.camera import Camera, simple_camera
+from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.clocks import Times, are_dates

@@ -23,7 +23,7 @@ FLOATS, INTS = ir.VectorType(llvm.F32, WIDTH), ir.VectorType(llvm.I32, WIDTH)
 _BYTES = ir.VectorType(llvm.BYTE, WIDTH)
 
 
-class Row(types.Type):
+class Row(types.Type):  # type: ignore[misc]
     """Numba's type of a vector of 16 floats."""
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ row = Row()
 
 
 @register_model(Row)
-class _RowModel(models.PrimitiveModel):
+class _RowModel(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, FLOATS)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Any, TypeAlias
 
+import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
@@ -16,6 +17,8 @@ from sfmapp.simd.llvm import data
 
 # numba's pointer to numbers of one type; it reads and writes as a flat array does, without bounds
 Pointer: TypeAlias = Any
+# a place in an array: counted, or read from an array of such
+Index: TypeAlias = int | np.signedinteger[Any]
 
 
 @intrinsic

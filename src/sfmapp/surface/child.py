@@ -7,6 +7,7 @@ import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +16,12 @@ from sfmapp.errors import NoReconstructionError
 from sfmapp.evaluation.measured import ProcessUsage, run_measured
 from sfmapp.events import Events
 
+AnyArray = NDArray[Any]
+
 
 def run_child(
-    module: str, task: str, arrays: Mapping[str, NDArray], arguments: tuple[object, ...], advice: str, events: Events
-) -> tuple[dict[str, NDArray], ProcessUsage]:
+    module: str, task: str, arrays: Mapping[str, AnyArray], arguments: tuple[object, ...], advice: str, events: Events
+) -> tuple[dict[str, AnyArray], ProcessUsage]:
     """Run ``python -m module INPUT OUTPUT ARGUMENTS`` and hand its arrays back.
 
     Args:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,7 +159,7 @@ def _pack(
     """Places of the vertices in texels (N, 2), whether faces have any (F,), the texture's width and height (2,), the
     number of charts, and the texels for a pixel of the photographs, a side."""
     covered = flat_areas(charts.pixels, charts.faces).sum()
-    arrays: dict[str, NDArray] = {
+    arrays: dict[str, NDArray[Any]] = {
         "uv": charts.pixels.astype(np.float32),
         "faces": charts.faces.astype(np.uint32),
         "chart": charts.chart.astype(np.uint32),

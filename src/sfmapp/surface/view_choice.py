@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,7 +101,7 @@ def _worth(
         worth.append((face_idx, pixels / area[face_idx] * _likeness(view, centers[face_idx], color[face_idx])))
     view_ptr = np.cumsum([0, *(len(face_idx) for face_idx, _ in worth)])
     middle, extent = mesh.xyz.mean(axis=0), float(np.ptp(mesh.xyz, axis=0).max())
-    arrays: dict[str, NDArray] = {
+    arrays: dict[str, NDArray[Any]] = {
         "xyz": ((mesh.xyz - middle) / extent).astype(np.float32),
         "faces": mesh.faces,
         "cameras": (scene.centers - middle) / extent,

@@ -148,7 +148,8 @@ def wave_steps(wave: NDArray[np.integer]) -> Ints:
         return waves.astype(np.int64)
     weight = np.cumsum(np.sqrt(counts[waves]))
     step = np.minimum((weight - 1e-9 * weight[-1]) / weight[-1] * MAX_STEPS, MAX_STEPS - 1).astype(np.int64)
-    return waves[np.append(np.diff(step) > 0, True)].astype(np.int64)
+    shown: Ints = waves[np.append(np.diff(step) > 0, True)].astype(np.int64)
+    return shown
 
 
 def _origin(xyz: NDArray[np.float64]) -> NDArray[np.float64]:

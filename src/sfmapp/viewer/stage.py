@@ -64,7 +64,8 @@ def set_stage(replay: Replay) -> Stage:
 
 def _poses(replay: Replay, m: int) -> Array:
     poses = replay.model_cam_from_world[m].astype(np.float64)
-    return poses[~np.isnan(poses[:, 0])]
+    known: Array = poses[~np.isnan(poses[:, 0])]
+    return known
 
 
 def _model(replay: Replay, m: int) -> tuple[Array, Array]:

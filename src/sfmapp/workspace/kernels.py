@@ -99,7 +99,7 @@ def _compile(events: Events, modules: tuple[str, ...]) -> Usage:
 def _listener(events: Events) -> Any:
     from numba.core.event import Event, Listener
 
-    class Compilations(Listener):
+    class Compilations(Listener):  # type: ignore[misc]
         """Tells of compilations; a kernel that comes from the cache is none."""
 
         num_compiled = 0

@@ -21,6 +21,9 @@ from sfmapp.adjust.options import AdjustOptions
 from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import SfmError, UsageError
 from sfmapp.features.extract import FeatureOptions
+from sfmapp.georeference.control_options import ControlOptions
+from sfmapp.georeference.options import GpsOptions
+from sfmapp.georeference.unit_options import UnitOptions
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.images.sequence import SequenceOptions
 from sfmapp.mapping.options import MappingOptions
@@ -39,7 +42,8 @@ class Options:
     """Everything that a run obeys. The options of a stage live next to its code.
 
     Attributes:
-        images, features, pairs, matching, mapping, adjust: the options of the stages of a reconstruction.
+        images, features, pairs, matching, mapping, adjust, gps: the options of the stages of a reconstruction.
+        control, units: ground control points of a reconstruction, or known lengths and the vertical.
         dense, surface: those of patches and of the mesh that is made of them.
         sequence, odometry, scale: those of odometry.
         seed: where every random choice starts; the same seed gives the same bytes.
@@ -53,6 +57,9 @@ class Options:
     matching: MatchingOptions = field(default_factory=MatchingOptions)
     mapping: MappingOptions = field(default_factory=MappingOptions)
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
+    control: ControlOptions = field(default_factory=ControlOptions)
+    units: UnitOptions = field(default_factory=UnitOptions)
+    gps: GpsOptions = field(default_factory=GpsOptions)
     dense: DenseOptions = field(default_factory=DenseOptions)
     surface: SurfaceOptions = field(default_factory=SurfaceOptions)
     sequence: SequenceOptions = field(default_factory=SequenceOptions)
@@ -102,14 +109,17 @@ def load_options(presets: Iterable[str] = (), settings: Iterable[str] = ()) -> O
 
 def options_from_dict(values: Mapping[str, Any]) -> Options:
     """Options of nested plain values, as in a TOML file or ``run.json``; what is not named keeps its default."""
-    return _build(Options, values, "")
+    options: Options = _build(Options, values, "")
+    return options
 
 
 def with_absolute_paths(options: Options) -> Options:
     """The same options, good in any working directory."""
     images = _with_absolute_paths(options.images, "camera", "mask_path")
+    control = _with_absolute_paths(options.control, "file")
     sequence = _with_absolute_paths(options.sequence, "camera", "imu", "ground_truth")
-    return dataclasses.replace(options, images=images, sequence=sequence)
+    gps = options.gps if options.gps.source in ("exif", "none") else _with_absolute_paths(options.gps, "source")
+    return dataclasses.replace(options, images=images, control=control, sequence=sequence, gps=gps)
 
 
 def _with_absolute_paths(stage: Any, *names: str) -> Any:

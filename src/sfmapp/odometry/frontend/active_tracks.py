@@ -76,7 +76,8 @@ class ActiveTracks:
         """(N, 3) where the tracks are believed to be, from their reference keyframes and inverse depths."""
         rays = np.column_stack([self.reference_ray, np.ones(len(self))]) / self.inverse_depth[:, None]
         k = references.position(self.reference)
-        return np.einsum("nji,nj->ni", references.rotation[k], rays - references.translation[k])
+        points: Array = np.einsum("nji,nj->ni", references.rotation[k], rays - references.translation[k])
+        return points
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.geometry import epipolar, rigid3
 from sfmapp.matching.options import MatchingOptions
-from sfmapp.matching.two_view import Ransac, verify_pair
+from sfmapp.matching.search import Ransac
+from sfmapp.matching.two_view import verify_pair
 from sfmapp.odometry.frontend.active_tracks import ActiveTracks, References
 from sfmapp.scene.correspondences import TwoViewConfig
 

@@ -65,7 +65,8 @@ def _quantile_bins(counts: Longs, share: float) -> Doubles:
     total, below = counts.sum(axis=1), np.cumsum(counts, axis=1)
     k = (below >= share * total[:, None]).argmax(axis=1)
     rows = np.arange(len(counts))
-    return k + (share * total - below[rows, k] + counts[rows, k]) / np.maximum(counts[rows, k], 1)
+    place: Doubles = k + (share * total - below[rows, k] + counts[rows, k]) / np.maximum(counts[rows, k], 1)
+    return place
 
 
 def _floors(scores: Longs, roughness: Longs) -> Floats:

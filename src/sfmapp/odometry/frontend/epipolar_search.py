@@ -110,7 +110,8 @@ class Matches(NamedTuple):
 
 
 def _is_unique(first: Floats, second: Floats) -> NDArray[np.bool_]:
-    return _UNIQUE * np.maximum(1.0 - first, _NOISE) < np.maximum(1.0 - second, _NOISE)
+    is_unique: NDArray[np.bool_] = _UNIQUE * np.maximum(1.0 - first, _NOISE) < np.maximum(1.0 - second, _NOISE)
+    return is_unique
 
 
 def search_along_epipolar(

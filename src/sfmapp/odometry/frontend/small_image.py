@@ -212,8 +212,8 @@ def align_small_images(reference: Pyramid, target: Pyramid, camera_focal_px: flo
     small2, _ = _small(target, _SEARCH_SIDE)
     height, width = small.shape
     found = np.zeros(3)
-    whole = [np.rint(_STEPS * image).astype(np.int16) for image in (small, small2)]
-    _best_shift(*whole, int(_MAX_SHIFT * width), int(_MAX_SHIFT * height), found)
+    steps, steps2 = (np.rint(_STEPS * image).astype(np.int16) for image in (small, small2))
+    _best_shift(steps, steps2, int(_MAX_SHIFT * width), int(_MAX_SHIFT * height), found)
     first, second = (np.empty((*image.shape, 3), np.float32) for image in (fine, fine2))
     _gradients(fine, first)
     _gradients(fine2, second)

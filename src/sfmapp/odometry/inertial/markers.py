@@ -223,7 +223,8 @@ def _fit_square(views: _Views, max_error_px: float) -> tuple[float, float, int] 
 
 
 def _corners(rotation: Array, center: Array, log_side: float) -> Array:
-    return np.exp(log_side) * _SQUARE @ rotation.T + center
+    corners: Array = np.exp(log_side) * _SQUARE @ rotation.T + center
+    return corners
 
 
 def _best_start(views: _Views, max_error_px: float) -> tuple[Array, Array, float] | None:

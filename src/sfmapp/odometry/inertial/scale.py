@@ -142,7 +142,8 @@ def apply_scale(reconstruction: Reconstruction, scale: float) -> Reconstruction:
 def scale_covariance(covariance: ArrayLike, scale: float) -> Array:
     """Covariances (..., 6, 6) of rotation and translation after :func:`apply_scale`; the scale's own is not in it."""
     factor = np.array([1.0, 1.0, 1.0, scale, scale, scale])
-    return np.asarray(covariance, np.float64) * factor[:, None] * factor
+    scaled: Array = np.asarray(covariance, np.float64) * factor[:, None] * factor
+    return scaled
 
 
 def scale_from_distance(

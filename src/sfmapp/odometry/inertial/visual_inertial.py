@@ -706,7 +706,9 @@ class _MapPose:
         """(6,) at a gtsam.Pose3 of the sensor, (4,) log scale, tilt and offset, and its velocity (3,)."""
         cam_from_world, rotation, center = self._later(pose, alignment, velocity)
         angle = rigid3.log_so3(cam_from_world @ rotation @ self._imu_from_cam)
-        return np.r_[angle, cam_from_world @ center / np.exp(alignment[0]) - self._cam_from_map @ self._center]
+        moved = cam_from_world @ center / np.exp(alignment[0]) - self._cam_from_map @ self._center
+        differences: Array = np.r_[angle, moved]
+        return differences
 
     def _later(self, pose: Any, alignment: Array, velocity: Array) -> tuple[Array, Array, Array]:
         """Of the camera, as the map has it, from the z-up world; and the sensor's rotation and the camera's centre

@@ -312,7 +312,8 @@ def _agreed_pairs(new_id: Ids, old_id: Ids) -> Ids:
         order = np.lexsort((pairs[:, 1 - column], -votes, pairs[:, column]))
         first = np.unique(pairs[order, column], return_index=True)[1]
         pairs, votes = pairs[order[first]], votes[order[first]]
-    return pairs[np.argsort(pairs[:, 0], kind="stable")]
+    ordered: Ids = pairs[np.argsort(pairs[:, 0], kind="stable")]
+    return ordered
 
 
 class _LoopSystem:

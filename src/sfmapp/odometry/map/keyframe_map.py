@@ -90,7 +90,8 @@ class KeyframeMap:
 
     def is_triangulated(self, point_id: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(N,) bool."""
-        return np.isfinite(self.point_xyz[point_id, 0])
+        known: NDArray[np.bool_] = np.isfinite(self.point_xyz[point_id, 0])
+        return known
 
     def reconstruction(self, keyframe_idx: NDArray[np.int64]) -> tuple[Reconstruction, NDArray[np.int64]]:
         """The given keyframes (ascending) and what they see, as a reconstruction, and the ids of its points.

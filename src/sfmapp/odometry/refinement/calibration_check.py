@@ -28,7 +28,8 @@ from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.lens import BROWN, FAMILY, RADIAL_FISHEYE
-from sfmapp.camera.models import PARAM_NAMES, CameraModel, canonical_from_params, kind_of
+from sfmapp.camera.models import PARAM_NAMES, canonical_from_params, kind_of
+from sfmapp.camera.names import CameraModel
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.geometry.triangulation import Observed, triangulate_tracks
@@ -433,7 +434,8 @@ def _distortion_slots(camera: Camera) -> NDArray[np.int64]:
     """Places in the canonical row of what bends the image."""
     model = _fullest(camera).model
     first = canonical_from_params(model).argmax(axis=0)
-    return first[[kind_of(name) == "distortion" for name in PARAM_NAMES[model]]]
+    slots: NDArray[np.int64] = first[[kind_of(name) == "distortion" for name in PARAM_NAMES[model]]]
+    return slots
 
 
 def _changed(model: Reconstruction, change: Array) -> Reconstruction:

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from sfmapp.adjust.covariance import estimate_covariances
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.solver import adjust_bundle
-from sfmapp.camera.camera import PARAM_NAMES, Camera
-from sfmapp.camera.models import kind_of, plain_params
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES, kind_of, plain_params
 from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.report.model import LensEvidence
 from sfmapp.scene.reconstruction import Reconstruction

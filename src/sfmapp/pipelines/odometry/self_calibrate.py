@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import CameraModel
+from sfmapp.camera.names import CameraModel
 from sfmapp.contradictions import Contradiction, widened
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
@@ -126,7 +126,8 @@ class _Follower:
         if is_kept.sum() < _LEFT * self._count:
             return True
         shift = np.linalg.norm(self._now - self._start, axis=2)
-        return float(np.median(shift)) > _MOTION * small.shape[1]
+        moved: bool = float(np.median(shift)) > _MOTION * small.shape[1]
+        return moved
 
     @property
     def worth(self) -> float:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from sfmapp.workspace.keys import input_key, stage_key
 from sfmapp.workspace.options import Options, options_to_dict
 
 if TYPE_CHECKING:
+    from sfmapp.formats.control_points import ControlPoints
     from sfmapp.images.image_set import ImageSet
 
 
 # where the stages begin; :mod:`sfmapp.workspace.code` finds what they import
 FEATURES, PAIRS, MATCHING = ("sfmapp.features.extract",), ("sfmapp.matching.pairs",), ("sfmapp.matching.stage",)
-MAPPING = ("sfmapp.mapping.incremental", "sfmapp.formats.colmap")
+MAPPING = (
+    "sfmapp.mapping.incremental", "sfmapp.formats.colmap", "sfmapp.georeference.stage",
+    "sfmapp.georeference.control_stage", "sfmapp.pipelines.sparse.units",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -37,8 +41,8 @@ class StageKeys:
         return f"{self.features}:{self.inputs[name]}"
 
 
-def stage_keys(options: Options, image_set: ImageSet) -> StageKeys:
-    """Keys of all stages for these photographs and options."""
+def stage_keys(options: Options, image_set: ImageSet, control: ControlPoints | None = None) -> StageKeys:
+    """Keys of all stages for these photographs, options and ground control points."""
     inputs = {record.name: input_key(record) for record in image_set.images}
     features = stage_key(FEATURES, options.features)
     images = [features, list(inputs.items()), options.seed]
@@ -48,5 +52,17 @@ def stage_keys(options: Options, image_set: ImageSet) -> StageKeys:
     places = [[record.timestamp, record.gps] for record in image_set.images]
     pairs = stage_key(PAIRS, options.pairs, images, places)
     matching = stage_key(MATCHING, options.matching, images, lenses, whose)
-    mapping = stage_key(MAPPING, options.mapping, options_to_dict(options.adjust), pairs, matching, priors)
+    measured = [record.position and asdict(record.position) for record in image_set.images]
+    adjust = options_to_dict(options.adjust)
+    world = [options_to_dict(options.gps), measured, _control_key(control), options_to_dict(options.units)]
+    mapping = stage_key(MAPPING, options.mapping, adjust, pairs, matching, priors, world)
     return StageKeys(inputs, features, pairs, matching, mapping)
+
+
+def _control_key(control: ControlPoints | None) -> list[object]:
+    """What of control points decides results."""
+    if control is None:
+        return []
+    arrays = (control.xyz, control.sigma_m, control.obs_point_idx, control.obs_image_idx, control.obs_xy,
+              control.obs_sigma_px)  # fmt: skip
+    return [control.crs, list(control.names), *(array.tolist() for array in arrays)]

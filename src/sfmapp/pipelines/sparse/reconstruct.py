@@ -14,12 +14,15 @@ from sfmapp.errors import NoReconstructionError, TooFewImagesError
 from sfmapp.events import Events
 from sfmapp.features.extract import extract_features
 from sfmapp.formats.colmap import read_model
+from sfmapp.georeference.sources import with_positions
 from sfmapp.images.load import Images, load_images, name_of
 from sfmapp.matching.pairs import select_pairs
 from sfmapp.matching.stage import match_images
 from sfmapp.pipelines.sparse import results
 from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
+from sfmapp.pipelines.sparse.known_lengths import parse_known_lengths
 from sfmapp.pipelines.sparse.run import Run
+from sfmapp.pipelines.sparse.world import closing, read_control
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.kernels import kernels_compiling
 from sfmapp.workspace.layout import RECONSTRUCT
@@ -92,9 +95,12 @@ def reconstruct(
 def _run(run: Run) -> ReconstructionReport:
     """The job: photographs, what still holds of an earlier run, models, and the report of it all."""
     with run.stage("images"):
-        run.image_set, images = load_images(run.images, run.options.images, run.events, threads=run.threads)
+        image_set, images = load_images(run.images, run.options.images, run.events, threads=run.threads)
+        run.image_set = with_positions(image_set, run.options.gps)
         run.stages = replace(run.stages, images=images)
-    keys = stage_keys(run.options, run.image_set)
+    run.control = read_control(run, run.image_set)
+    run.known = parse_known_lengths(run.options.units.known, run.image_set.names)
+    keys = stage_keys(run.options, run.image_set, run.control)
     if report := results.earlier_report(run, keys):
         return report
     run.workspace.manifest["image_root"] = os.fspath(run.image_set.root or "")
@@ -141,7 +147,7 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
     with run.stage("mapping"):
         models, mapped = map_images(
             image_set, run.features, run.correspondences, options.mapping,
-            adjust_options=options.adjust, threads=threads, events=events,
+            adjust_options=options.adjust, threads=threads, events=events, closing=closing(run, image_set),
         )  # fmt: skip
         run.stages = replace(run.stages, mapping=mapped)
     return models

@@ -12,9 +12,17 @@ import numpy as np
 from sfmapp.errors import NoReconstructionError
 from sfmapp.formats.colmap import MODEL_FILES
 from sfmapp.geometry.orientation import MIRRORED
+from sfmapp.georeference.world_frame import GEOREFERENCE, write_georeference
 from sfmapp.mapping.report import MappingReport, ModelEntry, Uncertainty
 from sfmapp.pipelines.stored_pixels import STORED, noted_orientations
-from sfmapp.report.document import FORMAT, camera_rows, funnel_of_images, funnel_without_matches, make_checks
+from sfmapp.report.document import (
+    FORMAT,
+    camera_rows,
+    check_control,
+    funnel_of_images,
+    funnel_without_matches,
+    make_checks,
+)
 from sfmapp.report.html import render_html
 from sfmapp.report.model import ImageReport, Outcome, ReconstructionReport
 from sfmapp.reporting import NamedReason, document_text
@@ -63,6 +71,10 @@ def write_results(
     run.save_first(lambda: workspace.begin("mapping", keys.mapping, **facts))
     with run.stage("output"):
         run.save_first(lambda: workspace.write_models(models, keypoints))
+        if run.georeference is not None:
+            write_georeference(workspace.folder, run.georeference)
+        else:
+            (workspace.folder / GEOREFERENCE).unlink(missing_ok=True)
     with run.stage("recording"):
         manifest["recording"] = _record(run, models)
     report = _make_report(run, models, failure)
@@ -119,7 +131,7 @@ def _make_report(
         outcome=Outcome.of(failure),
         run=run.facts(),
         models=entries,
-        checks=make_checks(entries, images, cameras) if models else [],
+        checks=[*make_checks(entries, images, cameras), *check_control(run.stages.control)] if models else [],
         images=images,
         skipped=[NamedReason(name=name, reason=reason) for name, reason in run.image_set.skipped],
         cameras=cameras,

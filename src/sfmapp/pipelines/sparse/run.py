@@ -11,7 +11,10 @@ from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.job import Job
 
 if TYPE_CHECKING:
+    from sfmapp.formats.control_points import ControlPoints
+    from sfmapp.georeference.world_frame import Georeference
     from sfmapp.images.image_set import ImageSet
+    from sfmapp.pipelines.sparse.known_lengths import KnownLength
     from sfmapp.scene.correspondences import Correspondences
     from sfmapp.scene.features import Features
 
@@ -25,6 +28,8 @@ class Run(Job):
         recorder: watches the run for a recording; None if none is wanted.
         image_set, features, correspondences: results so far.
         stages: what each stage has said.
+        control: ground control points that it was given; known: lengths.
+        georeference: where models lie in the world; None where they do not.
     """
 
     images: Images
@@ -33,3 +38,6 @@ class Run(Job):
     features: list[Features] = field(default_factory=list)
     correspondences: Correspondences | None = None
     stages: Stages = field(default_factory=Stages)
+    control: ControlPoints | None = None
+    known: list[KnownLength] = field(default_factory=list)
+    georeference: Georeference | None = None

@@ -1,0 +1,171 @@
+"""A model that lies in the frame already, adjusted with the measured places of its cameras, and both judged by it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.geometry import rigid3
+from sfmapp.georeference.factors import position_graph
+from sfmapp.georeference.fit import MAX_CHI2, MIN_REDUNDANT, LevelOfImage, RobustFit, estimate_factors, fit_similarity
+from sfmapp.mapping.mapper import Mapper
+from sfmapp.scene.reconstruction import Reconstruction
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Rounds of adjusting and of judging the positions anew, and the change of sigmas that calls for another.
+_MAX_ROUNDS, _SETTLED = 4, 0.1
+# Positions add three numbers each, and may cost the reprojections about as much chi square; so many times that is a
+# contradiction between photographs and positions, not noise.
+_MAX_COST_PER_NUMBER = 10.0
+# An autocorrelation this many standard deviations above zero is one; above the second nothing is left to be told.
+_CORRELATED_SIGMAS, _MAX_CORRELATION = 2.6, 0.9
+
+
+class Measured(NamedTuple):
+    """Places (m, 3) of images (m,) and their sigmas (m, 3) as stated or guessed, in metres, infinite for no height."""
+
+    image_idx: NDArray[np.int64]
+    places: Array
+    sigma: Array
+    is_stated: Mask
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """What came of it.
+
+    Attributes:
+        fit: places against cameras as they lie now.
+        covariance: (3, 3) of the centre of each image, in the frame; empty where that could not be had.
+    """
+
+    fit: RobustFit
+    covariance: dict[int, Array]
+
+
+def adjust_with_positions(
+    mapper: Mapper, measured: Measured, fit: RobustFit, level: LevelOfImage | None, inflation: float
+) -> Adjusted | None:
+    """Adjust a model in place with the positions that agree, and judge all of them by what came of it.
+
+    How good positions are follows from their residuals and from what the adjustment leaves of each (its redundancy), so
+    that a model that gives way to them does not make them look better than they are.
+
+    Args:
+        mapper: of a model that lies in the frame.
+        fit: of its cameras to the places.
+        level: more about the vertical.
+        inflation: what errors that positions have in common multiply their sigmas by.
+
+    Returns:
+        None where photographs and positions contradict each other: the model is then to be taken back.
+    """
+    model, noise_px = mapper.reconstruction, mapper.noise_px
+    before = model.copy()
+    if measured.is_stated.any():  # what the shape of the model makes of residuals is no reason to doubt them yet
+        fit = _with_factors(fit, measured, np.where(measured.is_stated, 1.0, fit.factor))
+    covariance: dict[int, Array] = {}
+    for _ in range(_MAX_ROUNDS):
+        used, factor = fit.is_inlier, np.array(fit.factor)
+        places, sigma = measured.places[used], fit.sigma[used] * inflation
+        images = measured.image_idx[used]
+        mapper.adjust_with(position_graph(images, places, sigma, noise_px, level))
+        if not model.is_registered[measured.image_idx].all():
+            return None
+        covariance = _center_covariances(mapper, position_graph(images, places, sigma, 1.0, level))
+        fit = _judged(fit, model.centers[measured.image_idx], measured, covariance, inflation)
+        if np.array_equal(fit.is_inlier, used) and np.allclose(fit.factor, factor, rtol=_SETTLED):
+            break
+    cost = _cost(before, model, noise_px)
+    if cost > _MAX_COST_PER_NUMBER * 3 * int(fit.is_inlier.sum()):
+        return None
+    return Adjusted(finished(fit, model, measured, level, inflation), covariance)
+
+
+def finished(
+    fit: RobustFit, model: Reconstruction, measured: Measured, level: LevelOfImage | None, inflation: float
+) -> RobustFit:
+    """A fit with residuals of the cameras as they lie, and sigmas with what errors have in common."""
+    centers = model.centers[measured.image_idx]
+    sigma = fit.sigma * inflation
+    residual = centers - measured.places
+    chi2 = np.nansum((residual / sigma) ** 2, axis=1)
+    is_inlier = chi2 <= MAX_CHI2 if len(chi2) >= MIN_REDUNDANT else np.ones(len(chi2), bool)
+    in_world = None
+    if level is not None:
+        turn = rigid3.rotation_matrix(model.cam_from_world[level.image_idx])
+        in_world = replace(level.level, up=turn.T @ level.level.up)
+    origin = centers.mean(0)
+    here = replace(fit.similarity, rotation=np.eye(3), scale=1.0, origin=origin, mean=origin)
+    found = fit_similarity(centers, measured.places, sigma, is_inlier, here, in_world)
+    return replace(
+        fit, similarity=found or fit.similarity, residual=residual, sigma=sigma, chi2=chi2, is_inlier=is_inlier
+    )
+
+
+def drift(fit: RobustFit, image_idx: NDArray[np.int64]) -> tuple[float, float]:
+    """Autocorrelation of residuals of photographs one after the other, and what it multiplies sigmas by.
+
+    Of n numbers with the correlation r from one to the next, n (1 - r) / (1 + r) count (Bartlett 1946). 1 where
+    the correlation is not above what independent errors show by chance.
+    """
+    order = np.argsort(image_idx)
+    order = order[fit.is_inlier[order]]
+    normal = (fit.residual / fit.sigma)[order]
+    products, squares = normal[1:] * normal[:-1], normal**2
+    num = int(np.isfinite(products).sum())
+    if num < 3 * MIN_REDUNDANT:
+        return 0.0, 1.0
+    correlation = float(np.nanmean(products) / np.nanmean(squares))
+    if correlation * np.sqrt(num) < _CORRELATED_SIGMAS:
+        return max(correlation, 0.0), 1.0
+    clipped = min(correlation, _MAX_CORRELATION)
+    return correlation, float(np.sqrt((1.0 + clipped) / (1.0 - clipped)))
+
+
+def _with_factors(fit: RobustFit, measured: Measured, factor: Array) -> RobustFit:
+    return replace(fit, factor=(float(factor[0]), float(factor[1])), sigma=measured.sigma * factor[[0, 0, 1]])
+
+
+def _judged(
+    fit: RobustFit, centers: Array, measured: Measured, covariance: dict[int, Array], inflation: float
+) -> RobustFit:
+    """Factors and inliers anew, by the residuals of cameras as they lie."""
+    residual = centers - measured.places
+    if len(centers) < MIN_REDUNDANT:
+        return replace(fit, residual=residual)
+    if covariance:
+        variance = np.array([np.diag(covariance[i]) for i in measured.image_idx.tolist()])
+        share = np.clip(variance / (fit.sigma * inflation) ** 2, 0.0, 1.0)
+        redundancy = np.where(fit.is_inlier[:, None], 1.0 - share, 1.0 + share)
+    else:
+        redundancy = fit.similarity.redundancy
+    squares = (residual / measured.sigma) ** 2
+    factor = estimate_factors(squares, redundancy, measured.sigma, fit.is_inlier, measured.is_stated)
+    fit = _with_factors(fit, measured, factor)
+    chi2 = np.nansum((residual / (fit.sigma * inflation)) ** 2, axis=1)
+    return replace(fit, residual=residual, chi2=chi2, is_inlier=chi2 <= MAX_CHI2)
+
+
+def _center_covariances(mapper: Mapper, graph: object) -> dict[int, Array]:
+    """(3, 3) of the centres of images, in the frame, by image; empty for large models."""
+    found = mapper.covariances_with(graph)
+    if found is None or not found.is_determined:
+        return {}
+    rotation = rigid3.rotation_matrix(mapper.reconstruction.cam_from_world[found.image_idx])
+    # c = -R^T t moves by -R^T v
+    turned = np.einsum("nji,njk,nkl->nil", rotation, found.poses[:, 3:, 3:], rotation)
+    return dict(zip(found.image_idx.tolist(), turned, strict=True))
+
+
+def _cost(before: Reconstruction, after: Reconstruction, noise_px: float) -> float:
+    """Growth of the squared residuals of observations that hold in both, in units of their noise; those far off are
+    counted as at three."""
+    both = before.obs_is_inlier & after.obs_is_inlier
+    chi2 = [np.minimum((model.residuals_px()[both] ** 2).sum(1) / noise_px**2, 9.0) for model in (before, after)]
+    return float((chi2[1] - chi2[0]).sum())

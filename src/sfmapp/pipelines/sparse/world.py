@@ -1,0 +1,70 @@
+"""Finished models into the world: by positions of photographs, and by ground control, read before the work begins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from sfmapp.formats.control_points import ControlPoints, read_control_points
+from sfmapp.pipelines.sparse.run import Run
+
+if TYPE_CHECKING:
+    from sfmapp.images.image_set import ImageSet
+    from sfmapp.mapping.mapper import Mapper
+
+
+def read_control(run: Run, image_set: ImageSet) -> ControlPoints | None:
+    """The control points that a run was given, checked against its photographs and for a system that there is.
+
+    Raises:
+        InputError: the file is not what it has to be; file, line, what was expected and what was found.
+        MissingPackageError: its coordinate system needs pyproj, which is not installed.
+    """
+    options = run.options.control
+    if options.file is None:
+        return None
+    from sfmapp.georeference.control import survey_in_frame
+
+    sizes = {record.name: (record.width, record.height) for record in image_set.images}
+    sigma_m = (options.sigma_m, options.sigma_m, options.sigma_up_m)
+    control = read_control_points(options.file, sizes, sigma_m=sigma_m, sigma_px=options.sigma_px)
+    survey_in_frame(control)  # refuses what is no place on Earth before an hour is spent
+    return control
+
+
+def closing(run: Run, image_set: ImageSet) -> Callable[[list[Mapper]], None] | None:
+    """What is to be done with finished models; None where nothing is known of where they lie."""
+    has_positions = any(record.position is not None for record in image_set.images)
+    units = run.options.units
+    if run.control is None and not has_positions and not run.known and units.up == "none":
+        return None
+
+    def bring_into_world(mappers: list[Mapper]) -> None:
+        if has_positions:
+            from sfmapp.georeference.stage import georeference_models
+
+            placed = georeference_models(mappers, image_set, run.options.gps, run.events)
+            run.georeference = placed.georeference
+            run.stages = replace(run.stages, georeference=placed.report)
+        if run.control is not None:
+            from sfmapp.georeference.control_stage import control_models, positions_after
+
+            controlled = control_models(mappers, run.control, run.georeference, run.events)
+            run.georeference = controlled.georeference
+            positions = run.stages.georeference
+            if positions is not None and controlled.georeference is not None:
+                positions = positions_after(positions, controlled.report, mappers)
+            run.stages = replace(run.stages, control=controlled.report, georeference=positions)
+        if run.known or units.up != "none":
+            from sfmapp.pipelines.sparse.units import give_units
+
+            metric = {place.model for place in run.georeference.models} if run.georeference is not None else set()
+            if run.stages.control is not None:
+                metric |= {row.model for row in run.stages.control.models if not row.reason}
+            found = give_units(
+                mappers, image_set, run.known, units.up, metric, threads=run.threads, events=run.events
+            )  # fmt: skip
+            run.stages = replace(run.stages, units=found)
+
+    return bring_into_world
