@@ -305,13 +305,17 @@ class SparseSystem:
                 graph.push_back(factor(keys[i], keys[j], empty[i][0], matrix, empty[i][1], *empty[j], 0.0))
         if self._ordering is None:
             self._ordering = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
-        try:
-            if not self._is_weak:
-                return self._unpacked(graph.optimize(self._ordering)) * root.ravel()
-        except RuntimeError:  # pivots of what only the damping holds are too small for it
-            self._is_weak = True
-        found = self._solve_weak(graph, right)
-        return None if found is None else found * root.ravel()
+        found: Array | None = None
+        if not self._is_weak:
+            try:
+                found = self._unpacked(graph.optimize(self._ordering))
+            except RuntimeError:  # pivots of what only the damping holds are too small for it
+                self._is_weak = True
+        if found is None:
+            found = self._solve_weak(graph, right)
+        if found is not None:
+            found *= root.ravel()
+        return found
 
     def _solve_weak(self, graph: Any, right: Array) -> Array | None:
         """The same by conjugate gradients, with gtsam's factor of the system with a little more on its diagonal."""
