@@ -7,25 +7,25 @@ import re
 from html import escape
 from typing import Any
 
-HELP = re.compile(r"^<!-- help: (\w+) -->$", re.MULTILINE)
+HELP = re.compile(r"^<!-- help: all -->$", re.MULTILINE)
 OPTIONS = re.compile(r"^<!-- options: (\w+) -->$", re.MULTILINE)
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Put ``sfmapp COMMAND --help`` and the options of a stage where a page asks for them."""
-    markdown = HELP.sub(lambda found: f"```text\n{help_of(found[1])}```", markdown)
+    """Put the help texts of all commands and the options of a stage where a page asks for them."""
+    markdown = HELP.sub(lambda _: help_of_all(), markdown)
     return OPTIONS.sub(lambda found: options_of(found[1]), markdown)
 
 
-def help_of(command: str) -> str:
-    """The help text of a command."""
+def help_of_all() -> str:
+    """The help text of every command, under a title each."""
     import os
 
     os.environ["COLUMNS"] = "110"
     from sfmapp.cli.main import make_parser
 
     (commands,) = (action for action in make_parser()._actions if isinstance(action, argparse._SubParsersAction))
-    return str(commands.choices[command].format_help())
+    return "\n".join(f"## {name}\n```text\n{one.format_help()}```\n" for name, one in commands.choices.items())
 
 
 def options_of(stage: str) -> str:

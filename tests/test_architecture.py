@@ -62,7 +62,8 @@ INNER_FLOORS = {
         ("frontend",),
         ("keyframe_images", "motion_model", "snapshot"),
         ("result", "state"),
-        ("inertial", "report"),
+        ("inertial",),
+        ("report",),
         ("options",),
     ),
     "pipelines": (

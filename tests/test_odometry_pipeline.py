@@ -109,7 +109,7 @@ def test_every_frame_has_its_row_and_gaps_are_marked(finished: tuple[Path, Track
     assert float(rows[0]["tracking_ms"]) == 10
     (gap,) = finished[1].report["frames"]["gaps"]
     assert (gap["first_frame"], gap["last_frame"], gap["num_frames"]) == (20, 24, 5)
-    assert gap["seconds"] == pytest.approx(0.6)
+    assert gap["duration_s"] == pytest.approx(0.6)
     assert (finished[0] / "trajectory.kitti.frames").read_text().split() == [r["index"] for r in rows if r["map"]]
 
 

@@ -14,12 +14,16 @@ import numpy as np
 import pytest
 
 from sfmapp.camera.camera import CameraModel, simple_camera
+from sfmapp.contradictions import Contradiction
 from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import InputError, UsageError
+from sfmapp.events import Event, Events
 from sfmapp.features.extract import FeatureOptions
 from sfmapp.images.image_set import ImageRecord, ImageSet
 from sfmapp.matching.options import MatchingOptions
+from sfmapp.odometry.report import MapFacts
 from sfmapp.pipelines.sparse.keys import stage_keys
+from sfmapp.reporting import Usage
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
 from sfmapp.workspace.keys import stage_key
@@ -44,13 +48,33 @@ def tiny_model(num_images: int = 3) -> Reconstruction:
     return model
 
 
+@pytest.mark.parametrize("model", [CameraModel.PINHOLE_SKEW, CameraModel.OPENCV_THIN_PRISM, CameraModel.EUCM])
+def test_cameras_that_colmap_refuses_are_named_with_a_remedy(model: CameraModel, tmp_path: Path) -> None:
+    import pycolmap
+
+    told: list[Event] = []
+    written = tiny_model()
+    written.cameras = [simple_camera(model, 640, 480, 500.0)]
+    with open_workspace(tmp_path / "out") as workspace:
+        workspace.write_models([written], events=Events(told.append))
+    messages = [event.message for event in told if event.kind == "warned"]
+    folder = tmp_path / "out" / "sparse" / "0"
+    if model.is_colmaps:
+        assert not messages
+        assert pycolmap.Reconstruction(folder).num_reg_images() == 3
+        return
+    assert len(messages) == 1
+    for word in (model.name, str(int(model)), "COLMAP", "sfmapp undistort"):
+        assert word in messages[0]
+
+
 def test_a_new_workspace_can_be_opened_again(tmp_path: Path) -> None:
     out = tmp_path / "a" / "b"
     with open_workspace(out) as workspace:
         workspace.begin("features", "k1")
         assert workspace.has_key("features", "k1")
         assert not workspace.is_current("features", "k1")
-        workspace.finish("features", {"wall_s": 1.0})
+        workspace.finish("features", Usage(wall_s=1.0, cpu_s=2.0))
         workspace.save()
     with open_workspace(out) as workspace:
         assert workspace.is_current("features", "k1")
@@ -88,6 +112,33 @@ def test_another_format_is_refused(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text(json.dumps({"format": "sfmapp workspace 99"}))
     with pytest.raises(UsageError, match="another version"), open_workspace(tmp_path):
         pass
+
+
+def test_what_is_noted_comes_back_and_a_damaged_manifest_is_told(tmp_path: Path) -> None:
+    facts = MapFacts(scale_source="imu", scale_sigma=0.01, contradictions=[Contradiction("a", "b", evidence={"n": 3})])
+    with open_workspace(tmp_path, "odometry") as workspace:
+        workspace.note(source="/walk.mp4", seed=3, recording="written")
+        workspace.begin("odometry", "k")
+        workspace.finish("odometry", Usage(wall_s=2.0, cpu_s=3.0, peak_memory_mb=4.0), maps=[facts])
+        workspace.save()
+    found = read_manifest(tmp_path, "odometry")
+    assert found == workspace.manifest
+    assert (found.source, found.seed, found.recording, found.image_root) == ("/walk.mp4", 3, "written", None)
+    entry = found.stage("odometry")
+    assert entry.is_done
+    assert (entry.wall_s, entry.cpu_s, entry.peak_memory_mb) == (2.0, 3.0, 4.0)
+    assert entry.maps == [facts]
+    assert found.stage("mapping") == {}
+    document = json.loads((tmp_path / "run.json").read_text())
+    for key, value, message in (
+        ("seed", "three", "seed: expected int, found str"), ("stages", [], "stages: expected dict"),
+        ("stages", {"odometry": {"is_done": 1}}, "is_done: expected bool"), ("speed", 1, "'speed' is no field"),
+    ):  # fmt: skip
+        (tmp_path / "run.json").write_text(json.dumps({**document, key: value}))
+        with pytest.raises(InputError, match=message):
+            read_manifest(tmp_path)
+        with pytest.raises(InputError, match=r"run\.json"), open_workspace(tmp_path, "odometry"):
+            pass
 
 
 def test_looking_at_a_folder_that_is_no_workspace_is_bad_input(tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ class AdjustReport(Report):
         noise_px: standard deviation of a pixel coordinate that the factors were weighed with.
         factors: what each kind of factor came to.
         num_left_out: extra factors over images, points or cameras that had no part.
-        time_s: wall clock.
+        wall_s: seconds that went by.
     """
 
     termination: str
@@ -127,7 +127,7 @@ class AdjustReport(Report):
     noise_px: float = 1.0
     factors: Sequence[FactorReport] = ()
     num_left_out: int = 0
-    time_s: float = 0.0
+    wall_s: float = 0.0
 
     def residual_text(self, factors: FactorReport) -> str:
         """Normalised residual of some factors: of reprojections in pixels, of others in their standard deviations."""

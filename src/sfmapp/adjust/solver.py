@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from importlib import import_module
 from threading import Thread
 from typing import Any
@@ -112,15 +113,14 @@ def run_engine(
         finally:
             write_back(problem, reconstruction)
     variance = engine.noise_px**2
-    for name in ("initial_cost", "final_cost"):
-        outcome[name] = outcome.get(name, 0.0) / variance
-    return AdjustReport(
-        **outcome, num_images=int((problem.image_block >= 0).sum()), num_cameras=int((problem.camera_block >= 0).sum()),
+    return replace(
+        outcome, initial_cost=outcome.initial_cost / variance, final_cost=outcome.final_cost / variance,
+        num_images=int((problem.image_block >= 0).sum()), num_cameras=int((problem.camera_block >= 0).sum()),
         num_points=len(problem.track_idx), num_observations=problem.num_observations,
         num_unknowns=int(problem.block_dim.sum()), solver=engine.solver, fill=engine.fill, noise_px=engine.noise_px,
         factors=engine.factor_reports() if engine.is_closing else (),
         num_left_out=engine.extras.num_left_out if engine.extras else 0,
-        time_s=time.perf_counter() - start,
+        wall_s=time.perf_counter() - start,
     )  # fmt: skip
 
 
@@ -345,16 +345,16 @@ class Engine:
         return [*out, *(self.extras.reports() if self.extras is not None else [])]
 
 
-def _minimize(engine: Engine, options: AdjustOptions, run: Callable[..., Any], events: Events | None) -> dict[str, Any]:
-    """Levenberg-Marquardt with the damping rule of Nielsen (1999), as Ceres has it. Returns fields of the report."""
+def _minimize(engine: Engine, options: AdjustOptions, run: Callable[..., Any], events: Events | None) -> AdjustReport:
+    """Levenberg-Marquardt with the damping rule of Nielsen (1999), as Ceres has it; what took part is not told."""
     problem = engine.problem
     if problem.num_observations == 0 and engine.extras is None:
-        return {"termination": "nothing"}
+        return AdjustReport(termination="nothing")
     damping, growth, tolerance = options.initial_damping, 2.0, options.relative_cost_tolerance
     first = cost = engine.linearize(damping, run)
     termination, iterations, rejected = "iterations", 0, 0
     if not np.isfinite(cost):
-        return {"termination": "stalled", "initial_cost": cost, "final_cost": cost}
+        return AdjustReport(termination="stalled", initial_cost=cost, final_cost=cost)
     while iterations < options.max_iterations:
         if events is not None:
             events.raise_if_cancelled()
@@ -391,7 +391,6 @@ def _minimize(engine: Engine, options: AdjustOptions, run: Callable[..., Any], e
             termination = "stalled"
             break
         engine.linearize(damping, run)
-    return {
-        "termination": termination, "num_iterations": iterations, "num_rejected": rejected, "initial_cost": first,
-        "final_cost": cost,
-    }  # fmt: skip
+    return AdjustReport(
+        termination=termination, num_iterations=iterations, num_rejected=rejected, initial_cost=first, final_cost=cost
+    )

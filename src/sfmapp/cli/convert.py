@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 
 from sfmapp.cli.common import add_output_flags, print_json
 
-FORMATS = ("colmap-bin", "colmap-text", "ply", "las", "laz", "bundler", "nerfstudio", "geojson", "kml")
+
+class _Formats:
+    """The formats, from the one table of them: it is loaded when somebody exports, or asks for this help."""
+
+    def __iter__(self) -> Iterator[str]:
+        from sfmapp.pipelines.export import EXPORTS
+
+        return iter(EXPORTS)
+
+    def __contains__(self, name: object) -> bool:
+        return name in list(self)
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -17,7 +28,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="Write OUT/sparse/0 in another format, read it back, and print the worst reprojection difference.",
     )  # fmt: skip
     parser.add_argument("output", metavar="OUT", type=Path, help="folder of a run")
-    parser.add_argument("--to", metavar="FORMAT", required=True, choices=FORMATS, help=", ".join(FORMATS))
+    parser.add_argument("--to", metavar="FORMAT", required=True, choices=_Formats(), help="%(choices)s")
     parser.add_argument("-o", dest="path", metavar="PATH", type=Path, required=True, help="file or folder to write")
     parser.add_argument(
         "--crs", metavar="EPSG:CODE",

@@ -225,7 +225,7 @@ def _print_summary(args: argparse.Namespace, report: OdometryRunReport) -> None:
     )
     for gap in frames.gaps:
         if gap.num_frames:
-            print(f"  no pose from frame {gap.first_frame} to {gap.last_frame} ({gap.seconds:.1f} s)")
+            print(f"  no pose from frame {gap.first_frame} to {gap.last_frame} ({gap.duration_s:.1f} s)")
     if len(report.maps) > 1:
         sizes = ", ".join(str(other.num_frames) for other in report.maps)
         print(f"  it falls into {len(report.maps)} maps of {sizes} frames, each with a world of its own")

@@ -22,6 +22,8 @@ _MAX_ROUNDS, _SETTLED = 4, 0.1
 # Positions add three numbers each, and may cost the reprojections about as much chi square; so many times that is a
 # contradiction between photographs and positions, not noise.
 _MAX_COST_PER_NUMBER = 10.0
+# Positions with sigmas so many times as large hold a model in its place, and do not bend it.
+_LOOSE = 1e3
 # An autocorrelation this many standard deviations above zero is one; above the second nothing is left to be told.
 _CORRELATED_SIGMAS, _MAX_CORRELATION = 2.6, 0.9
 
@@ -66,6 +68,9 @@ def adjust_with_positions(
         None where photographs and positions contradict each other: the model is then to be taken back.
     """
     model, noise_px = mapper.reconstruction, mapper.noise_px
+    # what photographs alone make of one more adjustment is no doing of the positions: those hold but the gauge here
+    loose = fit.sigma * _LOOSE
+    mapper.adjust_with(position_graph(measured.image_idx, measured.places, loose, noise_px, level))
     before = model.copy()
     if measured.is_stated.any():  # what the shape of the model makes of residuals is no reason to doubt them yet
         fit = _with_factors(fit, measured, np.where(measured.is_stated, 1.0, fit.factor))

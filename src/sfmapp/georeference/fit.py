@@ -5,7 +5,7 @@ Coordinates of places are x east, y north, z up in metres. A place may have no h
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -183,6 +183,8 @@ def robust_fit(
         previous, is_inlier = is_inlier, chi2 <= MAX_CHI2 if is_redundant else np.ones(len(centers), bool)
         if is_inlier.sum() < 3:
             return None
+        if level is not None and n == 0:
+            fit = _leveled(fit, level, centers[is_inlier])
         better = fit_similarity(centers, places, wide, is_inlier, fit, level)
         if better is None:
             return None
@@ -197,6 +199,17 @@ def robust_fit(
     residual = fit.apply(centers) - places
     chi2 = np.nansum((residual / wide) ** 2, axis=1)
     return RobustFit(fit, is_inlier, residual, wide, (float(factor[0]), float(factor[1])), chi2)
+
+
+def _leveled(start: Similarity, level: Level, centers: Array) -> Similarity:
+    """A start turned about the line that centers (n, 3) lie along until what is known to be up is nearest to up."""
+    origin = centers.mean(0)
+    axis = start.rotation @ np.linalg.svd(centers - origin)[2][0]
+    up, wanted = start.rotation @ level.up, np.array([0.0, 0.0, 1.0])
+    up, wanted = up - (up @ axis) * axis, wanted - (wanted @ axis) * axis
+    angle = np.arctan2(axis @ np.cross(up, wanted), up @ wanted)
+    turned = rigid3.exp_so3(angle * axis) @ start.rotation
+    return replace(start, rotation=turned, origin=origin, mean=start.apply(origin[None])[0])
 
 
 def estimate_factors(squares: Array, redundancy: Array, sigma: Array, is_inlier: Mask, is_stated: Mask) -> Array:

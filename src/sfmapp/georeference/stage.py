@@ -118,7 +118,7 @@ def georeference_models(mappers: Sequence[Mapper], image_set: ImageSet, options:
 def _place(number: int, mapper: Mapper, tags: Tags, events: Events) -> _Model | PlacedModel:
     """A model brought into the frame, or why it is not."""
     model = mapper.reconstruction
-    n = np.flatnonzero(model.is_registered[tags.image_idx])
+    n = np.flatnonzero(model.is_registered[tags.image_idx] & (tags.first == np.arange(len(tags.first))))
     image_idx = tags.image_idx[n]
     fit, leveled, reason = _first_fit(model.cam_from_world, image_idx, tags, n)
     if fit is None:
@@ -156,7 +156,7 @@ def _first_fit(
     fit, leveled = robust_fit(*given), None
     tilt = np.inf if fit is None else _largest_sigma(fit.similarity.covariance[:2, :2])
     if tilt > LEVEL_ENOUGH_RAD:
-        level = known_level(cam_from_world)
+        level = known_level(cam_from_world, image_idx, tags.pitch_deg[n])
         again = robust_fit(*given, level)
         # a vertical that contradicts what positions do tell is none
         if again is not None and (fit is None or turn_between(fit, again) < 3.0 * np.hypot(tilt, level.sigma_rad)):
@@ -295,6 +295,12 @@ def _images(
                 is_used=bool(fit.is_inlier[k]),
                 reason=reasons[k],
             )
+        for n in np.flatnonzero(tags.first != np.arange(len(tags.first))).tolist():
+            i, earlier = int(tags.image_idx[n]), names[tags.image_idx[tags.first[n]]]
+            if numbers[i] == model.number:
+                at = mappers[model.number].reconstruction.centers[i]
+                reason = f"the same position as {earlier}, to the last digit: no new measurement"
+                rows[i] = replace(rows[i], adjusted_m=_three(at), reason=reason)
     return [rows[i] for i in sorted(rows)]
 
 
@@ -335,7 +341,7 @@ def _three_or_less(values: Array) -> tuple[float, float, float | None]:
 
 def _rejections(images: Sequence[PositionedImage]) -> list[Finding]:
     """Positions that photographs refute, each by name."""
-    return [Finding(images=[row.name], message=row.reason) for row in images if row.adjusted_m and not row.is_used]
+    return [Finding(images=[row.name], message=row.reason) for row in images if row.residual_m and not row.is_used]
 
 
 def _tell(model: _Model, row: PlacedModel, events: Events) -> None:

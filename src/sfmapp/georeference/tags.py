@@ -13,6 +13,7 @@ from sfmapp.georeference.coordinate_systems import HeightReference
 from sfmapp.georeference.options import GpsOptions
 from sfmapp.georeference.report import Finding
 from sfmapp.images.image_set import ImageRecord
+from sfmapp.images.position import Position
 
 Array = NDArray[np.float64]
 
@@ -34,6 +35,9 @@ class Tags:
         sigma: (n, 3) metres; infinite for heights that are unknown.
         source: n, of each measurement.
         is_stated: (2,) bool: whether sigmas are more than weights, horizontally and vertically.
+        first: (n,) the first of the tags that are the same to the last digit: a receiver that had no new fix, or that
+            stood still, wrote the others, which are no measurements of their own.
+        pitch_deg: (n,) of the optical axis above the horizon, as a gimbal says; NaN where none does.
         frame: about the middle of them.
         heights: what heights are above.
     """
@@ -44,6 +48,8 @@ class Tags:
     sigma: Array
     source: list[str]
     is_stated: NDArray[np.bool_]
+    first: NDArray[np.int64]
+    pitch_deg: Array
     frame: LocalFrame
     heights: HeightReference
 
@@ -61,7 +67,13 @@ def tags_of(records: Sequence[ImageRecord], options: GpsOptions) -> tuple[Tags |
             Finding(images=[], message=f"all {len(known)} photographs carry the same position, which is left aside")
         )
         return None, findings
-    findings += _without_false_heights(geodetic, [records[i].name for i, _ in known])
+    names = [records[i].name for i, _ in known]
+    first = _first_of_same(geodetic)
+    repeated = [name for name, n, k in zip(names, first, range(len(first)), strict=True) if n != k]
+    if repeated:
+        text = "the position of an earlier photograph to the last digit, which is no new measurement, and left aside"
+        findings.append(Finding(images=repeated, message=text))
+    findings += _without_false_heights(geodetic, names)
     sigma = np.array([[_or_nan(p.sigma_m), _or_nan(p.sigma_up_m)] for p in positions])
     is_stated = np.array([all(p.is_stated for p in positions)] * 2)
     for k, given in enumerate((options.sigma_m, options.sigma_up_m)):
@@ -83,7 +95,24 @@ def tags_of(records: Sequence[ImageRecord], options: GpsOptions) -> tuple[Tags |
     heights: HeightReference = kinds.pop() if len(kinds) == 1 else "unknown"
     index = np.array([i for i, _ in known], np.int64)
     sources = [p.source for p in positions]
-    return Tags(index, geodetic, places, sigma[:, [0, 0, 1]], sources, is_stated, frame, heights), findings
+    pitch = np.array([_gimbal_pitch(records[i].orientation, p) for i, p in known])
+    return Tags(
+        index, geodetic, places, sigma[:, [0, 0, 1]], sources, is_stated, first, pitch, frame, heights
+    ), findings
+
+
+def _first_of_same(geodetic: Array) -> NDArray[np.int64]:
+    """(n,) for each position the first that is equal to it."""
+    _, first, number = np.unique(np.nan_to_num(geodetic, nan=-1e9), axis=0, return_index=True, return_inverse=True)
+    return first[number.ravel()].astype(np.int64)
+
+
+def _gimbal_pitch(orientation: int, position: Position) -> float:
+    """Of XMP alone, where it means the same with every maker; NaN for what is rolled or turned."""
+    attitude = position.attitude_deg
+    if position.source != "XMP" or attitude is None or orientation != 1:
+        return np.nan
+    return attitude[1] if abs(attitude[2]) < 10.0 and abs(attitude[1]) <= 90.0 else np.nan
 
 
 def _or_nan(value: float | None) -> float:

@@ -15,10 +15,25 @@ Array = NDArray[np.float64]
 LEVEL_ENOUGH_RAD = float(np.radians(5.0))
 # How level people hold cameras, as a mean over many photographs.
 _PHOTOGRAPHS_RAD = float(np.radians(5.0))
+# How well a gimbal knows the vertical, and the length of the mean of unit vectors that differ by ten degrees at most.
+_GIMBAL_RAD, _AGREEING = float(np.radians(3.0)), 0.98
 
 
-def known_level(cam_from_world: Array) -> Level:
-    """What tells the vertical of a model beside positions: photographs (I, 7) that were held level."""
+def known_level(cam_from_world: Array, image_idx: NDArray[np.int64], pitch_deg: Array) -> Level:
+    """What tells the vertical of a model beside positions: a drone's gimbal, else photographs that were held level.
+
+    Args:
+        cam_from_world: (I, 7) of the model.
+        image_idx: (m,) images with positions; pitch_deg: (m,) of their optical axes above the horizon, NaN if unknown.
+    """
+    known = np.isfinite(pitch_deg)
+    if known.any():
+        pitch, rotation = np.radians(pitch_deg[known]), rigid3.rotation_matrix(cam_from_world[image_idx[known]])
+        seen = np.stack([np.zeros_like(pitch), -np.cos(pitch), np.sin(pitch)], 1)
+        mean = np.einsum("nji,nj->ni", rotation, seen).mean(0)
+        length = float(np.linalg.norm(mean))
+        if length > _AGREEING:
+            return Level(mean / length, _GIMBAL_RAD, "gimbal")
     return Level(up_direction(cam_from_world), _PHOTOGRAPHS_RAD, "photographs")
 
 

@@ -31,7 +31,7 @@ class FrameRecord:
         live: (7,) cam_from_world as it was given out.
         covariance: (6, 6) of the pose given the map, as of ``refine_pose``; NaN where it was not measured.
         point_id: (N,) int32 and xy: (N, 2) float32, the points that its pose was measured with.
-        time_s: CPU time of tracking, without the back end.
+        cpu_s: CPU seconds of tracking, without the back end.
     """
 
     frame_idx: int
@@ -46,7 +46,7 @@ class FrameRecord:
     covariance: Array = field(default_factory=_NO_COVARIANCE.copy)
     point_id: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     xy: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
-    time_s: float = 0.0
+    cpu_s: float = 0.0
 
     @property
     def has_pose(self) -> bool:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 from sfmapp.contradictions import Contradiction
-from sfmapp.reporting import Plain, Report
+from sfmapp.reporting import Report
 
 
 class OdometryReport(Report):
@@ -43,6 +44,201 @@ class MapFacts(Report):
     contradictions: Sequence[Contradiction]
 
 
+# ------------------------------------------------------------------------------------------- the end of a map
+
+
+class ScaleParts(Report):
+    """What the relative standard deviation of a rig's unit of length is made of.
+
+    Attributes:
+        baseline, calibration, disparity: of the measured baseline, of what the images leave open of the calibration,
+            and of the noise of disparities.
+        focal, aspect, distortion, turn: each part of the calibration alone.
+        shift: what another calibration, which the images would rather have, makes of the length.
+        sigma: all of it.
+        beyond_the_lens_model: what a refined calibration adds for what no lens model has.
+    """
+
+    baseline: float
+    calibration: float
+    focal: float
+    aspect: float
+    distortion: float
+    turn: float
+    disparity: float
+    shift: float
+    sigma: float
+    beyond_the_lens_model: float | None = None
+
+
+class CalibrationCheck(Report):
+    """What the images of a map say of the calibration that was given; absent where they tell nothing.
+
+    Attributes:
+        is_refined: it was replaced by what they say.
+        surprise, max_surprise: how much they are against it, and how much errors of patches alone may be.
+        noise_inflation: how much more the data vary than independent errors would.
+        change, sigma: what they would change, by name, and how sure they are of it.
+        held_out_sigmas, direction_sigmas: what other tracks gain by the change, all of it and direction by direction.
+        is_settled: looking for it has come to rest.
+        given, refined: parameters of the cameras. focal_change: relative.
+        scale: of a rig: what its unit of length is known by.
+    """
+
+    is_refined: bool
+    surprise: float | None = None
+    max_surprise: float | None = None
+    noise_inflation: float | None = None
+    change: Mapping[str, float] | None = None
+    sigma: Mapping[str, float] | None = None
+    held_out_sigmas: float | None = None
+    direction_sigmas: Sequence[float] | None = None
+    is_settled: bool | None = None
+    given: Sequence[Sequence[float]] | None = None
+    focal_change: Sequence[float] | None = None
+    refined: Sequence[Sequence[float]] | None = None
+    scale: ScaleParts | None = None
+
+
+class ShutterReport(Report):
+    """What looking for a rolling shutter has found.
+
+    Attributes:
+        readout: time from the first row to the last as a share of the time between frames; 0 where nothing was changed.
+        first_readout, evidence, min_evidence: the first one found, what it explains in units of the noise, and what it
+            must.
+    """
+
+    evidence: float
+    min_evidence: float
+    first_readout: float
+    readout: float
+
+
+class SharedErrors(Report):
+    """By how much errors that observations share make the variance of the poses larger: along tracks, and between."""
+
+    within_tracks: float
+    between_tracks: float
+
+
+class AdjustmentReport(Report):
+    """The adjustment of a whole map at its end.
+
+    Attributes:
+        camera: the calibration, held against the images.
+        sigma_px: the noise of an observation.
+        covariance: absent where none was asked for.
+        shutter: absent where it was not looked for.
+        is_piecewise: the map is too large to be adjusted at once.
+    """
+
+    camera: CalibrationCheck
+    sigma_px: float | None = None
+    covariance: SharedErrors | None = None
+    shutter: ShutterReport | None = None
+    is_piecewise: bool | None = None
+
+
+# ------------------------------------------------------------------------------------------- the unit of length
+
+
+class DistanceEvidence(Report):
+    """A known distance between two frames, in metres, and what it measures in the map; absent: not known."""
+
+    metres: float | None = None
+    sigma_m: float | None = None
+    distance_map_units: float | None = None
+
+
+class PathEvidence(Report):
+    """A known length of the path; ``path_of_every_second_map_units``: without every second pose."""
+
+    metres: float
+    sigma_m: float
+    path_map_units: float
+    path_of_every_second_map_units: float
+    num_poses: int
+
+
+class HeightEvidence(Report):
+    """A known height of the camera over the ground.
+
+    Attributes:
+        num_keyframes, num_keyframes_with_ground: of the map, and those below which a plane was found.
+        height_map_units: median. relative_spread: of the heights. last_over_first_third: of the map, which is drift.
+        median_points, median_keyframe_sigma: of the planes.
+    """
+
+    metres: float
+    sigma_m: float
+    num_keyframes: int
+    num_keyframes_with_ground: int
+    height_map_units: float | None = None
+    relative_spread: float | None = None
+    last_over_first_third: float | None = None
+    median_points: int | None = None
+    median_keyframe_sigma: float | None = None
+
+
+class MarkerRow(Report):
+    """A marker that was measured."""
+
+    side_map_units: float
+    sigma_relative: float
+    num_images: int
+
+
+class MarkerEvidence(Report):
+    """Markers whose sides are known; ``markers``: by id."""
+
+    metres: float
+    sigma_m: float
+    num_sightings: int
+    markers: Mapping[str, MarkerRow]
+
+
+class Fault(Report):
+    """What would explain measurements that contradict the map; ``residual``: what is left a degree of freedom then."""
+
+    fault: str
+    remedy: str
+    residual: float
+
+
+class InertialEvidence(Report):
+    """Inertial measurements against a map, as far as the alignment came.
+
+    Attributes:
+        rotation_residual_deg, rotation_deg: of an interval: what gyroscope and map differ by, and how far it turns.
+        condition: of the linear start.
+        position_sigma_map_units, rotation_sigma_deg: noise of the poses as they fit.
+        residual: chi2 over degrees of freedom. gravity_sigma_deg: of its direction.
+        gyro_bias, accel_bias: (3,) rad/s and m/s^2.
+        clock_offset_s, clock_sigma_s: to be added to a time of the frames for that of the measurements.
+        explained_by: what may be wrong with the measurements, where they contradict the map.
+    """
+
+    num_poses: int
+    num_intervals: int
+    rotation_residual_deg: float | None = None
+    rotation_deg: float | None = None
+    condition: float | None = None
+    position_sigma_map_units: float | None = None
+    residual: float | None = None
+    gravity_sigma_deg: float | None = None
+    rotation_sigma_deg: float | None = None
+    gyro_bias: Sequence[float] | None = None
+    accel_bias: Sequence[float] | None = None
+    clock_offset_s: float | None = None
+    clock_sigma_s: float | None = None
+    explained_by: Sequence[Fault] | None = None
+
+
+ScaleEvidence: TypeAlias = InertialEvidence | MarkerEvidence | HeightEvidence | PathEvidence | DistanceEvidence
+"""Numbers behind a unit of length, by its source."""
+
+
 class ScaleReport(Report):
     """Where the metres of a map come from, or why there are none.
 
@@ -55,7 +251,7 @@ class ScaleReport(Report):
 
     map: int
     source: str
-    evidence: Mapping[str, Plain]
+    evidence: ScaleEvidence
     metres_per_unit: float | None = None
     sigma_relative: float | None = None
     reason: str | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,7 @@ from sfmapp.odometry.recognition import Recognition
 from sfmapp.odometry.records import FrameRecord, gather, leave_keyframe, measure_again
 from sfmapp.odometry.refinement.early_calibration import EarlyCalibration
 from sfmapp.odometry.refinement.final_adjustment import adjust_finally
-from sfmapp.odometry.report import OdometryReport
+from sfmapp.odometry.report import OdometryReport, ShutterReport
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.shutter import straighten
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
@@ -121,13 +121,13 @@ class Odometry:
         self.records.append(record)
         self._go_through_phases(record, view)
         self.tracked.previous = view.pyramids[0]
-        record.time_s = time.thread_time() - start
+        record.cpu_s = time.thread_time() - start
         if record.is_keyframe:
             self.keyframe_images.look(frame.idx, frame.images[0])
         snapshot = FrameSnapshot(
             frame.idx, frame.name, frame.shown_s, record.state, frame.images[0],
             self.tracked.tracks.xy.astype(np.float32), self.tracked.is_mapped, record.live, record.map_idx,
-            record.time_s,
+            record.cpu_s,
         )  # fmt: skip
         self.events.advanced(STAGE, message=frame.name, snapshot=snapshot)
         return record
@@ -412,10 +412,10 @@ class Odometry:
             maps[number] = local.keyframes
             self.events.started("adjustment", f"adjusting {local.newest + 1} keyframes together")
             straightened = self._straighten(local)
-            conclusions[number] = adjust_finally(local.keyframes, self.options, self.events, self.given_rig)
-            conclusions[number].report["shutter"] = straightened
-            conclusions[number].contradictions.extend(self.clock.contradictions(local.keyframes))
-            conclusions[number].contradictions.extend(local.witnesses.contradictions(local.keyframes))
+            conclusion = adjust_finally(local.keyframes, self.options, self.events, self.given_rig)
+            conclusion.contradictions.extend(self.clock.contradictions(local.keyframes))
+            conclusion.contradictions.extend(local.witnesses.contradictions(local.keyframes))
+            conclusions[number] = replace(conclusion, report=replace(conclusion.report, shutter=straightened))
             measure_again(self.records, local.keyframes, number)
             self.events.finished("adjustment", **conclusions[number].report)
         if self.executor is not None:
@@ -433,13 +433,14 @@ class Odometry:
         result.report = self._report(result)
         return result
 
-    def _straighten(self, local: LocalMap) -> dict[str, Any]:
-        """Undo a rolling shutter where the images clearly show one; the numbers behind that."""
+    def _straighten(self, local: LocalMap) -> ShutterReport | None:
+        """Undo a rolling shutter where the images clearly show one; the numbers behind that, None where it was not
+        looked for."""
         if self.rig.is_stereo or not self.options.refine_camera or is_too_large(local.keyframes):
-            return {}
+            return None
         numbers = straighten(self.records, local.keyframes, local.map_idx)
         self.events.raise_if_cancelled()
-        if numbers["readout"]:
+        if numbers.readout:
             self.events.decided("adjustment", "the images show a rolling shutter, which is undone", **numbers)
         return numbers
 
@@ -448,7 +449,7 @@ class Odometry:
         return OdometryReport(
             num_frames=len(self.records), num_tracked=int(tracked.sum()), num_maps=len(result.maps),
             num_keyframes=[len(m.keyframe_frame_idx) for m in result.maps],
-            tracking_cpu_s=sum(record.time_s for record in self.records),
+            tracking_cpu_s=sum(record.cpu_s for record in self.records),
             backend_cpu_s=sum(local.backend.cpu_s for local in self.atlas), **asdict(self.counts),
             right_late_frames=self.clock.shift, pairs=self.clock.contradictions(),
         )  # fmt: skip

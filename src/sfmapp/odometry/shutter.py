@@ -9,7 +9,6 @@ cost is least, and whether the images care at all: a global shutter, or a camera
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from sfmapp.odometry.map.backend import Job, make_job, take_over
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.records import FrameRecord, measure_again
 from sfmapp.odometry.refinement.final_adjustment import MIN_EVIDENCE, MIN_SIGMA_PX
+from sfmapp.odometry.report import ShutterReport
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -41,20 +41,19 @@ _MAX_GAP = 2.5
 _STEPS, _GLANCE_STEPS = 12, 3
 
 
-def straighten(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int) -> dict[str, Any]:
+def straighten(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int) -> ShutterReport:
     """Find the readout of the camera of a map, and move what its frames saw to where a global shutter had seen it.
 
     Where that is worth it, the map is adjusted, and observations and poses are changed in place. Else nothing is.
 
     Returns:
-        The numbers behind the decision; ``readout``: time from the first row to the last as a share of the time between
-        frames, 0 where nothing was changed.
+        The numbers behind the decision.
     """
-    total, report = 0.0, dict[str, Any]()
+    total, first = 0.0, (0.0, 0.0)
     for stride in _STRIDES:
         readout, evidence, job = _search(records, keyframes, map_idx, stride)
         if stride == _STRIDES[0]:
-            report = {"evidence": evidence, "min_evidence": MIN_EVIDENCE, "first_readout": readout}
+            first = evidence, readout
         # what is next gained is little, but never a loss
         least = MIN_EVIDENCE if stride == _STRIDES[0] else 0.0
         if job is None or not evidence >= least or not _MIN_READOUT <= abs(total + readout) <= _MAX_READOUT:
@@ -63,7 +62,7 @@ def straighten(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int)
         _move(records, keyframes, map_idx, readout)
         take_over(job, keyframes)
         measure_again(records, keyframes, map_idx)
-    return report | {"readout": total}
+    return ShutterReport(evidence=first[0], min_evidence=MIN_EVIDENCE, first_readout=first[1], readout=total)
 
 
 def _search(

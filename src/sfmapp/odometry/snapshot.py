@@ -23,7 +23,7 @@ class FrameSnapshot:
         xy: (N, 2) float32 tracked points, pixels. is_mapped: (N,) bool, those that the pose was measured with.
         cam_from_world: (7,) pose as it was given out, NaN without one.
         map_idx: which map the pose is in, counted from 0 in the order in which they began.
-        time_s: CPU time of tracking, back end not included.
+        cpu_s: CPU seconds of tracking, back end not included.
     """
 
     frame_idx: int
@@ -35,7 +35,7 @@ class FrameSnapshot:
     is_mapped: NDArray[np.bool_]
     cam_from_world: Array
     map_idx: int
-    time_s: float
+    cpu_s: float
 
 
 @dataclass(frozen=True)

@@ -252,7 +252,7 @@ def _of_sequence(folder: Path, estimate: Path) -> TrajectoryFile:
 
     options = SequenceOptions()
     if (estimate / MANIFEST).is_file():
-        options = options_from_dict(read_manifest(estimate).get("options", {})).sequence
+        options = options_from_dict(read_manifest(estimate).options).sequence
     sequence = open_sequence(folder, options, Events(), require_camera=False)
     if sequence.ground_truth is None:
         raise InputError(

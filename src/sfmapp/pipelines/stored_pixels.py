@@ -8,16 +8,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sfmapp.errors import InputError
+from sfmapp.errors import InputError, SfmError
 from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.orientation import INVERSE, MIRRORED, ROTATION_OF, upright_poses
-from sfmapp.workspace.layout import MANIFEST, REPORT
-from sfmapp.workspace.manifest import read_json
+from sfmapp.workspace.layout import REPORT
+from sfmapp.workspace.manifest import Manifest, read_json, read_manifest
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,9 +33,9 @@ STORED = "stored"
 _TURNED_SHARE = 0.2
 
 
-def has_stored_pixels(manifest: Mapping[str, Any]) -> bool:
+def has_stored_pixels(manifest: Manifest) -> bool:
     """Whether the model of a reconstruction counts in the pixels of the files."""
-    return bool(manifest.get("stages", {}).get("mapping", {}).get("pixels") == STORED)
+    return manifest.stage("mapping").pixels == STORED
 
 
 def noted_orientations(images: Iterable[ImageRecord]) -> dict[str, int]:
@@ -45,10 +45,11 @@ def noted_orientations(images: Iterable[ImageRecord]) -> dict[str, int]:
 
 def orientations_of(folder: Path) -> dict[str, int]:
     """EXIF orientation of the photographs of a reconstruction that it turns, by name; empty where it is not known."""
-    manifest = read_json(folder / MANIFEST)
-    stages = manifest.get("stages", {}) if isinstance(manifest, dict) else {}
-    noted: dict[str, int] = stages.get("mapping", {}).get("orientations", {})
-    return noted
+    try:
+        noted = read_manifest(folder).stage("mapping").orientations
+    except SfmError:
+        return {}
+    return dict(noted or {})
 
 
 def _orientations_of_earlier_version(folder: Path) -> dict[str, int]:
@@ -61,7 +62,7 @@ def _orientations_of_earlier_version(folder: Path) -> dict[str, int]:
         return {}
 
 
-def check_pixels(folder: Path, manifest: Mapping[str, Any]) -> None:
+def check_pixels(folder: Path, manifest: Manifest) -> None:
     """The model of a workspace has to fit its photographs as other programs read them.
 
     Raises:
@@ -74,7 +75,7 @@ def check_pixels(folder: Path, manifest: Mapping[str, Any]) -> None:
         raise InputError(
             f"{folder}: expected a model in the pixels of the files, found one of an earlier version of sfmapp, which "
             f"turned {len(turned)} of the photographs upright as EXIF says, {turned[0]} for one",
-            f"run it again: sfmapp reconstruct {manifest.get('source') or 'PHOTOS'} -o {folder}",
+            f"run it again: sfmapp reconstruct {manifest.source or 'PHOTOS'} -o {folder}",
         )
 
 

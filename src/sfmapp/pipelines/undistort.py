@@ -30,9 +30,15 @@ from sfmapp.images.pixels import decode_file, read_file, read_mask_file
 from sfmapp.images.rewrite import encode, encode_mask, without_turn
 from sfmapp.pipelines.dense.source import DenseSource, find_source, model_digest
 from sfmapp.report.model import UndistortedCamera, UndistortNumbers, UndistortReport
-from sfmapp.reporting import NamedReason, from_plain
+from sfmapp.reporting import NamedReason
 from sfmapp.scene.reconstruction import Reconstruction
-from sfmapp.scene.undistortion import Undistortion, has_distortion, plan_undistortion, undistort_reconstruction
+from sfmapp.scene.undistortion import (
+    Undistortion,
+    has_distortion,
+    plan_undistortion,
+    undistort_reconstruction,
+    warn_of_sides,
+)
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.keys import input_key, stage_key
 from sfmapp.workspace.layout import UNDISTORT
@@ -119,6 +125,7 @@ def undistort(
             model, where.images, job.options.images,
             is_upright=where.is_upright, with_copies=True, threads=job.threads, events=job.events,
         )  # fmt: skip
+        warn_of_sides(job.photographs.cameras, STAGE, job.events)
         job.undistortions = [plan_undistortion(camera, blank_pixels, max_size) for camera in job.photographs.cameras]
         key = stage_key(
             (__name__,), None, [blank_pixels, max_size, where.is_upright], model_digest(where.model),
@@ -146,13 +153,13 @@ def _check_target(where: DenseSource) -> None:
 
 
 def _note_source(job: _Job, where: DenseSource) -> None:
-    job.workspace.manifest |= {
+    job.workspace.note(
         # what the model belongs to, for the commands that take this workspace; and what that was made of
-        "source": os.path.abspath(where.output / IMAGES),
-        "photographs": os.path.abspath(where.images),
-        "model": os.path.abspath(where.model),
-        "versions": {"sfmapp": sfmapp.__version__, **recorded_versions()},
-    }
+        source=os.path.abspath(where.output / IMAGES),
+        photographs=os.path.abspath(where.images),
+        model=os.path.abspath(where.model),
+        versions={"sfmapp": sfmapp.__version__, **recorded_versions()},
+    )
 
 
 def _target(job: _Job, folder: str, name: str) -> Path:
@@ -175,8 +182,7 @@ def _begin(job: _Job, key: str) -> None:
     _target(job, "sparse/0", MODEL_FILES[0])
     if not workspace.has_key(STAGE, key):
         workspace.write_models([])
-        earlier = workspace.manifest["stages"].get(STAGE, {}).get("names", [])
-        for name in {str(name) for name in earlier}:
+        for name in set(workspace.manifest.stage(STAGE).names or ()):
             if not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts:
                 _target(job, IMAGES, name).unlink(missing_ok=True)
                 _target(job, MASKS, f"{name}.png").unlink(missing_ok=True)
@@ -190,10 +196,7 @@ def _known_numbers(job: _Job, key: str) -> UndistortNumbers | None:
     wanted += [folder / "sparse" / "0" / name for name in MODEL_FILES]
     if not job.workspace.is_current(STAGE, key) or not all(path.is_file() for path in wanted):
         return None
-    try:
-        return from_plain(UndistortNumbers, job.workspace.manifest["stages"][STAGE]["report"])
-    except ValueError:
-        return None
+    return job.workspace.manifest.stage(STAGE).report
 
 
 def _write_photographs(job: _Job) -> None:

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError, SfmError
 from sfmapp.evaluation.poses import PoseErrors, compare_reconstructions, evaluate_poses
@@ -23,7 +23,7 @@ from sfmapp.pipelines.stored_pixels import check_pixels, ground_truth_in_stored_
 from sfmapp.report.validation import PycolmapSide, Side, Validation
 from sfmapp.reporting import Usage, to_json
 from sfmapp.workspace.layout import MANIFEST, RECONSTRUCT, REPORT
-from sfmapp.workspace.manifest import read_manifest
+from sfmapp.workspace.manifest import Manifest, read_manifest
 from sfmapp.workspace.options import options_from_dict
 
 if TYPE_CHECKING:
@@ -102,25 +102,25 @@ def validate(
 _USAGE_KEYS = ("wall_s", "cpu_s", "peak_memory_mb")
 
 
-def _photographs(manifest: Mapping[str, Any], events: Events) -> tuple[ImageSet, ImageOptions]:
+def _photographs(manifest: Manifest, events: Events) -> tuple[ImageSet, ImageOptions]:
     """The photographs of the run, as it read them."""
-    image_options = options_from_dict({"images": manifest.get("options", {}).get("images", {})}).images
-    if not manifest.get("source"):
+    image_options = options_from_dict({"images": manifest.options.get("images", {})}).images
+    if not manifest.source:
         raise InputError("run.json does not name the photographs", "run sfmapp reconstruct again")
-    if manifest["source"] == IN_MEMORY:
+    if manifest.source == IN_MEMORY:
         raise InputError(
             "the photographs of this run were arrays in memory, and pycolmap reads files",
             "write them as files, and run sfmapp reconstruct on their folder",
         )
-    image_set = load_images(manifest["source"], image_options, events)[0]
+    image_set = load_images(manifest.source, image_options, events)[0]
     if not image_set.images:
-        raise InputError(f"{manifest['source']}: the photographs of this run are gone")
+        raise InputError(f"{manifest.source}: the photographs of this run are gone")
     return image_set, image_options
 
 
-def _changed_photographs(manifest: Mapping[str, Any], image_set: ImageSet) -> list[str]:
+def _changed_photographs(manifest: Manifest, image_set: ImageSet) -> list[str]:
     """A note if these are not the files that our run saw."""
-    seen = manifest.get("inputs")
+    seen = manifest.inputs
     if not seen:
         return []
     # a key is the digest of the file, and what masks it
@@ -203,9 +203,9 @@ def _side(model: Reconstruction | None, num_images: int, usage: Mapping[str, flo
     )
 
 
-def _own_usage(manifest: Mapping[str, Any], notes: list[str]) -> Mapping[str, float | None]:
+def _own_usage(manifest: Manifest, notes: list[str]) -> Mapping[str, float | None]:
     """Time and memory of our run as the manifest tells; None where it does not."""
-    run: Mapping[str, float | None] = manifest["stages"].get("mapping", {}).get("run") or {}
+    run: Mapping[str, float | None] = manifest.stage("mapping").run or {}
     if any(run.get(key) is None for key in _USAGE_KEYS):
         notes.append(f"{MANIFEST} of our run does not tell its time and memory")
     return run

@@ -409,14 +409,14 @@ class Gap(Report):
     """Frames without a pose; none of them where one map follows right after another.
 
     Attributes:
-        seconds: between the poses on both sides.
+        duration_s: between the poses on both sides.
         map_before, map_after: None at the ends of the sequence.
     """
 
     first_frame: int
     last_frame: int
     num_frames: int
-    seconds: float
+    duration_s: float
     map_before: int | None
     map_after: int | None
 

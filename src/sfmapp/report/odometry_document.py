@@ -86,7 +86,7 @@ def gaps(result: OdometryResult) -> list[Gap]:
                 first_frame=int(result.frame_idx[first]),
                 last_frame=int(result.frame_idx[end - 1]),
                 num_frames=int(end - first),
-                seconds=float(result.timestamps_s[after] - result.timestamps_s[before]),
+                duration_s=float(result.timestamps_s[after] - result.timestamps_s[before]),
                 map_before=int(result.frame_map[first - 1]) if first else None,
                 map_after=int(result.frame_map[end]) if end < len(has_pose) else None,
             )
@@ -98,7 +98,7 @@ def gaps(result: OdometryResult) -> list[Gap]:
                 first_frame=int(result.frame_idx[k + 1]),
                 last_frame=int(result.frame_idx[k]),
                 num_frames=0,
-                seconds=float(result.timestamps_s[k + 1] - result.timestamps_s[k]),
+                duration_s=float(result.timestamps_s[k + 1] - result.timestamps_s[k]),
                 map_before=int(result.frame_map[k]),
                 map_after=int(result.frame_map[k + 1]),
             )

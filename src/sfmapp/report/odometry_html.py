@@ -151,8 +151,8 @@ def _gaps(gaps: Sequence[Gap]) -> str:
         ("", "map before"),
         ("", "map after"),
     ]
-    keys = ("first_frame", "last_frame", "num_frames", "seconds", "map_before", "map_after")
-    rows = [[("", f"{row[k]:.2f}" if k == "seconds" else row[k]) for k in keys] for row in gaps[:MAX_GAPS]]
+    keys = ("first_frame", "last_frame", "num_frames", "duration_s", "map_before", "map_after")
+    rows = [[("", f"{row[k]:.2f}" if k == "duration_s" else row[k]) for k in keys] for row in gaps[:MAX_GAPS]]
     more = f"<p class=dim>{len(gaps) - MAX_GAPS} more in report.json</p>" if len(gaps) > MAX_GAPS else ""
     return "<h2>Gaps: frames without a pose</h2>" + table(head, rows) + more
 

@@ -171,7 +171,7 @@ class LiveView:
             xy=seen.xy if has_points else None, is_mapped=seen.is_mapped if has_points else None,
             num_tracked=0 if is_lost else len(seen.xy),
             num_mapped=0 if is_lost else int(np.count_nonzero(seen.is_mapped)), map_idx=seen.map_idx,
-            cam_from_world=seen.cam_from_world, time_s=seen.time_s,
+            cam_from_world=seen.cam_from_world, cpu_s=seen.cpu_s,
         )  # fmt: skip
         self._send_decisions()
 

@@ -116,7 +116,7 @@ class LiveDrawing:
         self._draw_image(message)
         for name, value in (("tracked", message["num_tracked"]), ("mapped", message["num_mapped"])):
             recording.log(f"plots/points/{name}", rr.Scalars(value))
-        recording.log("plots/time/tracking", rr.Scalars(1e3 * message["time_s"]))
+        recording.log("plots/time/tracking", rr.Scalars(1e3 * message["cpu_s"]))
         pose, map_idx = message["cam_from_world"], message["map_idx"]
         if not np.isfinite(pose[0]) or map_idx < 0:
             return

@@ -34,13 +34,13 @@ class RecordingReport:
     Attributes:
         path: where it is, None if it could not be written.
         num_bytes: its size.
-        seconds: wall time.
+        wall_s: seconds that went by.
         problem: why there is none, empty if all went well.
     """
 
     path: Path | None
     num_bytes: int
-    seconds: float
+    wall_s: float
     problem: str
 
 

@@ -140,7 +140,7 @@ class Job:
         if not recording.is_file():
             return False
         recording.unlink()
-        self.workspace.manifest["recording"] = FAILED
+        self.workspace.note(recording=FAILED)
         self.events.warned("recording", f"{recording} is given up: the disk is full, and the rest matters more")
         return True
 
@@ -155,19 +155,19 @@ class Job:
             seed=self.options.seed,
             threads=self.threads,
             options=options_to_dict(self.options),
-            versions=self.workspace.manifest["versions"],
+            versions=self.workspace.manifest.versions,
             started=self.started.isoformat(timespec="seconds"),
             **self.watch.read(),
         )
 
     def note_inputs(self, inputs: dict[str, str]) -> None:
         """Write down what this run works on and how, before it begins; ``inputs``: digests by name."""
-        self.workspace.manifest |= {
+        self.workspace.note(
             # absolute, so that the workspace can be looked at from anywhere; a stream has no place
-            "source": self.source if "://" in self.source else os.path.abspath(self.source),
-            "seed": self.options.seed,
-            "options": options_to_dict(self.options),
-            "versions": {"sfmapp": sfmapp.__version__, **recorded_versions()},
-            "inputs": inputs,
-        }
+            source=self.source if "://" in self.source else os.path.abspath(self.source),
+            seed=self.options.seed,
+            options=options_to_dict(self.options),
+            versions={"sfmapp": sfmapp.__version__, **recorded_versions()},
+            inputs=inputs,
+        )
         self.workspace.save()

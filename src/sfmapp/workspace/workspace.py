@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,19 +20,20 @@ from sfmapp.formats.atomic import replaced_file
 from sfmapp.reporting import R, Usage, from_plain, to_json
 from sfmapp.workspace.layout import LOCK, MANIFEST, RECONSTRUCT, REPORT
 from sfmapp.workspace.lock import locked
-from sfmapp.workspace.manifest import check_command, manifest_of, new_manifest, read_json
+from sfmapp.workspace.manifest import Manifest, StageEntry, check_command, manifest_of, new_manifest, read_json
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from sfmapp.events import Events
     from sfmapp.scene.reconstruction import Reconstruction
 
 
 class Workspace:
     """One output folder, locked by this process while it is open. Make it with :func:`open_workspace`."""
 
-    def __init__(self, folder: Path, manifest: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, manifest: Manifest) -> None:
         self.folder = folder
         self.manifest = manifest
 
@@ -53,22 +55,29 @@ class Workspace:
 
     def is_current(self, stage: str, key: str) -> bool:
         """The stage was run to its end with this key."""
-        entry = self.manifest["stages"].get(stage, {})
-        return bool(entry.get("key") == key and entry.get("is_done"))
+        return self.has_key(stage, key) and bool(self.manifest.stage(stage).is_done)
 
     def has_key(self, stage: str, key: str) -> bool:
         """The stage was begun with this key: what it has stored so far can be used."""
-        return bool(self.manifest["stages"].get(stage, {}).get("key") == key)
+        return self.manifest.stage(stage).key == key
+
+    def note(self, **facts: Any) -> None:
+        """Put facts, fields of the manifest, in the place of what it says of them. The caller saves."""
+        self.manifest = replace(self.manifest, **facts)
 
     def begin(self, stage: str, key: str, **facts: Any) -> None:
-        """Note, before anything is overwritten, that the stage now works under this key."""
-        self.manifest["stages"][stage] = {"key": key, "is_done": False, **facts}
+        """Note, before anything is overwritten, that the stage now works under this key, and facts of its entry."""
+        entry = StageEntry(key=key, is_done=False, **facts)
+        self.note(stages={**self.manifest.stages, stage: entry})
         self.save()
 
     def finish(self, stage: str, usage: Usage | None, **facts: Any) -> None:
         """Note that the stage has ended, with its time and memory. The caller saves."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        self.manifest["stages"][stage] |= {"is_done": True, "finished": now, **(usage or {}), **facts}
+        entry = replace(
+            self.manifest.stages[stage], is_done=True, finished=now, **(facts if usage is None else {**usage, **facts})
+        )
+        self.note(stages={**self.manifest.stages, stage: entry})
 
     def save(self) -> None:
         """Write ``run.json``, beside and renamed."""
@@ -96,17 +105,29 @@ class Workspace:
             return None
 
     def write_models(
-        self, models: Sequence[Reconstruction], keypoints: list[NDArray[np.float64]] | None = None
+        self,
+        models: Sequence[Reconstruction],
+        keypoints: list[NDArray[np.float64]] | None = None,
+        events: Events | None = None,
     ) -> None:
         """Write ``sparse/0``, ``sparse/1`` and so on, and take away what an earlier run left behind them.
 
-        Only files that sfmapp itself writes are replaced or removed: whatever else lies in these folders stays.
+        Only files that sfmapp itself writes are replaced or removed: whatever else lies in these folders stays. The
+        events are told of cameras that COLMAP will refuse.
         """
         from sfmapp.formats.colmap import write_model
 
         for idx, model in enumerate(models):
             write_model(self.model(idx), model, keypoints)
         self._remove_models(len(models))
+        foreign = {camera.model for model in models for camera in model.cameras if not camera.model.is_colmaps}
+        if foreign and events is not None:
+            names = " and ".join(f"{model.name} (number {int(model)})" for model in sorted(foreign))
+            events.warned(
+                "output",
+                f"sparse/ holds {names} cameras, which COLMAP and what reads its files refuse; sfmapp reads them. For "
+                "other programs: sfmapp undistort, which writes pictures with PINHOLE cameras, or another model",
+            )
 
     def _remove_models(self, first: int) -> None:
         from sfmapp.formats.colmap import MODEL_FILES

@@ -9,7 +9,7 @@ with its remedy.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,6 +38,7 @@ from sfmapp.odometry.inertial.visual_inertial import (
     linear_system,
     turns_of,
 )
+from sfmapp.odometry.report import Fault, InertialEvidence
 
 if TYPE_CHECKING:
     from sfmapp.images.sequence import Imu
@@ -136,14 +137,19 @@ def _told(refusal: ScaleRefusal, kept: list[tuple[_Case, float]], imu: Imu) -> S
             "no order or sign of the axes, unit, missing gravity, mounting or offset of the clocks explains it: "
             "check the sensor's calibration and its file, or whether the map is bent"
         )
-        return contradicted(refusal.reason, advice, refusal.evidence)
-    rows: dict[str, dict[str, Any]] = {}
+        return contradicted(refusal.reason, advice, _inertial(refusal))
+    rows: dict[str, Fault] = {}
     for case, left in kept:  # a turn that is found twice is one
         fault, remedy = _words(case, imu)
-        rows.setdefault(fault, {"fault": fault, "remedy": remedy, "residual": left})
+        rows.setdefault(fault, Fault(fault=fault, remedy=remedy, residual=left))
     reason = f"{refusal.reason}; it is explained if {', or '.join(rows)}"
-    evidence: dict[str, Any] = refusal.evidence | {"explained_by": list(rows.values())}
-    return contradicted(reason, "; or ".join(row["remedy"] for row in rows.values()), evidence)
+    evidence = replace(_inertial(refusal), explained_by=list(rows.values()))
+    return contradicted(reason, "; or ".join(row.remedy for row in rows.values()), evidence)
+
+
+def _inertial(refusal: ScaleRefusal) -> InertialEvidence:
+    assert isinstance(refusal.evidence, InertialEvidence)
+    return refusal.evidence
 
 
 def _cases(times: Array, poses: Array, imu: Imu, is_metric: bool, options: InertialOptions) -> list[_Case]:

@@ -16,6 +16,7 @@ from sfmapp.camera.camera import pixels_to_normalized
 from sfmapp.errors import UsageError
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.inertial.scale import Length, ScaleEstimate, ScaleRefusal, parse_length
+from sfmapp.odometry.report import MarkerEvidence, MarkerRow
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -137,13 +138,13 @@ def scale_from_markers(
         fitted = _fit_square(views, options.max_error_px)
         if fitted is not None:
             found[int(marker_id)] = fitted
-    evidence: dict[str, Any] = {
-        "metres": side.metres, "sigma_m": side.sigma_m, "num_sightings": int(use.sum()),
-        "markers": {
-            str(m): {"side_map_units": float(np.exp(s)), "sigma_relative": sigma, "num_images": n}
+    evidence = MarkerEvidence(
+        metres=side.metres, sigma_m=side.sigma_m, num_sightings=int(use.sum()),
+        markers={
+            str(m): MarkerRow(side_map_units=float(np.exp(s)), sigma_relative=sigma, num_images=n)
             for m, (s, sigma, n) in found.items()
         },
-    }  # fmt: skip
+    )  # fmt: skip
     if not found:
         what = f"{int(use.sum())} sightings" if use.any() else "no marker was seen"
         return ScaleRefusal("marker", f"no marker was measured from two keyframes that agree ({what})", evidence)

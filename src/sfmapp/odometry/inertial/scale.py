@@ -7,8 +7,8 @@ Markers have :mod:`sfmapp.odometry.inertial.markers`, inertial measurements
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from sfmapp.contradictions import Contradiction
 from sfmapp.errors import UsageError
 from sfmapp.geometry import rigid3
+from sfmapp.odometry.report import DistanceEvidence, HeightEvidence, PathEvidence, ScaleEvidence
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -34,13 +35,13 @@ class ScaleEstimate:
         scale: metres per map unit.
         sigma_relative: standard deviation of the scale over the scale.
         source: as in ``MapResult.scale_source``.
-        evidence: numbers for the report, JSON-able.
+        evidence: numbers for the report.
     """
 
     scale: float
     sigma_relative: float
     source: Source
-    evidence: dict[str, Any]
+    evidence: ScaleEvidence
 
 
 @dataclass(frozen=True)
@@ -50,13 +51,13 @@ class ScaleRefusal:
     Attributes:
         source: which.
         reason: a sentence for the report, with the numbers that failed.
-        evidence: more numbers, JSON-able.
+        evidence: more numbers.
         contradiction: set where the source does not fall silent but says something else than the map.
     """
 
     source: Source
     reason: str
-    evidence: dict[str, Any]
+    evidence: ScaleEvidence
     contradiction: Contradiction | None = None
 
 
@@ -163,11 +164,13 @@ def scale_from_distance(
     """
     centers = np.stack([rigid3.center(pose) for pose in (cam_from_world_a, cam_from_world_b)])
     if not np.isfinite(centers).all():
-        return ScaleRefusal("distance", "one of the two frames has no pose", {})
+        return ScaleRefusal("distance", "one of the two frames has no pose", DistanceEvidence())
     line = centers[1] - centers[0]
     distance = float(np.linalg.norm(line))
     if not distance > 1e-9 * max(float(np.abs(centers).max()), 1e-300):
-        return ScaleRefusal("distance", "the two frames are in the same place", {"distance_map_units": distance})
+        return ScaleRefusal(
+            "distance", "the two frames are in the same place", DistanceEvidence(distance_map_units=distance)
+        )
     variance = 0.0
     for pose, covariance in ((cam_from_world_a, covariance_a), (cam_from_world_b, covariance_b)):
         if covariance is not None:
@@ -175,7 +178,7 @@ def scale_from_distance(
             along = rigid3.rotation_matrix(pose) @ (line / distance)
             variance += float(along @ np.asarray(covariance, np.float64)[3:, 3:] @ along)
     sigma = float(np.hypot(np.sqrt(variance) / distance, length.sigma_m / length.metres))
-    evidence = {"metres": length.metres, "sigma_m": length.sigma_m, "distance_map_units": distance}
+    evidence = DistanceEvidence(metres=length.metres, sigma_m=length.sigma_m, distance_map_units=distance)
     return ScaleEstimate(length.metres / distance, sigma, "distance", evidence)
 
 
@@ -192,16 +195,17 @@ def scale_from_path(cam_from_world: ArrayLike, length: Length) -> ScaleEstimate 
     """
     centers = rigid3.center(cam_from_world)
     if len(centers) < 2 or not np.isfinite(centers).all():
-        return ScaleRefusal("distance", "the path has gaps or no length: give the distance of two frames instead", {})
+        reason = "the path has gaps or no length: give the distance of two frames instead"
+        return ScaleRefusal("distance", reason, DistanceEvidence())
     path = _path_length(centers)
     if not path > 0:
-        return ScaleRefusal("distance", "the camera did not move", {})
+        return ScaleRefusal("distance", "the camera did not move", DistanceEvidence())
     coarse = np.concatenate([centers[:-1:2], centers[-1:]])
     sigma = float(np.hypot(abs(path - _path_length(coarse)) / path, length.sigma_m / length.metres))
-    evidence = {
-        "metres": length.metres, "sigma_m": length.sigma_m, "path_map_units": path,
-        "path_of_every_second_map_units": _path_length(coarse), "num_poses": len(centers),
-    }  # fmt: skip
+    evidence = PathEvidence(
+        metres=length.metres, sigma_m=length.sigma_m, path_map_units=path,
+        path_of_every_second_map_units=_path_length(coarse), num_poses=len(centers),
+    )  # fmt: skip
     return ScaleEstimate(length.metres / path, sigma, "distance", evidence)
 
 
@@ -331,10 +335,9 @@ def _height_verdict(
 ) -> ScaleEstimate | ScaleRefusal:
     """Median over the keyframes, or why there is none."""
     good = np.flatnonzero(np.isfinite(heights))
-    evidence: dict[str, Any] = {
-        "metres": height.metres, "sigma_m": height.sigma_m, "num_keyframes": len(heights),
-        "num_keyframes_with_ground": len(good),
-    }  # fmt: skip
+    evidence = HeightEvidence(
+        metres=height.metres, sigma_m=height.sigma_m, num_keyframes=len(heights), num_keyframes_with_ground=len(good)
+    )
     if len(good) < options.min_keyframes:
         return ScaleRefusal(
             "camera_height",
@@ -347,10 +350,10 @@ def _height_verdict(
     spread = float(_MAD_TO_SIGMA * np.median(np.abs(log_height - middle)))
     third = max(len(good) // 3, 1)
     drift = float(np.exp(np.median(log_height[-third:]) - np.median(log_height[:third])))
-    evidence |= {
-        "height_map_units": float(np.exp(middle)), "relative_spread": spread, "last_over_first_third": drift,
-        "median_points": int(np.median(counts[good])), "median_keyframe_sigma": float(np.median(sigmas[good])),
-    }  # fmt: skip
+    evidence = replace(
+        evidence, height_map_units=float(np.exp(middle)), relative_spread=spread, last_over_first_third=drift,
+        median_points=int(np.median(counts[good])), median_keyframe_sigma=float(np.median(sigmas[good])),
+    )  # fmt: skip
     if not spread <= options.max_spread:
         return ScaleRefusal(
             "camera_height",

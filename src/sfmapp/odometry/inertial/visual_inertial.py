@@ -23,6 +23,7 @@ from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.odometry.inertial.gyroscope import Turns, imu_steps, multiply, read_as_given, turn_by
 from sfmapp.odometry.inertial.scale import ScaleEstimate, ScaleRefusal
+from sfmapp.odometry.report import InertialEvidence
 
 if TYPE_CHECKING:
     from sfmapp.images.sequence import Imu
@@ -69,7 +70,7 @@ class InertialAlignment:
         clock_offset_s: to be added to a time of the frames for the time that the measurements carry; clock_sigma_s.
         gyro_bias, accel_bias: (3,) means over the poses; gyro_bias_sigma, accel_bias_sigma: (3,) at the middle one.
         residual: chi2 over degrees of freedom of the refined graph, 1 where all noises are as modelled.
-        evidence: numbers for the report, JSON-able.
+        evidence: numbers for the report.
     """
 
     scale: float
@@ -86,7 +87,7 @@ class InertialAlignment:
     gyro_bias_sigma: Array
     accel_bias_sigma: Array
     residual: float
-    evidence: dict[str, Any]
+    evidence: InertialEvidence
 
     @property
     def scale_estimate(self) -> ScaleEstimate:
@@ -160,7 +161,7 @@ def align_imu(
         poses[~np.isfinite(covariance).all((1, 2))] = np.nan
     chosen = choose_poses(times, poses, options)
     intervals = _intervals(times, chosen, imu, options.max_interval_s)
-    evidence: dict[str, Any] = {"num_poses": len(chosen), "num_intervals": len(intervals)}
+    evidence = InertialEvidence(num_poses=len(chosen), num_intervals=len(intervals))
     if len(intervals) < options.min_intervals:
         return ScaleRefusal("imu", _too_few(intervals, times[chosen], imu, options), evidence)
     clock = read_as_given(turns_of(times, poses, chosen, options.max_interval_s), imu)
@@ -171,7 +172,7 @@ def align_imu(
     if isinstance(found, ScaleRefusal):
         return found
     offset = found.clock_offset_s + (clock.offset_s if np.isfinite(clock.offset_sigma_s) else 0.0)
-    evidence = found.evidence | {"clock_offset_s": offset, "clock_sigma_s": found.clock_sigma_s}
+    evidence = replace(found.evidence, clock_offset_s=offset, clock_sigma_s=found.clock_sigma_s)
     return _accept(replace(found, clock_offset_s=offset, evidence=evidence), options)
 
 
@@ -191,15 +192,14 @@ def _too_few(intervals: list[_Interval], times: Array, imu: Imu, options: Inerti
 
 
 def _fit(
-    path: _MapPath, imu: Imu, intervals: list[_Interval], options: InertialOptions, evidence: dict[str, Any]
+    path: _MapPath, imu: Imu, intervals: list[_Interval], options: InertialOptions, evidence: InertialEvidence
 ) -> InertialAlignment | ScaleRefusal:
     """The alignment with measurements as they are, accepted or not."""
     map_from_imu = _map_from_imu_rotation(path.poses, imu)
     gyro_bias, rotation_residual, rotation = _gyro_bias(intervals, map_from_imu)
-    evidence |= {
-        "rotation_residual_deg": float(np.degrees(rotation_residual)),
-        "rotation_deg": float(np.degrees(rotation)),
-    }
+    evidence = replace(
+        evidence, rotation_residual_deg=float(np.degrees(rotation_residual)), rotation_deg=float(np.degrees(rotation))
+    )
     if not rotation_residual <= max(np.radians(1.0), options.max_rotation_residual * rotation):
         reason = (
             f"the gyroscope contradicts the map's rotations by {np.degrees(rotation_residual):.1f} of "
@@ -208,7 +208,7 @@ def _fit(
         return contradicted(reason, "", evidence)
     intervals = [_reintegrate(interval, gyro_bias) for interval in intervals]
     start = _solve_linear(intervals, gyro_bias, map_from_imu, path, imu)
-    evidence |= {"condition": start.condition, "position_sigma_map_units": start.position_sigma}
+    evidence = replace(evidence, condition=start.condition, position_sigma_map_units=start.position_sigma)
     if not start.inverse_scale > 0:
         return ScaleRefusal("imu", "the motion does not tell the scale: accelerations and positions disagree", evidence)
     graph = _Graph(path, imu, intervals, start, gyro_bias, rotation_residual / np.sqrt(2.0))
@@ -234,7 +234,7 @@ def _accept(found: InertialAlignment, options: InertialOptions) -> InertialAlign
     return contradicted(reason, "", found.evidence)
 
 
-def contradicted(reason: str, advice: str, evidence: dict[str, Any]) -> ScaleRefusal:
+def contradicted(reason: str, advice: str, evidence: InertialEvidence) -> ScaleRefusal:
     """A refusal because map and measurements say different things. The map in its own unit is not touched by it."""
     numbers = {key: value for key, value in evidence.items() if not isinstance(value, float) or np.isfinite(value)}
     return ScaleRefusal("imu", reason, evidence, Contradiction("inertial measurements", reason, advice, numbers))
@@ -508,7 +508,7 @@ class _Graph:
         centers = rigid3.center(self._poses[self._index])
         return 1e-7 * float(np.linalg.norm(np.ptp(centers, axis=0))) + 1e-300
 
-    def solve(self, evidence: dict[str, Any]) -> InertialAlignment | ScaleRefusal:
+    def solve(self, evidence: InertialEvidence) -> InertialAlignment | ScaleRefusal:
         """Refine; poses without covariances are weighed twice: by the start's residuals, then by the graph's own."""
         values = self._initial()
         rounds = 2 if self._covariance is None else 1
@@ -608,7 +608,7 @@ class _Graph:
         # the graph bends towards the poses: it may not talk their noise away
         self._sigmas = np.maximum(np.repeat(sigma, 3), 0.3 * self._sigmas)
 
-    def _read(self, graph: Any, values: Any, evidence: dict[str, Any]) -> InertialAlignment:
+    def _read(self, graph: Any, values: Any, evidence: InertialEvidence) -> InertialAlignment:
         from gtsam.symbol_shorthand import A, B, V
 
         log_scale, *tilt, offset = values.atVector(A(0))
@@ -626,12 +626,12 @@ class _Graph:
         bias_sigma = widen * np.sqrt(np.diag(bias_covariance))
         sigma = 0.0 if self._is_metric else float(widen * np.sqrt(covariance[0, 0]))
         gravity_sigma = float(widen * np.sqrt(covariance[1, 1] + covariance[2, 2]))
-        evidence = evidence | {
-            "residual": float(residual), "gravity_sigma_deg": float(np.degrees(gravity_sigma)),
-            "rotation_sigma_deg": float(np.degrees(self._sigmas[0])),
-            "position_sigma_map_units": float(self._sigmas[3]),
-            "gyro_bias": biases[3:].tolist(), "accel_bias": biases[:3].tolist(),
-        }  # fmt: skip
+        evidence = replace(
+            evidence, residual=float(residual), gravity_sigma_deg=float(np.degrees(gravity_sigma)),
+            rotation_sigma_deg=float(np.degrees(self._sigmas[0])),
+            position_sigma_map_units=float(self._sigmas[3]),
+            gyro_bias=biases[3:].tolist(), accel_bias=biases[:3].tolist(),
+        )  # fmt: skip
         scale = 1.0 if self._is_metric else float(np.exp(log_scale))
         return InertialAlignment(
             scale, sigma, similarity.from_parts(upright, np.zeros(3), scale), gravity, gravity_sigma,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from sfmapp.adjust.clustered import clustered_covariances
 from sfmapp.adjust.covariance import pose_errors_in_gauge
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.geometry import rigid3
+from sfmapp.odometry.report import SharedErrors
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -32,7 +32,7 @@ _UNKNOWN_SHARE_OF_SCALE = 0.25
 
 def estimate_map_covariance(
     model: Reconstruction, num_sensors: int, loss_scale_px: float
-) -> tuple[Array, str, dict[str, Any]]:
+) -> tuple[Array, str, SharedErrors]:
     """(K, 6, 6) of the keyframes, NaN for those that no point holds, what they are relative to, and how they came.
 
     Args:
@@ -53,7 +53,7 @@ def estimate_map_covariance(
     of_first = found.image_idx % num_sensors == 0
     covariance[found.image_idx[of_first] // num_sensors] = shared * found.poses[of_first]
     covariance[~np.isfinite(covariance).all((1, 2))] = np.nan
-    numbers = {"within_tracks": found.correlation, "between_tracks": shared}
+    numbers = SharedErrors(within_tracks=found.correlation, between_tracks=shared)
     return covariance, "centroid, mean rotation" + ("" if num_sensors > 1 else " and spread"), numbers
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +34,7 @@ from sfmapp.geometry import rigid3, similarity
 from sfmapp.geometry.triangulation import Observed, triangulate_tracks
 from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.map.backend import classify
+from sfmapp.odometry.report import CalibrationCheck, ScaleParts
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -100,7 +100,7 @@ class Answer:
 
     model: Reconstruction
     is_refined: bool
-    report: dict[str, Any]
+    report: CalibrationCheck
     contradictions: list[Contradiction]
     scale_sigma: float | None
     pose_covariance: Array | None = None
@@ -232,7 +232,7 @@ def question_calibration(
         begin = _look(found_before[0], unknowns.between(model, found_before[0]), found_before[1], sigma, unknowns)
     if first is None or begin is None:
         is_rig = len(model.cameras) > 1
-        return Answer(model, False, {"is_refined": False}, [], _UNKNOWN_SCALE if is_rig else None)
+        return Answer(model, False, CalibrationCheck(is_refined=False), [], _UNKNOWN_SCALE if is_rig else None)
     limit = _SHARED_ERRORS * float(chdtri(len(first.x), _MAX_CHANCE))
     surprise = float(first.step @ first.data_information @ first.step)
     if begin is first and surprise < limit / _SHARED_ERRORS:
@@ -244,10 +244,11 @@ def question_calibration(
     known = (np.sqrt(np.diag(last.covariance)) < _MAX_UNSURE * np.abs(last.x))[far].all()
     settled = last.step_sigmas < _SETTLED_SIGMAS * _ROUNDS
     agree = held_out[:-1] > _MIN_DIRECTION_SIGMAS
-    report = _report(last, surprise, limit, unknowns) | {
-        "held_out_sigmas": float(held_out[-1]), "direction_sigmas": held_out[:-1].tolist(), "is_settled": settled,
-        "given": [c.params.tolist() for c in model.cameras],
-    }  # fmt: skip
+    report = replace(
+        _report(last, surprise, limit, unknowns),
+        held_out_sigmas=float(held_out[-1]), direction_sigmas=held_out[:-1].tolist(), is_settled=settled,
+        given=[c.params.tolist() for c in model.cameras],
+    )  # fmt: skip
     is_better = last.cost < first.cost and held_out[-1] > _MIN_HELD_OUT_SIGMAS
     if may_refine and settled and known and surprise > limit and is_better and agree.any():
         # x = basis a, and what other tracks do not confirm stays as it was given
@@ -256,21 +257,21 @@ def question_calibration(
         if refined is not None and refined.cost < first.cost:
             refined = _start_afresh(refined, sigma, unknowns)
             pairs = zip(refined.model.cameras, model.cameras, strict=True)
-            report |= {
-                "is_refined": True, "focal_change": [c.focal / g.focal - 1 for c, g in pairs],
-                "refined": [c.params.tolist() for c in refined.model.cameras],
-            }  # fmt: skip
+            report = replace(
+                report, is_refined=True, focal_change=[c.focal / g.focal - 1 for c, g in pairs],
+                refined=[c.params.tolist() for c in refined.model.cameras],
+            )  # fmt: skip
             return _refined(refined, dropped, unknowns, report)
     found = [_contradiction(first, last, report, unknowns)] if surprise > limit and far.any() else []
     return _kept(first, last, unknowns, report, found)
 
 
-def _report(look: _Look, surprise: float, limit: float, unknowns: Unknowns) -> dict[str, Any]:
+def _report(look: _Look, surprise: float, limit: float, unknowns: Unknowns) -> CalibrationCheck:
     """What the images would change, how sure they are of it, and how much is needed to be believed."""
-    return {
-        "is_refined": False, "surprise": surprise, "max_surprise": limit, "noise_inflation": look.noise,
-        "change": unknowns.named(look.change), "sigma": unknowns.named(np.sqrt(np.diag(look.covariance))),
-    }  # fmt: skip
+    return CalibrationCheck(
+        is_refined=False, surprise=surprise, max_surprise=limit, noise_inflation=look.noise,
+        change=unknowns.named(look.change), sigma=unknowns.named(np.sqrt(np.diag(look.covariance))),
+    )  # fmt: skip
 
 
 # ------------------------------------------------------------------ what the images say
@@ -483,10 +484,10 @@ def _start_afresh(look: _Look, sigma: float, unknowns: Unknowns) -> _Look:
 # ------------------------------------------------------------------ what follows from it
 
 
-def _refined(look: _Look, dropped: Array, unknowns: Unknowns, report: dict[str, Any]) -> Answer:
+def _refined(look: _Look, dropped: Array, unknowns: Unknowns, report: CalibrationCheck) -> Answer:
     """The calibration that was found is believed, as far as it is known; what (Q,) was dropped of it may be right."""
     num, look = len(look.x), replace(look, covariance=look.covariance + np.outer(dropped, dropped))
-    scale_sigma, report["scale"] = _scale_sigma(look, 0.0, unknowns)
+    scale = _scale_parts(look, 0.0, unknowns)
     num_sensors = len(look.model.cameras)
     poses, freedoms = look.model.cam_from_world[::num_sensors], 6 if num_sensors > 1 else 7
     basis, constraint = (rows[:freedoms] for rows in similarity_basis(poses))
@@ -495,20 +496,23 @@ def _refined(look: _Look, dropped: Array, unknowns: Unknowns, report: dict[str, 
     by_frame = moved.reshape(-1, 6, num)
     open_ = by_frame @ look.covariance @ by_frame.transpose(0, 2, 1)
     excess = max(1.0, float(np.abs(look.x / unknowns.sigmas).max()) / _PRIOR_SIGMAS)
-    return Answer(look.model, True, report, [], scale_sigma, open_, excess)
+    sigma = None if scale is None else scale.sigma
+    return Answer(look.model, True, replace(report, scale=scale), [], sigma, open_, excess)
 
 
-def _kept(first: _Look, last: _Look, unknowns: Unknowns, report: dict[str, Any], found: list[Contradiction]) -> Answer:
+def _kept(
+    first: _Look, last: _Look, unknowns: Unknowns, report: CalibrationCheck, found: list[Contradiction]
+) -> Answer:
     """The given calibration stays; what the images would rather have is part of what the scale is not known by."""
     if last is first:
         shift = float(first.system.log_scale[: len(first.x)] @ first.step)
     else:
         shift = math.log(rigid3.spread(last.model.cam_from_world) / rigid3.spread(first.model.cam_from_world))
-    scale_sigma, report["scale"] = _scale_sigma(first, shift, unknowns)
-    return Answer(first.model, False, report, found, scale_sigma)
+    scale = _scale_parts(first, shift, unknowns)
+    return Answer(first.model, False, replace(report, scale=scale), found, None if scale is None else scale.sigma)
 
 
-def _scale_sigma(look: _Look, shift: float, unknowns: Unknowns) -> tuple[float | None, dict[str, float]]:
+def _scale_parts(look: _Look, shift: float, unknowns: Unknowns) -> ScaleParts | None:
     """Relative standard deviation of the unit of length of a rig, and what it is made of; None without a rig.
 
     With a path that does not bend and points that are far, a turn of the second camera by w looks like a scale that is
@@ -516,7 +520,7 @@ def _scale_sigma(look: _Look, shift: float, unknowns: Unknowns) -> tuple[float |
     left as wide as the priors are.
     """
     if len(look.model.cameras) == 1:
-        return None, {}
+        return None
     by = look.system.log_scale[: len(look.x)]
     sigmas = np.sqrt(np.diag(look.covariance))
     parts = {
@@ -526,13 +530,12 @@ def _scale_sigma(look: _Look, shift: float, unknowns: Unknowns) -> tuple[float |
     calibration = float(np.sqrt(by @ look.covariance @ by))
     noise = math.sqrt(look.noise * look.system.scale_variance)
     total = math.sqrt(_BASELINE_SIGMA**2 + calibration**2 + noise**2 + shift**2)
-    return total, {
-        "baseline": _BASELINE_SIGMA, "calibration": calibration, **parts, "disparity": noise, "shift": abs(shift),
-        "sigma": total,
-    }  # fmt: skip
+    return ScaleParts(
+        baseline=_BASELINE_SIGMA, calibration=calibration, **parts, disparity=noise, shift=abs(shift), sigma=total
+    )
 
 
-def _contradiction(first: _Look, last: _Look, report: dict[str, Any], unknowns: Unknowns) -> Contradiction:
+def _contradiction(first: _Look, last: _Look, report: CalibrationCheck, unknowns: Unknowns) -> Contradiction:
     """The images say clearly that the given calibration is wrong; what is right they do not, or it may not be taken."""
     num_sensors = len(first.model.cameras)
     given, found = first.model.cam_from_world[::num_sensors], last.model.cam_from_world[::num_sensors]
@@ -540,7 +543,7 @@ def _contradiction(first: _Look, last: _Look, report: dict[str, Any], unknowns: 
     turn = rigid3.log_so3(rigid3.rotation_matrix(rigid3.compose(moved, rigid3.inverse(given))))
     shift = rigid3.center(moved) - rigid3.center(given)
     size = max(rigid3.spread(first.model.cam_from_world), 1e-12)
-    share = 1.0 if report["is_settled"] else _PART_OF_THE_WAY
+    share = 1.0 if report.is_settled else _PART_OF_THE_WAY
     # where not even a step made it better, the map is torn: anything may be off
     torn = 0.0 if last.x.any() else 1.0
     focal = [first.model.cameras[0].focal, last.model.cameras[0].focal]
@@ -548,9 +551,9 @@ def _contradiction(first: _Look, last: _Look, report: dict[str, Any], unknowns: 
         focal[1] *= math.exp(last.step[0])
     return Contradiction(
         "given calibration",
-        f"the images contradict the given calibration by {report['surprise']:.0f} where shared errors make up to "
-        f"{report['max_surprise']:.0f}: a focal length of {focal[0]:.1f} px is given, they lead to {focal[1]:.1f}"
-        + ("" if report["is_settled"] else " and have not settled there"),
+        f"the images contradict the given calibration by {report.surprise:.0f} where shared errors make up to "
+        f"{report.max_surprise:.0f}: a focal length of {focal[0]:.1f} px is given, they lead to {focal[1]:.1f}"
+        + ("" if report.is_settled else " and have not settled there"),
         "calibrate the camera, or give a focal length that is nearer the right one",
         {k: report[k] for k in ("surprise", "max_surprise", "is_settled", "change")},
         rotation_sigma_deg=max(share * float(np.degrees(np.sqrt((turn**2).mean()))), 180.0 * torn),

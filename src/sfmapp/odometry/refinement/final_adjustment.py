@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +25,7 @@ from sfmapp.odometry.refinement.calibration_check import (
     close_poses,
     question_calibration,
 )
+from sfmapp.odometry.report import AdjustmentReport
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig
 
@@ -64,7 +64,7 @@ class FinalAdjustment:
 
     covariance: Array | None
     gauge: str
-    report: dict[str, Any]
+    report: AdjustmentReport
     contradictions: list[Contradiction] = field(default_factory=list)
     scale_sigma: float | None = None
     noise_covariance: Array | None = None
@@ -85,7 +85,7 @@ def adjust_finally(
         return _adjust_large_map(keyframes, options, events)
     everything = np.arange(len(keyframes.keyframes))
     job = make_job(keyframes, everything, everything > 0)
-    model, report = job.model, dict[str, Any]()
+    model = job.model
     # which observations agree is clear long before all have settled
     adjust_poses(model, residual_scale_px(model, MIN_SIGMA_PX), _FIRST_STEPS, _TOLERANCE)
     classify(model, job.num_elsewhere)
@@ -98,19 +98,19 @@ def adjust_finally(
         found_before, model = (model, 2 * adjustment.final_cost), _with_rig(model, given)
         adjustment = close_poses(model, sigma, _MAX_STEPS, _TOLERANCE)
     answer = _question(model, 2 * adjustment.final_cost, sigma, options, events, found_before)
-    report["camera"] = answer.report
     num_sensors, of_refinement = len(keyframes.rig.cameras), np.zeros((6, 6))
     if answer.is_refined:
         adjustment = close_poses(answer.model, sigma, _MAX_STEPS, _TOLERANCE)
         of_refinement = covariance_of_refinement(model, answer.model, num_sensors) / answer.excess**2
     events.decided(STAGE, f"closing adjustment: {adjustment.text}", **adjustment)
     job.model = model = answer.model
-    report["sigma_px"] = classify(model, job.num_elsewhere)
+    report = AdjustmentReport(camera=answer.report, sigma_px=classify(model, job.num_elsewhere))
     take_over(job, keyframes)
     keyframes.rig = rig_of(model)
     covariance, noise, gauge, contradictions = None, None, "", list(answer.contradictions)
     if options.covariance and 1 < len(everything) <= MAX_COVARIANCE_KEYFRAMES:
-        noise, gauge, report["covariance"] = estimate_map_covariance(model, num_sensors, LOSS_SIGMAS * sigma)
+        noise, gauge, shared = estimate_map_covariance(model, num_sensors, LOSS_SIGMAS * sigma)
+        report = replace(report, covariance=shared)
         covariance = noise + of_refinement
         if answer.pose_covariance is not None:
             covariance += answer.pose_covariance
@@ -136,19 +136,18 @@ def _left_open(covariance: Array, size: float, events: Events) -> list[Contradic
 
 def _adjust_large_map(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -> FinalAdjustment:
     """The same piece by piece, without covariances; the cameras are questioned on the newest keyframes alone."""
-    report: dict[str, Any] = {"is_piecewise": True}
     num = len(keyframes.keyframes)
     part = np.arange(num - _NUM_QUESTIONED, num)
     job = make_job(keyframes, part, part > part[0])
     sigma = residual_scale_px(job.model, MIN_SIGMA_PX)
     cost = adjust_poses(job.model, sigma, _MAX_STEPS, _TOLERANCE)
     answer = _question(job.model, cost, sigma, options, events)
-    report["camera"] = answer.report
     if answer.is_refined:
         keyframes.rig = rig_of(answer.model)
         if answer.model.rig is not None:
             _rescale(keyframes, rigid3.spread(answer.model.cam_from_world) / rigid3.spread(job.model.cam_from_world))
     sweep(keyframes, options, events)
+    report = AdjustmentReport(camera=answer.report, is_piecewise=True)
     return FinalAdjustment(None, "", report, answer.contradictions, answer.scale_sigma)
 
 
@@ -162,10 +161,13 @@ def _question(
 ) -> Answer:
     """Question the calibration of an adjusted map, and tell of what comes of it."""
     answer = question_calibration(model, cost, sigma, may_refine=options.refine_camera, found_before=found_before)
-    if answer.is_refined and answer.scale_sigma is not None:
+    if answer.is_refined and answer.scale_sigma is not None and answer.report.scale is not None:
         of_refinement = scale_sigma_of_refinement(model, answer.model) / answer.excess
-        answer = replace(answer, scale_sigma=math.hypot(answer.scale_sigma, of_refinement))
-        answer.report["scale"]["beyond_the_lens_model"] = of_refinement
+        parts = replace(answer.report.scale, beyond_the_lens_model=of_refinement)
+        answer = replace(
+            answer, scale_sigma=math.hypot(answer.scale_sigma, of_refinement),
+            report=replace(answer.report, scale=parts),
+        )  # fmt: skip
     events.raise_if_cancelled()
     if answer.is_refined:
         message = "the images contradict the given calibration, which is refined"

@@ -74,7 +74,7 @@ def mesh_workspace(
         raise InputError(f"{folder} holds no patches to make a mesh of", f"run first: sfmapp dense {folder}")
     options = with_absolute_paths(options or Options())
     # the views are those that the patches were made of, whatever is said of them now
-    earlier = options_from_dict({"dense": manifest.get("options", {}).get("dense", {})})
+    earlier = options_from_dict({"dense": manifest.options.get("dense", {})})
     options = replace(options, dense=earlier.dense)
     with dense_job(find_source(folder, None, None, options), events, watch) as job:
         return _run(job, record)
@@ -89,7 +89,7 @@ def _run(job: DenseJob, record: bool) -> MeshResult:
     patches, names = read_patches(folder / dense_results.PATCHES)
     with job.stage("views"):
         plan, _ = plan_source(job)
-    made_of = job.workspace.manifest["stages"].get(dense_results.STAGE, {}).get("model")
+    made_of = job.workspace.manifest.stage(dense_results.STAGE).model
     # earlier versions noted no model, and turned photographs that this one takes as they are stored
     is_other = (
         has_stored_pixels(job.workspace.manifest) if made_of is None else made_of != model_digest(job.known.model)

@@ -73,7 +73,7 @@ def earlier_mesh(job: DenseJob, key: str, files: Sequence[str]) -> MeshRunReport
 def _earlier_document(job: DenseJob, stage: str, key: str, files: Sequence[str]) -> Document | None:
     if not job.workspace.is_current(stage, key):
         return None
-    raise_as_before(job.workspace.manifest["stages"][stage])
+    raise_as_before(job.workspace.manifest.stage(stage))
     if not all((job.workspace.folder / name).is_file() for name in files):
         return None
     return _document(job)

@@ -5,11 +5,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
-from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from sfmapp.dense.photographs import find_photographs
 from sfmapp.dense.prepare import DensePlan, plan_views
@@ -20,7 +18,7 @@ from sfmapp.formats.colmap import has_model, is_model_file, read_model
 from sfmapp.pipelines.stored_pixels import has_stored_pixels
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.layout import DENSE, ODOMETRY, RECONSTRUCT, UNDISTORT, USUAL_FOLDERS
-from sfmapp.workspace.manifest import image_root, missing_photographs, read_manifest
+from sfmapp.workspace.manifest import Manifest, image_root, missing_photographs, read_manifest
 from sfmapp.workspace.options import Options, options_from_dict, options_to_dict
 from sfmapp.workspace.usage import Stopwatch
 
@@ -67,13 +65,13 @@ class DenseJob(Job):
 
     def note_source(self) -> None:
         """Write down what this run works on and how; a reconstruction has noted its own photographs."""
-        manifest = self.workspace.manifest
         if self.known.command == DENSE:
             self.note_inputs({})
-            manifest["model"], manifest["is_upright"] = os.path.abspath(self.known.model), self.known.is_upright
+            self.workspace.note(model=os.path.abspath(self.known.model), is_upright=self.known.is_upright)
         else:
             plain = options_to_dict(self.options)
-            manifest.setdefault("options", {}).update({name: plain[name] for name in ("dense", "surface")})
+            own = {name: plain[name] for name in ("dense", "surface")}
+            self.workspace.note(options={**self.workspace.manifest.options, **own})
         self.workspace.save()
 
 
@@ -127,7 +125,7 @@ def find_source(
     """
     folder = Path(source)
     # what undistort has written is a COLMAP model with its photographs where COLMAP has them
-    if (folder / "run.json").is_file() and read_manifest(folder).get("command") != UNDISTORT:
+    if (folder / "run.json").is_file() and read_manifest(folder).command != UNDISTORT:
         return _in_workspace(folder, output, images, options, asked_for)
     if not has_model(folder):
         if not has_model(folder / "sparse" / "0"):
@@ -146,11 +144,11 @@ def _in_workspace(
     asked_for: str,
 ) -> DenseSource:
     manifest = read_manifest(folder)
-    command = manifest.get("command", RECONSTRUCT)
+    command = manifest.command
     if command == ODOMETRY and asked_for == UNDISTORT and output is not None:
         return DenseSource(
             folder / "sparse" / "0",
-            _frame_folder(str(manifest.get("source") or ""), images),
+            _frame_folder(manifest.source, images),
             Path(output),
             DENSE,
             False,
@@ -164,23 +162,23 @@ def _in_workspace(
     is_own = output is None or Path(output).resolve() == folder.resolve()
     target = folder if output is None else Path(output)
     if command == DENSE:
-        model = Path(str(manifest.get("model", "")))
-        found = Path(images) if images is not None else Path(str(manifest.get("source", "")))
-        is_upright = bool(manifest.get("is_upright"))
+        model = Path(manifest.model or "")
+        found = Path(images) if images is not None else Path(manifest.source)
+        is_upright = bool(manifest.is_upright)
     else:
         model = folder / "sparse" / "0"
         found = Path(images) if images is not None else _photograph_folder(folder, manifest)
         is_upright = not has_stored_pixels(manifest)
         if not has_model(model):
             raise NoReconstructionError(f"{folder} holds no model", "run sfmapp reconstruct first")
-    earlier = options_from_dict({"images": manifest.get("options", {}).get("images", {})}).images
+    earlier = options_from_dict({"images": manifest.options.get("images", {})}).images
     if options.images.mask_path is None and earlier.mask_path is not None:
         images_options = dataclasses.replace(options.images, mask_path=earlier.mask_path)
         options = dataclasses.replace(options, images=images_options)
     return DenseSource(model, found, target, command if is_own else DENSE, is_upright, options)
 
 
-def _photograph_folder(folder: Path, manifest: Mapping[str, Any]) -> Path:
+def _photograph_folder(folder: Path, manifest: Manifest) -> Path:
     """The folder of a reconstruction's photographs. Raises InputError if they are gone."""
     found = image_root(manifest)
     if found is None:

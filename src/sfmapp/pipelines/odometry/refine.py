@@ -6,12 +6,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from collections.abc import Sequence as Rows
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +45,7 @@ from sfmapp.sequences.open import open_sequence
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.kernels import kernels_compiling
 from sfmapp.workspace.layout import ODOMETRY, REFINE
-from sfmapp.workspace.manifest import read_manifest
+from sfmapp.workspace.manifest import Manifest, read_manifest
 from sfmapp.workspace.options import Options, options_from_dict
 from sfmapp.workspace.usage import Stopwatch
 
@@ -112,12 +111,12 @@ def refine(
         return RefineResult(after, _write(job, before, after, sequence, added))
 
 
-def _open_sequence(manifest: Mapping[str, Any], job: Job, *, required: bool) -> Sequence | None:
+def _open_sequence(manifest: Manifest, job: Job, *, required: bool) -> Sequence | None:
     """The sequence of the run, for its ground truth and its images; None if it is gone and only the ground truth was
     wanted."""
-    wanted = options_from_dict({"sequence": manifest["options"]["sequence"]}).sequence
+    wanted = options_from_dict({"sequence": manifest.options.get("sequence", {})}).sequence
     try:
-        return open_sequence(manifest["source"], wanted, job.events, require_camera=False)
+        return open_sequence(manifest.source, wanted, job.events, require_camera=False)
     except InputError as error:
         if required:
             raise
@@ -247,7 +246,7 @@ def _write(
     """Models, trajectories and the report, which is returned."""
     workspace, ground_truth = job.workspace, sequence.ground_truth if sequence is not None else None
     with job.measured("output"):
-        workspace.write_models([entry.reconstruction for entry in after.maps])
+        workspace.write_models([entry.reconstruction for entry in after.maps], events=job.events)
         write_trajectories(workspace, after)
     fits = {
         name: [fit_to_ground_truth(result, ground_truth, m) for m in range(len(result.maps))]
@@ -273,7 +272,7 @@ def _write(
     )
     workspace.write_text("report.html", render_refine_html(report, after, ground_truth, fits["after"]))
     workspace.write_text("report.json", document_text(report))
-    workspace.manifest["usage"] = job.usage
+    workspace.note(usage=job.usage)
     workspace.save()
     return report
 

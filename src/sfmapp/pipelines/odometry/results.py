@@ -42,8 +42,9 @@ from sfmapp.report.odometry_document import (
     map_row,
 )
 from sfmapp.report.odometry_html import render_odometry_html
-from sfmapp.reporting import document_text, from_plain
-from sfmapp.workspace.layout import ODOMETRY, REPORT
+from sfmapp.reporting import document_text
+from sfmapp.workspace.job import FAILED, NOT_WANTED, WRITTEN
+from sfmapp.workspace.layout import MANIFEST, ODOMETRY, REPORT
 from sfmapp.workspace.manifest import read_manifest
 
 if TYPE_CHECKING:
@@ -70,7 +71,8 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
         # what matters most comes first, should the disk be full
         run.save_first(lambda: write_trajectories(workspace, result, facts))
         run.save_first(lambda: workspace.write_text("frames.csv", _frames_csv(result, facts)))
-        run.save_first(lambda: workspace.write_models([entry.reconstruction for entry in result.maps]))
+        models = [entry.reconstruction for entry in result.maps]
+        run.save_first(lambda: workspace.write_models(models, events=run.events))
         run.save_first(lambda: workspace.write_text("covariance.csv", _covariance_csv(result)))
         run.save_first(lambda: workspace.write_text("frame_covariance.csv", _frame_covariance_csv(result)))
     against = (
@@ -86,7 +88,7 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
     # the last measurement that can still be written down
     report = replace(report, run=replace(report.run, **run.watch.read()))
     run.save_first(lambda: workspace.write_text(REPORT, document_text(report)))
-    workspace.manifest["usage"] = run.usage
+    workspace.note(usage=run.usage)
     workspace.finish(ODOMETRY, run.usage["odometry"], maps=[_map_facts(entry) for entry in result.maps])
     run.save_first(workspace.save)
     return report
@@ -140,9 +142,11 @@ def read_odometry(folder: Path) -> OdometryResult:
         indices = np.array([int(row["index"]) for row in rows], np.int64)
         times = np.array([float(row["timestamp_s"]) for row in rows])
         names = [row["name"] for row in rows]
-        known = [from_plain(MapFacts, entry) for entry in read_manifest(folder, ODOMETRY)["stages"][ODOMETRY]["maps"]]
+        known = read_manifest(folder, ODOMETRY).stage(ODOMETRY).maps
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{folder}: not the results of sfmapp odometry: {error}", "run it again") from error
+    if known is None:
+        raise InputError(f"{folder}: not the results of sfmapp odometry: {MANIFEST} tells of no maps", "run it again")
     poses = np.full((len(rows), 7), np.nan)
     maps = []
     position = {name: k for k, name in enumerate(names)}
@@ -209,16 +213,16 @@ def _csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 def _finish_recording(run: Tracking, result: OdometryResult, against: Sequence[GroundTruthFit | None]) -> None:
     """Let the recording show the end; a failure is a warning. A recording of other results is taken away."""
-    manifest = run.workspace.manifest
+    workspace = run.workspace
     if run.live is None or not run.live.is_recording:
-        run.workspace.recording.unlink(missing_ok=True)
-        manifest["recording"] = "not wanted"
+        workspace.recording.unlink(missing_ok=True)
+        workspace.note(recording=NOT_WANTED)
     if run.live is None:
         return
     fits = [None if fit is None else fit.error.ground_truth_from_estimate for fit in against]
     problem = run.live.end(result, fits, errors_of_frames(result, against))
     if run.live.is_recording:
-        manifest["recording"] = "failed" if problem else "written"
+        workspace.note(recording=FAILED if problem else WRITTEN)
     if problem:
         run.workspace.recording.unlink(missing_ok=True)
         run.events.without_cancellation().warned("recording", f"no recording: {problem}")

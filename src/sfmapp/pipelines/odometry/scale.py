@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +27,7 @@ from sfmapp.odometry.inertial.scale import (
     scale_from_distance,
     scale_from_path,
 )
-from sfmapp.odometry.report import ScaleReport
+from sfmapp.odometry.report import DistanceEvidence, InertialEvidence, ScaleEvidence, ScaleReport
 from sfmapp.odometry.result import MapResult, OdometryResult
 
 STAGE = "scale"
@@ -129,9 +127,11 @@ def scale_maps(
     return rows
 
 
-def _clocks_apart(evidence: Mapping[str, Any]) -> str:
+def _clocks_apart(evidence: ScaleEvidence) -> str:
     """What the offset between the clocks is, where it is one; empty elsewhere."""
-    offset, sigma = evidence.get("clock_offset_s", 0.0), evidence.get("clock_sigma_s", np.inf)
+    if not isinstance(evidence, InertialEvidence) or evidence.clock_offset_s is None or evidence.clock_sigma_s is None:
+        return ""
+    offset, sigma = evidence.clock_offset_s, evidence.clock_sigma_s
     if not abs(offset) > max(_WORTH_SAYING_S, 3 * sigma):
         return ""
     side = "late" if offset > 0 else "early"
@@ -180,9 +180,9 @@ def _from_distance(result: OdometryResult, m: int, scale_request: KnownDistance)
         if k is None:
             shown = ", ".join(result.frame_names[:2])
             reason = f"there is no frame {name!r}; they are named such as {shown}, or by number"
-            return ScaleRefusal("distance", reason, {})
+            return ScaleRefusal("distance", reason, DistanceEvidence())
         if result.frame_map[k] != m:
-            return ScaleRefusal("distance", f"frame {name} has no pose in it", {})
+            return ScaleRefusal("distance", f"frame {name} has no pose in it", DistanceEvidence())
     a, b = (k for k in positions if k is not None)
     poses = result.cam_from_world
     return scale_from_distance(

@@ -32,7 +32,7 @@ class FrameLog:
             is_lost = seen.state == FrameState.LOST
             counts = (0, 0) if is_lost else (len(seen.xy), int(np.count_nonzero(seen.is_mapped)))
             has_pose = bool(np.isfinite(seen.cam_from_world[0]))
-            self._rows[seen.frame_idx] = (*counts, seen.time_s, seen.map_idx if has_pose else -1)
+            self._rows[seen.frame_idx] = (*counts, seen.cpu_s, seen.map_idx if has_pose else -1)
 
     @property
     def tracking_s(self) -> float:

@@ -103,7 +103,7 @@ def _run(run: Run) -> ReconstructionReport:
     keys = stage_keys(run.options, run.image_set, run.control)
     if report := results.earlier_report(run, keys):
         return report
-    run.workspace.manifest["image_root"] = os.fspath(run.image_set.root or "")
+    run.workspace.note(image_root=os.fspath(run.image_set.root or ""))
     run.note_inputs(keys.inputs)
     try:
         models = _reconstruct(run, run.image_set, keys)

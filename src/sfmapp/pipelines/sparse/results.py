@@ -45,12 +45,12 @@ def earlier_report(run: Run, keys: StageKeys) -> ReconstructionReport | None:
     workspace = run.workspace
     if not workspace.is_current("mapping", keys.mapping):
         return None
-    has_recording = workspace.recording.is_file() or workspace.manifest.get("recording") in (NO_MODEL, FAILED)
+    has_recording = workspace.recording.is_file() or workspace.manifest.recording in (NO_MODEL, FAILED)
     if (run.recorder is not None and not has_recording) or not (workspace.folder / "report.html").is_file():
         return None
-    entry = workspace.manifest["stages"]["mapping"]
+    entry = workspace.manifest.stage("mapping")
     raise_as_before(entry)
-    models = [workspace.model(idx) for idx in range(entry["num_models"])]
+    models = [workspace.model(idx) for idx in range(entry.num_models or 0)]
     if not all((model / name).is_file() for model in models for name in MODEL_FILES):
         return None
     report = workspace.read_report(ReconstructionReport)
@@ -63,20 +63,20 @@ def write_results(
     run: Run, keys: StageKeys, models: Sequence[Reconstruction], failure: NoReconstructionError | None = None
 ) -> ReconstructionReport:
     """Write the models, the recording and the report, in this order; returns the report."""
-    workspace, manifest = run.workspace, run.workspace.manifest
+    workspace = run.workspace
     if failure is not None and isinstance(failure.report, MappingReport):
         run.stages = replace(run.stages, mapping=failure.report)
     keypoints = [features.keypoints[:, :2].astype(np.float64) for features in run.features]
     facts = {"pixels": STORED, "orientations": noted_orientations(run.image_set.images)} if run.image_set else {}
     run.save_first(lambda: workspace.begin("mapping", keys.mapping, **facts))
     with run.stage("output"):
-        run.save_first(lambda: workspace.write_models(models, keypoints))
+        run.save_first(lambda: workspace.write_models(models, keypoints, run.events))
         if run.georeference is not None:
             write_georeference(workspace.folder, run.georeference)
         else:
             (workspace.folder / GEOREFERENCE).unlink(missing_ok=True)
     with run.stage("recording"):
-        manifest["recording"] = _record(run, models)
+        workspace.note(recording=_record(run, models))
     report = _make_report(run, models, failure)
     page = render_html(report, models[0] if models else None)
     run.save_first(lambda: workspace.write_text("report.html", page))
@@ -85,7 +85,7 @@ def write_results(
     run.save_first(lambda: workspace.write_text(REPORT, document_text(report)))
     outcome = Outcome.of(failure)
     workspace.finish("mapping", run.usage.get("mapping"), outcome=outcome, num_models=len(models), run=took)
-    manifest["usage"] = run.usage
+    workspace.note(usage=run.usage)
     run.save_first(workspace.save)
     return report
 
