@@ -94,13 +94,28 @@ def test_a_model_comes_to_its_control_points(
     assert "times as long as the ground" in page
     assert main(command) == 0
     assert "up to date" in capsys.readouterr().out
-    # another coordinate is another model
-    text = (tmp_path / "gcp_list.txt").read_text()
-    (tmp_path / "gcp_list.txt").write_text(text.replace("EPSG:32633", "EPSG:25833"))
-    assert main([*command, "-q"]) == 0
-    (again,) = json.loads((out / "report.json").read_text())["stages"]["control"]["models"]
-    assert json.loads((out / "report.json").read_text())["stages"]["control"]["crs"] == "EPSG:25833"
-    assert again["summary"]["num_points"] == 7
+    # two points, beside positions of 2 cm whose base was put down a metre off
+    kept = [
+        line for line in (tmp_path / "gcp_list.txt").read_text().splitlines() if line.split()[-1] in "EPSG:32633 G0 G1"
+    ]
+    (tmp_path / "gcp_list.txt").write_text("\n".join(kept) + "\n")
+    rng, rows = np.random.default_rng(1), ["image,latitude,longitude,height,sigma,sigma_up"]
+    for name in found.image_names:
+        place = PLACE.geodetic_from_enu(truth[Path(name).stem] + [0.6, -0.8, 0.3] + 0.02 * rng.normal(size=3))
+        rows.append(f"{name},{place[0]:.9f},{place[1]:.9f},{place[2]:.3f},0.02,0.02")
+    (tmp_path / "geo.csv").write_text("\n".join(rows) + "\n")
+    assert main([*command, "--gps", str(tmp_path / "geo.csv"), "-q"]) == 0
+    report = json.loads((out / "report.json").read_text())
+    check_schema("reconstruct", report)
+    (model,) = report["stages"]["control"]["models"]
+    assert [point["role"] for point in model["points"]] == ["control"] * 2
+    residual = np.array([image["residual_m"] for image in report["stages"]["georeference"]["images"]])
+    # cameras a metre or two apart leave half a degree, on points six metres away
+    np.testing.assert_allclose(residual.mean(0), [-0.6, 0.8, -0.3], atol=0.2)
+    found, where = read_model(out / "sparse" / "0")[0], read_georeference(out)
+    assert where is not None
+    centers = PLACE.enu_from_geodetic(where.frame.geodetic_from_enu(found.centers))
+    assert np.linalg.norm(centers - wanted, axis=1).max() < 0.25
 
 
 @pytest.mark.parametrize(

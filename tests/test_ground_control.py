@@ -23,6 +23,7 @@ from sfmapp.geometry import rigid3, similarity
 from sfmapp.geometry.geodesy import LocalFrame
 from sfmapp.georeference.control import align_to_survey, leave_out, survey_in_frame
 from sfmapp.georeference.control_adjustment import Adjusting, ControlSolution, adjust_to_control
+from sfmapp.georeference.landmarks import Positions
 from sfmapp.georeference.marks import check_marks
 from sfmapp.scene.reconstruction import Reconstruction
 
@@ -124,6 +125,39 @@ def test_intervals_hold_the_truth() -> None:
     low, high = binom.interval(0.999, num, 0.95)
     assert low <= flat <= high
     assert low <= up <= high
+
+
+def test_few_points_place_what_positions_hold_in_shape() -> None:
+    """RTK of 2 cm whose base is off by metres, and two points: the others agree, cameras lie better than by all six."""
+    survey = make_survey(6, "grid", 6)
+    model, control, truth = on_its_own(survey), survey.control, survey.truth
+    rng = np.random.default_rng(0)
+    base, sigma = np.array([1.0, -2.0, 3.0]), np.array([0.02, 0.02, 0.03])
+    places = truth.centers + base + sigma * rng.normal(size=truth.centers.shape)
+    positions = Positions(np.arange(len(places)), places, sigma, np.full(3, 10.0))
+    world_from_model = similarity.umeyama(model.centers, places)
+    model.cam_from_world[:] = similarity.transform_poses(world_from_model, model.cam_from_world)
+    model.point_xyz[:] = similarity.apply(world_from_model, model.point_xyz)
+
+    def graph() -> FactorGraph:
+        made = FactorGraph(model, OPTIONS, noise_px=NOISE_PX)
+        positions.add_to(made)
+        return made
+
+    marked, surveyed = check_marks(model, control), survey_in_frame(control)
+    used = np.arange(6) < 2
+    found = adjust_to_control(model, control, marked, surveyed, used, Adjusting(graph, graph, adjusting(model).free))
+    # all six agree, and come in
+    assert found.is_used.all()
+    for one in found.left_out:
+        assert one is not None
+        assert one.normalized_horizontal < 4
+        assert one.normalized_vertical < 4
+    np.testing.assert_allclose(model.centers, truth.centers, atol=5 * 0.03)
+    alone = on_its_own(survey)
+    solve(alone, control)
+    error = [np.abs((one.centers - truth.centers)[:, 2]).max() for one in (model, alone)]
+    assert error[0] < 0.5 * error[1]
 
 
 def test_a_slip_of_the_hand_is_named() -> None:

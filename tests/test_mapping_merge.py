@@ -70,7 +70,7 @@ def test_models_without_a_shared_image_or_common_points_stay_apart():
     assert find_merge(target, apart) is None
 
 
-@pytest.mark.parametrize("share", [0.5, 1.0])
+@pytest.mark.parametrize("share", [0.6, 1.0])
 def test_points_that_disagree_on_the_scale_do_not_vote(share):
     for seed in range(4):
         ground_truth = make_scene(seed, 10, 600, sigma_px=0.0).ground_truth
@@ -78,13 +78,12 @@ def test_points_that_disagree_on_the_scale_do_not_vote(share):
         rng = np.random.default_rng(seed)
         astray = rng.random(len(source.point_xyz)) < share
         center = source.centers[5]
-        source.point_xyz[astray] += (source.point_xyz[astray] - center) * rng.uniform(-0.8, 4.0, (astray.sum(), 1))
+        # all of them too far away, so that no mean or median of everything is right
+        source.point_xyz[astray] += (source.point_xyz[astray] - center) * rng.uniform(0.2, 4.0, (astray.sum(), 1))
         found, common = find_merge(target, source), target.is_triangulated & source.is_triangulated
-        # of scales that are anything from a fifth to the fivefold, few agree within a twentieth by chance
-        by_chance = 0.25 * (common & astray).sum()
         if share < 1.0:
             assert found is not None
             assert found[0][7] == pytest.approx(1 / 2.5, rel=1e-9)
-            assert 0 <= found[1] - (common & ~astray).sum() < by_chance
-        else:
-            assert found is None or found[1] < by_chance
+            assert found[1] == (common & ~astray).sum()
+        else:  # few agree within a twentieth by chance
+            assert found is None or found[1] < 0.3 * common.sum()

@@ -19,6 +19,7 @@ from schemas import check_schema
 from sfmapp.camera.camera import Camera, CameraModel, pixels_to_normalized
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError, UsageError
+from sfmapp.events import Event, Events
 from sfmapp.formats.colmap import read_model, write_model
 from sfmapp.geometry import rigid3
 from sfmapp.images.exif import read_exif
@@ -28,7 +29,7 @@ from sfmapp.pipelines.dense.source import find_source
 from sfmapp.reporting import plain
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import RigImages
-from sfmapp.scene.undistortion import move_pixels, plan_undistortion, undistort_reconstruction
+from sfmapp.scene.undistortion import move_pixels, plan_undistortion, undistort_reconstruction, warn_of_sides
 from sfmapp.workspace.layout import FORMAT
 from sfmapp.workspace.options import load_options
 
@@ -91,6 +92,18 @@ def test_a_lens_whose_border_has_no_inverse_gets_a_picture_of_bounded_size_witho
     seen = camera.params[2:4] + 100.0 * theta[:, None] * rays / np.linalg.norm(rays, axis=1, keepdims=True)
     assert (seen > 0).all()
     assert (seen < [400, 300]).all()
+
+
+def test_of_lenses_that_see_all_round_it_is_said_that_the_front_is_laid_out() -> None:
+    told: list[Event] = []
+    panorama = Camera(CameraModel.EQUIRECTANGULAR, 400, 200, np.array([400.0, 200.0]))
+    warn_of_sides([*LENSES, STRAIGHT], "undistort", Events(told.append))
+    assert not told
+    warn_of_sides([*LENSES, panorama, panorama], "undistort", Events(told.append))
+    assert [event.kind for event in told] == ["warned"]
+    assert told[0].message.startswith("2 photographs")
+    assert "EQUIRECTANGULAR" in told[0].message
+    assert "pinhole" in told[0].message
 
 
 # --------------------------------------------------------------------------------------------- pictures and the model

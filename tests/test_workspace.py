@@ -17,6 +17,7 @@ from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.contradictions import Contradiction
 from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import InputError, UsageError
+from sfmapp.events import Event, Events
 from sfmapp.features.extract import FeatureOptions
 from sfmapp.images.image_set import ImageRecord, ImageSet
 from sfmapp.matching.options import MatchingOptions
@@ -45,6 +46,26 @@ def tiny_model(num_images: int = 3) -> Reconstruction:
     model = Reconstruction.empty([camera], names, np.zeros(num_images, np.int32), tracks)
     model.cam_from_world[:], model.point_xyz[:], model.obs_is_inlier[:] = poses, points, True
     return model
+
+
+@pytest.mark.parametrize("model", [CameraModel.PINHOLE_SKEW, CameraModel.OPENCV_THIN_PRISM, CameraModel.EUCM])
+def test_cameras_that_colmap_refuses_are_named_with_a_remedy(model: CameraModel, tmp_path: Path) -> None:
+    import pycolmap
+
+    told: list[Event] = []
+    written = tiny_model()
+    written.cameras = [simple_camera(model, 640, 480, 500.0)]
+    with open_workspace(tmp_path / "out") as workspace:
+        workspace.write_models([written], events=Events(told.append))
+    messages = [event.message for event in told if event.kind == "warned"]
+    folder = tmp_path / "out" / "sparse" / "0"
+    if model.is_colmaps:
+        assert not messages
+        assert pycolmap.Reconstruction(folder).num_reg_images() == 3
+        return
+    assert len(messages) == 1
+    for word in (model.name, str(int(model)), "COLMAP", "sfmapp undistort"):
+        assert word in messages[0]
 
 
 def test_a_new_workspace_can_be_opened_again(tmp_path: Path) -> None:

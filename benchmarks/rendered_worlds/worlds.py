@@ -260,6 +260,43 @@ def _room_furniture(build: WorldBuilder, wood: Skin, dark: Skin, cloth: Skin) ->
 
 
 @lru_cache(maxsize=2)
+def gallery_world(seed: int = 0) -> World:
+    """A room of 5 x 6 x 3 m with something to see in every direction: pictures all over, boxes on the floor."""
+    rng = np.random.default_rng([seed, 0x6A11])
+    build = WorldBuilder(rng)
+    dirt = build.texture(textures.dirt(rng))
+    walls, floor, ceiling = (
+        Skin(build.texture(image), metres, dirt, 3.7)
+        for image, metres in (
+            (textures.concrete(rng, 1024), 2.2), (textures.planks(rng, 1024, 12), 2.4),
+            (textures.planks(rng, 1024, 16, 160), 3.1),
+        )
+    )  # fmt: skip
+    build.inside(ROOM_HALF, 3.0, walls, floor, ceiling)
+    hx, hy = ROOM_HALF
+    for normal, length in (((-1, 0), hy), ((1, 0), hy), ((0, -1), hx), ((0, 1), hx)):
+        n = np.array([*normal, 0.0])
+        for along in np.arange(-length + 0.5, length, 0.85):
+            for z in (0.75, 1.6, 2.45):
+                image = textures.poster(rng) if rng.random() < 0.5 else textures.picture(rng)
+                centre = -n * (np.array([hx, hy, 0.0]) - 0.02) + np.abs(n[[1, 0, 2]]) * (along + rng.uniform(-0.1, 0.1))
+                width, height = rng.uniform(0.45, 0.68, 2)
+                build.wall(centre + UP * (z + rng.uniform(-0.06, 0.06)), n, width, height, Skin(build.texture(image)))
+    for x in (-1.7, 0.0, 1.7):  # on the ceiling, seen from below
+        for y in (-2.2, -0.7, 0.7, 2.2):
+            skin = Skin(build.texture(textures.picture(rng)), glows=True)
+            build.quad((x - 0.4, y - 0.4, 2.99), (0.8, 0, 0), (0, 0.8, 0), skin)
+    sides = [Skin(build.texture(textures.carton(rng))) for _ in range(6)]
+    sides += [Skin(build.texture(textures.machine(rng))) for _ in range(3)]
+    for k in range(16):
+        turn = 2 * np.pi * k / 16 + rng.uniform(-0.1, 0.1)
+        place = np.array([(hx - 0.55) * np.cos(turn), (hy - 0.6) * np.sin(turn), 0.0])
+        skins = [sides[int(i)] for i in rng.integers(len(sides), size=3)]
+        build.box(place, rng.uniform(0.3, 0.6, 3).tolist(), skins, rng.uniform(-40, 40))
+    return build.build()
+
+
+@lru_cache(maxsize=2)
 def hall_world(seed: int = 0) -> World:
     """A machine hall of 14 x 20 x 7 m: brick walls, windows, pillars, machines, pipes, crates."""
     rng = np.random.default_rng([seed, 0x4A11])

@@ -14,7 +14,7 @@ from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.pose import refine_pose
 from sfmapp.adjust.problem import Varying
 from sfmapp.api.reconstruction import Reconstruction
-from sfmapp.camera.camera import Camera, pixels_to_normalized, project
+from sfmapp.camera.camera import Camera, bearings, project
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.geometry import resection, rigid3
@@ -194,8 +194,7 @@ def estimate_pose(
         raise InputError(
             f"estimate_pose: expected finite points (N, 3) and pixels (N, 2), found {points.shape} and {pixels.shape}"
         )
-    normalized = pixels_to_normalized(camera, pixels)
-    found = resection.estimate_pose(points, normalized, max_error_px / camera.focal)
+    found = resection.estimate_pose(points, bearings([camera], [pixels])[0], max_error_px / camera.focal)
     if found is None:
         raise NoReconstructionError(
             f"none of the poses that were tried agrees with four of {len(points)} points",

@@ -6,7 +6,9 @@ Models and the order of their parameters are COLMAP's. Inside kernels a camera i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numba
 import numpy as np
@@ -18,6 +20,9 @@ from sfmapp.camera.models import PARAM_NAMES, canonical_from_params, family_of, 
 from sfmapp.camera.names import CameraModel
 
 Array = NDArray[np.float64]
+
+# Places along each side of a picture where it is asked how far a lens sees.
+_WIDE_STEPS = 17
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,10 @@ class Camera:
     @property
     def canonical(self) -> Array:
         """(17,) float64 ``fx, fy, cx, cy``, twelve of distortion and the family: the row that the kernels take."""
+        return self._canonical.copy()
+
+    @cached_property
+    def _canonical(self) -> Array:
         row = np.zeros(ROW)
         row[:FAMILY] = canonical_from_params(self.model) @ self.params
         row[FAMILY] = family_of(self.model)
@@ -85,6 +94,16 @@ class Camera:
     def family(self) -> int:
         """Number of the family of lenses in :mod:`sfmapp.camera.lens`."""
         return family_of(self.model)
+
+    @cached_property
+    def is_wide(self) -> bool:
+        """Whether the picture shows what lies more than 88 degrees off the axis, where there is no normalised plane."""
+        if self.family in (lens.BROWN, lens.RATIONAL, lens.SKEW):
+            return False
+        steps = np.linspace(0.0, 1.0, _WIDE_STEPS)
+        xy = np.stack(np.meshgrid(steps * self.width, steps * self.height), axis=-1).reshape(-1, 2)
+        # False for NaN, in the corners that a circular picture leaves black
+        return bool((pixels_to_rays(self, xy)[:, 2] <= lens.NARROW).any())
 
     @property
     def is_pinhole(self) -> bool:
@@ -141,6 +160,13 @@ def pixels_to_rays(camera: Camera, xy: ArrayLike) -> Array:
     out = np.empty((len(xy), 3))
     _unproject_all(camera.canonical, xy, out)
     return out
+
+
+def bearings(cameras: Sequence[Camera], pixels: Sequence[ArrayLike]) -> list[Array]:
+    """What poses are estimated from, of pixels (N, 2) each: normalised image points (N, 2), or unit rays (N, 3) of all
+    where one of the cameras is wide. NaN where the lens has no inverse."""
+    find = pixels_to_rays if any(camera.is_wide for camera in cameras) else pixels_to_normalized
+    return [find(camera, xy) for camera, xy in zip(cameras, pixels, strict=True)]
 
 
 def project(camera: Camera, xyz_cam: ArrayLike) -> Array:

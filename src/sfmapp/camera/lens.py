@@ -45,7 +45,7 @@ LAST_ON_PLANE = RADIAL_FISHEYE
 JACOBIAN = 40
 
 # Cosine of the angle from the axis beyond which the normalised plane is no useful chart: 88 degrees.
-_NARROW = math.cos(1.536)
+NARROW = math.cos(1.536)
 # Smallest depth in front of a lens that sees no further.
 _NEAREST = 1e-12
 
@@ -128,7 +128,7 @@ def undistort(c: Array, u: float, v: float) -> tuple[float, float]:
     if c[FAMILY] == RADIAL_FISHEYE:
         return radial_fisheye.undistort(c, xd, yd)
     x, y, z = _ray_of_image(c, xd, yd)
-    if not z > _NARROW:
+    if not z > NARROW:
         return math.nan, math.nan
     return x / z, y / z
 

@@ -18,6 +18,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera import newton
+
 Array = NDArray[np.float64]
 
 
@@ -84,17 +86,10 @@ def ray_jacobian(c: Array, x: float, y: float, z: float, J: Array) -> None:
 def unproject(c: Array, xd: float, yd: float) -> tuple[float, float, float]:
     """Unit ray of an image point; NaN where the lens has no inverse."""
     x, y = xd, yd
-    for _ in range(100):  # Newton, from nearer the middle where it starts beyond the fold
+    for _ in range(100):
         u, v, xx, xy, yx, yy = _bend(c, x, y)
-        det = xx * yy - xy * yx
-        if not (det > 1e-9 and xx + yy > 0.0):
-            x, y = 0.5 * x, 0.5 * y
-            continue
-        e0, e1 = u - xd, v - yd
-        dx, dy = (yy * e0 - xy * e1) / det, (xx * e1 - yx * e0) / det
-        x -= dx
-        y -= dy
-        if dx * dx + dy * dy < 1e-26 * (1.0 + x * x + y * y):
+        x, y, moved2 = newton.step(x, y, u - xd, v - yd, xx, xy, yx, yy)
+        if moved2 < 1e-26 * (1.0 + x * x + y * y):
             norm = 1.0 / math.sqrt(x * x + y * y + 1.0)
             return x * norm, y * norm, norm
     return math.nan, math.nan, math.nan

@@ -22,7 +22,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera import equidistant
+from sfmapp.camera import equidistant, newton
 
 Array = NDArray[np.float64]
 
@@ -127,16 +127,9 @@ def ray_jacobian(c: Array, classic: bool, x: float, y: float, z: float, J: Array
 def unproject(c: Array, classic: bool, xd: float, yd: float) -> tuple[float, float, float]:
     """Unit ray of an image point; NaN where the lens has no inverse."""
     a, b = xd, yd
-    for _ in range(100):  # Newton, from nearer the middle where it starts beyond the fold
+    for _ in range(100):
         u, v, aa, ab, ba, bb = _bend(c, classic, a, b)
-        det = aa * bb - ab * ba
-        if not (det > 1e-9 and aa + bb > 0.0):
-            a, b = 0.5 * a, 0.5 * b
-            continue
-        e0, e1 = u - xd, v - yd
-        da, db = (bb * e0 - ab * e1) / det, (aa * e1 - ba * e0) / det
-        a -= da
-        b -= db
-        if da * da + db * db < 1e-26:
+        a, b, moved2 = newton.step(a, b, u - xd, v - yd, aa, ab, ba, bb)
+        if moved2 < 1e-26:
             return equidistant.unproject(a, b)
     return math.nan, math.nan, math.nan

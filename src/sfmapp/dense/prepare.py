@@ -22,6 +22,7 @@ from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import read_on_white
 from sfmapp.reporting import NamedReason
 from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.undistortion import warn_of_sides
 
 # without a level: the largest longer side
 LONGER_SIDE_PX = 1600
@@ -74,6 +75,7 @@ def plan_views(
     """
     events = events or Events()
     _check_count(model, photographs, options)
+    warn_of_sides(photographs.cameras, STAGE, events)
     poses = model.cam_from_world[photographs.image_idx]
     xyz, ptr, view_idx = _points(model, photographs.image_idx)
     depth = _median_depths(poses, xyz, ptr, view_idx)
@@ -190,12 +192,19 @@ def _only(
 def _points(
     model: Reconstruction, image_idx: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int32]]:
-    """Points seen by two or more of the views, with the views in ascending order, each once."""
+    """Points seen by two or more of the views, with the views in ascending order, each once.
+
+    What a wide lens sees behind it is not on the plane that its photograph is laid out on.
+    """
     view = np.full(len(model.image_names), -1, np.int32)
     view[image_idx] = np.arange(len(image_idx))
     tracks = model.tracks
     seen = view[tracks.obs_image_idx]
     used = model.obs_is_inlier & (seen >= 0) & model.is_triangulated[tracks.obs_track_idx]
+    is_wide = np.array([camera.is_wide for camera in model.cameras], bool)[model.image_camera_idx]
+    of_wide = np.flatnonzero(used & is_wide[tracks.obs_image_idx])
+    poses, xyz = model.cam_from_world[tracks.obs_image_idx[of_wide]], model.point_xyz[tracks.obs_track_idx[of_wide]]
+    used[of_wide] = rigid3.apply(poses, xyz)[:, 2] > 0.0
     pairs = np.unique(np.stack([tracks.obs_track_idx[used], seen[used]], axis=1), axis=0)
     count = np.bincount(pairs[:, 0], minlength=tracks.num_tracks)
     ptr = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)

@@ -2,7 +2,9 @@
 
 Everywhere ``x2^T F x1 = 0`` and ``x2^T E x1 = 0``, and the pose is ``cam2_from_cam1`` (7,) as in
 :mod:`sfmapp.geometry.rigid3`. Pixels ``xy`` are (N, 2) float64 in any frame as long as F is in the same one; ``xn`` are
-normalised image points (N, 2), that is (X/Z, Y/Z). HZ stands for Hartley and Zisserman, "Multiple View Geometry", 2004.
+normalised image points (N, 2), that is (X/Z, Y/Z). Where it is said, they may be unit rays (N, 3) instead, which see in
+every direction: a point then lies in front of a camera if it lies along its ray, errors are angles in radians, and
+depths are distances. HZ stands for Hartley and Zisserman, "Multiple View Geometry", 2004.
 """
 
 from __future__ import annotations
@@ -107,10 +109,34 @@ def _sampson_errors(f: Array, xy1: Array, xy2: Array, out: Array) -> None:
         out[i] = r * r / denominator if denominator > 0.0 else math.inf
 
 
+@numba.njit(cache=True, nogil=True)
+def ray_sampson_error(e: Array, x: float, y: float, z: float, u: float, v: float, w: float) -> float:
+    """The same of the unit rays (x, y, z) and (u, v, w), radians squared: the gradient is that on both unit spheres."""
+    a = e[0, 0] * x + e[0, 1] * y + e[0, 2] * z
+    b = e[1, 0] * x + e[1, 1] * y + e[1, 2] * z
+    c = e[2, 0] * x + e[2, 1] * y + e[2, 2] * z
+    d = e[0, 0] * u + e[1, 0] * v + e[2, 0] * w
+    f = e[0, 1] * u + e[1, 1] * v + e[2, 1] * w
+    g = e[0, 2] * u + e[1, 2] * v + e[2, 2] * w
+    r = u * a + v * b + w * c
+    denominator = a * a + b * b + c * c + d * d + f * f + g * g - 2.0 * r * r
+    return r * r / denominator if denominator > 0.0 else math.inf
+
+
+@numba.njit(cache=True, nogil=True)
+def _ray_sampson_errors(e: Array, a: Array, b: Array, out: Array) -> None:
+    for i in range(a.shape[0]):
+        out[i] = ray_sampson_error(e, a[i, 0], a[i, 1], a[i, 2], b[i, 0], b[i, 1], b[i, 2])
+
+
 def sampson_errors(matrix: Array, xy1: Array, xy2: Array) -> Array:
-    """(N,) squared Sampson distances to the epipolar geometry, in the units of the points squared (HZ 11.9)."""
+    """(N,) squared Sampson distances to the epipolar geometry, in the units of the points squared (HZ 11.9).
+
+    Of unit rays (N, 3), with E as the matrix, radians squared.
+    """
     out = np.empty(len(xy1))
-    _sampson_errors(np.ascontiguousarray(matrix, np.float64), *_contiguous(xy1, xy2), out)
+    kernel = _ray_sampson_errors if xy1.shape[1] == 3 else _sampson_errors
+    kernel(np.ascontiguousarray(matrix, np.float64), *_contiguous(xy1, xy2), out)
     return out
 
 
@@ -126,18 +152,19 @@ def sampson_weights(fundamental: Array, xy1: Array, xy2: Array) -> Array:
 
 @numba.njit(cache=True, nogil=True)
 def _ray_depths(rotation: Array, t: Array, xn1: Array, xn2: Array, depths: Array, angles: Array) -> None:
+    is_ray = xn1.shape[1] == 3
     for i in range(xn1.shape[0]):
-        x, y = xn1[i, 0], xn1[i, 1]
-        a0 = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
-        a1 = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
-        a2 = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]
-        b0, b1 = xn2[i, 0], xn2[i, 1]
+        x, y, z = xn1[i, 0], xn1[i, 1], xn1[i, 2] if is_ray else 1.0
+        a0 = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
+        a1 = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
+        a2 = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+        b0, b1, b2 = xn2[i, 0], xn2[i, 1], xn2[i, 2] if is_ray else 1.0
         aa = a0 * a0 + a1 * a1 + a2 * a2
-        bb = b0 * b0 + b1 * b1 + 1.0
-        ab = a0 * b0 + a1 * b1 + a2
+        bb = b0 * b0 + b1 * b1 + b2 * b2
+        ab = a0 * b0 + a1 * b1 + a2 * b2
         at = a0 * t[0] + a1 * t[1] + a2 * t[2]
-        bt = b0 * t[0] + b1 * t[1] + t[2]
-        c0, c1, c2 = a1 - a2 * b1, a2 * b0 - a0, a0 * b1 - a1 * b0
+        bt = b0 * t[0] + b1 * t[1] + b2 * t[2]
+        c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
         det = c0 * c0 + c1 * c1 + c2 * c2  # |a x b|^2 = aa bb - ab^2 without the cancellation
         angles[i] = math.atan2(math.sqrt(det), ab)
         # below 1e-6 radians the depth is noise in double precision
@@ -153,10 +180,11 @@ def ray_depths(cam2_from_cam1: ArrayLike, xn1: Array, xn2: Array) -> tuple[Array
 
     Args:
         cam2_from_cam1: (7,) pose; the depths are in the unit of its translation.
-        xn1, xn2: (N, 2) normalised image points.
+        xn1, xn2: (N, 2) normalised image points, or (N, 3) unit rays.
 
     Returns:
-        (N, 2) depths along z in camera 1 and 2, negative behind the camera, NaN where the rays are parallel;
+        (N, 2) depths along z in camera 1 and 2, along the rays where these are given, negative behind the camera, NaN
+        where the rays are parallel;
         (N,) angles in radians, 0 to pi.
     """
     pose = np.asarray(cam2_from_cam1, np.float64)
@@ -171,7 +199,7 @@ def choose_in_front(poses: Array, xn1: Array, xn2: Array) -> tuple[Array, NDArra
 
     Args:
         poses: (K, 7) candidates for cam2_from_cam1.
-        xn1, xn2: (N, 2) normalised image points.
+        xn1, xn2: (N, 2) normalised image points, or (N, 3) unit rays.
 
     Returns:
         The pose (7,), (N,) which points lie in front of both cameras, (N,) angles between the rays in radians.
@@ -260,6 +288,61 @@ def _pose_normal_equations(
 
 
 @numba.njit(cache=True, nogil=True)
+def _pose_normal_equations_of_rays(
+    r: Array, t: Array, rays1: Array, rays2: Array, scale2: float, tangent: Array, h: Array, g: Array
+) -> float:
+    """:func:`_pose_normal_equations` with unit rays (N, 3), of the error on the unit spheres."""
+    e, jacobian = np.empty((6, 3, 3)), np.empty(5)
+    _essential_and_slopes(r, t, tangent, e)
+    g[:], h[:] = 0.0, 0.0
+    cost = 0.0
+    line1, line2, slope1, slope2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(rays1.shape[0]):
+        a, b = rays1[i], rays2[i]
+        _lines(e[0], a, b, line1, line2)
+        product = line2[0] * b[0] + line2[1] * b[1] + line2[2] * b[2]
+        s2 = -2.0 * product * product
+        for k in range(3):
+            s2 += line1[k] * line1[k] + line2[k] * line2[k]
+        if s2 <= 0.0:
+            continue
+        s = 1.0 / math.sqrt(s2)
+        residual = product * s
+        ratio = residual * residual / scale2
+        weight = 1.0 / (1.0 + ratio)
+        cost += math.log1p(ratio)
+        for k in range(5):
+            _lines(e[k + 1], a, b, slope1, slope2)
+            change = slope2[0] * b[0] + slope2[1] * b[1] + slope2[2] * b[2]
+            longer = -2.0 * product * change
+            for m in range(3):
+                longer += line1[m] * slope1[m] + line2[m] * slope2[m]
+            jacobian[k] = s * (change - residual * s * longer)
+        for k in range(5):
+            g[k] += weight * jacobian[k] * residual
+            for m in range(k + 1):
+                h[k, m] += weight * jacobian[k] * jacobian[m]
+    return cost
+
+
+@numba.njit(cache=True, nogil=True)
+def _lines(e: Array, a: Array, b: Array, line1: Array, line2: Array) -> None:
+    """E^T b and E a."""
+    for k in range(3):
+        line1[k] = e[0, k] * b[0] + e[1, k] * b[1] + e[2, k] * b[2]
+        line2[k] = e[k, 0] * a[0] + e[k, 1] * a[1] + e[k, 2] * a[2]
+
+
+@numba.njit(cache=True, nogil=True)
+def _linearize_pose(
+    r: Array, t: Array, xn1: Array, xn2: Array, scale2: float, tangent: Array, h: Array, g: Array
+) -> float:
+    if xn1.shape[1] == 3:
+        return _pose_normal_equations_of_rays(r, t, xn1, xn2, scale2, tangent, h, g)
+    return _pose_normal_equations(r, t, xn1, xn2, scale2, tangent, h, g)
+
+
+@numba.njit(cache=True, nogil=True)
 def _solve_damped(h: Array, g: Array, damping: float, factor: Array, step: Array) -> bool:
     """Cholesky solution of (H + damping diag(H)) step = -g from the lower triangle of H; False if it is singular."""
     n = g.shape[0]
@@ -314,14 +397,14 @@ def _refine_pose(rotations: Array, ts: Array, xn1: Array, xn2: Array, scale2: fl
     tangent = np.empty((2, 3, 2))
     now = 0
     _tangent_plane(ts[now], tangent[now])
-    cost = _pose_normal_equations(rotations[now], ts[now], xn1, xn2, scale2, tangent[now], h[now], g[now])
+    cost = _linearize_pose(rotations[now], ts[now], xn1, xn2, scale2, tangent[now], h[now], g[now])
     damping = 1e-4
     for _ in range(max_iterations):
         new, new_cost = 1 - now, math.inf
         if _solve_damped(h[now], g[now], damping, factor, step):
             _move_pose(rotations[now], ts[now], tangent[now], step, rotations[new], ts[new])
             _tangent_plane(ts[new], tangent[new])
-            new_cost = _pose_normal_equations(rotations[new], ts[new], xn1, xn2, scale2, tangent[new], h[new], g[new])
+            new_cost = _linearize_pose(rotations[new], ts[new], xn1, xn2, scale2, tangent[new], h[new], g[new])
         if not new_cost < cost:
             damping *= 10.0
             if damping > 1e3:
@@ -342,8 +425,8 @@ def refine_relative_pose(
 
     Args:
         cam2_from_cam1: (7,) start with a non-zero translation.
-        xn1, xn2: (N, 2) normalised image points; outliers are borne by the robust weight.
-        scale: residual, in normalised units, at which a point's weight has halved.
+        xn1, xn2: (N, 2) normalised image points, or (N, 3) unit rays; outliers are borne by the robust weight.
+        scale: residual, in normalised units or radians, at which a point's weight has halved.
 
     Returns:
         (7,) pose with unit translation; its cost is never above that of the start.

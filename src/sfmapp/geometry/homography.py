@@ -50,11 +50,16 @@ def poses_from_homography(homography: Array, k1: Array, k2: Array) -> Array:
 
 
 def rotation_from_rays(xn1: Array, xn2: Array, weights: Array) -> Array:
-    """Rotation (3, 3) that best turns the rays of xn1 into those of xn2, both (N, 2) (Kabsch 1976)."""
-    a = np.concatenate([xn1, np.ones((len(xn1), 1))], 1)
-    b = np.concatenate([xn2, np.ones((len(xn2), 1))], 1)
-    a /= np.linalg.norm(a, axis=1, keepdims=True)
-    b /= np.linalg.norm(b, axis=1, keepdims=True)
+    """Rotation (3, 3) that best turns the rays of xn1 into those of xn2 (Kabsch 1976).
+
+    Both are (N, 2) normalised image points, or (N, 3) unit rays.
+    """
+    a, b = xn1, xn2
+    if xn1.shape[1] == 2:
+        a = np.concatenate([xn1, np.ones((len(xn1), 1))], 1)
+        b = np.concatenate([xn2, np.ones((len(xn2), 1))], 1)
+        a /= np.linalg.norm(a, axis=1, keepdims=True)
+        b /= np.linalg.norm(b, axis=1, keepdims=True)
     u, _, vt = np.linalg.svd((b * weights[:, None]).T @ a)
     rotation: Array = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     return rotation

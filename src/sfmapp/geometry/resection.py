@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.geometry import rigid3
+from sfmapp.geometry import p3p, rigid3
 
 Array = NDArray[np.float64]
 
@@ -40,19 +40,26 @@ def estimate_pose(
 
     Args:
         xyz: (N, 3) float64 points in the world.
-        normalized: (N, 2) float64 undistorted image points X/Z, Y/Z; NaN where the lens has no inverse.
-        max_error: largest distance of an inlier in the normalised image plane.
+        normalized: (N, 2) float64 undistorted image points X/Z, Y/Z, or (N, 3) unit rays in any direction; NaN where
+            the lens has no inverse.
+        max_error: largest distance of an inlier in the normalised image plane, or on the unit sphere.
         confidence: wanted probability that one all-inlier sample was drawn.
         max_iterations: bound on the number of samples.
 
     Returns:
-        The pose with at least four inliers in front of the camera, or None.
+        The pose with at least four inliers in front of the camera (along their rays), or None.
     """
     import cv2
 
     valid = np.flatnonzero(~np.isnan(normalized[:, 0]))
     if len(valid) < 4:
         return None
+    if normalized.shape[1] == 3:
+        pose = p3p.find_pose(xyz[valid], normalized[valid], max_error, confidence, max_iterations)
+        if pose is None:
+            return None
+        is_inlier = p3p.squared_errors(pose, xyz, normalized) <= max_error**2  # False for NaN
+        return Resection(pose, is_inlier) if is_inlier.sum() >= 4 else None
     try:
         found, rotation_vector, translation, _ = cv2.solvePnPRansac(
             np.ascontiguousarray(xyz[valid]), np.ascontiguousarray(normalized[valid]), np.eye(3), None,

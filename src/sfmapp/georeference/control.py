@@ -129,12 +129,16 @@ def align_to_survey(place: Array, surveyed: Array) -> Alignment:
     return Alignment(kept, none, "")
 
 
-def similarity_covariance(place: Array, covariance: Array) -> Array:
+def similarity_covariance(place: Array, covariance: Array) -> Array | None:
     """(7, 7) of the similarity that points (P, 3) with covariances (P, 3, 3) hold: the turn about their middle (radians
-    about east, north, up), the logarithm of the scale, and the shift of the middle."""
+    about east, north, up), the logarithm of the scale, and the shift of the middle. None where they hold none."""
     arm = place - place.mean(0)
     slope = np.concatenate([-rigid3.skew(arm), arm[:, :, None], np.broadcast_to(np.eye(3), (len(arm), 3, 3))], 2)
-    inverse: Array = np.linalg.inv(np.einsum("pia,pij,pjb->ab", slope, np.linalg.inv(covariance), slope))
+    information = np.einsum("pia,pij,pjb->ab", slope, np.linalg.inv(covariance), slope)
+    root = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    if np.linalg.cond(information / np.outer(root, root)) > _HELD_BY_ITSELF**-2:
+        return None
+    inverse: Array = np.linalg.inv(information)
     return inverse
 
 

@@ -1,7 +1,8 @@
 """Models to ground control: marks checked, a similarity, the adjustment, and a table of points left out in turn.
 
-Control decides where a model lies, also where positions of photographs have placed it before: those of a phone are a
-hundred times poorer, and those of RTK have a base whose place may be off. What they then differ by is said.
+Control decides where a model lies, also where positions of photographs have placed it before. These go on holding its
+shape, as well as they are: those of a phone hardly, those of RTK better than a few points do. What they are off
+together, as RTK is by its base, is a variable of the adjustment; so one or two points suffice beside them.
 """
 
 from __future__ import annotations
@@ -17,9 +18,17 @@ from sfmapp.adjust.problem import free_params
 from sfmapp.events import Events
 from sfmapp.formats.control_points import ControlPoints
 from sfmapp.geometry import similarity
-from sfmapp.georeference.control import LeftOut, Survey, align_to_survey, similarity_covariance, survey_in_frame
+from sfmapp.georeference.control import (
+    Alignment,
+    LeftOut,
+    Survey,
+    align_to_survey,
+    similarity_covariance,
+    survey_in_frame,
+)
 from sfmapp.georeference.control_adjustment import Adjusting, ControlSolution, adjust_to_control
 from sfmapp.georeference.control_report import ControlledModel, ControlPointRow, ControlReport, LeftOutSummary, Role
+from sfmapp.georeference.landmarks import Positions
 from sfmapp.georeference.marks import MarkedPoints, check_marks
 from sfmapp.georeference.report import GeoreferenceReport
 from sfmapp.georeference.world_frame import Georeference, ModelPlace
@@ -34,6 +43,8 @@ _HORIZONTAL_95, _VERTICAL_95 = 2.448, 1.960
 # 0.55 of what squares make, and errors of 1.09 times their variance: beside other factors it counts like squares whose
 # noise has 1.09 * 0.55 of its variance.
 _ROBUST_NOISE = 0.778
+# Positions and survey may name one datum and mean two, and a base may be put down anywhere: in metres.
+_LEAST_COMMON_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -50,21 +61,26 @@ class Controlled:
 
 
 def control_models(
-    mappers: Sequence[Mapper], control: ControlPoints, before: Georeference | None, events: Events
+    mappers: Sequence[Mapper],
+    control: ControlPoints,
+    before: Georeference | None,
+    positions: GeoreferenceReport | None,
+    events: Events,
 ) -> Controlled:
     """Bring finished models to ground control points, in place, where three of these or more tell how.
 
     Args:
         mappers: of the models.
         control: whose images are those of the models.
-        before: where positions of photographs have placed models; its frame is kept.
+        before: where positions of photographs have placed models; its frame is kept. positions: what was said of them.
         events: told of slips, refuted points and decisions.
     """
     survey = survey_in_frame(control, before.frame if before is not None else None)
     places = {place.model: place for place in before.models} if before is not None else {}
     models: list[ControlledModel] = []
     for number, mapper in enumerate(mappers):
-        row, place = _control_model(number, mapper, control, survey, places.get(number), events)
+        known = _positions_of(number, mapper, positions) if survey.frame is not None else None
+        row, place = _control_model(number, mapper, control, survey, (places.get(number), known), events)
         for finding in row.findings:
             events.warned(STAGE, finding)
         models.append(row)
@@ -82,7 +98,7 @@ def control_models(
 def positions_after(
     report: GeoreferenceReport, control: ControlReport, mappers: Sequence[Mapper]
 ) -> GeoreferenceReport:
-    """What positions of photographs come to beside cameras that control has moved: they have no part in those."""
+    """What positions of photographs come to beside cameras that control has moved, their common error included."""
     moved = {row.model for row in control.models if not row.reason}
     rows = []
     for row in report.images:
@@ -91,21 +107,31 @@ def positions_after(
             center = mapper.reconstruction.centers[mapper.reconstruction.image_names.index(row.name)]
             east, north, up = center - row.measured_m
             row = replace(
-                row, adjusted_m=_three(center), residual_sigma_m=None, ellipse=None, is_used=False,
+                row, adjusted_m=_three(center), residual_sigma_m=None, ellipse=None,
                 residual_m=(float(east), float(north), None if row.height_m is None else float(up)),
-                reason="ground control tells the place",
             )  # fmt: skip
         rows.append(row)
     return replace(report, images=rows)
 
 
 def _control_model(
-    number: int, mapper: Mapper, control: ControlPoints, survey: Survey, before: ModelPlace | None, events: Events
+    number: int,
+    mapper: Mapper,
+    control: ControlPoints,
+    survey: Survey,
+    known: tuple[ModelPlace | None, Positions | None],
+    events: Events,
 ) -> tuple[ControlledModel, ModelPlace | None]:
-    """A row of the report, and how the model lies now; None where control does not tell."""
-    model = mapper.reconstruction
+    """A row of the report, and how the model lies now; None where control does not tell.
+
+    Args:
+        known: how positions of its photographs have placed the model, and these.
+    """
+    model, (before, positions) = mapper.reconstruction, known
     marked = check_marks(model, control)
     alignment = align_to_survey(marked.place, survey.place)
+    if alignment.world_from_model is None and positions is not None and marked.is_placed.any():
+        alignment = Alignment(similarity.IDENTITY, marked.is_placed, "")  # it lies in the frame already
     if alignment.world_from_model is None:
         events.decided(STAGE, f"model {number} is not brought to ground control: {alignment.problem}")
         return _unmoved(number, control, marked, survey, alignment.problem), None
@@ -113,20 +139,39 @@ def _control_model(
     moved = alignment.world_from_model
     model.cam_from_world[:] = similarity.transform_poses(moved, model.cam_from_world)
     model.point_xyz[:] = similarity.apply(moved, model.point_xyz)
-    solution = adjust_to_control(model, control, marked, survey, alignment.is_inlier, adjusting_of(mapper))
+    solution = adjust_to_control(model, control, marked, survey, alignment.is_inlier, adjusting_of(mapper, positions))
     if not solution.is_used.any():
         model.cam_from_world[:], model.point_xyz[:], model.cameras[:] = (
             first.cam_from_world, first.point_xyz, first.cameras,
         )  # fmt: skip
-        problem = "no three control points agree with each other"
+        problem = "no control points agree with each other"
         return _unmoved(number, control, marked, survey, problem), None
     row = _row(number, control, marked, survey, solution)
     _tell(row, events)
     return row, _model_place(number, survey, moved, solution, before)
 
 
-def adjusting_of(mapper: Mapper) -> Adjusting:
-    """How a finished map is adjusted with control: as it was in the end without."""
+def _positions_of(number: int, mapper: Mapper, report: GeoreferenceReport | None) -> Positions | None:
+    """Positions of photographs that hold the shape of a model; None where they do not."""
+    rows = {row.model: row for row in report.models} if report is not None else {}
+    row = rows.get(number)
+    if report is None or row is None or not row.is_adjusted or row.sigma_m is None or row.common_offset_m is None:
+        return None
+    images = {name: i for i, name in enumerate(mapper.reconstruction.image_names)}
+    used = [image for image in report.images if image.model == number and image.is_used and image.height_m is not None]
+    if len(used) < 3:
+        return None
+    (flat, up), (common, common_up) = row.sigma_m, row.common_offset_m
+    return Positions(
+        np.array([images[image.name] for image in used], np.int64),
+        np.array([image.measured_m for image in used]),
+        np.array([flat, flat, up]),
+        np.maximum([common, common, common_up], _LEAST_COMMON_M),
+    )
+
+
+def adjusting_of(mapper: Mapper, positions: Positions | None = None) -> Adjusting:
+    """How a finished map is adjusted with control, and with positions: as it was in the end without."""
     options, varying, noise_px = mapper.closing_options()
     free = [
         free_params(
@@ -139,9 +184,12 @@ def adjusting_of(mapper: Mapper) -> Adjusting:
     def graph(is_robust: bool) -> FactorGraph:
         chosen = options.robust(noise_px) if is_robust else options
         unit = noise_px * (1.0 if chosen is options else _ROBUST_NOISE)
-        return FactorGraph(
+        made = FactorGraph(
             mapper.reconstruction, chosen, varying=varying, prior_cameras=mapper.prior_cameras, noise_px=unit
         )
+        if positions is not None:
+            positions.add_to(made)
+        return made
 
     return Adjusting(lambda: graph(True), lambda: graph(False), free)
 
@@ -154,7 +202,13 @@ def _model_place(
     if survey.frame is None:
         return None
     covariance = similarity_covariance(solution.place[used], survey.covariance[used])
-    deviations = solution.survey_spread * np.sqrt(np.diag(covariance))
+    if covariance is None:
+        # too few points to tell more than a shift: scale and turn are those of the positions
+        assert before is not None
+        at = np.sqrt(np.diagonal(survey.covariance[used], axis1=1, axis2=2).mean(0) / used.sum())
+        deviations = np.array([*np.radians(before.rotation_sigma_deg), before.scale_sigma_share, *at])
+    else:
+        deviations = solution.survey_spread * np.sqrt(np.diag(covariance))
     if before is not None:
         earlier = np.array([*before.rotation, *before.translation_m, before.scale])
         moved = similarity.compose(moved, earlier)

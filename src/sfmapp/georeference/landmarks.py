@@ -21,6 +21,7 @@ import numpy as np
 from gtsam.symbol_shorthand import K, X
 from numpy.typing import NDArray
 
+from sfmapp.adjust.graph import FactorGraph
 from sfmapp.camera.camera import Camera, project_jacobian
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
@@ -28,6 +29,8 @@ from sfmapp.scene.reconstruction import Reconstruction
 Array = NDArray[np.float64]
 
 _MAX_STEPS, _SMALL_STEP = 30, 1e-12
+# Huber's loss bends here, in standard deviations, where it costs nothing: wrong positions were left out before.
+_HUBER_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
@@ -135,6 +138,43 @@ def _at(
         residual[size:] = surveyed.root_information @ (place - surveyed.place)
         by_place[size:] = surveyed.root_information
     return Linearized(place, residual, by_place, by_pose, by_params) if np.isfinite(residual).all() else None
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Measured places of cameras that are off together, as those of a receiver whose base was put down wrongly.
+
+    Attributes:
+        image_idx: (N,) int64; places: (N, 3) metres in the frame of the model.
+        sigma_m: (3,) of one of them; common_sigma_m: (3,) of what all have in common.
+    """
+
+    image_idx: NDArray[np.int64]
+    places: Array
+    sigma_m: Array
+    common_sigma_m: Array
+
+    def add_to(self, graph: FactorGraph) -> None:
+        """Add the positions to a graph, and what they have in common as a variable of its own."""
+        common = gtsam.symbol("o", 0)
+        graph.insert(common, np.zeros(3))
+        graph.add(gtsam.PriorFactorPoint3(common, np.zeros(3), gtsam.noiseModel.Diagonal.Sigmas(self.common_sigma_m)))
+        huber = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER_SIGMAS)
+        noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Diagonal.Sigmas(self.sigma_m))
+        for i, place in zip(self.image_idx.tolist(), self.places, strict=True):
+            graph.add(gtsam.CustomFactor(noise, [X(i), common], _position_error(X(i), common, place)))
+
+
+def _position_error(image: int, common: int, place: Array) -> Any:
+    def error(_: Any, values: Any, jacobians: list[Array] | None) -> Array:
+        pose = values.atPose3(image)
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(np.concatenate([np.zeros((3, 3)), pose.rotation().matrix()], 1))
+            jacobians[1] = np.asfortranarray(-np.eye(3))
+        residual: Array = pose.translation() - values.atPoint3(common) - place
+        return residual
+
+    return error
 
 
 class LandmarkFactor:

@@ -152,7 +152,7 @@ def _camera(
         prior = _common_prior(priors)
         camera = simple_camera(model, width, height, prior.focal_px, prior.sigma_px, prior.source)
         reason = prior.reason
-    if model == CameraModel.EQUIRECTANGULAR:  # its size says all
+    if camera.model == CameraModel.EQUIRECTANGULAR:  # its size says all
         return replace(camera, focal_source="user", focal_sigma=None, is_fixed=True), "the size of a panorama"
     return replace(camera, is_fixed=options.fix_intrinsics), reason
 

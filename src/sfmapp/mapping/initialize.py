@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import pixels_to_normalized
+from sfmapp.camera.camera import bearings
 from sfmapp.geometry import epipolar, rigid3
 from sfmapp.mapping.focal import matched_pixels
 from sfmapp.mapping.options import MappingOptions
@@ -146,7 +146,7 @@ def _examine(
         return InitialPair((first, second), num_matches, 0, 0.0, nothing, reason)
     xy1, xy2 = matched_pixels(reconstruction.tracks, correspondences, pair_idx)
     cameras = [reconstruction.cameras[reconstruction.image_camera_idx[i]] for i in (first, second)]
-    x1, x2 = (pixels_to_normalized(c, xy) for c, xy in zip(cameras, (xy1, xy2), strict=True))
+    x1, x2 = bearings(cameras, (xy1, xy2))
     valid = ~(np.isnan(x1) | np.isnan(x2)).any(axis=1)
     x1, x2 = x1[valid], x2[valid]
     focal = 0.5 * (cameras[0].focal + cameras[1].focal)

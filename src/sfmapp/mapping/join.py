@@ -18,7 +18,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import pixels_to_normalized
+from sfmapp.camera.camera import bearings, pixels_to_rays
 from sfmapp.camera.lens import across_seam, project
 from sfmapp.geometry import resection, rigid3, similarity
 from sfmapp.mapping.mapper import Mapper
@@ -88,6 +88,7 @@ class _Checks(NamedTuple):
     rotation: Array
     translation: Array
     canonical: Array
+    ray: Array
     num_links: int
     point_target: Array
     point_source: Array
@@ -250,9 +251,26 @@ def _checks(target: Reconstruction, source: Reconstruction, correspondences: Cor
         np.repeat([True, False], [len(link) for link in group_link]), np.concatenate([xyz for _, xyz, _, _ in parts]),
         np.concatenate([viewer.tracks.obs_xy[obs] for _, _, viewer, obs in parts]),
         np.concatenate(image).astype(np.int64), rigid3.rotation_matrix(pose), np.ascontiguousarray(pose[:, 4:]),
-        np.concatenate([row[c] for row, c in zip(rows, camera, strict=True)]), len(track_target),
+        np.concatenate([row[c] for row, c in zip(rows, camera, strict=True)]),
+        np.concatenate([
+            _coarse_rays(viewer, c, viewer.tracks.obs_xy[obs])
+            for (_, _, viewer, obs), c in zip(parts, camera, strict=True)
+        ]),
+        len(track_target),
         target.point_xyz[track_target[both]], source.point_xyz[track_source[both]],
     )  # fmt: skip
+
+
+def _coarse_rays(model: Reconstruction, camera_idx: NDArray[np.int32], xy: Array) -> Array:
+    """(N, 3) rays of pixels. The lens is left out where it sees no farther than a pinhole: a vote is coarse, and the
+    refinement is not."""
+    canonical = model.canonical_cameras()[camera_idx]
+    rays = np.ones((len(xy), 3))
+    rays[:, :2] = (xy - canonical[:, 2:4]) / canonical[:, :2]
+    for k in np.unique(camera_idx):
+        if model.cameras[k].is_wide:
+            rays[camera_idx == k] = pixels_to_rays(model.cameras[k], xy[camera_idx == k])
+    return rays
 
 
 def _links(model: Reconstruction, sides: tuple[Bools, Bools], correspondences: Correspondences) -> tuple[Ints, Ints]:
@@ -336,10 +354,10 @@ def _from_image(
     own = target if is_own else source
     mine = (checks.image_idx == image_idx) & (checks.is_forward == is_own)
     camera = own.cameras[own.image_camera_idx[image_idx]]
-    normalized = pixels_to_normalized(camera, checks.xy[mine])
+    (points,) = bearings([camera], [checks.xy[mine]])
     # a bridge that has to be searched for longer is none
     found = resection.estimate_pose(
-        checks.xyz[mine], normalized, tolerance_px / camera.focal, confidence=0.99, max_iterations=500
+        checks.xyz[mine], points, tolerance_px / camera.focal, confidence=0.99, max_iterations=500
     )
     if found is None:
         return np.zeros((0, 8))
@@ -363,11 +381,9 @@ def _voted_scale(checks: _Checks, chosen: Bools, center: Array, to_other: Array,
     if not chosen.any():
         return None
     direction = (checks.xyz[chosen] - own_center) @ to_other.T
-    rotation, canonical = checks.rotation[chosen], checks.canonical[chosen]
+    rotation = checks.rotation[chosen]
     offset = np.einsum("nij,j->ni", rotation, center) + checks.translation[chosen]
-    # the lens is left out: a vote is coarse, and the refinement is not
-    ray = np.ones((len(offset), 3))
-    ray[:, :2] = (checks.xy[chosen] - canonical[:, 2:4]) / canonical[:, :2]
+    ray = checks.ray[chosen]
     a, b = np.cross(ray, np.einsum("nij,nj->ni", rotation, direction)), np.cross(ray, offset)
     with np.errstate(divide="ignore", invalid="ignore"):
         votes = -(a * b).sum(axis=1) / (a * a).sum(axis=1)

@@ -36,7 +36,10 @@ def similarity_through_image(
         return None
     in_target = rigid3.apply(target.cam_from_world[image_idx], target.point_xyz[common])
     in_source = rigid3.apply(source.cam_from_world[image_idx], source.point_xyz[common])
+    cameras = (model.cameras[model.image_camera_idx[image_idx]] for model in (target, source))
     in_front = (in_target[:, 2] > 0) & (in_source[:, 2] > 0)
+    if any(camera.is_wide for camera in cameras):  # it may see them behind it; their directions are compared below
+        in_front[:] = True
     ratios = np.log(np.linalg.norm(in_target[in_front], axis=1) / np.linalg.norm(in_source[in_front], axis=1))
     if len(ratios) < MIN_COMMON_POINTS:
         return None

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.lens import EQUIRECTANGULAR, FAMILY, project
+from sfmapp.camera.lens import project
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry.triangulation import Views
 from sfmapp.mapping.report import NearPair
@@ -66,9 +66,10 @@ def near_views(model: Reconstruction, correspondences: Correspondences) -> NearV
     tried = np.flatnonzero(registered[correspondences.pair_image_idx].all(axis=1))
     images = correspondences.pair_image_idx[tried].astype(np.int64)
     sizes = np.array([(c.width, c.height) for c in model.cameras], np.float64)
+    is_wide = np.array([c.is_wide for c in model.cameras], bool)
     tracks, counts = model.tracks, np.zeros((len(images), 3), np.int64)
     points = _Points(tracks.image_ptr, tracks.image_obs, tracks.obs_track_idx, model.obs_is_inlier, model.point_xyz)
-    _count_in_view(images, points, model.views(), model.centers, sizes, counts)
+    _count_in_view(images, points, model.views(), model.centers, sizes, is_wide, counts)
     visible = counts[:, :2].min(axis=1)
     shared = np.maximum(counts[:, 2], correspondences.num_inliers[tried])
     enough = visible >= MIN_VISIBLE
@@ -140,11 +141,11 @@ class _Points(NamedTuple):
 @numba.njit(cache=True, nogil=True)
 def _count_in_view(
     images: NDArray[np.int64], points: _Points, views: Views, centers: NDArray[np.float64],
-    sizes: NDArray[np.float64], counts: NDArray[np.int64],
+    sizes: NDArray[np.float64], is_wide: NDArray[np.bool_], counts: NDArray[np.int64],
 ) -> None:  # fmt: skip
     """Fill counts (K, 3): points of the first image in view of the second, of the second in that of the first, both's.
 
-    sizes: (C, 2) pixels.
+    sizes: (C, 2) pixels. is_wide: (C,) whether the lens sees beyond its half space.
     """
     image_ptr, image_obs, obs_track, is_inlier, xyz = points
     rotation, translation, camera_of, canonical = views
@@ -170,7 +171,7 @@ def _count_in_view(
                 r, s = rotation[j], translation[j]
                 depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + s[2]
                 # beyond 80 degrees a lens model that is good in the picture may fold back into it
-                if not depth > 0.17 * b and canonical[c, FAMILY] != EQUIRECTANGULAR:
+                if not depth > 0.17 * b and not is_wide[c]:
                     continue
                 right = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + s[0]
                 down = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + s[1]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sfmapp.camera.camera import Camera, pixels_to_normalized
+from sfmapp.camera.camera import Camera, bearings
 from sfmapp.geometry import homography, rigid3
 from sfmapp.mapping.focal import matched_pixels
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
@@ -79,12 +79,12 @@ def find_one_place(
     members = np.unique(np.concatenate([i, j]))
     shifts, turns = [], []
     for pair in pairs[np.argsort(-counts[pairs], kind="stable")][:_MOST_PAIRS]:
-        first, second = (cameras[image_camera_idx[k]] for k in correspondences.pair_image_idx[pair])
+        both = [cameras[image_camera_idx[k]] for k in correspondences.pair_image_idx[pair]]
         xy1, xy2 = matched_pixels(tracks, correspondences, int(pair))
         if len(xy1) < 3:
             continue
         shifts.append(float(np.median(np.linalg.norm(xy2 - xy1, axis=1))))
-        turns.append(_turn_deg(pixels_to_normalized(first, xy1), pixels_to_normalized(second, xy2)))
+        turns.append(_turn_deg(*bearings(both, (xy1, xy2))))
     if not shifts:
         return None
     return OnePlace(len(members), len(np.unique(place[members])), max(shifts), max(turns))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.pose import RefinedPose, refine_pose
-from sfmapp.camera.camera import pixels_to_normalized
+from sfmapp.camera.camera import bearings, pixels_to_normalized
 from sfmapp.geometry import resection, rigid3
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.scene.reconstruction import Reconstruction
@@ -127,12 +127,12 @@ def register_image(
         )  # fmt: skip
     camera = reconstruction.cameras[reconstruction.image_camera_idx[image_idx]]
     xyz = reconstruction.point_xyz[tracks.obs_track_idx[obs]]
-    normalized = pixels_to_normalized(camera, tracks.obs_xy[obs])
     max_error = max_error_px / camera.focal
     if search_focal:
+        normalized = pixels_to_normalized(camera, tracks.obs_xy[obs])
         found = resection.estimate_pose_and_focal(xyz, normalized, max_error, FOCAL_SCALES)
     else:
-        found = resection.estimate_pose(xyz, normalized, max_error)
+        found = resection.estimate_pose(xyz, bearings([camera], [tracks.obs_xy[obs]])[0], max_error)
     needed = _needed_inliers(len(obs), options)
     if found is None or found.num_inliers < needed:
         num_inliers = found.num_inliers if found is not None else 0

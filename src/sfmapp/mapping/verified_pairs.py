@@ -18,7 +18,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.lens import undistort
+from sfmapp.camera.lens import undistort, unproject
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3
 from sfmapp.mapping import near_views
@@ -118,9 +118,10 @@ def pair_agreement(reconstruction: Reconstruction, correspondences: Corresponden
         diagonal = np.array([math.hypot(c.width, c.height) for c in reconstruction.cameras])[camera_of[image_idx]]
         tolerance_px = np.clip(TOLERANCE_SHARE * diagonal.max(axis=1), *TOLERANCE_PX)
         tracks = reconstruction.tracks
-        rays = np.empty((tracks.num_observations, 2))
-        _undistort_observations(
-            tracks.obs_xy, camera_of[tracks.obs_image_idx], canonical, registered[tracks.obs_image_idx], rays
+        rays = np.empty((tracks.num_observations, 3))
+        is_wide = np.array([camera.is_wide for camera in reconstruction.cameras], bool)
+        _rays_of_observations(
+            tracks.obs_xy, camera_of[tracks.obs_image_idx], canonical, is_wide, registered[tracks.obs_image_idx], rays
         )
         _count_matches(
             pair_idx, image_idx, _matches_of(tracks, correspondences), rays, tracks.obs_track_idx,
@@ -452,15 +453,20 @@ def _roots_before(when: int, parent: Ints, joined_as: Ints) -> Ints:
 
 
 @numba.njit(cache=True, nogil=True)
-def _undistort_observations(
-    xy: Array, camera_idx: NDArray[np.int32], canonical: Array, wanted: Bools, out: Array
+def _rays_of_observations(
+    xy: Array, camera_idx: NDArray[np.int32], canonical: Array, is_wide: Bools, wanted: Bools, out: Array
 ) -> None:
-    """Fill out (O, 2) with normalised image points; NaN where they are not wanted."""
+    """Fill out (O, 3) with rays, of unit length for wide cameras, else to z = 1; NaN where they are not wanted."""
     for o in range(len(xy)):
-        out[o, 0] = out[o, 1] = math.nan
-        if wanted[o]:
-            k = camera_idx[o]
+        out[o, 0] = out[o, 1] = out[o, 2] = math.nan
+        if not wanted[o]:
+            continue
+        k = camera_idx[o]
+        if is_wide[k]:
+            out[o, 0], out[o, 1], out[o, 2] = unproject(canonical[k], xy[o, 0], xy[o, 1])
+        else:
             out[o, 0], out[o, 1] = undistort(canonical[k], xy[o, 0], xy[o, 1])
+            out[o, 2] = 1.0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -486,36 +492,38 @@ def _count_matches(
             if a < 0 or b < 0:
                 continue
             counts[n, 0] += 1
-            if _rays_meet(r, t, rays[a, 0], rays[a, 1], rays[b, 0], rays[b, 1], tolerance[n]):
+            if _rays_meet(r, t, rays[a], rays[b], tolerance[n]):
                 counts[n, 1] += 1
             if obs_track_idx[a] == obs_track_idx[b] and obs_is_inlier[a] and obs_is_inlier[b]:
                 counts[n, 2] += 1
 
 
 @numba.njit(cache=True, nogil=True)
-def _rays_meet(r: Array, t: Array, x: float, y: float, u: float, v: float, tolerance: float) -> bool:
-    """Whether the rays (x, y, 1) of camera 1 and (u, v, 1) of camera 2 meet in front of both, or are parallel.
+def _rays_meet(r: Array, t: Array, ray1: Array, ray2: Array, tolerance: float) -> bool:
+    """Whether the rays (3,) of camera 1 and camera 2 meet in front of both, or are parallel.
 
     r and t are camera 2 from camera 1; the tolerance is an angle in radians. NaN meets nothing.
     """
-    a0 = r[0, 0] * x + r[0, 1] * y + r[0, 2]
-    a1 = r[1, 0] * x + r[1, 1] * y + r[1, 2]
-    a2 = r[2, 0] * x + r[2, 1] * y + r[2, 2]
-    aa, bb = a0 * a0 + a1 * a1 + a2 * a2, u * u + v * v + 1.0
-    ab = a0 * u + a1 * v + a2
-    c0, c1, c2 = a1 - a2 * v, a2 * u - a0, a0 * v - a1 * u
+    x, y, z = ray1[0], ray1[1], ray1[2]
+    u, v, w = ray2[0], ray2[1], ray2[2]
+    a0 = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z
+    a1 = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z
+    a2 = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z
+    aa, bb = a0 * a0 + a1 * a1 + a2 * a2, u * u + v * v + w * w
+    ab = a0 * u + a1 * v + a2 * w
+    c0, c1, c2 = a1 * w - a2 * v, a2 * u - a0 * w, a0 * v - a1 * u
     cross = c0 * c0 + c1 * c1 + c2 * c2
     if ab > 0.0 and cross <= tolerance * tolerance * aa * bb:
         return True
     # the angles of both rays to the plane of the other one and the baseline
     e0, e1, e2 = t[1] * a2 - t[2] * a1, t[2] * a0 - t[0] * a2, t[0] * a1 - t[1] * a0
-    f0, f1, f2 = t[1] - t[2] * v, t[2] * u - t[0], t[0] * v - t[1] * u
-    volume = abs(u * e0 + v * e1 + e2)
+    f0, f1, f2 = t[1] * w - t[2] * v, t[2] * u - t[0] * w, t[0] * v - t[1] * u
+    volume = abs(u * e0 + v * e1 + w * e2)
     near_plane = volume <= tolerance * math.sqrt(bb * (e0 * e0 + e1 * e1 + e2 * e2))
     near_other = volume <= tolerance * math.sqrt(aa * (f0 * f0 + f1 * f1 + f2 * f2))
     if not (near_plane and near_other):
         return False
-    at, bt = a0 * t[0] + a1 * t[1] + a2 * t[2], u * t[0] + v * t[1] + t[2]
+    at, bt = a0 * t[0] + a1 * t[1] + a2 * t[2], u * t[0] + v * t[1] + w * t[2]
     return ab * bt - bb * at > 0.0 and aa * bt - ab * at > 0.0
 
 

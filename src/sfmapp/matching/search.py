@@ -50,10 +50,21 @@ def is_significant(inlier: Mask, threshold: float, extent: tuple[float, float]) 
         threshold: distance from the epipolar line in pixels.
         extent: width and height in pixels of where the matches could lie.
     """
+    return _is_no_chance(inlier, min(2.0 * threshold * math.hypot(*extent) / max(extent[0] * extent[1], 1.0), 1.0))
+
+
+def is_significant_of_rays(inlier: Mask, threshold: float) -> bool:
+    """The same of rays that fill half of the sphere or more; the threshold is an angle in radians.
+
+    A band on both sides of a half circle takes this share of a half sphere.
+    """
+    return _is_no_chance(inlier, min(2.0 * threshold, 1.0))
+
+
+def _is_no_chance(inlier: Mask, band_share: float) -> bool:
     n, k = len(inlier), int(inlier.sum())
     if k < 8:
         return False
-    band_share = min(2.0 * threshold * math.hypot(*extent) / max(extent[0] * extent[1], 1.0), 1.0)
 
     def log_choose(a: int, b: int) -> float:
         return math.lgamma(a + 1) - math.lgamma(b + 1) - math.lgamma(a - b + 1)

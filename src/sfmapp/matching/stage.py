@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import Camera, pixels_to_normalized
-from sfmapp.camera.lens import BROWN, RATIONAL, SKEW
+from sfmapp.camera.camera import Camera, pixels_to_rays
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.geometry import epipolar
@@ -101,7 +100,7 @@ def match_images(
     events.started(_STAGE, f"matching {len(pairs)} pairs", total=len(pairs))
     if num_known:
         events.advanced(_STAGE, num_known)
-    _tell_of_wide_angles(cameras, features, events)
+    _tell_of_blind_corners(cameras, features, events)
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         to_do = [pair for pair in pairs if pair not in done]
         guidable = sorted({i for pair in to_do for i in pair if is_guidable(features[i], options)})
@@ -138,19 +137,19 @@ def match_images(
     return join_pairs(pair_image_idx, results), report
 
 
-def _tell_of_wide_angles(cameras: Sequence[Camera], features: Sequence[Features], events: Events) -> None:
-    """Say how many features are too far off the axis of their lens to take part."""
-    total = beyond = 0
+def _tell_of_blind_corners(cameras: Sequence[Camera], features: Sequence[Features], events: Events) -> None:
+    """Say how many features lie where their lens has no inverse, as in the corners about a circular picture."""
+    total = blind = 0
     for camera, each in zip(cameras, features, strict=True):
-        if camera.family not in (BROWN, RATIONAL, SKEW):
+        if camera.is_wide:
             xy = each.keypoints[:, :2].astype(np.float64)
             total += len(xy)
-            beyond += int(np.isnan(pixels_to_normalized(camera, xy)[:, 0]).sum())
-    if beyond:
+            blind += int(np.isnan(pixels_to_rays(camera, xy)[:, 0]).sum())
+    if blind:
         events.warned(
             _STAGE,
-            f"{beyond} of {total} features of wide lenses lie more than 88 degrees off the axis, or where the lens has "
-            "no inverse: pairs are verified without them",
+            f"{blind} of {total} features of wide lenses lie where the lens has no inverse: pairs are verified without "
+            "them. If they are not in the black corners of the picture, the calibration is not of this lens",
         )
 
 
@@ -177,7 +176,7 @@ def verify_matches(
     start = time.monotonic()
     cameras = [image_set.cameras[image.camera_idx] for image in image_set.images]
     events.started(_STAGE, "verifying matches", total=None)
-    _tell_of_wide_angles(cameras, features, events)
+    _tell_of_blind_corners(cameras, features, events)
     futures: dict[tuple[int, int], Future[MatchedPair]] = {}
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         try:
@@ -237,6 +236,8 @@ def match_pair(
     start = time.thread_time()
     # 31 bits: OpenCV's state is a signed int
     ransac = Ransac(options.max_ransac_trials, int(np.random.SeedSequence(seed).generate_state(1)[0]) & 0x7FFFFFFF)
+    if any(camera.is_wide for camera in cameras):
+        backgrounds = (None, None)  # epipolar lines of what lies behind a camera are none
     if given is not None:
         putative = Putative(given)
     else:

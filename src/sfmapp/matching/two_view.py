@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import Camera, pixels_to_normalized
-from sfmapp.geometry import epipolar, homography, rigid3
+from sfmapp.camera.camera import Camera, pixels_to_normalized, pixels_to_rays
+from sfmapp.geometry import epipolar, five_point, homography, rigid3
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.search import (
     Ransac,
@@ -21,6 +21,7 @@ from sfmapp.matching.search import (
     find_homography,
     first_matrix,
     is_significant,
+    is_significant_of_rays,
     polish_fundamental,
 )
 from sfmapp.matching.second_motion import geometry_off_plane
@@ -35,6 +36,8 @@ _WATERMARK_BORDER_SHARE = 0.1
 _WATERMARK_MIN_SHARE = 0.7
 # With so many inliers among the matches there is nothing left that a second search could find.
 _CLEAN_SHARE = 0.9
+# Two views that a rotation explains so well have no baseline.
+_TURNED_SHARE = 0.9
 
 
 def _no_matrix() -> Array:
@@ -92,12 +95,30 @@ def verify_pair(
 ) -> TwoViewGeometry:
     """Find the geometry of a pair and the matches that it explains.
 
+    Where one of the cameras sees beyond its normalised plane, the essential matrix of unit rays is all that is looked
+    for, and F and H stay NaN: no matrix maps pixels of what lies behind a camera.
+
     Args:
         xy1, xy2: (N, 2) float64 matched pixels.
         camera1, camera2: their focals are trusted if their source is not ``default``, else only used for the pose.
         ransac: the same gives the same answer on any thread.
         fundamental: (3, 3) that is known to be nearly right, in place of a search.
     """
+    if camera1.is_wide or camera2.is_wide:
+        return _verify_rays(xy1, xy2, camera1, camera2, options, ransac)
+    return verify_front(xy1, xy2, camera1, camera2, options, ransac, fundamental)
+
+
+def verify_front(
+    xy1: Array,
+    xy2: Array,
+    camera1: Camera,
+    camera2: Camera,
+    options: MatchingOptions,
+    ransac: Ransac,
+    fundamental: Array | None = None,
+) -> TwoViewGeometry:
+    """:func:`verify_pair` on what lies up to 88 degrees from the axes, however wide the lenses are."""
     if len(xy1) < max(options.min_inliers, 8):
         return TwoViewGeometry(TwoViewConfig.UNDEFINED, np.zeros(len(xy1), bool))
     result, inliers = _verify(xy1, xy2, camera1, camera2, options, ransac, fundamental)
@@ -216,9 +237,12 @@ class _RelativePoses:
     # Enough that the pose is limited by the focal, not by the points; the adjustment has the last word anyway.
     max_points = 1000
 
-    def __init__(self, xy1: Array, xy2: Array, camera1: Camera, camera2: Camera, threshold: float) -> None:
+    def __init__(
+        self, xy1: Array, xy2: Array, camera1: Camera, camera2: Camera, threshold: float, *, on_rays: bool = False
+    ) -> None:
         self.k1, self.k2 = camera1.k_matrix, camera2.k_matrix
-        self.xn1, self.xn2 = pixels_to_normalized(camera1, xy1), pixels_to_normalized(camera2, xy2)
+        find = pixels_to_rays if on_rays else pixels_to_normalized
+        self.xn1, self.xn2 = find(camera1, xy1), find(camera2, xy2)
         self.is_valid = np.isfinite(self.xn1).all(1) & np.isfinite(self.xn2).all(1)
         self.scale = 2.0 * threshold / (camera1.focal + camera2.focal)
 
@@ -279,6 +303,53 @@ def _estimate_pose(
     inliers.e = epipolar.sampson_errors(result.essential, poses.xn1, poses.xn2) < poses.scale**2
 
 
+def _verify_rays(
+    xy1: Array, xy2: Array, camera1: Camera, camera2: Camera, options: MatchingOptions, ransac: Ransac
+) -> TwoViewGeometry:
+    """The essential matrix that explains most matches of views in all directions, or the rotation between them."""
+    result = TwoViewGeometry(TwoViewConfig.UNDEFINED, np.zeros(len(xy1), bool))
+    if len(xy1) < max(options.min_inliers, 8):
+        return result
+    threshold = error_threshold_px(camera1, camera2, options)
+    poses = _RelativePoses(xy1, xy2, camera1, camera2, threshold, on_rays=True)
+    a, b = poses.subset(np.ones(len(xy1), bool))
+    # half the threshold, as for the essential matrix of a plane: of the poses within it the better one
+    essential = five_point.find_essential(a, b, 0.5 * poses.scale, ransac.max_trials, ransac.seed)
+    result.config = TwoViewConfig.DEGENERATE
+    if essential is None:
+        return result
+    pose = poses.best([epipolar.decompose_essential(essential)], a, b)
+    essential = epipolar.essential_from_pose(pose)
+    depths, angles = epipolar.ray_depths(pose, poses.xn1, poses.xn2)
+    # a great circle goes all round: what lies far away is in front of both within the noise
+    meets = (depths > 0).all(1) | (angles <= poses.scale)
+    inlier = meets & (epipolar.sampson_errors(essential, poses.xn1, poses.xn2) < poses.scale**2)  # False for NaN
+    result.num_inliers_e = int(inlier.sum())
+    if result.num_inliers_e < options.min_inliers or not is_significant_of_rays(inlier, poses.scale):
+        return result
+    result.config, result.is_inlier, result.essential, result.cam2_from_cam1 = (
+        TwoViewConfig.CALIBRATED, inlier, essential, pose,
+    )  # fmt: skip
+    result.median_angle_deg = float(np.degrees(np.median(angles[inlier])))
+    rotation, is_turned = _turn_of_rays(*poses.subset(inlier), poses.scale)
+    if is_turned.mean() > _TURNED_SHARE:
+        result.config, result.essential, result.median_angle_deg = TwoViewConfig.PANORAMIC, _no_matrix(), 0.0
+        result.cam2_from_cam1 = rigid3.from_matrix(rotation, np.zeros(3))
+    elif _is_watermark(xy1, xy2, inlier, camera1, camera2, threshold):
+        result.config = TwoViewConfig.WATERMARK
+    return result
+
+
+def _turn_of_rays(a: Array, b: Array, scale: float) -> tuple[Array, Mask]:
+    """The rotation (3, 3) that takes most of the unit rays a (N, 3) to b, and which are within the scale (radians)."""
+    weights = np.ones(len(a))
+    for _ in range(3):
+        rotation = homography.rotation_from_rays(a, b, weights)
+        error = ((a @ rotation.T - b) ** 2).sum(1) / scale**2
+        weights = 1.0 / (1.0 + error)
+    return rotation, error < 1.0
+
+
 def _is_watermark(xy1: Array, xy2: Array, inlier: Mask, camera1: Camera, camera2: Camera, threshold: float) -> bool:
     in_border = inlier.copy()
     for xy, camera in ((xy1, camera1), (xy2, camera2)):
@@ -309,7 +380,7 @@ def _tell_planar_apart(result: TwoViewGeometry, inlier_h: Mask, poses: _Relative
     log_focal, reach = 0.0, math.log(1.3 if is_calibrated else 2.0)
     for _ in range(3):  # a grid within a grid leaves 2 % of focal, then 0.5 %
         rotation, errors = _rotation_only(a, b, poses.scale, log_focal)
-        if (errors < 1.0).mean() > 0.9:
+        if (errors < 1.0).mean() > _TURNED_SHARE:
             result.config, result.is_inlier = TwoViewConfig.PANORAMIC, inlier_h
             result.cam2_from_cam1 = rigid3.from_matrix(rotation, np.zeros(3))
             result.essential, result.median_angle_deg = _no_matrix(), 0.0

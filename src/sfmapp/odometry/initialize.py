@@ -13,7 +13,7 @@ from sfmapp.geometry import epipolar, homography, rigid3
 from sfmapp.geometry.planar_motion import estimate_planar_motion
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.search import Ransac
-from sfmapp.matching.two_view import TwoViewGeometry, verify_pair
+from sfmapp.matching.two_view import TwoViewGeometry, verify_front
 from sfmapp.odometry.frontend.alignment import align_patches
 from sfmapp.odometry.frontend.corners import find_corners
 from sfmapp.odometry.frontend.pose_choice import RIVAL_SHARE, explaining_poses, is_way_known, tells_apart
@@ -142,7 +142,7 @@ class MapInitializer:
     def _two_views(self, track: NDArray[np.int64]) -> TwoViews | None:
         xy1, xy2 = self.corners[track], self.seen[-1][track]
         limit = max(1.0, 1e-3 * self.camera.width)
-        found = verify_pair(
+        found = verify_front(
             xy1, xy2, self.camera, self.camera, MatchingOptions(max_error_px=limit), Ransac(2000, self.seed)
         )
         if self.options.motion == "planar" and found.config != TwoViewConfig.PANORAMIC:

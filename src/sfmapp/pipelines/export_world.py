@@ -87,7 +87,9 @@ class World:
     def notes(self, system: CoordinateSystem | None, offset: str = "") -> tuple[str, ...]:
         """What a user of coordinates has to know."""
         if self.georeference is None:
-            return ("the model is in no frame of the world: coordinates are its own, in an arbitrary unit",)
+            return (
+                "the model is in no frame of the world: coordinates are its own, in metres only if it was given some",
+            )
         if system is None:
             where = self.georeference
             return (

@@ -32,7 +32,13 @@ from sfmapp.pipelines.dense.source import DenseSource, find_source, model_digest
 from sfmapp.report.model import UndistortedCamera, UndistortNumbers, UndistortReport
 from sfmapp.reporting import NamedReason
 from sfmapp.scene.reconstruction import Reconstruction
-from sfmapp.scene.undistortion import Undistortion, has_distortion, plan_undistortion, undistort_reconstruction
+from sfmapp.scene.undistortion import (
+    Undistortion,
+    has_distortion,
+    plan_undistortion,
+    undistort_reconstruction,
+    warn_of_sides,
+)
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.keys import input_key, stage_key
 from sfmapp.workspace.layout import UNDISTORT
@@ -119,6 +125,7 @@ def undistort(
             model, where.images, job.options.images,
             is_upright=where.is_upright, with_copies=True, threads=job.threads, events=job.events,
         )  # fmt: skip
+        warn_of_sides(job.photographs.cameras, STAGE, job.events)
         job.undistortions = [plan_undistortion(camera, blank_pixels, max_size) for camera in job.photographs.cameras]
         key = stage_key(
             (__name__,), None, [blank_pixels, max_size, where.is_upright], model_digest(where.model),

@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import Camera, pixels_to_normalized, project, simple_camera
+from sfmapp.camera.camera import Camera, bearings, project, simple_camera
 from sfmapp.camera.models import PARAM_NAMES, kind_of
 from sfmapp.camera.names import CameraModel
 from sfmapp.geometry import rigid3
@@ -23,7 +23,7 @@ from sfmapp.scene.rig import Rig, RigImages
 from sfmapp.scene.tracks import make_tracks
 
 Array = NDArray[np.float64]
-Layout = Literal["ring", "grid", "forward"]
+Layout = Literal["ring", "grid", "forward", "inside"]
 
 _DISTORTION = {
     "k1": -0.08, "k2": 0.02, "p1": 5e-4, "p2": -4e-4, "k3": -0.004, "k4": 0.001, "k5": 5e-4, "k6": 2e-4, "k0": -0.03,
@@ -96,8 +96,8 @@ def make_scene(
             :func:`synthetic_camera`, or those of the rig.
         sigma_px: standard deviation of the pixel noise in each coordinate.
         outlier_ratio: share of the observations replaced by a random pixel of the image.
-        layout: ``ring`` of inward cameras around an object, ``grid`` of aerial views, or ``forward`` motion down
-            a street.
+        layout: ``ring`` of inward cameras around an object, ``grid`` of aerial views, ``forward`` motion down a
+            street, or ``inside`` a hollow, looking anywhere.
         detection: probability that a visible point is observed.
         rig: of S cameras, that takes S images at once, with constant places on it: image S k + s is that of sensor s
             at frame k. ``num_images``, a multiple of S, counts them all. None for images that are on no rig.
@@ -356,8 +356,11 @@ def _poses(layout: Layout, num: int, rng: np.random.Generator) -> Array:
         centers = np.stack([column - (columns - 1) / 2, row - (columns - 1) / 2, np.full(num, 3.0)], 1) + jitter
         targets = centers * [1.0, 1.0, 0.0] + rng.normal(0.0, 0.3, (num, 3)) * [1.0, 1.0, 0.0]
         return _look_at(centers, targets, np.array([0.0, -1.0, 0.0]))
+    if layout == "inside":
+        centers = rng.uniform(-1.0, 1.0, (num, 3))
+        return _look_at(centers, centers + rng.normal(size=(num, 3)), np.array([0.0, 0.0, -1.0]))
     if layout != "forward":
-        raise ValueError(f"layout must be ring, grid or forward, got {layout!r}")
+        raise ValueError(f"layout must be ring, grid, forward or inside, got {layout!r}")
     centers = np.stack([np.zeros(num), np.zeros(num), 0.6 * np.arange(num)], 1) + jitter
     return _look_at(centers, centers + [0.0, 0.0, 5.0] + 3 * jitter, np.array([0.0, 1.0, 0.0]))
 
@@ -367,6 +370,9 @@ def _surface(layout: Layout, num: int, poses: Array, rng: np.random.Generator) -
     if layout == "ring":
         normals = _unit(rng.normal(size=(num, 3)))
         return normals * rng.uniform(0.7, 1.3, (num, 1)), normals
+    if layout == "inside":
+        outward = _unit(rng.normal(size=(num, 3)))
+        return outward * rng.uniform(2.5, 4.0, (num, 1)), -outward
     centers = rigid3.center(poses)
     low, high = centers.min(0), centers.max(0)
     if layout == "grid":
@@ -405,16 +411,19 @@ def _points_and_visibility(
 
 
 def _sees(camera: Camera, pose: Array, xyz: Array, normals: Array) -> NDArray[np.bool_]:
-    """(N,) bool: in front, inside the image, on the front side of the surface, and where the lens is one to one."""
+    """(N,) bool: in front (or anywhere, of a wide lens), inside the image, on the front side of the surface, and where
+    the lens is one to one."""
     xyz_cam = rigid3.apply(pose, xyz)
+    depth = np.linalg.norm(xyz_cam, axis=1) if camera.is_wide else xyz_cam[:, 2]
     # 75 degrees off the normal is about where detectors lose a patch
     facing = (_unit(rigid3.center(pose) - xyz) * normals).sum(1) > np.cos(np.radians(75))
-    near = (xyz_cam[:, 2] > 0.3) & (xyz_cam[:, 2] < 12.0)
+    near = (depth > 0.3) & (depth < 12.0)
     pixels = project(camera, xyz_cam)
     inside = (pixels > 0).all(1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
     seen: NDArray[np.bool_] = near & facing & inside
-    back = pixels_to_normalized(camera, pixels[seen])
-    seen[seen] = np.abs(back - xyz_cam[seen, :2] / xyz_cam[seen, 2:]).max(1, initial=0.0) < 1e-6
+    (back,) = bearings([camera], [pixels[seen]])
+    there = xyz_cam[seen, : back.shape[1]] / depth[seen, None]
+    seen[seen] = np.abs(back - there).max(1, initial=0.0) < 1e-6  # False for NaN
     return seen
 
 

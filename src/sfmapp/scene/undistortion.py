@@ -6,6 +6,7 @@ give the same camera: focal lengths stay, the picture grows or shrinks about the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.camera.names import CameraModel
+from sfmapp.events import Events
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
 
@@ -47,6 +49,19 @@ class Undistortion:
 def has_distortion(camera: Camera) -> bool:
     """Whether the camera is more than a pinhole."""
     return not camera.is_pinhole
+
+
+def warn_of_sides(cameras: Sequence[Camera], stage: str, events: Events) -> None:
+    """Say of which photographs, by their cameras, a plane holds no more than the front."""
+    wide = [camera.model.name for camera in cameras if camera.is_wide]
+    if wide:
+        names = ", ".join(sorted(set(wide)))
+        events.warned(
+            stage,
+            f"{len(wide)} photographs are by lenses that see to their sides and behind ({names}): only what lies in "
+            "front of them is laid out flat and used. For all round, cut them into pinhole pictures of several "
+            "directions, and reconstruct those",
+        )
 
 
 def plan_undistortion(camera: Camera, blank_pixels: float = 0.0, max_size: int | None = None) -> Undistortion:

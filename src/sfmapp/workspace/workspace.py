@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from sfmapp.events import Events
     from sfmapp.scene.reconstruction import Reconstruction
 
 
@@ -104,17 +105,29 @@ class Workspace:
             return None
 
     def write_models(
-        self, models: Sequence[Reconstruction], keypoints: list[NDArray[np.float64]] | None = None
+        self,
+        models: Sequence[Reconstruction],
+        keypoints: list[NDArray[np.float64]] | None = None,
+        events: Events | None = None,
     ) -> None:
         """Write ``sparse/0``, ``sparse/1`` and so on, and take away what an earlier run left behind them.
 
-        Only files that sfmapp itself writes are replaced or removed: whatever else lies in these folders stays.
+        Only files that sfmapp itself writes are replaced or removed: whatever else lies in these folders stays. The
+        events are told of cameras that COLMAP will refuse.
         """
         from sfmapp.formats.colmap import write_model
 
         for idx, model in enumerate(models):
             write_model(self.model(idx), model, keypoints)
         self._remove_models(len(models))
+        foreign = {camera.model for model in models for camera in model.cameras if not camera.model.is_colmaps}
+        if foreign and events is not None:
+            names = " and ".join(f"{model.name} (number {int(model)})" for model in sorted(foreign))
+            events.warned(
+                "output",
+                f"sparse/ holds {names} cameras, which COLMAP and what reads its files refuse; sfmapp reads them. For "
+                "other programs: sfmapp undistort, which writes pictures with PINHOLE cameras, or another model",
+            )
 
     def _remove_models(self, first: int) -> None:
         from sfmapp.formats.colmap import MODEL_FILES

@@ -15,7 +15,7 @@ from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.geometry import epipolar, rigid3
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.search import Ransac
-from sfmapp.matching.two_view import verify_pair
+from sfmapp.matching.two_view import verify_front
 from sfmapp.odometry.frontend.active_tracks import ActiveTracks, References
 from sfmapp.scene.correspondences import TwoViewConfig
 
@@ -45,7 +45,7 @@ def chain_pose(camera: Camera, tracks: ActiveTracks, references: References, xyz
         return None
     xy1, xy2 = tracks.reference_xy[mine], tracks.xy[mine]
     options = MatchingOptions(max_error_px=max(1.0, 1e-3 * camera.width))
-    found = verify_pair(xy1, xy2, camera, camera, options, Ransac(1000, seed))
+    found = verify_front(xy1, xy2, camera, camera, options, Ransac(1000, seed))
     usable = found.config in (TwoViewConfig.CALIBRATED, TwoViewConfig.PLANAR)
     if not usable or not found.median_angle_deg > _MIN_ANGLE_DEG:
         return None

@@ -238,7 +238,7 @@ def _write(
     """Models, trajectories and the report, which is returned."""
     workspace, ground_truth = job.workspace, sequence.ground_truth if sequence is not None else None
     with job.measured("output"):
-        workspace.write_models([entry.reconstruction for entry in after.maps])
+        workspace.write_models([entry.reconstruction for entry in after.maps], events=job.events)
         write_trajectories(workspace, after)
     fits = {
         name: [fit_to_ground_truth(result, ground_truth, m) for m in range(len(result.maps))]

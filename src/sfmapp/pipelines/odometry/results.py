@@ -71,7 +71,8 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
         # what matters most comes first, should the disk be full
         run.save_first(lambda: write_trajectories(workspace, result, facts))
         run.save_first(lambda: workspace.write_text("frames.csv", _frames_csv(result, facts)))
-        run.save_first(lambda: workspace.write_models([entry.reconstruction for entry in result.maps]))
+        models = [entry.reconstruction for entry in result.maps]
+        run.save_first(lambda: workspace.write_models(models, events=run.events))
         run.save_first(lambda: workspace.write_text("covariance.csv", _covariance_csv(result)))
         run.save_first(lambda: workspace.write_text("frame_covariance.csv", _frame_covariance_csv(result)))
     against = (

@@ -70,7 +70,7 @@ def write_results(
     facts = {"pixels": STORED, "orientations": noted_orientations(run.image_set.images)} if run.image_set else {}
     run.save_first(lambda: workspace.begin("mapping", keys.mapping, **facts))
     with run.stage("output"):
-        run.save_first(lambda: workspace.write_models(models, keypoints))
+        run.save_first(lambda: workspace.write_models(models, keypoints, run.events))
         if run.georeference is not None:
             write_georeference(workspace.folder, run.georeference)
         else:

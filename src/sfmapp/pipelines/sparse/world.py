@@ -50,7 +50,9 @@ def closing(run: Run, image_set: ImageSet) -> Callable[[list[Mapper]], None] | N
         if run.control is not None:
             from sfmapp.georeference.control_stage import control_models, positions_after
 
-            controlled = control_models(mappers, run.control, run.georeference, run.events)
+            controlled = control_models(
+                mappers, run.control, run.georeference, run.stages.georeference, run.events
+            )  # fmt: skip
             run.georeference = controlled.georeference
             positions = run.stages.georeference
             if positions is not None and controlled.georeference is not None:
