@@ -144,6 +144,7 @@ class FactorGraph:
 
     @property
     def factors(self) -> Any:
+        """gtsam.NonlinearFactorGraph of what was added; see the class."""
         if self._factors is None:
             import gtsam
 
@@ -152,6 +153,7 @@ class FactorGraph:
 
     @property
     def values(self) -> Any:
+        """gtsam.Values of variables that were inserted; see the class."""
         if self._values is None:
             import gtsam
 
