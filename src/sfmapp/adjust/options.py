@@ -28,14 +28,14 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class AdjustOptions:
-    """How a bundle adjustment is done. Lengths are in pixels; the noise of an observation counts as one pixel.
+    """Options of a bundle adjustment. Lengths are in pixels; the noise of an observation counts as one pixel.
 
     Attributes:
         loss: robust loss on the length of each residual; huber and cauchy as in Ceres and gtsam
-        loss_scale_px: residual length at which the loss begins to bend
+        loss_scale_px: residual length at which the loss turns from quadratic to robust
         max_iterations: Levenberg-Marquardt steps, rejected ones included
         relative_cost_tolerance: stop when an accepted step lowers the cost by less than this share
-        initial_damping: first share of the diagonal that is added to it; Ceres' 1 / trust region radius
+        initial_damping: share of the diagonal added to it at first; 1 / trust region radius in Ceres
         refine_focal: focal lengths may change
         refine_distortion: distortion coefficients may change
         refine_principal_point: principal points may change

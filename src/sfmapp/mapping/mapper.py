@@ -23,6 +23,7 @@ from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_in
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
 from sfmapp.mapping.report import CameraSigmas, ImageSigmas, InitialPairReport, Uncertainty
+from sfmapp.mapping.snapshot import ModelSnapshot
 from sfmapp.mapping.tracks import USELESS_CONFIGS
 from sfmapp.mapping.verified_pairs import MIN_MATCHES, pair_agreement
 from sfmapp.scene.correspondences import Correspondences
@@ -588,12 +589,8 @@ class Mapper:
         self.events.decided(
             STAGE, f"{message}; {summary.num_points} points, {summary.mean_reprojection_error_px:.2f} px",
             **summary,
-            snapshot={
-                "image_idx": images,
-                "cam_from_world": self.reconstruction.cam_from_world.copy(),
-                "point_xyz": self.reconstruction.point_xyz.astype(np.float32),
-                "num_registered": summary.num_registered,
-                "num_points": summary.num_points,
-                "mean_error_px": summary.mean_reprojection_error_px,
-            },
+            snapshot=ModelSnapshot(
+                tuple(images), summary.num_registered, summary.num_points, summary.mean_reprojection_error_px,
+                self.reconstruction.cam_from_world.copy(), self.reconstruction.point_xyz.astype(np.float32),
+            ),
         )  # fmt: skip
