@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from machine import RESULTS, describe_machine
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.camera.camera import Camera, CameraModel, project, simple_camera
 from sfmapp.events import Events
@@ -37,7 +38,6 @@ from sfmapp.scene.synthetic import SyntheticScene, true_correspondences
 from sfmapp.scene.tracks import make_tracks
 
 Array = NDArray[np.float64]
-RESULTS = Path(__file__).parent / "results"
 KINDS = ("grid", "orbit", "walk")
 # by name: sigma along east and north, of heights (metres), and whether the tags say so
 RECEIVERS = {"phone": (3.0, 6.0, False), "rtk": (0.02, 0.03, True)}
@@ -268,7 +268,7 @@ def summarize(outcomes: list[Outcome]) -> dict[str, float]:
 
 def write_results(rows: list[dict[str, Any]]) -> None:
     """The table as JSON and as Markdown."""
-    (RESULTS / "surveys.json").write_text(json.dumps(rows, indent=1) + "\n")
+    (RESULTS / "surveys.json").write_text(json.dumps(describe_machine() | {"rows": rows}, indent=1) + "\n")
     lines = [
         "# Positions: how often intervals hold the truth",
         "",

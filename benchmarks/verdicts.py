@@ -187,6 +187,9 @@ def promises(folder: Path) -> Iterator[Promise]:
     within = sum(abs(run["error_percent"]) <= 2 * run["sigma_percent"] for run in found)
     text = "a self-calibrated focal length is within two stated sigmas"
     yield Promise("self_calibration", text, within, len(found), report["date"][:10])
+    report = read(folder, "surveys")
+    found, wrong = (sum(row[name] for row in report["rows"]) for name in ("found", "wrong"))
+    yield Promise("surveys", "a grossly wrong position is found", found, wrong, report["date"][:10])
     report = read(folder, "odometry")
     same = [row["same_bytes"] for row in report["rows"]]
     yield Promise("odometry", "two runs write the same bytes", sum(same), len(same), report["date"][:10])

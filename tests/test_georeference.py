@@ -12,6 +12,7 @@ import pytest
 import surveys
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
+from sfmapp.georeference.adjustment import drift
 from sfmapp.georeference.fit import robust_fit
 from sfmapp.georeference.options import GpsOptions
 from sfmapp.georeference.stage import Placed, georeference_models
@@ -233,3 +234,23 @@ def test_a_position_that_is_written_twice_counts_once(
     placed, _ = georeferenced(changed(image_set, {11: first, 12: first}), orbit)
     assert [row.name for row in placed.report.images if not row.is_used] == ["image0011.jpg", "image0012.jpg"]
     assert "no new measurement" in placed.report.findings[0].message
+
+
+def test_drift_of_a_receiver_is_seen_and_independent_errors_are_not_taken_for_it() -> None:
+    seen = {}
+    for rho in (0.0, 0.7):
+        inflated = []
+        for seed in range(40):
+            centers, places, _, _ = similar(seed, 30)
+            rng = np.random.default_rng([seed, 9])
+            error = rng.normal(size=(30, 3))
+            for k in range(1, 30):
+                error[k] = rho * error[k - 1] + np.sqrt(1 - rho**2) * error[k]
+            fit = robust_fit(centers, places + error, np.full((30, 3), 1.0), NOT_STATED)
+            assert fit is not None
+            inflated.append(drift(fit, np.arange(30))[1])
+        seen[rho] = np.array(inflated)
+    # one in twenty by chance; drift of 0.7 asks for a factor of 2.4, of which the fit itself takes some away
+    assert (seen[0.0] > 1.0).mean() < 0.15
+    assert (seen[0.7] > 1.0).mean() > 0.9
+    assert 1.6 < np.median(seen[0.7]) < 2.6

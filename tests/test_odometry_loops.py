@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+from itertools import pairwise
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 
 from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.odometry.frontend.pyramid import build_pyramid
 from sfmapp.odometry.loops import relocalize as relocalization
 from sfmapp.odometry.loops.closing import apply_closure, fuse_points, join_maps
 from sfmapp.odometry.loops.detection import LoopFinder, LoopOptions
@@ -24,6 +27,8 @@ from sfmapp.odometry.loops.relocalize import (
     twist,
 )
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.map.local_map import View as FrameView
+from sfmapp.odometry.recognition import Recognition
 from sfmapp.scene.rig import Rig
 
 Array = np.ndarray
@@ -249,6 +254,46 @@ def test_a_lost_image_is_found_again(walked: tuple[KeyframeMap, PlaceIndex], wal
         assert located.agreement > 0.7
         seen = project(CAMERA, rigid3.apply(pose, keyframes.point_xyz[located.point_id]))
         assert np.median(np.linalg.norm(seen - corners(image)[located.corner_idx], axis=1)) < 1.5
+
+
+def frame_of(frame_idx: int, image: Array) -> FrameView:
+    return FrameView(frame_idx, 0.1 * frame_idx, f"{frame_idx:04d}", (image,), (build_pyramid(image),))
+
+
+def test_recognition_remembers_what_is_new_and_finds_lost_frames_roll_by_roll(wall: Wall) -> None:
+    """Steps of 0.3 m before 3.4 m of wall: half of the points are new after five of them or six."""
+    walker, recognition = Walker(wall), Recognition(seed=0)
+    local = SimpleNamespace(map_idx=0, keyframes=walker.keyframes, newest=-1)
+    maps = {0: local}
+    assert recognition.find(maps, frame_of(0, wall.photograph(pose_at(4.0, 4.0), 0))) is None  # nothing is known yet
+    for n in range(41):
+        keyframe = walker.step(n, pose_at(4.0 + 0.3 * n, 4.0))
+        local.newest = n
+        view = frame_of(n, walker.images[n])
+        assert recognition.remember(maps, local, view, keyframe.xy[:, 0], keyframe.point_id) is None
+    places = recognition._places
+    known = sorted(places._row)
+    assert known[0] == 0
+    assert 6 <= len(known) <= 10
+    shared = [np.isin(places[b].point_id, places[a].point_id).mean() for a, b in pairwise(known)]
+    assert 0.3 < max(shared) <= 0.5
+    # a frame with a roll of 27 degrees: the first search looks straight, the second at a roll that fits
+    lost = frame_of(99, wall.photograph(pose_at(9.1, 4.1, 3.1, 27.0), 99))
+    pose = pose_at(9.1, 4.1, 3.1, 27.0)
+    found = [recognition.find(maps, lost) for _ in range(3)]
+    assert [one is not None for one in found] == [False, True, False]
+    assert found[1] is not None
+    assert found[1][0] is local
+    assert np.linalg.norm(rigid3.center(found[1][2]) - rigid3.center(pose)) < 0.03
+    seen = project(CAMERA, rigid3.apply(pose, walker.keyframes.point_xyz[found[1][3]]))
+    assert np.median(np.linalg.norm(seen - found[1][4], axis=1)) < 1.5
+    # a white frame has nothing to be known by, and a place that was forgotten is no candidate
+    assert recognition.find(maps, frame_of(100, np.full((240, 320), 255, np.uint8))) is None
+    near = found[1][1]
+    assert recognition.forget(near)
+    assert near not in places
+    again = [recognition.find(maps, lost) for _ in range(3)]
+    assert all(one is None or one[1] != near for one in again)
 
 
 def test_a_turned_image_is_found_at_the_roll_it_is_tried_with(

@@ -13,6 +13,7 @@ import pytest
 
 from odometry_fakes import FPS, FakeRunner, FakeSequence, path
 from schemas import check_schema
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.errors import InterruptedRunError, NoReconstructionError, UsageError
 from sfmapp.evaluation.trajectory import Trajectory, absolute_error, associate
@@ -40,6 +41,13 @@ from sfmapp.scene.rig import Rig
 from sfmapp.workspace.options import Options, load_options, options_from_dict
 
 Patch = pytest.MonkeyPatch
+
+
+def test_the_gtsam_backend_is_refused_with_the_reason(tmp_path):
+    options = Options(adjust=AdjustOptions(backend="gtsam"))
+    with pytest.raises(UsageError, match="windows while it tracks") as failure:
+        track_sequence(tmp_path, tmp_path / "out", options)
+    assert "sfmapp refine" in failure.value.advice
 
 
 def use(monkeypatch: Patch, sequence: FakeSequence, runner: object) -> None:

@@ -15,6 +15,10 @@ import sfmapp
 from schemas import check_schema
 from sfmapp.errors import InputError, InterruptedRunError, NoReconstructionError, TooFewImagesError
 from sfmapp.events import Event, Events
+from sfmapp.formats.colmap import read_model
+from sfmapp.geometry import rigid3
+from sfmapp.geometry.geodesy import LocalFrame
+from sfmapp.georeference.world_frame import read_georeference
 from sfmapp.pipelines.sparse.reconstruct import RunResult, reconstruct
 from sfmapp.viewer.recording import RecordingReport
 from sfmapp.workspace.options import Options, load_options
@@ -405,3 +409,38 @@ def test_a_bug_leaves_its_traceback_in_the_log_and_a_workspace_that_resumes(
     monkeypatch.undo()
     run(photos, output, None, counter)
     assert counter.num_extracted == 0
+
+
+def test_positions_of_a_file_bring_the_model_into_the_world_and_none_take_it_back(
+    photos: Path, copy: Path, tmp_path: Path
+) -> None:
+    model = read_model(copy / "sparse" / "0")[0]
+    frame, rng = LocalFrame(47.4, 8.5, 430.0), np.random.default_rng(0)
+    # the model's own places, ten units to the metre and turned, as a receiver would measure them to a centimetre
+    turn = rigid3.exp_so3([0.3, -0.2, 1.0])
+    places = 10.0 * model.centers @ turn.T + rng.normal(0.0, 0.01, (7, 3))
+    rows = [
+        f"{name},{latitude:.9f},{longitude:.9f},{height:.3f},0.01,0.01"
+        for name, (latitude, longitude, height) in zip(
+            model.image_names, frame.geodetic_from_enu(places).tolist(), strict=True
+        )
+    ]
+    table = tmp_path / "gps.csv"
+    table.write_text("\n".join(["image,latitude,longitude,height,sigma,sigma_up", *rows]) + "\n")
+    before = model_bytes(copy)
+    run(photos, copy, load_options(settings=[f"gps.source={table}"]))
+    found = read_georeference(copy)
+    assert found is not None
+    place = found.place_of(0)
+    assert place is not None
+    spread = np.linalg.norm(places - places.mean(0), axis=1).max()
+    assert place.scale == pytest.approx(10.0, abs=10.0 * (5 * place.scale_sigma_share + 0.02 / spread))
+    moved = read_model(copy / "sparse" / "0")[0].centers
+    np.testing.assert_allclose(frame.enu_from_geodetic(found.frame.geodetic_from_enu(moved)), places, rtol=0, atol=0.06)
+    report = json.loads((copy / "report.json").read_text())
+    check_schema("reconstruct", report)
+    assert report["stages"]["georeference"]["models"][0]["num_used"] == 7
+    assert "North is up" in (copy / "report.html").read_text()
+    run(photos, copy)
+    assert read_georeference(copy) is None
+    assert model_bytes(copy) == before

@@ -20,6 +20,7 @@ from sfmapp.geometry.upright import up_direction
 from sfmapp.images.image_set import ImageOptions, ImageRecord, ImageSet
 from sfmapp.images.load import load_images
 from sfmapp.images.pixels import read_rgb
+from sfmapp.mapping.snapshot import ModelSnapshot
 from sfmapp.scene.features import Features
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
@@ -113,10 +114,7 @@ def replayed(model: Reconstruction) -> RecordingListener:
         xyz[:: count + 1] = np.nan
         events.decided(
             "mapping", f"registered {count - 1}", num_points=3,
-            snapshot={
-                "cam_from_world": poses, "point_xyz": xyz, "num_registered": count, "num_points": 40,
-                "image_idx": [0, 1] if count == 2 else count - 1, "mean_error_px": 0.5,
-            },
+            snapshot=ModelSnapshot((0, 1) if count == 2 else (count - 1,), count, 40, 0.5, poses, xyz),
         )  # fmt: skip
     events.warned("mapping", "two images are left")
     return listener
@@ -235,10 +233,7 @@ def test_listener_stays_small_in_a_long_run() -> None:
     for k in range(num_steps):
         events.decided(
             "mapping", "m",
-            snapshot={
-                "step": k % 400, "cam_from_world": poses, "point_xyz": xyz if k % 3 == 0 else None, "image_idx": None,
-                "num_registered": 2, "num_points": num_tracks, "mean_error_px": 1.0,
-            },
+            snapshot=ModelSnapshot((), 2, num_tracks, 1.0, poses, xyz if k % 3 == 0 else None),
         )  # fmt: skip
     steps = [step.step for step in listener.steps]
     assert len(steps) == num_steps
@@ -262,10 +257,7 @@ def test_listener_keeps_no_reference_to_the_arrays_of_the_run() -> None:
     poses, xyz = np.zeros((2, 7)), np.zeros((5, 3), np.float32)
     Events(listener).decided(
         "mapping", "m",
-        snapshot={
-            "cam_from_world": poses, "point_xyz": xyz, "image_idx": 1, "num_registered": 1, "num_points": 5,
-            "mean_error_px": 0.0,
-        },
+        snapshot=ModelSnapshot((1,), 1, 5, 0.0, poses, xyz),
     )  # fmt: skip
     poses[:], xyz[:] = 9, 9
     assert not listener.steps[0].cam_from_world.any()  # type: ignore[union-attr]

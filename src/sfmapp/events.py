@@ -20,7 +20,7 @@ Kind = Literal["started", "advanced", "decided", "warned", "finished"]
 
 @dataclass(frozen=True)
 class Event:
-    """One thing that happened.
+    """One thing that happened in a run: a stage began, went on or ended, something was decided or warned of.
 
     Attributes:
         kind: ``started``, ``advanced``, ``decided``, ``warned`` or ``finished``.
@@ -45,7 +45,7 @@ Listener = Callable[[Event], None]
 
 
 class Events:
-    """A thread-safe line from the stages to the listeners, and the request to stop back to the stages."""
+    """A thread-safe channel from the stages to the listeners, and for the request to stop back to the stages."""
 
     def __init__(self, *listeners: Listener) -> None:
         self._listeners = list(listeners)

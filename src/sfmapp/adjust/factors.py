@@ -14,6 +14,7 @@ import numpy as np
 from gtsam.symbol_shorthand import K, L, X
 from numpy.typing import NDArray
 
+from sfmapp.adjust.linear import gather_scaled, group_blocks
 from sfmapp.adjust.options import REJECTED_WEIGHT, FactorReport
 from sfmapp.adjust.problem import Mentioned, Problem, free_values
 from sfmapp.geometry import rigid3
@@ -23,6 +24,9 @@ Places = NDArray[np.int64]
 
 # The most rows that a block has.
 _MAX_DIM = 8
+# gtsam refuses a pivot that is 2^24 times smaller than the one before, as those are that only the damping of a free
+# gauge holds. With this share of the diagonal added none is; rounds until the residual is this share of what it was.
+_ENOUGH, _SOLVED, _MAX_ROUNDS = 2.0**-21, 1e-12, 50
 
 
 def gtsam_pose(cam_from_world: Array) -> Any:
@@ -239,53 +243,134 @@ class ExtraFactors:
 
 
 class SparseSystem:
-    """The reduced system as gtsam Hessian factors, one per pair of blocks that meet (keys a B + b in order, and numbers
-    of their tiles), eliminated by gtsam in COLAMD order: an approximate minimum degree. METIS takes as long, and fails
-    where a block meets no other. Unknowns are scaled to a unit diagonal, as gtsam compares pivots of different units.
+    """The reduced system as gtsam Hessian factors, eliminated by gtsam.
+
+    Poses that see much the same are one variable of the linear system: with a factor for each pair of single poses
+    gtsam takes three times as long. The order is COLAMD's, an approximate minimum degree; METIS takes as long, and
+    fails where a block meets no other. Unknowns are scaled to a unit diagonal, as gtsam compares pivots of different
+    units.
+
+    Args:
+        keys: (N,) a B + b of the pairs of blocks a <= b that meet, in order; numbers: (N,) their tiles.
+        own_keys: of the blocks that only the other factors know.
     """
 
     def __init__(self, problem: Problem, keys: Places, numbers: Places, own_keys: list[int]) -> None:
-        blocks, first = problem.num_blocks, problem.num_pose_blocks
-        images = problem.image_idx[problem.pose_images[problem.pose_block >= 0]]
-        own = np.flatnonzero(problem.camera_block >= first)
-        self._keys = [X(int(i)) for i in images]
-        for c in own:
-            number = int(problem.camera_idx[c])
-            self._keys += [K(number), *([gtsam.symbol("j", number)] if problem.second_block[c] >= 0 else [])]
-        self._keys += [L(int(t)) for t in problem.track_idx[problem.point_block >= 0]]
-        self._keys += own_keys
-        self._first, self._second = np.divmod(keys, blocks)
-        self._numbers, self._diagonal = numbers, numbers[self._first == self._second]
-        self._pairs = list(zip(self._first.tolist(), self._second.tolist(), strict=True))
-        self._dims = problem.block_dim.tolist()
+        blocks, dims = problem.num_blocks, problem.block_dim
+        first, second = np.divmod(keys, blocks)
+        self._pairs = np.stack([first, second, numbers], 1)
+        self._diagonal, self._dims = numbers[first == second], dims
+        near = np.zeros((blocks, blocks), bool)
+        near[first, second] = near[second, first] = True
+        groups = group_blocks(near, problem.num_pose_blocks)
+        of_block, row = np.empty(blocks, np.int64), np.empty(blocks, np.int64)
+        for n, group in enumerate(groups):
+            of_block[group], row[group] = n, np.cumsum(dims[group]) - dims[group]
+        self._rows = [np.concatenate([8 * b + np.arange(dims[b]) for b in group]) for group in groups]
+        sizes = np.array([len(rows) for rows in self._rows])
+        low, high = of_block[first], of_block[second]
+        is_turned = low > high
+        low, high = np.where(is_turned, high, low), np.where(is_turned, low, high)
+        met, of_pair = np.unique(low * len(groups) + high, return_inverse=True)
+        self._group_pairs = np.stack(np.divmod(met, len(groups)), 1)
+        areas = sizes[self._group_pairs].prod(1)
+        start = np.cumsum(areas) - areas
+        upper, left = np.where(is_turned, row[second], row[first]), np.where(is_turned, row[first], row[second])
+        width = sizes[high]
+        self._places = np.stack([start[of_pair] + upper * width + left, width, is_turned.astype(np.int64)], 1)
+        self._buffer = np.zeros(int(areas.sum()))
+        shapes = [(sizes[i], sizes[j]) for i, j in self._group_pairs]
+        self._matrices = [
+            self._buffer[s : s + a].reshape(shape) for s, a, shape in zip(start, areas, shapes, strict=True)
+        ]
+        names = _block_keys(problem, own_keys)
+        self._keys = [names[group[0]] for group in groups]
+        self._empty = [(np.zeros((size, size)), np.zeros(size)) for size in sizes]
         self._ordering: Any = None
+        self._is_weak = False
 
     def solve(self, tiles: Array, rhs: Array) -> Array | None:
         """Solution (B * 8,) of the damped system in tiles (N * 64,), None where it is not positive definite."""
-        graph, factor, keys, dims = gtsam.GaussianFactorGraph(), gtsam.HessianFactor, self._keys, self._dims
-        tiles = tiles.reshape(-1, 8, 8)
-        diagonal = tiles[self._diagonal][:, np.arange(8), np.arange(8)]
+        diagonal = tiles.reshape(-1, 8, 8)[self._diagonal][:, np.arange(8), np.arange(8)]
         if not (diagonal > 0.0).all():
             return None
         root = 1.0 / np.sqrt(diagonal)
-        right = rhs.reshape(-1, 8) * root
-        scaled = tiles[self._numbers] * root[self._first][:, :, None] * root[self._second][:, None, :]
-        nothing = [(np.zeros((d, d)), np.zeros(d)) for d in range(9)]
-        for n, (a, b) in enumerate(self._pairs):
-            p, q = dims[a], dims[b]
-            block = scaled[n, :p, :q]
-            if a == b:
-                graph.push_back(factor(keys[a], block, right[a, :p], 0.0))
+        gather_scaled(tiles, self._pairs, self._places, root, self._dims, self._buffer)
+        right = rhs * root.ravel()
+        graph, factor, keys, empty = gtsam.GaussianFactorGraph(), gtsam.HessianFactor, self._keys, self._empty
+        for (i, j), matrix in zip(self._group_pairs.tolist(), self._matrices, strict=True):
+            if i == j:
+                graph.push_back(factor(keys[i], matrix, right[self._rows[i]], 0.0))
             else:
-                (zero_a, none_a), (zero_b, none_b) = nothing[p], nothing[q]
-                graph.push_back(factor(keys[a], keys[b], zero_a, block, none_a, zero_b, none_b, 0.0))
+                graph.push_back(factor(keys[i], keys[j], empty[i][0], matrix, empty[i][1], *empty[j], 0.0))
         if self._ordering is None:
             self._ordering = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
-        try:
-            solution = graph.optimize(self._ordering)
-        except RuntimeError:  # indeterminate: the caller raises the damping
-            return None
-        step = np.zeros((len(dims), 8))
-        step[np.arange(8) < np.array(dims)[:, None]] = solution.vector(keys)
-        found: Array = (step * root).ravel()
+        found: Array | None = None
+        if not self._is_weak:
+            try:
+                found = self._unpacked(graph.optimize(self._ordering))
+            except RuntimeError:  # pivots of what only the damping holds are too small for it
+                self._is_weak = True
+        if found is None:
+            found = self._solve_weak(graph, right)
+        if found is not None:
+            found *= root.ravel()
         return found
+
+    def _solve_weak(self, graph: Any, right: Array) -> Array | None:
+        """The same by conjugate gradients, with gtsam's factor of the system with a little more on its diagonal."""
+        for key, (square, nothing) in zip(self._keys, self._empty, strict=True):
+            graph.push_back(gtsam.HessianFactor(key, _ENOUGH * np.eye(len(square)), nothing, 0.0))
+        try:
+            net = graph.eliminateSequential(self._ordering)
+        except RuntimeError:  # not positive definite: the caller raises the damping
+            return None
+        found, rest = np.zeros(len(right)), right.copy()
+        better = direction = self._unpacked(net.backSubstitute(net.backSubstituteTranspose(self._packed(rest))))
+        gain = rest @ better
+        for _ in range(_MAX_ROUNDS):
+            image = self._product(direction)
+            curvature = direction @ image
+            if not curvature > 0.0:
+                break
+            found += gain / curvature * direction
+            rest -= gain / curvature * image
+            if np.abs(rest).max() <= _SOLVED * np.abs(right).max():
+                break
+            better = self._unpacked(net.backSubstitute(net.backSubstituteTranspose(self._packed(rest))))
+            before, gain = gain, rest @ better
+            direction = better + gain / before * direction
+        return found
+
+    def _product(self, x: Array) -> Array:
+        """The scaled system times x (B * 8,)."""
+        out = np.zeros(len(x))
+        for (i, j), matrix in zip(self._group_pairs.tolist(), self._matrices, strict=True):
+            if i == j:
+                upper = np.triu(matrix)
+                out[self._rows[i]] += upper @ x[self._rows[i]] + np.triu(matrix, 1).T @ x[self._rows[i]]
+            else:
+                out[self._rows[i]] += matrix @ x[self._rows[j]]
+                out[self._rows[j]] += matrix.T @ x[self._rows[i]]
+        return out
+
+    def _packed(self, x: Array) -> Any:
+        out = gtsam.VectorValues()
+        for key, rows in zip(self._keys, self._rows, strict=True):
+            out.insert(key, x[rows])
+        return out
+
+    def _unpacked(self, values: Any) -> Array:
+        out = np.zeros(8 * len(self._dims))
+        out[np.concatenate(self._rows)] = values.vector(self._keys)
+        return out
+
+
+def _block_keys(problem: Problem, own_keys: list[int]) -> list[int]:
+    """gtsam's keys of all blocks; X(i) where the intrinsics of an image stand in the block of its pose."""
+    images = problem.image_idx[problem.pose_images[problem.pose_block >= 0]]
+    out = [X(int(i)) for i in images]
+    for c in np.flatnonzero(problem.camera_block >= problem.num_pose_blocks):
+        number = int(problem.camera_idx[c])
+        out += [K(number), *([gtsam.symbol("j", number)] if problem.second_block[c] >= 0 else [])]
+    return [*out, *(L(int(t)) for t in problem.track_idx[problem.point_block >= 0]), *own_keys]

@@ -16,23 +16,45 @@ Ints = NDArray[np.int64]
 
 SolverName = Literal["tiles", "gtsam", "lapack"]
 
-# Measured by benchmarks/reduced_systems.py; fill is the share of pairs of blocks that meet. A closing adjustment goes
-# to gtsam up to the fill at which LAPACK begins to be quicker, of whatever size. The quick rounds keep the tiles up to
-# the size at which nothing beats them by much, and beyond that in the range of fill in which they are quickest.
-_GTSAM_FILL, _FEW_BLOCKS, _TILES_FILL = 0.15, 160, (0.3, 0.5)
+# Measured by benchmarks/reduced_systems.py; fill is the share of pairs of blocks that meet. In a closing adjustment
+# gtsam is as quick as LAPACK up to about a quarter, of whatever size. Beyond that it falls behind by up to four times,
+# which is less than 30 ms a step up to 800 unknowns, and not worth it where the system is nearly full.
+_GTSAM_FILL, _SMALL, _NEARLY_FULL = 0.25, 800, 0.75
+# The quick rounds keep the tiles up to the size at which nothing beats them by much, and beyond that in the range of
+# fill in which they are quickest.
+_FEW_BLOCKS, _TILES_FILL = 160, (0.3, 0.5)
+# Poses that gtsam eliminates together.
+_GROUP = 6
 # What rounding leaves of a zero pivot, against the diagonal before.
 _NO_PIVOT = 1e-14
 
 
-def choose_solver(num_blocks: int, fill: float, *, is_closing: bool) -> SolverName:
+def choose_solver(num_blocks: int, num_unknowns: int, fill: float, *, is_closing: bool) -> SolverName:
     """What solves a reduced system best."""
     if is_closing:
-        return "gtsam" if fill <= _GTSAM_FILL else "lapack"
+        limit = _NEARLY_FULL if num_unknowns <= _SMALL else _GTSAM_FILL
+        return "gtsam" if fill <= limit else "lapack"
     if num_blocks <= _FEW_BLOCKS:
         return "tiles"
     if fill <= _TILES_FILL[0]:
         return "gtsam"
     return "tiles" if fill <= _TILES_FILL[1] else "lapack"
+
+
+def group_blocks(near: NDArray[np.bool_], num_poses: int) -> list[Ints]:
+    """Blocks, ascending, in groups of poses that meet much the same blocks, others alone; near (B, B): which meet."""
+    out, is_free = [], np.ones(len(near), bool)
+    is_free[num_poses:] = False
+    for seed in range(num_poses):
+        if not is_free[seed]:
+            continue
+        is_free[seed] = False
+        others = np.flatnonzero(near[seed] & is_free)
+        shared = (near[others] & near[seed]).sum(1) / np.maximum(1, (near[others] | near[seed]).sum(1))
+        best = others[np.argsort(-shared, kind="stable")[: _GROUP - 1]]
+        is_free[best] = False
+        out.append(np.sort(np.append(best, seed)))
+    return [*out, *(np.array([b]) for b in range(num_poses, len(near)))]
 
 
 def aligned_zeros(*shape: int) -> Array:
@@ -272,6 +294,10 @@ class LapackSystem:
     """
 
     def __init__(self, block_dim: Ints, keys: Ints, numbers: Ints) -> None:
+        # loaded here, so that the caller finds the library that it is to hold to one thread
+        from scipy.linalg import lapack
+
+        self._lapack = lapack
         self._pairs = np.stack([*np.divmod(keys, len(block_dim)), numbers], 1)
         self._first = np.cumsum(block_dim) - block_dim
         self._dim, self._used = block_dim, np.arange(8) < block_dim[:, None]
@@ -279,15 +305,13 @@ class LapackSystem:
         self._matrix = np.zeros((size, size))
 
     def solve(self, tiles: Array, rhs: Array) -> Array | None:
-        from scipy.linalg.lapack import dpotrf, dpotrs
-
         _gather_upper(tiles, self._pairs, self._first, self._dim, self._matrix)
         diagonal = self._matrix.diagonal().copy()
         # the upper triangle by rows is the lower one by columns, which LAPACK works on in place
-        factor, info = dpotrf(self._matrix.T, lower=1, clean=0, overwrite_a=1)
+        factor, info = self._lapack.dpotrf(self._matrix.T, lower=1, clean=0, overwrite_a=1)
         if info != 0 or not (factor.diagonal() ** 2 > _NO_PIVOT * diagonal).all():
             return None
-        found, _ = dpotrs(factor, rhs.reshape(-1, 8)[self._used], lower=1)
+        found, _ = self._lapack.dpotrs(factor, rhs.reshape(-1, 8)[self._used], lower=1)
         step = np.zeros((len(self._dim), 8))
         step[self._used] = found
         return step.ravel()
@@ -302,3 +326,20 @@ def _gather_upper(tiles: Array, pairs: Ints, first: Ints, block_dim: Ints, matri
         for j in range(block_dim[a]):
             for k in range(block_dim[b]):
                 matrix[first[a] + j, first[b] + k] = tiles[tile * 64 + 8 * j + k]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def gather_scaled(tiles: Array, pairs: Ints, places: Ints, root: Array, block_dim: Ints, out: Array) -> None:
+    """Gather tiles, scaled by root (B, 8) on both sides, in the matrices of groups of blocks that lie in out.
+
+    pairs (M, 3) are blocks a, b and number of the tile; places (M, 3) where its first number goes, the width of that
+    matrix, and whether the tile is turned there.
+    """
+    out[:] = 0.0
+    for n in range(pairs.shape[0]):
+        a, b, tile = pairs[n]
+        start, width, is_turned = places[n]
+        for j in range(block_dim[a]):
+            for k in range(block_dim[b]):
+                value = tiles[tile * 64 + 8 * j + k] * root[a, j] * root[b, k]
+                out[start + (k * width + j if is_turned else j * width + k)] = value

@@ -28,14 +28,14 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class AdjustOptions:
-    """How a bundle adjustment is done. Lengths are in pixels; the noise of an observation counts as one pixel.
+    """Options of a bundle adjustment. Lengths are in pixels; the noise of an observation counts as one pixel.
 
     Attributes:
         loss: robust loss on the length of each residual; huber and cauchy as in Ceres and gtsam
-        loss_scale_px: residual length at which the loss begins to bend
+        loss_scale_px: residual length at which the loss turns from quadratic to robust
         max_iterations: Levenberg-Marquardt steps, rejected ones included
         relative_cost_tolerance: stop when an accepted step lowers the cost by less than this share
-        initial_damping: first share of the diagonal that is added to it; Ceres' 1 / trust region radius
+        initial_damping: share of the diagonal added to it at first; 1 / trust region radius in Ceres
         refine_focal: focal lengths may change
         refine_distortion: distortion coefficients may change
         refine_principal_point: principal points may change
@@ -128,3 +128,25 @@ class AdjustReport(Report):
     factors: Sequence[FactorReport] = ()
     num_left_out: int = 0
     wall_s: float = 0.0
+
+    def residual_text(self, factors: FactorReport) -> str:
+        """Normalised residual of some factors: of reprojections in pixels, of others in their standard deviations."""
+        if factors.kind == "reprojection":
+            return f"{factors.normalized_residual * self.noise_px:.2f} px"
+        return f"{factors.normalized_residual:.2f} sigmas"
+
+    @property
+    def text(self) -> str:
+        """In a line: the size, the solver, the costs, and what each kind of factor came to."""
+        solver = {"none": "gtsam, one factor per observation"}.get(self.solver, self.solver)
+        parts = [
+            f"{self.num_unknowns} unknowns, {self.fill:.0%} full, by {solver}",
+            f"{self.num_iterations} steps, {self.termination}",
+            f"cost {self.initial_cost:.6g} to {self.final_cost:.6g}",
+        ]
+        for f in self.factors:
+            rejected = f", {f.num_rejected} rejected" if f.num_rejected else ""
+            parts.append(f"{f.num_factors} {f.kind} at {self.residual_text(f)}{rejected}")
+        if self.num_left_out:
+            parts.append(f"{self.num_left_out} factors left out")
+        return "; ".join(parts)

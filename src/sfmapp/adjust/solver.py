@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from importlib import import_module
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -37,8 +40,16 @@ Mask = NDArray[np.bool_]
 
 # Beyond so many blocks only the tiles of pairs that meet are kept, if they are at most this share of all.
 _MAX_DENSE_BLOCKS, _DENSE_SHARE = 160, 0.3
+# So few images nearly all see each other: their systems go to LAPACK.
+_FEW_IMAGES = 12
 # Work worth a chunk of its own, and the most memory that the chunks' private sums may take together.
 _CHUNK_OBSERVATIONS, _MAX_CHUNKS, _CHUNK_BYTES = 16384, 8, 1 << 26
+
+
+def import_ahead(num_images: int) -> None:
+    """Begin to import gtsam in a thread, which takes 0.7 s, if closing adjustments may ask it."""
+    if num_images > _FEW_IMAGES and "gtsam" not in sys.modules:
+        Thread(target=import_module, args=("gtsam",), name="import-gtsam").start()
 
 
 def adjust_bundle(
@@ -205,9 +216,9 @@ class Engine:
             met.reshape(-1)[self.extras.pairs] = True
         keys = np.flatnonzero(met)
         self.fill = 2 * len(keys) / max(1, blocks * (blocks + 1))
-        self.solver = choose_solver(blocks, self.fill, is_closing=is_closing)
+        self.solver = choose_solver(blocks, int(p.block_dim.sum()), self.fill, is_closing=is_closing)
         numbers = keys
-        if blocks > _MAX_DENSE_BLOCKS and self.fill <= _DENSE_SHARE:
+        if self.solver != "tiles" and blocks > _MAX_DENSE_BLOCKS and self.fill <= _DENSE_SHARE:
             self.num_tiles, numbers = len(keys), np.arange(len(keys))
             self.hash_keys, self.hash_values = number_keys(keys)
         if self.solver == "gtsam":

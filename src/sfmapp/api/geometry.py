@@ -120,7 +120,7 @@ def triangulate(
     max_error_px: float = 4.0,
     min_angle_deg: float = 1.5,
 ) -> TriangulatedPoints:
-    """Find points from the pixels at which views with known poses see them.
+    """Triangulate points from their pixels in views with known poses.
 
     Every pair of views of a point proposes one; the proposal that most views agree with is refined over them.
 
@@ -167,7 +167,7 @@ def triangulate(
 def estimate_pose(
     xyz: ArrayLike, xy: ArrayLike, camera: Camera, *, max_error_px: float = 8.0, inlier_px: float = 4.0
 ) -> PoseEstimate:
-    """The pose of a calibrated camera from points with known places (PnP): RANSAC over P3P, then all inliers together.
+    """Pose of a calibrated camera from 3D points and their pixels (PnP): RANSAC over P3P, refined on all inliers.
 
     The result is the same at every call.
 
@@ -217,7 +217,7 @@ def verify_pair(
     *,
     seed: int = 0,
 ) -> TwoViewGeometry:
-    """Find the geometry of two views, and which of their matches it explains.
+    """Estimate the two-view geometry of an image pair, and which of its matches are inliers.
 
     F, E and H are estimated robustly (MAGSAC++) and compared, as in COLMAP's two-view geometry.
 

@@ -127,7 +127,7 @@ def track_sequence(
     threads: int | None = None,
     seed: int | None = None,
 ) -> TrackResult:
-    """Follow a camera, or a stereo rig, through a sequence.
+    """Track a camera, or a stereo rig, through a sequence.
 
     Args:
         source: a folder of frames, a video file or stream, or the folder of a KITTI, TUM or EuRoC sequence; or frames
@@ -180,7 +180,7 @@ def refine(
     threads: int | None = None,
     seed: int | None = None,
 ) -> TrackResult:
-    """Adjust the maps of an odometry run whole, reject what does not fit, and move the frames with their keyframes.
+    """Adjust the maps of an odometry run globally, reject outliers, and move all frames along with their keyframes.
 
     Args:
         output: workspace of an odometry run; it is not changed.
@@ -223,7 +223,7 @@ def densify(
     events: Events | None = None,
     threads: int | None = None,
 ) -> DenseResult:
-    """Reconstruct oriented patches all over the surfaces that the photographs of a model show.
+    """Reconstruct a dense cloud of oriented patches from a model and its photographs.
 
     What an earlier run in the same workspace has done is used where it still holds.
 
@@ -244,7 +244,7 @@ def densify(
     Raises:
         UsageError: a workspace of another command.
         InputError: no model, or too few of its photographs are there.
-        NoReconstructionError: hardly a patch was found; the report and what there is are written.
+        NoReconstructionError: too few patches were found; they and the report are written.
         InterruptedRunError: ``events`` was asked to stop; the same call resumes.
 
     Example:
@@ -338,7 +338,7 @@ def evaluate(
     *,
     times: FilePath | None = None,
 ) -> Evaluation:
-    """Compare a trajectory with the true one: absolute and relative errors, and KITTI's drift.
+    """Compare a trajectory with the ground truth: absolute (ATE) and relative errors (RPE), and KITTI's drift.
 
     Args:
         estimate: trajectory of TUM, KITTI or EuRoC, or the folder of an odometry run.
@@ -372,7 +372,7 @@ def undistort(
     events: Events | None = None,
     threads: int | None = None,
 ) -> UndistortResult:
-    """Write the photographs of a model without distortion, and the model with PINHOLE cameras beside them.
+    """Write undistorted photographs of a model, and the model with PINHOLE cameras beside them.
 
     The same call again resumes one that was cut off.
 

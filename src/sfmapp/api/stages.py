@@ -32,7 +32,7 @@ PairOfImages = tuple[int, int] | tuple[str, str]
 
 
 class Matcher(Protocol):
-    """What pairs keypoints, in place of our own: LightGlue, SuperGlue, a mutual nearest neighbour of yours.
+    """A matcher of keypoints in place of our own: LightGlue, SuperGlue, or a nearest-neighbour search of yours.
 
     Example:
         >>> class LightGlueMatcher:

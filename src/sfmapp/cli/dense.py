@@ -27,9 +27,9 @@ examples:
   sfmapp dense out/ --set dense.level=0 --region -1 -1 0 1 1 2 --maps
 
 SOURCE is a workspace of sfmapp reconstruct, or a COLMAP model (binary or text, any of our camera models) with the
-folder of its photographs. Its poses belong to its cameras: a calibration counts when the model is made, with
-sfmapp reconstruct --camera FILE. Writes OUT/dense/fused.ply (places, normals, colours, number of views, score, sigma)
-and patches.npz; the same command again resumes a run that was cut off, and does nothing where all is done."""
+folder of its photographs. Its poses were estimated with its cameras: to use another calibration, make the model with
+sfmapp reconstruct --camera FILE. Writes OUT/dense/fused.ply (positions, normals, colours, number of views, score,
+sigma) and patches.npz; the same command again resumes a run that was cut off, and does nothing where all is done."""
 
 
 MESH_EXAMPLES = """\
@@ -38,7 +38,7 @@ examples:
   sfmapp mesh out/ --texture
   sfmapp mesh out/dense/fused.ply -o surface/ --set surface.depth=9
 
-Writes OUT/mesh/mesh.ply and OUT/mesh/mesh.glb, with the colours of its vertices or, with --texture, the photographs."""
+Writes OUT/mesh/mesh.ply and OUT/mesh/mesh.glb, with vertex colours or, with --texture, the photographs as texture."""
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -100,14 +100,14 @@ def _add_dense_flags(parser: argparse.ArgumentParser) -> None:
     group = _add_option_flags(parser)
     group.add_argument("--level", metavar="N", help="halve the photographs N times; default: to 1600 px or less a side")
     group.add_argument(
-        "--ground-sampling", metavar="D", help="instead: the size of a pixel on the surface, world units"
+        "--ground-sampling", metavar="D", help="instead of --level: size of a pixel on the surface, in world units"
     )
     group.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black pixels are ignored")
     group.add_argument(
         "--region", metavar=("X", "Y", "Z", "X", "Y", "Z"), nargs=6,
         help="lower and upper corners of the box to reconstruct",
     )  # fmt: skip
-    group.add_argument("--max-memory", metavar="MB", help="work on clusters of views that need less than this")
+    group.add_argument("--max-memory", metavar="MB", help="split the views into clusters that need less than this")
     group.add_argument("--no-recording", action="store_true", help="do not write dense/recording.rrd")
 
 

@@ -48,10 +48,10 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     errors = parser.add_argument_group("errors")
     errors.add_argument("--align", choices=ALIGNMENTS, action="append",
-                        help="sim3: best rotation, translation and scale; se3: the same without scale; origin: the "
-                        "first poses on each other; none. May be repeated; default: sim3 and se3")  # fmt: skip
+                        help="sim3: best rotation, translation and scale; se3: the same without scale; origin: align "
+                        "the first poses; none. May be repeated; default: sim3 and se3")  # fmt: skip
     errors.add_argument("--delta", metavar="N{f,s,m}", action="append",
-                        help="RPE over so many frames, seconds or metres of path, such as 1f, 0.5s, 10m. May be "
+                        help="interval of the RPE in frames, seconds or metres of path, such as 1f, 0.5s, 10m. May be "
                         "repeated; default: a frame, a second, and about a tenth of the path")  # fmt: skip
     errors.add_argument("--all-pairs", action="store_true",
                         help="overlapping RPE: motions from every pose, not end to end")  # fmt: skip

@@ -30,8 +30,8 @@ examples:
   sfmapp odometry frames/ -o out/ --camera calib.json --scale marker:DICT_4X4_50:0.16
 
 Frames come from a folder of images, a video or stream, or a sequence of KITTI, TUM or EuRoC, whose cameras, times,
-ground truth and IMU are found by themselves. With two cameras lengths are metres; with one their unit is arbitrary
-unless --scale tells it. OUT/report.html tells how good it is, where there are gaps, and why."""
+ground truth and IMU are found automatically. With two cameras lengths are in metres; with one their unit is arbitrary
+unless --scale gives it. OUT/report.html says how good the result is, where there are gaps, and why."""
 
 SCALE = (
     "source of metric scale: marker:DICT:METRES (side of an ArUco or AprilTag marker), distance:A:B:METRES (between "
@@ -88,7 +88,7 @@ def _add_sequence_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--start", metavar="N", help="first frame to play")
     group.add_argument("--stop", metavar="N", help="play the frames before this one")
     group.add_argument("--step", metavar="N", help="play every Nth frame")
-    group.add_argument("--reverse", action="store_true", help="play it backwards")
+    group.add_argument("--reverse", action="store_true", help="play the sequence backwards")
     group.add_argument("--fps", metavar="RATE", help="frame rate; overrides the timestamps of the sequence")
 
 

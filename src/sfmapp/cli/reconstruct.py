@@ -32,7 +32,7 @@ examples:
   sfmapp reconstruct 'frames/*.png' -o out/ --camera-model OPENCV_FISHEYE --seed 7
 
 The same command again resumes a run that was cut off, does nothing where all is done, and re-runs only what a changed
-option touches. The largest model is OUT/sparse/0, in COLMAP's format; OUT/report.html tells how good it is and why."""
+option touches. The largest model is OUT/sparse/0, in COLMAP's format; OUT/report.html says how good it is and why."""
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

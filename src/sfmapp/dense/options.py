@@ -19,19 +19,19 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class DenseOptions:
-    """What ``sfmapp dense`` obeys.
+    """Options of ``sfmapp dense``.
 
     Attributes:
-        level: how often the images are halved before they are matched; 0 is full resolution, None lets the longer side
-            come out at 1600 pixels or fewer.
-        ground_sampling: resolution by target: what a pixel should measure on the surface, in units of the world;
-            each image is shrunk to it. None: ``level`` decides.
-        cell_px: a patch for each cell of so many pixels a side; 1 is densest.
+        level: how many times the images are halved before matching; 0: full resolution; None: until the longer side is
+            1600 pixels or less.
+        ground_sampling: size of a pixel on the surface, in units of the world, to which each image is shrunk. None:
+            ``level`` decides.
+        cell_px: side of a cell in pixels; each cell gets one patch, so 1 is densest.
         min_views: images that have to trust a patch, its reference image among them. One fewer will do, down to two,
             where none of the others can see it: outside of their pictures, turned away, or hidden by other patches.
-        max_neighbors: images that each image is matched with.
+        max_neighbors: most images that each image is matched with.
         region: x y z of the lower and x y z of the upper corner of the box to reconstruct, world; None: no bounds.
-        max_memory_mb: views are worked on in clusters that are expected to stay below this.
+        max_memory_mb: the views are split into clusters that are expected to need less than this.
     """
 
     level: int | None = None

@@ -24,8 +24,9 @@ _MAX_ROUNDS, _SETTLED = 4, 0.1
 _MAX_COST_PER_NUMBER = 10.0
 # Positions with sigmas so many times as large hold a model in its place, and do not bend it.
 _LOOSE = 1e3
-# An autocorrelation this many standard deviations above zero is one; above the second nothing is left to be told.
-_CORRELATED_SIGMAS, _MAX_CORRELATION = 2.6, 0.9
+# An autocorrelation this many standard deviations above zero is one: of independent errors one set in twenty is taken
+# for drift and gets wider sigmas, which costs less than drift that is not seen. Above the second nothing can be told.
+_CORRELATED_SIGMAS, _MAX_CORRELATION = 1.645, 0.9
 
 
 class Measured(NamedTuple):
@@ -126,7 +127,8 @@ def drift(fit: RobustFit, image_idx: NDArray[np.int64]) -> tuple[float, float]:
     num = int(np.isfinite(products).sum())
     if num < 3 * MIN_REDUNDANT:
         return 0.0, 1.0
-    correlation = float(np.nanmean(products) / np.nanmean(squares))
+    # a fit of seven parameters takes as much out of what neighbours have in common
+    correlation = float(np.nanmean(products) / np.nanmean(squares)) + 7.0 / num
     if correlation * np.sqrt(num) < _CORRELATED_SIGMAS:
         return max(correlation, 0.0), 1.0
     clipped = min(correlation, _MAX_CORRELATION)

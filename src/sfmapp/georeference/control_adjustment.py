@@ -93,7 +93,7 @@ def adjust_to_control(
         inside[[found is None for found in solution.left_out]] = np.inf
         changed = is_used.copy()
         if outside.max(initial=0.0) > limit:
-            worst, second = np.sort(outside)[::-1][:2]
+            worst, second = np.sort([*outside, 0.0])[::-1][:2]
             if worst - second < _CLEARLY or (marked.is_placed & ~is_used).sum() >= most_wrong or spread > 1.0:
                 # who is wrong cannot be told, or too many would be: the survey is poorer than it says
                 wider = spread * float(np.sqrt(np.median(squares[squares > 0]) / _MEDIAN_CHI2))

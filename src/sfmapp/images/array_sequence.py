@@ -20,7 +20,7 @@ Pixels = NDArray[np.uint8]
 
 
 class ArraySequence:
-    """Frames in memory, for ``track_sequence``. What is grabbed by a generator can be walked through once.
+    """Frames in memory, for ``track_sequence``. Those of a generator can be played once.
 
     Args:
         frames: (H, W) grey or (H, W, 3) RGB arrays of uint8 or uint16, or, of a rig, a tuple with one for each camera.

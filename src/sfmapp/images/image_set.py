@@ -21,7 +21,7 @@ CameraSharing = Literal["auto", "all", "per_folder", "per_image"]
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """What to read and what is known about the cameras.
+    """Which images are read, and what is known about their cameras.
 
     Attributes:
         camera: ``MODEL,PARAMETER,...``, as of ``camera_model`` and ``camera_params``, or the path of a calibration: of
@@ -96,7 +96,7 @@ class ImageOptions:
 
 
 class ImageSource(Protocol):
-    """Photographs that are no files of their own: in memory, in an archive, in a database.
+    """Photographs that are not files: in memory, in an archive, in a database.
 
     Whatever has these three can be given wherever photographs are wanted. ``pixels`` and ``mask`` are called from
     several threads at a time, more than once for each image.

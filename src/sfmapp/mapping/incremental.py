@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -105,13 +105,13 @@ def map_images(
 
         mapped, look_alikes = tell_apart(mapped, correspondences, map_again, events)
         models = mapped.models
+        adjustments = [mapped.mapper_of(model).polish() for model in models]
         for model in models:
-            mapped.mapper_of(model).polish()
             model.point_rgb = track_colors(model.tracks, features)
         contradictions = contradictions_of(models, correspondences)
         model_reports = [
-            _model_report(mapped, model, found, apart, map_all, events)
-            for model, found, apart in zip(models, contradictions, mapped.apart, strict=True)
+            replace(_model_report(mapped, model, found, apart, map_all, events), adjustment=adjustment)
+            for model, found, apart, adjustment in zip(models, contradictions, mapped.apart, adjustments, strict=True)
         ]
         if closing is not None:
             closing([mapped.mapper_of(model) for model in models])

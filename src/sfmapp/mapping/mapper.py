@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import Covariances, estimate_covariances
-from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.graph import FactorGraph
+from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera
@@ -22,6 +23,7 @@ from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_in
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
 from sfmapp.mapping.report import CameraSigmas, ImageSigmas, InitialPairReport, Uncertainty
+from sfmapp.mapping.snapshot import ModelSnapshot
 from sfmapp.mapping.tracks import USELESS_CONFIGS
 from sfmapp.mapping.verified_pairs import MIN_MATCHES, pair_agreement
 from sfmapp.scene.correspondences import Correspondences
@@ -41,6 +43,9 @@ ELSEWHERE = 2.0
 MAX_CHANGED, MAX_POLISHED = 1e-3, 2
 # Synthetic keypoints may be exact; no detector's are better than this.
 MIN_NOISE_PX = 0.02
+_NO_CENTERS = (
+    "principal points stay as they were: adjust.backend=gtsam has no calibration with one focal length that frees them"
+)
 # Uncertainties cost an inverse of eight unknowns per image: half a second and 50 MB for this many.
 MAX_UNCERTAINTY_IMAGES = 200
 
@@ -315,33 +320,42 @@ class Mapper:
             if changed <= MAX_CHANGED * before.sum():
                 return
 
-    def polish(self) -> None:
-        """Adjust a finished map with a loss that lets go of what is far off the noise, until it settles.
+    def polish(self) -> AdjustReport:
+        """Adjust a finished map with a loss that lets go of what is far off the noise, until it settles: the closing
+        adjustments, of which the last is reported.
 
         A pixel may be ten standard deviations of precise keypoints: with squares alone, the few observations near the
         limit decide what many others tell little of, such as the lens.
         """
         reconstruction = self.reconstruction
+        if self._wanted_principal_points().any() and not self._free_principal_points().any():
+            self.events.warned(STAGE, _NO_CENTERS)
         for _ in range(MAX_POLISHED):
             before = reconstruction.obs_is_inlier.copy()
             options, chosen = self._polishing()
-            adjust_bundle(reconstruction, options, varying=Varying(centers=chosen), prior_cameras=self.prior_cameras)
+            graph = FactorGraph(
+                reconstruction, options, varying=Varying(centers=chosen), prior_cameras=self.prior_cameras, noise_px=1.0
+            )
+            report = graph.optimize()
+            self.events.decided(STAGE, f"closing adjustment: {report.text}", **report)
             self._settle_points()
             changed = int((before != reconstruction.obs_is_inlier).sum())
             summary = reconstruction.summary()
             self.events.decided(STAGE, f"robust adjustment: {changed} observations changed sides", **summary)
             if changed <= MAX_CHANGED * before.sum():
-                return
+                break
+        return report
 
     def adjust_with(self, extra_factors: Any) -> None:
         """Adjust a finished map once more as :meth:`polish` does, with gtsam factors over ``X(i)`` beside the
         reprojections, and settle its points."""
         options, chosen = self._polishing()
         options = replace(options, initial_damping=1e-6, relative_cost_tolerance=1e-6)
-        adjust_bundle(
+        report = adjust_bundle(
             self.reconstruction, options, varying=Varying(centers=chosen), prior_cameras=self.prior_cameras,
             extra_factors=extra_factors,
         )  # fmt: skip
+        self.events.decided(STAGE, f"closing adjustment: {report.text}", **report)
         self._settle_points()
 
     def covariances_with(self, extra_factors: Any) -> Covariances | None:
@@ -384,12 +398,16 @@ class Mapper:
     def _free_principal_points(self) -> NDArray[np.bool_]:
         """(C,) bool: cameras whose principal point is refined. None by gtsam's backend, whose calibrations with one
         focal length hold it fixed."""
+        return self._wanted_principal_points() & (self.adjust_options.backend == "schur")
+
+    def _wanted_principal_points(self) -> NDArray[np.bool_]:
+        """(C,) bool: cameras whose principal point MappingOptions has refined."""
         reconstruction, mode = self.reconstruction, self.options.refine_principal_point
         registered = reconstruction.image_camera_idx[reconstruction.is_registered]
         shared = np.bincount(registered, minlength=len(reconstruction.cameras)) >= 3
         unknown = np.array([mode == "always" or c.focal_source == "default" for c in reconstruction.cameras], bool)
-        free: NDArray[np.bool_] = shared & unknown & (mode != "never" and self.adjust_options.backend == "schur")
-        return free
+        wanted: NDArray[np.bool_] = shared & unknown & (mode != "never")
+        return wanted
 
     def with_free_centers(self, options: AdjustOptions, chosen: NDArray[np.bool_]) -> AdjustOptions:
         """The options with free principal points under the prior of MappingOptions, for cameras chosen (C,) bool."""
@@ -571,12 +589,8 @@ class Mapper:
         self.events.decided(
             STAGE, f"{message}; {summary.num_points} points, {summary.mean_reprojection_error_px:.2f} px",
             **summary,
-            snapshot={
-                "image_idx": images,
-                "cam_from_world": self.reconstruction.cam_from_world.copy(),
-                "point_xyz": self.reconstruction.point_xyz.astype(np.float32),
-                "num_registered": summary.num_registered,
-                "num_points": summary.num_points,
-                "mean_error_px": summary.mean_reprojection_error_px,
-            },
+            snapshot=ModelSnapshot(
+                tuple(images), summary.num_registered, summary.num_points, summary.mean_reprojection_error_px,
+                self.reconstruction.cam_from_world.copy(), self.reconstruction.point_xyz.astype(np.float32),
+            ),
         )  # fmt: skip

@@ -54,8 +54,8 @@ class MappingOptions:
         principal_point_sigma: Standard deviation of that prior as a share of the longer side: lenses are decentred by 1
             %, crops by more.
         min_model_images: Images a model needs to be kept. Two are kept only if there are only two.
-        multiple_models: Go on with the images that are left over when a model cannot grow any more.
-        estimate_focal: Search a first focal length from the pairs where neither the user nor EXIF knows one.
+        multiple_models: Start another model with the images that are left over when one cannot grow any more.
+        estimate_focal: Estimate an initial focal length from verified pairs where neither the user nor EXIF gives one.
     """
 
     min_initial_inliers: int = 100

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
+from sfmapp.adjust.options import AdjustReport
 from sfmapp.contradictions import Contradiction
 from sfmapp.reporting import Report
 from sfmapp.scene.reconstruction import ModelSummary
@@ -181,9 +182,10 @@ class ModelEntry(ModelSummary):
 
 
 class ModelReport(ModelEntry):
-    """A model and how sure it is."""
+    """A model, how sure it is, and the last of its closing adjustments."""
 
     uncertainty: Uncertainty
+    adjustment: AdjustReport | None = None
 
 
 class MappingReport(Report):

@@ -20,7 +20,7 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class MatchingOptions:
-    """How keypoints are paired between two images and how the pairs are verified.
+    """How keypoints are matched between two images and how the matches are verified.
 
     Distances between descriptors are Euclidean with SIFT descriptors scaled to unit norm (0 to sqrt 2), and a share of
     the bits for ORB.

@@ -22,23 +22,23 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class OdometryOptions:
-    """How a camera is followed through a sequence. Shares and angles where possible, so that no size is assumed.
+    """How a camera is tracked through a sequence. Shares and angles where possible, so that no image size is assumed.
 
     Attributes:
-        max_tracks: corners followed at a time, spread over the image
+        max_tracks: corners tracked at a time, spread over the image
         keyframe_parallax: median shift beyond rotation since the last keyframe, share of the image width
-        keyframe_loss: a keyframe is due when fewer than this share of its mapped points is still tracked
-        cull_seen: a keyframe is dropped once this share of its points is seen by three others; 1 for never
+        keyframe_loss: a keyframe is due when less than this share of the last one's mapped points is still tracked
+        cull_seen: a keyframe is dropped once this share of its points is seen by three others; 1: never
         window: keyframes whose poses the local adjustment may change
         window_anchors: earlier keyframes that take part unchanged, those that share the most points
         min_triangulation_deg: smallest angle between the rays of a new point of one moving camera
-        min_stereo_deg: the same with a rig, whose baseline is known: a depth to a tenth or so
-        max_lost_s: seconds without relocalisation after which a new map is begun
-        motion: planar: a wheeled robot on level ground, for the first two views
-        loops: look for places seen before, close loops and join maps
-        refine_camera: there, refine the calibration where the images clearly contradict it
-        smooth: also give the trajectory through an error-state filter: steadier, short gaps bridged
-        covariance: covariances of the keyframes, at the end
+        min_stereo_deg: the same for a rig, whose baseline is known; depths are then good to about 10 %
+        max_lost_s: seconds without relocalization before a new map is begun
+        motion: of the first two views; planar for a wheeled robot on level ground
+        loops: recognise places seen before, close loops and join maps
+        refine_camera: refine the calibration where the images clearly contradict it
+        smooth: also write the trajectory smoothed by an error-state filter: steadier, with short gaps bridged
+        covariance: estimate covariances of the keyframes after the final adjustment
     """
 
     max_tracks: int = 600
@@ -62,7 +62,7 @@ class OdometryOptions:
 
 @dataclass(frozen=True)
 class ScaleOptions:
-    """Where metres come from when there is one camera.
+    """Where the metric scale of a single camera comes from.
 
     Attributes:
         source: marker:DICT:METRES, distance:FRAME:FRAME:METRES, distance:path:METRES, camera_height:METRES, imu or

@@ -9,6 +9,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.adjust.options import AdjustReport
 from sfmapp.contradictions import Contradiction
 from sfmapp.images.sequence import RepeatedFrame
 from sfmapp.odometry.inertial.markers import MarkerSightings
@@ -48,6 +49,7 @@ class MapResult:
         noise_covariance: (K, 6, 6) the part of ``covariance`` that the noise of the observations makes; the rest
             (calibration, contradictions) is common to neighbouring keyframes. In the map's first unit of length.
         sightings: the markers in the keyframes, where they were looked for.
+        adjustment: the closing adjustment; None for a map that was adjusted piece by piece, or read from files.
     """
 
     reconstruction: Reconstruction
@@ -61,6 +63,7 @@ class MapResult:
     covariance_gap: str = ""
     noise_covariance: Array | None = None
     sightings: MarkerSightings = field(default_factory=MarkerSightings.none)
+    adjustment: AdjustReport | None = None
 
 
 @dataclass

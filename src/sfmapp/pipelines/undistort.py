@@ -90,7 +90,7 @@ def undistort(
     events: Events | None = None,
     watch: Stopwatch | None = None,
 ) -> UndistortResult:
-    """Write the photographs of a model without distortion, and the model with PINHOLE cameras beside them.
+    """Write undistorted photographs of a model, and the model with PINHOLE cameras beside them.
 
     The same call again resumes one that was cut off.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from sfmapp.report.control_html import control_section, units_section
 from sfmapp.report.dense_html import dense_section
 from sfmapp.report.model import CameraReport, ImageReport, ReconstructionReport
-from sfmapp.report.page import check_table, failure_box, log_table, render_page, table, usage_table
+from sfmapp.report.page import adjustment_table, check_table, failure_box, log_table, render_page, table, usage_table
 from sfmapp.report.top_view import top_view_svg
 from sfmapp.report.world_map import world_section
 from sfmapp.reporting import NamedReason
@@ -57,6 +57,9 @@ def render_html(
     body.append(_failed(report.images) + _skipped(report.skipped))
     body.append("<h2>Images</h2>" + _images(report.images))
     body.append("<h2>Cameras</h2>" + _cameras(report.cameras))
+    if report.stages.mapping is not None:
+        entries = enumerate(report.stages.mapping.models)
+        body.append(adjustment_table((f"model {m}", model.adjustment) for m, model in entries))
     body.append(usage_table(report.usage, report.run))
     body.append(log_table("Warnings", report.warnings) + log_table("Decisions", report.decisions))
     return render_page(f"sfmapp: {report.run.source}", body)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
+from sfmapp.adjust.options import AdjustReport
 from sfmapp.contradictions import Contradiction
 from sfmapp.dense.report import (
     CloudNumbers,
@@ -451,6 +452,7 @@ class MapReport(Report):
         gauge: what the covariance holds fixed.
         position_sigma, rotation_sigma_deg: of the keyframes; None where not known.
         covariance_gap: why keyframes lack a covariance; empty where none does.
+        adjustment: the closing adjustment; absent where there was none of the whole map.
     """
 
     idx: int
@@ -471,6 +473,7 @@ class MapReport(Report):
     rotation_sigma_deg: MedianMax | None
     covariance_gap: str
     contradictions: Sequence[Contradiction]
+    adjustment: AdjustReport | None = None
 
 
 class GroundTruthReport(Report):

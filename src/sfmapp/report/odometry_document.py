@@ -131,6 +131,7 @@ def map_row(result: OdometryResult, map_idx: int) -> MapReport:
         rotation_sigma_deg=rotation_deg,
         covariance_gap=entry.covariance_gap,
         contradictions=entry.contradictions,
+        adjustment=entry.adjustment,
     )
 
 

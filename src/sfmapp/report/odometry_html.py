@@ -23,7 +23,7 @@ from sfmapp.report.model import (
     TimingReport,
 )
 from sfmapp.report.odometry_document import FrameTable, GroundTruthFit, errors_of_frames, unit_of
-from sfmapp.report.page import check_table, failure_box, log_table, render_page, table, usage_table
+from sfmapp.report.page import adjustment_table, check_table, failure_box, log_table, render_page, table, usage_table
 from sfmapp.report.path_view import GROUND_TRUTH_COLOR, PATH_COLOR, PathScene, legend, path_view_svg
 from sfmapp.report.plots import Curve, plot_svg
 
@@ -45,6 +45,7 @@ def render_odometry_html(
         body.append(_gaps(report.frames.gaps))
     body.append(_maps(report.maps) + _ground_truth(report.ground_truth))
     body.append(_loops(report.decisions) + _sequence(report.sequence, report.stages))
+    body.append(adjustment_table((f"map {row.idx}", row.adjustment) for row in report.maps))
     body.append(_timing(report.timing) + usage_table(report.usage, report.run))
     body.append(log_table("Warnings", report.warnings) + log_table("Decisions", report.decisions))
     return render_page(f"sfmapp odometry: {report.run.source}", body)

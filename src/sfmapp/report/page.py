@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
+from sfmapp.adjust.options import AdjustReport
 from sfmapp.report.model import Check, LogLine, Outcome
 from sfmapp.reporting import Usage
 
@@ -75,6 +76,35 @@ def usage_table(usage: Mapping[str, Usage], run: Usage) -> str:
         numbers = [("", f"{entry.wall_s:.2f}"), ("", f"{entry.cpu_s:.2f}"), ("", peak)]
         rows.append([("t", name), *numbers, ("t dim", note)])
     return "<h2>Time and memory</h2>" + table(head, rows)
+
+
+def adjustment_table(entries: Iterable[tuple[str, AdjustReport | None]]) -> str:
+    """What the factors of closing adjustments came to; entries are names of models or maps with theirs."""
+    head = [
+        ("t", ""),
+        ("t", "factors"),
+        ("", "count"),
+        ("", "residual"),
+        ("", "rejected"),
+        ("", "cost"),
+        ("t", ""),
+    ]
+    rows = []
+    for name, report in entries:
+        if report is None:
+            continue
+        size = f"{report.num_unknowns} unknowns, {report.fill:.0%} full, solved by {report.solver}"
+        notes = [size, f"{report.num_iterations} steps, {report.termination}; cost {report.initial_cost:.6g} at first"]
+        for n, factors in enumerate(report.factors):
+            numbers = [
+                ("", factors.num_factors),
+                ("", report.residual_text(factors)),
+                ("", factors.num_rejected),
+            ]
+            note = notes[n] if n < len(notes) else ""
+            cost = ("", f"{factors.cost:.6g}")
+            rows.append([("t", "" if n else name), ("t", factors.kind), *numbers, cost, ("t dim", note)])
+    return "<h2>Closing adjustment</h2>" + table(head, rows) if rows else ""
 
 
 def log_table(title: str, lines: Sequence[LogLine]) -> str:

@@ -11,7 +11,7 @@ from sfmapp.report.document import check_contradictions
 from sfmapp.report.model import PhotoReport, RefineReport
 from sfmapp.report.odometry_document import GroundTruthFit
 from sfmapp.report.odometry_html import trajectory_views
-from sfmapp.report.page import check_table, failure_box, log_table, render_page, table, usage_table
+from sfmapp.report.page import adjustment_table, check_table, failure_box, log_table, render_page, table, usage_table
 from sfmapp.reporting import NamedReason
 
 REFINE_FORMAT = "sfmapp refine report 2"
@@ -36,6 +36,7 @@ def render_refine_html(
     body += [failure_box(report.outcome), check_table(found), "<h2>Before and after</h2>" + _comparison(report)]
     body.append(trajectory_views(result, ground_truth, against, report.orientation))
     body.append(_photographs(report.photographs, report.skipped))
+    body.append(adjustment_table((f"map {row.idx}", row.adjustment) for row in report.maps.after))
     body.append(usage_table(report.usage, run))
     body.append(log_table("Warnings", report.warnings) + log_table("Decisions", report.decisions))
     return render_page(f"sfmapp refine: {run.source}", body)

@@ -25,7 +25,7 @@ class TwoViewConfig(IntEnum):
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Pairs sorted by image positions; pairs that were tried and failed stay in, with their counts and no matches.
+    """Verified matches of image pairs, in the order of the images; pairs that failed stay, with counts and no matches.
 
     Attributes:
         pair_image_idx: (P, 2) int32, positions i < j of the images.

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras and where they sit. The rig's frame is that of its first camera.
+    """Cameras that are mounted rigidly together. The rig's frame is that of its first camera.
 
     Attributes:
         cameras: S intrinsics, one for each sensor.

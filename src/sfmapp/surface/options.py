@@ -18,20 +18,21 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """What ``sfmapp mesh`` obeys.
+    """Options of ``sfmapp mesh``.
 
     Attributes:
-        depth: of the octree: the scene's box is divided 2^depth times a side; None: cells of about two patch spacings.
-        trim_distance: surface is cut off that is farther than this from every patch, in spacings of the patches there.
+        depth: of the octree, which divides each side of the scene's box into 2^depth; None: cells of about two patch
+            spacings.
+        trim_distance: surface farther than this from every patch is cut off, in units of the local patch spacing.
             At 3, of the distances and density quantiles tried on a rendered scene, accuracy and completeness were both
             best.
-        trim_density: share of the vertices, those with the fewest patches around them, that is cut off before; 0: none.
-        max_hole: gaps that come of trimming are closed again if their share of the surface's area is no more than this,
+        trim_density: share of the vertices, those with the fewest patches around them, that is cut off first; 0: none.
+        max_hole: holes left by trimming are closed again if their share of the surface's area is no more than this,
             or a quarter of this where views show them, and no larger one is left: all-round captures stay closed where
             nothing was matched. A surface that stays open elsewhere has just its small holes closed, up to 20 spacings
             of the patches wide: what lies behind larger ones is a guess. 0: none. At 0.2 there is room on both sides:
             the unseen base of a small temple is 0.15, what would close the outline of a wall about 1.
-        min_island: pieces that hold less than this share of the surface's area are dropped.
+        min_island: connected pieces with less than this share of the surface's area are dropped.
         texture: give ``mesh.glb`` the photographs as a texture (:func:`~sfmapp.surface.texture.texture_mesh`).
         texture_px: longest side of the texture; it is smaller where the photographs have less to show.
     """

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Event
+from sfmapp.mapping.snapshot import ModelSnapshot
 
 # What is kept of a run of any length: with these, poses of 1000 images take 7 MB and clouds 10 MB.
 MAX_CLOUDS = 40
@@ -53,12 +53,10 @@ class Message:
 
 
 class RecordingListener:
-    """Collects the snapshots of ``decided`` events and all messages; subscribe it to the Events of a run.
+    """Collects the snapshots of mapping and all messages; subscribe it to the Events of a run.
 
-    A snapshot is a dict under the key ``snapshot`` of the event's data: ``cam_from_world`` (I, 7), ``point_xyz`` (T, 3)
-    or None, ``image_idx`` (an int, a list or None), ``num_registered``, ``num_points``, ``mean_error_px`` and maybe
-    ``step``. Arrays are copied in part, never kept. When there are more than fit, the steps that remain are spread
-    geometrically: much happens in the first ones, and each later one changes less.
+    Arrays are copied in part, never kept. When there are more than fit, the steps that remain are spread geometrically:
+    much happens in the first ones, and each later one changes less.
     """
 
     def __init__(self) -> None:
@@ -67,38 +65,30 @@ class RecordingListener:
         self._priority: NDArray[np.int32] | None = None
 
     def __call__(self, event: Event) -> None:
-        if isinstance(event.data.get("snapshot"), dict):
-            self._add(event.data["snapshot"])
+        if isinstance(snapshot := event.data.get("snapshot"), ModelSnapshot):
+            self._add(snapshot)
         if event.kind in _LEVELS and event.message and len(self.messages) < MAX_MESSAGES:
             step = self.steps[-1].step if self.steps else -1
             text = f"[{event.time_s:7.2f} s] {event.stage}: {event.message}"
             self.messages.append(Message(step, _LEVELS[event.kind], text))
 
-    def _add(self, snapshot: dict[str, Any]) -> None:
-        last = self.steps[-1].step if self.steps else -1
-        images = snapshot.get("image_idx")
-        images = () if images is None else np.atleast_1d(np.asarray(images, np.int64)).tolist()
-        track_idx, xyz = self._sample(snapshot.get("point_xyz"))
+    def _add(self, snapshot: ModelSnapshot) -> None:
+        track_idx, xyz = self._sample(snapshot.point_xyz)
         self.steps.append(
             Step(
-                # a second model may count from zero again
-                max(last + 1, int(snapshot.get("step", 0))),
-                tuple(images),
-                int(snapshot["num_registered"]),
-                int(snapshot["num_points"]),
-                float(snapshot["mean_error_px"]),
-                np.asarray(snapshot["cam_from_world"], np.float64).astype(np.float32),
-                track_idx,
-                xyz,
+                self.steps[-1].step + 1 if self.steps else 0, snapshot.image_idx, snapshot.num_registered,
+                snapshot.num_points, snapshot.mean_error_px, snapshot.cam_from_world.astype(np.float32), track_idx, xyz,
             )
-        )
+        )  # fmt: skip
         self._thin(lambda s: s.point_xyz is not None, MAX_CLOUDS, point_track_idx=None, point_xyz=None)
         # clouds are drawn among the cameras of their step, so those keep their poses
         self._thin(
             lambda s: s.cam_from_world is not None and s.point_xyz is None, MAX_POSES - MAX_CLOUDS, cam_from_world=None
         )
 
-    def _sample(self, point_xyz: Any) -> tuple[NDArray[np.int32] | None, NDArray[np.float32] | None]:
+    def _sample(
+        self, point_xyz: NDArray[np.float32] | None
+    ) -> tuple[NDArray[np.int32] | None, NDArray[np.float32] | None]:
         """Up to MAX_CLOUD_POINTS points that exist, the same ones every time as far as they do."""
         if point_xyz is None:
             return None, None

@@ -39,7 +39,7 @@ LIST_ADVICE = "sfmapp reconstruct --list-options shows every option with its def
 
 @dataclass(frozen=True)
 class Options:
-    """Everything that a run obeys. The options of a stage live next to its code.
+    """Options of all stages of a run. The options of a stage live next to its code.
 
     Attributes:
         images, features, pairs, matching, mapping, adjust, gps: the options of the stages of a reconstruction.

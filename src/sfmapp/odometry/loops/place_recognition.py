@@ -202,7 +202,7 @@ class PlaceIndex:
         return self._best(vector, np.ones(len(self._places), bool), self._usual(), True)
 
     def rename_points(self, map_idx: int, old_id: Ids, new_id: Ids) -> None:
-        """Points of a map that are others in ground truth. Of two that become the same in one place the first stays."""
+        """Points of a map that turned out to be others. Of two that become the same in one place the first stays."""
         if not len(old_id):
             return
         order = np.argsort(old_id, kind="stable")

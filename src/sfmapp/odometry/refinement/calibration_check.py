@@ -21,7 +21,8 @@ from scipy.special import chdtri
 
 from sfmapp.adjust.calibration import RAW, CalibrationSystem, reduce_to_calibration
 from sfmapp.adjust.covariance import similarity_basis
-from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.graph import FactorGraph
+from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera
@@ -278,6 +279,17 @@ def _report(look: _Look, surprise: float, limit: float, unknowns: Unknowns) -> C
 
 def adjust_poses(model: Reconstruction, sigma: float, max_steps: int, tolerance: float) -> float:
     """Adjust poses and points of a map, in place, its first keyframe held; returns the cost in units of the noise."""
+    options, varying = _of_poses(model, sigma, max_steps, tolerance)
+    return 2 * adjust_bundle(model, options, varying=varying).final_cost / sigma**2
+
+
+def close_poses(model: Reconstruction, sigma: float, max_steps: int, tolerance: float) -> AdjustReport:
+    """The same as the closing adjustment; twice its final cost is in units of the noise."""
+    options, varying = _of_poses(model, sigma, max_steps, tolerance)
+    return FactorGraph(model, options, varying=varying, noise_px=sigma).optimize()
+
+
+def _of_poses(model: Reconstruction, sigma: float, max_steps: int, tolerance: float) -> tuple[AdjustOptions, Varying]:
     num_sensors = 1 if model.rig is None else len(model.rig.cam_from_rig)
     variable = np.ones(len(model.image_names), bool)
     variable[:num_sensors] = False
@@ -285,7 +297,7 @@ def adjust_poses(model: Reconstruction, sigma: float, max_steps: int, tolerance:
         loss="cauchy", loss_scale_px=LOSS_SIGMAS * sigma, max_iterations=max_steps, relative_cost_tolerance=tolerance,
         refine_focal=False, refine_distortion=False,
     )  # fmt: skip
-    return 2 * adjust_bundle(model, options, varying=Varying(images=variable)).final_cost / sigma**2
+    return options, Varying(images=variable)
 
 
 def _look(model: Reconstruction, x: Array, cost: float, sigma: float, unknowns: Unknowns) -> _Look | None:

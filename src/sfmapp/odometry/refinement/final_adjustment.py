@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.adjust.options import AdjustReport
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
@@ -17,7 +18,13 @@ from sfmapp.odometry.map.backend import classify, make_job, take_over
 from sfmapp.odometry.map.covariance import covariance_of_refinement, estimate_map_covariance, scale_sigma_of_refinement
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
-from sfmapp.odometry.refinement.calibration_check import LOSS_SIGMAS, Answer, adjust_poses, question_calibration
+from sfmapp.odometry.refinement.calibration_check import (
+    LOSS_SIGMAS,
+    Answer,
+    adjust_poses,
+    close_poses,
+    question_calibration,
+)
 from sfmapp.odometry.report import AdjustmentReport
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig
@@ -52,6 +59,7 @@ class FinalAdjustment:
         contradictions: evidence against the map that stands unresolved.
         scale_sigma: relative standard deviation of the unit of length of a rig; None without one.
         noise_covariance: (K, 6, 6) what the noise of the observations alone makes of ``covariance``.
+        adjustment: the last of all keyframes together; None where they were too many.
     """
 
     covariance: Array | None
@@ -60,6 +68,7 @@ class FinalAdjustment:
     contradictions: list[Contradiction] = field(default_factory=list)
     scale_sigma: float | None = None
     noise_covariance: Array | None = None
+    adjustment: AdjustReport | None = None
 
 
 def adjust_finally(
@@ -77,20 +86,23 @@ def adjust_finally(
     everything = np.arange(len(keyframes.keyframes))
     job = make_job(keyframes, everything, everything > 0)
     model = job.model
-    for steps in (_FIRST_STEPS, _MAX_STEPS):  # which observations agree is clear long before all have settled
-        sigma = residual_scale_px(model, MIN_SIGMA_PX)
-        cost = adjust_poses(model, sigma, steps, _TOLERANCE)
-        if steps == _FIRST_STEPS:
-            classify(model, job.num_elsewhere)
-        events.raise_if_cancelled()
+    # which observations agree is clear long before all have settled
+    adjust_poses(model, residual_scale_px(model, MIN_SIGMA_PX), _FIRST_STEPS, _TOLERANCE)
+    classify(model, job.num_elsewhere)
+    events.raise_if_cancelled()
+    sigma = residual_scale_px(model, MIN_SIGMA_PX)
+    adjustment = close_poses(model, sigma, _MAX_STEPS, _TOLERANCE)
+    events.raise_if_cancelled()
     found_before = None
     if given is not None and keyframes.rig is not given:
-        found_before, model = (model, cost), _with_rig(model, given)
-        cost = adjust_poses(model, sigma, _MAX_STEPS, _TOLERANCE)
-    answer = _question(model, cost, sigma, options, events, found_before)
+        found_before, model = (model, 2 * adjustment.final_cost), _with_rig(model, given)
+        adjustment = close_poses(model, sigma, _MAX_STEPS, _TOLERANCE)
+    answer = _question(model, 2 * adjustment.final_cost, sigma, options, events, found_before)
     num_sensors, of_refinement = len(keyframes.rig.cameras), np.zeros((6, 6))
     if answer.is_refined:
+        adjustment = close_poses(answer.model, sigma, _MAX_STEPS, _TOLERANCE)
         of_refinement = covariance_of_refinement(model, answer.model, num_sensors) / answer.excess**2
+    events.decided(STAGE, f"closing adjustment: {adjustment.text}", **adjustment)
     job.model = model = answer.model
     report = AdjustmentReport(camera=answer.report, sigma_px=classify(model, job.num_elsewhere))
     take_over(job, keyframes)
@@ -104,7 +116,7 @@ def adjust_finally(
             covariance += answer.pose_covariance
         if answer.is_refined:
             contradictions += _left_open(covariance, rigid3.spread(model.cam_from_world), events)
-    return FinalAdjustment(covariance, gauge, report, contradictions, answer.scale_sigma, noise)
+    return FinalAdjustment(covariance, gauge, report, contradictions, answer.scale_sigma, noise, adjustment)
 
 
 def _left_open(covariance: Array, size: float, events: Events) -> list[Contradiction]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.adjust.options import AdjustReport
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.features.extract import extract_features
@@ -46,10 +47,12 @@ class PhotoResult:
     Attributes:
         rows: of each one.
         skipped: (name, reason) of files that could not be used.
+        adjustment: the closing adjustment of the map with them.
     """
 
     rows: list[PhotoReport]
     skipped: tuple[tuple[str, str], ...]
+    adjustment: AdjustReport
 
 
 def add_photos(
@@ -102,10 +105,10 @@ def add_photos(
     mapper.triangulate_images([idx for idx, _ in keyframes])
     mapper.grow()
     mapper.finish()
-    mapper.polish()
+    adjustment = mapper.polish()
     rows = [_row(joined, len(model.image_names) + k, attempts) for k in range(len(found.images))]
     events.finished(STAGE, f"{sum(row.is_registered for row in rows)} of {len(rows)} photographs registered")
-    return joined, PhotoResult(rows, found.skipped)
+    return joined, PhotoResult(rows, found.skipped, adjustment)
 
 
 def _chosen_keyframes(odometry: OdometryResult) -> dict[int, int]:

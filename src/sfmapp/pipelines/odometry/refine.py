@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.options import AdjustOptions
-from sfmapp.adjust.solver import adjust_bundle
+from sfmapp.adjust.graph import FactorGraph
+from sfmapp.adjust.options import AdjustOptions, AdjustReport
+from sfmapp.adjust.solver import import_ahead
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
@@ -129,12 +130,15 @@ def _refined(
 ) -> tuple[OdometryResult, PhotoResult | None]:  # fmt: skip
     """All maps refined, the largest with photographs in it."""
     options = job.options
-    maps = []
+    import_ahead(max(len(entry.keyframe_frame_idx) for entry in before.maps))
+    maps, adjustments = [], list[AdjustReport | None]()
     with job.stage("adjustment"):
         job.events.started(STAGE, "adjusting maps", total=len(before.maps))
         for entry in before.maps:
             mapping = lenient(options.mapping, entry.reconstruction)
-            maps.append(adjusted(entry.reconstruction, mapping, options.adjust, free_intrinsics, pool, job.events))
+            model, report = adjusted(entry.reconstruction, mapping, options.adjust, free_intrinsics, pool, job.events)
+            maps.append(model)
+            adjustments.append(report)
             job.events.advanced(STAGE)
         job.events.finished(STAGE)
     added = None
@@ -147,8 +151,11 @@ def _refined(
                 replace(options, mapping=lenient(options.mapping, maps[0])), threads=job.threads, pool=pool,
                 events=job.events,
             )  # fmt: skip
-            maps[0] = map_with_photos
-    entries = [in_previous_gauge(entry, model) for entry, model in zip(before.maps, maps, strict=True)]
+            maps[0], adjustments[0] = map_with_photos, added.adjustment
+    entries = [
+        in_previous_gauge(replace(entry, adjustment=report), model)
+        for entry, report, model in zip(before.maps, adjustments, maps, strict=True)
+    ]
     return moved_frames(before, entries), added
 
 
@@ -161,15 +168,16 @@ def lenient(options: MappingOptions, model: Reconstruction) -> MappingOptions:
 def adjusted(
     model: Reconstruction, mapping: MappingOptions, adjust: AdjustOptions, free_intrinsics: bool, pool: Executor,
     events: Events,
-) -> Reconstruction:  # fmt: skip
-    """A copy, adjusted and filtered in turn until its observations settle."""
+) -> tuple[Reconstruction, AdjustReport]:  # fmt: skip
+    """A copy, adjusted and filtered in turn until its observations settle, and the last adjustment."""
     model = model.copy()
     model.cameras = [replace(camera, is_fixed=not free_intrinsics) for camera in model.cameras]
     priors = [replace(camera, focal_sigma=_FOCAL_SIGMA * camera.focal) for camera in model.cameras]
     for _ in range(_MAX_ROUNDS):
         used = model.obs_is_inlier.copy()
         sigma_px = structure.residual_scale_px(model, _MIN_SIGMA_PX)
-        adjust_bundle(model, adjust.robust(sigma_px), prior_cameras=priors)
+        report = FactorGraph(model, adjust.robust(sigma_px), prior_cameras=priors, noise_px=1.0).optimize()
+        events.decided(STAGE, f"closing adjustment: {report.text}", **report)
         sigma_px = structure.residual_scale_px(model, _MIN_SIGMA_PX)
         limit_px = mapping.max_reprojection_error_sigmas * sigma_px
         limit_px = float(np.clip(limit_px, _MIN_LIMIT_PX, mapping.max_reprojection_error_px))
@@ -182,7 +190,7 @@ def adjusted(
         events.raise_if_cancelled()
         if changed <= 1e-3 * used.sum():
             break
-    return model
+    return model, report
 
 
 def in_previous_gauge(entry: MapResult, model: Reconstruction) -> MapResult:

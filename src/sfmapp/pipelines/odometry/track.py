@@ -82,6 +82,12 @@ def track_sequence(
     name = os.fspath(source) if isinstance(source, str | os.PathLike) else source.source
     if sequence is not None and self_calibrate:
         raise UsageError("frames in memory come with their camera, and cannot be looked at twice to calibrate it")
+    if options is not None and options.adjust.backend != "schur":
+        raise UsageError(
+            "odometry cannot take adjust.backend=gtsam: it adjusts windows while it tracks, and with one factor per "
+            "observation each takes ten times as long",
+            "leave it out; sfmapp refine --set adjust.backend=gtsam adjusts the finished map so",
+        )
     request = parse_scale(options.scale.source) if options is not None and options.scale.source is not None else None
     with Tracking.opened(
         ODOMETRY, name, output, options, events=events, watch=watch, scale_request=request, sequence=sequence

@@ -9,6 +9,7 @@ import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
+from sfmapp.adjust.solver import import_ahead
 from sfmapp.errors import NoReconstructionError, TooFewImagesError
 from sfmapp.events import Events
 from sfmapp.features.extract import extract_features
@@ -119,6 +120,7 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
     options, events, threads = run.options, run.events, run.threads
     if len(image_set.images) < 2:
         raise _too_few_photographs(image_set)
+    import_ahead(len(image_set.images))
     feature_keys = [keys.of_features(record.name) for record in image_set.images]
     with (
         kernels_compiling(events, run.usage),
