@@ -5,13 +5,12 @@ them, and ``places``, neighbours in a plane in random order, as a pile of photog
 same tiles and has to find the same step; the least of several runs counts, as other work on the machine only adds.
 
     python benchmarks/reduced_systems.py
-    python benchmarks/reduced_systems.py --sizes 60 300 --fills 0.1 0.5 -o /tmp/new/reduced_systems.json
+    python benchmarks/reduced_systems.py --sizes 60 300 --fills 0.1 0.5 -o /tmp/new/reduced_systems.md
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Callable
 from functools import partial
@@ -38,7 +37,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="numbers of poses")
     parser.add_argument("--fills", type=float, nargs="+", default=FILLS, help="shares of pairs that meet")
-    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "reduced_systems.json")
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "reduced_systems.md")
     arguments = parser.parse_args()
     rows = []
     with threadpool_limits(1, "blas"):
@@ -53,8 +52,7 @@ def main() -> None:
                     done.add(row["fill"])
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     report = describe_machine() | {"rows": rows}
-    arguments.output.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    arguments.output.with_suffix(".md").write_text(table(report), encoding="utf-8")
+    arguments.output.write_text(table(report), encoding="utf-8")
 
 
 def measure(pattern: str, size: int, fill: float) -> dict[str, Any]:

@@ -193,6 +193,15 @@ def promises(folder: Path) -> Iterator[Promise]:
     report = read(folder, "odometry")
     same = [row["same_bytes"] for row in report["rows"]]
     yield Promise("odometry", "two runs write the same bytes", sum(same), len(same), report["date"][:10])
+    report = read(folder, "lens_families")
+    runs = report["runs"]
+    whole = sum(run["num_registered"] == run["num_images"] and run["num_models"] == 1 for run in runs)
+    yield Promise(
+        "lens_families", "all images through a lens are registered in one model", whole, len(runs), report["date"][:10]
+    )
+    bends = [run["straight"]["bend_px"] for run in runs if run.get("straight")]
+    text = "lines are straight to half a pixel in undistorted pictures"
+    yield Promise("lens_families", text, sum(bend < 0.5 for bend in bends), len(runs), report["date"][:10])
     report = read(folder, "dense")
     digests = {run["digest"] for run in report["runs"] if run["case"] == "fountain" and "digest" in run}
     text = "one and two threads make the same patches"

@@ -17,9 +17,9 @@ Ints = NDArray[np.int64]
 SolverName = Literal["tiles", "gtsam", "lapack"]
 
 # Measured by benchmarks/reduced_systems.py; fill is the share of pairs of blocks that meet. In a closing adjustment
-# gtsam is as quick as LAPACK up to about a quarter, of whatever size. Beyond that it falls behind by up to four times,
-# which is less than 20 ms a step up to 800 unknowns, and not worth it where the system is nearly full.
-_GTSAM_FILL, _SMALL, _NEARLY_FULL = 0.25, 800, 0.75
+# gtsam is as quick as LAPACK up to about a quarter, of whatever size. Beyond that it falls behind by up to six times,
+# which is some 5 ms a step up to 400 unknowns, and not worth it where the system is nearly full.
+_GTSAM_FILL, _SMALL, _NEARLY_FULL = 0.25, 400, 0.75
 # The quick rounds keep the tiles up to the size at which nothing beats them by much, and beyond that in the range of
 # fill in which they are quickest.
 _FEW_BLOCKS, _TILES_FILL = 160, (0.3, 0.5)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.solver import import_ahead
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Frame, Sequence
@@ -406,7 +405,6 @@ class Odometry:
     def finish(self) -> OdometryResult:
         """Adjust what there is once more, and gather the result."""
         conclusions, maps = {}, dict[int, KeyframeMap]()
-        import_ahead(max((len(local.keyframes.keyframes) for local in self.atlas.maps.values()), default=0))
         for number, local in self.atlas.maps.items():
             local.backend.finish(local.keyframes)
             maps[number] = local.keyframes

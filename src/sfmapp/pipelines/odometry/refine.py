@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
-from sfmapp.adjust.solver import import_ahead
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
@@ -130,7 +129,6 @@ def _refined(
 ) -> tuple[OdometryResult, PhotoResult | None]:  # fmt: skip
     """All maps refined, the largest with photographs in it."""
     options = job.options
-    import_ahead(max(len(entry.keyframe_frame_idx) for entry in before.maps))
     maps, adjustments = [], list[AdjustReport | None]()
     with job.stage("adjustment"):
         job.events.started(STAGE, "adjusting maps", total=len(before.maps))
