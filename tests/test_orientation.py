@@ -464,7 +464,7 @@ def test_live_frames_are_upright(orientation: int) -> None:
     drawing.draw({
         "kind": "frame", "frame_idx": 0, "timestamp_s": 0.0, "state": int(FrameState.TRACKED), "image": stored,
         "xy": xy, "is_mapped": np.array([True, False]), "num_tracked": 2, "num_mapped": 1, "map_idx": 0,
-        "cam_from_world": rigid3.IDENTITY, "time_s": 0.01,
+        "cam_from_world": rigid3.IDENTITY, "cpu_s": 0.01,
     })  # fmt: skip
     jpeg = bytes(logged.last["image", "EncodedImage"].blob.as_arrow_array().to_pylist()[0])
     shown = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)

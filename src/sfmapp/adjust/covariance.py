@@ -118,7 +118,7 @@ def estimate_covariances(
     engine = make_engine(reconstruction, options, varying, prior_cameras=prior_cameras, extra_factors=extra_factors)
     problem, extras = engine.problem, engine.extras
     used = (np.arange(8) < problem.block_dim[:, None]).ravel()
-    variance = sigma_px**2 if sigma_px is not None else _variance(engine, int(used.sum()))
+    variance = sigma_px**2 if sigma_px is not None else residual_variance(engine)
     # everything below is in units of that noise, which makes the priors weaker or stronger
     engine.priors.weight *= variance
     if extras is not None:
@@ -134,9 +134,10 @@ def estimate_covariances(
     return _collect(engine, reconstruction, full * variance, variance, len(basis), determined)
 
 
-def _variance(engine: Engine, num_unknowns: int) -> float:
-    """Variance of a pixel coordinate from weighted residuals and degrees of freedom."""
+def residual_variance(engine: Engine) -> float:
+    """Variance of a pixel coordinate from weighted residuals and degrees of freedom; infinite without redundancy."""
     p = engine.problem
+    num_unknowns = int(p.block_dim.sum())
     total, _, _ = weigh_observations(p.points, p.images(engine.rows), p.lenses, engine.loss, 0.0)
     is_free = (p.pose_block >= 0).all() and not p.is_constant.any() and engine.extras is None
     free_gauge = 0 if not is_free else 6 if p.has_baseline else 7

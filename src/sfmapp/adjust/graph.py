@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.covariance import constrained_columns, gauge_of, reduced_matrix
+from sfmapp.adjust.covariance import constrained_columns, gauge_of, reduced_matrix, residual_variance
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.problem import EVERYTHING, Problem, Varying, write_back
 from sfmapp.adjust.solver import Engine, make_engine, run_engine
@@ -22,7 +22,6 @@ from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.geometry.noise import sigma_of_lengths
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -119,7 +118,7 @@ class FactorGraph:
         noise_px: float | None = None,
         threads: int = 1,
     ) -> None:
-        """Nothing is computed yet.
+        """Nothing is adjusted yet.
 
         Args:
             reconstruction: its inlier observations are the reprojection factors.
@@ -127,17 +126,18 @@ class FactorGraph:
             varying: which poses, intrinsics and points take part and may change; all by default.
             prior_cameras: (C,) cameras as they were known beforehand: Gaussian priors around their parameters, with
                 ``focal_sigma`` for focal lengths and the options' sigmas for the rest. None for no priors.
-            noise_px: None to take it from the median of the residuals as they are now.
+            noise_px: None to take it from the residuals as they are now, (robustly) weighted, and from how many degrees
+                of freedom an adjustment leaves them.
             threads: at most this many; the result does not depend on it.
 
         Raises:
-            InputError: the noise is not positive, or there is no residual to take it from.
+            InputError: the noise is not positive, or there are too few residuals to take it from.
         """
         self.reconstruction, self.options = reconstruction, options or AdjustOptions()
-        self.noise_px = _measured_noise(reconstruction) if noise_px is None else noise_px
+        self._varying, self._prior_cameras, self._threads = varying, prior_cameras, threads
+        self.noise_px = self._measured_noise() if noise_px is None else noise_px
         if not (np.isfinite(self.noise_px) and self.noise_px > 0.0):
             raise InputError(f"the noise of a pixel coordinate must be positive, found {noise_px}")
-        self._varying, self._prior_cameras, self._threads = varying, prior_cameras, threads
         self._factors: Any = None
         self._values: Any = None
         self._plain: Any = None
@@ -286,20 +286,23 @@ class FactorGraph:
             is_closing=is_closing, noise_px=self.noise_px,
         )  # fmt: skip
 
+    def _measured_noise(self) -> float:
+        engine = make_engine(
+            self.reconstruction, self.options, self._varying, prior_cameras=self._prior_cameras, is_closing=False
+        )
+        if not engine.problem.num_observations:
+            raise InputError("the reconstruction has no observation to take the noise from")
+        variance = residual_variance(engine)
+        if not np.isfinite(variance):
+            raise InputError("the observations are too few to tell their noise; give noise_px")
+        return max(_MIN_NOISE_PX, float(np.sqrt(variance)))
+
     def _plain_graph(self) -> Any:
         from sfmapp.adjust.reference import PlainGraph
 
         return PlainGraph(
             self.reconstruction, self.options, self._varying, self._prior_cameras, self._extras(), self.noise_px
         )
-
-
-def _measured_noise(reconstruction: Reconstruction) -> float:
-    lengths = np.linalg.norm(reconstruction.residuals_px()[reconstruction.obs_is_inlier], axis=1)
-    lengths = lengths[np.isfinite(lengths)]
-    if not len(lengths):
-        raise InputError("the reconstruction has no observation to take the noise from")
-    return max(_MIN_NOISE_PX, sigma_of_lengths(lengths))
 
 
 def _rows_of(
