@@ -88,7 +88,8 @@ class PlainLines:
         self._spoke = now
         took = event.time_s - self._started.get(event.stage, event.time_s)
         left = ""
-        if event.total and event.done:
+        # mapping counts what it registers, some of it twice where models are joined: then nobody knows how long
+        if event.total and 0 < event.done <= event.total:
             left = f" of {event.total}, about {took / event.done * (event.total - event.done):.0f} s left"
         _say(f"{event.stage}: {event.done}{left}")
 
@@ -116,7 +117,8 @@ class Bars:
             self._tasks[event.stage] = self._progress.add_task(event.stage, total=event.total, message=event.message)
         elif event.kind == "advanced" and event.stage in self._tasks:
             fields: dict[str, Any] = {"message": event.message} if event.message else {}
-            self._progress.update(self._tasks[event.stage], completed=event.done, total=event.total, **fields)
+            total = None if event.total is None else max(event.total, event.done)
+            self._progress.update(self._tasks[event.stage], completed=event.done, total=total, **fields)
         elif event.kind == "warned":
             self._print(f"warning: {event.message}", "yellow")
         elif event.kind == "decided" and self._is_verbose:

@@ -231,7 +231,7 @@ def _print_world(report: ReconstructionReport) -> None:
             f"north to {model.rotation_sigma_deg[2]:.2g} degrees"
         )
     for finding in placed.findings:
-        print(f"  positions: {', '.join([*finding.images[:3], ''])}{finding.message}")
+        print(f"  positions: {finding.sentence}")
 
 
 def _print_control(report: ReconstructionReport) -> None:

@@ -18,6 +18,14 @@ class Finding(Report):
     images: Sequence[str]
     message: str
 
+    @property
+    def sentence(self) -> str:
+        """The message with the names before it, of which there are three at most."""
+        if not self.images:
+            return self.message
+        more = f" and {len(self.images) - 3} more" if len(self.images) > 3 else ""
+        return f"{', '.join(self.images[:3])}{more}: {self.message}"
+
 
 class Ellipse(Report):
     """Standard deviations of a place: of the horizontal ellipse along its axes, the azimuth of the longer one from

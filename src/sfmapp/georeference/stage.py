@@ -84,7 +84,7 @@ def georeference_models(mappers: Sequence[Mapper], image_set: ImageSet, options:
     """
     tags, findings = tags_of(image_set.images, options)
     for finding in findings:
-        events.warned(STAGE, finding.message, names=list(finding.images))
+        events.warned(STAGE, f"positions: {finding.sentence}", names=list(finding.images))
     placed: list[_Model] = []
     reports: list[PlacedModel] = []
     for number, mapper in enumerate(mappers if tags is not None else ()):
@@ -100,7 +100,7 @@ def georeference_models(mappers: Sequence[Mapper], image_set: ImageSet, options:
     images = _images(tags, placed, mappers, image_set.names) if tags is not None else []
     findings += _rejections(images)
     for finding in _rejections(images):
-        events.warned(STAGE, f"{', '.join(finding.images)}: {finding.message}; the position is left aside")
+        events.warned(STAGE, f"positions: {finding.sentence}; it is left aside")
     num = sum(record.position is not None for record in image_set.images)
     report = GeoreferenceReport(
         source=options.source, num_positions=num, findings=findings, models=reports, images=images

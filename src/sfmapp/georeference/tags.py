@@ -71,7 +71,7 @@ def tags_of(records: Sequence[ImageRecord], options: GpsOptions) -> tuple[Tags |
     first = _first_of_same(geodetic)
     repeated = [name for name, n, k in zip(names, first, range(len(first)), strict=True) if n != k]
     if repeated:
-        text = "the position of an earlier photograph to the last digit, which is no new measurement, and left aside"
+        text = "the same position as an earlier photograph, to the last digit: no new measurement, and left aside"
         findings.append(Finding(images=repeated, message=text))
     findings += _without_false_heights(geodetic, names)
     sigma = np.array([[_or_nan(p.sigma_m), _or_nan(p.sigma_up_m)] for p in positions])

@@ -32,10 +32,7 @@ def world_section(report: GeoreferenceReport, model: Reconstruction | None) -> s
         report: of the stage.
         model: the largest one, for its points; None where it does not lie in the world.
     """
-    findings = "".join(
-        f"<li>{escape(', '.join(finding.images) + ': ' if finding.images else '')}{escape(finding.message)}</li>"
-        for finding in report.findings
-    )
+    findings = "".join(f"<li>{escape(finding.sentence)}</li>" for finding in report.findings)
     parts = [f"<ul>{findings}</ul>" if findings else ""]
     if any(image.adjusted_m for image in report.images):
         parts.insert(0, world_map_svg(report.images, model))
@@ -127,15 +124,22 @@ def _models(models: Sequence[PlacedModel]) -> str:
     head = [
         ("", "model"), ("", "positions used"), ("", "scale sigma"), ("", "rotation sigma (east, north, up)"),
         ("", "mean place sigma (east, north, up)"), ("", "rms residual, horizontal and up"),
-        ("", "sigma of a position"), ("t", "adjusted with them"), ("t", "remarks"),
+        ("", "sigma of a position"), ("t", "adjusted with them"),
     ]  # fmt: skip
-    return table(head, [_model_row(model) for model in models])
+    notes = [
+        f"model {model.model} is in arbitrary units: {model.reason}"
+        if model.reason
+        else f"model {model.model}: {remarks(model)}"
+        for model in models
+    ]
+    listed = "".join(f"<li>{escape(note)}</li>" for note in notes)
+    return table(head, [_model_row(model) for model in models]) + f"<ul>{listed}</ul>"
 
 
 def _model_row(model: PlacedModel) -> list[tuple[str, object]]:
     count = f"{model.num_used} of {model.num_positions}"
     if model.reason:
-        return [("", model.model), ("", count), *[("", None)] * 6, ("w", f"in arbitrary units: {model.reason}")]
+        return [("", model.model), ("", count), *[("", None)] * 5, ("t", "no")]
     assert model.scale_sigma_share is not None
     assert model.rotation_sigma_deg is not None
     assert model.position_sigma_m is not None
@@ -148,7 +152,6 @@ def _model_row(model: PlacedModel) -> list[tuple[str, object]]:
         ("", _pair(model.rms_residual_m)),
         ("", _pair(model.sigma_m)),
         ("t", f"yes, bent by {model.moved_m:.2g} m" if model.is_adjusted else "no, moved as a whole"),
-        ("w", remarks(model)),
     ]
 
 
