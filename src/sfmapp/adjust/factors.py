@@ -6,7 +6,7 @@ one tangent (rotation, translation) is the negative of the other.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import gtsam
@@ -298,7 +298,7 @@ class SparseSystem:
         gather_scaled(tiles, self._pairs, self._places, root, self._dims, self._buffer)
         right = rhs * root.ravel()
         graph, factor, keys, empty = gtsam.GaussianFactorGraph(), gtsam.HessianFactor, self._keys, self._empty
-        for (i, j), matrix in zip(self._group_pairs.tolist(), self._matrices, strict=True):
+        for (i, j), matrix in self._blocks():
             if i == j:
                 graph.push_back(factor(keys[i], matrix, right[self._rows[i]], 0.0))
             else:
@@ -325,11 +325,12 @@ class SparseSystem:
             net = graph.eliminateSequential(self._ordering)
         except RuntimeError:  # not positive definite: the caller raises the damping
             return None
+        blocks = [np.triu(m) + np.triu(m, 1).T if i == j else m for (i, j), m in self._blocks()]
         found, rest = np.zeros(len(right)), right.copy()
         better = direction = self._unpacked(net.backSubstitute(net.backSubstituteTranspose(self._packed(rest))))
         gain = rest @ better
         for _ in range(_MAX_ROUNDS):
-            image = self._product(direction)
+            image = self._product(blocks, direction)
             curvature = direction @ image
             if not curvature > 0.0:
                 break
@@ -342,15 +343,16 @@ class SparseSystem:
             direction = better + gain / before * direction
         return found
 
-    def _product(self, x: Array) -> Array:
+    def _blocks(self) -> Iterator[tuple[tuple[int, int], Array]]:
+        """Pairs of groups and their parts of the scaled system; of those on the diagonal only the upper half counts."""
+        return zip(map(tuple, self._group_pairs.tolist()), self._matrices, strict=True)
+
+    def _product(self, blocks: list[Array], x: Array) -> Array:
         """The scaled system times x (B * 8,)."""
         out = np.zeros(len(x))
-        for (i, j), matrix in zip(self._group_pairs.tolist(), self._matrices, strict=True):
-            if i == j:
-                upper = np.triu(matrix)
-                out[self._rows[i]] += upper @ x[self._rows[i]] + np.triu(matrix, 1).T @ x[self._rows[i]]
-            else:
-                out[self._rows[i]] += matrix @ x[self._rows[j]]
+        for ((i, j), _), matrix in zip(self._blocks(), blocks, strict=True):
+            out[self._rows[i]] += matrix @ x[self._rows[j]]
+            if i != j:
                 out[self._rows[j]] += matrix.T @ x[self._rows[i]]
         return out
 
