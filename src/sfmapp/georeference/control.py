@@ -27,6 +27,10 @@ _MAX_TRIPLES = 2300
 _SPREAD_OVER_RESIDUAL = 3.0
 # A direction in which the survey has but this share of its variance of its own is not held by anything else.
 _HELD_BY_ITSELF = 1e-6
+# Chance that any good point, or known length, is left aside.
+FALSE_ALARM = 1e-3
+# One is the wrong one and not another if the squares fall by this much more without it: 3 sigma.
+CLEARLY = 9.0
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ from scipy.stats import chi2
 
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.formats.control_points import ControlPoints
-from sfmapp.georeference.control import LeftOut, Survey, leave_out, left_out_already
+from sfmapp.georeference.control import CLEARLY, FALSE_ALARM, LeftOut, Survey, leave_out, left_out_already
+from sfmapp.georeference.fit import MEDIAN_CHI2
 from sfmapp.georeference.landmarks import LandmarkFactor, Marks, Surveyed
 from sfmapp.georeference.marks import MarkedPoints
 from sfmapp.scene.reconstruction import Reconstruction
@@ -25,14 +26,8 @@ from sfmapp.scene.reconstruction import Reconstruction
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Chance that any of the good points is left aside.
-_FALSE_ALARM = 1e-3
-# One point is the wrong one and not another if the cost falls by this much more without it: 3 sigma.
-_CLEARLY = 9.0
 # No more of the points than this may be wrong.
 _MAX_WRONG = 1 / 3
-# For three degrees of freedom.
-_MEDIAN_CHI2 = 2.366
 
 
 @dataclass(frozen=True)
@@ -87,16 +82,16 @@ def adjust_to_control(
     spread, seen = 1.0, {is_used.tobytes()}
     while True:
         solution = points.solve(is_used, spread)
-        limit = float(chi2.isf(_FALSE_ALARM / max(1, len(is_used)), 3))
+        limit = float(chi2.isf(FALSE_ALARM / max(1, len(is_used)), 3))
         squares = np.array([0.0 if found is None else found.square for found in solution.left_out])
         outside, inside = np.where(is_used, squares, 0.0), np.where(is_used, np.inf, squares)
         inside[[found is None for found in solution.left_out]] = np.inf
         changed = is_used.copy()
         if outside.max(initial=0.0) > limit:
             worst, second = np.sort([*outside, 0.0])[::-1][:2]
-            if worst - second < _CLEARLY or (marked.is_placed & ~is_used).sum() >= most_wrong or spread > 1.0:
+            if worst - second < CLEARLY or (marked.is_placed & ~is_used).sum() >= most_wrong or spread > 1.0:
                 # who is wrong cannot be told, or too many would be: the survey is poorer than it says
-                wider = spread * float(np.sqrt(np.median(squares[squares > 0]) / _MEDIAN_CHI2))
+                wider = spread * float(np.sqrt(np.median(squares[squares > 0]) / MEDIAN_CHI2[3]))
                 is_used, spread = start & marked.is_placed, max(wider, 1.2 * spread)
                 continue
             changed[int(np.argmax(outside))] = False

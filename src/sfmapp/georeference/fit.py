@@ -21,7 +21,7 @@ Mask = NDArray[np.bool_]
 # a thousand right ones one is lost, which costs nothing.
 MAX_CHI2 = 16.27
 # medians of chi square with 2 and 3 degrees of freedom
-_MEDIAN_CHI2 = {2: 1.386, 3: 2.366}
+MEDIAN_CHI2 = {2: 1.386, 3: 2.366}
 # All triples up to this many, else as many drawn: with 40 % wrong tags one in five triples is right.
 _MAX_TRIPLES = 2000
 # ... and fewer where there are so many tags that memory would matter: then fewer do
@@ -276,7 +276,7 @@ def _least_median(centers: Array, places: Array, sigma: Array) -> tuple[Similari
         return None, 1.0
     # as for the median absolute deviation of few values: Rousseeuw and Leroy 1987, page 202
     freedom = 3 if has_height.mean() > 0.5 else 2
-    scale2 = float(np.median(squares[best])) / _MEDIAN_CHI2[freedom] * (1.0 + 5.0 / max(num - 3, 1)) ** 2
+    scale2 = float(np.median(squares[best])) / MEDIAN_CHI2[freedom] * (1.0 + 5.0 / max(num - 3, 1)) ** 2
     start = Similarity(
         rotation[best], float(scale[best]), np.zeros(3), shift[best], np.zeros((7, 7)), np.ones((num, 3))
     )

@@ -9,14 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from sfmapp.georeference.control import CLEARLY, FALSE_ALARM
 from sfmapp.georeference.control_report import ScaleBarRow, ScaledModel
 
 Array = NDArray[np.float64]
-
-# Chance that any of the good bars is left aside.
-_FALSE_ALARM = 1e-3
-# One bar is the wrong one and not another if the squares fall by this much more without it: 3 sigma.
-_CLEARLY = 9.0
 
 
 @dataclass(frozen=True)
@@ -60,15 +56,14 @@ def scale_by_bars(model: int, bars: Sequence[ScaleBar], unmeasured: Sequence[str
         return ScaledModel(model=model, reason="; ".join(unmeasured), bars=[], findings=list(unmeasured))
     logs, sigmas = np.array([bar.log_scale for bar in bars]), np.array([bar.sigma_share for bar in bars])
     used, spread = np.ones(len(bars), bool), 1.0
-    limit = float(norm.isf(_FALSE_ALARM / (2 * len(bars))))
+    limit = float(norm.isf(FALSE_ALARM / (2 * len(bars))))
     while used.sum() > 1:
-        ratios = np.array([abs(_left_out(logs, sigmas, used, n)[0]) for n in range(len(bars))])
-        ratios /= np.array([_left_out(logs, sigmas, used, n)[1] for n in range(len(bars))])
-        inside = np.where(used, ratios, 0.0)
+        errors, deviations = np.array([_left_out(logs, sigmas, used, n) for n in range(len(bars))]).T
+        inside = np.where(used, np.abs(errors) / deviations, 0.0)
         worst, second = np.sort(inside)[::-1][:2] ** 2
         if inside.max() <= limit:
             break
-        if used.sum() == 2 or worst - second < _CLEARLY:
+        if used.sum() == 2 or worst - second < CLEARLY:
             mean, _ = _mean(logs, sigmas, used)
             squares = float((((logs - mean) / sigmas)[used] ** 2).sum())
             spread = max(1.0, float(np.sqrt(squares / (used.sum() - 1))))

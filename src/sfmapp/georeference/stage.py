@@ -98,8 +98,9 @@ def georeference_models(mappers: Sequence[Mapper], image_set: ImageSet, options:
             reports.append(_report_of(outcome, tags))
             _tell(outcome, reports[-1], events)
     images = _images(tags, placed, mappers, image_set.names) if tags is not None else []
-    findings += _rejections(images)
-    for finding in _rejections(images):
+    rejections = _rejections(images)
+    findings += rejections
+    for finding in rejections:
         events.warned(STAGE, f"positions: {finding.sentence}; it is left aside")
     num = sum(record.position is not None for record in image_set.images)
     report = GeoreferenceReport(
