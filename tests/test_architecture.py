@@ -36,7 +36,7 @@ FLOORS = (
     ("features",),
     ("sequences",),
     ("images",),
-    ("calibration",),
+    ("camera_files",),
     ("formats",),
     ("evaluation",),
     ("scene",),

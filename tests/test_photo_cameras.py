@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfmapp.calibration.reading import read_calibration
 from sfmapp.camera.camera import Camera, CameraModel, pixels_to_normalized, project
+from sfmapp.camera_files.reading import read_calibration
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Event, Events

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from statistics import median, pstdev
 
-from sfmapp.calibration.photographs import GivenCamera, Photograph, read_given_cameras
 from sfmapp.camera.camera import Camera, simple_camera
 from sfmapp.camera.names import CameraModel
+from sfmapp.camera_files.photographs import GivenCamera, Photograph, read_given_cameras
 from sfmapp.errors import UsageError
 from sfmapp.events import Events
 from sfmapp.geometry.orientation import MIRRORED

@@ -26,7 +26,7 @@ class SequenceOptions:
 
     Attributes:
         camera: ``MODEL,PARAMETER,...`` in COLMAP's order and pixel rule (the centre of the top-left pixel is 0.5), or
-            the path of a calibration file (see :func:`sfmapp.calibration.reading.read_calibration`). None: what
+            the path of a calibration file (see :func:`sfmapp.camera_files.reading.read_calibration`). None: what
             lies beside the frames.
         mono: use the first camera alone, also where there are two.
         start, stop: first frame and the one behind the last, as positions in the sequence; None: to its end.

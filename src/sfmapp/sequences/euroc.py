@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.calibration.fields import read_pose
-from sfmapp.calibration.reading import Calibration, read_calibration
+from sfmapp.camera_files.fields import read_pose
+from sfmapp.camera_files.reading import Calibration, read_calibration
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.clocks import Times, parse_time, read_column

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.calibration.reading import Calibration
+from sfmapp.camera_files.reading import Calibration
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.clocks import Times, are_dates, parse_time, read_column, times_of_names

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.calibration.reading import kitti_calibration
+from sfmapp.camera_files.reading import kitti_calibration
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.sequences.files import (

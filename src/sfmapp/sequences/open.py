@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.calibration.fields import camera_from_text, is_calibration_path, oddity
-from sfmapp.calibration.opencv_lens import sampling_map
-from sfmapp.calibration.reading import Calibration, read_calibration
 from sfmapp.camera.camera import Camera, simple_camera
 from sfmapp.camera.names import CameraModel
+from sfmapp.camera_files.fields import camera_from_text, is_calibration_path, oddity
+from sfmapp.camera_files.opencv_lens import sampling_map
+from sfmapp.camera_files.reading import Calibration, read_calibration
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.clocks import Times, are_dates

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.calibration.opencv_lens import camera_from_opencv, scaled_to
-from sfmapp.calibration.reading import Calibration
+from sfmapp.camera_files.opencv_lens import camera_from_opencv, scaled_to
+from sfmapp.camera_files.reading import Calibration
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.clocks import Times, parse_time, read_column

@@ -1,7 +1,7 @@
 """Calibrations of one camera or of a pair, in the forms that people have them.
 
-Where one comes from, and how its camera is told from its fields, is in :mod:`sfmapp.calibration.files` and
-:mod:`sfmapp.calibration.fields`.
+Where one comes from, and how its camera is told from its fields, is in :mod:`sfmapp.camera_files.files` and
+:mod:`sfmapp.camera_files.fields`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.calibration.fields import (
+from sfmapp.camera_files.fields import (
     Fields,
     camera_of_fields,
     cameras_in,
@@ -23,9 +23,9 @@ from sfmapp.calibration.fields import (
     read_pose,
     rectified_projection,
 )
-from sfmapp.calibration.files import read_fields
-from sfmapp.calibration.lens_types import type_fields
-from sfmapp.calibration.opencv_lens import CalibratedCamera, FullLens, Size, camera_from_opencv, scaled_to
+from sfmapp.camera_files.files import read_fields
+from sfmapp.camera_files.lens_types import type_fields
+from sfmapp.camera_files.opencv_lens import CalibratedCamera, FullLens, Size, camera_from_opencv, scaled_to
 from sfmapp.errors import InputError
 from sfmapp.formats.text_input import nearest_rotation
 from sfmapp.geometry import rigid3
@@ -64,7 +64,7 @@ def read_calibration(path: str | Path, image_sizes: Sequence[Size]) -> Calibrati
     ``sensor.yaml``, Kalibr's ``camchain.yaml``, ROS's ``camera_info.yaml``, OpenCV's yml and xml (``camera_matrix`` or
     ``M1``, ``D1``, ``M2``, ``D2``, ``R``, ``T``), settings of ORB-SLAM and VINS-Fusion, KITTI's ``calib.txt``, and
     plain text of ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` or of the 3 x 3 matrix. What they call the lens counts: see
-    :mod:`sfmapp.calibration.lens_types`.
+    :mod:`sfmapp.camera_files.lens_types`.
 
     Args:
         image_sizes: (width, height) of the images of each camera that is wanted; a calibration of another size but the

@@ -18,24 +18,24 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.calibration.lens_types import (
+from sfmapp.camera.camera import Camera, simple_camera
+from sfmapp.camera.models import PARAM_NAMES, kind_of
+from sfmapp.camera.names import CameraModel
+from sfmapp.camera_files.lens_types import (
     LensType,
     is_without_distortion,
     lens_type,
     named_coefficients,
     type_fields,
 )
-from sfmapp.calibration.opencv_lens import (
+from sfmapp.camera_files.opencv_lens import (
     SIGMA_CALIBRATED,
     CalibratedCamera,
     Size,
     camera_from_colmap,
     camera_from_opencv,
 )
-from sfmapp.calibration.slam_settings import orb_slam_fields, vins_fields
-from sfmapp.camera.camera import Camera, simple_camera
-from sfmapp.camera.models import PARAM_NAMES, kind_of
-from sfmapp.camera.names import CameraModel
+from sfmapp.camera_files.slam_settings import orb_slam_fields, vins_fields
 from sfmapp.errors import InputError, UsageError
 from sfmapp.formats.text_input import nearest_rotation
 from sfmapp.geometry import rigid3

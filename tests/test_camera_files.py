@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfmapp.calibration.opencv_lens import FullLens, camera_from_opencv, sampling_map
-from sfmapp.calibration.reading import read_calibration
 from sfmapp.camera.camera import Camera, CameraModel, project
+from sfmapp.camera_files.opencv_lens import FullLens, camera_from_opencv, sampling_map
+from sfmapp.camera_files.reading import read_calibration
 from sfmapp.errors import InputError
 from sfmapp.formats.flat_yaml import parse_flat_yaml
 from sfmapp.geometry import rigid3

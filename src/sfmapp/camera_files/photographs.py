@@ -11,7 +11,8 @@ from pathlib import Path, PurePath, PurePosixPath
 
 import numpy as np
 
-from sfmapp.calibration.fields import (
+from sfmapp.camera.camera import Camera
+from sfmapp.camera_files.fields import (
     camera_from_text,
     camera_of_fields,
     cameras_in,
@@ -19,9 +20,8 @@ from sfmapp.calibration.fields import (
     oddity,
     stated_size,
 )
-from sfmapp.calibration.files import read_fields
-from sfmapp.calibration.opencv_lens import CalibratedCamera, Size, exact_camera, scaled_to
-from sfmapp.camera.camera import Camera
+from sfmapp.camera_files.files import read_fields
+from sfmapp.camera_files.opencv_lens import CalibratedCamera, Size, exact_camera, scaled_to
 from sfmapp.errors import InputError
 from sfmapp.geometry.orientation import INVERSE, is_sideways
 from sfmapp.scene.turned_camera import fault_of_upright, turned_camera
@@ -238,7 +238,7 @@ class GivenCameras:
 
 def read_given_cameras(given: str) -> GivenCameras:
     """The cameras of ``MODEL,PARAMETER,...``, of a calibration file of any form that
-    :func:`sfmapp.calibration.reading.read_calibration` knows, or of a folder that holds one.
+    :func:`sfmapp.camera_files.reading.read_calibration` knows, or of a folder that holds one.
 
     Raises:
         InputError: the file cannot be read, or holds no camera.

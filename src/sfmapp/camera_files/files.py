@@ -7,9 +7,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from sfmapp.calibration.fields import Fields, is_of_camera
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.names import MODEL_NAMES
+from sfmapp.camera_files.fields import Fields, is_of_camera
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_binary import read_binary_cameras, read_binary_images
 from sfmapp.formats.colmap_text import read_text_images

@@ -1,1 +1,0 @@
-"""Calibration files of other programs."""

@@ -1,0 +1,1 @@
+"""Camera files: calibrations in the forms of other programs."""
