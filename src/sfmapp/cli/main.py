@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 
 import sfmapp
-from sfmapp.cli import convert, dense, evaluate, inspect, odometry, reconstruct, undistort
+from sfmapp.cli import calibrate, convert, dense, evaluate, inspect, odometry, reconstruct, undistort
 from sfmapp.cli.signals import signals_interrupt
 from sfmapp.cli.streams import standard_streams
 from sfmapp.errors import InputError, InterruptedRunError, SfmError, refusal
@@ -78,7 +78,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"sfmapp {sfmapp.__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for family in (reconstruct, dense, odometry, evaluate, inspect, convert, undistort):
+    for family in (reconstruct, dense, odometry, evaluate, inspect, convert, undistort, calibrate):
         family.add_commands(commands)
     for command in commands.choices.values():
         command.allow_abbrev = False  # half a flag would mean another one as soon as there are more
