@@ -1,13 +1,13 @@
-"""``sfmapp calibrate``: cameras from boards, targets, lines and rigs. Each way has a file beside this one."""
+"""``sfmapp calibrate``: cameras from boards, targets, lines and rigs. Each way is a file ``calibrate_WAY`` beside this
+one, with ``add_way``."""
 
 from __future__ import annotations
 
 import argparse
+import importlib
+import pkgutil
 
-from sfmapp.cli import calibrate_print
-
-# a way to calibrate is a module with add_command(ways), named here
-WAYS = (calibrate_print,)
+from sfmapp import cli
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -18,7 +18,8 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "taken by --camera of reconstruct and odometry.",
     )  # fmt: skip
     ways = parser.add_subparsers(title="ways", metavar="WAY", required=True)
-    for way in WAYS:
-        way.add_command(ways)
-    for one in ways.choices.values():
-        one.allow_abbrev = False
+    for module in sorted(found.name for found in pkgutil.iter_modules(cli.__path__)):
+        if module.startswith("calibrate_"):
+            importlib.import_module(f"{cli.__name__}.{module}").add_way(ways)
+    for way in ways.choices.values():
+        way.allow_abbrev = False  # as those of the commands

@@ -9,7 +9,7 @@ from sfmapp.calibration.board_forms import BOARD_FORMS
 from sfmapp.cli.common import add_output_flags, print_json
 
 
-def add_command(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_way(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add this way to the parser."""
     parser = ways.add_parser(
         "print-board", help="a board on paper, at true size, as SVG or PDF",
