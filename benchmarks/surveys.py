@@ -143,10 +143,10 @@ def _observed(camera: Camera, poses: Array, xyz: Array, rng: np.random.Generator
 
 
 def positions(
-    survey: Survey, receiver: str, seed: int, wrong_share: float = 0.0
+    survey: Survey, receiver: str, seed: int | list[int], wrong_share: float = 0.0
 ) -> tuple[ImageSet, NDArray[np.bool_], Array]:
     """The photographs with measured positions, which are grossly wrong (n,), and what was measured (n, 3)."""
-    rng = np.random.default_rng([seed, 77])
+    rng = np.random.default_rng([*np.atleast_1d(seed).tolist(), 77])
     flat, up, is_stated = RECEIVERS[receiver]
     centers = survey.truth.centers
     num = len(centers)
@@ -200,7 +200,9 @@ class Outcome:
 def run(kind: str, receiver: str, seed: int, wrong_share: float = 0.0) -> Outcome | None:
     """One survey; None where the model was left as it was."""
     survey = make_survey(kind, seed)
-    image_set, is_wrong, _ = positions(survey, receiver, seed, wrong_share)
+    # errors of their own for every kind, receiver and share: the same ones over and over would count as one survey
+    own = [seed, KINDS.index(kind), list(RECEIVERS).index(receiver), round(100 * wrong_share)]
+    image_set, is_wrong, _ = positions(survey, receiver, own, wrong_share)
     with ThreadPoolExecutor(1) as pool:
         mapper = mapper_of(survey, pool)
         mapper.polish()
