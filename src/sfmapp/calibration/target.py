@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,8 +44,13 @@ Points = tuple[Array, Array]
 ENOUGH_FOR_DISTORTION = 20
 """Points below which the distortion of a lens is not looked for unless the user asks, and then with a warning."""
 
-_SOLID = (CameraModel.PINHOLE, CameraModel.SIMPLE_RADIAL, CameraModel.RADIAL, CameraModel.OPENCV)
-_PLANE = (CameraModel.SIMPLE_PINHOLE, CameraModel.SIMPLE_RADIAL)
+# What is tried where the user has named no lens: the first, unless another surely foretells left-out points better.
+# With points enough, all distortion is free: what is held at zero wrongly, for it is just too small to show,
+# takes the focal length along, and no sigma would say so.
+_FEW_IN_SPACE, _FEW_IN_PLANE = (CameraModel.PINHOLE,), (CameraModel.SIMPLE_PINHOLE,)
+_MANY_IN_SPACE, _MANY_IN_PLANE = (CameraModel.OPENCV, CameraModel.OPENCV_FISHEYE), (CameraModel.RADIAL,)
+# Standard errors by which another lens has to be better.
+_SURELY_BETTER = 3.0
 _PERSPECTIVE = ("BROWN", "RATIONAL", "SKEW", "DIVISION")
 # Samples of the points that starts are taken from: with 40 % of them wrong, 23 of 500 samples of six have none.
 _MAX_SAMPLES = 500
@@ -70,7 +76,7 @@ class LensTrial:
         rms_px: of these.
         left_out_px: root mean square distance of all points from where the others put them, each no more than what is
             far off; None where the points are too few.
-        is_chosen: the one with the least of these, or that the user asked for.
+        is_chosen: the first, unless another is surely better by these.
     """
 
     model: CameraModel
@@ -162,8 +168,8 @@ def calibrate_target(
     Args:
         xyz: (N, 3) places in any unit; N >= 6, or 5 on a plane. xy: (N, 2) the pixels that show them.
         size: width and height of the photograph.
-        camera_model: None: the one that foretells points best that were left out, among those with square or oblong
-            pixels and, from 20 points on, distortion. ``PINHOLE_SKEW`` takes the skew as it comes.
+        camera_model: None: PINHOLE, from 20 points on OPENCV, or OPENCV_FISHEYE where that foretells points that were
+            left out surely better; on a plane SIMPLE_PINHOLE and RADIAL. ``PINHOLE_SKEW`` takes the skew as it comes.
         sigma_px: standard deviation of a marked coordinate, if known; None: from the residuals.
 
     Returns:
@@ -176,7 +182,8 @@ def calibrate_target(
     """
     xyz, xy = _checked(xyz, xy)
     points = xyz, xy
-    models = _models(camera_model)
+    if camera_model == CameraModel.EQUIRECTANGULAR:
+        raise UsageError(f"{camera_model.name} has nothing to calibrate", "a panorama is known by its size")
     is_plane = _flatness(xyz) < _FLAT
     least = 5 if is_plane else dlt.MIN_POINTS
     if len(xy) < least:
@@ -185,13 +192,12 @@ def calibrate_target(
             f"expected at least {least} points that lie {kind}, found {len(xy)}", "measure and mark more of them"
         )
     start = _start_on_plane(points, size) if is_plane else _start_in_space(points, size)
-    if models is None:
-        models = (_PLANE if is_plane else _SOLID)[: None if len(xy) >= ENOUGH_FOR_DISTORTION else 1]
     share = _CENTER_SHARE if is_plane else None
-    view, trials = _trials({model: _fit_lens(model, start, points, share, sigma_px) for model in models}, sigma_px)
+    lenses = _lenses(camera_model, len(xy), is_plane)
+    view, trials = _trials([_fit_lens(model, start, points, share, sigma_px) for model in lenses], sigma_px)
     if view is None:
         raise InputError(
-            f"{len(xy)} points are too few for {models[0].name}, or its lens sees none of them",
+            f"{len(xy)} points are too few for {lenses[0].name}, or its lens sees none of them",
             "use more points, or a camera model with fewer parameters",
         )
     return _told(points, view, is_plane, trials, sigma_px)
@@ -215,10 +221,13 @@ def _checked(xyz: Array, xy: Array) -> Points:
     return xyz, xy
 
 
-def _models(camera_model: CameraModel | None) -> tuple[CameraModel, ...] | None:
-    if camera_model == CameraModel.EQUIRECTANGULAR:
-        raise UsageError(f"{camera_model.name} has nothing to calibrate", "a panorama is known by its size")
-    return None if camera_model is None else (camera_model,)
+def _lenses(camera_model: CameraModel | None, count: int, is_plane: bool) -> tuple[CameraModel, ...]:
+    """Camera models to try."""
+    if camera_model is not None:
+        return (camera_model,)
+    if count < ENOUGH_FOR_DISTORTION:
+        return _FEW_IN_PLANE if is_plane else _FEW_IN_SPACE
+    return _MANY_IN_PLANE if is_plane else _MANY_IN_SPACE
 
 
 def _flatness(xyz: Array) -> float:
@@ -279,6 +288,8 @@ def _start_in_space(points: Points, size: tuple[int, int]) -> _Start:
     is_used = _agreeing(squares, dlt.MIN_POINTS)
     linear = dlt.find_projection(xyz[is_used], xy[is_used])
     behind = (dlt.homogeneous(xyz[is_used]) @ linear.matrix[2] <= 0.0).mean()
+    if behind > 0.5 and linear.rank < 11:  # of a target that is too flat to tell its front from its back
+        raise _open_camera(points, None, None)
     if behind > 0.5:
         raise InputError(
             "expected points in front of the camera, found a camera that has them behind it: the picture is the mirror "
@@ -357,6 +368,7 @@ def _fit_lens(
         sigma_px: of a mark, if known.
     """
     camera = _with_lens(model, start.camera)
+    is_free = np.ones(len(camera.params), bool)
     num_unknown = len(camera.params) + POSE
     if 2 * len(points[1]) < num_unknown - (2 if center_share else 0):
         return None
@@ -367,7 +379,6 @@ def _fit_lens(
     if center_share is not None:
         sigmas = np.where([kind_of(name) == "center" for name in PARAM_NAMES[model]], center_share, np.inf)
         prior = Prior(camera.params, sigmas * max(camera.width, camera.height))
-    is_free = np.ones(len(camera.params), bool)
     noise_px = sigma_px or 1.0
 
     def refit(view: OneView, is_used: Bools) -> OneView:
@@ -394,34 +405,37 @@ def _with_lens(model: CameraModel, pinhole: Camera) -> Camera:
     return camera.with_params([known.get(name, value) for name, value in zip(names, camera.params, strict=True)])
 
 
-def _trials(
-    fits: dict[CameraModel, OneView | None], sigma_px: float | None
-) -> tuple[OneView | None, tuple[LensTrial, ...]]:
-    """The fit that foretells points best that were left out, and all that were tried.
+def _trials(fits: Sequence[OneView | None], sigma_px: float | None) -> tuple[OneView | None, tuple[LensTrial, ...]]:
+    """The fit to go on with, and all that were tried.
 
-    A point counts by its distance from where the others put it, as far as three sigmas of the best fit: a model may not
+    A point counts by its distance from where the others put it, as far as three sigmas of the best fit: a lens may not
     win by calling what it does not fit wrong.
     """
-    found = {model: view for model, view in fits.items() if view is not None}
+    found = [view for view in fits if view is not None]
     if not found:
         return None, ()
-    told = [v.squares / v.degrees_of_freedom for v in found.values() if v.degrees_of_freedom > 2.0]
+    told = [v.squares / v.degrees_of_freedom for v in found if v.degrees_of_freedom > 2.0]
     far = 3.0 * np.sqrt(2.0 * min(told)) if told else np.inf
-    trials = []
-    for model, view in found.items():
-        distance = deletion_statistics(view, sigma_px)[1]
-        left_out = None
-        if np.isfinite(far) and view.degrees_of_freedom > 2.0:
-            left_out = float(np.sqrt((np.minimum(np.nan_to_num(distance, nan=far), far) ** 2).mean()))
-        trials.append(
-            LensTrial(
-                model=model, num_unknown=view.num_unknown, num_used=int(view.is_used.sum()),
-                rms_px=float(np.sqrt(view.squares / max(view.is_used.sum(), 1))), left_out_px=left_out,
-            )
-        )  # fmt: skip
-    best = min(range(len(trials)), key=lambda k: (trials[k].left_out_px is None, trials[k].left_out_px or 0.0, k))
-    trials[best] = replace(trials[best], is_chosen=True)
-    return found[trials[best].model], tuple(trials)
+    squares = [
+        np.minimum(np.nan_to_num(deletion_statistics(view, sigma_px)[1], nan=far), far) ** 2 if told else None
+        for view in found
+    ]
+    best = 0
+    for k in range(1, len(found)):
+        first, other = squares[best], squares[k]
+        if first is not None and other is not None:
+            gain = first - other
+            if gain.mean() > _SURELY_BETTER * gain.std() / np.sqrt(len(gain)):
+                best = k
+    trials = [
+        LensTrial(
+            model=view.camera.model, num_unknown=view.num_unknown, num_used=int(view.is_used.sum()),
+            rms_px=float(np.sqrt(view.squares / max(view.is_used.sum(), 1))),
+            left_out_px=None if square is None else float(np.sqrt(square.mean())), is_chosen=k == best,
+        )
+        for k, (view, square) in enumerate(zip(found, squares, strict=True))
+    ]  # fmt: skip
+    return found[best], tuple(trials)
 
 
 # ----------------------------------------------------------------------------------------------------- what it comes to
