@@ -30,6 +30,7 @@ FLOORS = (
     ("surface",),
     ("dense",),
     ("georeference",),
+    ("calibration",),
     ("mapping",),
     ("adjust",),
     ("matching",),
@@ -69,7 +70,7 @@ INNER_FLOORS = {
     "pipelines": (
         ("*",),
         ("export_world",),
-        ("dense", "odometry"),
+        ("calibration", "dense", "odometry"),
         ("sparse",),
         ("stored_pixels",),
     ),
