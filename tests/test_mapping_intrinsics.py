@@ -142,5 +142,5 @@ def test_photographs_that_were_cut_each_otherwise_are_red(offset):
         model.cameras, model.image_camera_idx = [TRUE], np.zeros(12, np.int32)
     result = map_with(scene, simple_camera(CameraModel.SIMPLE_RADIAL, 1000, 750, 1200.0, 600.0))
     found = [row["subject"] for row in result.row["contradictions"]]
-    assert found == (["middle of the photographs"] if offset else [])
+    assert found == (["cropped photographs"] if offset else [])
     assert worst_error_in_sigmas(result, scene) < (3 if offset else 4)
