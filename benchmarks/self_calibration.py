@@ -61,7 +61,7 @@ def main() -> None:
 
 def described(run: dict[str, Any]) -> str:
     """A sequence in a line."""
-    error, sigma, word = run["error_percent"], run["sigma_percent"], "settled" if run["is_settled"] else "calibration is uncertain"
+    error, sigma, word = run["error_percent"], run["sigma_percent"], "settled" if run["is_settled"] else "not settled"
     return f"{run['sequence']}: {run['focal_px']:.1f} px, {error:+.2f} % of {sigma:.2f} %, {word}"
 
 
