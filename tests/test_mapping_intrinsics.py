@@ -118,7 +118,7 @@ def test_fixed_intrinsics_that_are_wrong_are_red_and_inside_the_stated_sigmas(la
     assert "f 9" in found["evidence"]["freed"] or "f 8" in found["evidence"]["freed"]
     assert 1e-4 < found["position_sigma_share"] < 1.0
     assert result.lights["contradiction: given intrinsics"] == "red"
-    assert any("the photographs say" in line for line in result.warnings)
+    assert any("the photographs indicate" in line for line in result.warnings)
     assert worst_error_in_sigmas(result, scene) < 3
 
 
