@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 from sfmapp.adjust.options import AdjustReport
+from sfmapp.calibration.rig_report import RigReport
 from sfmapp.contradictions import Contradiction
 from sfmapp.dense.report import (
     CloudNumbers,
@@ -348,6 +349,13 @@ class UndistortReport(UndistortNumbers):
     """The report of ``sfmapp undistort``."""
 
     run: RunUsage
+
+
+class CalibrateRigReport(Report):
+    """The report of ``sfmapp calibrate rig``."""
+
+    rig: RigReport
+    run: RunFacts
 
 
 class ExportReport(Report):

@@ -16,6 +16,7 @@ from typing import Any, Union
 from sfmapp.georeference.world_frame import Georeference
 from sfmapp.report.evaluation import EvaluationReport
 from sfmapp.report.model import (
+    CalibrateRigReport,
     DenseRunReport,
     ExportReport,
     OdometryRunReport,
@@ -38,6 +39,7 @@ KINDS: Mapping[str, type[Report]] = {
     "validate-cloud": CloudValidation,
     "evaluate": EvaluationReport,
     "undistort": UndistortReport,
+    "calibrate-rig": CalibrateRigReport,
     "export": ExportReport,
     "georeference": Georeference,
 }
