@@ -38,7 +38,7 @@ def overlapping_rig(rng: np.random.Generator, cameras: Sequence[Camera], num_sho
 
 
 def apart_rig(rng: np.random.Generator, num_shots: int, axes: Sequence[float] = (0.3, 0.3, 0.45)) -> RigFit:
-    """Two cameras back to back, a board before each, fixed to each other, and the rig moved. ``axes``: most of turns."""
+    """Two cameras back to back, a board before each, fixed to each other, and the rig moved. ``axes``: of turns."""
     mounts = np.array([rigid3.IDENTITY, pose([0.05, 0.9 * np.pi, 0.1], [-0.1, 0.02, 0.05])])
     first = pose([0.0, 0.0, 0.0], np.array([0.0, 0.0, 0.5]) - MIDDLE)
     second = pose([0.1, 0.05, 0.0], np.array([0.0, 0.0, 0.5]) - MIDDLE)

@@ -264,9 +264,9 @@ def tables(report: dict[str, Any]) -> str:
         row = cv["epipolar_rms_px"][name]
         lines.append(f"| {text} | {row['sfmapp']:.4f} | {row['OpenCV']:.4f} |")
     baseline = cv["baseline_mm"]
-    lines += ["", f"Baseline {baseline['sfmapp']:.3f} +- {baseline['sigma']:.3f} mm, OpenCV's {baseline['OpenCV']:.3f}; "
-              f"R and t apart by {', '.join(f'{v:.1f}' for v in cv['apart_in_sigmas'])} stated sigmas, which are "
-              f"{cv['widening']:.2f} times those of the noise.", ""]  # fmt: skip
+    apart = ", ".join(f"{value:.1f}" for value in cv["apart_in_sigmas"])
+    lines += ["", f"Baseline {baseline['sfmapp']:.3f} +- {baseline['sigma']:.3f} mm, OpenCV's {baseline['OpenCV']:.3f}. R "
+              f"and t are apart by {apart} stated sigmas, which are {cv['widening']:.2f} times those of the noise.", ""]  # fmt: skip
     lines += [f"- {reason}" for reason in cv["odd"]] + [""]
     lines += ["| photographs | from | pairs | that tell | focal, px | sigma | truth |", "|---|---|---|---|---|---|---|"]
     for r in report["focal"]:

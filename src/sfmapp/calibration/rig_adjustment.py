@@ -19,14 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.calibration.adjustment import (
-    _FIRST_DAMPING as FIRST_DAMPING,
-)
-from sfmapp.calibration.adjustment import (
-    _LARGEST_DAMPING as LARGEST_DAMPING,
-)
-from sfmapp.calibration.adjustment import (
+    FIRST_DAMPING,
+    LARGEST_DAMPING,
     TargetView,
-    _solved,
+    damped_step,
     empty_normal,
     observations_of,
     param_of_slot,
@@ -210,7 +206,7 @@ def refine_rig(start: RigFit, problem: RigProblem, weights: Sequence[Array] | No
     fit, damping, factor, steps = start, FIRST_DAMPING, 4.0, 0
     cost, normal = rig_normal(fit, problem, obs)
     while steps < _MAX_STEPS and math.isfinite(cost) and damping < LARGEST_DAMPING:
-        step = _solved(normal, damping, hold_poses=False)
+        step = damped_step(normal, damping, hold_poses=False)
         tried = None if step is None else _moved(fit, *step)
         new_cost = math.nan if tried is None else float(shot_costs(tried, problem, obs).sum())
         if tried is None or not new_cost <= cost:

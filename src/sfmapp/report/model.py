@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 from sfmapp.adjust.options import AdjustReport
+from sfmapp.calibration.report import BoardReport
 from sfmapp.calibration.rig_report import RigReport
 from sfmapp.contradictions import Contradiction
 from sfmapp.dense.report import (
@@ -349,6 +350,17 @@ class UndistortReport(UndistortNumbers):
     """The report of ``sfmapp undistort``."""
 
     run: RunUsage
+
+
+class CalibrateReport(Report):
+    """The report of ``sfmapp calibrate``: of each way that was gone.
+
+    Attributes:
+        board: from photographs of a board.
+    """
+
+    board: BoardReport
+    run: RunFacts
 
 
 class CalibrateRigReport(Report):
