@@ -265,8 +265,9 @@ def tables(report: dict[str, Any]) -> str:
         lines.append(f"| {text} | {row['sfmapp']:.4f} | {row['OpenCV']:.4f} |")
     baseline = cv["baseline_mm"]
     apart = ", ".join(f"{value:.1f}" for value in cv["apart_in_sigmas"])
-    lines += ["", f"Baseline {baseline['sfmapp']:.3f} +- {baseline['sigma']:.3f} mm, OpenCV's {baseline['OpenCV']:.3f}. R "
-              f"and t are apart by {apart} stated sigmas, which are {cv['widening']:.2f} times those of the noise.", ""]  # fmt: skip
+    stated = f"{baseline['sfmapp']:.3f} +- {baseline['sigma']:.3f} mm, OpenCV's {baseline['OpenCV']:.3f}"
+    wider = f"which are {cv['widening']:.2f} times those of the noise"
+    lines += ["", f"Baseline {stated}. R and t are apart by {apart} stated sigmas, {wider}.", ""]
     lines += [f"- {reason}" for reason in cv["odd"]] + [""]
     lines += ["| photographs | from | pairs | that tell | focal, px | sigma | truth |", "|---|---|---|---|---|---|---|"]
     for r in report["focal"]:
