@@ -16,10 +16,10 @@ Ints = NDArray[np.int64]
 
 SolverName = Literal["tiles", "gtsam", "lapack"]
 
-# Measured by benchmarks/reduced_systems.py; fill is the share of pairs of blocks that meet. In a closing adjustment
-# gtsam is as quick as LAPACK up to about a quarter, of whatever size. Beyond that it falls behind by up to six times,
-# which is some 5 ms a step up to 400 unknowns, and not worth it where the system is nearly full.
-_GTSAM_FILL, _SMALL, _NEARLY_FULL = 0.25, 400, 0.75
+# Measured by benchmarks/reduced_systems.py; fill is the share of pairs of blocks that meet. Up to 400 unknowns, some
+# 65 poses, LAPACK is as quick as gtsam at any fill, for so few poses fill much of their system when they are eliminated
+# whatever it held before. Beyond that gtsam is as quick up to about a quarter, and falls behind by up to six times.
+_SMALL, _GTSAM_FILL = 400, 0.25
 # The quick rounds keep the tiles up to the size at which nothing beats them by much, and beyond that in the range of
 # fill in which they are quickest.
 _FEW_BLOCKS, _TILES_FILL = 160, (0.3, 0.5)
@@ -29,11 +29,15 @@ _GROUP = 6
 _NO_PIVOT = 1e-14
 
 
+def is_beyond_lapack(num_unknowns: int) -> bool:
+    """Whether gtsam may solve a closing system of that size."""
+    return num_unknowns > _SMALL
+
+
 def choose_solver(num_blocks: int, num_unknowns: int, fill: float, *, is_closing: bool) -> SolverName:
     """What solves a reduced system best."""
     if is_closing:
-        limit = _NEARLY_FULL if num_unknowns <= _SMALL else _GTSAM_FILL
-        return "gtsam" if fill <= limit else "lapack"
+        return "gtsam" if is_beyond_lapack(num_unknowns) and fill <= _GTSAM_FILL else "lapack"
     if num_blocks <= _FEW_BLOCKS:
         return "tiles"
     if fill <= _TILES_FILL[0]:

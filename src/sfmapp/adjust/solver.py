@@ -25,6 +25,7 @@ from sfmapp.adjust.linear import (
     aligned_zeros,
     assemble,
     choose_solver,
+    is_beyond_lapack,
     mark_pairs,
     number_keys,
 )
@@ -40,15 +41,16 @@ Mask = NDArray[np.bool_]
 
 # Beyond so many blocks only the tiles of pairs that meet are kept, if they are at most this share of all.
 _MAX_DENSE_BLOCKS, _DENSE_SHARE = 160, 0.3
-# So few images nearly all see each other: their systems go to LAPACK.
-_FEW_IMAGES = 12
 # Work worth a chunk of its own, and the most memory that the chunks' private sums may take together.
 _CHUNK_OBSERVATIONS, _MAX_CHUNKS, _CHUNK_BYTES = 16384, 8, 1 << 26
 
 
-def import_ahead(num_images: int) -> None:
-    """Begin to import gtsam in a thread, which takes 0.7 s, if closing adjustments may ask it."""
-    if num_images > _FEW_IMAGES and "gtsam" not in sys.modules:
+def import_ahead(num_images: int, *, with_factors: bool) -> None:
+    """Begin to import gtsam in a thread, which takes 0.7 s and 57 MB, if closing adjustments may ask it.
+
+    They do where they have factors beside the reprojections, or more unknowns than LAPACK solves best at any fill.
+    """
+    if (with_factors or is_beyond_lapack(6 * num_images)) and "gtsam" not in sys.modules:
         Thread(target=import_module, args=("gtsam",), name="import-gtsam").start()
 
 

@@ -33,6 +33,11 @@ def read_control(run: Run, image_set: ImageSet) -> ControlPoints | None:
     return control
 
 
+def has_factors(run: Run, image_set: ImageSet) -> bool:
+    """Whether models are adjusted to more than photographs: to positions or control points."""
+    return run.control is not None or any(record.position is not None for record in image_set.images)
+
+
 def closing(run: Run, image_set: ImageSet) -> Callable[[list[Mapper]], None] | None:
     """What is to be done with finished models; None where nothing is known of where they lie."""
     has_positions = any(record.position is not None for record in image_set.images)
