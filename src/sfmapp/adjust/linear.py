@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Literal, Protocol
 
 import numba
@@ -269,6 +271,20 @@ def number_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
     return table, values
 
 
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Hold the linear algebra of numpy and scipy to one thread: our workers use the cores, and the order of sums, to
+    the last bit of results, must not depend on how many they are.
+
+    What is loaded later is not held, so scipy's own BLAS is loaded before.
+    """
+    import scipy.linalg  # noqa: F401
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1, "blas"):
+        yield
+
+
 class ReducedSystem(Protocol):
     """What solves the reduced system."""
 
@@ -298,7 +314,6 @@ class LapackSystem:
     """
 
     def __init__(self, block_dim: Ints, keys: Ints, numbers: Ints) -> None:
-        # loaded here, so that the caller finds the library that it is to hold to one thread
         from scipy.linalg import lapack
 
         self._lapack = lapack

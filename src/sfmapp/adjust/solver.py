@@ -28,6 +28,7 @@ from sfmapp.adjust.linear import (
     is_beyond_lapack,
     mark_pairs,
     number_keys,
+    one_blas_thread,
 )
 from sfmapp.adjust.options import REJECTED_WEIGHT, AdjustOptions, AdjustReport, FactorReport
 from sfmapp.adjust.priors import IntrinsicPriors
@@ -234,12 +235,7 @@ class Engine:
 
     def lone(self) -> AbstractContextManager[Any]:
         """A context in which LAPACK has one thread, if it is asked: with more its bytes would depend on how many."""
-        if self.solver != "lapack":
-            return nullcontext()
-        from threadpoolctl import threadpool_limits
-
-        limited: AbstractContextManager[Any] = threadpool_limits(1, "blas")
-        return limited
+        return one_blas_thread() if self.solver == "lapack" else nullcontext()
 
     def linearize(self, damping: float, run: Callable[..., Any]) -> float:
         """Reduced system at the current state with damped points; returns the cost of the state."""

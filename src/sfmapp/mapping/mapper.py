@@ -23,7 +23,7 @@ from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_in
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
 from sfmapp.mapping.report import CameraSigmas, ImageSigmas, InitialPairReport, Uncertainty
-from sfmapp.mapping.settling import FEW_STEPS, Round, adjust_until_settled, round_options
+from sfmapp.mapping.settling import Round, adjust_until_settled, round_options
 from sfmapp.mapping.snapshot import ModelSnapshot
 from sfmapp.mapping.tracks import USELESS_CONFIGS
 from sfmapp.mapping.verified_pairs import MIN_MATCHES, pair_agreement
@@ -332,8 +332,6 @@ class Mapper:
         """
         if self._wanted_principal_points().any() and not self._free_principal_points().any():
             self.events.warned(STAGE, _NO_CENTERS)
-        self.loss_scale_px = self._residual_scale_px
-        self._polish_once(FEW_STEPS)
         self.loss_scale_px = self._residual_scale_px
         return adjust_until_settled(self._polish_once, STAGE, self.events)
 

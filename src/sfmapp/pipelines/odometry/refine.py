@@ -23,7 +23,7 @@ from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import Sequence
 from sfmapp.mapping import structure
 from sfmapp.mapping.options import MappingOptions
-from sfmapp.mapping.settling import FEW_STEPS, Round, adjust_until_settled, round_options
+from sfmapp.mapping.settling import Round, adjust_until_settled, round_options
 from sfmapp.odometry.result import MapResult, OdometryResult
 from sfmapp.pipelines.odometry.add_photos import PhotoResult, add_photos
 from sfmapp.pipelines.odometry.results import read_odometry, write_trajectories
@@ -188,8 +188,6 @@ def adjusted(
         events.raise_if_cancelled()
         return made
 
-    sigma_px = structure.residual_scale_px(model, _MIN_SIGMA_PX)
-    adjust_once(FEW_STEPS)
     sigma_px = structure.residual_scale_px(model, _MIN_SIGMA_PX)
     return model, adjust_until_settled(adjust_once, STAGE, events)
 
