@@ -13,8 +13,8 @@ from sfmapp.geometry import rigid3, similarity
 from sfmapp.scene.reconstruction import Reconstruction
 
 # Common points that must agree on the scale, and the probability that as many do by chance through one image. Where
-# distances scatter by a third, eight of eight do within the tolerance in one case of four million, but of a hundred as a
-# rule some fifteen: the more there are, the more have to.
+# distances scatter by a third, eight of eight do within the tolerance in one case of four million, but of a hundred
+# thirteen as a rule: the more there are, the more have to.
 MIN_COMMON_POINTS, MAX_CHANCE = 8, 1e-4
 # Depths of points near the edge of a model are good to a few per cent.
 SCALE_TOLERANCE = 0.05
