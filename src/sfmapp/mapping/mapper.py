@@ -354,7 +354,9 @@ class Mapper:
         self._settle_points()
         made = Round(report, before, reconstruction.obs_is_inlier.copy())
         summary = reconstruction.summary()
-        self.events.decided(STAGE, f"robust adjustment: {made.num_changed} observations became inliers or outliers", **summary)
+        self.events.decided(
+            STAGE, f"robust adjustment: {made.num_changed} observations became inliers or outliers", **summary
+        )
         return made
 
     def adjust_with(self, extra_factors: Any) -> None:

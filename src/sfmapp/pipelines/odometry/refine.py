@@ -184,7 +184,9 @@ def adjusted(
         made = Round(report, before, model.obs_is_inlier.copy())
         summary = model.summary()
         text = f"{summary.num_points} points, {summary.mean_reprojection_error_px:.3f} px"
-        events.decided(STAGE, f"adjusted: {made.num_changed} observations became inliers or outliers; {text}", **summary)
+        events.decided(
+            STAGE, f"adjusted: {made.num_changed} observations became inliers or outliers; {text}", **summary
+        )
         events.raise_if_cancelled()
         return made
 
