@@ -61,7 +61,7 @@ def settle_clock(
     times = np.array([image_set.images[i].timestamp for i in known], np.float64) + options.time_offset_s
     found = find_offset(_in_metres(track), times, model.centers[known])
     report = replace(found, given_s=options.time_offset_s)
-    if not found.is_applied:
+    if not found.is_applied or found.offset_s is None:
         events.decided(STAGE, f"the clock of the photographs is left as it is: {found.reason}", **report)
         return image_set, report
     text = f"the clock of the photographs is {found.offset_s:+.2f} s (+- {found.sigma_s:.2g}) off that of the track"
@@ -177,20 +177,19 @@ def _nearest(way: _Way, times: Array, centers: Array) -> float:
 def _refined(way: _Way, times: Array, centers: Array, start: float) -> tuple[float, float] | None:
     """Offset and its standard deviation by Gauss-Newton steps over a similarity and the offset; None where they are not
     determined."""
-    offset, fit = start, None
+    offset = start
+    fit: RobustFit | None = None
     for n in range(_MAX_ROUNDS):
         places, velocity = way.at(times + offset)
         known = np.isfinite(places[:, 0])
         if known.sum() < _LEAST:
             return None
-        if n % 4 == 0:
+        if n % 4 == 0 or fit is None or len(fit.sigma) != known.sum():
             guess = np.tile([1.0, 1.0, 2.0], (int(known.sum()), 1))
-            fit, of = robust_fit(centers[known], places[known], guess, np.zeros(2, bool)), known
-        elif fit is not None and np.array_equal(of, known):
+            fit = robust_fit(centers[known], places[known], guess, np.zeros(2, bool))
+        else:
             found = fit_similarity(centers[known], places[known], fit.sigma, fit.is_inlier, fit.similarity)
             fit = fit if found is None else replace(fit, similarity=found)
-        else:
-            return None
         if fit is None:
             return None
         residual = fit.similarity.apply(centers[known]) - places[known]
@@ -199,10 +198,11 @@ def _refined(way: _Way, times: Array, centers: Array, start: float) -> tuple[flo
             return None
         offset += float(np.clip(step, -_LONGEST_STEP_S, _LONGEST_STEP_S))
         if abs(step) < 0.05 * sigma:
-            break
-    order = np.argsort(np.argsort(times[known])).astype(np.float64)
-    slope = _slope(fit, centers[known], velocity[known])
-    return offset, sigma * float(estimate_drift(residual, fit.sigma, slope, fit.is_inlier, order).spread[7])
+            order = np.argsort(np.argsort(times[known])).astype(np.float64)
+            slope = _slope(fit, centers[known], velocity[known])
+            drift = estimate_drift(residual, fit.sigma, slope, fit.is_inlier, order)
+            return offset, sigma * float(drift.spread[7])
+    return None
 
 
 def _slope(fit: RobustFit, centers: Array, velocity: Array) -> Array:

@@ -135,10 +135,10 @@ def _along_track(found: PositionFile, records: Sequence[ImageRecord], offset_s: 
         for place in places_along(track, times).tolist()
     ]
     if not any(position is not None for position in positions):
-        times = [record.timestamp for record in records if record.timestamp is not None]
+        taken = [record.timestamp for record in records if record.timestamp is not None]
         raise InputError(
             f"{found.path}: the track is from {_clock(track[0, 0])} to {_clock(track[-1, 0])}, the photographs by "
-            f"their clock from {_clock(min(times))} to {_clock(max(times))}: none of them lies on it",
+            f"their clock from {_clock(min(taken))} to {_clock(max(taken))}: none of them lies on it",
             "give the seconds to add to the photographs' clock: --set gps.time_offset_s=...; a track counts in UTC, "
             "cameras mostly in local time",
         )
