@@ -21,7 +21,7 @@ Mask = NDArray[np.bool_]
 _MAX_ROUNDS, _SETTLED = 4, 0.1
 # Positions add three numbers each, and may cost the reprojections about as much chi square; so many times that is a
 # contradiction between photographs and positions, not noise.
-_MAX_COST_PER_NUMBER = 10.0
+MAX_COST_PER_NUMBER = 10.0
 # Positions with sigmas so many times as large hold a model in its place, and do not bend it.
 _LOOSE = 1e3
 # An autocorrelation this many standard deviations above zero is one: of independent errors one set in twenty is taken
@@ -87,8 +87,8 @@ def adjust_with_positions(
         fit = _judged(fit, model.centers[measured.image_idx], measured, covariance, inflation)
         if np.array_equal(fit.is_inlier, used) and np.allclose(fit.factor, factor, rtol=_SETTLED):
             break
-    cost = _cost(before, model, noise_px)
-    if cost > _MAX_COST_PER_NUMBER * 3 * int(fit.is_inlier.sum()):
+    cost = growth_of_cost(before, model, noise_px)
+    if cost > MAX_COST_PER_NUMBER * 3 * int(fit.is_inlier.sum()):
         return None
     return Adjusted(finished(fit, model, measured, level, inflation), covariance)
 
@@ -170,7 +170,7 @@ def _center_covariances(mapper: Mapper, graph: object) -> dict[int, Array]:
     return dict(zip(found.image_idx.tolist(), turned, strict=True))
 
 
-def _cost(before: Reconstruction, after: Reconstruction, noise_px: float) -> float:
+def growth_of_cost(before: Reconstruction, after: Reconstruction, noise_px: float) -> float:
     """Growth of the squared residuals of observations that hold in both, in units of their noise; those far off are
     counted as at three."""
     both = before.obs_is_inlier & after.obs_is_inlier

@@ -24,6 +24,7 @@ from sfmapp.errors import SfmError
 from sfmapp.evaluation.report import Statistics
 from sfmapp.features.report import FeaturesReport
 from sfmapp.georeference.control_report import ControlReport, UnitsReport
+from sfmapp.georeference.pose_report import PosesReport
 from sfmapp.georeference.report import GeoreferenceReport
 from sfmapp.images.report import ImagesReport
 from sfmapp.mapping.report import FocalEvidence, MappingReport, ModelEntry
@@ -269,6 +270,7 @@ class Stages(Report):
     matching: MatchingReport | None = None
     mapping: MappingReport | None = None
     control: ControlReport | None = None
+    poses: PosesReport | None = None
     units: UnitsReport | None = None
     georeference: GeoreferenceReport | None = None
     dense: DenseReport | None = None
@@ -325,11 +327,14 @@ class UndistortNumbers(Report):
     """What ``sfmapp undistort`` has written.
 
     Attributes:
+        num_images: pictures, which are the images of the model.
+        num_faces: how many of them are faces of a cube.
         num_copied: files that had no distortion.
         num_dropped: observations outside of the pictures, or in photographs that are missing.
     """
 
     num_images: int
+    num_faces: int
     num_copied: int
     num_masks: int
     cameras: Sequence[UndistortedCamera]
