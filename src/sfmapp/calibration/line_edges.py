@@ -2,8 +2,8 @@
 
 Under the division model a straight line of the world is an arc of a circle, whatever the strength of the distortion
 (Fitzgibbon, CVPR 2001), so chains are cut where they leave a circle, before anything is known of the lens. Edge points
-are maxima of the gradient along the nearer axis of the grid, refined by a parabola, and linked where each is the other's
-best neighbour (Grompone von Gioi and Randall, "A sub-pixel edge detector", IPOL 2017, after Devernay 1995).
+are maxima of the gradient along the nearer axis of the grid, refined by a parabola, and linked where each is the
+other's best neighbour (Grompone von Gioi and Randall, "A sub-pixel edge detector", IPOL 2017, after Devernay 1995).
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def find_arcs(grey: Grey, mask: NDArray[np.bool_] | None = None) -> Arcs:
         magnitude[cv2.erode(allowed, np.ones((7, 7), np.uint8)) == 0] = 0.0
     # gradients of noise are Rayleigh distributed, with the median 1.18 sigma; in a busy picture this is the texture
     floor = float(np.clip(_NOISE_SIGMAS * np.median(magnitude) / 1.18, _LEAST_GRADIENT, _SURE_GRADIENT))
-    xy, ends = _chains(*_edge_points(gx, gy, magnitude, np.float32(floor)))
+    xy, ends = _chains(*_edge_points(gx, gy, magnitude, floor))
     least = max(_LEAST_PX, _LEAST_SHARE * max(smooth.shape))
     # the circle of a line has a radius of at least 1 / sqrt(-lambda), which no lens makes less than the half diagonal
     radius = 0.5 * math.hypot(*smooth.shape)
@@ -186,8 +186,8 @@ def _chains(xy: Array, normal: Array, number: NDArray[np.int32]) -> tuple[Array,
 def _fit_circle(xy: Array, first: int, last: int, circle: Array) -> float:
     """Fit ``y = a + b x + c (x^2 + y^2)`` in the frame of the chord of the points first to last (excluded).
 
-    circle (7,) becomes the frame's origin and direction, and a, b, c: exact for circles, linear, and well posed also for
-    straight lines. Returns the rms distance, infinite where there is no chord.
+    circle (7,) becomes the frame's origin and direction, and a, b, c: exact for circles, linear, and well posed also
+    for straight lines. Returns the rms distance, infinite where there is no chord.
     """
     ox, oy = xy[first, 0], xy[first, 1]
     ux, uy = xy[last - 1, 0] - ox, xy[last - 1, 1] - oy
@@ -225,7 +225,7 @@ def _off(circle: Array, x: float, y: float, length: float) -> float:
     c = circle[6]
     value = v - circle[4] - circle[5] * u - c * (u * u + v * v)
     gu, gv = circle[5] + 2.0 * c * u, 1.0 - 2.0 * c * v
-    return abs(value) / math.sqrt(gu * gu + gv * gv)
+    return float(abs(value) / math.sqrt(gu * gu + gv * gv))
 
 
 @numba.njit(cache=True, nogil=True)

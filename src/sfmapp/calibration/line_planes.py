@@ -2,12 +2,12 @@
 
 Pixels count from the principal point in units of half the picture's diagonal, R. The division model lifts a pixel to
 ``s = (x, y, 1 + lambda (x^2 + y^2))``, its ray for the focal length 1 (Fitzgibbon, CVPR 2001). The points of a straight
-line have ``m . s = 0``: a circle in the photograph. For the focal length f, in units of R, the ray is (x, y, f s_z), the
-normal of the projection plane (m_x, m_y, m_z / f), and a direction v of the world vanishes at ``p = (v_x, v_y, v_z / f)``,
-which the line meets where ``m . p = 0``. So all that does not need f is computed once.
+line have ``m . s = 0``: a circle in the photograph. For the focal length f, in units of R, the ray is (x, y, f s_z),
+the normal of the projection plane (m_x, m_y, m_z / f), and a direction v of the world vanishes at ``p = (v_x, v_y, v_z
+/ f)``, which the line meets where ``m . p = 0``. So all that does not need f is computed once.
 
-The literature also writes the model as x' = cx + (x - cx)(sqrt(1 + 4 r d) - 1)/(2 r d) with d the squared distance of the
-straight point from the centre: that is r = -lambda.
+The literature also writes the model as x' = cx + (x - cx)(sqrt(1 + 4 r d) - 1)/(2 r d) with d the squared distance of
+the straight point from the centre: that is r = -lambda.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ class DivisionLens:
 
     def slopes(self, lifted: Array, normals: Array) -> Array:
         """(N, K) length of the gradient."""
-        return np.maximum(np.sqrt((self.gradients(lifted, normals) ** 2).sum(-1)), 1e-12)
+        slopes: Array = np.maximum(np.sqrt((self.gradients(lifted, normals) ** 2).sum(-1)), 1e-12)
+        return slopes
 
 
 def fit_planes(lens: DivisionLens, points: Array) -> tuple[Array, Array, Array]:

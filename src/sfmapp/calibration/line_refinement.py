@@ -2,8 +2,8 @@
 
 What is minimised are distances in the photograph: of the points of each line from the best image of a line through its
 vanishing point, or from the best of any line where it belongs to no direction. That best line is found anew for each
-trial of the unknowns (variable projection, Golub and Pereyra 1973), so lines are no unknowns. Lines count less the worse
-they fit (Geman and McClure 1985).
+trial of the unknowns (variable projection, Golub and Pereyra 1973), so lines are no unknowns. Lines count less the
+worse they fit (Geman and McClure 1985).
 
 The covariance is that of clustered errors (the sandwich of White 1980, Liang and Zeger 1986): lines of one direction in
 one part of the picture are the edges of one thing, and count as one witness.
@@ -25,8 +25,8 @@ from sfmapp.geometry import rigid3
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# The unknowns of the camera: strength of the distortion, logarithm of the focal length, principal point; the last two in
-# units of R.
+# The unknowns of the camera: strength of the distortion, logarithm of the focal length, principal point; the last two
+# in units of R.
 STRENGTH, LOG_FOCAL, CENTER_X, CENTER_Y, NUM_CAMERA = 0, 1, 2, 3, 4
 # A line that is off by this many sigmas has lost three quarters of its weight.
 _LOST_AT = 2.5
@@ -84,7 +84,8 @@ class Lines:
     def sigma_px(self, pixel_scale: float) -> Array:
         """(N,) what a line's points may be off by."""
         is_built = self.member >= 0
-        return np.hypot(SIGMA_PX * pixel_scale, is_built * SIGMA_BUILT * self.arcs.length_px / np.sqrt(12.0))
+        sigma: Array = np.hypot(SIGMA_PX * pixel_scale, is_built * SIGMA_BUILT * self.arcs.length_px / np.sqrt(12.0))
+        return sigma
 
 
 @dataclass(frozen=True)
@@ -158,11 +159,13 @@ def _vanishing_of(camera: Array, photo: Lines, group: NDArray[np.intp]) -> Array
     member = photo.member[group]
     if photo.world is None or member[0] < 0:
         return None
-    return vanishing_points(photo.world.directions, float(np.exp(camera[LOG_FOCAL])))[member]
+    points: Array = vanishing_points(photo.world.directions, float(np.exp(camera[LOG_FOCAL])))[member]
+    return points
 
 
 def _scale(problem: Problem, photo: Lines) -> Array:
-    return 1.0 / (np.sqrt(KNOTS) * photo.sigma_px(problem.pixel_scale)[:, None])
+    scale: Array = 1.0 / (np.sqrt(KNOTS) * photo.sigma_px(problem.pixel_scale)[:, None])
+    return scale
 
 
 def _fit(problem: Problem, camera: Array, photo: Lines) -> _Fit:
@@ -191,7 +194,8 @@ def _derivative(problem: Problem, fit: _Fit, ahead: tuple[Array, Lines], behind:
 
 
 def _weights(residuals: Array) -> Array:
-    return 1.0 / (1.0 + (residuals**2).sum(1) / _LOST_AT**2) ** 2
+    weights: Array = 1.0 / (1.0 + (residuals**2).sum(1) / _LOST_AT**2) ** 2
+    return weights
 
 
 def _cost(fits: Sequence[_Fit]) -> float:
@@ -214,7 +218,7 @@ def solve(problem: Problem, camera: Array, photos: Sequence[Lines]) -> Solution:
         is_better = False
         for _ in range(6):
             damped = hessian + damping * np.diag(np.maximum(np.diag(hessian), 1e-12))
-            step = -np.linalg.lstsq(damped, gradient, rcond=None)[0]
+            step: Array = -np.linalg.lstsq(damped, gradient, rcond=None)[0].astype(np.float64)
             new_camera, new_photos = _moved(camera, photos, step, free)
             new_fits = [_fit(problem, new_camera, photo) for photo in new_photos]
             new_cost = _cost(new_fits) + _prior_cost(problem, new_camera)
@@ -252,7 +256,7 @@ def _moved(camera: Array, photos: Sequence[Lines], step: Array, free: Ints) -> t
 def _normal_equations(
     problem: Problem, camera: Array, photos: Sequence[Lines], fits: Sequence[_Fit]
 ) -> tuple[Array, Array, Array, Ints]:
-    """Hessian (P, P), gradient (P,), the gradients of the witnesses (W, P), and which unknowns of the camera are free."""
+    """Hessian (P, P), gradient (P,), gradients of the witnesses (W, P), and which unknowns of the camera are free."""
     free = np.flatnonzero(problem.is_free)
     sizes = [0 if photo.world is None else 3 + len(photo.world.extra_angles) for photo in photos]
     num = len(free) + sum(sizes)
@@ -291,7 +295,8 @@ def _witness_of(problem: Problem, photo: Lines) -> Ints:
     """(N,) a number for each line, the same for lines of one direction in one part of the picture."""
     middle = photo.arcs.points.mean(1) / [problem.width, problem.height]
     cell = np.clip((middle * _CELLS).astype(np.int64), 0, _CELLS - 1)
-    return (photo.member + 1) * _CELLS**2 + cell[:, 0] * _CELLS + cell[:, 1]
+    witness: Ints = (photo.member + 1) * _CELLS**2 + cell[:, 0] * _CELLS + cell[:, 1]
+    return witness
 
 
 def covariance_of(problem: Problem, camera: Array, photos: Sequence[Lines]) -> Array:

@@ -15,7 +15,8 @@ class LineParameter(Report):
     """A parameter, or what belongs together, and whether the lines tell it.
 
     Attributes:
-        verdict: ``measured``; ``left alone`` where it is zero or the middle as far as lines show; ``unknown`` where they
+        verdict: ``measured``; ``left alone`` where it is zero or the middle as far as lines show; ``unknown`` where
+        they
             do not show it.
         value, sigma: in the unit that the name says.
         reason: the evidence, or what is missing.
@@ -85,7 +86,8 @@ class LinesReport(Report):
     """A calibration from lines.
 
     Attributes:
-        mode: ``directions`` where a world of directions was found, ``plumb lines`` where lines are straight, and no more.
+        mode: ``directions`` where a world of directions was found, ``plumb lines`` where lines are straight, and no
+        more.
         parameters: distortion, focal length, principal point.
         strengths, votes: distortions lambda R^2 that were tried, and how many lines are straight with each.
         held_out: the evidence; absent where there were too few lines to hold any out.

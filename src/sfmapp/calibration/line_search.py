@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from sfmapp.calibration.line_edges import Arcs
 from sfmapp.calibration.line_planes import fit_planes
 from sfmapp.calibration.line_refinement import (
-    CENTER_X,
     LOG_FOCAL,
     NUM_CAMERA,
     STRENGTH,
@@ -43,7 +42,8 @@ from sfmapp.calibration.vanishing import (
 
 Array = NDArray[np.float64]
 
-# Strengths lambda R^2 that are tried: the corner of the photograph goes out to ten times its radius, or comes in to 0.7.
+# Strengths lambda R^2 that are tried: the corner of the photograph goes out to ten times its radius, or comes in to
+# 0.7.
 STRENGTHS = np.concatenate([np.arange(-0.9, -0.3, 0.02), np.arange(-0.3, 0.4001, 0.01)])
 # A line is straight below this many sigmas, and belongs to a direction below that many.
 STRAIGHT_SIGMAS, MEMBER_SIGMAS = 1.5, 3.0
@@ -149,14 +149,12 @@ def lines_of(problem: Problem, camera: Array, arcs: Arcs) -> PlaneLines:
     return plane_lines(normals, covariances, arcs.length_px, problem.pixel_scale)
 
 
-def _likely_frames(
-    problem: Problem, arcs: Sequence[Arcs], camera: Array, seed: int
-) -> list[tuple[float, list[Array]]]:
+def _likely_frames(problem: Problem, arcs: Sequence[Arcs], camera: Array, seed: int) -> list[tuple[float, list[Array]]]:
     """Focal lengths in units of R that stand out, each with a rotation for each photograph."""
     longer = max(problem.width, problem.height) / problem.radius_px
     limit = STRAIGHT_SIGMAS * SIGMA_PX * problem.pixel_scale
     lens = problem.lens(camera)
-    searched = []
+    searched: list[tuple[PlaneLines | None, Array]] = []
     for k, one in enumerate(arcs):
         straight = one.take(straightness_px(lens, one) < limit)
         if len(straight) < _LEAST_OF_DIRECTION:
@@ -167,11 +165,11 @@ def _likely_frames(
     own = [focals_of_pairs(axes[:8], FOCAL_SHARES[0] * longer, FOCAL_SHARES[-1] * longer) for _, axes in searched]
     focals = np.unique(np.concatenate([FOCAL_SHARES * longer, *own]))[:400]
     total, rotations = np.zeros(len(focals)), []
-    for k, (lines, axes) in enumerate(searched):
-        if lines is None or len(axes) == 0:
+    for k, (searchable, axes) in enumerate(searched):
+        if searchable is None or len(axes) == 0:
             rotations.append(np.broadcast_to(np.eye(3), (len(focals), 3, 3)))
             continue
-        gain, found = search_frames(lines, axes, focals, np.random.default_rng([seed, k, 1]))
+        gain, found = search_frames(searchable, axes, focals, np.random.default_rng([seed, k, 1]))
         total += gain
         rotations.append(found)
     chosen: list[int] = []
@@ -183,7 +181,9 @@ def _likely_frames(
     return [(float(focals[i]), [found[i] for found in rotations]) for i in chosen]
 
 
-def settle(problem: Problem, arcs: Sequence[Arcs], camera: Array, worlds: Sequence[World], rounds: int = _ROUNDS) -> Found:
+def settle(
+    problem: Problem, arcs: Sequence[Arcs], camera: Array, worlds: Sequence[World], rounds: int = _ROUNDS
+) -> Found:
     """Assign lines to directions and solve, in turn, until it rests."""
     worlds = list(worlds)
     solution = None

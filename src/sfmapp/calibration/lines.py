@@ -1,9 +1,9 @@
 """A camera from the straight lines of photographs, without a board: what they tell of it, how surely, and what not.
 
 Two kinds of evidence: straight lines of the world are straight without the distortion, wherever they run (plumb lines);
-and in a built world most run in a few directions at right angles, whose vanishing points tell focal length and principal
-point. Lines vote, nothing is started from (:mod:`sfmapp.calibration.line_search`), and what comes out has to convince
-lines that it was not made from.
+and in a built world most run in a few directions at right angles, whose vanishing points tell focal length and
+principal point. Lines vote, nothing is started from (:mod:`sfmapp.calibration.line_search`), and what comes out has to
+convince lines that it was not made from.
 """
 
 from __future__ import annotations
@@ -41,15 +41,14 @@ from sfmapp.calibration.line_report import (
 )
 from sfmapp.calibration.line_search import (
     CENTER_SHARE,
-    MEMBER_SIGMAS,
     STRAIGHT_SIGMAS,
     STRENGTHS,
     Found,
     find_worlds,
     likely_strengths,
     lines_of,
-    plain_problem,
     losses,
+    plain_problem,
     settle,
     sharpened,
     solve_plumb,
@@ -75,13 +74,13 @@ _SEEN_SIGMAS = 3.0
 _LEAST_MET_SIGMAS = 5.0
 # A line is bent by a distortion from this rms distance on; a distortion lambda R^2 that is no better known is unknown.
 _BENT_PX, _WORST_STRENGTH = 0.3, 0.05
-# A focal length that is no better known than this share is not called known, nor one whose halves differ by more than so
-# many sigmas (and one per cent), nor one with a rival of nearly its likelihood (a ratio of e to this).
+# A focal length that is no better known than this share is not called known, nor one whose halves differ by more than
+# so many sigmas (and one per cent), nor one with a rival of nearly its likelihood (a ratio of e to this).
 _WORST_FOCAL, _MOST_APART_SIGMAS, _RIVAL_GAIN = 0.05, 3.0, 12.0
 # Fewer lines than this along a direction do not count it.
 _LEAST_OF_DIRECTION = 6
-# What is assumed where lines do not tell: the project's default for photographs that say nothing, and how far off it may
-# be (mapping's prior has the same two).
+# What is assumed where lines do not tell: the project's default for photographs that say nothing, and how far off it
+# may be (mapping's prior has the same two).
 _DEFAULT_FOCAL, _DEFAULT_LOG_SIGMA = 1.2, 0.6
 _ADVICE = (
     "photograph a built place across a corner of a house or a room, with long lines out to the borders of the picture; "
@@ -137,8 +136,8 @@ def calibrate_from_lines(pictures: Sequence[LinePicture], seed: int = 0) -> Line
         )
     ((height, width),) = sizes
     return calibrate_from_arcs(
-        [picture.name for picture in pictures], [find_arcs(one.grey, one.mask) for one in pictures], (width, height), seed
-    )  # fmt: skip
+        [one.name for one in pictures], [find_arcs(one.grey, one.mask) for one in pictures], (width, height), seed
+    )
 
 
 def calibrate_from_arcs(
@@ -155,12 +154,17 @@ def calibrate_from_arcs(
     shown = [arcs[k] for k in used]
     votes = np.sum([strength_votes(problem, one) for one in shown], axis=0)
     search = _search(problem, shown, likely_strengths(votes), seed)
-    trials = [_try_half(problem, *halves, search is not None, seed) for halves in _halves(problem, shown)]
+    trials = [
+        _try_half(problem, *halves, has_worlds=search is not None, seed=seed) for halves in _halves(problem, shown)
+    ]
     held_out = _held_out(trials, search)
     focal = _judge_focal(search, trials, held_out)
-    solution = _best_solution(problem, shown, votes, search if focal.is_told else None)
     if search is not None and focal.is_told:
-        problem = search.problem
+        problem, solution = search.problem, search.best.solution
+    else:  # a world that does not convince says nothing of the distortion either
+        solution = solve_plumb(problem, shown, float(likely_strengths(votes)[0]))
+        trials = [_try_half(problem, *halves, has_worlds=False, seed=seed) for halves in _halves(problem, shown)]
+        held_out = _held_out(trials, None)
     strength = _judge_strength(solution, trials)
     solution, center = _final(problem, solution, strength)
     if not (focal.is_told or strength.is_told or strength.is_none):
@@ -226,12 +230,6 @@ def _search(problem: Problem, arcs: Sequence[Arcs], strengths: Array, seed: int)
     return _Search(best, sharp, agreeing, rivals[0] if rivals else None)
 
 
-def _best_solution(problem: Problem, arcs: Sequence[Arcs], votes: Array, search: _Search | None) -> Solution:
-    if search is not None:
-        return search.best.solution
-    return solve_plumb(problem, arcs, float(likely_strengths(votes)[0]))
-
-
 # --------------------------------------------------------------------------------------------------- held-out lines
 
 
@@ -269,18 +267,23 @@ class _Trial:
 def _cells(problem: Problem, arcs: Arcs) -> NDArray[np.int64]:
     """(N, 2) the field of the picture that the middle of each line is in."""
     middle = arcs.points.mean(1) / [problem.width, problem.height]
-    return np.clip((middle * _HELD_CELLS).astype(np.int64), 0, _HELD_CELLS - 1)
+    cells: NDArray[np.int64] = np.clip((middle * _HELD_CELLS).astype(np.int64), 0, _HELD_CELLS - 1)
+    return cells
 
 
 def _halves(problem: Problem, arcs: Sequence[Arcs]) -> list[tuple[list[Arcs], list[Arcs]]]:
     """Lines to learn from and lines to ask, both ways round: the white and the black fields of the pictures, so that
     the edges of one thing are on one side."""
     white = [_cells(problem, one).sum(1) % 2 == 0 for one in arcs]
-    halves = [[one.take(w) for one, w in zip(arcs, white, strict=True)], [one.take(~w) for one, w in zip(arcs, white, strict=True)]]
+    halves = [
+        [one.take(w) for one, w in zip(arcs, white, strict=True)],
+        [one.take(~w) for one, w in zip(arcs, white, strict=True)],
+    ]
     return [(halves[0], halves[1]), (halves[1], halves[0])]
 
 
-def _try_half(problem: Problem, learn: list[Arcs], ask: list[Arcs], has_worlds: bool, seed: int) -> _Trial:
+def _try_half(problem: Problem, learn: list[Arcs], ask: list[Arcs], *, has_worlds: bool, seed: int) -> _Trial:
+    """Calibrate from one half of the lines and ask the other."""
     votes = np.sum([strength_votes(problem, one) for one in learn], axis=0)
     strengths = likely_strengths(votes)
     found = find_worlds(problem, learn, strengths, seed) if has_worlds else []
@@ -304,10 +307,14 @@ def _try_half(problem: Problem, learn: list[Arcs], ask: list[Arcs], has_worlds: 
     return _Trial(
         float(camera[STRENGTH]), float(camera[LOG_FOCAL]) if found else None,
         float(np.sqrt(found[0].solution.covariance[LOG_FOCAL, LOG_FOCAL])) if found else math.inf,
-        *(np.concatenate(part) if part else np.zeros(0) for part in (predicted, before, after, gained)),
+        _joined(predicted), _joined(before), _joined(after), _joined(gained),
         np.concatenate(witness) if witness else np.zeros(0, np.int64),
         int(each[0]), float(each[1]), int(each[2]), float(each[3]),
     )  # fmt: skip
+
+
+def _joined(parts: Sequence[Array]) -> Array:
+    return np.concatenate(parts) if parts else np.zeros(0)
 
 
 def _without_distortion(
@@ -331,7 +338,8 @@ def _meetings(problem: Problem, camera: Array, arcs: Arcs, world: World) -> Arra
     lines = lines_of(problem, camera, straight)
     directions = world.directions
     miss = misses(lines, vanishing_points(directions, float(np.exp(camera[LOG_FOCAL]))))
-    # within two sigmas on either side of one of the directions, of half a circle; the peak is 1 / (2 pi)^(1/2) sigmas high
+    # within two sigmas on either side of one of the directions, of half a circle; the peak is 1 / (2 pi)^(1/2) sigmas
+    # high
     chance = np.minimum(len(directions) * 4.0 / (math.sqrt(2.0 * math.pi) * lines.peak), 1.0)
     return np.array([(miss.min(1) < 2.0).sum(), chance.sum(), len(straight), (chance * (1.0 - chance)).sum()])
 
@@ -454,9 +462,8 @@ def _final(problem: Problem, solution: Solution, strength: _Judged) -> tuple[Sol
         assumed = CENTER_SHARE * max(problem.width, problem.height)
         missing = "three vanishing points at finite distance" if has_worlds else "a strong distortion"
         reason = (
-            (f"only {axes} is told; " if axes else "")
-            + f"it takes {missing} to tell it: the middle of the picture is taken for it, with a sigma of {assumed:.0f} px"
-        )
+            f"only {axes} is told; " if axes else ""
+        ) + f"it takes {missing} to tell it: the middle is taken instead, with a sigma of {assumed:.0f} px"
     return Solution(solved.camera, solved.photos, covariance), _Judged(bool(told.all()), reason)
 
 
@@ -482,9 +489,14 @@ def _calibration(
     jacobian = np.zeros((4, NUM_CAMERA))
     jacobian[0, LOG_FOCAL], jacobian[3, LOG_FOCAL], jacobian[3, STRENGTH] = focal_px, 2.0 * k, share**2
     jacobian[1, CENTER_X] = jacobian[2, CENTER_X + 1] = radius
-    source, sigma = ("lines", math.sqrt(covariance[LOG_FOCAL, LOG_FOCAL]) * focal_px) if focal.is_told else ("default", None)
+    sigma_px = math.sqrt(covariance[LOG_FOCAL, LOG_FOCAL]) * focal_px
     camera = Camera(
-        CameraModel.SIMPLE_DIVISION, problem.width, problem.height, np.array([focal_px, *center, k]), sigma, source
+        CameraModel.SIMPLE_DIVISION,
+        problem.width,
+        problem.height,
+        np.array([focal_px, *center, k]),
+        sigma_px,
+        "lines" if focal.is_told else "default",
     )
     views = [_view(problem, solution, name, photo) for name, photo in zip(names, solution.photos, strict=True)]
     num = sum(int(view.is_used.sum()) for view in views)
@@ -493,8 +505,8 @@ def _calibration(
     square = sum(float((view.residuals[view.is_used] ** 2).sum()) for view in views)
     freedom = max(num - spent - NUM_CAMERA - 3 * len(views), 1)
     return CameraCalibration(
-        camera, jacobian @ covariance @ jacobian.T, _method(solution, focal, len(names)), math.sqrt(square / freedom), freedom,
-        tuple(views), warnings=tuple(_warnings(strength, focal)),
+        camera, jacobian @ covariance @ jacobian.T, _method(solution, focal, len(names)), math.sqrt(square / freedom),
+        freedom, tuple(views), warnings=tuple(_warnings(strength, focal)),
     )  # fmt: skip
 
 
@@ -525,7 +537,7 @@ def _parameters(
     problem: Problem, solution: Solution, calibration: CameraCalibration, judged: tuple[_Judged, _Judged, _Judged]
 ) -> list[LineParameter]:
     strength, focal, center = judged
-    f, _, _, k = calibration.camera.params
+    f = calibration.camera.params[0]
     sigma_f, sigma_x, sigma_y, _ = calibration.sigmas
     # the sigma of lambda, without that of the focal length which is in that of k
     sigma = math.sqrt(solution.covariance[STRENGTH, STRENGTH])

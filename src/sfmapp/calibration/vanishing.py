@@ -50,7 +50,7 @@ class PlaneLines:
 
 
 def plane_lines(normals: Array, covariances: Array, length_px: Array, pixel_scale: float) -> PlaneLines:
-    """Lines with the errors that are expected of them; pixel_scale is how much larger than usual the pixels' errors are."""
+    """Lines with the errors that are expected of them; pixel_scale is by what those of pixels are larger than usual."""
     # points at even steps that are turned by an angle are off by length / sqrt(12) times the angle, rms
     lever = length_px / math.sqrt(12.0)
     sigma = np.hypot(SIGMA_PX * pixel_scale, SIGMA_BUILT * lever)
@@ -66,7 +66,7 @@ def _miss2(m: Array, c: Array, p0: float, p1: float, p2: float) -> float:
         c[0, 0] * p0 * p0 + c[1, 1] * p1 * p1 + c[2, 2] * p2 * p2
         + 2.0 * (c[0, 1] * p0 * p1 + c[0, 2] * p0 * p2 + c[1, 2] * p1 * p2)
     )  # fmt: skip
-    return off * off / max(spread, 1e-300)
+    return float(off * off / max(spread, 1e-300))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -95,7 +95,9 @@ def gains(lines: PlaneLines, points: Array, num: int) -> tuple[Array, NDArray[np
 
 
 @numba.njit(cache=True, nogil=True)
-def _judge_meeting_points(m: Array, c: Array, sigma: Array, peak: Array, pairs: NDArray[np.int64], score: Array) -> None:
+def _judge_meeting_points(
+    m: Array, c: Array, sigma: Array, peak: Array, pairs: NDArray[np.int64], score: Array
+) -> None:
     for k in range(len(pairs)):
         i, j = pairs[k]
         p = np.cross(m[i], m[j])
@@ -133,8 +135,8 @@ def find_axes(lines: PlaneLines, rng: np.random.Generator) -> Array:
 
 @numba.njit(cache=True, nogil=True)
 def _frame(a: Array, m: Array, f: float, is_point: bool, points: Array) -> bool:
-    """Fill points (3, 3) with the vanishing points of the frame of the axis a and a second direction: that of the line m
-    at right angles to it, or, for ``is_point``, the vanishing point m brought to a right angle."""
+    """Fill points (3, 3) with the vanishing points of the frame of the axis a and a second direction: that of the line
+    m at right angles to it, or, for ``is_point``, the vanishing point m brought to a right angle."""
     v0, v1, v2 = a[0], a[1], a[2] * f
     norm = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
     v0, v1, v2 = v0 / norm, v1 / norm, v2 / norm
@@ -203,8 +205,8 @@ def focals_of_pairs(axes: Array, low: float, high: float) -> Array:
 
 
 def search_frames(lines: PlaneLines, axes: Array, focals: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """For each focal length (F,), in units of R, the gain (F,) and the rotation (F, 3, 3) of the best frame: column k is
-    the direction k of the world in the camera."""
+    """For each focal length (F,), in units of R, the gain (F,) and the rotation (F, 3, 3) of the best frame: column k
+    is the direction k of the world in the camera."""
     num = len(lines.normals)
     seconds = rng.integers(0, num, (len(axes), _SECONDS))
     best, points = np.empty(len(focals)), np.zeros((len(focals), 3, 3))

@@ -2,10 +2,10 @@
 
 A line is six Plücker coordinates, a unit direction d and the moment m = X x d of any of its points X: d . m = 0, and
 abs(m) is the distance from the origin. A segment of a photograph with the rays s and e of its ends spans, with the
-camera's centre, the projection plane with the normal n = s x e; a line seen twice is where two such planes meet (Bartoli
-and Sturm, "Structure from motion using lines", CVIU 2005; Zhang et al., "Building a 3-D line-based map using stereo
-SLAM", TRO 2015). Planes that coincide meet in no line: that is so where the line is in one plane with both centres, as
-horizontal lines are for two cameras of one height that look across the way between them.
+camera's centre, the projection plane with the normal n = s x e; a line seen twice is where two such planes meet
+(Bartoli and Sturm, "Structure from motion using lines", CVIU 2005; Zhang et al., "Building a 3-D line-based map using
+stereo SLAM", TRO 2015). Planes that coincide meet in no line: that is so where the line is in one plane with both
+centres, as horizontal lines are for two cameras of one height that look across the way between them.
 """
 
 from __future__ import annotations
@@ -83,7 +83,8 @@ def plane_of_segment(start: ArrayLike, end: ArrayLike, sigma: float) -> tuple[Ar
     norm = float(np.linalg.norm(normal))
     if not norm > max(_ROUNDING, _LEAST_SIGMAS * sigma):
         raise DegenerateLinesError(
-            f"the ends of a segment are {math.degrees(norm):.2g} degrees apart: it has no direction; expected a longer one"
+            f"the ends of a segment are {math.degrees(norm):.2g} degrees apart: it has no direction; expected a "
+            "longer one"
         )
     unit = normal / norm
     across = (np.eye(3) - np.outer(unit, unit)) / norm
@@ -122,8 +123,8 @@ def line_of_planes(
     sigma = math.sqrt(sum(float(t @ c @ t) for t, c in zip(toward, spread, strict=True))) if sine > _ROUNDING else 0.0
     if not sine > max(_ROUNDING, least_sigmas * sigma):
         raise DegenerateLinesError(
-            f"the projection planes are {math.degrees(sine):.2g} degrees apart ({math.degrees(sigma):.2g} are noise): the "
-            "line lies in one plane with both cameras; expected a photograph from off this plane"
+            f"the projection planes are {math.degrees(sine):.2g} degrees apart ({math.degrees(sigma):.2g} are noise): "
+            "the line lies in one plane with both cameras; expected a photograph from off this plane"
         )
     # points of plane k: n_k . X = h_k; the line is d = n0 x n1, m = h1 n0 - h0 n1 (signs as of m = X x d), over abs(d)
     h = (n * centers).sum(1)
