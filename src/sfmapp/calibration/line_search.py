@@ -60,6 +60,9 @@ _MOST_EXTRAS = 3
 # Nearer than this to an axis it is the axis, of a frame that is not quite right.
 _NEAREST_EXTRA = math.radians(10.0)
 _ROUNDS = 4
+# One whose gain is this much below that of the best after the first round, or this share of it, is dropped as well:
+# what further rounds change is less.
+_HOPELESS, _HOPELESS_SHARE = 40.0, 0.3
 # Arcs of all photographs together that hypotheses are refined with, and of one at least.
 _MOST_ARCS, _LEAST_ARCS = 300, 60
 # A start whose focal length has come this near to that of a better one after the first round is dropped.
@@ -126,21 +129,30 @@ def find_worlds(problem: Problem, arcs: Sequence[Arcs], strengths: Array, seed: 
         strengths: where distortion may start.
         seed: of the search.
     """
-    found: list[Found] = []
     # arcs are in the order of their length: the longest tell hypotheses apart
     most = max(_MOST_ARCS // len(arcs), _LEAST_ARCS)
     arcs = [one.take(np.arange(min(len(one), most))) for one in arcs]
+    firsts: list[Found] = []
     for strength in strengths:
         camera = np.zeros(NUM_CAMERA)
         camera[STRENGTH] = strength
         for focal, rotations in _likely_frames(problem, arcs, camera, seed):
             camera[LOG_FOCAL] = math.log(focal)
-            worlds = [World(rotation) for rotation in rotations]
-            first = settle(problem, arcs, camera, worlds, rounds=1)
-            if all(abs(math.log(first.focal / other.focal)) > _MERGED for other in found):
-                worlds = [photo.world for photo in first.solution.photos if photo.world is not None]
-                found.append(settle(problem, arcs, first.solution.camera, worlds))
+            first = settle(problem, arcs, camera, [World(rotation) for rotation in rotations], rounds=1)
+            if all(abs(math.log(first.focal / other.focal)) > _MERGED for other in firsts):
+                firsts.append(first)
+    top = max((first.gain for first in firsts), default=0.0)
+    found = [
+        settle(problem, arcs, first.solution.camera, worlds_of(first.solution))
+        for first in firsts
+        if first.gain > top - max(_HOPELESS, _HOPELESS_SHARE * top)
+    ]
     return sorted(found, key=lambda one: -one.gain)
+
+
+def worlds_of(solution: Solution) -> list[World]:
+    """The worlds of all photographs of a solution that has them."""
+    return [photo.world for photo in solution.photos if photo.world is not None]
 
 
 def lines_of(problem: Problem, camera: Array, arcs: Arcs) -> PlaneLines:
@@ -191,7 +203,7 @@ def settle(
         photos = [assigned(problem, camera, one, world) for one, world in zip(arcs, worlds, strict=True)]
         solution = solve(problem, camera, photos)
         camera = solution.camera
-        worlds = [photo.world for photo in solution.photos if photo.world is not None]
+        worlds = worlds_of(solution)
         if turn == 1:
             worlds = [_with_extras(problem, camera, one, world) for one, world in zip(arcs, worlds, strict=True)]
     assert solution is not None

@@ -53,6 +53,7 @@ from sfmapp.calibration.line_search import (
     sharpened,
     solve_plumb,
     strength_votes,
+    worlds_of,
 )
 from sfmapp.calibration.result import CameraCalibration, ViewFit
 from sfmapp.calibration.vanishing import SIGMA_PX, misses
@@ -222,11 +223,9 @@ def _search(problem: Problem, arcs: Sequence[Arcs], strengths: Array, seed: int)
         if one.gain > top.gain - _RIVAL_GAIN and abs(math.log(one.focal / top.focal)) > _WORST_FOCAL
     ]  # fmt: skip
     agreeing = sum(abs(math.log(one.focal / top.focal)) < _SAME_FOCAL for one in tops)
-    worlds = [photo.world for photo in top.solution.photos if photo.world is not None]
-    best = settle(problem, arcs, top.solution.camera, worlds)
+    best = settle(problem, arcs, top.solution.camera, worlds_of(top.solution))
     sharp = sharpened(problem, best.solution)
-    worlds = [photo.world for photo in best.solution.photos if photo.world is not None]
-    best = settle(sharp, arcs, best.solution.camera, worlds)
+    best = settle(sharp, arcs, best.solution.camera, worlds_of(best.solution))
     return _Search(best, sharp, agreeing, rivals[0] if rivals else None)
 
 
@@ -325,8 +324,7 @@ def _without_distortion(
     camera = np.where(held.is_free, camera, 0.0)
     if not found:
         return camera, [None] * len(arcs)
-    worlds = [photo.world for photo in found[0].solution.photos if photo.world is not None]
-    solution = settle(held, arcs, camera, worlds).solution
+    solution = settle(held, arcs, camera, worlds_of(found[0].solution)).solution
     return solution.camera, [photo.world for photo in solution.photos]
 
 
