@@ -294,7 +294,7 @@ def make_mesh(
             raise UsageError(f"the mesh of {source} is written into it", "leave the output folder out")
         return mesh_workspace(source, options, record=record, events=events)
     if output is None:
-        raise UsageError(f"where is the mesh of {source} to be written?", "name a folder for it")
+        raise UsageError(f"expected a folder to write the mesh of {source} to, found none", "name one")
     return mesh_cloud(source, output, options, events=events)
 
 
@@ -492,7 +492,7 @@ def _tracked_in_memory(source: FilePath | Sequence, options: Options, events: Ev
     if request is not None:
         scale_maps(found, request, source.imu, events)
     if not found.maps:
-        raise NoReconstructionError(f"{len(found.frame_idx)} frames were given, but no map could be begun")
+        raise NoReconstructionError(f"{len(found.frame_idx)} frames were given, but no map could be initialized")
     return _with_views(found)
 
 

@@ -158,7 +158,7 @@ def _plan(job: _Job, layout: Layout) -> None:
     names = job.names
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{twice}: a photograph has the name of another one's face of a cube", "rename one of them")
+        raise InputError(f"{twice}: a photograph and a face of a cube have the same name", "rename one of them")
 
 
 def _check_target(where: DenseSource) -> None:
@@ -189,7 +189,7 @@ def _target(job: _Job, folder: str, name: str) -> Path:
     root = job.workspace.folder
     path = root / folder / name
     if not path.parent.resolve().is_relative_to(root.resolve()):
-        raise UsageError(f"{path}: a link in the way leads out of {root}", "take it away, or choose another folder: -o")
+        raise UsageError(f"{path}: a symbolic link leads out of {root}", "remove it, or choose another folder: -o")
     return path
 
 

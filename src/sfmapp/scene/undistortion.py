@@ -106,7 +106,7 @@ def warn_of_sides(cameras: Sequence[Camera], stage: str, remedy: str, events: Ev
         events.warned(
             stage,
             f"{len(wide)} photographs are by lenses that see to their sides and behind ({names}): only what lies in "
-            f"front of them is laid out flat and used. For all round: {remedy}",
+            f"front of them is undistorted and used. For all round: {remedy}",
         )
 
 
