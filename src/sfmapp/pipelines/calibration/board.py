@@ -32,7 +32,7 @@ from sfmapp.pipelines.calibration.pictures import BoardPictures, look_at_picture
 from sfmapp.pipelines.calibration.results import write_camera
 from sfmapp.report.calibration_html import render_board_html
 from sfmapp.report.model import CalibrateReport
-from sfmapp.viewer.calibration_replay import record_calibration
+from sfmapp.viewer.calibration_recording import record_calibration
 from sfmapp.workspace.job import FAILED, WRITTEN, Job
 from sfmapp.workspace.layout import CALIBRATE, REPORT
 from sfmapp.workspace.options import Options
