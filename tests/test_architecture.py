@@ -255,6 +255,7 @@ MOST_PARAMETERS, MOST_OF_KERNELS = 8, 12
 # what users call with keywords, each of which stands for itself
 LONG_LISTS = {
     "api/jobs.py track_sequence",
+    "api/jobs.py undistort",
     "api/stages.py match_images",
     "matching/stage.py match_images",
     "scene/synthetic.py make_scene",

@@ -231,7 +231,7 @@ def test_what_cannot_be_is_refused(
     assert main([*command, "--fix-poses"]) == 2
     assert "--pose-priors FILE" in capsys.readouterr().err
     assert main([*command, "--pose-priors", str(tmp_path / "cameras.json"), "--up", "exif"]) == 2
-    assert "both say where models lie" in capsys.readouterr().err
+    assert "both set the frame of the models" in capsys.readouterr().err
     assert main([*command, "--pose-priors", str(tmp_path / "cameras.json")]) == 3
     assert "found one of 7" in capsys.readouterr().err
     (tmp_path / "cameras.json").write_text('{"cameras": [{"file": "x.jpg", "R_w2c": 1}]}')

@@ -59,7 +59,7 @@ def test_the_workspace_is_locked_and_sums_are_of_one_thread(tmp_path: Path) -> N
     before = [library["num_threads"] for library in threadpool_info()]
     with Job.opened("weigh", tmp_path, tmp_path / "out", None) as job:
         assert {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"} == {1}
-        with pytest.raises(UsageError, match="is at work"), open_workspace(tmp_path / "out", "weigh"):
+        with pytest.raises(UsageError, match="is running"), open_workspace(tmp_path / "out", "weigh"):
             pass
         assert job.threads == job.options.num_workers
     assert [library["num_threads"] for library in threadpool_info()] == before

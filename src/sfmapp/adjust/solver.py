@@ -183,7 +183,7 @@ class Engine:
         self.system: ReducedSystem | None = None
         self.rows = np.empty((images, 12))
         kernels.fill_rows(p.poses, p.image_pose, p.image_mount, p.mounts, self.rows)
-        if is_closing or blocks > _MAX_DENSE_BLOCKS:
+        if blocks and (is_closing or blocks > _MAX_DENSE_BLOCKS):
             self._choose_system(is_closing)
         fitting = max(1, _CHUNK_BYTES // max(1, self.num_tiles * 512))
         self.num_chunks = int(np.clip(p.num_observations // _CHUNK_OBSERVATIONS, 1, min(_MAX_CHUNKS, fitting)))

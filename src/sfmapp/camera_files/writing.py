@@ -47,7 +47,7 @@ class WrittenCamera:
 
 
 @dataclass(frozen=True)
-class _Terms:
+class OpenCVTerms:
     """A camera in OpenCV's terms: pixel centres at whole numbers, and coefficients (4, 5, 8 or 12)."""
 
     intrinsics: Sequence[float]
@@ -100,6 +100,11 @@ def _difference_px(camera: Camera, path: Path) -> float:
     found = camera_of_fields(str(path), section, (camera.width, camera.height))
     read = found.camera if found.stated is None else exact_camera(found.stated)
     assert read is not None  # nothing here writes a tilted sensor
+    return difference_px(camera, read)
+
+
+def difference_px(camera: Camera, read: Camera) -> float:
+    """Largest difference, of a coordinate of pixels over the picture of a camera, between it and another."""
     steps = np.linspace(0.0, 1.0, _STEPS)
     xy = np.stack(np.meshgrid(steps * camera.width, steps * camera.height), axis=-1).reshape(-1, 2)
     rays = pixels_to_rays(camera, xy)
@@ -107,23 +112,24 @@ def _difference_px(camera: Camera, path: Path) -> float:
     return float(np.abs(project(read, rays[is_known]) - xy[is_known]).max(initial=0.0))
 
 
-def _terms(camera: Camera) -> _Terms | None:
+def terms_of(camera: Camera) -> OpenCVTerms | None:
     """A camera in OpenCV's terms; None for a lens that OpenCV does not have."""
     fx, fy, cx, cy, *rest = camera.canonical[: lens.FAMILY].tolist()
     intrinsics = (fx, fy, cx - 0.5, cy - 0.5)
     if camera.family == lens.RADIAL_FISHEYE:
-        return _Terms(intrinsics, rest[:4], True)
+        return OpenCVTerms(intrinsics, rest[:4], True)
     if camera.is_pinhole and camera.family != lens.SKEW:
-        return _Terms(intrinsics, [0.0] * 4, False)
+        return OpenCVTerms(intrinsics, [0.0] * 4, False)
     if camera.family == lens.BROWN:
-        return _Terms(intrinsics, rest[:4], False)
+        return OpenCVTerms(intrinsics, rest[:4], False)
     if camera.family == lens.RATIONAL:
         count = next(n for n in _OPENCV_COUNTS if not any(rest[n:]))
-        return _Terms(intrinsics, rest[:count], False)
+        return OpenCVTerms(intrinsics, rest[:count], False)
     return None
 
 
-def _list(values: Sequence[float]) -> str:
+def number_list(values: Sequence[float]) -> str:
+    """Numbers as YAML has them, none rounded."""
     # the shortest text that is the same number again
     return "[" + ", ".join(repr(float(value)) for value in values) + "]"
 
@@ -137,35 +143,43 @@ def _colmap(camera: Camera, name: str) -> str | None:
 
 
 def _opencv(camera: Camera, name: str) -> str | None:
-    terms = _terms(camera)
+    terms = terms_of(camera)
     if terms is None:
         return None
-
-    def matrix(rows: int, cols: int, values: Sequence[float]) -> str:
-        return f"!!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: {_list(values)}\n"
 
     kind = "fisheye" if terms.is_fisheye else "pinhole"
     return (
         f"%YAML:1.0\n---\nimage_width: {camera.width}\nimage_height: {camera.height}\ncamera_model: {kind}\n"
-        f"camera_matrix: {matrix(3, 3, terms.matrix)}"
-        f"distortion_coefficients: {matrix(1, len(terms.coefficients), terms.coefficients)}"
+        f"camera_matrix: {opencv_matrix(3, 3, terms.matrix)}"
+        f"distortion_coefficients: {opencv_matrix(1, len(terms.coefficients), terms.coefficients)}"
     )
 
 
+def opencv_matrix(rows: int, cols: int, values: Sequence[float]) -> str:
+    """A matrix as OpenCV's YAML has it, to be put behind its name."""
+    return f"!!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: {number_list(values)}\n"
+
+
 def _kalibr(camera: Camera, name: str) -> str | None:
-    terms = _terms(camera)
+    section = kalibr_section(camera, name)
+    return None if section is None else f"cam0:\n{section}"
+
+
+def kalibr_section(camera: Camera, name: str) -> str | None:
+    """What Kalibr's camchain says of a camera; None for a lens that it does not have."""
+    terms = terms_of(camera)
     if terms is None or len(terms.coefficients) > 4:
         return None
     kind = "equidistant" if terms.is_fisheye else "radtan"
     return (
-        f"cam0:\n  camera_model: pinhole\n  intrinsics: {_list(terms.intrinsics)}\n  distortion_model: {kind}\n"
-        f"  distortion_coeffs: {_list(terms.coefficients)}\n  resolution: [{camera.width}, {camera.height}]\n"
+        f"  camera_model: pinhole\n  intrinsics: {number_list(terms.intrinsics)}\n  distortion_model: {kind}\n"
+        f"  distortion_coeffs: {number_list(terms.coefficients)}\n  resolution: [{camera.width}, {camera.height}]\n"
         f"  rostopic: /{name}/image_raw\n"
     )
 
 
 def _ros(camera: Camera, name: str) -> str | None:
-    terms = _terms(camera)
+    terms = terms_of(camera)
     if terms is None or len(terms.coefficients) > 8:
         return None
     values = [*terms.coefficients]
@@ -176,7 +190,7 @@ def _ros(camera: Camera, name: str) -> str | None:
     fx, fy, cx, cy = terms.intrinsics
 
     def matrix(field: str, rows: int, cols: int, entries: Sequence[float]) -> str:
-        return f"{field}:\n  rows: {rows}\n  cols: {cols}\n  data: {_list(entries)}\n"
+        return f"{field}:\n  rows: {rows}\n  cols: {cols}\n  data: {number_list(entries)}\n"
 
     return (
         f"image_width: {camera.width}\nimage_height: {camera.height}\ncamera_name: {name}\n"

@@ -22,7 +22,7 @@ from sfmapp.packages import missing_package
 # what most people look for comes first in the help; the other families follow by name
 FIRST = ("reconstruct", "dense", "odometry")
 EXIT_CODES = """\
-exit codes: 0 done, 1 a bug, 2 usage, 3 bad input, or no room for what is to be written or held in memory,
+exit codes: 0 done, 1 a bug, 2 usage, 3 bad input, or out of disk space or memory,
             4 no reconstruction (the report is still written), 5 fewer images than asked for,
             130 interrupted (reconstruct resumes)"""
 

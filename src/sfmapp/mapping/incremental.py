@@ -88,8 +88,8 @@ def map_images(
         tracks, track_report = build_tracks(correspondences, features)
         events.warned(
             STAGE,
-            f"{num_flat} pairs match on something flat alone that is no part of the scene; they were left out. Masks "
-            "over it (images.mask_path) would save what else they share",
+            f"{num_flat} pairs match only on something flat that is not part of the scene; they were left out. A mask "
+            "over it (images.mask_path) would keep what else they share",
         )
     events.decided(STAGE, f"{track_report.num_tracks} tracks", **track_report)
     with ThreadPoolExecutor(threads) as pool:
@@ -365,8 +365,8 @@ def _with_left_over(
         is_kept = agreeing > verified_pairs.AGREES * matches and grown.is_registered[model.is_registered].all()
         events.decided(
             STAGE,
-            f"{int(new.sum())} images that had waited {'came last' if is_kept else 'do not fit'}: {agreeing} of their "
-            f"{matches} verified matches agree",
+            f"{int(new.sum())} images held back {'are registered last' if is_kept else 'do not fit'}: {agreeing} of "
+            f"their {matches} verified matches agree",
         )
         out.append(grown if is_kept else model)
     return out

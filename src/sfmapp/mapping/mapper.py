@@ -319,7 +319,9 @@ class Mapper:
             self._settle_points()
             changed = int((before != self.reconstruction.obs_is_inlier).sum())
             summary = self.reconstruction.summary()
-            self.events.decided(STAGE, f"final adjustment: {changed} observations changed sides", **summary)
+            self.events.decided(
+                STAGE, f"final adjustment: {changed} observations became inliers or outliers", **summary
+            )
             if changed <= MAX_CHANGED * before.sum():
                 return
 
@@ -345,7 +347,9 @@ class Mapper:
             self._settle_points()
             changed = int((before != reconstruction.obs_is_inlier).sum())
             summary = reconstruction.summary()
-            self.events.decided(STAGE, f"robust adjustment: {changed} observations changed sides", **summary)
+            self.events.decided(
+                STAGE, f"robust adjustment: {changed} observations became inliers or outliers", **summary
+            )
             if changed <= MAX_CHANGED * before.sum():
                 break
         return report
@@ -555,7 +559,7 @@ class Mapper:
         self.attempts[image_idx] = Registration(image_idx, num_correspondences, num_inliers, None, reason=reason)
         self.failed_with[image_idx] = num_correspondences
         self.times_dropped[image_idx] = self.times_dropped.get(image_idx, 0) + 1
-        self.events.decided(STAGE, f"took back {self.reconstruction.image_names[image_idx]}: {reason}")
+        self.events.decided(STAGE, f"deregistered {self.reconstruction.image_names[image_idx]}: {reason}")
 
     # ---------------------------------------------------------------- helpers
 

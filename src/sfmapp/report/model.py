@@ -327,11 +327,14 @@ class UndistortNumbers(Report):
     """What ``sfmapp undistort`` has written.
 
     Attributes:
+        num_images: pictures, which are the images of the model.
+        num_faces: how many of them are faces of a cube.
         num_copied: files that had no distortion.
         num_dropped: observations outside of the pictures, or in photographs that are missing.
     """
 
     num_images: int
+    num_faces: int
     num_copied: int
     num_masks: int
     cameras: Sequence[UndistortedCamera]

@@ -141,7 +141,7 @@ class Job:
             return False
         recording.unlink()
         self.workspace.note(recording=FAILED)
-        self.events.warned("recording", f"{recording} is given up: the disk is full, and the rest matters more")
+        self.events.warned("recording", f"{recording} is deleted: the disk is full, and the results matter more")
         return True
 
     def took(self, *, is_up_to_date: bool = False) -> RunUsage:

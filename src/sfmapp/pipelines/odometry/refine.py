@@ -119,7 +119,7 @@ def _open_sequence(manifest: Manifest, job: Job, *, required: bool) -> Sequence 
     except InputError as error:
         if required:
             raise
-        job.events.warned(STAGE, f"the sequence is not there any more, nor is its ground truth: {error}")
+        job.events.warned(STAGE, f"the sequence and its ground truth are gone: {error}")
         return None
 
 
@@ -184,7 +184,7 @@ def adjusted(
         changed = int((used != model.obs_is_inlier).sum())
         summary = model.summary()
         text = f"{summary.num_points} points, {summary.mean_reprojection_error_px:.3f} px"
-        events.decided(STAGE, f"adjusted: {changed} observations changed sides; {text}", **summary)
+        events.decided(STAGE, f"adjusted: {changed} observations became inliers or outliers; {text}", **summary)
         events.raise_if_cancelled()
         if changed <= 1e-3 * used.sum():
             break

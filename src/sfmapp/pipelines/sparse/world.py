@@ -46,14 +46,14 @@ def read_known_poses(run: Run, image_set: ImageSet) -> PoseFile | None:
     options = run.options
     if options.poses.file is None:
         if options.poses.fixed:
-            raise UsageError("--fix-poses holds known poses, and there are none", "give them: --pose-priors FILE")
+            raise UsageError("--fix-poses needs known poses, found none", "give them: --pose-priors FILE")
         return None
     others = {"--gcp": options.control.file is not None, "--scale": bool(options.units.known),
               "--up": options.units.up != "none", "--gps": options.gps.source not in ("exif", "none")}  # fmt: skip
     beside = [name for name, is_given in others.items() if is_given]
     if beside:
         raise UsageError(
-            f"--pose-priors and {beside[0]} both say where models lie",
+            f"--pose-priors and {beside[0]} both set the frame of the models",
             "give one of them; known poses bring their frame",
         )
     from sfmapp.georeference.pose_stage import read_poses
