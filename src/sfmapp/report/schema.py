@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Union
 
+from sfmapp.calibration.point_reports import LocationReport, MeasureReport, TargetReport
 from sfmapp.georeference.world_frame import Georeference
 from sfmapp.report.evaluation import EvaluationReport
 from sfmapp.report.model import (
@@ -28,7 +29,7 @@ from sfmapp.reporting import Report, field_types
 
 # by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry and refine;
 # validation/report.json and validation/cloud.json; what evaluate, undistort and export print with --json; and
-# georeference.json
+# georeference.json; report.json of calibrate target and locate, and what measure prints
 KINDS: Mapping[str, type[Report]] = {
     "reconstruct": ReconstructionReport,
     "dense": DenseRunReport,
@@ -40,6 +41,9 @@ KINDS: Mapping[str, type[Report]] = {
     "undistort": UndistortReport,
     "export": ExportReport,
     "georeference": Georeference,
+    "target": TargetReport,
+    "locate": LocationReport,
+    "measure": MeasureReport,
 }
 _SIMPLE = {bool: "boolean", int: "integer", float: "number", str: "string", type(None): "null"}
 
