@@ -37,7 +37,9 @@ _BEZIER = 4.0 / 3.0 * (math.sqrt(2.0) - 1.0)
 
 
 @dataclass(frozen=True)
-class _Rectangle:
+class Rectangle:
+    """A black rectangle, millimetres from the top left."""
+
     x: float
     y: float
     width: float
@@ -45,7 +47,9 @@ class _Rectangle:
 
 
 @dataclass(frozen=True)
-class _Disk:
+class Disk:
+    """A black disk, millimetres from the top left."""
+
     x: float
     y: float
     radius: float
@@ -85,9 +89,9 @@ def write_board(path: Path, board: Board, paper: str) -> None:
         )
     sheet = PAPERS[paper][::-1]
     left, top = (sheet[0] - width) / 2.0, (sheet[1] - _CAPTION_MM - height) / 2.0
-    shapes = [_moved(shape, left, top) for shape in _shapes(board)]
+    shapes = [_moved(shape, left, top) for shape in shapes_of(board)]
     below = sheet[1] - _MARGIN_MM
-    shapes.append(_Rectangle(sheet[0] - _MARGIN_MM - _RULER_MM, below - 0.5, _RULER_MM, 0.5))
+    shapes.append(Rectangle(sheet[0] - _MARGIN_MM - _RULER_MM, below - 0.5, _RULER_MM, 0.5))
     caption = f"{board.text()}  print at 100 %, without fitting to the page; the line is {_RULER_MM:.0f} mm long"
     text = (_MARGIN_MM, below, caption)
     with replaced_file(path) as beside:
@@ -101,19 +105,19 @@ def _room(paper: str) -> tuple[float, float]:
     return long - 2.0 * _MARGIN_MM, short - 2.0 * _MARGIN_MM - _CAPTION_MM
 
 
-def _shapes(board: Board) -> Iterator[_Rectangle | _Disk]:
+def shapes_of(board: Board) -> Iterator[Rectangle | Disk]:
     """What is black, in millimetres from the top left of the board."""
     s = 1000.0 * board.spacing
     if board.kind == "chessboard":
         for r in range(board.rows + 1):
             for c in range(r % 2, board.columns + 1, 2):
-                yield _Rectangle(c * s, r * s, s, s)
+                yield Rectangle(c * s, r * s, s, s)
     elif board.kind == "charuco":
         m, number = 1000.0 * board.marker, 0
         for r in range(board.rows):
             for c in range(board.columns):
                 if (r + c) % 2 == 0:
-                    yield _Rectangle(c * s, r * s, s, s)
+                    yield Rectangle(c * s, r * s, s, s)
                 else:
                     at = (c * s + (s - m) / 2.0, r * s + (s - m) / 2.0)
                     yield from _marker(marker_bits(board.dictionary, number, 1), at, m)
@@ -128,31 +132,31 @@ def _shapes(board: Board) -> Iterator[_Rectangle | _Disk]:
                 yield from _marker(marker_bits(board.dictionary, number, KALIBR_BORDER), at, s)
         for r in range(board.rows + 1):
             for c in range(board.columns + 1):
-                yield _Rectangle(c * (s + gap), r * (s + gap), gap, gap)
+                yield Rectangle(c * (s + gap), r * (s + gap), gap, gap)
     else:
         for x, y, _ in 1000.0 * board.points:
-            yield _Disk(x + 0.5 * s, y + 0.5 * s, CIRCLE_RADIUS * s * (1.0 if board.kind == "circles" else 1.2))
+            yield Disk(x + 0.5 * s, y + 0.5 * s, CIRCLE_RADIUS * s * (1.0 if board.kind == "circles" else 1.2))
 
 
-def _marker(bits: NDArray[np.bool_], at: tuple[float, float], side: float) -> Iterator[_Rectangle]:
+def _marker(bits: NDArray[np.bool_], at: tuple[float, float], side: float) -> Iterator[Rectangle]:
     """The black cells of a marker, those beside each other as one."""
     cell = side / len(bits)
     for r, row in enumerate(bits):
         edges = np.flatnonzero(np.diff(np.concatenate([[True], row, [True]]).astype(np.int8)))
         for first, last in zip(edges[::2], edges[1::2], strict=True):
-            yield _Rectangle(at[0] + first * cell, at[1] + r * cell, (last - first) * cell, cell)
+            yield Rectangle(at[0] + first * cell, at[1] + r * cell, (last - first) * cell, cell)
 
 
-def _moved(shape: _Rectangle | _Disk, dx: float, dy: float) -> _Rectangle | _Disk:
-    if isinstance(shape, _Disk):
-        return _Disk(shape.x + dx, shape.y + dy, shape.radius)
-    return _Rectangle(shape.x + dx, shape.y + dy, shape.width, shape.height)
+def _moved(shape: Rectangle | Disk, dx: float, dy: float) -> Rectangle | Disk:
+    if isinstance(shape, Disk):
+        return Disk(shape.x + dx, shape.y + dy, shape.radius)
+    return Rectangle(shape.x + dx, shape.y + dy, shape.width, shape.height)
 
 
-def _svg(sheet: tuple[float, float], shapes: list[_Rectangle | _Disk], text: tuple[float, float, str]) -> bytes:
+def _svg(sheet: tuple[float, float], shapes: list[Rectangle | Disk], text: tuple[float, float, str]) -> bytes:
     parts = []
     for shape in shapes:
-        if isinstance(shape, _Disk):
+        if isinstance(shape, Disk):
             parts.append(f'<circle cx="{shape.x:.5f}" cy="{shape.y:.5f}" r="{shape.radius:.5f}"/>')
         else:
             place = f'x="{shape.x:.5f}" y="{shape.y:.5f}"'
@@ -164,12 +168,12 @@ def _svg(sheet: tuple[float, float], shapes: list[_Rectangle | _Disk], text: tup
     return f'<svg xmlns="http://www.w3.org/2000/svg" {size} fill="#000">\n{body}\n</svg>\n'.encode()
 
 
-def _pdf(sheet: tuple[float, float], shapes: list[_Rectangle | _Disk], text: tuple[float, float, str]) -> bytes:
+def _pdf(sheet: tuple[float, float], shapes: list[Rectangle | Disk], text: tuple[float, float, str]) -> bytes:
     """A page of PDF 1.4 (ISO 32000-1): y goes up, lengths are points once the matrix has scaled millimetres."""
     k = _POINTS_PER_MM
     lines = [f"{k:.8f} 0 0 {-k:.8f} 0 {sheet[1] * k:.5f} cm", "0 g"]
     for shape in shapes:
-        if isinstance(shape, _Rectangle):
+        if isinstance(shape, Rectangle):
             lines.append(f"{shape.x:.5f} {shape.y:.5f} {shape.width:.5f} {shape.height:.5f} re f")
             continue
         x, y, r, b = shape.x, shape.y, shape.radius, shape.radius * _BEZIER

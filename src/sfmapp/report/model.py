@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 from sfmapp.adjust.options import AdjustReport
+from sfmapp.calibration.report import BoardReport
 from sfmapp.contradictions import Contradiction
 from sfmapp.dense.report import (
     CloudNumbers,
@@ -348,6 +349,17 @@ class UndistortReport(UndistortNumbers):
     """The report of ``sfmapp undistort``."""
 
     run: RunUsage
+
+
+class CalibrateReport(Report):
+    """The report of ``sfmapp calibrate``: of each way that was gone.
+
+    Attributes:
+        board: from photographs of a board.
+    """
+
+    board: BoardReport
+    run: RunFacts
 
 
 class ExportReport(Report):

@@ -13,10 +13,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Union
 
+from sfmapp.calibration.file import CalibrationDocument
 from sfmapp.calibration.point_reports import LocationReport, MeasureReport, TargetReport
 from sfmapp.georeference.world_frame import Georeference
 from sfmapp.report.evaluation import EvaluationReport
 from sfmapp.report.model import (
+    CalibrateReport,
     DenseRunReport,
     ExportReport,
     OdometryRunReport,
@@ -27,9 +29,9 @@ from sfmapp.report.model import (
 from sfmapp.report.validation import CloudValidation, Validation
 from sfmapp.reporting import Report, field_types
 
-# by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry and refine;
-# validation/report.json and validation/cloud.json; what evaluate, undistort and export print with --json; and
-# georeference.json; report.json of calibrate target and locate, and what measure prints
+# by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry, refine,
+# calibrate and locate; calibration.json; validation/report.json and validation/cloud.json; what evaluate, undistort,
+# export and measure print with --json; and georeference.json
 KINDS: Mapping[str, type[Report]] = {
     "reconstruct": ReconstructionReport,
     "dense": DenseRunReport,
@@ -39,9 +41,11 @@ KINDS: Mapping[str, type[Report]] = {
     "validate-cloud": CloudValidation,
     "evaluate": EvaluationReport,
     "undistort": UndistortReport,
+    "calibrate-board": CalibrateReport,
+    "calibration": CalibrationDocument,
     "export": ExportReport,
     "georeference": Georeference,
-    "target": TargetReport,
+    "calibrate-target": TargetReport,
     "locate": LocationReport,
     "measure": MeasureReport,
 }
