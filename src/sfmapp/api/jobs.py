@@ -9,9 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from sfmapp.adjust.linear import one_blas_thread
 from sfmapp.api.images import load_images
 from sfmapp.api.reconstruction import Reconstruction
-from sfmapp.api.stages import extract_features, map_images, match_images, one_blas_thread
+from sfmapp.api.stages import extract_features, map_images, match_images
 from sfmapp.errors import UsageError
 from sfmapp.events import Event, Events
 from sfmapp.images.load import Images

@@ -139,10 +139,8 @@ def _center_covariances(mapper: Mapper, graph: object) -> dict[int, Array]:
     found = mapper.covariances_with(graph)
     if found is None or not found.is_determined:
         return {}
-    rotation = rigid3.rotation_matrix(mapper.reconstruction.cam_from_world[found.image_idx])
-    # c = -R^T t moves by -R^T v
-    turned = np.einsum("nji,njk,nkl->nil", rotation, found.poses[:, 3:, 3:], rotation)
-    return dict(zip(found.image_idx.tolist(), turned, strict=True))
+    of_centers = rigid3.center_covariance(mapper.reconstruction.cam_from_world[found.image_idx], found.poses)
+    return dict(zip(found.image_idx.tolist(), of_centers, strict=True))
 
 
 def growth_of_cost(before: Reconstruction, after: Reconstruction, noise_px: float) -> float:

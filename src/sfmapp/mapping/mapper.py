@@ -23,6 +23,7 @@ from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_in
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
 from sfmapp.mapping.report import CameraSigmas, ImageSigmas, InitialPairReport, Uncertainty
+from sfmapp.mapping.settling import Round, adjust_until_settled, round_options
 from sfmapp.mapping.snapshot import ModelSnapshot
 from sfmapp.mapping.tracks import USELESS_CONFIGS
 from sfmapp.mapping.verified_pairs import MIN_MATCHES, pair_agreement
@@ -39,8 +40,8 @@ WEAK_SHARE_OF_ANGLE = 0.1
 # A weak image waits for another model if a pair with an image outside of this one has so many times the matches of its
 # strongest pair inside: no matter of chance, and what comes with one image comes with its neighbours too.
 ELSEWHERE = 2.0
-# An adjustment has settled when no larger share of the observations changes sides; rounds of the last one at most.
-MAX_CHANGED, MAX_POLISHED = 1e-3, 2
+# An adjustment of squares has settled when no larger share of the observations changes sides.
+MAX_CHANGED = 1e-3
 # Synthetic keypoints may be exact; no detector's are better than this.
 MIN_NOISE_PX = 0.02
 _NO_CENTERS = (
@@ -56,6 +57,7 @@ class Mapper:
 
     ``prior_cameras`` are what the cameras of the model, in their order, were before anything was seen with them.
     ``locked`` (I,) bool are images that this model must not register. ``attempts``: the last one for each image.
+    ``loss_scale_px``: the noise that robust losses are set for, once it has been measured.
     ``waits``: weak images whose strongest pairs are with images outside of the model are left to another one, which
     may grow from there. ``held`` (I,) bool: images whose poses are known and stay as they are; None for none.
     """
@@ -72,6 +74,7 @@ class Mapper:
     failed_with: dict[int, int] = field(default_factory=dict)
     times_dropped: dict[int, int] = field(default_factory=dict)
     size_at_global: tuple[int, int] = (0, 0)
+    loss_scale_px: float | None = None
     waits: bool = True
     held: NDArray[np.bool_] | None = None
     max_error_px: float = field(init=False)
@@ -327,32 +330,34 @@ class Mapper:
 
     def polish(self) -> AdjustReport:
         """Adjust a finished map with a loss that lets go of what is far off the noise, until it settles: the closing
-        adjustments, of which the last is reported.
+        adjustments, of which the last is reported, as ``unsettled`` where it has not.
 
         A pixel may be ten standard deviations of precise keypoints: with squares alone, the few observations near the
         limit decide what many others tell little of, such as the lens.
         """
-        reconstruction = self.reconstruction
         if self._wanted_principal_points().any() and not self._free_principal_points().any():
             self.events.warned(STAGE, _NO_CENTERS)
-        for _ in range(MAX_POLISHED):
-            before = reconstruction.obs_is_inlier.copy()
-            options, chosen = self._polishing()
-            graph = FactorGraph(
-                reconstruction, options, varying=self._everything(centers=chosen), prior_cameras=self.prior_cameras,
-                noise_px=1.0,
-            )  # fmt: skip
-            report = graph.optimize()
-            self.events.decided(STAGE, f"closing adjustment: {report.text}", **report)
-            self._settle_points()
-            changed = int((before != reconstruction.obs_is_inlier).sum())
-            summary = reconstruction.summary()
-            self.events.decided(
-                STAGE, f"robust adjustment: {changed} observations became inliers or outliers", **summary
-            )
-            if changed <= MAX_CHANGED * before.sum():
-                break
-        return report
+        self.loss_scale_px = self._residual_scale_px
+        return adjust_until_settled(self._polish_once, STAGE, self.events)
+
+    def _polish_once(self, num_steps: int) -> Round:
+        """Some steps of closing adjustment, after which observations are chosen anew."""
+        reconstruction = self.reconstruction
+        before = reconstruction.obs_is_inlier.copy()
+        options, chosen = self._polishing()
+        graph = FactorGraph(
+            reconstruction, round_options(options, num_steps), varying=self._everything(centers=chosen),
+            prior_cameras=self.prior_cameras, noise_px=1.0,
+        )  # fmt: skip
+        report = graph.optimize()
+        self.events.decided(STAGE, f"closing adjustment: {report.text}", **report)
+        self._settle_points()
+        made = Round(report, before, reconstruction.obs_is_inlier.copy())
+        summary = reconstruction.summary()
+        self.events.decided(
+            STAGE, f"robust adjustment: {made.num_changed} observations became inliers or outliers", **summary
+        )
+        return made
 
     def adjust_with(self, extra_factors: Any) -> None:
         """Adjust a finished map once more as :meth:`polish` does, with gtsam factors over ``X(i)`` beside the
@@ -380,13 +385,18 @@ class Mapper:
     def _polishing(self) -> tuple[AdjustOptions, NDArray[np.bool_]]:
         """Options of the last adjustment, and the cameras (C,) bool whose principal points are free in it."""
         chosen = self._free_principal_points()
-        options = self.adjust_options.robust(self.noise_px)
+        options = self.adjust_options.robust(self.loss_scale_px or self._residual_scale_px)
         options = replace(options, max_iterations=100, initial_damping=1e-8, relative_cost_tolerance=1e-5)
         return self.with_free_centers(options, chosen) if chosen.any() else options, chosen
 
     @property
     def noise_px(self) -> float:
         """Standard deviation of the keypoints by the residuals, pixels."""
+        return self._residual_scale_px
+
+    @property
+    def _residual_scale_px(self) -> float:
+        """Standard deviation of residuals, which is below that of keypoints where tracks are short, in pixels."""
         return structure.residual_scale_px(self.reconstruction, MIN_NOISE_PX)
 
     def agreement(self) -> tuple[int, int]:

@@ -22,7 +22,7 @@ from sfmapp.pipelines.sparse import results
 from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
 from sfmapp.pipelines.sparse.known_lengths import parse_known_lengths
 from sfmapp.pipelines.sparse.run import Run
-from sfmapp.pipelines.sparse.world import closing, held_poses, read_control, read_known_poses
+from sfmapp.pipelines.sparse.world import closing, has_factors, held_poses, read_control, read_known_poses
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.kernels import kernels_compiling
 from sfmapp.workspace.layout import RECONSTRUCT
@@ -122,7 +122,7 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
     options, events, threads = run.options, run.events, run.threads
     if len(image_set.images) < 2:
         raise _too_few_photographs(image_set)
-    import_ahead(len(image_set.images))
+    import_ahead(len(image_set.images), with_factors=has_factors(run, image_set))
     feature_keys = [keys.of_features(record.name) for record in image_set.images]
     with (
         kernels_compiling(events, run.usage),

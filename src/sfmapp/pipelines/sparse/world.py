@@ -36,6 +36,12 @@ def read_control(run: Run, image_set: ImageSet) -> ControlPoints | None:
     return control
 
 
+def has_factors(run: Run, image_set: ImageSet) -> bool:
+    """Whether models are adjusted to more than photographs: to positions, known poses or control points."""
+    has_positions = any(record.position is not None for record in image_set.images)
+    return has_positions or run.poses is not None or run.control is not None
+
+
 def read_known_poses(run: Run, image_set: ImageSet) -> PoseFile | None:
     """The poses that a run was given, by photograph.
 
