@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 _MAX_STEPS = 100
-_FIRST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e10
+FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e10
 # relative: a step that lowers the cost by less is the last
 _CONVERGED = 1e-11
 
@@ -96,11 +96,11 @@ def refine(start: Fit, obs: Observations, *, hold_poses: bool = False, hold_came
         slots = np.full_like(slots, -1)
     num_params = len(start.camera.params)
     normal = empty_normal(num_params + len(start.bend), len(obs.ptr) - 1)
-    fit, damping, factor = start, _FIRST_DAMPING, 4.0
+    fit, damping, factor = start, FIRST_DAMPING, 4.0
     cost = normal_equations(_state(fit), obs, slots, normal)
     steps = 0
-    while steps < _MAX_STEPS and math.isfinite(cost) and damping < _LARGEST_DAMPING:
-        step = _solved(normal, damping, hold_poses=hold_poses)
+    while steps < _MAX_STEPS and math.isfinite(cost) and damping < LARGEST_DAMPING:
+        step = damped_step(normal, damping, hold_poses=hold_poses)
         if step is None:
             damping *= factor
             continue
@@ -165,7 +165,7 @@ def _moved(fit: Fit, shared: Array, own: Array) -> Fit:
     )
 
 
-def _solved(normal: Normal, damping: float, *, hold_poses: bool) -> tuple[Array, Array] | None:
+def damped_step(normal: Normal, damping: float, *, hold_poses: bool) -> tuple[Array, Array] | None:
     """The damped step of the shared unknowns and of the views; None where there is none."""
     diagonal = np.diag(normal.shared).copy()
     is_free = diagonal > 0

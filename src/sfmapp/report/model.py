@@ -11,6 +11,7 @@ from typing import Literal
 
 from sfmapp.adjust.options import AdjustReport
 from sfmapp.calibration.report import BoardReport
+from sfmapp.calibration.rig_report import RigReport
 from sfmapp.contradictions import Contradiction
 from sfmapp.dense.report import (
     CloudNumbers,
@@ -359,6 +360,13 @@ class CalibrateReport(Report):
     """
 
     board: BoardReport
+    run: RunFacts
+
+
+class CalibrateRigReport(Report):
+    """The report of ``sfmapp calibrate rig``."""
+
+    rig: RigReport
     run: RunFacts
 
 

@@ -19,6 +19,7 @@ from sfmapp.georeference.world_frame import Georeference
 from sfmapp.report.evaluation import EvaluationReport
 from sfmapp.report.model import (
     CalibrateReport,
+    CalibrateRigReport,
     DenseRunReport,
     ExportReport,
     OdometryRunReport,
@@ -42,6 +43,7 @@ KINDS: Mapping[str, type[Report]] = {
     "evaluate": EvaluationReport,
     "undistort": UndistortReport,
     "calibrate-board": CalibrateReport,
+    "calibrate-rig": CalibrateRigReport,
     "calibration": CalibrationDocument,
     "export": ExportReport,
     "georeference": Georeference,
