@@ -61,15 +61,16 @@ def _board(args: argparse.Namespace) -> int:
     load_numba_without_blas()
     from sfmapp.calibration.boards import parse_board
     from sfmapp.camera.names import CameraModel
-    from sfmapp.pipelines.calibration.board import calibrate_board
+    from sfmapp.pipelines.calibration.board import BoardOptions, calibrate_board
     from sfmapp.workspace.usage import Stopwatch
 
     watch = Stopwatch(whole_process=True)
     model = None if args.model is None else CameraModel[args.model]
+    asked = BoardOptions(model, bends=not args.flat, recording=not args.no_recording)
     with listening(args) as events:
         result = calibrate_board(
             args.source, args.output, parse_board(args.board), options,
-            model=model, bends=not args.flat, recording=not args.no_recording, events=events, watch=watch,
+            asked=asked, events=events, watch=watch,
         )  # fmt: skip
     if args.json:
         print_json({"exit_code": 0, "output": str(result.output), **result.report})

@@ -40,6 +40,25 @@ from sfmapp.workspace.usage import Stopwatch
 
 
 @dataclass(frozen=True)
+class BoardOptions:
+    """What a user may say of a calibration from a board.
+
+    Attributes:
+        model: of the lens; None: chosen by views that are held out.
+        bends: look whether the board is bent.
+        recording: write ``recording.rrd``.
+    """
+
+    model: CameraModel | None = None
+    bends: bool = True
+    recording: bool = True
+
+    def __post_init__(self) -> None:
+        if self.model == CameraModel.EQUIRECTANGULAR:
+            raise UsageError("model is EQUIRECTANGULAR: a panorama has no parameters to calibrate")
+
+
+@dataclass(frozen=True)
 class CalibrationResult:
     """What was found and written.
 
@@ -60,9 +79,7 @@ def calibrate_board(
     board: Board,
     options: Options | None = None,
     *,
-    model: CameraModel | None = None,
-    bends: bool = True,
-    recording: bool = True,
+    asked: BoardOptions | None = None,
     events: Events | None = None,
     watch: Stopwatch | None = None,
 ) -> CalibrationResult:
@@ -73,18 +90,15 @@ def calibrate_board(
         output: a new folder, an empty one, or that of an earlier call.
         board: what they show.
         options: of these, those of images and ``threads``.
-        model: of the lens; None: chosen by views that are held out.
-        bends: look whether the board is bent.
-        recording: write ``recording.rrd``.
+        asked: for the lens model and the rest; None for the defaults.
         events: progress, decisions, warnings and cancellation.
         watch: started when the run began.
 
     Raises:
         InputError: nothing to read, fewer than three photographs with a board, or views that leave the camera open.
-        UsageError: a panorama as a model, or an output that holds something else.
+        UsageError: an output that holds something else.
     """
-    if model == CameraModel.EQUIRECTANGULAR:
-        raise UsageError("model is EQUIRECTANGULAR: a panorama has no parameters to calibrate")
+    asked = asked or BoardOptions()
     with Job.opened(CALIBRATE, source, output, options, events=events, watch=watch) as job:
         with job.stage("detection"):
             pictures = look_at_pictures(job, board)
@@ -100,7 +114,13 @@ def calibrate_board(
             views = [TargetView(one.name, board.points[one.detection.idx], one.detection.xy) for one in used]
             facts = [_facts(board, len(one.detection.idx), one.detection.sharpness_px) for one in used]
             solution = solve_views(
-                views, pictures.size, model, facts=facts, bends=bends, threads=job.threads, events=job.events
+                views,
+                pictures.size,
+                asked.model,
+                facts=facts,
+                bends=asked.bends,
+                threads=job.threads,
+                events=job.events,
             )
         with job.stage("plan"):
             made = solution.calibration
@@ -112,7 +132,7 @@ def calibrate_board(
             report = CalibrateReport(board=_report(board, pictures, solution, coming, files), run=job.facts())
             job.workspace.write_json(REPORT, report)
             job.workspace.write_text("report.html", render_board_html(report, made))
-        if recording:
+        if asked.recording:
             with job.stage("recording"):
                 _record(job, board, pictures, made)
         job.workspace.save()
