@@ -37,8 +37,8 @@ Corners: TypeAlias = tuple[dict[int, Array], dict[int, Array]]
 STAGE = "units"
 # Of a corner of a marker that a detector has refined.
 _CORNER_PX = 0.3
-# All corners of blurred squares are found too far inside by about this much (drawn ones: 0.14 px at a side of 50 pixels,
-# 0.09 at 200), which no mean over pictures takes away. The middle of a marker does not feel it.
+# All corners of blurred squares are found too far inside by about this much (drawn ones: 0.14 px at a side of 50
+# pixels, 0.09 at 200), which no mean over pictures takes away. The middle of a marker does not feel it.
 _INWARD_PX = 0.12
 # A known length and a model that is in metres already differ by less than this many sigmas.
 _AGREES = 3.0
