@@ -261,7 +261,9 @@ def measure(lens: Lens, work: Path, world: World) -> dict[str, Any]:
     if values["dense"]["exit_code"] == 0:
         patches = read_ply_geometry(out / "dense" / "fused.ply").xyz
         values["patches"] = cloud_errors(patches, errors.reference_from_estimate, world, distance)
-    values["undistort"] = run(["undistort", str(out), "-o", str(flat)], folder / "undistort.log")
+    # one picture of each photograph, which is what the straightness is measured of
+    command = ["undistort", str(out), "-o", str(flat), "--front-only"]
+    values["undistort"] = run(command, folder / "undistort.log")
     if values["undistort"]["exit_code"] == 0:
         values |= undistorted(flat, poses, world)
     return values

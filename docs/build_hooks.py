@@ -25,7 +25,12 @@ def help_of_all() -> str:
     from sfmapp.cli.main import make_parser
 
     (commands,) = (action for action in make_parser()._actions if isinstance(action, argparse._SubParsersAction))
-    return "\n".join(f"## {name}\n```text\n{one.format_help()}```\n" for name, one in commands.choices.items())
+    found: list[tuple[str, argparse.ArgumentParser]] = []
+    for name, one in commands.choices.items():
+        found.append((name, one))
+        for ways in (action for action in one._actions if isinstance(action, argparse._SubParsersAction)):
+            found += [(f"{name} {way}", each) for way, each in ways.choices.items()]
+    return "\n".join(f"## {name}\n```text\n{one.format_help()}```\n" for name, one in found)
 
 
 def options_of(stage: str) -> str:

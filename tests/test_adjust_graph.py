@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import gtsam
@@ -256,6 +257,13 @@ def test_solvers_agree_and_threads_change_nothing(monkeypatch):
             model = graph.reconstruction
             states[kind, threads] = model.cam_from_world.tobytes() + model.point_xyz.tobytes()
         assert states[kind, 1] == states[kind, 2]
+
+
+def test_a_small_graph_without_factors_needs_no_gtsam(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gtsam", None)  # an import raises
+    monkeypatch.delitem(sys.modules, "sfmapp.adjust.factors")
+    scene = make_scene(3, 20, 300, sigma_px=0.5)
+    assert FactorGraph(start_of(scene), OPTIONS).optimize().solver == "lapack"
 
 
 def test_weak_directions_are_solved_as_exactly_as_the_others():

@@ -134,7 +134,7 @@ def test_a_program_gets_one_document_and_events_as_lines(tmp_path: Path, fake: P
 def test_no_map_is_4(tmp_path: Path, fake: Patch, capsys: Capture) -> None:
     use(fake, FakeRunner(finds_nothing=True))
     assert main(["odometry", "fake", "-o", str(tmp_path / "out"), "--no-recording"]) == 4
-    assert "no map could be begun" in capsys.readouterr().err
+    assert "no map could be initialized" in capsys.readouterr().err
     assert (tmp_path / "out" / "report.html").is_file()
 
 

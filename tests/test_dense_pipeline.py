@@ -351,5 +351,5 @@ def test_what_is_no_source(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="found no folder"):
         dense(model, tmp_path / "out", images=tmp_path / "gone")
     (tmp_path / "wall" / "images").rename(tmp_path / "wall" / "elsewhere")
-    with pytest.raises(UsageError, match="where are the photographs"):
+    with pytest.raises(UsageError, match="expected its photographs in"):
         dense(model, tmp_path / "out")

@@ -135,6 +135,18 @@ def test_a_georeference_is_read_back(tmp_path: Path) -> None:
     assert found.place_of(1) is None
 
 
+@pytest.mark.parametrize("name", ["scale_sigma_share", "rotation_sigma_deg", "position_sigma_m"])
+def test_a_place_that_is_said_to_be_exact_is_refused(tmp_path: Path, name: str) -> None:
+    write_georeference(tmp_path, georeference())
+    path = tmp_path / GEOREFERENCE
+    document = json.loads(path.read_text())
+    value = document["models"][0][name]
+    document["models"][0][name] = 0.0 if isinstance(value, float) else [0.0, *value[1:]]
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"model 0: expected sigmas above zero, found 0"):
+        read_georeference(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -12,7 +12,7 @@ import pytest
 import surveys
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.georeference.adjustment import drift
+from sfmapp.georeference.drift import estimate_drift
 from sfmapp.georeference.fit import robust_fit
 from sfmapp.georeference.options import GpsOptions
 from sfmapp.georeference.stage import Placed, georeference_models
@@ -194,7 +194,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     """A lean copy of benchmarks/surveys.py: one in ten positions wrong, all kinds; 200 surveys are in its results."""
     outcomes = [
         surveys.run(kind, receiver, seed, 0.1)
-        for kind in surveys.KINDS for receiver in surveys.RECEIVERS for seed in (11,)
+        for kind in surveys.KINDS for receiver in ("phone", "rtk") for seed in (11,)
     ]  # fmt: skip
     done = [outcome for outcome in outcomes if outcome is not None]
     assert len(done) == 6
@@ -236,21 +236,39 @@ def test_a_position_that_is_written_twice_counts_once(
     assert "no new measurement" in placed.report.findings[0].message
 
 
-def test_drift_of_a_receiver_is_seen_and_independent_errors_are_not_taken_for_it() -> None:
-    seen = {}
-    for rho in (0.0, 0.7):
-        inflated = []
-        for seed in range(40):
-            centers, places, _, _ = similar(seed, 30)
-            rng = np.random.default_rng([seed, 9])
-            error = rng.normal(size=(30, 3))
+def test_intervals_hold_the_truth_where_a_receiver_drifts() -> None:
+    """Errors of neighbours correlate by 0.8: without that reckoned with, 39 % of mean places were inside."""
+    for rho, least in ((0.0, 0.93), (0.8, 0.88)):
+        inside, correlation = [], []
+        for seed in range(50):
+            centers, places, rotation, scale = similar(seed, 30)
+            error = np.random.default_rng([seed, 9]).normal(size=(30, 3))
             for k in range(1, 30):
                 error[k] = rho * error[k - 1] + np.sqrt(1 - rho**2) * error[k]
-            fit = robust_fit(centers, places + error, np.full((30, 3), 1.0), NOT_STATED)
+            sigma = np.full((30, 3), 1.0)
+            fit = robust_fit(centers, places + error, sigma, NOT_STATED)
             assert fit is not None
-            inflated.append(drift(fit, np.arange(30))[1])
-        seen[rho] = np.array(inflated)
-    # one in twenty by chance; drift of 0.7 asks for a factor of 2.4, of which the fit itself takes some away
-    assert (seen[0.0] > 1.0).mean() < 0.15
-    assert (seen[0.7] > 1.0).mean() > 0.9
-    assert 1.6 < np.median(seen[0.7]) < 2.6
+            found = fit.similarity
+            arm = found.apply(centers) - found.mean
+            drift = estimate_drift(fit.residual, fit.sigma, arm, fit.is_inlier, np.arange(30.0))
+            mean = found.mean - (scale * found.origin @ rotation.T + [10.0, -20.0, 3.0])
+            off = np.r_[rigid3.log_so3(found.rotation @ rotation.T), np.log(found.scale / scale), mean]
+            inside.append(np.abs(off) < 1.96 * drift.spread * np.sqrt(np.diag(found.covariance)))
+            correlation.append(drift.correlation)
+        assert least < np.mean(inside) < 0.995
+        assert least < np.mean(np.array(inside)[:, 4:]) <= 1.0
+        # the fit takes away some of what is slow
+        assert rho - 0.15 < np.mean(correlation) < rho + 0.1
+
+
+def test_drift_of_a_set_with_gaps_is_the_same() -> None:
+    """Positions that are missing leave the correlation from one photograph to the next as it is."""
+    rng, found = np.random.default_rng(3), []
+    for _ in range(20):
+        error = rng.normal(size=(120, 3))
+        for k in range(1, 120):
+            error[k] = 0.8 * error[k - 1] + 0.6 * error[k]
+        arm, kept = rng.normal(size=(120, 3)) * 10.0, np.sort(rng.permutation(120)[:60])
+        ones = np.ones((60, 3))
+        found.append(estimate_drift(error[kept], ones, arm[kept], np.ones(60, bool), kept.astype(float)).correlation)
+    assert np.mean(found) == pytest.approx(0.8, abs=0.06)

@@ -60,7 +60,7 @@ def test_a_buffer_that_is_used_again_does_no_harm() -> None:
     sequence = sfmapp.ArraySequence(grab(), SMALL)
     assert sequence.num_frames is None
     assert [frame.images[0][0, 0] for frame in list(sequence.frames())] == [1, 2, 3]
-    with pytest.raises(sfmapp.InputError, match="walked through once"):
+    with pytest.raises(sfmapp.InputError, match="read only once"):
         next(sequence.frames())
     again = sfmapp.ArraySequence([buffer], SMALL)
     assert len(list(again.frames())) == len(list(again.frames())) == again.num_frames == 1

@@ -117,7 +117,7 @@ def test_results_inside_the_folder_are_no_photographs(tmp_path: Path, version: i
     assert names(load(tmp_path / "photos/**/*.*g")[0]) == wanted
     # what is named is used
     assert names(load(tmp_path / "photos/out/dense/maps")[0]) == ["a.jpg.depth.png"]
-    with pytest.raises(InputError, match="results of sfmapp alone, in dense/"):
+    with pytest.raises(InputError, match="matches only results of sfmapp, in dense/"):
         load(str(tmp_path / "photos/out/**/*.depth.png"))
     (tmp_path / "list.txt").write_text("photos/out/picture.png\nphotos/a.jpg\n")
     assert names(load(tmp_path / "list.txt")[0]) == ["a.jpg", "out/picture.png"]

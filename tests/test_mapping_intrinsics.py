@@ -118,7 +118,7 @@ def test_fixed_intrinsics_that_are_wrong_are_red_and_inside_the_stated_sigmas(la
     assert "f 9" in found["evidence"]["freed"] or "f 8" in found["evidence"]["freed"]
     assert 1e-4 < found["position_sigma_share"] < 1.0
     assert result.lights["contradiction: given intrinsics"] == "red"
-    assert any("the photographs say" in line for line in result.warnings)
+    assert any("the photographs indicate" in line for line in result.warnings)
     assert worst_error_in_sigmas(result, scene) < 3
 
 
@@ -142,5 +142,5 @@ def test_photographs_that_were_cut_each_otherwise_are_red(offset):
         model.cameras, model.image_camera_idx = [TRUE], np.zeros(12, np.int32)
     result = map_with(scene, simple_camera(CameraModel.SIMPLE_RADIAL, 1000, 750, 1200.0, 600.0))
     found = [row["subject"] for row in result.row["contradictions"]]
-    assert found == (["middle of the photographs"] if offset else [])
+    assert found == (["cropped photographs"] if offset else [])
     assert worst_error_in_sigmas(result, scene) < (3 if offset else 4)

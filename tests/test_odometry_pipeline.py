@@ -279,7 +279,7 @@ def test_no_map_at_all_is_a_failure_with_a_report(tmp_path: Path, monkeypatch: P
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["outcome"]["exit_code"] == 4
     assert report["maps"] == []
-    assert "no map could be begun" in (tmp_path / "out" / "report.html").read_text()
+    assert "no map could be initialized" in (tmp_path / "out" / "report.html").read_text()
     # nothing of the earlier run is left that could be taken for a result of this one
     assert not list((tmp_path / "out").glob("trajectory*"))
     assert not list((tmp_path / "out").glob("sparse/*"))

@@ -280,7 +280,7 @@ def test_a_model_tells_by_the_names_of_its_images(tmp_path: Path, is_text: bool)
             f"{prefix}a.jpg": CameraModel.OPENCV, f"{prefix}b.jpg": CameraModel.OPENCV_FISHEYE,
             f"{prefix}c.jpg": CameraModel.OPENCV,
         }  # fmt: skip
-    with pytest.raises(InputError, match=r"found 2 that differ"):
+    with pytest.raises(InputError, match=r"found 2 different ones"):
         read_calibration(tmp_path / "model", [(W, H)])
 
 

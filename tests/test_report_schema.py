@@ -16,7 +16,7 @@ from sfmapp.reporting import NamedReason, plain
 
 def undistorted() -> UndistortReport:
     return UndistortReport(
-        num_images=1, num_copied=0, num_masks=0, num_points=5, num_observations=9, num_dropped=1,
+        num_images=1, num_faces=0, num_copied=0, num_masks=0, num_points=5, num_observations=9, num_dropped=1,
         cameras=[UndistortedCamera(width=4, height=3, params=[1.0, 1.0, 2.0, 1.5])],
         missing=[NamedReason(name="a.jpg", reason="gone")], run=RunUsage(wall_s=1.0, cpu_s=2.0),
     )  # fmt: skip

@@ -76,7 +76,7 @@ def test_json_there_and_back_is_the_same(end: Row | Other | None) -> None:
         ({"pair": [1]}, "expected 2 entries, found 1"),
         ({"light": "blue"}, "expected one of"),
         ({"end": {"reason": 1}}, "Whole.end.reason: expected str"),
-        ({"unknown": 1}, "'unknown' is no field"),
+        ({"unknown": 1}, "'unknown' is not one of its fields"),
     ],
 )
 def test_what_does_not_fit_is_named(change: dict[str, object], words: str) -> None:

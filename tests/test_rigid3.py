@@ -50,6 +50,18 @@ def test_exp_and_log_at_the_ends(axis, angle):
     np.testing.assert_allclose(rigid3.exp_so3(rigid3.log_so3(rotation)), rotation, atol=1e-12)
 
 
+@given(poses, vectors, vectors)
+def test_centres_move_as_their_jacobian_says(pose, w, v):
+    step = 1e-7
+    moved = rigid3.compose(rigid3.from_matrix(rigid3.exp_so3(step * w), step * v), pose)
+    tangent = np.concatenate([w, v])
+    np.testing.assert_allclose(
+        (rigid3.center(moved) - rigid3.center(pose)) / step, rigid3.center_jacobian(pose) @ tangent, atol=1e-4
+    )
+    along = rigid3.center_covariance(pose, np.outer(tangent, tangent))
+    np.testing.assert_allclose(along, np.outer(*2 * [rigid3.center_jacobian(pose) @ tangent]), atol=1e-9)
+
+
 def test_functions_broadcast():
     rng = np.random.default_rng(0)
     many = rigid3.from_matrix(rigid3.exp_so3(rng.normal(size=(4, 5, 3))), rng.normal(size=(4, 5, 3)))

@@ -526,7 +526,7 @@ def test_imu_and_ground_truth_from_elsewhere(tmp_path: Path, told: Told) -> None
     assert there.ground_truth is not None
     np.testing.assert_allclose(here.imu.imu_from_cam, there.imu.imu_from_cam)
     np.testing.assert_allclose(here.ground_truth.cam_from_world, there.ground_truth.cam_from_world)
-    with pytest.raises(InputError, match="where the IMU sits"):
+    with pytest.raises(InputError, match="expected the pose of the IMU"):
         open_sequence(tmp_path / "photos", SequenceOptions(camera=PINHOLE, imu=str(mav / "imu0")), told.events)
 
 

@@ -16,7 +16,7 @@ from PIL import Image, ImageOps
 import sfmapp
 from dense_models import make_model, row_of_poses, see_wall, texture
 from schemas import check_schema
-from sfmapp.camera.camera import Camera, CameraModel, pixels_to_normalized
+from sfmapp.camera.camera import Camera, CameraModel, pixels_to_normalized, pixels_to_rays, project
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Event, Events
@@ -29,7 +29,8 @@ from sfmapp.pipelines.dense.source import find_source
 from sfmapp.reporting import plain
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import RigImages
-from sfmapp.scene.undistortion import move_pixels, plan_undistortion, undistort_reconstruction, warn_of_sides
+from sfmapp.scene.tracks import Tracks
+from sfmapp.scene.undistortion import Layout, move_pixels, plan_undistortion, undistort_reconstruction, warn_of_sides
 from sfmapp.workspace.layout import FORMAT
 from sfmapp.workspace.options import load_options
 
@@ -77,14 +78,16 @@ def test_the_pinhole_is_the_one_of_pycolmap(camera: Camera, blank: float, max_si
     theirs = pycolmap.undistort_camera(
         wanted, pycolmap.Camera(model=camera.model.name, width=camera.width, height=camera.height, params=camera.params)
     )
-    ours = plan_undistortion(camera, blank, None if max_size < 0 else max_size).camera
+    (planned,) = plan_undistortion(camera, Layout(blank, None if max_size < 0 else max_size))
+    ours = planned.camera
     assert (ours.width, ours.height) == (theirs.width, theirs.height)
     assert ours.params == pytest.approx(theirs.params, abs=1e-6)
 
 
 def test_a_lens_whose_border_has_no_inverse_gets_a_picture_of_bounded_size_without_blank_pixels() -> None:
     camera = Camera(CameraModel.OPENCV_FISHEYE, 400, 300, np.array([100.0, 100.0, 200.0, 150.0, 0.0, 0.0, 0.0, 0.0]))
-    found = plan_undistortion(camera).camera
+    (planned,) = plan_undistortion(camera, Layout(front_only=True))
+    found = planned.camera
     assert (found.width, found.height) == (800, 600)
     corners = np.array([[0.5, 0.5], [799.5, 599.5]])
     rays = (corners - found.params[2:]) / found.params[:2]
@@ -97,13 +100,13 @@ def test_a_lens_whose_border_has_no_inverse_gets_a_picture_of_bounded_size_witho
 def test_of_lenses_that_see_all_round_it_is_said_that_the_front_is_laid_out() -> None:
     told: list[Event] = []
     panorama = Camera(CameraModel.EQUIRECTANGULAR, 400, 200, np.array([400.0, 200.0]))
-    warn_of_sides([*LENSES, STRAIGHT], "undistort", Events(told.append))
+    warn_of_sides([*LENSES, STRAIGHT], "dense", "cut them up", Events(told.append))
     assert not told
-    warn_of_sides([*LENSES, panorama, panorama], "undistort", Events(told.append))
+    warn_of_sides([*LENSES, panorama, panorama], "dense", "cut them up", Events(told.append))
     assert [event.kind for event in told] == ["warned"]
     assert told[0].message.startswith("2 photographs")
     assert "EQUIRECTANGULAR" in told[0].message
-    assert "pinhole" in told[0].message
+    assert told[0].message.endswith("cut them up")
 
 
 # --------------------------------------------------------------------------------------------- pictures and the model
@@ -186,8 +189,8 @@ def test_residuals_are_those_of_the_rays_to_a_millionth_of_a_pixel(camera: Camer
     model.tracks.obs_xy[:] += np.random.default_rng(3).normal(0.0, 0.7, model.tracks.obs_xy.shape)
     model.tracks.obs_xy[0] = 0.1  # beyond the crop
     keypoints = [model.tracks.obs_xy[model.tracks.observations_of_image(m)] for m in range(3)]
-    planned = [plan_undistortion(camera)] * 3
-    flat, _ = undistort_reconstruction(model, keypoints, np.arange(3), planned)
+    planned = plan_undistortion(camera, Layout())
+    flat, _ = undistort_reconstruction(model, keypoints, np.arange(3), [planned] * 3)
     expected = model.tracks.obs_xy + model.residuals_px()
     expected = move_pixels(planned[0], expected) - move_pixels(planned[0], model.tracks.obs_xy)
     moved = move_pixels(planned[0], model.tracks.obs_xy)
@@ -201,14 +204,14 @@ def test_residuals_are_those_of_the_rays_to_a_millionth_of_a_pixel(camera: Camer
 def test_what_falls_outside_takes_its_track_elements_and_its_empty_points_along() -> None:
     model = make_model([BARREL] * 2, row_of_poses(2), 50)
     keypoints = [model.tracks.obs_xy[model.tracks.observations_of_image(m)] for m in range(2)]
-    planned = plan_undistortion(BARREL)
+    (planned,) = plan_undistortion(BARREL, Layout())
     # a point whose pixels lie where the crop is, and a keypoint of no track inside
     lost = int(model.tracks.obs_track_idx[0])
     corner = np.array([[0.1, 0.1]])
     assert (move_pixels(planned, corner) < 0).any()
     model.tracks.obs_xy[model.tracks.obs_track_idx == lost] = corner
     keypoints[0] = np.concatenate([keypoints[0], [[160.0, 120.0]]])
-    flat, moved = undistort_reconstruction(model, keypoints, np.arange(2), [planned] * 2)
+    flat, moved = undistort_reconstruction(model, keypoints, np.arange(2), [[planned]] * 2)
     assert np.isnan(flat.point_xyz[lost]).all()
     assert lost not in flat.tracks.obs_track_idx
     assert not np.isnan(np.delete(flat.point_xyz, lost, axis=0)).any()
@@ -242,7 +245,7 @@ def test_straight_lines_are_straight(tmp_path: Path, camera: Camera) -> None:
         Image.fromarray(np.round(gray).astype(np.uint8)).save(tmp_path / "images" / name)
     sfmapp.undistort(tmp_path, tmp_path / "out", ONE)
     flat = stored(tmp_path / "out" / "images" / model.image_names[0]).astype(float)
-    planned = plan_undistortion(camera).camera
+    planned = plan_undistortion(camera, Layout())[0].camera
     place = float(planned.params[2] - 0.42 * planned.params[0])
     assert flat.ndim == 2  # grey stays grey
     assert edge_deviation(gray, int(gray[120].argmax())) > 1.5
@@ -280,6 +283,150 @@ def test_photographs_at_half_the_size_of_their_cameras(tmp_path: Path) -> None:
     assert np.abs(flat.residuals_px()).max() < 1e-6  # the scene is exact
 
 
+# ------------------------------------------------------------------------------------- lenses that see to their sides
+
+PANORAMA = Camera(CameraModel.EQUIRECTANGULAR, 400, 200, np.array([400.0, 200.0]))
+# 85 degrees from the axis in the middle of the borders, 119 in the corners
+WIDE = Camera(CameraModel.OPENCV_FISHEYE, 240, 240, np.array([80.0, 80.5, 119.0, 121.0, 0.01, -0.002, 0.0, 0.0]))
+
+
+def sky(directions: Array) -> Array:
+    """Brightness of unit vectors (N, 3) of the world: smooth, another one everywhere."""
+    waves = np.array([[2.0, 3.0, -1.0], [-3.0, 1.0, 2.0], [1.0, -2.0, 4.0]])
+    return 127.0 + 35.0 * np.sin(directions @ waves.T + [0.3, 1.1, 2.0]).sum(axis=1)
+
+
+def rays_of(camera: Camera, pose: Array) -> Array:
+    """Unit vectors (H * W, 3) of the world that the pixels see."""
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    return pixels_to_rays(camera, np.stack([u.ravel(), v.ravel()], axis=1)) @ rigid3.rotation_matrix(pose)
+
+
+def write_surroundings(folder: Path, cameras: list[Camera]) -> Reconstruction:
+    """``folder/sparse/0`` and ``folder/images`` of points and a sky all round the cameras, with noisy observations."""
+    rng = np.random.default_rng(5)
+    poses = np.array([rigid3.from_matrix(rigid3.exp_so3(rng.normal(size=3)), rng.normal(size=3)) for _ in cameras])
+    xyz = rng.normal(size=(300, 3))
+    xyz *= 6.0 / np.linalg.norm(xyz, axis=1, keepdims=True)
+    pixels = np.array([project(camera, rigid3.apply(pose, xyz)) for camera, pose in zip(cameras, poses, strict=True)])
+    sizes = np.array([(camera.width, camera.height) for camera in cameras])[:, None]
+    image, track = np.nonzero(((pixels > 4) & (pixels < sizes - 4)).all(axis=2))
+    xy = pixels[image, track] + rng.normal(0.0, 0.5, (len(image), 2))
+    tracks = Tracks.from_observations(track, image, xy, num_images=len(cameras))
+    names = [f"view_{m}.png" for m in range(len(cameras))]
+    kinds = list({id(camera): camera for camera in cameras}.values())
+    camera_idx = np.array([[kind is camera for kind in kinds].index(True) for camera in cameras], np.int32)
+    model = Reconstruction.empty(kinds, names, camera_idx, tracks)
+    model.cam_from_world, model.point_xyz, model.obs_is_inlier[:] = poses, xyz, True
+    write_model(folder / "sparse" / "0", model)
+    (folder / "images").mkdir()
+    for name, camera, pose in zip(names, cameras, poses, strict=True):
+        picture = np.nan_to_num(sky(rays_of(camera, pose))).reshape(camera.height, camera.width)
+        Image.fromarray(np.round(picture).astype(np.uint8)).save(folder / "images" / name)
+    return model
+
+
+@pytest.mark.parametrize("max_size", [None, 50])
+def test_photographs_of_all_round_become_faces_of_cubes_on_a_rig(tmp_path: Path, max_size: int | None) -> None:
+    import pycolmap
+
+    cameras = [PANORAMA, WIDE, STRAIGHT, PANORAMA]
+    model = write_surroundings(tmp_path, cameras)
+    report = sfmapp.undistort(tmp_path, tmp_path / "out", ONE, max_size=max_size).report
+    before, after = (pycolmap.Reconstruction(tmp_path / place / "sparse" / "0") for place in (".", "out"))
+    # nothing is lost, and nothing counted twice; the fisheye sees nothing of what is straight behind it
+    assert (report["num_images"], report["num_faces"], report["num_dropped"]) == (6 + 5 + 1 + 6, 17, 0)
+    assert after.compute_num_observations() == before.compute_num_observations() == report["num_observations"]
+    assert after.num_points3D() == before.num_points3D()
+    # two kinds of cubes, each a rig, and the photograph that needs none
+    assert sorted(len(frame.data_ids) for frame in after.frames.values()) == [1, 5, 6, 6]
+    assert sorted(rig.num_sensors() for rig in after.rigs.values()) == [1, 5, 6]
+    tracks = model.tracks
+    pairs = zip(tracks.obs_image_idx.tolist(), tracks.obs_track_idx.tolist(), strict=True)
+    observed = dict(zip(pairs, tracks.obs_xy, strict=True))
+    for image in after.images.values():
+        number, camera = int(image.name.removeprefix("view_")[0]), after.cameras[image.camera_id]
+        assert camera.model.name == "PINHOLE"
+        assert max_size is None or camera.width <= max_size
+        pose = model.cam_from_world[number]
+        assert image.projection_center() == pytest.approx(rigid3.center(pose), abs=1e-9)
+        picture_from_cam = image.cam_from_world().rotation.matrix() @ rigid3.rotation_matrix(pose).T
+        for point in image.points2D:
+            if point.has_point3D():
+                assert (point.xy >= 0).all()
+                assert (point.xy < [camera.width, camera.height]).all()
+                # observation and reprojection lie on the same rays as those of the photograph
+                ray = pixels_to_rays(cameras[number], observed[number, point.point3D_id - 1][None])[0]
+                assert camera.img_from_cam(picture_from_cam @ ray) == pytest.approx(point.xy, abs=1e-6)
+                xyz = before.points3D[point.point3D_id].xyz
+                wanted = camera.img_from_cam(picture_from_cam @ rigid3.apply(pose, xyz))
+                assert camera.img_from_cam(image.cam_from_world() * xyz) == pytest.approx(wanted, abs=1e-6)
+
+
+def test_a_cube_that_is_mounted_on_a_rig_stays_on_it(tmp_path: Path) -> None:
+    import pycolmap
+
+    model = write_surroundings(tmp_path, [STRAIGHT, WIDE, STRAIGHT, WIDE])
+    mount = rigid3.compose(model.cam_from_world[1], rigid3.inverse(model.cam_from_world[0]))
+    model.cam_from_world[3] = rigid3.compose(mount, model.cam_from_world[2])
+    frame, sensor = np.array([0, 0, 1, 1], np.int32), np.array([0, 1, 0, 1], np.int32)
+    model.rig = RigImages(frame, sensor, np.array([rigid3.IDENTITY, mount]))
+    write_model(tmp_path / "sparse" / "0", model)
+    sfmapp.undistort(tmp_path, tmp_path / "out", ONE, max_size=20)
+    before, after = (pycolmap.Reconstruction(tmp_path / place / "sparse" / "0") for place in (".", "out"))
+    assert (after.num_rigs(), after.num_frames(), after.num_cameras(), after.num_reg_images()) == (1, 2, 6, 12)
+    for image in after.images.values():
+        old = next(each for each in before.images.values() if image.name[:6] == each.name[:6])
+        assert image.projection_center() == pytest.approx(old.projection_center(), abs=1e-9)
+        if "front" in image.name:
+            assert image.cam_from_world().matrix() == pytest.approx(old.cam_from_world().matrix(), abs=1e-12)
+
+
+def test_faces_show_what_lies_there_across_seam_and_poles_masks_too(tmp_path: Path) -> None:
+    model = write_surroundings(tmp_path, [PANORAMA, PANORAMA, WIDE])
+    (tmp_path / "masks").mkdir()
+    night = sky(rays_of(PANORAMA, model.cam_from_world[1])).reshape(200, 400) < 120.0
+    Image.fromarray((255 * ~night).astype(np.uint8)).save(tmp_path / "masks" / "view_1.png.png")
+    options = load_options([], ["threads=1", f"images.mask_path={tmp_path / 'masks'}"])
+    sfmapp.undistort(tmp_path, tmp_path / "out", options)
+    flat, _ = read_model(tmp_path / "out" / "sparse")
+    for name, camera_idx, pose in zip(flat.image_names, flat.image_camera_idx, flat.cam_from_world, strict=True):
+        camera = flat.cameras[camera_idx]
+        found = stored(tmp_path / "out" / "images" / name).astype(float)
+        assert found.shape == (camera.height, camera.width)
+        mask = tmp_path / "out" / "masks" / f"{name}.png"
+        usable = stored(mask) > 0 if mask.is_file() else np.ones(found.shape, bool)
+        wanted = sky(rays_of(camera, pose)).reshape(found.shape)
+        if "view_1" in name:
+            assert not (usable & (wanted < 116.0)).any(), name
+            assert usable[wanted > 124.0].all(), name
+            usable[:] = True
+        # of the fisheye's faces only the one in front is full
+        assert usable.all() == ("view_2" not in name or "front" in name), name
+        inside = cv2.erode(usable.astype(np.uint8), np.ones((5, 5)), borderValue=1) > 0
+        assert np.abs(found - wanted)[inside].max() < 2.0, name  # two roundings, and a little of interpolation
+        assert (found[~usable] == 0).all()
+
+
+def test_the_front_alone_is_one_picture_of_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_surroundings(tmp_path, [PANORAMA, WIDE])
+    assert main(["undistort", str(tmp_path), "-o", str(tmp_path / "out"), "--front-only", "--threads", "1"]) == 0
+    assert "2 photographs are by lenses that see to their sides" in capsys.readouterr().err
+    flat, _ = read_model(tmp_path / "out" / "sparse")
+    assert flat.image_names == ["view_0.png", "view_1.png"]
+    assert flat.rig is None
+
+
+def test_faces_and_photographs_of_one_name_are_refused(tmp_path: Path) -> None:
+    model = write_surroundings(tmp_path, [PANORAMA, STRAIGHT])
+    (tmp_path / "images" / "view_1.png").rename(tmp_path / "images" / "view_0_left.png")
+    model.image_names[1] = "view_0_left.png"
+    write_model(tmp_path / "sparse" / "0", model)
+    with pytest.raises(InputError, match=r"view_0_left\.png: a photograph has the name"):
+        sfmapp.undistort(tmp_path, tmp_path / "out", ONE)
+    assert not (tmp_path / "out" / "images").exists()
+
+
 # -------------------------------------------------------------------------------------------------- what files hold
 
 
@@ -314,7 +461,7 @@ def test_nobody_turns_what_is_written(tmp_path: Path, camera: Camera, suffix: st
     with Image.open(path) as picture:
         assert picture.format == {"jpg": "JPEG", "tif": "TIFF"}.get(suffix, suffix.upper())
         plain, turned = np.asarray(picture), np.asarray(ImageOps.exif_transpose(picture))
-    planned = plan_undistortion(camera).camera
+    planned = plan_undistortion(camera, Layout())[0].camera
     assert plain.shape == (planned.height, planned.width, 3)
     assert (plain == turned).all()
     for flags in (cv2.IMREAD_COLOR_RGB, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION):
@@ -353,7 +500,7 @@ def test_sixteen_bits_alpha_and_masks_are_carried_along(tmp_path: Path) -> None:
     assert deep.max() / 2 < found.max() <= deep.max()
     assert len(np.unique(found)) > 1000  # no 8 bits on the way
     flat_alpha = stored(out / "images" / "view_1.png")[..., 3]
-    planned = plan_undistortion(BARREL)
+    (planned,) = plan_undistortion(BARREL, Layout())
     border = move_pixels(planned, np.stack([np.full(200, 100.0), np.linspace(20, 220, 200)], axis=1))
     for x, y in border[(border[:, 1] > 5) & (border[:, 1] < planned.camera.height - 5)]:
         assert flat_alpha[int(y), int(x) - 3] == 0

@@ -125,7 +125,7 @@ def test_what_cannot_be_scored_is_told(workspace: Path, tmp_path: Path) -> None:
         validate_cloud(workspace, ground_truth, ground_truth_poses=tmp_path)
     with pytest.raises(InputError, match=r"expected dense/fused\.ply or mesh/mesh\.ply"):
         validate_cloud(tmp_path, ground_truth, distance=1)
-    with pytest.raises(InputError, match="none that is finite"):
+    with pytest.raises(InputError, match="expected finite ground-truth points"):
         validate_cloud(workspace, save(tmp_path / "empty.ply", floor()[:0]))
     (workspace / "dense" / "patches.npz").write_bytes(b"no archive")
     with pytest.raises(InputError, match="expected an array 'size'"):

@@ -132,7 +132,8 @@ def test_what_is_noted_comes_back_and_a_damaged_manifest_is_told(tmp_path: Path)
     document = json.loads((tmp_path / "run.json").read_text())
     for key, value, message in (
         ("seed", "three", "seed: expected int, found str"), ("stages", [], "stages: expected dict"),
-        ("stages", {"odometry": {"is_done": 1}}, "is_done: expected bool"), ("speed", 1, "'speed' is no field"),
+        ("stages", {"odometry": {"is_done": 1}}, "is_done: expected bool"),
+        ("speed", 1, "'speed' is not one of its fields"),
     ):  # fmt: skip
         (tmp_path / "run.json").write_text(json.dumps({**document, key: value}))
         with pytest.raises(InputError, match=message):

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,7 +62,7 @@ def test_the_workspace_is_locked_and_sums_are_of_one_thread(tmp_path: Path) -> N
     before = [library["num_threads"] for library in threadpool_info()]
     with Job.opened("weigh", tmp_path, tmp_path / "out", None) as job:
         assert {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"} == {1}
-        with pytest.raises(UsageError, match="is at work"), open_workspace(tmp_path / "out", "weigh"):
+        with pytest.raises(UsageError, match="is running"), open_workspace(tmp_path / "out", "weigh"):
             pass
         assert job.threads == job.options.num_workers
     assert [library["num_threads"] for library in threadpool_info()] == before
@@ -120,3 +123,18 @@ def test_a_log_that_cannot_be_written_is_told_in_the_report(tmp_path: Path) -> N
     with Job.opened("weigh", tmp_path, tmp_path / "out", None) as job:
         pass
     assert "the run goes on without it" in str(job.log.warnings[0]["message"])
+
+
+def test_linear_algebra_that_is_loaded_later_keeps_to_one_thread_too():
+    """In a fresh process, whose scipy brings a BLAS of its own when it is first imported."""
+    code = (
+        "from sfmapp.adjust.linear import one_blas_thread\n"
+        "with one_blas_thread():\n"
+        "    import numpy, scipy.linalg, threadpoolctl\n"
+        "    print([library['num_threads'] for library in threadpoolctl.threadpool_info()])\n"
+    )
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "2", "MKL_NUM_THREADS": "2"}
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    numbers = json.loads(ran.stdout)
+    assert numbers
+    assert set(numbers) == {1}

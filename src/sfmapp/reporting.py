@@ -191,7 +191,7 @@ def _read_one_of(kinds: Sequence[type[Report]], value: Any, place: str) -> Repor
 def _read_report(kind: type[Report], value: dict[str, object], place: str) -> Report:
     known = field_types(kind)
     if unknown := sorted(set(value) - set(known)):
-        raise ValueError(f"{place}: {unknown[0]!r} is no field of it")
+        raise ValueError(f"{place}: {unknown[0]!r} is not one of its fields")
     if missing := [name for name, (_, is_optional) in known.items() if name not in value and not is_optional]:
         raise ValueError(f"{place}: {missing[0]!r} is missing")
     return kind(**{name: _read(known[name][0], entry, f"{place}.{name}") for name, entry in value.items()})

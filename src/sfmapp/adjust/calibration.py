@@ -120,12 +120,11 @@ def _adjoints(mounts: Array) -> Array:
 
 def _stretch(model: Reconstruction, num_sensors: int) -> Array:
     """(F * 6,) derivative of the logarithm of the rms distance of the frames from their middle, by their poses."""
-    centers, rotation = model.centers[::num_sensors], rigid3.rotation_matrix(model.cam_from_world[::num_sensors])
+    poses = model.cam_from_world[::num_sensors]
+    centers = rigid3.center(poses)
     away = centers - centers.mean(0)
-    out = np.zeros((len(centers), 6))
-    # x <- exp(w) x + v turns a camera about its own centre and moves that by -R^T v
-    out[:, 3:] = -np.einsum("nij,nj->ni", rotation, away) / max(float((away**2).sum()), 1e-300)
-    return out.ravel()
+    out = np.einsum("nij,ni->nj", rigid3.center_jacobian(poses), away) / max(float((away**2).sum()), 1e-300)
+    return np.asarray(out.ravel(), np.float64)
 
 
 class _Seen(NamedTuple):

@@ -137,16 +137,9 @@ def estimate_covariances(
 
 def residual_variance(engine: Engine) -> float:
     """Variance of a pixel coordinate from weighted residuals and degrees of freedom; infinite without redundancy."""
-    p = engine.problem
-    num_unknowns = int(p.block_dim.sum())
+    p, num_redundant = engine.problem, engine.degrees_of_freedom
     total, _, _ = weigh_observations(p.points, p.images(engine.rows), p.lenses, engine.loss, 0.0)
-    is_free = (p.pose_block >= 0).all() and not p.is_constant.any() and engine.extras is None
-    free_gauge = 0 if not is_free else 6 if p.has_baseline else 7
-    num_eliminated = int((~p.is_constant & (p.point_block < 0)).sum())
-    if engine.extras is not None:
-        num_unknowns -= engine.extras.num_own_dims
-    dof = 2 * p.num_observations - 3 * num_eliminated - num_unknowns + free_gauge
-    return total / dof if dof > 0 else np.inf
+    return total / num_redundant if num_redundant > 0 else np.inf
 
 
 def reduced_matrix(engine: Engine, is_kept: Mask | None = None) -> Array:

@@ -53,7 +53,7 @@ class MarginalCovariance:
     num_gauge: int
     is_determined: bool
     _places: dict[tuple[str, int], slice]
-    _rotations: Array
+    _poses: Array
 
     def of_image(self, image: int) -> Array:
         """(6, 6) of the pose of an image position. Raises InputError if it was not asked for."""
@@ -69,10 +69,10 @@ class MarginalCovariance:
 
     def of_center(self, image: int) -> Array:
         """(3, 3) of the centre of an image's camera, in the world. Raises InputError if it was not asked for."""
-        found = self._of("image", image)[3:, 3:]
-        rotation = self._rotations[np.flatnonzero(self.image_idx == image)[0]]
-        # c = -R^T t moves by -R^T v
-        return np.asarray(rotation.T @ found @ rotation if np.isfinite(found).all() else found, np.float64)
+        found = self._of("image", image)
+        if not np.isfinite(found).all():
+            return np.full((3, 3), np.inf)
+        return rigid3.center_covariance(self._poses[np.flatnonzero(self.image_idx == image)[0]], found)
 
     def of_variable(self, key: int) -> Array:
         """(D, D) of a variable that was inserted. Raises InputError if it was not asked for."""
@@ -276,10 +276,10 @@ class FactorGraph:
         columns = constrained_columns(information, scale, basis, constraint, wanted.T)
         size = len(rows)
         matrix = np.full((size, size), np.inf) if columns is None else self.noise_px**2 * wanted @ columns
-        rotations = rigid3.rotation_matrix(self.reconstruction.cam_from_world[image_idx].reshape(-1, 7))
+        poses = self.reconstruction.cam_from_world[image_idx].reshape(-1, 7)
         return MarginalCovariance(
             0.5 * (matrix + matrix.T), np.array(image_idx, np.int64), np.array(camera_idx, np.int64),
-            np.array(track_idx, np.int64), len(basis), columns is not None, places, rotations,
+            np.array(track_idx, np.int64), len(basis), columns is not None, places, poses,
         )  # fmt: skip
 
     def _image_position(self, image: int | str) -> int:

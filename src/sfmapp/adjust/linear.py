@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Literal, Protocol
 
 import numba
@@ -16,10 +18,10 @@ Ints = NDArray[np.int64]
 
 SolverName = Literal["tiles", "gtsam", "lapack"]
 
-# Measured by benchmarks/reduced_systems.py; fill is the share of pairs of blocks that meet. In a closing adjustment
-# gtsam is as quick as LAPACK up to about a quarter, of whatever size. Beyond that it falls behind by up to six times,
-# which is some 5 ms a step up to 400 unknowns, and not worth it where the system is nearly full.
-_GTSAM_FILL, _SMALL, _NEARLY_FULL = 0.25, 400, 0.75
+# Measured by benchmarks/reduced_systems.py; fill is the share of pairs of blocks that meet. Up to 400 unknowns, some
+# 65 poses, LAPACK is as quick as gtsam at any fill, for so few poses fill much of their system when they are eliminated
+# whatever it held before. Beyond that gtsam is as quick up to about a quarter, and falls behind by up to six times.
+_SMALL, _GTSAM_FILL = 400, 0.25
 # The quick rounds keep the tiles up to the size at which nothing beats them by much, and beyond that in the range of
 # fill in which they are quickest.
 _FEW_BLOCKS, _TILES_FILL = 160, (0.3, 0.5)
@@ -29,11 +31,15 @@ _GROUP = 6
 _NO_PIVOT = 1e-14
 
 
+def is_beyond_lapack(num_unknowns: int) -> bool:
+    """Whether gtsam may solve a closing system of that size."""
+    return num_unknowns > _SMALL
+
+
 def choose_solver(num_blocks: int, num_unknowns: int, fill: float, *, is_closing: bool) -> SolverName:
     """What solves a reduced system best."""
     if is_closing:
-        limit = _NEARLY_FULL if num_unknowns <= _SMALL else _GTSAM_FILL
-        return "gtsam" if fill <= limit else "lapack"
+        return "gtsam" if is_beyond_lapack(num_unknowns) and fill <= _GTSAM_FILL else "lapack"
     if num_blocks <= _FEW_BLOCKS:
         return "tiles"
     if fill <= _TILES_FILL[0]:
@@ -265,6 +271,20 @@ def number_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
     return table, values
 
 
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Hold the linear algebra of numpy and scipy to one thread: our workers use the cores, and the order of sums, to
+    the last bit of results, must not depend on how many they are.
+
+    What is loaded later is not held, so scipy's own BLAS is loaded before.
+    """
+    import scipy.linalg  # noqa: F401
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1, "blas"):
+        yield
+
+
 class ReducedSystem(Protocol):
     """What solves the reduced system."""
 
@@ -294,7 +314,6 @@ class LapackSystem:
     """
 
     def __init__(self, block_dim: Ints, keys: Ints, numbers: Ints) -> None:
-        # loaded here, so that the caller finds the library that it is to hold to one thread
         from scipy.linalg import lapack
 
         self._lapack = lapack

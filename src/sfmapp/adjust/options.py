@@ -20,6 +20,7 @@ _RANGES = {
     "loss_scale_px": positive(),
     "max_iterations": Range(1, 100_000),
     "relative_cost_tolerance": Range(0.0, 1.0),
+    "settled_sigmas": Range(0.0, 1.0),
     "initial_damping": positive(),
     "principal_point_sigma_px": positive(),
     "distortion_sigma": positive(),
@@ -35,6 +36,8 @@ class AdjustOptions:
         loss_scale_px: residual length at which the loss turns from quadratic to robust
         max_iterations: Levenberg-Marquardt steps, rejected ones included
         relative_cost_tolerance: stop when an accepted step lowers the cost by less than this share
+        settled_sigmas: stop, too, when a step moves poses and intrinsics, whichever way they are combined, by less than
+            this share of their standard deviation, and only points still move; 0 for never
         initial_damping: share of the diagonal added to it at first; 1 / trust region radius in Ceres
         refine_focal: focal lengths may change
         refine_distortion: distortion coefficients may change
@@ -48,6 +51,7 @@ class AdjustOptions:
     loss_scale_px: float = 1.0
     max_iterations: int = 50
     relative_cost_tolerance: float = 1e-6
+    settled_sigmas: float = 0.0
     initial_damping: float = 1e-4
     refine_focal: bool = True
     refine_distortion: bool = True
@@ -96,8 +100,9 @@ class AdjustReport(Report):
     """What an adjustment did.
 
     Attributes:
-        termination: ``converged``, ``iterations`` (limit reached), ``stalled`` (no damping gives a better state) or
-            ``nothing`` (no unknowns or no observations).
+        termination: ``converged``, ``iterations`` (limit reached), ``stalled`` (no damping gives a better state),
+            ``nothing`` (no unknowns or no observations), or ``unsettled``: of a closing adjustment whose rounds of
+            adjusting and of choosing observations ran out before they came to rest.
         num_iterations, num_rejected: steps tried, and those of them that were refused.
         initial_cost, final_cost: half the sum of the losses, priors and extra factors included; square pixels, or of a
             graph with ``noise_px``, square standard deviations.

@@ -25,8 +25,10 @@ from sfmapp.adjust.linear import (
     aligned_zeros,
     assemble,
     choose_solver,
+    is_beyond_lapack,
     mark_pairs,
     number_keys,
+    one_blas_thread,
 )
 from sfmapp.adjust.options import REJECTED_WEIGHT, AdjustOptions, AdjustReport, FactorReport
 from sfmapp.adjust.priors import IntrinsicPriors
@@ -40,15 +42,18 @@ Mask = NDArray[np.bool_]
 
 # Beyond so many blocks only the tiles of pairs that meet are kept, if they are at most this share of all.
 _MAX_DENSE_BLOCKS, _DENSE_SHARE = 160, 0.3
-# So few images nearly all see each other: their systems go to LAPACK.
-_FEW_IMAGES = 12
+# Beside a shape that has settled, single points may still lower the cost by this share of it.
+_POINTS_SETTLED = 1e-3
 # Work worth a chunk of its own, and the most memory that the chunks' private sums may take together.
 _CHUNK_OBSERVATIONS, _MAX_CHUNKS, _CHUNK_BYTES = 16384, 8, 1 << 26
 
 
-def import_ahead(num_images: int) -> None:
-    """Begin to import gtsam in a thread, which takes 0.7 s, if closing adjustments may ask it."""
-    if num_images > _FEW_IMAGES and "gtsam" not in sys.modules:
+def import_ahead(num_images: int, *, with_factors: bool) -> None:
+    """Begin to import gtsam in a thread, which takes 0.7 s and 57 MB, if closing adjustments may ask it.
+
+    They do where they have factors beside the reprojections, or more unknowns than LAPACK solves best at any fill.
+    """
+    if (with_factors or is_beyond_lapack(6 * num_images)) and "gtsam" not in sys.modules:
         Thread(target=import_module, args=("gtsam",), name="import-gtsam").start()
 
 
@@ -183,7 +188,7 @@ class Engine:
         self.system: ReducedSystem | None = None
         self.rows = np.empty((images, 12))
         kernels.fill_rows(p.poses, p.image_pose, p.image_mount, p.mounts, self.rows)
-        if is_closing or blocks > _MAX_DENSE_BLOCKS:
+        if blocks and (is_closing or blocks > _MAX_DENSE_BLOCKS):
             self._choose_system(is_closing)
         fitting = max(1, _CHUNK_BYTES // max(1, self.num_tiles * 512))
         self.num_chunks = int(np.clip(p.num_observations // _CHUNK_OBSERVATIONS, 1, min(_MAX_CHUNKS, fitting)))
@@ -205,7 +210,7 @@ class Engine:
         self.scratch = [Scratch(aligned_zeros(doubles), np.zeros(integers, np.int64)) for doubles, integers in sizes]
         self.new_poses, self.new_rows = np.empty_like(p.poses), np.empty_like(self.rows)
         self.new_canonical, self.new_xyz = np.empty_like(p.canonical), np.empty_like(p.xyz)
-        self.damping = 0.0
+        self.damping = self.shape_decrease = 0.0
 
     def _choose_system(self, is_closing: bool) -> None:
         """See which blocks meet, keep only their tiles unless that is most of them, and choose what solves."""
@@ -230,12 +235,7 @@ class Engine:
 
     def lone(self) -> AbstractContextManager[Any]:
         """A context in which LAPACK has one thread, if it is asked: with more its bytes would depend on how many."""
-        if self.solver != "lapack":
-            return nullcontext()
-        from threadpoolctl import threadpool_limits
-
-        limited: AbstractContextManager[Any] = threadpool_limits(1, "blas")
-        return limited
+        return one_blas_thread() if self.solver == "lapack" else nullcontext()
 
     def linearize(self, damping: float, run: Callable[..., Any]) -> float:
         """Reduced system at the current state with damped points; returns the cost of the state."""
@@ -272,9 +272,12 @@ class Engine:
         return cost + extras.cost(p.poses, p.canonical, p.xyz, extras.values) if extras is not None else cost
 
     def solve(self) -> Array | None:
-        """Step of the blocks (B * 8,), or None where the damped system is not positive definite."""
+        """Step of the blocks (B * 8,), or None where the damped system is not positive definite.
+
+        ``shape_decrease`` is then what the blocks have to gain, were all points at their best already.
+        """
         p, blocks, tiles = self.problem, self.problem.num_blocks, self.tiles[0]
-        step = -self.gradient[0].reshape(2, -1).sum(0)
+        right = -self.gradient[0].reshape(2, -1).sum(0)
         if self.extras is not None:
             self.extras.add_pairs(tiles, self.tile_numbers(self.extras.pairs))
         place = self.tile_numbers(np.arange(blocks) * (blocks + 1))[:, None] * 64 + np.arange(8) * 9
@@ -282,8 +285,35 @@ class Engine:
         tiles[place[used]] += self.damping * self.diagonal.reshape(-1, 8)[used]
         if self.system is None:
             self.system = TileSystem(blocks)
-        found = self.system.solve(tiles, step)
-        return found if found is not None and np.isfinite(found).all() else None
+        found = self.system.solve(tiles, right.copy())
+        if found is None or not np.isfinite(found).all():
+            return None
+        self.shape_decrease = 0.5 * float(right @ found)
+        return found
+
+    def has_settled(self, sigmas: float, cost: float, decrease: float) -> bool:
+        """Whether the last step, which lowered the cost so much, moved no combination of the blocks by more than so
+        many of its standard deviations, as the cost that is left tells them, and the points by little.
+
+        The greatest such move is the length of the step in the metric of the reduced system. Robust losses let go of
+        single observations long after that, step by step, which moves a few points and nothing else.
+        """
+        num_redundant = self.degrees_of_freedom
+        if sigmas == 0.0 or num_redundant <= 0 or decrease > _POINTS_SETTLED * cost:
+            return False
+        return self.shape_decrease <= sigmas**2 * cost / num_redundant
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Numbers observed beyond those that are unknown, extra factors and their own unknowns left out."""
+        p = self.problem
+        num_unknowns = int(p.block_dim.sum())
+        is_free = (p.pose_block >= 0).all() and not p.is_constant.any() and self.extras is None
+        free_gauge = 0 if not is_free else 6 if p.has_baseline else 7
+        num_eliminated = int((~p.is_constant & (p.point_block < 0)).sum())
+        if self.extras is not None:
+            num_unknowns -= self.extras.num_own_dims
+        return 2 * p.num_observations - 3 * num_eliminated - num_unknowns + free_gauge
 
     def tile_numbers(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
         """Tiles of block pairs a B + b."""
@@ -373,7 +403,9 @@ def _minimize(engine: Engine, options: AdjustOptions, run: Callable[..., Any], e
             if new_cost < cost and gain > 1e-3:
                 engine.accept()
                 decrease, cost = cost - new_cost, new_cost
-                if decrease <= tolerance * (cost + decrease):
+                if decrease <= tolerance * (cost + decrease) or engine.has_settled(
+                    options.settled_sigmas, cost, decrease
+                ):
                     termination = "converged"
                     break
                 damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-10)

@@ -9,9 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from sfmapp.adjust.linear import one_blas_thread
 from sfmapp.api.images import load_images
 from sfmapp.api.reconstruction import Reconstruction
-from sfmapp.api.stages import extract_features, map_images, match_images, one_blas_thread
+from sfmapp.api.stages import extract_features, map_images, match_images
 from sfmapp.errors import UsageError
 from sfmapp.events import Event, Events
 from sfmapp.images.load import Images
@@ -294,7 +295,7 @@ def make_mesh(
             raise UsageError(f"the mesh of {source} is written into it", "leave the output folder out")
         return mesh_workspace(source, options, record=record, events=events)
     if output is None:
-        raise UsageError(f"where is the mesh of {source} to be written?", "name a folder for it")
+        raise UsageError(f"expected a folder to write the mesh of {source} to, found none", "name one")
     return mesh_cloud(source, output, options, events=events)
 
 
@@ -369,12 +370,14 @@ def undistort(
     images: FilePath | None = None,
     blank_pixels: float = 0.0,
     max_size: int | None = None,
+    front_only: bool = False,
     events: Events | None = None,
     threads: int | None = None,
 ) -> UndistortResult:
     """Write undistorted photographs of a model, and the model with PINHOLE cameras beside them.
 
-    The same call again resumes one that was cut off.
+    A photograph that shows more than 88 degrees from the axis of its lens, a panorama for example, becomes the faces of
+    a cube that it shows some of, mounted together as a rig. The same call again resumes one that was cut off.
 
     Args:
         source: the workspace of a reconstruction or of odometry on a folder of frames, or the folder of a COLMAP model.
@@ -383,6 +386,7 @@ def undistort(
         images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
         blank_pixels: from 0 for pictures without a blank pixel to 1 for all that the photographs show.
         max_size: largest side of the pictures in pixels; None for no limit.
+        front_only: of such photographs one picture of what lies in front, in place of the faces.
         events: told of progress, and can ask to stop.
         threads: photographs worked on at a time; None: as ``options.threads`` says, or one for each core.
 
@@ -391,7 +395,7 @@ def undistort(
 
     Raises:
         UsageError: a share or size that makes no sense, or an output that holds something else.
-        InputError: no model, or none of its photographs.
+        InputError: no model, none of its photographs, or two pictures of the same name.
         NoReconstructionError: the workspace holds no model.
         InterruptedRunError: ``events`` was asked to stop.
 
@@ -399,11 +403,10 @@ def undistort(
         >>> sfmapp.undistort("out/", "splat/")  # for trainers of Gaussian splats
     """
     from sfmapp.pipelines import undistort as pipeline
+    from sfmapp.scene.undistortion import Layout
 
-    return pipeline.undistort(
-        source, output, _with(options, threads), images=images, blank_pixels=blank_pixels, max_size=max_size,
-        events=events,
-    )  # fmt: skip
+    layout = Layout(blank_pixels, max_size, front_only)
+    return pipeline.undistort(source, output, _with(options, threads), images=images, layout=layout, events=events)
 
 
 def export(
@@ -490,7 +493,7 @@ def _tracked_in_memory(source: FilePath | Sequence, options: Options, events: Ev
     if request is not None:
         scale_maps(found, request, events)
     if not found.maps:
-        raise NoReconstructionError(f"{len(found.frame_idx)} frames were given, but no map could be begun")
+        raise NoReconstructionError(f"{len(found.frame_idx)} frames were given, but no map could be initialized")
     return _with_views(found)
 
 

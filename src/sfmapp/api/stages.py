@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sfmapp.adjust.linear import one_blas_thread
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.api.images import load_images
 from sfmapp.api.reconstruction import Reconstruction
@@ -186,15 +186,6 @@ def map_images(
         )  # fmt: skip
     keypoints = [found.keypoints[:, :2].astype(np.float64) for found in features]
     return [Reconstruction.of(model, keypoints) for model in models]
-
-
-@contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Our workers use the cores; sums must not depend on how many the linear algebra beneath them would use."""
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(1, "blas"):
-        yield
 
 
 def _check_one_for_each(images: ImageSet, features: Sequence[Features]) -> None:

@@ -72,11 +72,13 @@ class CalibratedCamera:
         camera: the nearest of our models.
         lens: what it stands for, where the difference matters: frames are then resampled with :func:`sampling_map`.
         notes: what was changed on the way, one line each.
+        stated: what the file says, of a lens with more coefficients than the camera has, whether that matters or not.
     """
 
     camera: Camera
     lens: FullLens | None = None
     notes: tuple[str, ...] = ()
+    stated: FullLens | None = None
 
 
 def camera_from_opencv(
@@ -101,14 +103,16 @@ def camera_from_opencv(
     if fisheye and len(known) > 4:
         raise InputError(f"{place}: expected 4 coefficients of a fisheye lens, found {len(known)}")
     lens: FullLens | None = None
+    stated: FullLens | None = None
     notes: tuple[str, ...] = ()
     params = [fx, fy, cx, cy, *known, *[0.0] * (4 - len(known))]
     if len(known) > 4:
-        params, lens, notes = _fitted(place, size, np.array([fx, fy, cx, cy]), known)
+        params, stated, is_near, notes = _fitted(place, size, np.array([fx, fy, cx, cy]), known)
+        lens = None if is_near else stated
     model = "OPENCV_FISHEYE" if fisheye else "OPENCV" if known else "PINHOLE"
     params[2:4] = [params[2] + 0.5, params[3] + 0.5]
     camera = checked_camera(Path(place), 0, model, *size, params[: 4 if model == "PINHOLE" else 8])
-    return CalibratedCamera(replace(camera, focal_sigma=SIGMA_CALIBRATED * camera.focal), lens, notes)
+    return CalibratedCamera(replace(camera, focal_sigma=SIGMA_CALIBRATED * camera.focal), lens, notes, stated)
 
 
 def exact_camera(lens: FullLens) -> Camera | None:
@@ -135,8 +139,8 @@ def camera_from_colmap(place: str, model: str, size: Size, params: Sequence[floa
 
 def _fitted(
     place: str, size: Size, intrinsics: Array, known: list[float]
-) -> tuple[list[float], FullLens | None, tuple[str, ...]]:
-    """OPENCV parameters near a lens of more coefficients; the lens itself if they are not near enough; and a note."""
+) -> tuple[list[float], FullLens, bool, tuple[str, ...]]:
+    """OPENCV parameters near a lens of more coefficients; the lens itself; whether they are near enough; and a note."""
     # OpenCV takes 4, 5, 8, 12 or 14
     wanted = next((count for count in (5, 8, 12, 14) if count >= len(known)), 0)
     if not wanted:
@@ -145,8 +149,8 @@ def _fitted(
     params, rms, largest = _nearest_opencv(place, lens)
     note = f"{place}: the nearest lens with k1, k2, p1, p2 is off by {rms:.2f} px rms and {largest:.2f} px at most"
     if rms < _GOOD_FIT_PX:
-        return params, None, (f"{note}: it is used",)
-    return params, lens, (f"{note}: frames are resampled by that much to be its own",)
+        return params, lens, True, (f"{note}: it is used",)
+    return params, lens, False, (f"{note}: frames are resampled by that much to be its own",)
 
 
 def _nearest_opencv(place: str, lens: FullLens) -> tuple[list[float], float, float]:

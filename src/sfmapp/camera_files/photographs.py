@@ -152,7 +152,7 @@ class GivenCameras:
         cameras, images = ", ".join([*self.cameras][:_NAMES_SHOWN]), [*self.of_image][:_NAMES_SHOWN]
         has = f", for images such as {', '.join(images)}" if images else ""
         return InputError(
-            f"{self.place}: expected to learn which camera took {photograph}, found {len(self.cameras)} cameras "
+            f"{self.place}: cannot tell which camera took {photograph}, found {len(self.cameras)} cameras "
             f"({cameras}){has}",
             "put what each camera took into a folder with its name (cam0, left, ...), or give a file with the one "
             "camera that took all",
@@ -199,7 +199,7 @@ class GivenCameras:
         exact = exact_camera(found.lens)
         if exact is None:
             raise InputError(
-                f"{self.place}: expected a lens before an upright sensor, found one that is tilted (tau_x, tau_y)",
+                f"{self.place}: expected a sensor perpendicular to the optical axis, found a tilted one (tau_x, tau_y)",
                 "calibrate without cv2.CALIB_TILTED_MODEL, or undistort the photographs first",
             )
         return CalibratedCamera(exact)

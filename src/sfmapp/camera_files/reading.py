@@ -100,7 +100,7 @@ def _from_list(place: str, fields: Fields, image_sizes: Sequence[Size]) -> Calib
     if len(cameras) > 1:
         names = ", ".join(list(cameras)[:4])
         raise InputError(
-            f"{place}: expected the camera of the frames, found {len(cameras)} that differ: {names}",
+            f"{place}: expected one camera for all frames, found {len(cameras)} different ones: {names}",
             "leave the one in the file that took them",
         )
     (section,) = cameras.values()

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import argparse
 import errno
+import importlib
 import json
+import pkgutil
 import sys
 from collections.abc import Sequence
+from types import ModuleType
 
 import sfmapp
-from sfmapp.cli import convert, dense, evaluate, inspect, odometry, reconstruct, undistort
+from sfmapp import cli
 from sfmapp.cli.signals import signals_interrupt
 from sfmapp.cli.streams import standard_streams
 from sfmapp.errors import InputError, InterruptedRunError, SfmError, refusal
 from sfmapp.kernel_cache import ADVICE, is_without_cache
 from sfmapp.packages import missing_package
 
+# what most people look for comes first in the help; the other families follow by name
+FIRST = ("reconstruct", "dense", "odometry")
 EXIT_CODES = """\
-exit codes: 0 done, 1 a bug, 2 usage, 3 bad input, or no room for what is to be written or held in memory,
+exit codes: 0 done, 1 a bug, 2 usage, 3 bad input, or out of disk space or memory,
             4 no reconstruction (the report is still written), 5 fewer images than asked for,
             130 interrupted (reconstruct resumes)"""
 
@@ -78,11 +83,18 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"sfmapp {sfmapp.__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for family in (reconstruct, dense, odometry, evaluate, inspect, convert, undistort):
+    for family in _families():
         family.add_commands(commands)
     for command in commands.choices.values():
         command.allow_abbrev = False  # half a flag would mean another one as soon as there are more
     return parser
+
+
+def _families() -> list[ModuleType]:
+    """The modules of this room that add commands; a new one is found here, and named nowhere."""
+    names = [*FIRST, *sorted({module.name for module in pkgutil.iter_modules(cli.__path__)} - {*FIRST})]
+    modules = [importlib.import_module(f"{cli.__name__}.{name}") for name in names]
+    return [module for module in modules if hasattr(module, "add_commands")]
 
 
 def _fail(args: argparse.Namespace, failure: SfmError) -> int:

@@ -99,6 +99,14 @@ def _add_option_flags(parser: argparse.ArgumentParser) -> None:
         "--scale", metavar="WHAT", action="append", default=[],
         help="a known length, repeatable: distance:IMAGE:IMAGE:METRES, marker:DICT:METRES, pair:DICT:ID:ID:METRES",
     )  # fmt: skip
+    group.add_argument(
+        "--pose-priors", metavar="FILE",
+        help="known poses of photographs: a COLMAP model, TUM, cameras.json or transforms.json; models come into "
+        "its frame",
+    )  # fmt: skip
+    group.add_argument(
+        "--fix-poses", action="store_true", help="hold the poses of --pose-priors, and triangulate points from them"
+    )
     group.add_argument("--up", metavar="HOW", help="turn models upright: auto, markers, plane or exif (as held)")
     group.add_argument("--min-registered", metavar="N", help="exit with code 5 if fewer images are registered")
     group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, the replay of the run")
@@ -119,6 +127,8 @@ def _options(args: argparse.Namespace) -> Options:
         "control.file": args.gcp,
         "units.known": ";".join(args.scale) or None,
         "units.up": args.up,
+        "poses.file": args.pose_priors,
+        "poses.fixed": "true" if args.fix_poses else None,
         "min_registered": args.min_registered,
     }
     settings = [*args.set, *(f"{name}={value}" for name, value in flags.items() if value is not None)]
@@ -260,6 +270,27 @@ def _print_control(report: ReconstructionReport) -> None:
             print(f"  {finding}")
 
 
+def _print_poses(report: ReconstructionReport) -> None:
+    """How models lie to poses that were known, and which of these were left aside."""
+    found = report.stages.poses
+    if found is None:
+        return
+    for model in found.models:
+        if model.reason:
+            print(f"  model {model.model} is in arbitrary units, and not in the frame of known poses: {model.reason}")
+        elif model.sigma is not None and model.sigma_deg is not None:
+            how = "holds" if found.is_fixed else "lies in the frame of"
+            print(
+                f"  model {model.model} {how} {model.num_used} of {model.num_known} known poses, which are good to"
+                f" {model.sigma:.2g} and {model.sigma_deg:.2g} degrees by the photographs"
+            )
+    for image in found.images:
+        if not image.is_used and image.model is not None and image.reason:
+            print(f"  {image.name}: {image.reason}; it was left aside")
+    if found.num_strange:
+        print(f"  {found.num_strange} poses of {found.path} are of no photograph")
+
+
 def _print_units(report: ReconstructionReport) -> None:
     """Metres by known lengths, each left out in turn, and what levelled models."""
     found = report.stages.units
@@ -296,6 +327,7 @@ def _print_summary(output: Path, report: ReconstructionReport) -> None:
                 print(f"  model {m} is {other.apart}")
     _print_world(report)
     _print_control(report)
+    _print_poses(report)
     _print_units(report)
     print_contradictions(found for one in report.models for found in one.contradictions)
     print(took(output, run))

@@ -23,6 +23,7 @@ examples:
   sfmapp undistort out/ -o splat/
   sfmapp undistort colmap/sparse/0 --images colmap/images -o splat/ --max-size 1600
   sfmapp undistort out/ -o splat/ --blank-pixels 1 --mask-path masks/
+  sfmapp undistort panoramas/ -o faces/ --max-size 1024
 
 SOURCE is a workspace of sfmapp reconstruct, one of sfmapp odometry on a folder of frames (its keyframes), or a COLMAP
 model with the folder of its photographs. Writes
@@ -33,6 +34,8 @@ model with the folder of its photographs. Writes
   DIR/sparse/0/         the model with PINHOLE cameras (cameras.bin, images.bin, points3D.bin, rigs.bin, frames.bin),
                         for gaussian-splatting, gsplat, Brush and nerfstudio; the same files in DIR/sparse/, where
                         COLMAP has them and OpenMVS reads them
+Of a photograph that shows more than 88 degrees from the axis, such as a panorama, NAME is each face of a cube that it
+shows some of: a.jpg becomes a_front.jpg, a_right.jpg, a_back.jpg, a_left.jpg, a_up.jpg, a_down.jpg, a rig in the model.
 The same command again resumes a run that was cut off."""
 
 
@@ -53,6 +56,11 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )  # fmt: skip
     parser.add_argument("--max-size", metavar="PX", type=int, help="limit of the longer side in pixels; default: none")
     parser.add_argument(
+        "--front-only", action="store_true",
+        help="of photographs that show more than 88 degrees from the axis, one picture of what lies in front, and not "
+        "the faces of a cube",
+    )  # fmt: skip
+    parser.add_argument(
         "--threads", metavar="N", help="number of workers, default: all cores; results do not depend on it"
     )
     add_output_flags(parser, has_log=True)
@@ -67,14 +75,14 @@ def _undistort(args: argparse.Namespace) -> int:
     options = load_options([], [f"{name}={value}" for name, value in flags.items() if value is not None])
     load_numba_without_blas()
     from sfmapp.pipelines.undistort import undistort
+    from sfmapp.scene.undistortion import Layout
     from sfmapp.workspace.usage import Stopwatch
 
-    watch = Stopwatch(whole_process=True)
+    watch, layout = Stopwatch(whole_process=True), Layout(args.blank_pixels, args.max_size, args.front_only)
     with listening(args) as events:
         result = undistort(
-            args.source, args.output, options, images=args.images, blank_pixels=args.blank_pixels,
-            max_size=args.max_size, events=events, watch=watch,
-        )  # fmt: skip
+            args.source, args.output, options, images=args.images, layout=layout, events=events, watch=watch
+        )
     if args.json:
         print_json({"exit_code": 0, "output": str(result.output), **result.report})
     elif not args.quiet:
@@ -87,9 +95,10 @@ def _print(output: Path, report: UndistortReport) -> None:
     sizes = sorted({(camera.width, camera.height) for camera in report.cameras})
     shown = ", ".join(f"{width}x{height}" for width, height in sizes[:3]) + (", ..." if len(sizes) > 3 else "")
     copied = f", {report.num_copied} of them copied as they were" if report.num_copied else ""
+    faces = f", {report.num_faces} of them faces of cubes" if report.num_faces else ""
     masks = f", {report.num_masks} masks" if report.num_masks else ""
     print(
-        f"{report.num_images} photographs without distortion ({shown}){copied}{masks},"
+        f"{report.num_images} photographs without distortion ({shown}){faces}{copied}{masks},"
         f" {report.num_points} points, {report.num_observations} observations ({report.num_dropped} dropped)"
     )
     print(took(output, report.run))

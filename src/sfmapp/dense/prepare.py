@@ -75,7 +75,7 @@ def plan_views(
     """
     events = events or Events()
     _check_count(model, photographs, options)
-    warn_of_sides(photographs.cameras, STAGE, events)
+    warn_of_sides(photographs.cameras, STAGE, "sfmapp undistort, then dense on its folder", events)
     poses = model.cam_from_world[photographs.image_idx]
     xyz, ptr, view_idx = _points(model, photographs.image_idx)
     depth = _median_depths(poses, xyz, ptr, view_idx)

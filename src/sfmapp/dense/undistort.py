@@ -11,14 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, pixels_to_normalized
-from sfmapp.camera.lens import distort
-from sfmapp.camera.models import PARAM_NAMES
+from sfmapp.camera.lens import distort, project
+from sfmapp.camera.names import CameraModel
+from sfmapp.scene.cube import radial_part, reach_angle
 from sfmapp.scene.undistortion import has_distortion
 
 Array = NDArray[np.float64]
 
 # what a wide lens shows farther out than this, in sides of the photograph, would be stretched more than it is worth
 LARGEST_MARGIN = 0.125
+# pixels beyond the border of a panorama that the interpolation reaches for
+_SEAM = 2
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,7 @@ def _undistort(
 
 
 def resample(
-    camera: Camera, k: Array, size: tuple[int, int], pixels: NDArray[Any]
+    camera: Camera, k: Array, size: tuple[int, int], pixels: NDArray[Any], plane_from_cam: Array | None = None
 ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
     """What a pinhole shows of a photograph.
 
@@ -146,6 +149,7 @@ def resample(
         size: its width and height in pixels.
         pixels: (H, W) or (H, W, C), uint8 or uint16; a channel of 16 bits never gets brighter than its brightest pixel,
             for cameras write fewer bits into them.
+        plane_from_cam: (3, 3) rotation to the axes of the pinhole; None where it looks where the camera does.
 
     Returns:
         The same of (h, w), and (h, w) 255 where the photograph shows it: beyond, its border is carried on.
@@ -153,20 +157,32 @@ def resample(
     layers = np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None])
     white = np.full(layers.shape[2], 255.0) if layers.dtype == np.uint8 else layers.max(axis=(0, 1)).astype(np.float64)
     flat, shown = np.empty((size[1], size[0], layers.shape[2]), layers.dtype), np.empty(size[::-1], np.uint8)
-    _resample(layers, camera.canonical, _reach(camera), k, white, flat, shown)
+    row = camera.canonical
+    if plane_from_cam is None:
+        _resample(layers, row, _reach(camera), k, white, flat, shown)
+    else:
+        if camera.model == CameraModel.EQUIRECTANGULAR:
+            layers = _with_neighbors(layers)
+            row[2:4] += _SEAM
+        cam_from_plane = np.ascontiguousarray(plane_from_cam.T)
+        _resample_turned(layers, row, math.cos(reach_angle(camera)), cam_from_plane, k, white, flat, shown)
     return flat.reshape(size[1], size[0], *pixels.shape[2:]), shown
 
 
 def _reach(camera: Camera) -> float:
     """Radius in the normalised plane up to which the lens is one to one: beyond, its polynomial folds back."""
-    radius = np.tan(np.linspace(0.0, 1.53, 4000))
-    # the tangential terms, skew and prism are no reason to fold
-    is_radial = [name[0] not in "ps" for name in PARAM_NAMES[camera.model]]
-    row = camera.with_params(np.where(is_radial, camera.params, 0.0)).canonical
-    row[:4] = 1.0, 1.0, 0.0, 0.0
+    radius, row = np.tan(np.linspace(0.0, 1.53, 4000)), radial_part(camera)
     image = np.array([distort(row, r, 0.0)[0] for r in radius])
     folds = np.flatnonzero(~(np.diff(image) > 0.0))
     return float(radius[folds[0]]) if len(folds) else math.inf
+
+
+def _with_neighbors(panorama: NDArray[Any]) -> NDArray[Any]:
+    """A panorama (H, W, C) with a rim of what is beyond its border: the other end, and across the poles half round."""
+    wide = np.concatenate([panorama[:, -_SEAM:], panorama, panorama[:, :_SEAM]], axis=1)
+    half = panorama.shape[1] // 2
+    above, below = (np.roll(wide[rows][::-1], half, axis=1) for rows in (slice(_SEAM), slice(-_SEAM, None)))
+    return np.ascontiguousarray(np.concatenate([above, wide, below]))
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -184,6 +200,22 @@ def _cubic_weights(t: float) -> tuple[float, float, float, float]:
     )
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _interpolate(pixels: NDArray[Any], px: float, py: float, white: NDArray[np.float64], out: NDArray[Any]) -> None:
+    """Fill out (C,) with the colour of a photograph (H, W, C) at a pixel."""
+    height, width, channels = pixels.shape
+    px, py = min(max(px, 0.0), float(width)) - 0.5, min(max(py, 0.0), float(height)) - 0.5
+    i, j = math.floor(px), math.floor(py)
+    wx, wy = _cubic_weights(px - i), _cubic_weights(py - j)
+    for c in range(channels):
+        total = 0.5
+        for b in range(4):
+            line = pixels[min(max(j - 1 + b, 0), height - 1)]
+            for a in range(4):
+                total += wy[b] * wx[a] * line[min(max(i - 1 + a, 0), width - 1), c]
+        out[c] = int(min(max(total, 0.0), white[c]))
+
+
 @numba.njit(cache=True, nogil=True)
 def _resample(
     pixels: NDArray[Any], row: NDArray[np.float64], reach: float, k: NDArray[np.float64], white: NDArray[np.float64],
@@ -193,7 +225,7 @@ def _resample(
 
     The border of the photograph is carried on, so that pixels at the edge have company of their kind.
     """
-    height, width, channels = pixels.shape
+    height, width, _ = pixels.shape
     for v in range(out.shape[0]):
         y = (v + 0.5 - k[3]) / k[1]
         for u in range(out.shape[1]):
@@ -201,13 +233,28 @@ def _resample(
             px, py = distort(row, x, y)
             is_shown = x * x + y * y < reach * reach and 0.0 <= px <= width and 0.0 <= py <= height
             shown[v, u] = 255 if is_shown else 0
-            px, py = min(max(px, 0.0), float(width)) - 0.5, min(max(py, 0.0), float(height)) - 0.5
-            i, j = math.floor(px), math.floor(py)
-            wx, wy = _cubic_weights(px - i), _cubic_weights(py - j)
-            for c in range(channels):
-                total = 0.5
-                for b in range(4):
-                    line = pixels[min(max(j - 1 + b, 0), height - 1)]
-                    for a in range(4):
-                        total += wy[b] * wx[a] * line[min(max(i - 1 + a, 0), width - 1), c]
-                out[v, u, c] = int(min(max(total, 0.0), white[c]))
+            _interpolate(pixels, px, py, white, out[v, u])
+
+
+@numba.njit(cache=True, nogil=True)
+def _resample_turned(
+    pixels: NDArray[Any], row: NDArray[np.float64], cos_reach: float, cam_from_plane: NDArray[np.float64],
+    k: NDArray[np.float64], white: NDArray[np.float64], out: NDArray[Any], shown: NDArray[np.uint8],
+) -> None:  # fmt: skip
+    """As :func:`_resample`, for a plane that looks elsewhere and lenses that see all round."""
+    height, width, _ = pixels.shape
+    r = cam_from_plane
+    for v in range(out.shape[0]):
+        y = (v + 0.5 - k[3]) / k[1]
+        for u in range(out.shape[1]):
+            x = (u + 0.5 - k[2]) / k[0]
+            a = r[0, 0] * x + r[0, 1] * y + r[0, 2]
+            b = r[1, 0] * x + r[1, 1] * y + r[1, 2]
+            c = r[2, 0] * x + r[2, 1] * y + r[2, 2]
+            px, py = project(row, a, b, c)
+            is_shown = c >= cos_reach * math.sqrt(a * a + b * b + c * c)
+            is_shown &= 0.0 <= px <= width and 0.0 <= py <= height
+            shown[v, u] = 255 if is_shown else 0
+            if math.isnan(px):
+                px = py = 0.0
+            _interpolate(pixels, px, py, white, out[v, u])

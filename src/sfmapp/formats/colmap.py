@@ -1,6 +1,6 @@
 """COLMAP models: folders of cameras, images, points3D, rigs and frames, binary or text.
 
-COLMAP's conventions are the house's own (cam_from_world, top-left pixel centre at 0.5, 0.5) but for the quaternion,
+COLMAP's conventions are ours (cam_from_world, top-left pixel centre at 0.5, 0.5) but for the quaternion,
 which its files hold as w x y z. See https://colmap.github.io/format.html.
 """
 

@@ -236,7 +236,7 @@ def _table_row(
         if not value > 0:
             raise InputError(
                 f"{path}, line {line}: expected standard deviations above zero, found {value:g} {unit}",
-                "give what the survey promises, or leave the field empty for the usual ones",
+                "give the accuracy that the survey states, or leave the field empty for the default",
             )
     return _Row(line, name, xyz, sigmas, image, (px, py), sigma[0] if sigma else defaults[1])
 
@@ -267,7 +267,7 @@ def _gather(
         if len(seen) < 2:
             raise InputError(
                 f"{path}, line {own[0].line}: expected point {name!r} in two photographs or more, found it in one",
-                "mark it in another photograph, or remove the line: one ray tells no place",
+                "mark it in another photograph, or remove the line: a single ray does not fix a point",
             )
         observations += [(p, image, seen[image]) for image in sorted(seen)]
     places = [_place(path, name, own) for name, own in points.items()]

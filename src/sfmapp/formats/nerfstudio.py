@@ -1,6 +1,6 @@
 """nerfstudio's transforms.json: world_from_cam matrices with OpenGL's camera axes (x right, y up, z backward).
 
-Its pixel rule is the house's (top-left pixel centre at 0.5, 0.5): its own conversion from COLMAP takes cx and cy over
+Its pixel convention is ours (top-left pixel centre at 0.5, 0.5): its own conversion from COLMAP takes cx and cy over
 as they are. That conversion also turns the world (``applied_transform``), because COLMAP's worlds tend to have y down
 and nerfstudio wants z up; files written here do the same and look alike.
 """

@@ -130,8 +130,8 @@ def _read(path: Path, file: BinaryIO) -> PlyGeometry:
             _skip(path, file, element, order)
     if order and line_end == b"\r\n" and last + 1 == len(elements) and file.read(1):
         raise InputError(
-            f"{path}: expected the end of the file after what its header promises, found more",
-            "its lines end as in a text file of Windows: if it was transferred as text, its numbers are damaged; "
+            f"{path}: expected the end of the file after what its header declares, found more",
+            "its lines end as in a Windows text file: if it was transferred as text, its numbers are damaged; "
             "transfer it as binary",
         )
     with np.errstate(invalid="ignore"):  # of NaN that were made to signal

@@ -94,6 +94,20 @@ def center(cam_from_world: ArrayLike) -> Array:
     return inverse(cam_from_world)[..., 4:]
 
 
+def center_jacobian(cam_from_world: ArrayLike) -> Array:
+    """(..., 3, 6) how the centres of cameras move in the world with their poses (..., 7): with the rotation w and the
+    translation v of ``x_cam <- exp(w) x_cam + v``, ``-R^T t`` moves by ``-R^T v``."""
+    turn = np.swapaxes(rotation_matrix(cam_from_world), -1, -2)
+    return np.concatenate([np.zeros_like(turn), -turn], -1)
+
+
+def center_covariance(cam_from_world: ArrayLike, covariance: ArrayLike) -> Array:
+    """Covariances (..., 3, 3) of camera centres, in the world, of those of poses (..., 6, 6) over (w, v) as above."""
+    jacobian = center_jacobian(cam_from_world)
+    out: Array = jacobian @ np.asarray(covariance, np.float64) @ np.swapaxes(jacobian, -1, -2)
+    return out
+
+
 def spread(cam_from_world: ArrayLike) -> float:
     """Root mean square distance of the camera centres of poses (N, 7) from their middle."""
     centers = center(cam_from_world)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
+from sfmapp.georeference.drift import Drift
 from sfmapp.georeference.factors import position_graph
 from sfmapp.georeference.fit import MAX_CHI2, MIN_REDUNDANT, LevelOfImage, RobustFit, estimate_factors, fit_similarity
 from sfmapp.mapping.mapper import Mapper
@@ -21,12 +22,9 @@ Mask = NDArray[np.bool_]
 _MAX_ROUNDS, _SETTLED = 4, 0.1
 # Positions add three numbers each, and may cost the reprojections about as much chi square; so many times that is a
 # contradiction between photographs and positions, not noise.
-_MAX_COST_PER_NUMBER = 10.0
+MAX_COST_PER_NUMBER = 10.0
 # Positions with sigmas so many times as large hold a model in its place, and do not bend it.
 _LOOSE = 1e3
-# An autocorrelation this many standard deviations above zero is one: of independent errors one set in twenty is taken
-# for drift and gets wider sigmas, which costs less than drift that is not seen. Above the second nothing can be told.
-_CORRELATED_SIGMAS, _MAX_CORRELATION = 1.645, 0.9
 
 
 class Measured(NamedTuple):
@@ -52,7 +50,7 @@ class Adjusted:
 
 
 def adjust_with_positions(
-    mapper: Mapper, measured: Measured, fit: RobustFit, level: LevelOfImage | None, inflation: float
+    mapper: Mapper, measured: Measured, fit: RobustFit, level: LevelOfImage | None, drift: Drift
 ) -> Adjusted | None:
     """Adjust a model in place with the positions that agree, and judge all of them by what came of it.
 
@@ -63,7 +61,7 @@ def adjust_with_positions(
         mapper: of a model that lies in the frame.
         fit: of its cameras to the places.
         level: more about the vertical.
-        inflation: what errors that positions have in common multiply their sigmas by.
+        drift: what errors of neighbouring positions have in common.
 
     Returns:
         None where photographs and positions contradict each other: the model is then to be taken back.
@@ -78,29 +76,28 @@ def adjust_with_positions(
     covariance: dict[int, Array] = {}
     for _ in range(_MAX_ROUNDS):
         used, factor = fit.is_inlier, np.array(fit.factor)
-        places, sigma = measured.places[used], fit.sigma[used] * inflation
+        places, sigma = measured.places[used], fit.sigma[used] * drift.inflation
         images = measured.image_idx[used]
         mapper.adjust_with(position_graph(images, places, sigma, noise_px, level))
         if not model.is_registered[measured.image_idx].all():
             return None
         covariance = _center_covariances(mapper, position_graph(images, places, sigma, 1.0, level))
-        fit = _judged(fit, model.centers[measured.image_idx], measured, covariance, inflation)
+        fit = _judged(fit, model.centers[measured.image_idx], measured, covariance, drift.inflation)
         if np.array_equal(fit.is_inlier, used) and np.allclose(fit.factor, factor, rtol=_SETTLED):
             break
-    cost = _cost(before, model, noise_px)
-    if cost > _MAX_COST_PER_NUMBER * 3 * int(fit.is_inlier.sum()):
+    cost = growth_of_cost(before, model, noise_px)
+    if cost > MAX_COST_PER_NUMBER * 3 * int(fit.is_inlier.sum()):
         return None
-    return Adjusted(finished(fit, model, measured, level, inflation), covariance)
+    return Adjusted(finished(fit, model, measured, level, drift), covariance)
 
 
 def finished(
-    fit: RobustFit, model: Reconstruction, measured: Measured, level: LevelOfImage | None, inflation: float
+    fit: RobustFit, model: Reconstruction, measured: Measured, level: LevelOfImage | None, drift: Drift
 ) -> RobustFit:
-    """A fit with residuals of the cameras as they lie, and sigmas with what errors have in common."""
+    """A fit with residuals of the cameras as they lie, and a covariance with what errors have in common."""
     centers = model.centers[measured.image_idx]
-    sigma = fit.sigma * inflation
     residual = centers - measured.places
-    chi2 = np.nansum((residual / sigma) ** 2, axis=1)
+    chi2 = np.nansum((residual / fit.sigma) ** 2, axis=1)
     is_inlier = chi2 <= MAX_CHI2 if len(chi2) >= MIN_REDUNDANT else np.ones(len(chi2), bool)
     in_world = None
     if level is not None:
@@ -108,31 +105,9 @@ def finished(
         in_world = replace(level.level, up=turn.T @ level.level.up)
     origin = centers.mean(0)
     here = replace(fit.similarity, rotation=np.eye(3), scale=1.0, origin=origin, mean=origin)
-    found = fit_similarity(centers, measured.places, sigma, is_inlier, here, in_world)
-    return replace(
-        fit, similarity=found or fit.similarity, residual=residual, sigma=sigma, chi2=chi2, is_inlier=is_inlier
-    )
-
-
-def drift(fit: RobustFit, image_idx: NDArray[np.int64]) -> tuple[float, float]:
-    """Autocorrelation of residuals of photographs one after the other, and what it multiplies sigmas by.
-
-    Of n numbers with the correlation r from one to the next, n (1 - r) / (1 + r) count (Bartlett 1946). 1 where
-    the correlation is not above what independent errors show by chance.
-    """
-    order = np.argsort(image_idx)
-    order = order[fit.is_inlier[order]]
-    normal = (fit.residual / fit.sigma)[order]
-    products, squares = normal[1:] * normal[:-1], normal**2
-    num = int(np.isfinite(products).sum())
-    if num < 3 * MIN_REDUNDANT:
-        return 0.0, 1.0
-    # a fit of seven parameters takes as much out of what neighbours have in common
-    correlation = float(np.nanmean(products) / np.nanmean(squares)) + 7.0 / num
-    if correlation * np.sqrt(num) < _CORRELATED_SIGMAS:
-        return max(correlation, 0.0), 1.0
-    clipped = min(correlation, _MAX_CORRELATION)
-    return correlation, float(np.sqrt((1.0 + clipped) / (1.0 - clipped)))
+    found = fit_similarity(centers, measured.places, fit.sigma, is_inlier, here, in_world) or fit.similarity
+    found = replace(found, covariance=found.covariance * np.outer(drift.spread, drift.spread))
+    return replace(fit, similarity=found, residual=residual, chi2=chi2, is_inlier=is_inlier)
 
 
 def _with_factors(fit: RobustFit, measured: Measured, factor: Array) -> RobustFit:
@@ -155,7 +130,7 @@ def _judged(
     squares = (residual / measured.sigma) ** 2
     factor = estimate_factors(squares, redundancy, measured.sigma, fit.is_inlier, measured.is_stated)
     fit = _with_factors(fit, measured, factor)
-    chi2 = np.nansum((residual / (fit.sigma * inflation)) ** 2, axis=1)
+    chi2 = np.nansum((residual / fit.sigma) ** 2, axis=1)
     return replace(fit, residual=residual, chi2=chi2, is_inlier=chi2 <= MAX_CHI2)
 
 
@@ -164,13 +139,11 @@ def _center_covariances(mapper: Mapper, graph: object) -> dict[int, Array]:
     found = mapper.covariances_with(graph)
     if found is None or not found.is_determined:
         return {}
-    rotation = rigid3.rotation_matrix(mapper.reconstruction.cam_from_world[found.image_idx])
-    # c = -R^T t moves by -R^T v
-    turned = np.einsum("nji,njk,nkl->nil", rotation, found.poses[:, 3:, 3:], rotation)
-    return dict(zip(found.image_idx.tolist(), turned, strict=True))
+    of_centers = rigid3.center_covariance(mapper.reconstruction.cam_from_world[found.image_idx], found.poses)
+    return dict(zip(found.image_idx.tolist(), of_centers, strict=True))
 
 
-def _cost(before: Reconstruction, after: Reconstruction, noise_px: float) -> float:
+def growth_of_cost(before: Reconstruction, after: Reconstruction, noise_px: float) -> float:
     """Growth of the squared residuals of observations that hold in both, in units of their noise; those far off are
     counted as at three."""
     both = before.obs_is_inlier & after.obs_is_inlier

@@ -5,6 +5,7 @@ Coordinates of places are x east, y north, z up in metres. A place may have no h
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
@@ -29,6 +30,7 @@ _MAX_SCORES = 4_000_000
 _MAX_ROUNDS = 20
 # A height that is unknown is held to that of the frame's origin within this, in metres.
 UNKNOWN_M = 1000.0
+_FLAT_AND_UP = (slice(0, 2), slice(2, 3))
 # Fewer tags than this leave no redundancy to find a wrong one by: seven unknowns, three numbers a tag.
 MIN_REDUNDANT = 5
 
@@ -212,16 +214,24 @@ def _leveled(start: Similarity, level: Level, centers: Array) -> Similarity:
     return replace(start, rotation=turned, origin=origin, mean=start.apply(origin[None])[0])
 
 
-def estimate_factors(squares: Array, redundancy: Array, sigma: Array, is_inlier: Mask, is_stated: Mask) -> Array:
-    """Factors (2,) on sigmas, horizontally and vertically, by which residuals are what they should be.
+def estimate_factors(
+    squares: Array,
+    redundancy: Array,
+    sigma: Array,
+    is_inlier: Mask,
+    is_stated: Mask,
+    groups: Sequence[slice] = _FLAT_AND_UP,
+) -> Array:
+    """Factors (G,) on sigmas by which residuals are what they should be, for each group of columns.
 
     Args:
-        squares: (n, 3) squared residuals over squared sigmas; redundancy: (n, 3) of the residuals.
-        sigma: (n, 3), infinite for no height.
-        is_inlier: (n,) bool; is_stated: (2,) bool.
+        squares: (n, K) squared residuals over squared sigmas; redundancy: (n, K) of the residuals.
+        sigma: (n, K), infinite for what is unknown.
+        is_inlier: (n,) bool; is_stated: (G,) bool.
+        groups: of columns with a factor of their own: horizontally and vertically, by default.
     """
-    factors = np.ones(2)
-    for k, axes in enumerate((slice(0, 2), slice(2, 3))):
+    factors = np.ones(len(groups))
+    for k, axes in enumerate(groups):
         counts = np.isfinite(sigma[:, axes]) & is_inlier[:, None]
         freedom = float(redundancy[:, axes][counts].sum())
         if freedom < 3.0:
@@ -229,11 +239,11 @@ def estimate_factors(squares: Array, redundancy: Array, sigma: Array, is_inlier:
         ratio = max(float(squares[:, axes][counts].sum()) / freedom, 1e-12)
         # within three standard deviations of the mean of chi square, what was stated stands
         if not is_stated[k] or abs(np.log(ratio)) > 3.0 * np.sqrt(2.0 / freedom):
-            factors[k] = np.sqrt(ratio) * _student(freedom)
+            factors[k] = np.sqrt(ratio) * student(freedom)
     return factors
 
 
-def _student(freedom: float) -> float:
+def student(freedom: float) -> float:
     """By what a sigma from so many degrees of freedom is to be multiplied for 1.96 of it to hold 95 %.
 
     Quantile of Student's t over that of the normal distribution; Abramowitz and Stegun 26.7.5.

@@ -76,11 +76,12 @@ class PlacedModel(Report):
         num_positions, num_used: photographs of it with a position, and those that the adjustment leaned on.
         scale_sigma_share: standard deviation of the scale as a share of it; rotation_sigma_deg: (3,) about east, north
             and up; position_sigma_m: (3,) of the mean of the cameras, were the errors of positions independent.
-        sigma_m: (2,) of one position horizontally (along each axis) and vertically, median, as used.
+        sigma_m: (2,) of one position horizontally (along each axis) and vertically, median, as used:
+            wider where errors of neighbours correlate.
         sigma_factor: (2,) what the residuals made of the sigmas as they were stated or guessed.
         rms_residual_m: (2,) of those used: horizontal distance, and height; None without heights.
-        correlation: of residuals of photographs taken one after the other; above 0: errors drift, and sigmas were
-            widened for it.
+        correlation: of errors of photographs taken one after the other, mean of what is likely; sigmas are wider for
+            it.
         common_offset_m: what all positions may be off together beside that, which nothing here can show.
         leveled_by: what told the vertical where positions do not: ``gimbal``, ``photographs``; empty if they do.
         is_adjusted: positions took part in the adjustment; False: the model was moved as a whole.

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.georeference.adjustment import Adjusted, Measured, adjust_with_positions, drift, finished
+from sfmapp.georeference.adjustment import Adjusted, Measured, adjust_with_positions, finished
+from sfmapp.georeference.drift import Drift, estimate_drift
 from sfmapp.georeference.faults import name_faults
 from sfmapp.georeference.fit import Level, LevelOfImage, RobustFit, Similarity, closed_form, robust_fit, turn_between
 from sfmapp.georeference.options import GpsOptions
@@ -57,7 +58,7 @@ class _Model:
 
     Attributes:
         image_idx: (m,) images of it that have tags; n: (m,) the tags.
-        fit: of its cameras to the tags, as they lie at last; sigmas widened for correlation.
+        fit: of its cameras to the tags, as they lie at last; drift: of errors of neighbours.
         first: the similarity that brought it there.
     """
 
@@ -67,7 +68,7 @@ class _Model:
     fit: RobustFit
     first: Similarity
     leveled_by: str
-    correlation: float
+    drift: Drift
     is_adjusted: bool
     moved_m: float
     center_covariance: dict[int, Array]
@@ -128,9 +129,10 @@ def _place(number: int, mapper: Mapper, tags: Tags, events: Events) -> _Model | 
     first = fit.similarity
     _move(model.cam_from_world, model.point_xyz, first.world_from_model)
     rigid = model.copy()
-    correlation, inflation = drift(fit, image_idx)
+    arm = model.centers[image_idx] - first.mean
+    drift = estimate_drift(fit.residual, fit.sigma, arm, fit.is_inlier, image_idx.astype(np.float64))
     measured = Measured(image_idx, tags.places[n], tags.sigma[n], tags.is_stated)
-    adjusted = adjust_with_positions(mapper, measured, fit, level, inflation)
+    adjusted = adjust_with_positions(mapper, measured, fit, level, drift)
     is_adjusted = adjusted is not None
     if adjusted is None:
         _restore(mapper, rigid)
@@ -139,11 +141,11 @@ def _place(number: int, mapper: Mapper, tags: Tags, events: Events) -> _Model | 
             f"model {number}: photographs and positions contradict each other in its shape; it was moved as a whole, "
             "and its shape left as the photographs have it",
         )
-        adjusted = Adjusted(finished(fit, model, measured, level, inflation), {})
+        adjusted = Adjusted(finished(fit, model, measured, level, drift), {})
     fit, covariance = adjusted.fit, adjusted.covariance
     moved = _bent(model.centers, rigid.centers)
     by = leveled.source if leveled is not None else ""
-    return _Model(number, image_idx, n, fit, first, by, correlation, is_adjusted, moved, covariance)
+    return _Model(number, image_idx, n, fit, first, by, drift, is_adjusted, moved, covariance)
 
 
 def _first_fit(
@@ -231,10 +233,13 @@ def _report_of(model: _Model, tags: Tags) -> PlacedModel:
         scale_sigma_share=float(sigma[3]),
         rotation_sigma_deg=_three(np.degrees(sigma[:3])),
         position_sigma_m=_three(sigma[4:]),
-        sigma_m=(float(np.median(fit.sigma[used, 0])), float(np.median(fit.sigma[used, 2]))),
+        sigma_m=(
+            model.drift.inflation * float(np.median(fit.sigma[used, 0])),
+            model.drift.inflation * float(np.median(fit.sigma[used, 2])),
+        ),
         sigma_factor=fit.factor,
         rms_residual_m=(flat, float(np.sqrt((heights**2).mean())) if len(heights) else None),
-        correlation=model.correlation,
+        correlation=model.drift.correlation,
         common_offset_m=_common_offset(tags),
         leveled_by=model.leveled_by,
         is_adjusted=model.is_adjusted,

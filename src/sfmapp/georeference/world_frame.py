@@ -134,6 +134,8 @@ def _fault(found: Georeference) -> str:
         if abs(float(np.linalg.norm(place.rotation)) - 1.0) > 1e-6:
             return f"model {place.model}: expected a unit quaternion, found {place.rotation}"
         sigmas = [place.scale_sigma_share, *place.rotation_sigma_deg, *place.position_sigma_m]
-        if not min(*sigmas, *place.common_offset_sigma_m) >= 0:
-            return f"model {place.model}: expected sigmas of zero or more"
+        if not min(sigmas) > 0:
+            return f"model {place.model}: expected sigmas above zero, found {min(sigmas):g}"
+        if not min(place.common_offset_sigma_m) >= 0:
+            return f"model {place.model}: expected a common offset with sigmas of zero or more"
     return ""

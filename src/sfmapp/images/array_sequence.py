@@ -73,7 +73,7 @@ class ArraySequence:
         """
         is_once = iter(self._given) is self._given or (self._times is not None and iter(self._times) is self._times)
         if is_once and self._is_used:
-            raise InputError("frames that a generator gives can be walked through once", "give a list of them")
+            raise InputError("the frames of a generator can be read only once", "give a list of them")
         self._is_used = True
         times = None if self._times is None else iter(self._times)
         white = [255] * len(self.rig.cameras)

@@ -71,7 +71,7 @@ def load_images(
         raise InputError(
             f"images: expected a path, arrays by name, an ImageSource or an ImageSet, found {type(images).__name__}"
         )
-    events.started(STAGE, f"{len(found.images)} photographs at hand", total=len(found.images))
+    events.started(STAGE, f"{len(found.images)} photographs in memory", total=len(found.images))
     tell_cameras(entries, STAGE, events)
     report = _report(name_of(images), found, entries, start)
     events.finished(STAGE, f"{len(found.images)} images, {len(found.cameras)} cameras", **report)

@@ -52,7 +52,7 @@ class SequenceOptions:
     def __post_init__(self) -> None:
         check_options("sequence", self, {"start": Range(0), "step": Range(1), "fps": Range(1e-3, 1e5)})
         if self.stop is not None and self.stop <= self.start:
-            raise UsageError(f"stop is {self.stop}, which is not behind start ({self.start})")
+            raise UsageError(f"stop is {self.stop}, expected more than start ({self.start})")
 
 
 @dataclass(frozen=True)

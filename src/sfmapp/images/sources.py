@@ -148,7 +148,7 @@ def _find_by_pattern(pattern: str, mask_root: Path | None) -> Found:
     if not found.paths and not found.skipped:
         if found.results:
             raise InputError(
-                f"the pattern {pattern} matches results of sfmapp alone, in {', '.join(found.results[:3])}",
+                f"the pattern {pattern} matches only results of sfmapp, in {', '.join(found.results[:3])}",
                 "name the folder of the photographs",
             )
         raise InputError(f"the pattern {pattern} matches no image", "put it in quotes, and check it with ls")

@@ -60,7 +60,7 @@ def _open_device(source: str) -> Any:
     if not capture.isOpened():
         capture.release()
         raise InputError(
-            f"{source}: expected a camera that can be read, found none", "see whether another program has it"
+            f"{source}: expected a camera that can be read, found none", "check whether another program uses it"
         )
     width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
     if not 0 < width * height <= LARGEST_FRAME_PX:

@@ -88,8 +88,8 @@ def map_images(
         tracks, track_report = build_tracks(correspondences, features)
         events.warned(
             STAGE,
-            f"{num_flat} pairs match on something flat alone that is no part of the scene; they were left out. Masks "
-            "over it (images.mask_path) would save what else they share",
+            f"{num_flat} pairs match only on something flat that is not part of the scene; they were left out. A mask "
+            "over it (images.mask_path) would keep what else they share",
         )
     events.decided(STAGE, f"{track_report.num_tracks} tracks", **track_report)
     with ThreadPoolExecutor(threads) as pool:
@@ -120,7 +120,7 @@ def map_images(
         focal=mapped.focal_report,
         look_alikes=look_alikes,
         initial_pairs=mapped.initial_reports,
-        images=_image_reports(names, models, mapped.attempts),
+        images=image_reports(names, models, mapped.attempts),
         models=model_reports,
     )
     events.finished(STAGE, f"{len(models)} model(s)", num_models=len(models))
@@ -145,7 +145,7 @@ class _Task:
         """Models that begin with the given cameras, from verified matches and their tracks."""
         names, options, events = self.names, self.options, self.events
         events.started(STAGE, "mapping", total=len(names))
-        cameras, focal_report = _first_cameras(given, self.image_camera_idx, correspondences, tracks, options, events)
+        cameras, focal_report = first_cameras(given, self.image_camera_idx, correspondences, tracks, options, events)
         attempts: dict[int, Registration] = {}
 
         def mapper_of(model: Reconstruction, locked: NDArray[np.bool_] | None = None) -> Mapper:
@@ -365,8 +365,8 @@ def _with_left_over(
         is_kept = agreeing > verified_pairs.AGREES * matches and grown.is_registered[model.is_registered].all()
         events.decided(
             STAGE,
-            f"{int(new.sum())} images that had waited {'came last' if is_kept else 'do not fit'}: {agreeing} of their "
-            f"{matches} verified matches agree",
+            f"{int(new.sum())} images held back {'are registered last' if is_kept else 'do not fit'}: {agreeing} of "
+            f"their {matches} verified matches agree",
         )
         out.append(grown if is_kept else model)
     return out
@@ -385,7 +385,7 @@ def no_reconstruction(report: MappingReport, here: OnePlace | None) -> NoReconst
     return error
 
 
-def _first_cameras(
+def first_cameras(
     cameras: Sequence[Camera],
     image_camera_idx: NDArray[np.int32],
     correspondences: Correspondences,
@@ -404,7 +404,7 @@ def _first_cameras(
     return [c.with_focal(ratio * max(c.width, c.height)) if c.focal_source == "default" else c for c in cameras], report
 
 
-def _image_reports(
+def image_reports(
     names: list[str], models: list[Reconstruction], attempts: dict[int, Registration]
 ) -> list[MappedImage]:
     """Per image: the model it is in, its points and observations, and what the last attempt to register it met."""

@@ -220,9 +220,9 @@ def _cut_photographs(mapped: Mapped, model: Reconstruction) -> Contradiction | N
     # focal lengths of one lens that scatter tell of a model that is bent beyond what the trial can straighten
     scatter = float(np.std(np.log([model.cameras[model.image_camera_idx[i]].focal for i in registered])))
     return Contradiction(
-        "middle of the photographs",
-        f"the photographs seem to be cut, each otherwise: with principal points {100 * offset:.0f} % of the longer "
-        f"side off the middle, points not fitted to them agree {1.0 / max(found.ratio, 1e-9):.1f} times better",
+        "cropped photographs",
+        f"the photographs seem to have been cropped, each differently: with principal points {100 * offset:.0f} % of "
+        f"the longer side off centre, held-out points agree {1.0 / max(found.ratio, 1e-9):.1f} times better",
         "give the photographs as the camera wrote them",
         {
             "held_out_residual_ratio": found.ratio,
@@ -269,8 +269,8 @@ def _given_intrinsics(
     more = f" (and {len(camera_idx) - 1} more cameras)" if len(camera_idx) > 1 else ""
     return Contradiction(
         "given intrinsics",
-        f"camera {camera_idx[0]}{more} was held at {held}; the photographs say {freed}, with which points that were "
-        f"not fitted to them agree {1.0 / max(found.ratio, 1e-9):.1f} times better, and which moves the cameras by "
+        f"camera {camera_idx[0]}{more} was fixed at {held}; the photographs indicate {freed}, with which held-out "
+        f"points agree {1.0 / max(found.ratio, 1e-9):.1f} times better, and which moves the cameras by "
         f"{100 * spread:.2g} % of their spread",
         "leave out images.fix_intrinsics, or give the right values for pictures of this size",
         {

@@ -218,7 +218,7 @@ def holds_together(
         return f"adjusted as one, {agreeing} of {matches} verified matches between them agree, {shared} support a point"
     pairs, visible, shared = missing_between(union, *sides, correspondences)
     if pairs:
-        return f"adjusted as one, {pairs} pairs stand side by side and share {shared} of the {visible} points in view"
+        return f"adjusted as one, {pairs} pairs are side by side and share {shared} of the {visible} points in view"
     return ""
 
 

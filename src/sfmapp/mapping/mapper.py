@@ -23,6 +23,7 @@ from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_in
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
 from sfmapp.mapping.report import CameraSigmas, ImageSigmas, InitialPairReport, Uncertainty
+from sfmapp.mapping.settling import Round, adjust_until_settled, round_options
 from sfmapp.mapping.snapshot import ModelSnapshot
 from sfmapp.mapping.tracks import USELESS_CONFIGS
 from sfmapp.mapping.verified_pairs import MIN_MATCHES, pair_agreement
@@ -39,8 +40,8 @@ WEAK_SHARE_OF_ANGLE = 0.1
 # A weak image waits for another model if a pair with an image outside of this one has so many times the matches of its
 # strongest pair inside: no matter of chance, and what comes with one image comes with its neighbours too.
 ELSEWHERE = 2.0
-# An adjustment has settled when no larger share of the observations changes sides; rounds of the last one at most.
-MAX_CHANGED, MAX_POLISHED = 1e-3, 2
+# An adjustment of squares has settled when no larger share of the observations changes sides.
+MAX_CHANGED = 1e-3
 # Synthetic keypoints may be exact; no detector's are better than this.
 MIN_NOISE_PX = 0.02
 _NO_CENTERS = (
@@ -56,8 +57,9 @@ class Mapper:
 
     ``prior_cameras`` are what the cameras of the model, in their order, were before anything was seen with them.
     ``locked`` (I,) bool are images that this model must not register. ``attempts``: the last one for each image.
+    ``loss_scale_px``: the noise that robust losses are set for, once it has been measured.
     ``waits``: weak images whose strongest pairs are with images outside of the model are left to another one, which
-    may grow from there.
+    may grow from there. ``held`` (I,) bool: images whose poses are known and stay as they are; None for none.
     """
 
     reconstruction: Reconstruction
@@ -72,7 +74,9 @@ class Mapper:
     failed_with: dict[int, int] = field(default_factory=dict)
     times_dropped: dict[int, int] = field(default_factory=dict)
     size_at_global: tuple[int, int] = (0, 0)
+    loss_scale_px: float | None = None
     waits: bool = True
+    held: NDArray[np.bool_] | None = None
     max_error_px: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -137,7 +141,7 @@ class Mapper:
                     self.adjust_around(registered)
                 self._decided(f"registered {self._names(registered)}", registered)
                 self.events.advanced(STAGE, len(registered))
-            taken_back = self._drop_contradicted_images()
+            taken_back = self.drop_contradicted_images()
             if not taken_back and (not self._candidates().size or self._size() == self.size_at_global):
                 return
             # a second chance: the adjusted map may hold more points and better poses
@@ -269,6 +273,8 @@ class Mapper:
         variable = np.zeros(len(self.reconstruction.image_names), bool)
         variable[images] = True
         variable[self._covisible_images(images)] = True
+        if self.held is not None:
+            variable &= ~self.held
         reconstruction, tracks = self.reconstruction, self.reconstruction.tracks
         # intrinsics vary only where no image outside the window depends on them
         outside = reconstruction.is_registered & ~variable
@@ -289,8 +295,8 @@ class Mapper:
         reconstruction = self.reconstruction
         reconstruction.cameras[:] = cameras
         options = replace(self.adjust_options, max_iterations=25, relative_cost_tolerance=1e-4)
-        fixed = np.zeros(len(cameras), bool)
-        adjust_bundle(reconstruction, options, varying=Varying(cameras=fixed), prior_cameras=self.prior_cameras)
+        varying = self._everything(cameras=np.zeros(len(cameras), bool))
+        adjust_bundle(reconstruction, options, varying=varying, prior_cameras=self.prior_cameras)
 
     def adjust_globally(self) -> None:
         """Adjust everything, filter, and triangulate again what was lost or has become possible."""
@@ -298,7 +304,7 @@ class Mapper:
         options = replace(self.adjust_options, max_iterations=25, relative_cost_tolerance=1e-4)
         if reconstruction.is_registered.sum() < 3:  # two views cannot tell the lens from the scene
             options = replace(options, refine_focal=False, refine_distortion=False)
-        adjust_bundle(reconstruction, options, prior_cameras=self.prior_cameras)
+        adjust_bundle(reconstruction, options, varying=self._everything(), prior_cameras=self.prior_cameras)
         self._settle_points()
         self.size_at_global = self._size()
 
@@ -311,40 +317,47 @@ class Mapper:
         options = replace(self.adjust_options, initial_damping=1e-7, relative_cost_tolerance=1e-7)
         for _ in range(6):
             before = self.reconstruction.obs_is_inlier.copy()
-            adjust_bundle(self.reconstruction, options, prior_cameras=self.prior_cameras)
+            adjust_bundle(self.reconstruction, options, varying=self._everything(), prior_cameras=self.prior_cameras)
             self._refine_principal_points(options)
             self._settle_points()
             changed = int((before != self.reconstruction.obs_is_inlier).sum())
             summary = self.reconstruction.summary()
-            self.events.decided(STAGE, f"final adjustment: {changed} observations changed sides", **summary)
+            self.events.decided(
+                STAGE, f"final adjustment: {changed} observations became inliers or outliers", **summary
+            )
             if changed <= MAX_CHANGED * before.sum():
                 return
 
     def polish(self) -> AdjustReport:
         """Adjust a finished map with a loss that lets go of what is far off the noise, until it settles: the closing
-        adjustments, of which the last is reported.
+        adjustments, of which the last is reported, as ``unsettled`` where it has not.
 
         A pixel may be ten standard deviations of precise keypoints: with squares alone, the few observations near the
         limit decide what many others tell little of, such as the lens.
         """
-        reconstruction = self.reconstruction
         if self._wanted_principal_points().any() and not self._free_principal_points().any():
             self.events.warned(STAGE, _NO_CENTERS)
-        for _ in range(MAX_POLISHED):
-            before = reconstruction.obs_is_inlier.copy()
-            options, chosen = self._polishing()
-            graph = FactorGraph(
-                reconstruction, options, varying=Varying(centers=chosen), prior_cameras=self.prior_cameras, noise_px=1.0
-            )
-            report = graph.optimize()
-            self.events.decided(STAGE, f"closing adjustment: {report.text}", **report)
-            self._settle_points()
-            changed = int((before != reconstruction.obs_is_inlier).sum())
-            summary = reconstruction.summary()
-            self.events.decided(STAGE, f"robust adjustment: {changed} observations changed sides", **summary)
-            if changed <= MAX_CHANGED * before.sum():
-                break
-        return report
+        self.loss_scale_px = self._residual_scale_px
+        return adjust_until_settled(self._polish_once, STAGE, self.events)
+
+    def _polish_once(self, num_steps: int) -> Round:
+        """Some steps of closing adjustment, after which observations are chosen anew."""
+        reconstruction = self.reconstruction
+        before = reconstruction.obs_is_inlier.copy()
+        options, chosen = self._polishing()
+        graph = FactorGraph(
+            reconstruction, round_options(options, num_steps), varying=self._everything(centers=chosen),
+            prior_cameras=self.prior_cameras, noise_px=1.0,
+        )  # fmt: skip
+        report = graph.optimize()
+        self.events.decided(STAGE, f"closing adjustment: {report.text}", **report)
+        self._settle_points()
+        made = Round(report, before, reconstruction.obs_is_inlier.copy())
+        summary = reconstruction.summary()
+        self.events.decided(
+            STAGE, f"robust adjustment: {made.num_changed} observations became inliers or outliers", **summary
+        )
+        return made
 
     def adjust_with(self, extra_factors: Any) -> None:
         """Adjust a finished map once more as :meth:`polish` does, with gtsam factors over ``X(i)`` beside the
@@ -352,7 +365,7 @@ class Mapper:
         options, chosen = self._polishing()
         options = replace(options, initial_damping=1e-6, relative_cost_tolerance=1e-6)
         report = adjust_bundle(
-            self.reconstruction, options, varying=Varying(centers=chosen), prior_cameras=self.prior_cameras,
+            self.reconstruction, options, varying=self._everything(centers=chosen), prior_cameras=self.prior_cameras,
             extra_factors=extra_factors,
         )  # fmt: skip
         self.events.decided(STAGE, f"closing adjustment: {report.text}", **report)
@@ -372,13 +385,18 @@ class Mapper:
     def _polishing(self) -> tuple[AdjustOptions, NDArray[np.bool_]]:
         """Options of the last adjustment, and the cameras (C,) bool whose principal points are free in it."""
         chosen = self._free_principal_points()
-        options = self.adjust_options.robust(self.noise_px)
+        options = self.adjust_options.robust(self.loss_scale_px or self._residual_scale_px)
         options = replace(options, max_iterations=100, initial_damping=1e-8, relative_cost_tolerance=1e-5)
         return self.with_free_centers(options, chosen) if chosen.any() else options, chosen
 
     @property
     def noise_px(self) -> float:
         """Standard deviation of the keypoints by the residuals, pixels."""
+        return self._residual_scale_px
+
+    @property
+    def _residual_scale_px(self) -> float:
+        """Standard deviation of residuals, which is below that of keypoints where tracks are short, in pixels."""
         return structure.residual_scale_px(self.reconstruction, MIN_NOISE_PX)
 
     def agreement(self) -> tuple[int, int]:
@@ -392,7 +410,7 @@ class Mapper:
         if chosen.any():
             options = self.with_free_centers(options, chosen)
             adjust_bundle(
-                self.reconstruction, options, varying=Varying(cameras=chosen), prior_cameras=self.prior_cameras
+                self.reconstruction, options, varying=self._everything(cameras=chosen), prior_cameras=self.prior_cameras
             )
 
     def _free_principal_points(self) -> NDArray[np.bool_]:
@@ -479,7 +497,7 @@ class Mapper:
         unknowns = 3 * int(reconstruction.is_triangulated.sum()) + 6 * int(reconstruction.is_registered.sum())
         left = max(numbers - unknowns, 1)
         noise_px = structure.residual_scale_px(reconstruction, MIN_NOISE_PX) * float(np.sqrt(numbers / left))
-        return options, Varying(centers=chosen), noise_px
+        return options, self._everything(centers=chosen), noise_px
 
     def _settle_points(self) -> None:
         """Measure the noise; filter accordingly, and triangulate again what was lost or has become possible."""
@@ -501,6 +519,8 @@ class Mapper:
         sees = reconstruction.is_triangulated[tracks.obs_track_idx]
         visible = np.bincount(tracks.obs_image_idx[sees], minlength=tracks.num_images)
         weak = (counts < least) | ((counts < 4 * least) & (counts < MIN_AGREEMENT * visible))
+        if self.held is not None:  # a pose that is known needs no support
+            weak &= ~self.held
         dropped = np.flatnonzero(reconstruction.is_registered & weak)
         # a model of two or three images stands or falls as a whole, with its points
         if len(dropped) == 0 or reconstruction.is_registered.sum() - len(dropped) < 3:
@@ -511,7 +531,7 @@ class Mapper:
             reason = f"{counts[i]} of {visible[i]} observations hold after the adjustment: too few to trust the pose"
             self._take_back(i, int(visible[i]), int(counts[i]), reason)
 
-    def _drop_contradicted_images(self) -> bool:
+    def drop_contradicted_images(self) -> bool:
         """Take back images that most of their own verified matches contradict, the worst first; True if there are any.
 
         What contradicts one image of a pair contradicts the other: once the wrong one is gone, nothing speaks against
@@ -529,6 +549,8 @@ class Mapper:
                 for w in (weight, against)
             )
             share = bad / np.maximum(total, 1)
+            if self.held is not None:
+                share[self.held] = 0.0
             worst = int(np.argmax(share))
             if share[worst] <= 0.5:
                 break
@@ -547,9 +569,18 @@ class Mapper:
         self.attempts[image_idx] = Registration(image_idx, num_correspondences, num_inliers, None, reason=reason)
         self.failed_with[image_idx] = num_correspondences
         self.times_dropped[image_idx] = self.times_dropped.get(image_idx, 0) + 1
-        self.events.decided(STAGE, f"took back {self.reconstruction.image_names[image_idx]}: {reason}")
+        self.events.decided(STAGE, f"deregistered {self.reconstruction.image_names[image_idx]}: {reason}")
 
     # ---------------------------------------------------------------- helpers
+
+    def _everything(
+        self, *, cameras: NDArray[np.bool_] | None = None, centers: NDArray[np.bool_] | None = None
+    ) -> Varying:
+        """All that an adjustment of the whole map may change; arguments as of :class:`Varying`."""
+        if self.held is None:
+            return Varying(cameras=cameras, centers=centers)
+        points = self.reconstruction.is_triangulated
+        return Varying(images=~self.held, cameras=cameras, centers=centers, points=points)
 
     def _size(self) -> tuple[int, int]:
         return int(self.reconstruction.is_registered.sum()), int(self.reconstruction.is_triangulated.sum())

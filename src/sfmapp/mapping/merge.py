@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.scene.reconstruction import Reconstruction
 
-# Common points that must agree on the scale. Chance agreement of this many within the tolerance is out of the question.
-MIN_COMMON_POINTS = 8
+# Common points that must agree on the scale, and the probability that as many do by chance through one image. Where
+# distances scatter by a third, eight of eight do within the tolerance in one case of four million, but of a hundred
+# thirteen as a rule: the more there are, the more have to.
+MIN_COMMON_POINTS, MAX_CHANCE = 8, 1e-4
 # Depths of points near the edge of a model are good to a few per cent.
 SCALE_TOLERANCE = 0.05
 
@@ -29,7 +31,7 @@ def similarity_through_image(
 
     Returns:
         ``target_from_source`` (8,) as in :mod:`sfmapp.geometry.similarity`, and the number of common points that agree
-        on the scale; None if fewer than MIN_COMMON_POINTS do.
+        on the scale; None if fewer than MIN_COMMON_POINTS do, or no more than may by chance.
     """
     common = np.flatnonzero(target.is_triangulated & source.is_triangulated)
     if len(common) < MIN_COMMON_POINTS:
@@ -40,7 +42,8 @@ def similarity_through_image(
     in_front = (in_target[:, 2] > 0) & (in_source[:, 2] > 0)
     if any(camera.is_wide for camera in cameras):  # it may see them behind it; their directions are compared below
         in_front[:] = True
-    ratios = np.log(np.linalg.norm(in_target[in_front], axis=1) / np.linalg.norm(in_source[in_front], axis=1))
+    of_target, of_source = (np.log(np.linalg.norm(points[in_front], axis=1)) for points in (in_target, in_source))
+    ratios = of_target - of_source
     if len(ratios) < MIN_COMMON_POINTS:
         return None
     # the ratio that most others agree with, then the median of those
@@ -53,13 +56,31 @@ def similarity_through_image(
         np.linalg.norm(in_target[in_front], axis=1) * np.linalg.norm(in_source[in_front], axis=1)
     )
     near &= cosine > np.cos(SCALE_TOLERANCE)
-    if near.sum() < MIN_COMMON_POINTS:
+    if near.sum() < max(MIN_COMMON_POINTS, _fewest_beyond_chance(of_target, of_source)):
         return None
     scale = float(np.exp(np.median(ratios[near])))
     # through the frame of the shared image: source to camera, scaled, camera to target
     target_from_camera = np.append(rigid3.inverse(target.cam_from_world[image_idx]), scale)
     camera_from_source = np.append(source.cam_from_world[image_idx], 1.0)
     return similarity.compose(target_from_camera, camera_from_source), int(near.sum())
+
+
+def _fewest_beyond_chance(of_target: NDArray[np.float64], of_source: NDArray[np.float64]) -> int:
+    """How many of N ratios must lie within the tolerance of one of them to be no work of chance; logarithms (N,) of the
+    distances in both models.
+
+    If these had nothing to do with each other, their ratios would scatter by as much as both together, and a window
+    about the most likely one would hold at most a share p of them: N windows, each with a binomial number of others.
+    """
+    from scipy.special import bdtrc
+
+    # standard deviations by the quartiles, whatever the tails are
+    scatter = float(np.hypot(*(np.subtract(*np.quantile(d, [0.75, 0.25])) / 1.349 for d in (of_target, of_source))))
+    num = len(of_target)
+    share = min(1.0, 2.0 * SCALE_TOLERANCE / (np.sqrt(2.0 * np.pi) * max(scatter, 1e-12)))
+    others = np.arange(num)
+    chance = num * bdtrc(others - 1, num - 1, share)  # of so many others or more
+    return 1 + int(np.argmax(np.append(chance, 0.0) <= MAX_CHANCE))
 
 
 def merge(target: Reconstruction, source: Reconstruction, target_from_source: NDArray[np.float64]) -> Reconstruction:

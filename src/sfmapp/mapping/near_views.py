@@ -111,11 +111,10 @@ def contradiction_of(model: Reconstruction, correspondences: Correspondences) ->
     return [
         Contradiction(
             "near views",
-            f"{len(missing)} pairs of photographs stand side by side in the model and do not show the same: "
-            f"{first.images[0]} and {first.images[1]} should share {first.num_visible} points and share "
-            f"{first.num_shared}",
-            "some of them were put in a wrong place, by parts that look alike: add photographs between them and the "
-            "rest, with more of what is around in the picture",
+            f"{len(missing)} pairs of photographs are side by side in the model but do not show the same points: "
+            f"{first.images[0]} and {first.images[1]} should share {first.num_visible} and share {first.num_shared}",
+            "parts that look alike have put some of them in the wrong place: add photographs between them and the rest "
+            "that show more of the surroundings",
             {"num_pairs": len(missing), "num_near_pairs": len(found.num_visible), "pairs": named},
             # an image that is in a wrong place may be anywhere in the model
             rotation_sigma_deg=180.0, position_sigma_share=1.0,

@@ -47,8 +47,8 @@ def repaired(
             continue
         events.decided(
             STAGE,
-            f"{int(part.sum())} images hung loosely on the model and were joined again: {after} points that they share "
-            f"with the rest hold, {before} before",
+            f"{int(part.sum())} weakly connected images were joined to the model again: they now share {after} points "
+            f"with the rest, {before} before",
         )
         model = union
     return model

@@ -265,15 +265,15 @@ def _inside(model: Reconstruction, correspondences: Correspondences) -> list[Con
     total = int(agreement.num_matches.sum())
     strongest = named[0]
     message = (
-        f"{_count(len(pairs), 'pair')} with {matches.sum()} verified matches lie elsewhere to each other than the "
-        f"model has them: {strongest.images[0]} and {strongest.images[1]} have {strongest.num_matches}, of "
-        f"which {strongest.num_agreeing} agree and {strongest.num_shared_points} are points of the model"
+        f"{_count(len(pairs), 'pair')} with {matches.sum()} verified matches contradict the poses in the model: "
+        f"{strongest.images[0]} and {strongest.images[1]} have {strongest.num_matches}, of which "
+        f"{strongest.num_agreeing} agree and {strongest.num_shared_points} are points of the model"
     )
     return [
         Contradiction(
             "verified pairs", message,
-            "parts that look alike were taken for one, or photographs were put in a wrong place: add photographs "
-            "between them, with more of what is around in the picture",
+            "parts that look alike were confused, or photographs are in the wrong place: add photographs between them "
+            "that show more of the surroundings",
             {
                 "num_pairs": len(pairs), "num_matches": int(matches.sum()), "num_matches_of_all": total,
                 "num_pairs_overruled": int((agreement.contradicts & ~standing.stands).sum()), "pairs": named,
@@ -316,8 +316,8 @@ def _between(
     ]
     strongest = named[0]
     message = (
-        f"{_count(len(pairs), 'pair')} with {matches.sum()} verified matches link it to model {other_idx}, but no way "
-        f"was found to join the two: {strongest.images[0]} and {strongest.images[1]} have "
+        f"{_count(len(pairs), 'pair')} with {matches.sum()} verified matches link it to model {other_idx}, but the two "
+        f"could not be joined: {strongest.images[0]} and {strongest.images[1]} have "
         f"{strongest.num_matches}"
     )
     return [
@@ -358,7 +358,7 @@ def _left_out(
     return [
         Contradiction(
             "photographs left out", message,
-            "parts that look alike may have been taken for one: add photographs with more of what is around",
+            "parts that look alike may have been confused: add photographs that show more of the surroundings",
             {"num_images": len(left_out), "num_pairs": len(pairs), "num_matches": int(matches.sum()), "pairs": named},
             # what was taken back may have been right, and the model wrong
             rotation_sigma_deg=180.0, position_sigma_share=1.0,

@@ -26,18 +26,18 @@ class MatchingOptions:
     the bits for ORB.
 
     Attributes:
-        max_ratio: Best distance over second best, in both directions (Lowe, IJCV 2004).
+        max_ratio: Largest ratio of the best distance to the second best, in both directions (Lowe, IJCV 2004).
         max_distance: Largest distance of a match.
         coarse_features: Features of each image, largest first, whose matches guide those of all others along the
             epipolar lines. Images with fewer than twice as many, and pairs on which these do not agree, are matched in
             full.
-        max_error_px: Inlier threshold on pixels in the full-size image. None: 0.2 % of the image diagonal, within 2 to
-            8 px.
-        min_inliers: Fewest verified matches of a pair that counts.
-        min_e_f_ratio: An essential matrix is believed if it explains this share of what the fundamental matrix
-            explains.
+        max_error_px: Inlier threshold in pixels of the full-size image. None: 0.2 % of the image diagonal, within
+            2 to 8 px.
+        min_inliers: Verified matches that a pair needs to be used.
+        min_e_f_ratio: An essential matrix is accepted if it has at least this share of the inliers of the fundamental
+            matrix.
         max_h_ratio: A pair is planar or panoramic if a homography explains more than this share of the inliers.
-        max_ransac_trials: Most RANSAC hypotheses for each model.
+        max_ransac_trials: Largest number of RANSAC hypotheses for each model.
     """
 
     max_ratio: float = 0.8

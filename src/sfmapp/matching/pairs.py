@@ -55,14 +55,14 @@ class PairOptions:
     """Options of the stage ``pairs``.
 
     Attributes:
-        method: auto: exhaustive for small sets, else the union of retrieval, sequence and GPS.
-        exhaustive_limit: auto: sets of at most this many images are matched exhaustively.
-        num_neighbors: Retrieval: images that look most alike, per image.
-        num_words: Retrieval: size of the vocabulary; more words tell finer differences and cost more memory.
-        num_query_features: Retrieval: keypoints per image that are looked at, the largest first.
-        sequence_overlap: Sequence: each image is paired with so many next ones.
-        sequence_quadratic: Sequence: also with those 2, 4, 8, ... images further, up to 2 to the power of the overlap.
-        num_gps_neighbors: GPS: nearest images, per image.
+        method: auto: exhaustive for small sets, otherwise the union of retrieval, sequence and GPS.
+        exhaustive_limit: auto: largest set in which every image is paired with every other.
+        num_neighbors: retrieval: most similar images that each image is paired with.
+        num_words: retrieval: size of the vocabulary; more words distinguish finer differences and take more memory.
+        num_query_features: retrieval: keypoints used of each image, the largest first.
+        sequence_overlap: sequential: each image is paired with this many that follow it.
+        sequence_quadratic: sequential: also with those 2, 4, 8, ... images ahead, up to 2 to the power of the overlap.
+        num_gps_neighbors: GPS: nearest images that each image is paired with.
     """
 
     method: Literal["auto", "exhaustive", "retrieval", "sequential"] = "auto"

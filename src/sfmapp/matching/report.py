@@ -59,7 +59,7 @@ class MatchingReport(Report):
     Attributes:
         num_resumed_pairs: those of an earlier run.
         num_matches: verified ones, of all pairs.
-        num_pairs_with_moving_plane: pairs in which something flat moves otherwise than the scene.
+        num_pairs_with_moving_plane: pairs in which something flat moves differently from the scene.
         configs: pairs by their two-view geometry.
         cpu_s: of the workers.
     """

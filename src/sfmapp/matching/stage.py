@@ -129,7 +129,7 @@ def match_images(
     if (num_moving := report.num_pairs_with_moving_plane) >= _MANY_MOVING:
         events.warned(
             _STAGE,
-            f"in {num_moving} pairs something flat moves otherwise than the scene (held into the picture, on the "
+            f"in {num_moving} pairs something flat moves differently from the scene (held into the picture, on the "
             "camera, or a background that stays while the object turns); its matches were left out. A mask over it "
             "(images.mask_path) is better",
         )

@@ -259,7 +259,7 @@ class StereoClock:
         self._settle(held)
         if self.shift:
             when = f"{abs(self.shift)} frame{'s' * (abs(self.shift) > 1)} {'late' if self.shift > 0 else 'early'}"
-            events.warned("odometry", f"the right camera is {when}: its images are paired anew", shift=self.shift)
+            events.warned("odometry", f"the right camera is {when}: its images are paired again", shift=self.shift)
         against = _mounting(self._looks)
         if 2 * sum(not seen.is_right for seen in self._looks) > len(self._looks):
             against = against or ([] if estimate_time_offset(self._looks).is_known else _strangers(self._looks))

@@ -1,4 +1,5 @@
-"""Photographs without their distortion and a PINHOLE model beside them, as COLMAP's undistorter lays them out.
+"""Photographs without their distortion and a PINHOLE model beside them, as COLMAP's undistorter lays them out. One that
+shows what is beside and behind the camera becomes the faces of a cube.
 
 ``images/`` holds the photographs under their names, ``masks/NAME.png`` what is to be ignored, and the model is in
 ``sparse/0``, where the trainers of Gaussian splats and nerfstudio look for it, and in ``sparse`` as well, where COLMAP
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -33,6 +35,7 @@ from sfmapp.report.model import UndistortedCamera, UndistortNumbers, UndistortRe
 from sfmapp.reporting import NamedReason
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.undistortion import (
+    Layout,
     Undistortion,
     has_distortion,
     plan_undistortion,
@@ -70,13 +73,19 @@ class _Job(Job):
 
     Attributes:
         photographs: that are there.
-        undistortions: one for each.
+        undistortions: of each the pictures that are made of it.
         lost: (name, reason) of photographs that could not be read.
     """
 
     photographs: Photographs = field(init=False)
-    undistortions: list[Undistortion] = field(init=False)
+    undistortions: list[list[Undistortion]] = field(init=False)
     lost: list[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def names(self) -> list[str]:
+        """Of the pictures."""
+        pairs = zip(self.photographs.records, self.undistortions, strict=True)
+        return [each.name_of(record.name) for record, group in pairs for each in group]
 
 
 def undistort(
@@ -85,8 +94,7 @@ def undistort(
     options: Options | None = None,
     *,
     images: str | os.PathLike[str] | None = None,
-    blank_pixels: float = 0.0,
-    max_size: int | None = None,
+    layout: Layout | None = None,
     events: Events | None = None,
     watch: Stopwatch | None = None,
 ) -> UndistortResult:
@@ -100,20 +108,16 @@ def undistort(
         output: a new folder, an empty one, or that of an earlier call.
         options: of these, the masks (``images.mask_path``) and ``threads``.
         images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
-        blank_pixels: from 0 for pictures without a blank pixel to 1 for all that the photographs show.
-        max_size: largest side of the pictures in pixels; None for no limit.
+        layout: how the pictures are cut; None: without a blank pixel, and of any size.
         events: progress, warnings and cancellation.
         watch: started when the run began.
 
     Raises:
-        UsageError: a share or size that makes no sense, or an output that holds something else.
+        UsageError: an output that holds something else.
         InputError: no model, or none of its photographs.
         NoReconstructionError: the workspace holds no model.
     """
-    if not 0.0 <= blank_pixels <= 1.0:
-        raise UsageError(f"blank_pixels is {blank_pixels:g}, expected a share from 0 to 1")
-    if max_size is not None and max_size < 1:
-        raise UsageError(f"max_size is {max_size}, expected 1 pixel or more")
+    layout = layout or Layout()
     where = find_source(source, output, images, options or Options(), UNDISTORT)
     _check_target(where)
     model, keypoints = read_model(where.model, events)
@@ -125,10 +129,11 @@ def undistort(
             model, where.images, job.options.images,
             is_upright=where.is_upright, with_copies=True, threads=job.threads, events=job.events,
         )  # fmt: skip
-        warn_of_sides(job.photographs.cameras, STAGE, job.events)
-        job.undistortions = [plan_undistortion(camera, blank_pixels, max_size) for camera in job.photographs.cameras]
+        if layout.front_only:
+            warn_of_sides(job.photographs.cameras, STAGE, "leave out --front-only", job.events)
+        _plan(job, layout)
         key = stage_key(
-            (__name__,), None, [blank_pixels, max_size, where.is_upright], model_digest(where.model),
+            (__name__,), layout, where.is_upright, model_digest(where.model),
             [input_key(record) for record in job.photographs.records], job.photographs.missing,
         )  # fmt: skip
         known = _known_numbers(job, key)
@@ -141,6 +146,19 @@ def undistort(
             job.workspace.save()
         report = UndistortReport(**numbers, run=job.took(is_up_to_date=known is not None))
         return UndistortResult(job.workspace.folder, report)
+
+
+def _plan(job: _Job, layout: Layout) -> None:
+    """Decide which pictures are made of each photograph.
+
+    Raises:
+        InputError: two of them would have the same name.
+    """
+    job.undistortions = [plan_undistortion(camera, layout) for camera in job.photographs.cameras]
+    names = job.names
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{twice}: a photograph and a face of a cube have the same name", "rename one of them")
 
 
 def _check_target(where: DenseSource) -> None:
@@ -171,14 +189,13 @@ def _target(job: _Job, folder: str, name: str) -> Path:
     root = job.workspace.folder
     path = root / folder / name
     if not path.parent.resolve().is_relative_to(root.resolve()):
-        raise UsageError(f"{path}: a link in the way leads out of {root}", "take it away, or choose another folder: -o")
+        raise UsageError(f"{path}: a symbolic link leads out of {root}", "remove it, or choose another folder: -o")
     return path
 
 
 def _begin(job: _Job, key: str) -> None:
     """Take away what an earlier run with another key has written, and note what this one is going to."""
     workspace = job.workspace
-    names = [record.name for record in job.photographs.records]
     _target(job, "sparse/0", MODEL_FILES[0])
     if not workspace.has_key(STAGE, key):
         workspace.write_models([])
@@ -186,13 +203,13 @@ def _begin(job: _Job, key: str) -> None:
             if not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts:
                 _target(job, IMAGES, name).unlink(missing_ok=True)
                 _target(job, MASKS, f"{name}.png").unlink(missing_ok=True)
-    workspace.begin(STAGE, key, names=names)
+    workspace.begin(STAGE, key, names=job.names)
 
 
 def _known_numbers(job: _Job, key: str) -> UndistortNumbers | None:
     """What an earlier run has written, if all of it is there."""
     folder = job.workspace.folder
-    wanted = [folder / IMAGES / record.name for record in job.photographs.records]
+    wanted = [folder / IMAGES / name for name in job.names]
     wanted += [folder / "sparse" / "0" / name for name in MODEL_FILES]
     if not job.workspace.is_current(STAGE, key) or not all(path.is_file() for path in wanted):
         return None
@@ -207,17 +224,16 @@ def _write_photographs(job: _Job) -> None:
     def write(i: int) -> tuple[str, str] | None:
         events.raise_if_cancelled()
         record = records[i]
-        target = _target(job, IMAGES, record.name)
+        targets = {each.name_of(record.name): each for each in job.undistortions[i]}
+        missing = {name: each for name, each in targets.items() if not _target(job, IMAGES, name).is_file()}
         reason = None
-        if not target.is_file():  # it appears whole, after its mask
-            try:
-                picture, mask = _undistorted(record, job.undistortions[i])
-            except InputError as error:
-                reason = record.name, str(error)
-            else:
-                if mask is not None:
-                    _write(_target(job, MASKS, f"{record.name}.png"), encode_mask(mask))
-                _write(target, picture)
+        try:
+            for name, (picture, mask) in zip(missing, _undistorted(record, list(missing.values())), strict=True):
+                if mask is not None:  # the picture appears whole, after its mask
+                    _write(_target(job, MASKS, f"{name}.png"), encode_mask(mask))
+                _write(_target(job, IMAGES, name), picture)
+        except InputError as error:
+            reason = record.name, str(error)
         events.advanced(STAGE)
         return reason
 
@@ -240,27 +256,32 @@ def _write(path: Path, data: bytes) -> None:
         beside.write_bytes(data)
 
 
-def _undistorted(record: ImageRecord, how: Undistortion) -> tuple[bytes, NDArray[np.bool_] | None]:
-    """The file of a photograph, and (h, w) True where it may be used; None for everywhere.
+def _undistorted(record: ImageRecord, pictures: list[Undistortion]) -> Iterator[tuple[bytes, NDArray[np.bool_] | None]]:
+    """The files of pictures of a photograph, and (h, w) True where each may be used; None for everywhere.
 
     Raises:
         InputError: it, or its mask, cannot be read.
     """
+    if not pictures:
+        return
     data, header = read_file(record)
     mask = read_mask_file(record)
-    if how.is_identity and record.turn == 1:
+    if pictures[0].is_identity and record.turn == 1:
         kept = without_turn(data, header)
-        return encode(decode_file(record, data, header), header.format) if kept is None else kept, mask
-    flat, shown = _lay_out(how, decode_file(record, data, header))
-    usable = shown == 255
-    flat[~usable] = 0
-    if mask is not None:
-        usable &= _lay_out(how, mask.astype(np.uint8) * 255)[0] > 127
-    try:
-        picture = encode(flat, header.format)
-    except InputError as error:
-        raise InputError(f"{record.name}: {error}") from error
-    return picture, usable if mask is not None or not usable.all() else None
+        yield encode(decode_file(record, data, header), header.format) if kept is None else kept, mask
+        return
+    pixels = decode_file(record, data, header)
+    for how in pictures:
+        flat, shown = _lay_out(how, pixels)
+        usable = shown == 255
+        flat[~usable] = 0
+        if mask is not None:
+            usable &= _lay_out(how, mask.astype(np.uint8) * 255)[0] > 127
+        try:
+            picture = encode(flat, header.format)
+        except InputError as error:
+            raise InputError(f"{record.name}: {error}") from error
+        yield picture, usable if mask is not None or not usable.all() else None
 
 
 def _lay_out(how: Undistortion, pixels: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.uint8]]:
@@ -270,7 +291,7 @@ def _lay_out(how: Undistortion, pixels: NDArray[Any]) -> tuple[NDArray[Any], NDA
     cv2.setNumThreads(1)
     size, final = (how.plane.width, how.plane.height), (how.camera.width, how.camera.height)
     if has_distortion(how.source):
-        flat, shown = resample(how.source, how.plane.params, size, pixels)
+        flat, shown = resample(how.source, how.plane.params, size, pixels, how.plane_from_cam)
     else:
         flat, shown = pixels, np.full(size[::-1], 255, np.uint8)
     if final != size:
@@ -287,11 +308,12 @@ def _write_model(job: _Job, model: Reconstruction, keypoints: list[NDArray[np.fl
     job.workspace.write_models([flat], moved)
     for name in MODEL_FILES:
         _share(job.workspace.model() / name, job.workspace.folder / "sparse" / name)
-    names = [photographs.records[i].name for i in kept]
-    masks = [job.workspace.folder / MASKS / f"{name}.png" for name in names]
+    pictures = [(each.name_of(photographs.records[i].name), each) for i in kept for each in job.undistortions[i]]
+    masks = [job.workspace.folder / MASKS / f"{name}.png" for name, _ in pictures]
     return UndistortNumbers(
-        num_images=len(kept),
-        num_copied=sum(each.is_identity for each in undistortions),
+        num_images=len(pictures),
+        num_faces=sum(each.face is not None for _, each in pictures),
+        num_copied=sum(each.is_identity for _, each in pictures),
         num_masks=sum(path.is_file() for path in masks),
         cameras=[UndistortedCamera(width=c.width, height=c.height, params=c.params.tolist()) for c in flat.cameras],
         num_points=int(flat.is_triangulated.sum()),

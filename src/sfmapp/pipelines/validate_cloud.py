@@ -64,7 +64,7 @@ def validate_cloud(
     limit = _distance(folder, distance, float(sim[7]))
     ground_truth = _points(read_ply_geometry(Path(ground_truth_cloud)), limit, os.fspath(ground_truth_cloud), notes)
     if not np.isfinite(ground_truth).all(axis=1).any():
-        raise InputError(f"{ground_truth_cloud}: expected true points, found none that is finite")
+        raise InputError(f"{ground_truth_cloud}: expected finite ground-truth points, found none")
     events.advanced("validate")
     found: dict[str, tuple[NDArray[np.float64], CloudScore]] = {}
     for name, path in files.items():
@@ -127,7 +127,9 @@ def _alignment(folder: Path, ground_truth_poses: Path, notes: list[str]) -> NDAr
     ground_truth = ground_truth_in_stored_pixels(ground_truth, model, orientations_of(folder), notes)
     errors = evaluate_poses(model.image_names, model.cam_from_world, ground_truth.names, ground_truth.cam_from_world)
     if errors.reference_from_estimate is None:
-        raise InputError(f"{ground_truth_poses}: expected two true cameras of photographs of the model, found fewer")
+        raise InputError(
+            f"{ground_truth_poses}: expected ground-truth cameras of two photographs of the model, found fewer"
+        )
     residual = np.nanmedian(errors.center_error)
     notes.append(
         f"moved by a similarity fitted to {int(errors.is_common.sum())} cameras, median residual {residual:.4g}"

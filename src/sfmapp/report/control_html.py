@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.georeference.control_report import ControlledModel, ControlPointRow, ControlReport, UnitsReport
+from sfmapp.georeference.pose_report import PosesReport
 from sfmapp.report.page import table
 from sfmapp.report.top_view import HEIGHT, WIDTH, fit_page
 from sfmapp.report.world_map import nice_length, scale_bar
@@ -67,6 +68,31 @@ def units_section(report: UnitsReport) -> str:
     head = [("t", "known length"), ("", "m"), ("", "sigma"), ("", "in the model"), ("", "left out"), ("", "expected")]
     texts = "".join(f"<li>{escape(line)}</li>" for line in lines)
     return f"<h2>Metres and up</h2><ul>{texts}</ul>" + (table(head, rows) if rows else "")
+
+
+def poses_section(report: PosesReport) -> str:
+    """Known poses beside those of the models."""
+    lines = []
+    for model in report.models:
+        text = f"not in the frame of known poses: {model.reason}"
+        if model.sigma is not None and model.sigma_deg is not None:
+            how = "held" if report.is_fixed else "leaned on"
+            text = (
+                f"{model.num_used} of {model.num_known} known poses {how}; good to {model.sigma:.2g} along each axis "
+                f"and {model.sigma_deg:.2g} degrees about each"
+            )
+        lines.append(f"model {model.model}: {text}")
+    rows = [
+        [
+            ("t green" if image.is_used else "t red", image.name),
+            *(("", None if value is None else f"{value:.3g}") for value in (image.off, image.off_deg, image.sigmas)),
+            ("w", image.reason),
+        ]
+        for image in report.images
+    ]
+    head = [("t", "photograph"), ("", "off"), ("", "degrees"), ("", "sigmas"), ("t", "")]
+    texts = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    return f'<h2>Known poses</h2><p class="dim">{escape(report.path)}</p><ul>{texts}</ul>' + table(head, rows)
 
 
 def _points(points: Sequence[ControlPointRow]) -> str:

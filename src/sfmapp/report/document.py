@@ -13,6 +13,7 @@ from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.contradictions import Contradiction
 from sfmapp.features.report import FEW_FEATURES
 from sfmapp.georeference.control_report import ControlReport
+from sfmapp.georeference.pose_report import PosesReport
 from sfmapp.mapping.report import FocalEvidence, MappedImage, ModelEntry, Uncertainty
 from sfmapp.report.model import CameraReport, Check, Failure, Funnel, ImageReport, Light
 
@@ -191,6 +192,18 @@ def check_control(control: ControlReport | None) -> list[Check]:
     light: Light = "red" if largest.reason else "amber" if wrong else "green"
     thresholds = "green: every point agrees with what the others expect of it; amber: see Ground control"
     return [Check(name="ground control", value=value, light=light, thresholds=thresholds)]
+
+
+def check_poses(poses: PosesReport | None) -> list[Check]:
+    """A light over known poses: amber where one is refuted, red where the largest model does not lie in their frame."""
+    if poses is None or not poses.models:
+        return []
+    refuted = sum(not image.is_used and image.model is not None for image in poses.images)
+    largest = poses.models[0]
+    light: Light = "red" if largest.reason else "amber" if refuted else "green"
+    value = largest.reason or f"{largest.num_used} of {largest.num_known} agree with the photographs"
+    thresholds = "green: photographs refute none; amber: see Known poses"
+    return [Check(name="known poses", value=value, light=light, thresholds=thresholds)]
 
 
 def _apart(models: Sequence[ModelEntry]) -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
-from sfmapp.report.control_html import control_section, units_section
+from sfmapp.report.control_html import control_section, poses_section, units_section
 from sfmapp.report.dense_html import dense_section
 from sfmapp.report.model import CameraReport, ImageReport, ReconstructionReport
 from sfmapp.report.page import adjustment_table, check_table, failure_box, log_table, render_page, table, usage_table
@@ -50,6 +50,8 @@ def render_html(
         body.append(world_section(placed, model if is_in_world else None))
     if report.stages.control is not None:
         body.append(control_section(report.stages.control, model))
+    if report.stages.poses is not None:
+        body.append(poses_section(report.stages.poses))
     if report.stages.units is not None:
         body.append(units_section(report.stages.units))
     if report.dense is not None:

@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 from sfmapp.adjust.options import AdjustReport
+from sfmapp.calibration.report import BoardReport
+from sfmapp.calibration.rig_report import RigReport
 from sfmapp.contradictions import Contradiction
 from sfmapp.dense.report import (
     CloudNumbers,
@@ -24,6 +26,7 @@ from sfmapp.errors import SfmError
 from sfmapp.evaluation.report import Statistics
 from sfmapp.features.report import FeaturesReport
 from sfmapp.georeference.control_report import ControlReport, UnitsReport
+from sfmapp.georeference.pose_report import PosesReport
 from sfmapp.georeference.report import GeoreferenceReport
 from sfmapp.images.report import ImagesReport
 from sfmapp.mapping.report import FocalEvidence, MappingReport, ModelEntry
@@ -269,6 +272,7 @@ class Stages(Report):
     matching: MatchingReport | None = None
     mapping: MappingReport | None = None
     control: ControlReport | None = None
+    poses: PosesReport | None = None
     units: UnitsReport | None = None
     georeference: GeoreferenceReport | None = None
     dense: DenseReport | None = None
@@ -325,11 +329,14 @@ class UndistortNumbers(Report):
     """What ``sfmapp undistort`` has written.
 
     Attributes:
+        num_images: pictures, which are the images of the model.
+        num_faces: how many of them are faces of a cube.
         num_copied: files that had no distortion.
         num_dropped: observations outside of the pictures, or in photographs that are missing.
     """
 
     num_images: int
+    num_faces: int
     num_copied: int
     num_masks: int
     cameras: Sequence[UndistortedCamera]
@@ -343,6 +350,24 @@ class UndistortReport(UndistortNumbers):
     """The report of ``sfmapp undistort``."""
 
     run: RunUsage
+
+
+class CalibrateReport(Report):
+    """The report of ``sfmapp calibrate``: of each way that was gone.
+
+    Attributes:
+        board: from photographs of a board.
+    """
+
+    board: BoardReport
+    run: RunFacts
+
+
+class CalibrateRigReport(Report):
+    """The report of ``sfmapp calibrate rig``."""
+
+    rig: RigReport
+    run: RunFacts
 
 
 class ExportReport(Report):

@@ -13,9 +13,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Union
 
+from sfmapp.calibration.file import CalibrationDocument
 from sfmapp.georeference.world_frame import Georeference
 from sfmapp.report.evaluation import EvaluationReport
 from sfmapp.report.model import (
+    CalibrateReport,
+    CalibrateRigReport,
     DenseRunReport,
     ExportReport,
     OdometryRunReport,
@@ -26,9 +29,9 @@ from sfmapp.report.model import (
 from sfmapp.report.validation import CloudValidation, Validation
 from sfmapp.reporting import Report, field_types
 
-# by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry and refine;
-# validation/report.json and validation/cloud.json; what evaluate, undistort and export print with --json; and
-# georeference.json
+# by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry, refine and
+# calibrate; calibration.json; validation/report.json and validation/cloud.json; what evaluate, undistort and export
+# print with --json; and georeference.json
 KINDS: Mapping[str, type[Report]] = {
     "reconstruct": ReconstructionReport,
     "dense": DenseRunReport,
@@ -38,6 +41,9 @@ KINDS: Mapping[str, type[Report]] = {
     "validate-cloud": CloudValidation,
     "evaluate": EvaluationReport,
     "undistort": UndistortReport,
+    "calibrate-board": CalibrateReport,
+    "calibrate-rig": CalibrateRigReport,
+    "calibration": CalibrationDocument,
     "export": ExportReport,
     "georeference": Georeference,
 }

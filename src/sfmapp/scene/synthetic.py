@@ -327,7 +327,9 @@ def _alike_correspondences(
 def _rig_images(rig: Rig, num_images: int) -> RigImages:
     frame, sensor = np.divmod(np.arange(num_images, dtype=np.int32), len(rig.cameras))
     if num_images % len(rig.cameras):
-        raise ValueError(f"expected a multiple of {len(rig.cameras)} images for a rig of so many, got {num_images}")
+        raise ValueError(
+            f"expected a multiple of {len(rig.cameras)} images, one for each camera of the rig, got {num_images}"
+        )
     return RigImages(frame, sensor, rig.cam_from_rig)
 
 

@@ -70,7 +70,7 @@ def read_euroc_sequence(mav: Path, events: Events, only: str | None = None) -> R
     cameras = [only] if only else [name for name in ("cam0", "cam1") if (mav / name).is_dir()]
     tables = [_read_frames(mav / name, events) for name in cameras]
     if len(tables) == 2 and not tables[0].keys() & tables[1].keys():
-        events.warned(STAGE, f"{mav / 'cam1'} is not used: no time in it is a time of cam0")
+        events.warned(STAGE, f"{mav / 'cam1'} is not used: none of its timestamps is one of cam0")
         cameras, tables = cameras[:1], tables[:1]
     stamps = list(tables[0])
     if len(tables) == 2:
@@ -89,7 +89,7 @@ def read_euroc_sequence(mav: Path, events: Events, only: str | None = None) -> R
     imu, ground_truth, notes = None, None, list[str]()
     if (mav / "imu0" / "data.csv").is_file():
         if body_from_cam is None:
-            events.warned(STAGE, f"{mav / 'imu0'} is not used: no calibration says where it sits (T_BS)")
+            events.warned(STAGE, f"{mav / 'imu0'} is not used: no calibration gives its pose (T_BS)")
         else:
             imu, note = read_imu(mav / "imu0" / "data.csv", body_from_cam, times)
             notes.append(note)

@@ -238,7 +238,7 @@ def _rig(
         camera = _guessed_camera(sizes[0], first)
         events.decided(
             STAGE,
-            f"no calibration: a focal length of {camera.focal:.0f} px is assumed to begin with",
+            f"no calibration: a focal length of {camera.focal:.0f} px is assumed at first",
             focal_px=camera.focal, focal_source=camera.focal_source,
         )  # fmt: skip
         return Rig.single(camera)
@@ -390,7 +390,7 @@ def _imu(
     if options.imu is not None:
         return _given_imu(options.imu, body_from_cam, clock.own, events)
     if recording.imu is not None and clock.own_s is not clock.frames_s:
-        events.warned(STAGE, "the IMU is not used: it shares the clock of the sequence, in whose place --fps was given")
+        events.warned(STAGE, "the IMU is not used: its clock is that of the sequence, which --fps replaces")
         return None
     return recording.imu
 
@@ -442,7 +442,8 @@ def _read_ground_truth(
     poses = file.cam_from_world
     if times is None:
         raise InputError(
-            f"{path}: expected a trajectory with times, as the frames of a video are known by them, found KITTI's form",
+            f"{path}: expected a trajectory with timestamps, by which the frames of a video are matched, "
+            "found KITTI's form",
             "write it as TUM has it: timestamp tx ty tz qx qy qz qw",
         )
     chosen = rows_of_frames(len(poses), first)
@@ -459,7 +460,7 @@ def _given_imu(given: str, body_from_cam: Array | None, times: Times | None, eve
     path = Path(given) / "data.csv" if Path(given).is_dir() else Path(given)
     if body_from_cam is None:
         raise InputError(
-            f"{path}: expected to know where the IMU sits, found no T_BS or T_cam_imu in the camera's calibration",
+            f"{path}: expected the pose of the IMU (T_BS or T_cam_imu) in the camera's calibration, found none",
             "give --camera a sensor.yaml of EuRoC or a camchain.yaml of Kalibr, which hold it",
         )
     imu, note = read_imu(path, body_from_cam, times)

@@ -80,7 +80,7 @@ class Job:
             UsageError: the folder holds something else, or another run is at work in it.
             InputError: it cannot be written.
         """
-        from threadpoolctl import threadpool_limits
+        from sfmapp.adjust.linear import one_blas_thread
 
         source, events = os.fspath(source), events or Events()
         with ExitStack() as stack:
@@ -89,8 +89,7 @@ class Job:
             events.subscribe(log)
             stack.callback(events.unsubscribe, log)
             lines = stack.enter_context(EventLog(workspace.log, events, source=source, version=sfmapp.__version__))
-            # our workers use the cores; sums must not depend on how many the linear algebra beneath them would use
-            stack.enter_context(threadpool_limits(1, "blas"))
+            stack.enter_context(one_blas_thread())
             options = with_absolute_paths(options or Options())
             job = cls(source, workspace, options, events, watch or Stopwatch(), log, stack, **own)
             job.listen(lines)
@@ -141,7 +140,7 @@ class Job:
             return False
         recording.unlink()
         self.workspace.note(recording=FAILED)
-        self.events.warned("recording", f"{recording} is given up: the disk is full, and the rest matters more")
+        self.events.warned("recording", f"{recording} is deleted: the disk is full, and the results matter more")
         return True
 
     def took(self, *, is_up_to_date: bool = False) -> RunUsage:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from sfmapp.images.products import FORMAT_NAME, MANIFEST
 
 __all__ = [
+    "CALIBRATE",
     "DENSE",
     "FORMAT",
     "LOCK",
@@ -20,6 +21,7 @@ __all__ = [
 FORMAT = f"{FORMAT_NAME} 1"
 # the commands that write workspaces; manifests of before the second one name none
 RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "refine", "dense", "undistort"
+CALIBRATE = "calibrate"
 LOCK, REPORT = ".lock", "report.json"
 # where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0
 USUAL_FOLDERS = ("images", "../images", "../../images")

@@ -25,7 +25,7 @@ def locked(path: Path) -> Iterator[None]:
             if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
                 raise
             raise UsageError(
-                f"another run (process {owner or 'unknown'}) is at work in {path.parent}",
+                f"another run (process {owner or 'unknown'}) is running in {path.parent}",
                 "wait for it to end, stop it, or choose another OUT",
             ) from error
         # the run before us may have taken the file away between our open and our lock

@@ -180,7 +180,7 @@ def missing_photographs(folder: Path, manifest: Manifest) -> InputError:
     """What to say where the photographs of a reconstruction are wanted and :func:`image_root` is None."""
     if manifest.source == IN_MEMORY:
         return InputError(
-            f"{folder}: its photographs were arrays in memory, of which no pixels were kept",
+            f"{folder}: its photographs were arrays in memory, whose pixels were not kept",
             "write them as files under the names that they have in the model, and give that folder: --images DIR",
         )
     place = manifest.image_root or manifest.source or "a folder that run.json does not name"
@@ -219,7 +219,7 @@ def _check_ended(folder: Path, manifest: Manifest) -> None:
     """Refuse an odometry run that is still at work or was cut off: its files may be those of an earlier run."""
     if manifest.stage(ODOMETRY).is_done is False:
         raise InputError(
-            f"{folder}: expected a run that has ended, found one that is still at work or was cut off",
+            f"{folder}: expected a run that has ended, found one that is still running or was interrupted",
             f"what it has tracked is in {folder / 'trajectory_live.tum'}; sfmapp odometry begins again",
         )
 

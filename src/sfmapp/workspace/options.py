@@ -23,6 +23,7 @@ from sfmapp.errors import SfmError, UsageError
 from sfmapp.features.extract import FeatureOptions
 from sfmapp.georeference.control_options import ControlOptions
 from sfmapp.georeference.options import GpsOptions
+from sfmapp.georeference.pose_options import PoseOptions
 from sfmapp.georeference.unit_options import UnitOptions
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.images.sequence import SequenceOptions
@@ -43,7 +44,7 @@ class Options:
 
     Attributes:
         images, features, pairs, matching, mapping, adjust, gps: the options of the stages of a reconstruction.
-        control, units: ground control points of a reconstruction, or known lengths and the vertical.
+        control, units, poses: ground control points of a reconstruction, known lengths and the vertical, known poses.
         dense, surface: those of patches and of the mesh that is made of them.
         sequence, odometry, scale: those of odometry.
         seed: where every random choice starts; the same seed gives the same bytes.
@@ -59,6 +60,7 @@ class Options:
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
     control: ControlOptions = field(default_factory=ControlOptions)
     units: UnitOptions = field(default_factory=UnitOptions)
+    poses: PoseOptions = field(default_factory=PoseOptions)
     gps: GpsOptions = field(default_factory=GpsOptions)
     dense: DenseOptions = field(default_factory=DenseOptions)
     surface: SurfaceOptions = field(default_factory=SurfaceOptions)
@@ -117,9 +119,10 @@ def with_absolute_paths(options: Options) -> Options:
     """The same options, good in any working directory."""
     images = _with_absolute_paths(options.images, "camera", "mask_path")
     control = _with_absolute_paths(options.control, "file")
+    poses = _with_absolute_paths(options.poses, "file")
     sequence = _with_absolute_paths(options.sequence, "camera", "imu", "ground_truth")
     gps = options.gps if options.gps.source in ("exif", "none") else _with_absolute_paths(options.gps, "source")
-    return dataclasses.replace(options, images=images, control=control, sequence=sequence, gps=gps)
+    return dataclasses.replace(options, images=images, control=control, poses=poses, sequence=sequence, gps=gps)
 
 
 def _with_absolute_paths(stage: Any, *names: str) -> Any:

@@ -174,9 +174,7 @@ def scale_from_distance(
     variance = 0.0
     for pose, covariance in ((cam_from_world_a, covariance_a), (cam_from_world_b, covariance_b)):
         if covariance is not None:
-            # x_cam <- exp(w) x_cam + v turns the camera about its own centre and moves that by -R^T v
-            along = rigid3.rotation_matrix(pose) @ (line / distance)
-            variance += float(along @ np.asarray(covariance, np.float64)[3:, 3:] @ along)
+            variance += float(line @ rigid3.center_covariance(pose, covariance) @ line) / distance**2
     sigma = float(np.hypot(np.sqrt(variance) / distance, length.sigma_m / length.metres))
     evidence = DistanceEvidence(metres=length.metres, sigma_m=length.sigma_m, distance_map_units=distance)
     return ScaleEstimate(length.metres / distance, sigma, "distance", evidence)

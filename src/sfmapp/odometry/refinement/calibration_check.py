@@ -551,10 +551,10 @@ def _contradiction(first: _Look, last: _Look, report: CalibrationCheck, unknowns
         focal[1] *= math.exp(last.step[0])
     return Contradiction(
         "given calibration",
-        f"the images contradict the given calibration by {report.surprise:.0f} where shared errors make up to "
-        f"{report.max_surprise:.0f}: a focal length of {focal[0]:.1f} px is given, they lead to {focal[1]:.1f}"
-        + ("" if report.is_settled else " and have not settled there"),
-        "calibrate the camera, or give a focal length that is nearer the right one",
+        f"the images contradict the given calibration by {report.surprise:.0f} where shared errors explain up to "
+        f"{report.max_surprise:.0f}: a focal length of {focal[0]:.1f} px is given, they indicate {focal[1]:.1f}"
+        + ("" if report.is_settled else ", and more refinement would change it further"),
+        "calibrate the camera, or give a better focal length",
         {k: report[k] for k in ("surprise", "max_surprise", "is_settled", "change")},
         rotation_sigma_deg=max(share * float(np.degrees(np.sqrt((turn**2).mean()))), 180.0 * torn),
         position_sigma_share=max(share * float(np.sqrt((shift**2).mean())) / size, torn),

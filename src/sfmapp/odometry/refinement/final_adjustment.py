@@ -226,8 +226,8 @@ def _question(
     if answer.scale_sigma is not None and answer.scale_sigma > _SCALE_OPEN:
         events.warned(
             STAGE,
-            f"the unit of length is known to {answer.scale_sigma:.1%} only: on so straight a path, or with points so "
-            "far, the images do not tell how long the lenses are and how the cameras are turned against each other",
+            f"the scale is known only to {answer.scale_sigma:.1%}: on so straight a path, or with points so far away, "
+            "the images do not determine the focal lengths and the relative rotation of the cameras",
         )
     return answer
 

@@ -93,7 +93,7 @@ def plan_source(job: DenseJob) -> tuple[DensePlan, ViewsReport]:
     """
     where = job.known
     if not has_model(where.model):
-        raise InputError(f"{where.model}: the model that this workspace was made of is gone", "bring it back")
+        raise InputError(f"{where.model}: the model that this workspace was made from is gone", "restore it")
     model, _ = read_model(where.model, job.events)
     photographs = find_photographs(
         model, where.images, job.options.images,
@@ -206,7 +206,7 @@ def _image_folder(model: Path, images: str | os.PathLike[str] | None) -> Path:
         if (model / name).is_dir():
             return model / name
     looked = ", ".join(os.path.normpath(model / name) for name in USUAL_FOLDERS)
-    raise UsageError(f"where are the photographs of {model}?", f"give --images DIR; there is no {looked}")
+    raise UsageError(f"{model}: expected its photographs in {looked}, found no such folder", "give --images DIR")
 
 
 def model_digest(model: Path) -> str:

@@ -52,7 +52,7 @@ class GrowingTrajectories:
                 self._append(seen)
             except OSError as last:
                 self._has_failed = True
-                self._events.warned("odometry", f"poses cannot be written as they come: {last.strerror}")
+                self._events.warned("odometry", f"live poses cannot be written: {last.strerror}")
 
     def close(self) -> None:
         """Close the files, before the final ones take their place."""

@@ -23,6 +23,7 @@ from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import Sequence
 from sfmapp.mapping import structure
 from sfmapp.mapping.options import MappingOptions
+from sfmapp.mapping.settling import Round, adjust_until_settled, round_options
 from sfmapp.odometry.result import MapResult, OdometryResult
 from sfmapp.pipelines.odometry.add_photos import PhotoResult, add_photos
 from sfmapp.pipelines.odometry.results import read_odometry, write_trajectories
@@ -54,7 +55,6 @@ STAGE = "refinement"
 FOLDER = "refined"
 # How far a calibration may be off that is freed: as in the last adjustment of odometry.
 _FOCAL_SIGMA = 0.01
-_MAX_ROUNDS = 6
 # Residuals are not believed to be better than that, however well a synthetic sequence fits.
 _MIN_SIGMA_PX = 0.02
 # Nor is an observation refused for less than half a pixel.
@@ -119,7 +119,7 @@ def _open_sequence(manifest: Manifest, job: Job, *, required: bool) -> Sequence 
     except InputError as error:
         if required:
             raise
-        job.events.warned(STAGE, f"the sequence is not there any more, nor is its ground truth: {error}")
+        job.events.warned(STAGE, f"the sequence and its ground truth are gone: {error}")
         return None
 
 
@@ -171,24 +171,27 @@ def adjusted(
     model = model.copy()
     model.cameras = [replace(camera, is_fixed=not free_intrinsics) for camera in model.cameras]
     priors = [replace(camera, focal_sigma=_FOCAL_SIGMA * camera.focal) for camera in model.cameras]
-    for _ in range(_MAX_ROUNDS):
-        used = model.obs_is_inlier.copy()
-        sigma_px = structure.residual_scale_px(model, _MIN_SIGMA_PX)
-        report = FactorGraph(model, adjust.robust(sigma_px), prior_cameras=priors, noise_px=1.0).optimize()
+
+    def adjust_once(num_steps: int) -> Round:
+        before = model.obs_is_inlier.copy()
+        chosen = round_options(adjust.robust(sigma_px), num_steps)
+        report = FactorGraph(model, chosen, prior_cameras=priors, noise_px=1.0).optimize()
         events.decided(STAGE, f"closing adjustment: {report.text}", **report)
-        sigma_px = structure.residual_scale_px(model, _MIN_SIGMA_PX)
-        limit_px = mapping.max_reprojection_error_sigmas * sigma_px
+        limit_px = mapping.max_reprojection_error_sigmas * structure.residual_scale_px(model, _MIN_SIGMA_PX)
         limit_px = float(np.clip(limit_px, _MIN_LIMIT_PX, mapping.max_reprojection_error_px))
         structure.filter_observations(model, mapping, pool, None, limit_px)
         structure.triangulate(model, np.flatnonzero(~model.is_triangulated), mapping, pool, limit_px)
-        changed = int((used != model.obs_is_inlier).sum())
+        made = Round(report, before, model.obs_is_inlier.copy())
         summary = model.summary()
         text = f"{summary.num_points} points, {summary.mean_reprojection_error_px:.3f} px"
-        events.decided(STAGE, f"adjusted: {changed} observations changed sides; {text}", **summary)
+        events.decided(
+            STAGE, f"adjusted: {made.num_changed} observations became inliers or outliers; {text}", **summary
+        )
         events.raise_if_cancelled()
-        if changed <= 1e-3 * used.sum():
-            break
-    return model, report
+        return made
+
+    sigma_px = structure.residual_scale_px(model, _MIN_SIGMA_PX)
+    return model, adjust_until_settled(adjust_once, STAGE, events)
 
 
 def in_previous_gauge(entry: MapResult, model: Reconstruction) -> MapResult:

@@ -60,7 +60,7 @@ def self_calibrated(source: str, options: Options, events: Events) -> tuple[Opti
     frames = choose_frames(sequence)
     if len(frames) < MIN_FRAMES:
         raise InputError(
-            f"{source}: the picture moves too little to calibrate with: {len(frames)} views that differ, "
+            f"{source}: the picture moves too little to calibrate: {len(frames)} distinct views, "
             f"at least {MIN_FRAMES} are needed",
             f"begin where the camera moves (--start), or {ADVICE}",
         )
@@ -69,7 +69,7 @@ def self_calibrated(source: str, options: Options, events: Events) -> tuple[Opti
     text = ",".join([found.model, *(f"{value!r}" for value in found.params.values())])
     events.finished(STAGE, found.text)
     if not found.is_settled:
-        events.warned(STAGE, f"the calibration is not settled: {found.text}")
+        events.warned(STAGE, f"the calibration is uncertain: {found.text}")
     return replace(options, sequence=replace(wanted, camera=text)), found
 
 
@@ -207,7 +207,7 @@ def widen(result: OdometryResult, calibration: CalibrationReport) -> None:
     relative = calibration.focal_sigma_relative
     found = Contradiction(
         "self-calibration",
-        f"the focal length is known to {100 * relative:.1f} % only: parts of the first minute contradict each other",
+        f"the focal length is known only to {100 * relative:.1f} %: parts of the first minute contradict each other",
         f"begin where the camera moves sideways and turns (--start), or {ADVICE}",
         {"focal_sigma_relative": relative, "settled": SETTLED_SIGMA, "parts": calibration.fit.parts},
         # a turn of 90 degrees is seen wrong by the same share, and so is what follows it

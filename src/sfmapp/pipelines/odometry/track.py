@@ -81,7 +81,9 @@ def track_sequence(
     sequence = None if isinstance(source, str | os.PathLike) else source
     name = os.fspath(source) if isinstance(source, str | os.PathLike) else source.source
     if sequence is not None and self_calibrate:
-        raise UsageError("frames in memory come with their camera, and cannot be looked at twice to calibrate it")
+        raise UsageError(
+            "frames in memory come with their camera, which they cannot calibrate: they are read only once"
+        )
     if options is not None and options.adjust.backend != "schur":
         raise UsageError(
             "odometry cannot take adjust.backend=gtsam: it adjusts windows while it tracks, and with one factor per "
@@ -159,7 +161,7 @@ def no_map(run: Tracking, result: OdometryResult) -> NoReconstructionError:
     num_repeated = int((result.frame_state == FrameState.REPEATED).sum())
     if num_repeated == seen - 1:
         return NoReconstructionError(f"{run.source}: all {seen} frames show the same picture", NO_MAP_ADVICE)
-    text = f"{run.source}: {seen} frames were read, but no map could be begun"
+    text = f"{run.source}: {seen} frames were read, but no map could be initialized"
     if (report := result.report) is None:
         return NoReconstructionError(text, NO_MAP_ADVICE)
     for against in report.pairs:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sfmapp.images.sequence import Sequence
     from sfmapp.pipelines.odometry.scale import ScaleRequest
 
-GIVEN_UP = "given up, for the disk is full, and the rest matters more"
+GIVEN_UP = "given up, for the disk is full, and the results matter more"
 
 
 @dataclass(kw_only=True)

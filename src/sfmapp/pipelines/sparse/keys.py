@@ -10,6 +10,7 @@ from sfmapp.workspace.options import Options, options_to_dict
 
 if TYPE_CHECKING:
     from sfmapp.formats.control_points import ControlPoints
+    from sfmapp.georeference.pose_stage import PoseFile
     from sfmapp.images.image_set import ImageSet
 
 
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
 FEATURES, PAIRS, MATCHING = ("sfmapp.features.extract",), ("sfmapp.matching.pairs",), ("sfmapp.matching.stage",)
 MAPPING = (
     "sfmapp.mapping.incremental", "sfmapp.formats.colmap", "sfmapp.georeference.stage",
-    "sfmapp.georeference.control_stage", "sfmapp.pipelines.sparse.units",
+    "sfmapp.georeference.control_stage", "sfmapp.georeference.pose_stage", "sfmapp.mapping.known_poses",
+    "sfmapp.pipelines.sparse.units",
 )  # fmt: skip
 
 
@@ -41,8 +43,10 @@ class StageKeys:
         return f"{self.features}:{self.inputs[name]}"
 
 
-def stage_keys(options: Options, image_set: ImageSet, control: ControlPoints | None = None) -> StageKeys:
-    """Keys of all stages for these photographs, options and ground control points."""
+def stage_keys(
+    options: Options, image_set: ImageSet, control: ControlPoints | None = None, poses: PoseFile | None = None
+) -> StageKeys:
+    """Keys of all stages for these photographs, options, ground control points and known poses."""
     inputs = {record.name: input_key(record) for record in image_set.images}
     features = stage_key(FEATURES, options.features)
     images = [features, list(inputs.items()), options.seed]
@@ -55,6 +59,8 @@ def stage_keys(options: Options, image_set: ImageSet, control: ControlPoints | N
     measured = [record.position and asdict(record.position) for record in image_set.images]
     adjust = options_to_dict(options.adjust)
     world = [options_to_dict(options.gps), measured, _control_key(control), options_to_dict(options.units)]
+    if poses is not None:
+        world.append([options_to_dict(options.poses), poses.cam_from_world.tolist()])
     mapping = stage_key(MAPPING, options.mapping, adjust, pairs, matching, priors, world)
     return StageKeys(inputs, features, pairs, matching, mapping)
 

@@ -22,7 +22,7 @@ from sfmapp.pipelines.sparse import results
 from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
 from sfmapp.pipelines.sparse.known_lengths import parse_known_lengths
 from sfmapp.pipelines.sparse.run import Run
-from sfmapp.pipelines.sparse.world import closing, read_control
+from sfmapp.pipelines.sparse.world import closing, has_factors, held_poses, read_control, read_known_poses
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.kernels import kernels_compiling
 from sfmapp.workspace.layout import RECONSTRUCT
@@ -99,8 +99,9 @@ def _run(run: Run) -> ReconstructionReport:
         run.image_set = with_positions(image_set, run.options.gps)
         run.stages = replace(run.stages, images=images)
     run.control = read_control(run, run.image_set)
+    run.poses = read_known_poses(run, run.image_set)
     run.known = parse_known_lengths(run.options.units.known, run.image_set.names)
-    keys = stage_keys(run.options, run.image_set, run.control)
+    keys = stage_keys(run.options, run.image_set, run.control, run.poses)
     if report := results.earlier_report(run, keys):
         return report
     run.workspace.note(image_root=os.fspath(run.image_set.root or ""))
@@ -116,11 +117,12 @@ def _run(run: Run) -> ReconstructionReport:
 def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconstruction]:
     """From photographs to models, the largest first."""
     from sfmapp.mapping.incremental import map_images
+    from sfmapp.mapping.known_poses import map_known_poses
 
     options, events, threads = run.options, run.events, run.threads
     if len(image_set.images) < 2:
         raise _too_few_photographs(image_set)
-    import_ahead(len(image_set.images))
+    import_ahead(len(image_set.images), with_factors=has_factors(run, image_set))
     feature_keys = [keys.of_features(record.name) for record in image_set.images]
     with (
         kernels_compiling(events, run.usage),
@@ -145,10 +147,15 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
             store.flush()
             run.stages = replace(run.stages, matching=matched)
     with run.stage("mapping"):
-        models, mapped = map_images(
-            image_set, run.features, run.correspondences, options.mapping,
-            adjust_options=options.adjust, threads=threads, events=events, closing=closing(run, image_set),
-        )  # fmt: skip
+        given = (image_set, run.features, run.correspondences, options.mapping)
+        if run.poses is not None and options.poses.fixed:
+            models, mapped = map_known_poses(
+                *given, adjust_options=options.adjust, threads=threads, events=events, poses=held_poses(run, run.poses)
+            )
+        else:
+            models, mapped = map_images(
+                *given, adjust_options=options.adjust, threads=threads, events=events, closing=closing(run, image_set)
+            )
         run.stages = replace(run.stages, mapping=mapped)
     return models
 

@@ -19,6 +19,7 @@ from sfmapp.report.document import (
     FORMAT,
     camera_rows,
     check_control,
+    check_poses,
     funnel_of_images,
     funnel_without_matches,
     make_checks,
@@ -131,7 +132,13 @@ def _make_report(
         outcome=Outcome.of(failure),
         run=run.facts(),
         models=entries,
-        checks=[*make_checks(entries, images, cameras), *check_control(run.stages.control)] if models else [],
+        checks=[
+            *make_checks(entries, images, cameras),
+            *check_control(run.stages.control),
+            *check_poses(run.stages.poses),
+        ]
+        if models
+        else [],
         images=images,
         skipped=[NamedReason(name=name, reason=reason) for name, reason in run.image_set.skipped],
         cameras=cameras,

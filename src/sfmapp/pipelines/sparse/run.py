@@ -12,6 +12,7 @@ from sfmapp.workspace.job import Job
 
 if TYPE_CHECKING:
     from sfmapp.formats.control_points import ControlPoints
+    from sfmapp.georeference.pose_stage import PoseFile
     from sfmapp.georeference.world_frame import Georeference
     from sfmapp.images.image_set import ImageSet
     from sfmapp.pipelines.sparse.known_lengths import KnownLength
@@ -28,7 +29,7 @@ class Run(Job):
         recorder: watches the run for a recording; None if none is wanted.
         image_set, features, correspondences: results so far.
         stages: what each stage has said.
-        control: ground control points that it was given; known: lengths.
+        control: ground control points that it was given; known: lengths; poses: of photographs.
         georeference: where models lie in the world; None where they do not.
     """
 
@@ -40,4 +41,5 @@ class Run(Job):
     stages: Stages = field(default_factory=Stages)
     control: ControlPoints | None = None
     known: list[KnownLength] = field(default_factory=list)
+    poses: PoseFile | None = None
     georeference: Georeference | None = None

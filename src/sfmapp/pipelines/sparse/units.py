@@ -131,10 +131,8 @@ def _between_images(mapper: Mapper, known: KnownLength) -> ScaleBar | str:
     options, varying, noise_px = mapper.closing_options()
     graph = FactorGraph(model, options, varying=varying, prior_cameras=mapper.prior_cameras, noise_px=noise_px)
     joint = graph.marginal_covariance(images=[a, b])
-    # c = -R^T t moves by -R^T v
-    slope = np.zeros(12)
-    slope[3:6] = rigid3.rotation_matrix(model.cam_from_world[a]) @ line / length
-    slope[9:12] = -rigid3.rotation_matrix(model.cam_from_world[b]) @ line / length
+    moves = rigid3.center_jacobian(model.cam_from_world[[a, b]])
+    slope = np.concatenate([-moves[0].T @ line, moves[1].T @ line]) / length
     return ScaleBar(
         known.text, known.length.metres, known.length.sigma_m, length, float(np.sqrt(slope @ joint.matrix @ slope))
     )

@@ -6,11 +6,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from sfmapp.errors import UsageError
 from sfmapp.formats.control_points import ControlPoints, read_control_points
 from sfmapp.pipelines.sparse.run import Run
 
 if TYPE_CHECKING:
+    from sfmapp.georeference.pose_stage import PoseFile
     from sfmapp.images.image_set import ImageSet
+    from sfmapp.mapping.known_poses import HeldPoses
     from sfmapp.mapping.mapper import Mapper
 
 
@@ -33,8 +36,58 @@ def read_control(run: Run, image_set: ImageSet) -> ControlPoints | None:
     return control
 
 
+def has_factors(run: Run, image_set: ImageSet) -> bool:
+    """Whether models are adjusted to more than photographs: to positions, known poses or control points."""
+    has_positions = any(record.position is not None for record in image_set.images)
+    return has_positions or run.poses is not None or run.control is not None
+
+
+def read_known_poses(run: Run, image_set: ImageSet) -> PoseFile | None:
+    """The poses that a run was given, by photograph.
+
+    Raises:
+        InputError: the file is not what it has to be, or holds poses of other photographs.
+        UsageError: something else places the models too, or there is nothing to be held.
+    """
+    options = run.options
+    if options.poses.file is None:
+        if options.poses.fixed:
+            raise UsageError("--fix-poses needs known poses, found none", "give them: --pose-priors FILE")
+        return None
+    others = {"--gcp": options.control.file is not None, "--scale": bool(options.units.known),
+              "--up": options.units.up != "none", "--gps": options.gps.source not in ("exif", "none")}  # fmt: skip
+    beside = [name for name, is_given in others.items() if is_given]
+    if beside:
+        raise UsageError(
+            f"--pose-priors and {beside[0]} both set the frame of the models",
+            "give one of them; known poses bring their frame",
+        )
+    from sfmapp.georeference.pose_stage import read_poses
+
+    return read_poses(options.poses, image_set.names)
+
+
+def held_poses(run: Run, poses: PoseFile) -> HeldPoses:
+    """Known poses that stay, and what judges them in the end."""
+    from sfmapp.georeference.pose_stage import judge_held_poses
+    from sfmapp.mapping.known_poses import HeldPoses
+
+    def judge(mapper: Mapper) -> None:
+        run.stages = replace(run.stages, poses=judge_held_poses(mapper, poses, run.events))
+
+    return HeldPoses(poses.cam_from_world, judge)
+
+
 def closing(run: Run, image_set: ImageSet) -> Callable[[list[Mapper]], None] | None:
     """What is to be done with finished models; None where nothing is known of where they lie."""
+    poses = run.poses
+    if poses is not None:
+        from sfmapp.georeference.pose_stage import pose_models
+
+        def bring_to_poses(mappers: list[Mapper]) -> None:
+            run.stages = replace(run.stages, poses=pose_models(mappers, poses, run.events))
+
+        return bring_to_poses
     has_positions = any(record.position is not None for record in image_set.images)
     units = run.options.units
     if run.control is None and not has_positions and not run.known and units.up == "none":

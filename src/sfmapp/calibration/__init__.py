@@ -1,0 +1,1 @@
+"""Calibration of cameras: from boards, targets, lines and rigs to parameters with their sigmas."""

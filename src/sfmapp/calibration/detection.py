@@ -1,0 +1,389 @@
+"""Points of a board in a photograph.
+
+What a board looks like is found in a picture that is reduced to what that takes; where its points are is measured in
+the picture itself. A board may be half out of the picture: markers say which points are there, and of a chessboard any
+part is as good a plane as the whole, so that it is numbered from wherever it fits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.calibration.boards import Board
+from sfmapp.calibration.lattice import Lattice, find_lattice
+from sfmapp.calibration.markers import dictionary_of
+from sfmapp.calibration.symmetry import symmetric_points
+from sfmapp.calibration.zhang import homography
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Pixels = NDArray[np.uint8]
+
+# longer side of the picture in which boards are looked for
+_REDUCED_PX = 1600
+# half of the window in which a crossing is measured, at most: beyond, the bend of the lens counts, and nothing is
+# gained
+_WINDOW_PX = 16.0
+# a measured point that is further than this from where its neighbours have it is none, in fields
+_STRAY = 0.25
+# beside markers there are other crossings, of their cells, a tenth of a field away and more
+_STRAY_BESIDE_MARKERS = 0.08
+_NEIGHBORS = 9
+_AROUND = 14
+# of a marker's side: OpenCV's patterns and Kalibr's
+_TAG_BORDERS = (2, 1)
+
+
+@dataclass(frozen=True)
+class Detection:
+    """Points of a board in a photograph.
+
+    Attributes:
+        idx: (N,) int64, which of the board's points; without doubles.
+        xy: (N, 2) pixels, centres at halves.
+        sharpness_px: width over which edges blur, pixels of the photograph; NaN where it was not measured.
+        problem: why there are none; None where there are.
+    """
+
+    idx: Ints
+    xy: Array
+    sharpness_px: float = float("nan")
+    problem: str | None = None
+
+
+def detect_board(gray: Pixels, board: Board) -> Detection:
+    """Find a board.
+
+    Args:
+        gray: (H, W).
+
+    Returns:
+        The points that were found, or why there are none.
+    """
+    import cv2
+
+    cv2.setNumThreads(1)
+    scale = max(1.0, max(gray.shape) / _REDUCED_PX)
+    small = gray
+    if scale > 1.0:
+        size = (round(gray.shape[1] / scale), round(gray.shape[0] / scale))
+        small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    find = {"chessboard": _chessboard, "charuco": _charuco, "aprilgrid": _april_grid}.get(board.kind, _circles)
+    idx, xy = find(np.ascontiguousarray(small), board)
+    if len(idx) < 4:
+        return Detection(np.zeros(0, np.int64), np.zeros((0, 2)), problem=_nothing(board))
+    xy = (xy + 0.5) * [gray.shape[1] / small.shape[1], gray.shape[0] / small.shape[0]] - 0.5
+    if board.kind in ("circles", "acircles"):
+        xy = _disk_centers(gray, board, idx, xy)
+    else:
+        xy = _crossings(gray, board, idx, xy)
+    is_good = np.isfinite(xy).all(1) & _fits_neighbors(board, idx, xy)
+    idx, xy = idx[is_good], xy[is_good]
+    if len(idx) < 6 or np.ptp(board.points[idx, :2], axis=0).min() == 0.0:
+        return Detection(np.zeros(0, np.int64), np.zeros((0, 2)), problem=_nothing(board))
+    return Detection(idx, xy + 0.5, _edge_width(gray, board, idx, xy))
+
+
+def _nothing(board: Board) -> str:
+    what = {"chessboard": "corners of a chessboard", "charuco": "markers", "aprilgrid": "tags"}.get(
+        board.kind, f"a grid of {board.columns}x{board.rows} circles"
+    )
+    return f"no {what} were found"
+
+
+# ------------------------------------------------------------------------------------------------------- chessboards
+
+
+def _chessboard(gray: Pixels, board: Board) -> tuple[Ints, Array]:
+    wanted = board.columns * board.rows
+    lattice = find_lattice(gray, wanted)
+    found = None if lattice is None else _placed(lattice, board)
+    if found is not None and len(found[0]) == wanted:
+        return found
+    whole = _opencvs_chessboard(gray, board)
+    if whole is not None:
+        return np.arange(wanted), whole
+    return (np.zeros(0, np.int64), np.zeros((0, 2))) if found is None else found
+
+
+def _opencvs_chessboard(gray: Pixels, board: Board) -> Array | None:
+    """(N, 2) the corners of a whole chessboard as OpenCV's finders see it."""
+    import cv2
+
+    size = (board.columns, board.rows)
+    if min(size) < 3:
+        return None
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_FAST_CHECK
+    is_found, corners = cv2.findChessboardCornersSB(gray, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    if not is_found:
+        is_found, corners = cv2.findChessboardCorners(gray, size, flags=flags)
+    if not is_found:
+        return None
+    xy = corners.reshape(-1, 2).astype(np.float64)
+    if _is_mirrored(board, np.arange(len(xy)), xy):
+        xy = xy.reshape(board.rows, board.columns, 2)[:, ::-1].reshape(-1, 2)
+    return np.ascontiguousarray(xy)
+
+
+def _is_mirrored(board: Board, idx: Ints, xy: Array) -> bool:
+    ones = np.ones((len(idx), 1))
+    affine = np.linalg.lstsq(np.concatenate([board.points[idx, :2], ones], 1), xy, rcond=None)[0]
+    return bool(np.linalg.det(affine[:2]) < 0)
+
+
+def _placed(lattice: Lattice, board: Board) -> tuple[Ints, Array] | None:
+    """The corners of a board that a grid may be, turned by quarters until it fits; the first corner has a dark field
+    at its upper left where that tells the two ends of a board apart."""
+    columns, rows = (int(side) + 1 for side in lattice.places.max(0))
+    best: tuple[Ints, Array] | None = None
+    best_score = (0, -np.inf, -1)
+    strength = np.log(lattice.strength)
+    for turn in range(4):
+        c, r = lattice.places.T
+        sense = lattice.sense * (-1 if turn % 2 else 1)
+        size = (columns, rows) if turn % 2 == 0 else (rows, columns)
+        c, r = ((c, r), (r, columns - 1 - c), (columns - 1 - c, rows - 1 - r), (rows - 1 - r, c))[turn]
+        # a grid that is larger than the board has caught the outer edge, where a light margin makes weaker crossings
+        for left in range(max(1, size[0] - board.columns + 1)):
+            for top in range(max(1, size[1] - board.rows + 1)):
+                is_on = (left <= c) & (c < left + board.columns) & (top <= r) & (r < top + board.rows)
+                parity = (sense * (1 - 2 * ((c - left + r - top) % 2)))[is_on].sum()
+                score = (int(is_on.sum()), round(float(strength[is_on].sum()), 3), int(parity > 0))
+                if score > best_score:
+                    idx = ((r - top) * board.columns + (c - left))[is_on]
+                    best, best_score = (idx.astype(np.int64), lattice.xy[is_on]), score
+    return best
+
+
+# ------------------------------------------------------------------------------------------------------------ markers
+
+
+def _markers(gray: Pixels, dictionary: str, border: int) -> dict[int, Array]:
+    """(4, 2) corners of each marker, clockwise from its own top left."""
+    import cv2
+
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = border
+    parameters.minMarkerPerimeterRate = 0.015
+    parameters.adaptiveThreshWinSizeMax = 53
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary_of(dictionary), parameters).detectMarkers(gray)
+    if ids is None:
+        return {}
+    found: dict[int, Array] = {}
+    doubles = set()
+    for number, quad in zip(ids.ravel().tolist(), corners, strict=True):
+        if number in found:
+            doubles.add(number)
+        found[number] = quad.reshape(4, 2).astype(np.float64)
+    return {number: quad for number, quad in found.items() if number not in doubles}
+
+
+def _charuco(gray: Pixels, board: Board) -> tuple[Ints, Array]:
+    """Corners of squares, where the markers around have them."""
+    found = _markers(gray, board.dictionary, 1)
+    best: tuple[Ints, Array] = (np.zeros(0, np.int64), np.zeros((0, 2)))
+    best_error = np.inf
+    # OpenCV's boards begin with a dark square; those of before 4.6 with a light one where rows are even
+    for first in {0, board.rows % 2 ^ 1}:
+        places = [(c, r) for r in range(board.rows) for c in range(board.columns) if (r + c + first) % 2 == 1]
+        known = [number for number in found if number < len(places)]
+        if not known:
+            continue
+        gap = 0.5 * (board.spacing - board.marker)
+        corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * board.marker + gap
+        source = np.concatenate([np.array(places[n]) * board.spacing + corners for n in known])
+        target = np.concatenate([found[n] for n in known])
+        idx, xy, error = _predicted(source, target, board)
+        if error < best_error:
+            best, best_error = (idx, xy), error
+    return best
+
+
+def _predicted(source: Array, target: Array, board: Board) -> tuple[Ints, Array, float]:
+    """Where points of a board are by the corners of markers beside them, and how well those fit each other."""
+    idx, xy, errors = [], [], []
+    for i, point in enumerate(board.points[:, :2]):
+        distance = np.abs(source - point).max(1)
+        near = np.flatnonzero(distance < 1.01 * board.spacing)
+        if len(near) < 4:
+            continue
+        if len(near) < 8:  # one marker beside it: more from further away keep the plane from tipping
+            near = np.flatnonzero(distance < 2.01 * board.spacing)
+        h = homography(source[near], target[near])
+        mapped = np.concatenate([source[near], np.ones((len(near), 1))], 1) @ h.T
+        errors.append(np.sqrt(((mapped[:, :2] / mapped[:, 2:] - target[near]) ** 2).sum(1).mean()))
+        at = h @ [*point, 1.0]
+        idx.append(i)
+        xy.append(at[:2] / at[2])
+    if not idx:
+        return np.zeros(0, np.int64), np.zeros((0, 2)), np.inf
+    return np.array(idx, np.int64), np.array(xy), float(np.median(errors))
+
+
+def _april_grid(gray: Pixels, board: Board) -> tuple[Ints, Array]:
+    """Corners of tags. Their numbers say where they are; which corner is the first depends on the program that drew
+    them, and is told from the grid."""
+    num = board.columns * board.rows
+    found: dict[int, Array] = {}
+    for border in _TAG_BORDERS:
+        tags = _markers(gray, board.dictionary, border)
+        tags = {number: quad for number, quad in tags.items() if number < num}
+        if len(tags) > len(found):
+            found = tags
+    if len(found) < 2:
+        return np.zeros(0, np.int64), np.zeros((0, 2))
+    best: tuple[Ints, Array] = (np.zeros(0, np.int64), np.zeros((0, 2)))
+    best_error = np.inf
+    for turn in range(4):
+        idx, xy = [], []
+        for number, quad in found.items():
+            row, column = board.rows - 1 - number // board.columns, number % board.columns
+            first = 4 * (row * board.columns + column)
+            idx += [first + k for k in range(4)]
+            xy += list(np.roll(quad, turn, axis=0))
+        source, target = board.points[idx, :2], np.array(xy)
+        h = homography(source, target)
+        mapped = np.concatenate([source, np.ones((len(idx), 1))], 1) @ h.T
+        error = float(np.median(np.hypot(*(mapped[:, :2] / mapped[:, 2:] - target).T)))
+        if error < best_error:
+            best, best_error = (np.array(idx, np.int64), target), error
+    return best
+
+
+# ------------------------------------------------------------------------------------------------------------- circles
+
+
+def _circles(gray: Pixels, board: Board) -> tuple[Ints, Array]:
+    import cv2
+
+    size = (board.columns, board.rows)
+    flags = cv2.CALIB_CB_SYMMETRIC_GRID if board.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
+    parameters = cv2.SimpleBlobDetector_Params()
+    # as large as circles get where few fill the picture
+    parameters.maxArea = 0.05 * gray.size
+    parameters.minArea = 12.0
+    parameters.minDistBetweenBlobs = 4.0
+    for more in (0, cv2.CALIB_CB_CLUSTERING):
+        for picture in (gray, 255 - gray):  # dark on light, or light on dark
+            detector = cv2.SimpleBlobDetector_create(parameters)
+            is_found, centers = cv2.findCirclesGrid(picture, size, flags=flags | more, blobDetector=detector)
+            if is_found:
+                xy = centers.reshape(-1, 2).astype(np.float64)
+                idx = np.arange(len(xy))
+                if _is_mirrored(board, idx, xy):
+                    if board.kind == "acircles":  # the shift of every other row tells left from right
+                        return np.zeros(0, np.int64), np.zeros((0, 2))
+                    xy = xy.reshape(board.rows, board.columns, 2)[:, ::-1].reshape(-1, 2)
+                return idx, np.ascontiguousarray(xy)
+    return np.zeros(0, np.int64), np.zeros((0, 2))
+
+
+def _disk_centers(gray: Pixels, board: Board, idx: Ints, xy: Array) -> Array:
+    """Centres of mass of the disks near pixels (N, 2): each weighted by how far it is from the ground around it."""
+    axes = _axes(board, idx, xy)
+    found = np.full_like(xy, np.nan)
+    for i, at in enumerate(xy):
+        reach = 0.46 * np.abs(axes[i]).sum(0) * (1.0 if board.kind == "circles" else 1.25)
+        x, y = at
+        for _ in range(3):
+            left, right = int(np.ceil(x - reach[0])), int(np.floor(x + reach[0]))
+            top, bottom = int(np.ceil(y - reach[1])), int(np.floor(y + reach[1]))
+            if left < 0 or top < 0 or right >= gray.shape[1] or bottom >= gray.shape[0] or right - left < 2:
+                break
+            patch = gray[top : bottom + 1, left : right + 1].astype(np.float64)
+            dark, light = np.percentile(patch, 2.0), np.percentile(patch, 98.0)
+            border = np.median(np.concatenate([patch[0], patch[-1], patch[:, 0], patch[:, -1]]))
+            ground, disk = (light, dark) if abs(border - light) < abs(border - dark) else (dark, light)
+            if ground == disk:
+                break
+            weight = np.clip(((patch - ground) / (disk - ground) - 0.15) / 0.7, 0.0, 1.0)
+            total = weight.sum()
+            x = float((weight.sum(0) * np.arange(left, right + 1)).sum() / total)
+            y = float((weight.sum(1) * np.arange(top, bottom + 1)).sum() / total)
+            found[i] = x, y
+    return found
+
+
+# --------------------------------------------------------------------------------------------------------- measurement
+
+
+def _axes(board: Board, idx: Ints, xy: Array) -> Array:
+    """(N, 2, 2) pixels along a field's two sides at each point, by the points nearest to it."""
+    plane = board.points[idx, :2] / board.spacing
+    distances = ((plane[:, None] - plane[None]) ** 2).sum(2)
+    near = np.argsort(distances, axis=1, kind="stable")[:, :_NEIGHBORS]
+    source = plane[near] - plane[:, None]
+    target = xy[near] - xy[:, None]
+    square = np.einsum("nka,nkb->nab", source, source) + 1e-9 * np.eye(2)
+    found: Array = np.linalg.solve(square, np.einsum("nka,nkb->nab", source, target))
+    return found
+
+
+def _reach(board: Board) -> Array:
+    """(2,) how far the window goes along the edges and how far from the nearer of them, in fields, so that it sees
+    nothing but the four fields that meet."""
+    if board.kind == "charuco":
+        return np.array([0.45, 0.45 * (1.0 - board.marker / board.spacing)])
+    if board.kind == "aprilgrid":
+        return np.array([0.9 * board.marker, 0.1])
+    return np.array([0.45, 0.45])
+
+
+def _crossings(gray: Pixels, board: Board, idx: Ints, xy: Array) -> Array:
+    """Crossings near pixels (N, 2): first in a window as wide as the picture was reduced by, then once more from
+    there."""
+    found = np.ascontiguousarray(xy)
+    for _ in range(2):
+        out = np.empty_like(found)
+        is_known = np.isfinite(found).all(1)
+        axes = np.full((len(found), 2, 2), np.nan)
+        if is_known.sum() < 4:
+            return found
+        axes[is_known] = _axes(board, idx[is_known], found[is_known])
+        out = np.full_like(found, np.nan)
+        kept = np.empty((int(is_known.sum()), 2))
+        symmetric_points(gray, found[is_known], axes[is_known], _reach(board), _WINDOW_PX, kept)
+        out[is_known] = kept
+        found = out
+    return found
+
+
+def _fits_neighbors(board: Board, idx: Ints, xy: Array) -> NDArray[np.bool_]:
+    """(N,) bool: a point is where the plane through its neighbours has it, a part of a field either way."""
+    is_good: NDArray[np.bool_] = np.asarray(np.isfinite(xy).all(1))
+    where = np.flatnonzero(is_good)
+    if len(where) < 6:
+        return is_good
+    plane, pixels = board.points[idx[where], :2] / board.spacing, xy[where]
+    near = np.argsort(((plane[:, None] - plane[None]) ** 2).sum(2), axis=1, kind="stable")[:, 1 : _AROUND + 1]
+    steps = np.linalg.norm(_axes(board, idx[where], pixels), axis=2).min(1)
+    stray = _STRAY if board.kind in ("chessboard", "circles", "acircles") else _STRAY_BESIDE_MARKERS
+    for n, point in enumerate(where):
+        h = homography(plane[near[n]], pixels[near[n]])
+        at = h @ [*plane[n], 1.0]
+        off = np.hypot(*(at[:2] / at[2] - pixels[n])) if at[2] != 0 else np.inf
+        is_good[point] = off < max(stray * steps[n], 1.5)
+    return is_good
+
+
+def _edge_width(gray: Pixels, board: Board, idx: Ints, xy: Array) -> float:
+    """Median width over which the brightness changes from dark to light across the edges at the points, pixels: the
+    difference of both over the steepest slope."""
+    axes = _axes(board, idx, xy)
+    widths = []
+    for at, axis in zip(xy, axes, strict=True):
+        reach = min(_WINDOW_PX, 0.4 * float(np.linalg.norm(axis, axis=1).min()))
+        left, top = (round(value - reach) for value in at)
+        side = int(2 * reach) + 1
+        patch = gray[max(top, 0) : top + side, max(left, 0) : left + side].astype(np.float64)
+        if min(patch.shape) < 4:
+            continue
+        dy, dx = np.gradient(patch)
+        slope = np.percentile(np.hypot(dx, dy), 99.0)
+        if slope > 0:
+            widths.append(float((np.percentile(patch, 95.0) - np.percentile(patch, 5.0)) / slope))
+    return float(np.median(widths)) if widths else float("nan")

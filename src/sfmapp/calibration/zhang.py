@@ -1,0 +1,142 @@
+"""A first camera and first poses from views of planes: normalised DLT, and Zhang's closed form.
+
+Z. Zhang, "A flexible new technique for camera calibration", PAMI 22(11), 2000; the row of the system is that of its
+equation 8, v_ij = (h_i1 h_j1, h_i1 h_j2 + h_i2 h_j1, h_i2 h_j2, h_i3 h_j1 + h_i1 h_j3, h_i3 h_j2 + h_i2 h_j3,
+h_i3 h_j3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.calibration.adjustment import TargetView
+from sfmapp.camera.camera import Camera, pixels_to_rays
+from sfmapp.geometry import rigid3
+
+Array = NDArray[np.float64]
+
+# A direction of the system that views hold no better than this many times the noise of their homographies is not held.
+_HELD = 5.0
+
+
+@dataclass(frozen=True)
+class ClosedForm:
+    """What Zhang's linear system says.
+
+    Attributes:
+        k_matrix: (3, 3) calibration matrix; None where it has no solution with positive focal lengths.
+        rank: directions of the six unknowns that the views hold; five are needed.
+        singular_values: (6,) of the system, of the largest.
+    """
+
+    k_matrix: Array | None
+    rank: int
+    singular_values: Array
+
+
+def homography(source: Array, target: Array) -> Array:
+    """(3, 3) homography from points (N, 2) of a plane to pixels (N, 2), N >= 4, by the normalised DLT.
+
+    Hartley and Zisserman, "Multiple View Geometry", 2nd ed., algorithm 4.2. Its last number is 1.
+    """
+    a, ta = _normalized(source)
+    b, tb = _normalized(target)
+    one = np.concatenate([a, np.ones((len(a), 1))], 1)
+    zero = np.zeros_like(one)
+    rows = np.concatenate([
+        np.concatenate([one, zero, -b[:, :1] * one], 1),
+        np.concatenate([zero, one, -b[:, 1:] * one], 1),
+    ])  # fmt: skip
+    h = np.linalg.svd(rows, full_matrices=False)[2][-1].reshape(3, 3)
+    found: Array = np.linalg.inv(tb) @ h @ ta
+    return found / found[2, 2] if found[2, 2] != 0 else found
+
+
+def _normalized(xy: Array) -> tuple[Array, Array]:
+    middle = xy.mean(0)
+    scale = np.sqrt(2.0) / max(float(np.sqrt(((xy - middle) ** 2).sum(1).mean())), 1e-300)
+    matrix = np.array([[scale, 0.0, -scale * middle[0]], [0.0, scale, -scale * middle[1]], [0.0, 0.0, 1.0]])
+    return (xy - middle) * scale, matrix
+
+
+def closed_form(views: Sequence[TargetView], size: tuple[int, int], *, has_skew: bool = False) -> ClosedForm:
+    """K from B = K^-T K^-1, which every homography constrains twice.
+
+    Args:
+        views: of planes, z of their points is not looked at.
+        size: of the pictures; the unknowns are scaled by it, so that singular values can be compared.
+        has_skew: False adds the equation that there is none.
+    """
+    scale = np.array([[2.0 / max(size), 0.0, -size[0] / max(size)], [0.0, 2.0 / max(size), -size[1] / max(size)],
+                      [0.0, 0.0, 1.0]])  # fmt: skip
+    rows, noise = [], []
+    for view in views:
+        h = homography(view.xyz[:, :2], view.xy)
+        mapped = view.xyz[:, :2] @ h[:, :2].T + h[:, 2]
+        error = np.sqrt(((mapped[:, :2] / mapped[:, 2:] - view.xy) ** 2).sum(1).mean())
+        noise.append(2.0 * error / max(size) / np.sqrt(len(view.xy)))
+        # the plane's own unit has no part in it
+        extent = float(np.sqrt(((view.xyz - view.xyz.mean(0)) ** 2).sum(1).mean()))
+        g = scale @ h @ np.diag([extent, extent, 1.0])
+        g = g / np.linalg.norm(g[:, :2]) * np.sqrt(2.0)
+        rows += [_row(g, 0, 1), _row(g, 0, 0) - _row(g, 1, 1)]
+    if not has_skew:
+        rows.append(np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]) * len(views))
+    _, values, vt = np.linalg.svd(np.array(rows), full_matrices=False)
+    values = np.concatenate([values, np.zeros(6 - len(values))])
+    # numerical noise bounds it from below where corners are exact
+    least = max(_HELD * float(np.median(noise)) * np.sqrt(len(views)), 1e-9)
+    return ClosedForm(_k_from_b(vt[-1], np.linalg.inv(scale)), int((values > least).sum()), values / values[0])
+
+
+def _row(h: Array, i: int, j: int) -> Array:
+    a, b = h[:, i], h[:, j]
+    return np.array([
+        a[0] * b[0], a[0] * b[1] + a[1] * b[0], a[1] * b[1],
+        a[2] * b[0] + a[0] * b[2], a[2] * b[1] + a[1] * b[2], a[2] * b[2],
+    ])  # fmt: skip
+
+
+def _k_from_b(b: Array, unscale: Array) -> Array | None:
+    """K of the six numbers of B, which are known up to a factor: the inverse of its Cholesky root."""
+    matrix = np.array([[b[0], b[1], b[3]], [b[1], b[2], b[4]], [b[3], b[4], b[5]]])
+    matrix = matrix if matrix[0, 0] > 0 else -matrix
+    try:
+        root = np.linalg.inv(np.linalg.cholesky(matrix).T)
+    except np.linalg.LinAlgError:
+        return None
+    k: Array = unscale @ root
+    found: Array = k / k[2, 2]
+    return found
+
+
+def plane_pose(camera: Camera, xyz: Array, xy: Array) -> Array | None:
+    """(7,) cam_from_target of a plane z = 0 from its points (N, 3) and their pixels (N, 2), of any lens.
+
+    The DLT of unit rays d: d x H (X, Y, 1) = 0, so that rays may be anywhere around; the two columns that are rotation
+    are brought onto SO(3) by SVD. None where there is none in front of the lens.
+    """
+    rays = pixels_to_rays(camera, xy)
+    is_known = np.isfinite(rays).all(1)
+    if is_known.sum() < 4:
+        return None
+    d, (plane, normalize) = rays[is_known], _normalized(xyz[is_known, :2])
+    one = np.concatenate([plane, np.ones((len(plane), 1))], 1)
+    rows = np.einsum("nij,nk->nijk", rigid3.skew(d), one).reshape(-1, 9)
+    h = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, 3)
+    if np.sign((d * (one @ h.T)).sum(1)).sum() < 0:
+        h = -h
+    h = h @ normalize
+    scale = np.sqrt(np.linalg.norm(h[:, 0]) * np.linalg.norm(h[:, 1]))
+    if not scale > 0:
+        return None
+    h = h / scale
+    first = np.stack([h[:, 0], h[:, 1], np.cross(h[:, 0], h[:, 1])], 1)
+    u, _, vt = np.linalg.svd(first)
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    pose: Array = rigid3.from_matrix(rotation, h[:, 2])
+    return pose if np.isfinite(pose).all() else None

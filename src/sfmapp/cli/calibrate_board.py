@@ -1,0 +1,100 @@
+"""``sfmapp calibrate board``: a camera from photographs or a video of a board."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sfmapp.calibration.board_forms import BOARD_FORMS
+from sfmapp.camera.names import MODEL_NAMES
+from sfmapp.cli.common import (
+    add_output_flags,
+    limit_library_threads,
+    listening,
+    load_numba_without_blas,
+    print_json,
+    took,
+)
+
+if TYPE_CHECKING:
+    from sfmapp.pipelines.calibration.board import CalibrationResult
+
+EPILOG = f"""\
+{BOARD_FORMS}
+
+writes
+  OUT/calibration.json   the camera with its covariances; give it, or OUT, to --camera of reconstruct and odometry
+  OUT/cameras.txt, OUT/opencv.yaml, OUT/camchain.yaml, OUT/camera_info.yaml
+                         the same for COLMAP, OpenCV, Kalibr and ROS, where they have words for the lens
+  OUT/report.html, OUT/report.json, OUT/recording.rrd
+                         residuals, coverage, sigmas over the picture, and what to photograph next"""
+
+
+def add_way(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add this way to the parser."""
+    parser = ways.add_parser(
+        "board", help="from a chessboard, ChArUco board, circle grid or AprilGrid",
+        description="Calibrate a camera from photographs or a video of a board, after Zhang: ten or more views, tilted "
+        "by 20 to 50 degrees about both axes, out to the corners of the picture.",
+        epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("source", metavar="INPUT", help="a folder, a glob pattern or a list of photographs, or a video")
+    parser.add_argument("-o", "--output", metavar="OUT", type=Path, required=True, help="output folder, new or empty")
+    parser.add_argument("--board", metavar="BOARD", required=True, help="what is photographed; see below")
+    parser.add_argument(
+        "--model", type=str.upper, choices=MODEL_NAMES, metavar="MODEL",
+        help="lens model, one of COLMAP's and others; default: by views that are held out",
+    )  # fmt: skip
+    parser.add_argument("--flat", action="store_true", help="do not look whether the board is bent")
+    parser.add_argument("--threads", metavar="N", help="number of workers, default: all cores")
+    add_output_flags(parser, has_log=True)
+    parser.set_defaults(run=_board)
+
+
+def _board(args: argparse.Namespace) -> int:
+    limit_library_threads()
+    from sfmapp.workspace.options import load_options
+
+    options = load_options([], [] if args.threads is None else [f"threads={args.threads}"])
+    load_numba_without_blas()
+    from sfmapp.calibration.boards import parse_board
+    from sfmapp.camera.names import CameraModel
+    from sfmapp.pipelines.calibration.board import calibrate_board
+    from sfmapp.workspace.usage import Stopwatch
+
+    watch = Stopwatch(whole_process=True)
+    model = None if args.model is None else CameraModel[args.model]
+    with listening(args) as events:
+        result = calibrate_board(
+            args.source, args.output, parse_board(args.board), options,
+            model=model, bends=not args.flat, events=events, watch=watch,
+        )  # fmt: skip
+    if args.json:
+        print_json({"exit_code": 0, "output": str(result.output), **result.report})
+    elif not args.quiet:
+        _print(result)
+    return 0
+
+
+def _print(result: CalibrationResult) -> None:
+    made = result.calibration
+    report = result.report.board
+    print(
+        f"{report.model} of {report.num_views} views, {report.width}x{report.height}: rms {report.rms_px:.3f} px, "
+        f"noise {report.noise_px:.3f} px a coordinate"
+    )
+    for name, value, sigma in zip(made.param_names, made.camera.params, made.sigmas, strict=True):
+        print(f"  {name:<6} {value:13.6g} +- {sigma:.2g}")
+    print(
+        f"a projection is sure to {report.median_sigma_px:.3f} px in the middle of the picture's places, "
+        f"{report.worst_sigma_px:.3f} px at the worst"
+    )
+    for picture in report.pictures:
+        why = picture.unused or picture.problem
+        if why:
+            print(f"  {picture.name}: {why}")
+    for warning in made.warnings:
+        print(f"  note: {warning}")
+    print(took(result.output, result.report.run))
+    print(f"calibration {result.output / 'calibration.json'}, report {result.output / 'report.html'}")

@@ -1,0 +1,175 @@
+"""Photographs or a video of a board to a camera, with every parameter's sigma."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sfmapp.calibration.adjustment import TargetView
+from sfmapp.calibration.boards import Board
+from sfmapp.calibration.report import (
+    BendReport,
+    BoardPictureReport,
+    BoardReport,
+    CameraFileReport,
+    ClosedFormReport,
+    LensTrialReport,
+)
+from sfmapp.calibration.result import CameraCalibration
+from sfmapp.calibration.solve import Solution, ViewFacts, solve_views
+from sfmapp.calibration.uncertainty import image_grid, projection_sigma
+from sfmapp.camera.names import CameraModel
+from sfmapp.errors import InputError, UsageError
+from sfmapp.events import Events
+from sfmapp.pipelines.calibration.pictures import BoardPictures, look_at_pictures
+from sfmapp.pipelines.calibration.results import write_camera
+from sfmapp.report.model import CalibrateReport
+from sfmapp.workspace.job import Job
+from sfmapp.workspace.layout import CALIBRATE, REPORT
+from sfmapp.workspace.options import Options
+from sfmapp.workspace.usage import Stopwatch
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """What was found and written.
+
+    Attributes:
+        output: the folder.
+        calibration: the camera.
+        report: what is in ``report.json``.
+    """
+
+    output: Path
+    calibration: CameraCalibration
+    report: CalibrateReport
+
+
+def calibrate_board(
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    board: Board,
+    options: Options | None = None,
+    *,
+    model: CameraModel | None = None,
+    bends: bool = True,
+    events: Events | None = None,
+    watch: Stopwatch | None = None,
+) -> CalibrationResult:
+    """Calibrate one camera from photographs of a board.
+
+    Args:
+        source: a folder, a glob pattern or a list of photographs, or a video.
+        output: a new folder, an empty one, or that of an earlier call.
+        board: what they show.
+        options: of these, those of images and ``threads``.
+        model: of the lens; None: chosen by views that are held out.
+        bends: look whether the board is bent.
+        events: progress, decisions, warnings and cancellation.
+        watch: started when the run began.
+
+    Raises:
+        InputError: nothing to read, fewer than three photographs with a board, or views that leave the camera open.
+        UsageError: a panorama as a model, or an output that holds something else.
+    """
+    if model == CameraModel.EQUIRECTANGULAR:
+        raise UsageError("model is EQUIRECTANGULAR: a panorama has no parameters to calibrate")
+    with Job.opened(CALIBRATE, source, output, options, events=events, watch=watch) as job:
+        with job.stage("detection"):
+            pictures = look_at_pictures(job, board)
+        job.note_inputs(pictures.digests)
+        used = pictures.used
+        if not used:
+            raise InputError(
+                f"{job.source}: expected a board {board.text()} in the photographs, found none in "
+                f"{len(pictures.pictures)}: {pictures.pictures[0].unused}",
+                "check --board: of a chessboard inner corners count, one less than fields",
+            )
+        with job.stage("calibration"):
+            views = [TargetView(one.name, board.points[one.detection.idx], one.detection.xy) for one in used]
+            facts = [_facts(board, len(one.detection.idx), one.detection.sharpness_px) for one in used]
+            solution = solve_views(
+                views, pictures.size, model, facts=facts, bends=bends, threads=job.threads, events=job.events
+            )
+        with job.stage("files"):
+            files = write_camera(job.workspace.folder, solution.calibration)
+        report = CalibrateReport(board=_report(board, pictures, solution, files), run=job.facts())
+        job.workspace.write_json(REPORT, report)
+        job.workspace.save()
+        return CalibrationResult(job.workspace.folder, solution.calibration, report)
+
+
+def _facts(board: Board, num: int, sharpness_px: float) -> ViewFacts:
+    # which part of a chessboard it is that a picture shows cannot be told
+    return ViewFacts(sharpness_px, board.kind != "chessboard" or num == len(board.points))
+
+
+def _report(
+    board: Board, pictures: BoardPictures, solution: Solution, files: Sequence[CameraFileReport]
+) -> BoardReport:
+    made, bend = solution.calibration, solution.bend
+    fits = {view.name: view for view in made.views}
+    rows = []
+    for one in pictures.pictures:
+        fit = fits.get(one.name)
+        num_used = 0 if fit is None else int(fit.is_used.sum())
+        problem = None if fit is None else fit.problem
+        rows.append(
+            BoardPictureReport(
+                name=one.name,
+                num_points=len(one.detection.idx),
+                num_used=num_used,
+                rms_px=fit.rms_px if fit is not None and num_used else None,
+                unused=one.unused if fit is None or num_used else problem,
+                problem=problem if num_used else None,
+            )
+        )
+    sigma = projection_sigma(made, image_grid(made.camera), made.distances[1] if made.distances else None)
+    linear = solution.closed_form
+    return BoardReport(
+        board=board.text(),
+        model=made.camera.model.name,
+        width=made.camera.width,
+        height=made.camera.height,
+        params=dict(zip(made.param_names, made.camera.params.tolist(), strict=True)),
+        sigmas=dict(zip(made.param_names, made.sigmas.tolist(), strict=True)),
+        correlations=made.correlations.tolist(),
+        rms_px=made.rms_px,
+        noise_px=made.noise_px,
+        degrees_of_freedom=made.degrees_of_freedom,
+        num_views=sum(bool(view.is_used.any()) for view in made.views),
+        pictures=rows,
+        lenses=[
+            LensTrialReport(
+                model=trial.model.name,
+                num_params=len(trial.model.params),
+                rms_px=trial.rms_px,
+                worst_px=trial.worst_px if np.isfinite(trial.worst_px) else None,
+                held_out_px=None if trial.held_out is None else trial.held_out_px,
+                reason=trial.reason,
+            )
+            for trial in solution.trials
+        ],
+        closed_form=ClosedFormReport(
+            rank=linear.rank,
+            singular_values=linear.singular_values.tolist(),
+            k_matrix=None if linear.k_matrix is None else linear.k_matrix.tolist(),
+        ),
+        bend=None
+        if bend is None
+        else BendReport(
+            coefficients_m=bend.coefficients.tolist(),
+            sigmas_m=bend.sigmas.tolist(),
+            depth_m=bend.depth,
+            rms_if_flat_px=bend.rms_before_px,
+        ),
+        bend_note=solution.bend_note,
+        median_sigma_px=float(np.nanmedian(sigma)),
+        worst_sigma_px=float(np.nanmax(sigma)),
+        files=list(files),
+        warnings=list(made.warnings),
+    )

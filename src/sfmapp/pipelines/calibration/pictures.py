@@ -1,0 +1,224 @@
+"""Photographs or frames of a board, and what was found in each."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.calibration.boards import Board
+from sfmapp.calibration.detection import Detection, detect_board
+from sfmapp.calibration.zhang import homography
+from sfmapp.errors import InputError
+from sfmapp.events import Events
+from sfmapp.images.folder import load_images
+from sfmapp.images.image_set import ImageRecord
+from sfmapp.images.pixels import read_gray
+from sfmapp.images.sequence import Frame, SequenceOptions
+from sfmapp.images.video import is_stream
+from sfmapp.sequences.open import open_sequence
+from sfmapp.workspace.job import Job
+
+Pixels = NDArray[np.uint8]
+
+STAGE = "detection"
+VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm"})
+# of a video: of so many pieces the sharpest frame is looked into, and so many of these are kept
+_PIECES, _KEPT = 120, 30
+# frames are alike whose boards are nearer than this share of the picture's diagonal, all corners together
+_ALIKE = 0.04
+# a frame whose edges are this many times as wide as the sharpest tenth's is blurred
+_BLURRED = 2.0
+
+
+@dataclass(frozen=True)
+class BoardPicture:
+    """A photograph or frame.
+
+    Attributes:
+        name: of the file, or number of the frame.
+        detection: what was found.
+        unused: why it is left aside; None for one that counts.
+        path: of a photograph; None of a frame.
+    """
+
+    name: str
+    detection: Detection
+    unused: str | None = None
+    path: Path | None = None
+
+
+@dataclass(frozen=True)
+class BoardPictures:
+    """All that were looked into.
+
+    Attributes:
+        size: width and height of those that count, as stored.
+        pictures: in their order.
+        digests: of the files, by name.
+    """
+
+    size: tuple[int, int]
+    pictures: tuple[BoardPicture, ...]
+    digests: dict[str, str]
+
+    @property
+    def used(self) -> list[BoardPicture]:
+        return [picture for picture in self.pictures if picture.unused is None]
+
+
+def is_video(source: str) -> bool:
+    """Whether a source is a video file or a stream, rather than photographs."""
+    return is_stream(source) or Path(source).suffix.lower() in VIDEOS
+
+
+def look_at_pictures(job: Job, board: Board) -> BoardPictures:
+    """Find the board in the photographs, or in frames of the video, that the job's source is.
+
+    Raises:
+        InputError: nothing can be read.
+    """
+    return _look_at_video(job, board) if is_video(job.source) else _look_at_photographs(job, board)
+
+
+def _look_at_photographs(job: Job, board: Board) -> BoardPictures:
+    images, _ = load_images(job.source, job.options.images, job.events, threads=job.threads)
+    if not images.images:
+        raise InputError(f"{job.source}: expected photographs of the board, found none that can be read")
+    counts = Counter((record.width, record.height) for record in images.images)
+    size = counts.most_common(1)[0][0]
+
+    def look(record: ImageRecord) -> BoardPicture:
+        if (record.width, record.height) != size:
+            turned = ", it was turned by a program" if (record.height, record.width) == size else ""
+            other = f"it has {record.width}x{record.height} pixels, most have {size[0]}x{size[1]}{turned}"
+            return BoardPicture(record.name, _nothing(other), other, record.path)
+        try:
+            found = detect_board(read_gray(record), board)
+        except InputError as error:
+            return BoardPicture(record.name, _nothing(str(error)), str(error), record.path)
+        return BoardPicture(record.name, found, found.problem, record.path)
+
+    pictures = _in_threads(look, images.images, job.threads, job.events)
+    return BoardPictures(size, tuple(pictures), {record.name: record.digest for record in images.images})
+
+
+def _nothing(problem: str) -> Detection:
+    return Detection(np.zeros(0, np.int64), np.zeros((0, 2)), problem=problem)
+
+
+def _in_threads(
+    look: Callable[[ImageRecord], BoardPicture], records: Sequence[ImageRecord], threads: int, events: Events
+) -> list[BoardPicture]:
+    events.started(STAGE, f"{len(records)} photographs", total=len(records))
+
+    def one(record: ImageRecord) -> BoardPicture:
+        events.raise_if_cancelled()
+        found = look(record)
+        events.advanced(STAGE)
+        return found
+
+    pool = ThreadPoolExecutor(threads)
+    try:
+        found = list(pool.map(one, records))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    num = sum(picture.unused is None for picture in found)
+    events.finished(STAGE, f"the board was found in {num} of {len(found)} photographs")
+    return found
+
+
+# -------------------------------------------------------------------------------------------------------------- videos
+
+
+def _look_at_video(job: Job, board: Board) -> BoardPictures:
+    """The sharpest frame of each piece of a video, and of those with a board some that differ."""
+    sequence = open_sequence(job.source, SequenceOptions(mono=True), job.events, require_camera=False)
+    total = sequence.num_frames
+    length = max(1, -(-total // _PIECES)) if total else 15
+    job.events.started(STAGE, "frames of the video", total=total)
+    sharpest: list[Frame] = []
+    best = -1.0
+    piece = -1
+    for frame in sequence.frames():
+        job.events.advanced(STAGE)
+        score = _sharpness(frame.images[0])
+        if frame.idx // length != piece:
+            piece, best = frame.idx // length, -1.0
+            sharpest.append(frame)
+        if score > best:
+            best, sharpest[-1] = score, frame
+    if not sharpest:
+        raise InputError(f"{job.source}: expected a video of the board, found no frame that can be read")
+    size = sharpest[0].images[0].shape[::-1]
+    with ThreadPoolExecutor(job.threads) as pool:
+        found = list(pool.map(lambda frame: detect_board(frame.images[0], board), sharpest))
+    pictures = [BoardPicture(frame.name, one, one.problem) for frame, one in zip(sharpest, found, strict=True)]
+    chosen = choose_frames(pictures, (int(size[0]), int(size[1])), board)
+    num = sum(picture.unused is None for picture in chosen)
+    job.events.finished(STAGE, f"{num} frames were picked of {len(chosen)} that were looked into")
+    return BoardPictures((int(size[0]), int(size[1])), tuple(chosen), {})
+
+
+def _sharpness(gray: Pixels) -> float:
+    import cv2
+
+    step = max(1, max(gray.shape) // 640)
+    return float(cv2.Laplacian(np.ascontiguousarray(gray[::step, ::step]), cv2.CV_32F).var())
+
+
+def choose_frames(pictures: Sequence[BoardPicture], size: tuple[int, int], board: Board) -> list[BoardPicture]:
+    """The same pictures; those that are blurred, or show what another shows, with the reason why they do not count.
+
+    Frames are taken one after another, each as far as can be from all that were taken: by where the corners of the
+    whole board are, so that place, distance and tilt all count.
+    """
+    where = {i: _outline(picture.detection, board) for i, picture in enumerate(pictures) if picture.unused is None}
+    widths = np.array([picture.detection.sharpness_px for picture in pictures])
+    reasons: dict[int, str] = {}
+    if where:
+        limit = _BLURRED * float(np.nanquantile(widths[list(where)], 0.1))
+        for i in list(where):
+            if widths[i] > limit:
+                reasons[i] = f"blurred: its edges are {widths[i]:.1f} px wide"
+                del where[i]
+    diagonal = float(np.hypot(*size))
+    # the one with most points begins
+    taken: list[int] = []
+    left = sorted(where, key=lambda i: (-len(pictures[i].detection.idx), i))
+    while left and len(taken) < _KEPT:
+        if taken:
+            away = [min(_apart(where[i], where[k]) for k in taken) / diagonal for i in left]
+            n = int(np.argmax(away))
+            if away[n] < _ALIKE:
+                break
+        else:
+            n = 0
+        taken.append(left.pop(n))
+    for i in left:
+        nearest = min(taken, key=lambda k: _apart(where[i], where[k]))
+        apart = _apart(where[i], where[nearest]) / diagonal
+        reasons[i] = f"like frame {pictures[nearest].name}: the board is {apart:.1%} of the picture away"
+    return [
+        BoardPicture(one.name, one.detection, reasons.get(i, one.unused), one.path) for i, one in enumerate(pictures)
+    ]
+
+
+def _outline(detection: Detection, board: Board) -> NDArray[np.float64]:
+    """(4, 2) pixels of the corners of the whole board, by the plane that the found points lie in."""
+    h = homography(board.points[detection.idx, :2], detection.xy)
+    low, high = board.points[:, :2].min(0), board.points[:, :2].max(0)
+    corners = np.array([[low[0], low[1], 1.0], [high[0], low[1], 1.0], [*high, 1.0], [low[0], high[1], 1.0]])
+    mapped = corners @ h.T
+    found: NDArray[np.float64] = mapped[:, :2] / mapped[:, 2:]
+    return found
+
+
+def _apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Root mean square distance of two outlines, pixels."""
+    return float(np.sqrt(((a - b) ** 2).sum(1).mean()))

@@ -1,0 +1,80 @@
+"""Points of boards in rendered pictures, whose places are known exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from board_views import render_board
+from sfmapp.calibration.boards import Board, parse_board
+from sfmapp.calibration.detection import detect_board
+from sfmapp.camera.camera import Camera, project
+from sfmapp.camera.names import CameraModel
+from sfmapp.geometry import rigid3
+
+CAMERA = Camera(CameraModel.OPENCV, 600, 450, np.array([480.0, 480.0, 300.0, 225.0, -0.2, 0.05, 1e-3, -5e-4]))
+CHESS = parse_board("chessboard:9x6:0.025")
+
+
+def pose_of(board: Board, tilt_deg: float, depth: float, shift: float = 0.0) -> np.ndarray:
+    rotation = rigid3.exp_so3(np.radians([0.15 * tilt_deg, tilt_deg, 8.0]))
+    middle = board.points.mean(0)
+    return rigid3.from_matrix(rotation, np.array([shift, 0.0, depth]) - rotation @ middle)
+
+
+def errors(board: Board, pose: np.ndarray, **picture: float) -> tuple[np.ndarray, np.ndarray]:
+    found = detect_board(render_board(CAMERA, board, pose, **picture), board)  # type: ignore[arg-type]
+    assert found.problem is None, found.problem
+    assert len(np.unique(found.idx)) == len(found.idx)
+    truth = project(CAMERA, rigid3.apply(pose, board.points))
+    return found.idx, found.xy - truth[found.idx]
+
+
+@pytest.mark.parametrize(("tilt", "blur", "rms"), [(20.0, 0.7, 0.03), (60.0, 0.7, 0.06), (20.0, 3.0, 0.06)])
+def test_corners_of_a_chessboard(tilt: float, blur: float, rms: float) -> None:
+    idx, error = errors(CHESS, pose_of(CHESS, tilt, 0.3), blur_px=blur, noise=2.0)
+    assert len(idx) == 54
+    assert np.sqrt((error**2).sum(1).mean()) < rms
+
+
+def test_half_a_chessboard_is_a_part_of_one() -> None:
+    pose = pose_of(CHESS, 25.0, 0.24, 0.12)
+    found = detect_board(render_board(CAMERA, CHESS, pose, blur_px=0.7, noise=2.0), CHESS)
+    truth = project(CAMERA, rigid3.apply(pose, CHESS.points))
+    inside = ((truth > 12) & (truth < [588, 438])).all(1)
+    assert 12 <= inside.sum() < 45
+    assert len(found.idx) >= inside.sum() - 3
+    # numbered from anywhere, but by steps of the board: what is apart by a step in the picture is so on the board
+    nearest = np.linalg.norm(truth[None] - found.xy[:, None], axis=2).argmin(1)
+    assert np.linalg.norm(truth[nearest] - found.xy, axis=1).max() < 0.3
+    one, other = CHESS.points[nearest], CHESS.points[found.idx]
+    apart = [np.linalg.norm(points[:, None] - points[None], axis=2) for points in (one, other)]
+    np.testing.assert_allclose(apart[0], apart[1], atol=1e-12)
+
+
+@pytest.mark.parametrize("text", ["charuco:7x5:0.035:0.026", "aprilgrid:4x3:0.04:0.3"])
+def test_points_beside_markers_are_numbered(text: str) -> None:
+    board = parse_board(text)
+    idx, error = errors(board, pose_of(board, 30.0, 0.3), blur_px=0.7, noise=2.0)
+    assert len(idx) >= 0.9 * len(board.points)
+    assert np.sqrt((error**2).sum(1).mean()) < 0.05
+    # half out of the picture
+    idx, error = errors(board, pose_of(board, 20.0, 0.26, 0.17), blur_px=0.7, noise=2.0)
+    assert 8 <= len(idx) < 0.85 * len(board.points)
+    assert np.sqrt((error**2).sum(1).mean()) < 0.05
+
+
+@pytest.mark.parametrize("text", ["circles:8x6:0.025", "acircles:4x9:0.02"])
+def test_centres_of_circles(text: str) -> None:
+    board = parse_board(text)
+    idx, error = errors(board, pose_of(board, 0.0, 0.32), blur_px=0.7, noise=2.0)
+    assert len(idx) >= 0.9 * len(board.points)
+    assert np.sqrt((error**2).sum(1).mean()) < 0.08
+
+
+def test_a_picture_without_a_board_says_so() -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (300, 400)).astype(np.uint8)
+    for text in ("chessboard:9x6:0.025", "charuco:7x5:0.035:0.026", "aprilgrid:4x3:0.04:0.3", "circles:8x6:0.02"):
+        found = detect_board(noise, parse_board(text))
+        assert found.problem is not None
+        assert len(found.idx) == 0

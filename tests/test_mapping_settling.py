@@ -1,0 +1,109 @@
+"""Closing adjustments come to rest, or say that they have not."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfmapp.adjust.covariance import reduced_matrix
+from sfmapp.adjust.graph import FactorGraph
+from sfmapp.adjust.options import AdjustOptions, AdjustReport
+from sfmapp.adjust.problem import Varying
+from sfmapp.adjust.solver import make_engine
+from sfmapp.events import Event, Events
+from sfmapp.geometry import rigid3
+from sfmapp.mapping.mapper import Mapper
+from sfmapp.mapping.options import MappingOptions
+from sfmapp.mapping.settling import Round, adjust_until_settled
+from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.synthetic import make_scene, perturb
+
+SIGMA_PX = 0.3
+ROBUST = AdjustOptions(loss="cauchy", loss_scale_px=2 * SIGMA_PX, initial_damping=1e-6, max_iterations=500)
+
+
+def with_tails(seed: int) -> Reconstruction:
+    """Eight photographs near their places, a tenth of whose keypoints are off by pixels."""
+    scene = make_scene(seed, 8, 300, sigma_px=SIGMA_PX)
+    model = perturb(scene.observed, rotation_deg=0.05, translation_fraction=0.001, focal_fraction=0.003)
+    rng = np.random.default_rng(seed)
+    wrong = rng.random(len(model.obs_is_inlier)) < 0.1
+    model.tracks.obs_xy[wrong] += rng.normal(scale=4.0, size=(int(wrong.sum()), 2)).astype(np.float32)
+    return model
+
+
+def sigmas_between(a: Reconstruction, b: Reconstruction) -> float:
+    """The most that any combination of poses and focal length differs by, in standard deviations."""
+    engine = make_engine(a.copy(), replace(ROBUST, relative_cost_tolerance=0.0))
+    engine.linearize(0.0, map)
+    problem = engine.problem
+    step = np.zeros(problem.num_blocks * 8)
+    relative = rigid3.compose(b.cam_from_world, rigid3.inverse(a.cam_from_world))
+    blocks = problem.pose_block[:, None] * 8
+    step[blocks + np.arange(3)] = rigid3.log_so3(rigid3.rotation_matrix(relative))
+    step[blocks + np.arange(3, 6)] = relative[:, 4:]
+    camera = problem.camera_block[0] * 8
+    for n, k in enumerate(problem.free.params[0]):
+        step[camera + n] = b.cameras[0].params[k] - a.cameras[0].params[k]
+    return float(np.sqrt(step @ reduced_matrix(engine) @ step)) / SIGMA_PX
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_what_has_settled_is_near_the_minimum_long_before_single_points_are(seed: int) -> None:
+    start = with_tails(seed)
+    settled, minimum = start.copy(), start.copy()
+    quick = FactorGraph(settled, replace(ROBUST, settled_sigmas=0.05, relative_cost_tolerance=0.0), noise_px=1.0)
+    whole = FactorGraph(minimum, replace(ROBUST, relative_cost_tolerance=1e-10), noise_px=1.0)
+    short, long = quick.optimize(), whole.optimize()
+    assert short.termination == long.termination == "converged"
+    assert short.num_iterations < 0.6 * long.num_iterations
+    assert sigmas_between(settled, minimum) < 0.5 < sigmas_between(start, minimum)
+
+
+def rounds_of(*changed: int, termination: str = "converged"):
+    """Rounds in which so many of a thousand observations change sides, the last over and over; and their steps."""
+    steps: list[int] = []
+
+    def adjust(num_steps: int) -> Round:
+        after = np.ones(1000, bool)
+        after[: changed[min(len(steps), len(changed) - 1)]] = False
+        steps.append(num_steps)
+        return Round(AdjustReport(termination=termination), np.ones(1000, bool), after)
+
+    return adjust, steps
+
+
+def test_rounds_end_when_the_observations_rest_and_say_so_when_they_never_do() -> None:
+    heard: list[Event] = []
+    events = Events()
+    events.subscribe(heard.append)
+    adjust, steps = rounds_of(50, 7, 0)
+    assert adjust_until_settled(adjust, "mapping", events).termination == "converged"
+    assert len(steps) == 3
+    assert not heard
+    adjust, steps = rounds_of(50)
+    assert adjust_until_settled(adjust, "mapping", events).termination == "unsettled"
+    adjust, steps = rounds_of(0, termination="iterations")
+    assert adjust_until_settled(adjust, "mapping", events).termination == "unsettled"
+    assert steps[1] > steps[0]  # at rest, the next goes to the end
+    assert [event.kind for event in heard] == ["warned"] * 2
+    assert "did not settle" in heard[0].message
+
+
+def test_one_more_adjustment_of_a_finished_map_changes_nothing() -> None:
+    model = with_tails(4)
+    with ThreadPoolExecutor(1) as pool:
+        mapper = Mapper(
+            reconstruction=model, correspondences=[], options=MappingOptions(refine_principal_point="never"),
+            adjust_options=AdjustOptions(), events=Events(), pool=pool, prior_cameras=list(model.cameras),
+            locked=np.zeros(8, bool),
+        )  # fmt: skip
+        assert mapper.polish().termination == "converged"
+        before = model.copy()
+        assert mapper.loss_scale_px is not None
+        robust = AdjustOptions(initial_damping=1e-6).robust(mapper.loss_scale_px)
+        FactorGraph(model, robust, varying=Varying(), noise_px=1.0).optimize()
+    assert sigmas_between(before, model) < 0.5
