@@ -271,7 +271,7 @@ class FactorGraph:
         has_row = np.arange(8) < problem.block_dim[:, None]
         used, inner = (is_kept[:, None] & has_row).ravel(), has_row[is_kept].ravel()
         information, scale = reduced_matrix(engine, is_kept)[np.ix_(inner, inner)], engine.diagonal[used]
-        basis, constraint = gauge_of(problem, used, information, scale)
+        basis, constraint = gauge_of(problem, used, information, scale, has_factors=extras is not None)
         wanted = rows[:, used]
         columns = constrained_columns(information, scale, basis, constraint, wanted.T)
         size = len(rows)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
 from sfmapp.camera.camera import Camera, project_jacobian
+from sfmapp.camera.names import CameraModel
 from sfmapp.geometry import rigid3
 
 Array = NDArray[np.float64]
@@ -167,6 +168,8 @@ def _linearized(
     by_turn = by_point @ -rigid3.skew(in_camera)
     slope = np.concatenate([by_params[:, :, is_free], by_turn, by_point], 2)
     residual = xy - pixels
+    if camera.model == CameraModel.EQUIRECTANGULAR:  # its left and right borders are one line
+        residual[:, 0] -= camera.width * np.round(residual[:, 0] / camera.width)
     information = np.zeros(slope.shape[2])
     pull = 0.0
     if prior is not None:

@@ -114,6 +114,7 @@ class TargetFit:
         tilt_deg: of the plane against the picture; None without one.
         trials: lenses that were tried.
         wrong: points that were left aside, the worst first.
+        distance: (N,) pixels of each point from where the others put it; NaN where nothing tells.
         unchecked: positions of points without which the camera would be open, so that nothing checks them.
         warnings: what a user has to know.
     """
@@ -127,6 +128,7 @@ class TargetFit:
     tilt_deg: float | None
     trials: tuple[LensTrial, ...]
     wrong: tuple[WrongPoint, ...]
+    distance: Array
     unchecked: tuple[int, ...]
     warnings: tuple[str, ...]
 
@@ -139,13 +141,19 @@ class TargetFit:
         weights /= weights.sum()
         return float(np.sqrt(weights @ self.covariance @ weights))
 
-    def calibration(self, name: str) -> CameraCalibration:
-        """As every calibration has it, with the name of the photograph."""
-        view, (xyz, xy) = self.view, self.points
-        num = len(view.is_free)
-        place = np.concatenate([np.flatnonzero(view.is_free), num + np.arange(POSE)])
+    @property
+    def whole_covariance(self) -> Array:
+        """(P + 6, P + 6) of all parameters and the pose."""
+        num = len(self.view.is_free)
+        place = np.concatenate([np.flatnonzero(self.view.is_free), num + np.arange(POSE)])
         whole = np.zeros((num + POSE, num + POSE))
         whole[np.ix_(place, place)] = self.covariance
+        return whole
+
+    def calibration(self, name: str) -> CameraCalibration:
+        """As every calibration has it, with the name of the photograph."""
+        view, (xyz, xy), whole = self.view, self.points, self.whole_covariance
+        num = len(view.is_free)
         distance = np.linalg.norm(rigid3.apply(view.cam_from_world, xyz), axis=1)
         how = "Tsai's radial alignment on a plane" if self.is_plane else "direct linear transform"
         return CameraCalibration(
@@ -457,7 +465,8 @@ def _told(
     fit = TargetFit(
         points=points, view=view, covariance=covariance, noise=noise, is_plane=is_plane, linear=linear,
         tilt_deg=_tilt_deg(xyz, view) if is_plane else None, trials=trials,
-        wrong=_wrong_points(points, view, distance), unchecked=tuple(np.flatnonzero(np.isnan(statistic)).tolist()),
+        wrong=_wrong_points(points, view, distance), distance=distance,
+        unchecked=tuple(np.flatnonzero(np.isnan(statistic)).tolist()),
         warnings=(),
     )  # fmt: skip
     if not fit.focal_sigma_px * _HELD_SIGMAS < view.camera.focal:
