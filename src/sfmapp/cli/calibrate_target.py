@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from sfmapp.calibration.point_reports import FitReport
     from sfmapp.pipelines.calibration.known_points import PointSource
 
+_NAMES_SHOWN = 10
+
 POINTS = """\
 a table of points has a line for each:  [name] X Y Z u v
   separated by commas, semicolons, tabs or spaces, with names of the columns in the first line or without; a unit in
@@ -75,7 +77,7 @@ def point_source(args: argparse.Namespace) -> PointSource:
     """What the flags say of the points."""
     from sfmapp.pipelines.calibration.known_points import PointSource
 
-    return PointSource(args.points, args.markers, args.dictionary, args.opencv_pixels)
+    return PointSource(args.points, args.markers, args.dictionary, is_opencv=args.opencv_pixels)
 
 
 def print_fit(fit: FitReport) -> None:
@@ -84,9 +86,11 @@ def print_fit(fit: FitReport) -> None:
         f"{fit.num_used} of {len(fit.points)} points agree, rms {fit.rms_px:.3f} px, noise of a mark "
         f"{fit.noise_px:.3g} px ({fit.noise_source})"
     )
-    for point in fit.points:
-        if not point.is_used:
-            print(f"  WRONG: {point.name}: {point.reason}")
+    wrong = [point for point in fit.points if not point.is_used]
+    for point in wrong[:_NAMES_SHOWN]:
+        print(f"  WRONG: {point.name}: {point.reason}")
+    if len(wrong) > _NAMES_SHOWN:
+        print(f"  and {len(wrong) - _NAMES_SHOWN} more, which the report names")
     for warning in fit.warnings:
         print(f"  {warning}")
     pose, axes = fit.pose, "xyz"

@@ -38,6 +38,7 @@ from sfmapp.formats.text_input import read_json_object
 from sfmapp.images.folder import describe_images
 from sfmapp.images.image_set import ImageOptions, ImageRecord
 from sfmapp.images.pixels import read_gray, read_rgb
+from sfmapp.pipelines.calibration.model_points import find_model_points
 from sfmapp.pipelines.calibration.results import write_camera
 from sfmapp.report.point_html import draw_residuals, render_location_html, render_target_html
 from sfmapp.reporting import document_text
@@ -57,12 +58,14 @@ class PointSource:
     Attributes:
         points: a table of ``[name] X Y Z u v``. markers: one of ``id corner X Y Z``.
         dictionary: of the markers.
+        model: a folder of ``sfmapp reconstruct`` whose points the photograph shows; for ``locate``.
         is_opencv: pixels of the table count the centre of the first pixel as 0, as OpenCV does, not as a half.
     """
 
     points: Path | None = None
     markers: Path | None = None
     dictionary: str | None = None
+    model: Path | None = None
     is_opencv: bool = False
 
 
@@ -152,7 +155,11 @@ def locate(
     given, covariance = _read_camera(camera, record)
     with Job.opened(LOCATE, photograph, output, None, events=events) as job:
         job.note_inputs({record.name: record.digest})
-        points = _read_points(record, source, job.events)
+        if source.model is None:
+            points = _read_points(record, source, job.events)
+        else:
+            names, xyz, xy = find_model_points(source.model, record, given, job.events)
+            points = _Points(PhotographFacts(record.name, names, "units"), xyz, xy)
         found = locate_camera(
             points.xyz, points.xy, given, method=method, max_error_px=max_error_px, sigma_px=sigma_px,
             camera_covariance=covariance,
