@@ -366,6 +366,7 @@ def test_calibrate_locate_and_measure_by_command(desk, tmp_path, capsys) -> None
     assert values["fx"][1] < 30.0
     assert found["fit"]["num_used"] >= 30
     assert (out / "report.html").read_text(encoding="utf-8").count("data:image/jpeg") == 1
+    assert (out / "recording.rrd").stat().st_size > 10_000
     # the calibration is taken by the next command, with its covariance; two points that changed places are named
     where = tmp_path / "where"
     located = run(capsys, "locate", photo, "--points", folder / "points.csv", "--camera", out, "-o", where)

@@ -56,6 +56,7 @@ def add_way(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--camera-model", choices=MODEL_NAMES, metavar="NAME",
         help="default: PINHOLE, from 20 points on OPENCV or a fisheye; PINHOLE_SKEW finds the skew as well",
     )  # fmt: skip
+    parser.add_argument("--no-recording", action="store_true", help="do not write recording.rrd")
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_calibrate)
 
@@ -113,7 +114,8 @@ def _calibrate(args: argparse.Namespace) -> int:
     watch = Stopwatch(whole_process=True)
     with listening(args) as events:
         result = calibrate_from_target(
-            args.photograph, args.output, point_source(args), sigma_px=args.sigma_px, events=events, watch=watch,
+            args.photograph, args.output, point_source(args), sigma_px=args.sigma_px, recording=not args.no_recording,
+            events=events, watch=watch,
             camera_model=None if args.camera_model is None else CameraModel[args.camera_model],
         )  # fmt: skip
     report = result.report

@@ -42,7 +42,8 @@ from sfmapp.pipelines.calibration.model_points import find_model_points
 from sfmapp.pipelines.calibration.results import write_camera
 from sfmapp.report.point_html import draw_residuals, render_location_html, render_target_html
 from sfmapp.reporting import document_text
-from sfmapp.workspace.job import Job
+from sfmapp.viewer.calibration_recording import record_calibration
+from sfmapp.workspace.job import FAILED, WRITTEN, Job
 from sfmapp.workspace.layout import CALIBRATE, LOCATE, REPORT
 from sfmapp.workspace.usage import Stopwatch
 
@@ -96,8 +97,8 @@ class _Points:
 
 def calibrate_from_target(
     photograph: str | os.PathLike[str], output: str | os.PathLike[str], source: PointSource, *,
-    camera_model: CameraModel | None = None, sigma_px: float | None = None, events: Events | None = None,
-    watch: Stopwatch | None = None,
+    camera_model: CameraModel | None = None, sigma_px: float | None = None, recording: bool = True,
+    events: Events | None = None, watch: Stopwatch | None = None,
 ) -> TargetResult:  # fmt: skip
     """Calibrate from one photograph, and write ``calibration.json``, ``pose.json``, files for others and a report.
 
@@ -105,6 +106,7 @@ def calibrate_from_target(
         photograph: a file. output: a new folder, an empty one, or that of an earlier call.
         source: of its points.
         camera_model, sigma_px: as in :func:`sfmapp.calibration.target.calibrate_target`.
+        recording: write ``recording.rrd``.
 
     Raises:
         UsageError: options that contradict each other, or an output that holds something else.
@@ -126,6 +128,8 @@ def calibrate_from_target(
         picture = draw_residuals(read_rgb(record), record.orientation, report.fit.points)
         _write(folder, picture[0], render_target_html(report, picture), document_text(report))
         _tell(report.fit.warnings, job.events)
+        if recording:
+            _record(job, record, fit)
         job.workspace.save()
         return TargetResult(folder, report, fit)
 
@@ -253,6 +257,20 @@ def _plane(text: str, known: Mapping[str, Array]) -> tuple[Plane, str]:
     return Plane.of_equation(
         np.array(values[:3]), values[3]
     ), f"{values[0]:g} X + {values[1]:g} Y + {values[2]:g} Z = {values[3]:g}"
+
+
+def _record(job: Job, record: ImageRecord, fit: TargetFit) -> None:
+    """The photograph, and the target in front of the camera as a rectangle along its two widest directions."""
+    xyz = fit.points[0]
+    middle = xyz.mean(0)
+    axes = np.linalg.svd(xyz - middle)[2][:2]
+    low, high = ((xyz - middle) @ axes.T).min(0), ((xyz - middle) @ axes.T).max(0)
+    outline = middle + np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) @ axes
+    made = fit.calibration(record.name)
+    told = record_calibration(job.workspace.recording, made, outline, {record.name: str(record.path)}, record.name)
+    job.workspace.note(recording=FAILED if told.problem else WRITTEN)
+    if told.problem:
+        job.events.warned("recording", f"no recording: {told.problem}")
 
 
 # ------------------------------------------------------------------------------------------------------------- reading
