@@ -383,6 +383,11 @@ class Mapper:
         )
         graph.add(extra_factors)
         report = graph.optimize()
+        factors = [
+            replace(f, normalized_residual=unit * f.normalized_residual) if f.kind == "intrinsics prior" else f
+            for f in report.factors
+        ]
+        report = replace(report, factors=factors)  # in the deviations that cameras claim
         self.events.decided(STAGE, f"closing adjustment: {report.text}", **report)
         if report.termination == "iterations":
             self.events.warned(STAGE, f"the closing adjustment did not settle in {report.num_iterations} steps")
