@@ -139,3 +139,29 @@ def test_undetermined_is_said():
     every[:] = False
     every[keep] = True
     assert not estimate_covariances(found, sigma_px=1.0, varying=Varying(points=every)).is_determined
+
+
+@pytest.mark.parametrize("sigma", [1.0, 20.0])
+def test_places_that_are_loosely_known_hold_a_precise_model_as_loosely(sigma: float) -> None:
+    """As a phone's positions hold a model of ten thousands of keypoints: far from nothing, and as a similarity says."""
+    import gtsam
+    from gtsam.symbol_shorthand import X
+
+    from sfmapp.geometry import rigid3
+
+    scene = make_scene(2, 8, 400, sigma_px=0.05)
+    model, centers = scene.observed.copy(), scene.ground_truth.centers
+    graph = gtsam.NonlinearFactorGraph()
+    for i in range(8):
+        graph.add(gtsam.GPSFactor(X(i), centers[i], gtsam.noiseModel.Isotropic.Sigma(3, sigma)))
+    covariances = estimate_covariances(model, OPTIONS, sigma_px=0.05, extra_factors=graph)
+    assert covariances.num_gauge == 0
+    arm = centers - centers.mean(0)
+    slope = np.concatenate([-rigid3.skew(arm), arm[:, :, None], np.broadcast_to(np.eye(3), (8, 3, 3))], 2)
+    of_similarity = np.linalg.inv(np.einsum("nai,naj->ij", slope, slope)) * sigma**2
+    turned = rigid3.rotation_matrix(model.cam_from_world)
+    for i in range(8):
+        found = turned[i].T @ covariances.of_image(i)[3:, 3:] @ turned[i]
+        # a turn and the place of a camera go together; what the photographs tell is a thousandth of this
+        expected = slope[i] @ of_similarity @ slope[i].T
+        np.testing.assert_allclose(found, expected, atol=0.02 * np.trace(expected))

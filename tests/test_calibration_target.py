@@ -253,3 +253,28 @@ def test_opencv_finds_the_same_minimum() -> None:
     theirs = [k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5, *distortion.ravel()[:4]]
     sigmas = np.sqrt(np.diag(fit.covariance))[:8]
     assert (np.abs(fit.view.camera.params - theirs) < 0.01 * sigmas).all()
+
+
+@pytest.mark.real
+def test_single_photographs_of_a_chessboard_tell_the_focal_length_within_their_sigmas(data_root) -> None:
+    """26 photographs of OpenCV's board by two cameras, beside cv2.calibrateCamera over all of them."""
+    import cv2
+
+    board = np.zeros((54, 3))
+    board[:, :2] = np.mgrid[0:9, 0:6].T.reshape(-1, 2)
+    away = []
+    for side in ("left", "right"):
+        views = []
+        for path in sorted((data_root / "opencv-doc-samples" / "calib").glob(f"{side}[0-9]*.jpg")):
+            gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            found, corners = cv2.findChessboardCorners(gray, (9, 6))
+            if found:
+                views.append(cv2.cornerSubPix(gray, corners, (5, 5), (-1, -1), (3, 50, 1e-4)).reshape(-1, 2))
+        _, k, *_ = cv2.calibrateCamera([board.astype(np.float32)] * len(views), views, (640, 480), None, None)
+        for corners in views:
+            fit = calibrate_target(board, corners.astype(np.float64) + 0.5, (640, 480))
+            away.append((fit.view.camera.focal - 0.5 * (k[0, 0] + k[1, 1])) / fit.focal_sigma_px)
+    assert len(away) >= 24
+    # of one view of a board that is not quite flat, a little beyond three sigmas is no wonder
+    assert (np.abs(away) < 3.0).sum() >= len(away) - 1
+    assert np.abs(away).max() < 4.5

@@ -12,7 +12,7 @@ import pytest
 import surveys
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.georeference.drift import estimate_drift
+from sfmapp.georeference.drift import estimate_drift, similarity_slope
 from sfmapp.georeference.fit import robust_fit
 from sfmapp.georeference.options import GpsOptions
 from sfmapp.georeference.stage import Placed, georeference_models
@@ -249,8 +249,8 @@ def test_intervals_hold_the_truth_where_a_receiver_drifts() -> None:
             fit = robust_fit(centers, places + error, sigma, NOT_STATED)
             assert fit is not None
             found = fit.similarity
-            arm = found.apply(centers) - found.mean
-            drift = estimate_drift(fit.residual, fit.sigma, arm, fit.is_inlier, np.arange(30.0))
+            slope = similarity_slope(found.apply(centers) - found.mean)
+            drift = estimate_drift(fit.residual, fit.sigma, slope, fit.is_inlier, np.arange(30.0))
             mean = found.mean - (scale * found.origin @ rotation.T + [10.0, -20.0, 3.0])
             off = np.r_[rigid3.log_so3(found.rotation @ rotation.T), np.log(found.scale / scale), mean]
             inside.append(np.abs(off) < 1.96 * drift.spread * np.sqrt(np.diag(found.covariance)))
@@ -270,5 +270,6 @@ def test_drift_of_a_set_with_gaps_is_the_same() -> None:
             error[k] = 0.8 * error[k - 1] + 0.6 * error[k]
         arm, kept = rng.normal(size=(120, 3)) * 10.0, np.sort(rng.permutation(120)[:60])
         ones = np.ones((60, 3))
-        found.append(estimate_drift(error[kept], ones, arm[kept], np.ones(60, bool), kept.astype(float)).correlation)
+        slope = similarity_slope(arm[kept])
+        found.append(estimate_drift(error[kept], ones, slope, np.ones(60, bool), kept.astype(float)).correlation)
     assert np.mean(found) == pytest.approx(0.8, abs=0.06)

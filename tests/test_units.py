@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -172,3 +173,56 @@ def test_metres_and_up_from_the_command_line(
     assert tilt < 3 * level["sigma_deg"]
     assert main([*command[:-1], "distance:nobody.jpg:there.jpg:2"]) == 2
     assert "no photograph 'nobody.jpg'" in capsys.readouterr().err
+
+
+SIDE_M = 0.8
+
+
+def put_up_markers(sample: Path, photos: Path, folder: Path) -> dict[str, np.ndarray]:
+    """Photographs of the courtyard with four markers on a plane before the cameras, drawn by their known cameras at
+    sixteen samples a pixel; returns the centres of the cameras in metres."""
+    truth = read_ground_truth(sample / "cameras.json")
+    assert truth.cameras is not None
+    pose_of = {Path(name).stem: (pose, camera) for name, pose, camera in zip(
+        truth.names, truth.cam_from_world, truth.cameras, strict=True)}  # fmt: skip
+    shown = [pose_of[path.stem][0] for path in sorted(photos.iterdir())]
+    forward = rigid3.rotation_matrix(np.array(shown))[:, 2].mean(0)
+    middle = rigid3.center(np.array(shown)).mean(0) + 4.0 * forward
+    aside, up = np.cross(forward, [0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
+    aside /= np.linalg.norm(aside)
+    board = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    folder.mkdir()
+    for path in sorted(photos.iterdir()):
+        pose, camera = pose_of[path.stem]
+        large = cv2.resize(cv2.imread(str(path)), None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+        for marker in range(4):
+            corner = middle + (1.4 * (marker % 2) - 1.1) * aside + (1.2 * (marker // 2) - 1.0) * up
+            places = np.array([corner, corner + SIDE_M * aside, corner + SIDE_M * (aside - up), corner - SIDE_M * up])
+            # at half size, and at four times that; OpenCV's first pixel has its centre at 0
+            pixels = 4 * project(camera, rigid3.apply(pose, places)) / 2 - 0.5
+            # a white rim of one of the six modules all round; corners go where the lens puts them
+            drawn = np.pad(cv2.aruco.generateImageMarker(board, marker, 240), 40, constant_values=255)
+            low, high = 39.5, 279.5
+            from_corners = np.array([(low, low), (high, low), (high, high), (low, high)], np.float32)
+            onto = cv2.getPerspectiveTransform(from_corners, pixels.astype(np.float32))
+            size = (large.shape[1], large.shape[0])
+            mask = cv2.warpPerspective(np.full_like(drawn, 255), onto, size)
+            large[mask > 127] = cv2.warpPerspective(drawn, onto, size)[mask > 127, None]
+        small = cv2.resize(large, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(folder / path.name), small)
+    return {name: rigid3.center(pose) for name, (pose, _) in pose_of.items()}
+
+
+def test_metres_by_markers_in_pictures(sample: Path, photos: Path, tmp_path: Path) -> None:
+    centers = put_up_markers(sample, photos, tmp_path / "photos")
+    out = tmp_path / "out"
+    command = ["reconstruct", str(tmp_path / "photos"), "-o", str(out), "--no-recording", "-q"]
+    known = [f"marker:DICT_4X4_50:{SIDE_M:.3f}", "pair:DICT_4X4_50:0:1:1.400"]
+    assert main([*command, *(part for one in known for part in ("--scale", one))]) == 0
+    (scale,) = json.loads((out / "report.json").read_text())["stages"]["units"]["scales"]
+    assert scale["findings"] == []
+    assert [bar["is_used"] for bar in scale["bars"]] == [True, True]
+    model = read_model(out / "sparse" / "0")[0]
+    wanted = np.array([centers[Path(name).stem] for name in model.image_names])
+    found = similarity.umeyama(model.centers, wanted)
+    assert abs(np.log(found[7])) < 3 * scale["sigma_share"] < 0.015

@@ -60,7 +60,7 @@ def clustered_covariances(reconstruction: Reconstruction, options: AdjustOptions
     engine.linearize(0.0, map)
     used = (np.arange(8) < problem.block_dim[:, None]).ravel()
     information, scale = reduced_matrix(engine)[np.ix_(used, used)], engine.diagonal[used]
-    inverse = constrained_inverse(information, scale, *gauge_of(problem, used, information, scale))
+    inverse = constrained_inverse(information, scale, *gauge_of(problem, used, information, scale, has_factors=False))
     num, correlation = len(scale), 1.0
     covariance = np.full((num, num), np.inf)
     num_tracks = int((np.diff(problem.point_ptr) > 1).sum())

@@ -48,6 +48,10 @@ _DEFAULTS = AdjustOptions()
 
 # A similarity is undetermined where its information is below this share of what it would be, were all else known.
 _NULL = 1e-9
+# Factors beside the reprojections may hold it, and much more loosely than these hold the rest: the positions of a
+# phone, some metres, beside thousands of keypoints that tell a place relative to others within a millimetre are 1e-10
+# of what is known. Rounding leaves 1e-15.
+_NULL_BESIDE_FACTORS = 1e-13
 
 
 @dataclass(frozen=True)
@@ -126,7 +130,7 @@ def estimate_covariances(
     engine.linearize(0.0, map)
     information = reduced_matrix(engine)[np.ix_(used, used)]
     scale = engine.diagonal[used]
-    basis, constraint = gauge_of(problem, used, information, scale)
+    basis, constraint = gauge_of(problem, used, information, scale, has_factors=extras is not None)
     covariance = constrained_inverse(information, scale, basis, constraint)
     determined = covariance is not None
     full = np.zeros((len(used), len(used)))
@@ -180,8 +184,11 @@ def similarity_basis(poses: Array) -> tuple[Array, Array]:
     return basis.reshape(7, -1), (basis * weight).reshape(7, -1)
 
 
-def gauge_of(problem: Problem, used: Mask, information: Array, scale: Array) -> tuple[Array, Array]:
-    """Directions (k, N) that the information leaves open among the similarities, and their constraints (k, N)."""
+def gauge_of(
+    problem: Problem, used: Mask, information: Array, scale: Array, *, has_factors: bool
+) -> tuple[Array, Array]:
+    """Directions (k, N) that the information leaves open among the similarities, and their constraints (k, N);
+    ``has_factors``: others than reprojections and priors of intrinsics had a part in it."""
     poses = np.flatnonzero(problem.pose_block >= 0)
     if len(poses) == 0:
         return np.zeros((0, len(scale))), np.zeros((0, len(scale)))
@@ -196,7 +203,7 @@ def gauge_of(problem: Problem, used: Mask, information: Array, scale: Array) -> 
     norm[norm == 0] = 1.0
     basis, constraint = basis / norm[:, None], constraint / norm[:, None]
     values, vectors = np.linalg.eigh(basis @ information @ basis.T)
-    open_ = vectors[:, values < _NULL].T
+    open_ = vectors[:, values < (_NULL_BESIDE_FACTORS if has_factors else _NULL)].T
     return open_ @ basis, open_ @ constraint
 
 

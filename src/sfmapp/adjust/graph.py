@@ -253,7 +253,7 @@ class FactorGraph:
         engine.linearize(0.0, map)
         used = (np.arange(8) < problem.block_dim[:, None]).ravel()
         information, scale = reduced_matrix(engine)[np.ix_(used, used)], engine.diagonal[used]
-        basis, constraint = gauge_of(problem, used, information, scale)
+        basis, constraint = gauge_of(problem, used, information, scale, has_factors=engine.extras is not None)
         wanted = rows[:, used]
         columns = constrained_columns(information, scale, basis, constraint, wanted.T)
         size = len(rows)

@@ -14,10 +14,11 @@ from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.pose import refine_pose
 from sfmapp.adjust.problem import Varying
 from sfmapp.api.reconstruction import Reconstruction
-from sfmapp.camera.camera import Camera, bearings, project
+from sfmapp.camera.camera import Camera, pixels_to_rays, project
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.geometry import resection, rigid3
+from sfmapp.geometry.resection import PoseMethod
 from sfmapp.geometry.rigid3 import Rigid3
 from sfmapp.geometry.triangulation import Observed, triangulate_tracks
 from sfmapp.matching import two_view
@@ -165,11 +166,13 @@ def triangulate(
 
 
 def estimate_pose(
-    xyz: ArrayLike, xy: ArrayLike, camera: Camera, *, max_error_px: float = 8.0, inlier_px: float = 4.0
-) -> PoseEstimate:
+    xyz: ArrayLike, xy: ArrayLike, camera: Camera, *, max_error_px: float = 8.0, inlier_px: float = 4.0,
+    method: PoseMethod = "p3p",
+) -> PoseEstimate:  # fmt: skip
     """Pose of a calibrated camera from 3D points and their pixels (PnP): RANSAC over P3P, refined on all inliers.
 
-    The result is the same at every call.
+    The result is the same at every call. :func:`sfmapp.calibration.locate.locate_camera` takes more time over few
+    points that a hand has marked: it finds the noise, names wrong points, and tells a second pose that fits as well.
 
     Args:
         xyz: (N, 3) points in the world, N >= 4.
@@ -177,6 +180,7 @@ def estimate_pose(
         camera: with its lens.
         max_error_px: largest reprojection error of an inlier while the pose is searched.
         inlier_px: the same of the refined pose.
+        method: ``p3p``, or ``all``: from all points at once, where none of them is far wrong.
 
     Returns:
         The pose, its inliers and its covariance.
@@ -194,7 +198,9 @@ def estimate_pose(
         raise InputError(
             f"estimate_pose: expected finite points (N, 3) and pixels (N, 2), found {points.shape} and {pixels.shape}"
         )
-    found = resection.estimate_pose(points, bearings([camera], [pixels])[0], max_error_px / camera.focal)
+    found = resection.estimate_pose(
+        points, pixels_to_rays(camera, pixels), max_error_px / camera.focal, method=method
+    )  # fmt: skip
     if found is None:
         raise NoReconstructionError(
             f"none of the poses that were tried agrees with four of {len(points)} points",

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
 from sfmapp.camera.camera import Camera, project_jacobian
+from sfmapp.camera.names import CameraModel
 from sfmapp.geometry import rigid3
 
 Array = NDArray[np.float64]
@@ -39,10 +40,14 @@ _EXACT_PX = 1e-8
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a camera beforehand: Gaussian, about parameters (P,), with sigmas (P,), infinite for none."""
+    """What is known of a camera beforehand: ``rows @ (p - params)`` is normal with unit variance.
+
+    Attributes:
+        params: (P,) the middle. rows: (Q, P), a combination of parameters each, by its standard deviation.
+    """
 
     params: Array
-    sigmas: Array
+    rows: Array
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,7 @@ class OneView:
         slope: (N, 2, F + 6) of the projected pixels by the free parameters, a turn w in radians and a shift v of
             ``x_cam <- exp(w) x_cam + v``.
         is_used: (N,) bool, the points that were fitted.
-        prior_information: (F + 6,) inverse squares of the prior's sigmas.
+        prior_information: (F + 6, F + 6) of the prior.
         cost: half the sum of squares over ``noise_px``, with the prior.
         noise_px: that a residual was divided by.
     """
@@ -84,7 +89,7 @@ class OneView:
     def information(self) -> Array:
         """(F + 6, F + 6) by the points and the prior."""
         rows = self.slope[self.is_used].reshape(-1, self.num_unknown) / self.noise_px
-        total: Array = rows.T @ rows + np.diag(self.prior_information)
+        total: Array = rows.T @ rows + self.prior_information
         return total
 
     @property
@@ -93,7 +98,7 @@ class OneView:
         cofactor = inverse(self.information)
         if cofactor is None:
             return 2.0 * float(self.is_used.sum()) - self.num_unknown
-        told = self.num_unknown - float((np.diag(cofactor) * self.prior_information).sum())
+        told = self.num_unknown - float((cofactor * self.prior_information).sum())
         return 2.0 * float(self.is_used.sum()) - told
 
 
@@ -167,11 +172,13 @@ def _linearized(
     by_turn = by_point @ -rigid3.skew(in_camera)
     slope = np.concatenate([by_params[:, :, is_free], by_turn, by_point], 2)
     residual = xy - pixels
-    information = np.zeros(slope.shape[2])
+    if camera.model == CameraModel.EQUIRECTANGULAR:  # its left and right borders are one line
+        residual[:, 0] -= camera.width * np.round(residual[:, 0] / camera.width)
+    information = np.zeros((slope.shape[2], slope.shape[2]))
     pull = 0.0
     if prior is not None:
-        information[:-POSE] = 1.0 / prior.sigmas[is_free] ** 2
-        pull = float((((camera.params - prior.params)[is_free] / prior.sigmas[is_free]) ** 2).sum())
+        information[:-POSE, :-POSE] = prior.rows[:, is_free].T @ prior.rows[:, is_free]
+        pull = float(((prior.rows @ (camera.params - prior.params)) ** 2).sum())
     squares = float((residual[is_used] ** 2).sum())
     cost = 0.5 * (squares / noise_px**2 + pull) if np.isfinite(squares) else np.inf
     return OneView(camera, pose, is_free, residual, slope, is_used, information, cost, noise_px)
@@ -181,7 +188,7 @@ def _step(view: OneView, prior: Prior | None, damping: float) -> Array | None:
     rows = view.slope[view.is_used].reshape(-1, view.num_unknown) / view.noise_px
     right = rows.T @ (view.residual[view.is_used].ravel() / view.noise_px)
     if prior is not None:
-        right[:-POSE] -= view.prior_information[:-POSE] * (view.camera.params - prior.params)[view.is_free]
+        right[:-POSE] -= prior.rows[:, view.is_free].T @ (prior.rows @ (view.camera.params - prior.params))
     normal = view.information
     diagonal = np.diag(normal).copy()
     if not (np.isfinite(normal).all() and (diagonal > 0.0).all()):
@@ -325,4 +332,4 @@ def with_noise(view: OneView, noise: Noise) -> Array | None:
     """(F + 6, F + 6) covariance of the free parameters and the pose; None if the points leave one of them open."""
     prior = view.prior_information
     rows = replace(view, noise_px=1.0, prior_information=np.zeros_like(prior)).information
-    return inverse(rows / noise.variance + np.diag(prior))
+    return inverse(rows / noise.variance + prior)

@@ -86,6 +86,20 @@ class ClosedFormReport(Report):
     k_matrix: Sequence[Sequence[float]] | None = None
 
 
+class NextViewReport(Report):
+    """A view that is worth taking.
+
+    Attributes:
+        hint: how to take it.
+        mean_sigma_px: of projections over the picture once it is taken, with those before it.
+        outline: corners of the board in the picture, pixels.
+    """
+
+    hint: str
+    mean_sigma_px: float
+    outline: Sequence[Sequence[float]]
+
+
 class BoardReport(Report):
     """What calibrating from a board came to.
 
@@ -96,7 +110,9 @@ class BoardReport(Report):
         rms_px: root mean square length of the residuals; noise_px: sigma of a coordinate, by degrees of freedom.
         lenses: that were tried, the chosen one first.
         bend: of the board, where the views show it; bend_note: what was found of it.
-        median_sigma_px, worst_sigma_px: of a projection over the picture, at the median distance of the boards.
+        median_sigma_px, worst_sigma_px, mean_sigma_px: of a projection over the picture, at the median distance of the
+            boards; the mean is the root of the mean variance.
+        next_views: what to photograph next, the best first.
         files: for other programs.
     """
 
@@ -118,5 +134,28 @@ class BoardReport(Report):
     bend_note: str
     median_sigma_px: float
     worst_sigma_px: float
+    mean_sigma_px: float
+    next_views: Sequence[NextViewReport]
     files: Sequence[CameraFileReport]
     warnings: Sequence[str]
+
+
+class ComparisonReport(Report):
+    """What ``sfmapp calibrate compare`` prints with --json.
+
+    Attributes:
+        is_same: as far as the sigmas tell; chance: that the same camera differs as much, by chi2.
+        turn_deg: that was taken out.
+        median_px, largest_px: length of the difference over the picture.
+        largest_at: pixel where it is largest; largest_sigma_px: sigma of a coordinate of it there.
+    """
+
+    is_same: bool
+    chance: float
+    chi2: float
+    degrees_of_freedom: int
+    turn_deg: float
+    median_px: float
+    largest_px: float
+    largest_at: Sequence[float]
+    largest_sigma_px: float

@@ -47,6 +47,7 @@ def add_way(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help="lens model, one of COLMAP's and others; default: by views that are held out",
     )  # fmt: skip
     parser.add_argument("--flat", action="store_true", help="do not look whether the board is bent")
+    parser.add_argument("--no-recording", action="store_true", help="do not write recording.rrd")
     parser.add_argument("--threads", metavar="N", help="number of workers, default: all cores")
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_board)
@@ -60,15 +61,16 @@ def _board(args: argparse.Namespace) -> int:
     load_numba_without_blas()
     from sfmapp.calibration.boards import parse_board
     from sfmapp.camera.names import CameraModel
-    from sfmapp.pipelines.calibration.board import calibrate_board
+    from sfmapp.pipelines.calibration.board import BoardOptions, calibrate_board
     from sfmapp.workspace.usage import Stopwatch
 
     watch = Stopwatch(whole_process=True)
     model = None if args.model is None else CameraModel[args.model]
+    asked = BoardOptions(model, bends=not args.flat, recording=not args.no_recording)
     with listening(args) as events:
         result = calibrate_board(
             args.source, args.output, parse_board(args.board), options,
-            model=model, bends=not args.flat, events=events, watch=watch,
+            asked=asked, events=events, watch=watch,
         )  # fmt: skip
     if args.json:
         print_json({"exit_code": 0, "output": str(result.output), **result.report})
@@ -87,8 +89,8 @@ def _print(result: CalibrationResult) -> None:
     for name, value, sigma in zip(made.param_names, made.camera.params, made.sigmas, strict=True):
         print(f"  {name:<6} {value:13.6g} +- {sigma:.2g}")
     print(
-        f"a projection is sure to {report.median_sigma_px:.3f} px in the middle of the picture's places, "
-        f"{report.worst_sigma_px:.3f} px at the worst"
+        f"sigma of a projection over the picture: {report.mean_sigma_px:.4f} px in the mean, "
+        f"{report.worst_sigma_px:.4f} px at worst"
     )
     for picture in report.pictures:
         why = picture.unused or picture.problem
@@ -96,5 +98,7 @@ def _print(result: CalibrationResult) -> None:
             print(f"  {picture.name}: {why}")
     for warning in made.warnings:
         print(f"  note: {warning}")
+    for n, view in enumerate(report.next_views, 1):
+        print(f"  photograph next, {n}: {view.hint}; then {view.mean_sigma_px:.4f} px")
     print(took(result.output, result.report.run))
     print(f"calibration {result.output / 'calibration.json'}, report {result.output / 'report.html'}")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.geometry import p3p, rigid3
+from sfmapp.geometry import p3p, pnp, rigid3
 
 Array = NDArray[np.float64]
 
@@ -31,10 +32,16 @@ class Resection:
         return int(self.is_inlier.sum())
 
 
+PoseMethod = Literal["p3p", "all"]
+"""``p3p``: RANSAC over three points, for correspondences of which many may be wrong; ``all``: every point at once, with
+three points or more of which none is wrong (:mod:`sfmapp.geometry.pnp`)."""
+
+
 def estimate_pose(
-    xyz: Array, normalized: Array, max_error: float, *, confidence: float = 0.9999, max_iterations: int = 10_000
-) -> Resection | None:
-    """Pose from 3D-2D correspondences by RANSAC over P3P (Fischler and Bolles, CACM 1981; OpenCV's loop).
+    xyz: Array, normalized: Array, max_error: float, *, confidence: float = 0.9999, max_iterations: int = 10_000,
+    method: PoseMethod = "p3p",
+) -> Resection | None:  # fmt: skip
+    """Pose from 3D-2D correspondences by RANSAC over P3P (Fischler and Bolles, CACM 1981; OpenCV's loop), or from all.
 
     The result is the same at every call: OpenCV's loop starts from a fixed seed.
 
@@ -45,10 +52,13 @@ def estimate_pose(
         max_error: largest distance of an inlier in the normalised image plane, or on the unit sphere.
         confidence: wanted probability that one all-inlier sample was drawn.
         max_iterations: bound on the number of samples.
+        method: whether some of the points may be wrong.
 
     Returns:
         The pose with at least four inliers in front of the camera (along their rays), or None.
     """
+    if method == "all":
+        return _pose_of_all(xyz, normalized, max_error)
     import cv2
 
     valid = np.flatnonzero(~np.isnan(normalized[:, 0]))
@@ -75,6 +85,19 @@ def estimate_pose(
         error = np.linalg.norm(in_camera[:, :2] / in_camera[:, 2:] - normalized, axis=1)
     is_inlier = (in_camera[:, 2] > 0) & (error <= max_error)  # False for NaN
     return Resection(pose, is_inlier) if is_inlier.sum() >= 4 else None
+
+
+def _pose_of_all(xyz: Array, normalized: Array, max_error: float) -> Resection | None:
+    valid = ~np.isnan(normalized[:, 0])
+    if valid.sum() < 4:
+        return None
+    rays = normalized if normalized.shape[1] == 3 else np.concatenate([normalized, np.ones((len(normalized), 1))], 1)
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    poses = pnp.poses_of_points(xyz[valid], rays[valid])
+    if not len(poses):
+        return None
+    is_inlier = p3p.squared_errors(poses[0], xyz, rays) <= max_error**2  # False for NaN
+    return Resection(poses[0], is_inlier) if is_inlier.sum() >= 4 else None
 
 
 def estimate_pose_and_focal(xyz: Array, normalized: Array, max_error: float, focal_scales: Array) -> Resection | None:

@@ -17,12 +17,10 @@ from sfmapp.formats.control_points import LOCAL, ControlPoints
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.geometry.geodesy import LocalFrame
 from sfmapp.georeference.coordinate_systems import HeightReference, coordinate_system
+from sfmapp.georeference.fit import least_median
 
 Array = NDArray[np.float64]
 
-# What a similarity is tried from: all triples of points up to so many, as many random ones beyond. With a third of the
-# points wrong, all of 2000 triples hold one of them with a probability of 1e-300.
-_MAX_TRIPLES = 2300
 # Points thinner than this many of their residuals are a line: three sigma.
 _SPREAD_OVER_RESIDUAL = 3.0
 # A direction in which the survey has but this share of its variance of its own is not held by anything else.
@@ -98,8 +96,8 @@ class Alignment:
 def align_to_survey(place: Array, surveyed: Array) -> Alignment:
     """Robust similarity from places in a model (P, 3), NaN where there is none, to those of the survey (P, 3).
 
-    Least trimmed squares: from triples of points to the better half of all (Rousseeuw and Van Driessen, 2006), then all
-    within 2.5 robust standard deviations. With three points nothing can be told apart.
+    It begins as :func:`~sfmapp.georeference.fit.least_median` has it; then all within 2.5 robust standard deviations
+    count. With three points nothing can be told apart.
     """
     known = np.flatnonzero(np.isfinite(place[:, 0]))
     none = np.zeros(len(place), bool)
@@ -110,22 +108,19 @@ def align_to_survey(place: Array, surveyed: Array) -> Alignment:
             f"{len(known)} control points have a place in the model: three that are not on a line are needed",
         )
     model, world = place[known], surveyed[known]
-    best, kept = np.inf, np.zeros(8)
-    for triple in _triples(len(known)):
-        try:
-            found = _concentrate(model, world, triple)
-        except ValueError:  # on a line
-            continue
-        if found[0] < best:
-            best, kept = found
-    if not np.isfinite(best):
-        return Alignment(None, none, "all control points lie on a line: the turn about it is open")
-    lengths = _lengths(kept, model, world)
+    start = least_median(model, world, np.ones_like(world))[0]
+    if start is None:
+        return Alignment(None, none, "the control points do not tell where the model lies")
+    lengths = np.linalg.norm(start.apply(model) - world, axis=1)
     # a length of three dimensions: the median is 1.538 sigma per axis, and 3.30 sigma of it stand for 2.5 of one axis
     sigma = (1 + 5 / max(len(known) - 3, 1)) * float(np.median(lengths)) / 1.538
     inlier = lengths <= max(3.30 * sigma, 1e-9 * float(np.abs(world).max()))
-    kept = similarity.umeyama(model[inlier], world[inlier])
-    residual = np.sqrt((_lengths(kept, model[inlier], world[inlier]) ** 2).sum() / max(3 * inlier.sum() - 7, 1))
+    try:
+        kept = similarity.umeyama(model[inlier], world[inlier])
+    except ValueError:
+        return Alignment(None, none, "all control points lie on a line: the turn about it is open")
+    off = similarity.apply(kept, model[inlier]) - world[inlier]
+    residual = np.sqrt((off**2).sum() / max(3 * inlier.sum() - 7, 1))
     spread = np.linalg.svd(world[inlier] - world[inlier].mean(0), compute_uv=False) / np.sqrt(inlier.sum())
     if spread[1] < _SPREAD_OVER_RESIDUAL * residual:
         return Alignment(None, none, "the control points lie as good as on a line: the turn about it is open")
@@ -144,39 +139,6 @@ def similarity_covariance(place: Array, covariance: Array) -> Array | None:
         return None
     inverse: Array = np.linalg.inv(information)
     return inverse
-
-
-def _triples(num: int) -> NDArray[np.int64]:
-    """(T, 3) of all positions below a number, or a sample of them."""
-    count = num * (num - 1) * (num - 2) // 6
-    if count <= _MAX_TRIPLES:
-        i, j, k = np.meshgrid(*[np.arange(num)] * 3, indexing="ij")
-        return np.stack([i, j, k], -1)[(i < j) & (j < k)].astype(np.int64)
-    rng = np.random.default_rng([num, 0x6C9])
-    return np.array([rng.choice(num, 3, replace=False) for _ in range(_MAX_TRIPLES)], np.int64)
-
-
-def _lengths(world_from_model: Array, model: Array, world: Array) -> Array:
-    lengths: Array = np.linalg.norm(similarity.apply(world_from_model, model) - world, axis=1)
-    return lengths
-
-
-def _concentrate(model: Array, world: Array, chosen: NDArray[np.integer]) -> tuple[float, Array]:
-    """Fit again and again to the better half; the squares of that half, and the fit. Raises ValueError on a line."""
-    half, best = max(3, len(model) // 2 + 1), np.inf
-    fit = similarity.umeyama(model[chosen], world[chosen])
-    for _ in range(20):
-        lengths = _lengths(fit, model, world)
-        chosen = np.argsort(lengths, kind="stable")[:half]
-        squares = float((lengths[chosen] ** 2).sum())
-        if not squares < best * (1 - 1e-9):
-            break
-        best, kept = squares, fit
-        try:
-            fit = similarity.umeyama(model[chosen], world[chosen])
-        except ValueError:
-            break
-    return best, kept
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,8 @@ class Drift:
         correlation: of errors from one photograph to the next, mean of what is likely.
         inflation: by what sigmas of positions are to be multiplied, as if errors were independent, for the mean place
             to be as uncertain as it is; one at least.
-        spread: (7,) by what standard deviations of a similarity that was fitted as if they were independent are to be
-            multiplied: rotation, scale, mean place.
+        spread: (K,) by what standard deviations of unknowns that were fitted as if they were independent are to be
+            multiplied: of rotation, scale and mean place, and of what else was fitted.
     """
 
     correlation: float
@@ -43,15 +43,22 @@ class Drift:
     spread: Array
 
 
-NO_DRIFT = Drift(0.0, 1.0, np.ones(7))
+def similarity_slope(arm: Array) -> Array:
+    """(n, 3, 7) how places move with rotation (radians), log scale and shift of a similarity about the mean place.
+
+    Args:
+        arm: (n, 3) of the places from it.
+    """
+    shift = np.broadcast_to(np.eye(3), (len(arm), 3, 3))
+    return np.concatenate([-rigid3.skew(arm), arm[:, :, None], shift], 2)
 
 
-def estimate_drift(residual: Array, sigma: Array, arm: Array, is_used: Mask, order: Array) -> Drift:
+def estimate_drift(residual: Array, sigma: Array, slope: Array, is_used: Mask, order: Array) -> Drift:
     """Drift of positions (n, 3) beside a model that was fitted to them.
 
     Args:
         residual: (n, 3) metres, east, north, up; sigma: (n, 3), infinite for no height.
-        arm: (n, 3) of the cameras from the mean place.
+        slope: (n, 3, K) of the residuals by what was fitted, a similarity first: see :func:`similarity_slope`.
         is_used: (n,) bool: those that it was fitted to.
         order: (n,) number of the photograph in time, increasing by one from each to the next.
     """
@@ -59,14 +66,13 @@ def estimate_drift(residual: Array, sigma: Array, arm: Array, is_used: Mask, ord
     rows = rows[np.argsort(order[rows], kind="stable")]
     known = np.isfinite(sigma[rows])
     if len(rows) < _LEAST or not known[:, 0].all():
-        return NO_DRIFT
+        return Drift(0.0, 1.0, np.ones(slope.shape[2]))
     axes = [k for k in range(3) if known[:, k].all()]  # heights that some have tell no drift
-    jacobian = np.concatenate(
-        [-rigid3.skew(arm[rows]), arm[rows][:, :, None], np.broadcast_to(np.eye(3), (len(rows), 3, 3))], 2
-    )[:, axes] / sigma[rows][:, axes, None]  # fmt: skip
+    jacobian = slope[rows][:, axes] / sigma[rows][:, axes, None]
     normal = residual[rows][:, axes] / sigma[rows][:, axes]
     gaps = np.maximum(np.diff(order[rows]), 1.0)
-    flat = jacobian.reshape(-1, 7)
+    num = slope.shape[2]
+    flat = jacobian.reshape(-1, num)
     information = flat.T @ flat
     # what no height holds, and a scale of its own for every unknown
     root = np.sqrt(np.maximum(np.diag(information), 1e-12))
@@ -90,14 +96,14 @@ def estimate_drift(residual: Array, sigma: Array, arm: Array, is_used: Mask, ord
 def _with_correlation(
     r: float, jacobian: Array, normal: Array, gaps: Array, held: Array, freedom: int
 ) -> tuple[float, Array]:
-    """Restricted log likelihood of a correlation, and variances (7,) of the fit with independent errors under it, in
+    """Restricted log likelihood of a correlation, and variances (K,) of the fit with independent errors under it, in
     units in which the sigmas of positions are as stated."""
     power = r**gaps
     left = np.sqrt(1.0 - power**2)
     white = [
         np.concatenate([x[:1], (x[1:] - _shaped(power, x) * x[:-1]) / _shaped(left, x)]) for x in (jacobian, normal)
     ]
-    slope, rest = white[0].reshape(-1, 7), white[1].ravel()
+    slope, rest = white[0].reshape(-1, jacobian.shape[2]), white[1].ravel()
     information = slope.T @ slope
     values, vectors = np.linalg.eigh(information)
     good = values > 1e-9 * values[-1]

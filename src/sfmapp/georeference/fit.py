@@ -172,7 +172,7 @@ def robust_fit(
     """
     if len(centers) < 3:
         return None
-    start, scale2 = _least_median(centers, places, sigma)
+    start, scale2 = least_median(centers, places, sigma)
     if start is None:
         return None
     is_redundant = len(centers) >= MIN_REDUNDANT
@@ -252,9 +252,12 @@ def student(freedom: float) -> float:
     return 1.0 + (z**2 + 1) / (4 * freedom) + (5 * z**4 + 16 * z**2 + 3) / (96 * freedom**2)
 
 
-def _least_median(centers: Array, places: Array, sigma: Array) -> tuple[Similarity | None, float]:
-    """The similarity of three tags whose median squared normalised residual over all is least, improved by the half
-    that it fits best, and the squared factor on the sigmas that this median tells."""
+def least_median(centers: Array, places: Array, sigma: Array) -> tuple[Similarity | None, float]:
+    """The similarity of three places whose median squared normalised residual over all is least, improved by the half
+    that it fits best, and the squared factor on the sigmas that this median tells; None where it is none.
+
+    Rousseeuw, JASA 1984; Rousseeuw and Van Driessen, 2006. Arguments as of :func:`fit_similarity`.
+    """
     num = len(centers)
     has_height = np.isfinite(sigma[:, 2])
     flat = np.where(np.isfinite(places), places, 0.0)
@@ -276,7 +279,7 @@ def _least_median(centers: Array, places: Array, sigma: Array) -> tuple[Similari
     order = np.argsort(np.median(scores(*found), axis=1), kind="stable")[:10]
     rotation, scale, shift = (part[order] for part in found)
     half = (num + 4) // 2
-    for _ in range(10):  # concentration steps: Rousseeuw and Van Driessen, 2006
+    for _ in range(10):  # concentration steps
         kept = np.argsort(scores(rotation, scale, shift), axis=1, kind="stable")[:, :half]
         rotation, scale, shift = closed_form(centers[kept], flat[kept])
     squares = scores(rotation, scale, shift)

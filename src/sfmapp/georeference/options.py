@@ -17,7 +17,8 @@ class GpsOptions:
         sigma_m: standard deviation of a position along east and along north; None: as its source says, else 5 m, and
             then as the residuals tell.
         sigma_up_m: of a height; None: as its source says, else twice that of the position.
-        time_offset_s: seconds to add to the clock of the photographs to get that of a track, which counts in UTC.
+        time_offset_s: seconds to add to the clock of the photographs to get that of a track, which counts in UTC; what
+            is left of it, a minute or so, is estimated where the way of the cameras tells it.
     """
 
     source: str = "exif"

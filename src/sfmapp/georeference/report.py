@@ -105,6 +105,23 @@ class PlacedModel(Report):
     moved_m: float | None = None
 
 
+class ClockReport(Report):
+    """What the clock of photographs is off that of a track.
+
+    Attributes:
+        given_s: seconds that the user has given to add to it.
+        offset_s: to add beside, by the way of the cameras; sigma_s: standard deviation. Absent where that tells none.
+        is_applied: positions were taken anew with it.
+        reason: why not; empty if they were.
+    """
+
+    given_s: float
+    offset_s: float | None = None
+    sigma_s: float | None = None
+    is_applied: bool
+    reason: str
+
+
 class GeoreferenceReport(Report):
     """What the stage ``georeference`` did.
 
@@ -114,6 +131,7 @@ class GeoreferenceReport(Report):
         findings: what was wrong with them.
         models: as in the report, the largest first.
         images: those with a position.
+        clock: of the photographs beside that of a track; absent where positions are of none.
     """
 
     source: str
@@ -121,3 +139,4 @@ class GeoreferenceReport(Report):
     findings: Sequence[Finding]
     models: Sequence[PlacedModel]
     images: Sequence[PositionedImage]
+    clock: ClockReport | None = None

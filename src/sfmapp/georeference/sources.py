@@ -125,36 +125,41 @@ def _along_track(found: PositionFile, records: Sequence[ImageRecord], offset_s: 
             f"{found.path}: a track is matched by time, and no photograph says when it was taken",
             "give a file with names of images in place of times",
         )
-    positions: list[Position | None] = []
-    for record in records:
-        place = None if record.timestamp is None else _place_at(track, record.timestamp + offset_s)
-        height = None if place is None or math.isnan(place[2]) else float(place[2])
-        positions.append(
-            None
-            if place is None
-            else Position(float(place[0]), float(place[1]), height, source=f"{found.path.name}, by time")
+    times = np.array([math.nan if record.timestamp is None else record.timestamp + offset_s for record in records])
+    positions = [
+        None
+        if math.isnan(place[0])
+        else Position(
+            place[0], place[1], None if math.isnan(place[2]) else place[2], source=f"{found.path.name}, by time"
         )
+        for place in places_along(track, times).tolist()
+    ]
     if not any(position is not None for position in positions):
-        times = [record.timestamp for record in records if record.timestamp is not None]
+        taken = [record.timestamp for record in records if record.timestamp is not None]
         raise InputError(
             f"{found.path}: the track is from {_clock(track[0, 0])} to {_clock(track[-1, 0])}, the photographs by "
-            f"their clock from {_clock(min(times))} to {_clock(max(times))}: none of them lies on it",
+            f"their clock from {_clock(min(taken))} to {_clock(max(taken))}: none of them lies on it",
             "give the seconds to add to the photographs' clock: --set gps.time_offset_s=...; a track counts in UTC, "
             "cameras mostly in local time",
         )
     return positions
 
 
-def _place_at(track: Array, time_s: float) -> Array | None:
-    """(3,) between the fixes around a time; None off the track, or in a gap of it."""
-    after = int(np.searchsorted(track[:, 0], time_s))
-    if after < len(track) and track[after, 0] == time_s:
-        return track[after, 1:]
-    if after in (0, len(track)) or track[after, 0] - track[after - 1, 0] > _LONGEST_GAP_S:
-        return None
-    share = (time_s - track[after - 1, 0]) / (track[after, 0] - track[after - 1, 0])
-    between: Array = track[after - 1, 1:] + share * (track[after, 1:] - track[after - 1, 1:])
-    return between
+def places_along(track: Array, times_s: Array) -> Array:
+    """(n, 3) between the fixes of a track (T, 4), whose first column ascends, around times (n,); NaN off the track, and
+    in a gap of it."""
+    after = np.searchsorted(track[:, 0], times_s)
+    inside = np.minimum(after, len(track) - 1)
+    before = np.maximum(inside - 1, 0)
+    length = track[inside, 0] - track[before, 0]
+    is_fix = track[inside, 0] == times_s
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = np.where(is_fix, 1.0, (times_s - track[before, 0]) / length)
+        between = track[before, 1:] + share[:, None] * (track[inside, 1:] - track[before, 1:])
+    places = np.where(is_fix[:, None], track[inside, 1:], between)
+    is_known = is_fix | ((after > 0) & (after < len(track)) & (length <= _LONGEST_GAP_S))
+    found: Array = np.where(is_known[:, None], places, np.nan)
+    return found
 
 
 def _clock(time_s: float) -> str:

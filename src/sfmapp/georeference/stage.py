@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.georeference.adjustment import Adjusted, Measured, adjust_with_positions, finished
-from sfmapp.georeference.drift import Drift, estimate_drift
+from sfmapp.georeference.clock import settle_clock
+from sfmapp.georeference.drift import Drift, estimate_drift, similarity_slope
 from sfmapp.georeference.faults import name_faults
 from sfmapp.georeference.fit import Level, LevelOfImage, RobustFit, Similarity, closed_form, robust_fit, turn_between
 from sfmapp.georeference.options import GpsOptions
@@ -83,6 +84,7 @@ def georeference_models(mappers: Sequence[Mapper], image_set: ImageSet, options:
         options: how far to believe them.
         events: told of findings and decisions.
     """
+    image_set, clock = settle_clock(mappers, image_set, options, events)
     tags, findings = tags_of(image_set.images, options)
     for finding in findings:
         events.warned(STAGE, f"positions: {finding.sentence}", names=list(finding.images))
@@ -105,7 +107,7 @@ def georeference_models(mappers: Sequence[Mapper], image_set: ImageSet, options:
         events.warned(STAGE, f"positions: {finding.sentence}; it is left aside")
     num = sum(record.position is not None for record in image_set.images)
     report = GeoreferenceReport(
-        source=options.source, num_positions=num, findings=findings, models=reports, images=images
+        source=options.source, num_positions=num, findings=findings, models=reports, images=images, clock=clock
     )
     if not placed:
         return Placed(None, report)
@@ -129,8 +131,8 @@ def _place(number: int, mapper: Mapper, tags: Tags, events: Events) -> _Model | 
     first = fit.similarity
     _move(model.cam_from_world, model.point_xyz, first.world_from_model)
     rigid = model.copy()
-    arm = model.centers[image_idx] - first.mean
-    drift = estimate_drift(fit.residual, fit.sigma, arm, fit.is_inlier, image_idx.astype(np.float64))
+    slope = similarity_slope(model.centers[image_idx] - first.mean)
+    drift = estimate_drift(fit.residual, fit.sigma, slope, fit.is_inlier, image_idx.astype(np.float64))
     measured = Measured(image_idx, tags.places[n], tags.sigma[n], tags.is_stated)
     adjusted = adjust_with_positions(mapper, measured, fit, level, drift)
     is_adjusted = adjusted is not None

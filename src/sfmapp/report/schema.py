@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Union
 
 from sfmapp.calibration.file import CalibrationDocument
+from sfmapp.calibration.point_reports import LocationReport, MeasureReport, TargetReport
 from sfmapp.georeference.world_frame import Georeference
 from sfmapp.report.evaluation import EvaluationReport
 from sfmapp.report.model import (
@@ -29,9 +30,9 @@ from sfmapp.report.model import (
 from sfmapp.report.validation import CloudValidation, Validation
 from sfmapp.reporting import Report, field_types
 
-# by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry, refine and
-# calibrate; calibration.json; validation/report.json and validation/cloud.json; what evaluate, undistort and export
-# print with --json; and georeference.json
+# by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry, refine,
+# calibrate and locate; calibration.json; validation/report.json and validation/cloud.json; what evaluate, undistort,
+# export and measure print with --json; and georeference.json
 KINDS: Mapping[str, type[Report]] = {
     "reconstruct": ReconstructionReport,
     "dense": DenseRunReport,
@@ -46,6 +47,9 @@ KINDS: Mapping[str, type[Report]] = {
     "calibration": CalibrationDocument,
     "export": ExportReport,
     "georeference": Georeference,
+    "calibrate-target": TargetReport,
+    "locate": LocationReport,
+    "measure": MeasureReport,
 }
 _SIMPLE = {bool: "boolean", int: "integer", float: "number", str: "string", type(None): "null"}
 

@@ -11,12 +11,18 @@ from pathlib import Path
 
 
 def main(kind: str, folder: str, output: str, threads: str) -> None:
-    """Draw what lies in folder: the replay of a run, or a dense result."""
+    """Draw what lies in folder: the replay of a run, a dense result, or a calibration."""
     if kind == "dense":
         from sfmapp.viewer.dense_replay import DenseReplay
         from sfmapp.viewer.dense_rrd import write_dense_rrd
 
         write_dense_rrd(DenseReplay.load(Path(folder)), Path(output))
+        return
+    if kind == "calibration":
+        from sfmapp.viewer.calibration_replay import CalibrationReplay
+        from sfmapp.viewer.calibration_rrd import write_calibration_rrd
+
+        write_calibration_rrd(CalibrationReplay.load(Path(folder)), Path(output))
         return
     from sfmapp.viewer.replay import Replay
     from sfmapp.viewer.rrd import write_rrd

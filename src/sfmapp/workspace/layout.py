@@ -8,6 +8,7 @@ __all__ = [
     "CALIBRATE",
     "DENSE",
     "FORMAT",
+    "LOCATE",
     "LOCK",
     "MANIFEST",
     "ODOMETRY",
@@ -21,7 +22,7 @@ __all__ = [
 FORMAT = f"{FORMAT_NAME} 1"
 # the commands that write workspaces; manifests of before the second one name none
 RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "refine", "dense", "undistort"
-CALIBRATE = "calibrate"
+CALIBRATE, LOCATE = "calibrate", "locate"
 LOCK, REPORT = ".lock", "report.json"
 # where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0
 USUAL_FOLDERS = ("images", "../images", "../../images")

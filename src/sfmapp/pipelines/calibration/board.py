@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sfmapp.calibration.adjustment import TargetView
+from sfmapp.calibration.adjustment import Fit, TargetView
 from sfmapp.calibration.boards import Board
+from sfmapp.calibration.planning import NextView, mean_sigma, next_views
 from sfmapp.calibration.report import (
     BendReport,
     BoardPictureReport,
@@ -18,6 +20,7 @@ from sfmapp.calibration.report import (
     CameraFileReport,
     ClosedFormReport,
     LensTrialReport,
+    NextViewReport,
 )
 from sfmapp.calibration.result import CameraCalibration
 from sfmapp.calibration.solve import Solution, ViewFacts, solve_views
@@ -27,11 +30,32 @@ from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
 from sfmapp.pipelines.calibration.pictures import BoardPictures, look_at_pictures
 from sfmapp.pipelines.calibration.results import write_camera
+from sfmapp.report.calibration_html import render_board_html
 from sfmapp.report.model import CalibrateReport
-from sfmapp.workspace.job import Job
+from sfmapp.viewer.calibration_recording import record_calibration
+from sfmapp.workspace.job import FAILED, WRITTEN, Job
 from sfmapp.workspace.layout import CALIBRATE, REPORT
 from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
+
+
+@dataclass(frozen=True)
+class BoardOptions:
+    """What a user may say of a calibration from a board.
+
+    Attributes:
+        model: of the lens; None: chosen by views that are held out.
+        bends: look whether the board is bent.
+        recording: write ``recording.rrd``.
+    """
+
+    model: CameraModel | None = None
+    bends: bool = True
+    recording: bool = True
+
+    def __post_init__(self) -> None:
+        if self.model == CameraModel.EQUIRECTANGULAR:
+            raise UsageError("model is EQUIRECTANGULAR: a panorama has no parameters to calibrate")
 
 
 @dataclass(frozen=True)
@@ -55,8 +79,7 @@ def calibrate_board(
     board: Board,
     options: Options | None = None,
     *,
-    model: CameraModel | None = None,
-    bends: bool = True,
+    asked: BoardOptions | None = None,
     events: Events | None = None,
     watch: Stopwatch | None = None,
 ) -> CalibrationResult:
@@ -67,17 +90,15 @@ def calibrate_board(
         output: a new folder, an empty one, or that of an earlier call.
         board: what they show.
         options: of these, those of images and ``threads``.
-        model: of the lens; None: chosen by views that are held out.
-        bends: look whether the board is bent.
+        asked: for the lens model and the rest; None for the defaults.
         events: progress, decisions, warnings and cancellation.
         watch: started when the run began.
 
     Raises:
         InputError: nothing to read, fewer than three photographs with a board, or views that leave the camera open.
-        UsageError: a panorama as a model, or an output that holds something else.
+        UsageError: an output that holds something else.
     """
-    if model == CameraModel.EQUIRECTANGULAR:
-        raise UsageError("model is EQUIRECTANGULAR: a panorama has no parameters to calibrate")
+    asked = asked or BoardOptions()
     with Job.opened(CALIBRATE, source, output, options, events=events, watch=watch) as job:
         with job.stage("detection"):
             pictures = look_at_pictures(job, board)
@@ -93,14 +114,37 @@ def calibrate_board(
             views = [TargetView(one.name, board.points[one.detection.idx], one.detection.xy) for one in used]
             facts = [_facts(board, len(one.detection.idx), one.detection.sharpness_px) for one in used]
             solution = solve_views(
-                views, pictures.size, model, facts=facts, bends=bends, threads=job.threads, events=job.events
+                views,
+                pictures.size,
+                asked.model,
+                facts=facts,
+                bends=asked.bends,
+                threads=job.threads,
+                events=job.events,
             )
+        with job.stage("plan"):
+            made = solution.calibration
+            solved = {view.name: view for view in views}
+            counted = [solved[view.name] for view in made.views if view.is_used.any()]
+            coming = next_views(made, _fit_of(solution, counted), counted, board)
         with job.stage("files"):
-            files = write_camera(job.workspace.folder, solution.calibration)
-        report = CalibrateReport(board=_report(board, pictures, solution, files), run=job.facts())
-        job.workspace.write_json(REPORT, report)
+            files = write_camera(job.workspace.folder, made)
+            report = CalibrateReport(board=_report(board, pictures, solution, coming, files), run=job.facts())
+            job.workspace.write_json(REPORT, report)
+            job.workspace.write_text("report.html", render_board_html(report, made))
+        if asked.recording:
+            with job.stage("recording"):
+                _record(job, board, pictures, made)
         job.workspace.save()
         return CalibrationResult(job.workspace.folder, solution.calibration, report)
+
+
+def _hull(xy: NDArray[np.float64]) -> list[list[float]]:
+    """The convex outline of pixels."""
+    import cv2
+
+    found: list[list[float]] = cv2.convexHull(xy.astype(np.float32))[:, 0].astype(np.float64).tolist()
+    return found
 
 
 def _facts(board: Board, num: int, sharpness_px: float) -> ViewFacts:
@@ -108,8 +152,33 @@ def _facts(board: Board, num: int, sharpness_px: float) -> ViewFacts:
     return ViewFacts(sharpness_px, board.kind != "chessboard" or num == len(board.points))
 
 
+def _fit_of(solution: Solution, views: Sequence[TargetView]) -> Fit:
+    """The fit with the poses of these views alone."""
+    poses = {view.name: view.cam_from_target for view in solution.calibration.views}
+    return replace(solution.fit, cam_from_target=np.array([poses[view.name] for view in views]))
+
+
+def _record(job: Job, board: Board, pictures: BoardPictures, made: CameraCalibration) -> None:
+    paths = {one.name: str(one.path) for one in pictures.pictures if one.path is not None}
+    outline = _outline(board)
+    told = record_calibration(job.workspace.recording, made, outline, paths, Path(job.source).name)
+    job.workspace.note(recording=FAILED if told.problem else WRITTEN)
+    if told.problem:
+        job.events.warned("recording", f"no recording: {told.problem}")
+
+
+def _outline(board: Board) -> NDArray[np.float64]:
+    """(4, 3) corners of the points of a board."""
+    low, high = board.points.min(0), board.points.max(0)
+    return np.array([[low[0], low[1], 0.0], [high[0], low[1], 0.0], [high[0], high[1], 0.0], [low[0], high[1], 0.0]])
+
+
 def _report(
-    board: Board, pictures: BoardPictures, solution: Solution, files: Sequence[CameraFileReport]
+    board: Board,
+    pictures: BoardPictures,
+    solution: Solution,
+    coming: Sequence[NextView],
+    files: Sequence[CameraFileReport],
 ) -> BoardReport:
     made, bend = solution.calibration, solution.bend
     fits = {view.name: view for view in made.views}
@@ -170,6 +239,10 @@ def _report(
         bend_note=solution.bend_note,
         median_sigma_px=float(np.nanmedian(sigma)),
         worst_sigma_px=float(np.nanmax(sigma)),
+        mean_sigma_px=mean_sigma(made, made.distances[1] if made.distances else None),
+        next_views=[
+            NextViewReport(hint=view.hint, mean_sigma_px=view.mean_sigma_px, outline=_hull(view.xy)) for view in coming
+        ],
         files=list(files),
         warnings=list(made.warnings),
     )

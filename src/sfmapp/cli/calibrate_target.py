@@ -1,0 +1,124 @@
+"""``sfmapp calibrate target``: a camera from one photograph of points with known places."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sfmapp.camera.names import MODEL_NAMES
+from sfmapp.cli.common import (
+    add_output_flags,
+    limit_library_threads,
+    listening,
+    load_numba_without_blas,
+    print_json,
+    took,
+)
+
+if TYPE_CHECKING:
+    from sfmapp.calibration.point_reports import FitReport
+    from sfmapp.pipelines.calibration.known_points import PointSource
+
+POINTS = """\
+a table of points has a line for each:  [name] X Y Z u v
+  separated by commas, semicolons, tabs or spaces, with names of the columns in the first line or without; a unit in
+  them (X [mm]) is that of the results. Without Z the points lie in one plane. Pixels are those of the file as stored,
+  the centre of the first one at (0.5, 0.5); with --opencv-pixels at (0, 0).
+a table of markers has four lines for each:  id corner X Y Z
+  with corners 0 to 3 clockwise from the top left of the marker itself."""
+
+EXAMPLES = f"""\
+examples:
+  sfmapp calibrate target box.jpg --points box.csv -o box/
+  sfmapp calibrate target room.jpg --markers room.csv --dictionary DICT_4X4_50 -o room/
+  sfmapp reconstruct photos/ -o out/ --camera box/calibration.json
+
+{POINTS}
+Six points that are not in one plane are needed, twenty and more are good. Points of a plane tell the focal length where
+it is tilted against the picture, with the principal point taken as near the middle."""
+
+
+def add_way(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add this way to the parser."""
+    parser = ways.add_parser(
+        "target", help="one photograph of points with known places, in space or in a plane",
+        description="Calibrate from one photograph of points with known places: the direct linear transform, or Tsai's "
+        "method where they lie in a plane, refined; points that are wrong are named.",
+        epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("photograph", metavar="PHOTO", type=Path, help="a photograph")
+    parser.add_argument("-o", "--output", metavar="DIR", type=Path, required=True, help="output folder, new or empty")
+    add_point_flags(parser)
+    parser.add_argument(
+        "--camera-model", choices=MODEL_NAMES, metavar="NAME",
+        help="default: PINHOLE, from 20 points on OPENCV or a fisheye; PINHOLE_SKEW finds the skew as well",
+    )  # fmt: skip
+    add_output_flags(parser, has_log=True)
+    parser.set_defaults(run=_calibrate)
+
+
+def add_point_flags(parser: argparse.ArgumentParser) -> None:
+    """Flags on the points of a photograph, which `locate` has as well."""
+    parser.add_argument("--points", metavar="CSV", type=Path, help="points: [name] X Y Z u v")
+    parser.add_argument("--markers", metavar="CSV", type=Path, help="corners of markers: id corner X Y Z")
+    parser.add_argument("--dictionary", metavar="NAME", help="of the markers, such as DICT_4X4_50")
+    parser.add_argument(
+        "--opencv-pixels", action="store_true", help="the centre of the first pixel is (0, 0) in tables"
+    )
+    parser.add_argument(
+        "--sigma-px", metavar="PX", type=float, help="standard deviation of a mark; default: from the residuals"
+    )
+
+
+def point_source(args: argparse.Namespace) -> PointSource:
+    """What the flags say of the points."""
+    from sfmapp.pipelines.calibration.known_points import PointSource
+
+    return PointSource(args.points, args.markers, args.dictionary, args.opencv_pixels)
+
+
+def print_fit(fit: FitReport) -> None:
+    """What a fit comes to, and what is wrong with its points."""
+    print(
+        f"{fit.num_used} of {len(fit.points)} points agree, rms {fit.rms_px:.3f} px, noise of a mark "
+        f"{fit.noise_px:.3g} px ({fit.noise_source})"
+    )
+    for point in fit.points:
+        if not point.is_used:
+            print(f"  WRONG: {point.name}: {point.reason}")
+    for warning in fit.warnings:
+        print(f"  {warning}")
+    pose, axes = fit.pose, "xyz"
+    shown = ", ".join(
+        f"{axis} {value:.6g} +- {sigma:.2g}"
+        for axis, value, sigma in zip(axes, pose.center, pose.sigma_center, strict=True)
+    )
+    turn = max(pose.sigma_rotation_deg)
+    print(f"the camera stood at {shown} {pose.unit}, its rotation is known to {turn:.2g} degrees")
+
+
+def _calibrate(args: argparse.Namespace) -> int:
+    limit_library_threads()
+    load_numba_without_blas()
+    from sfmapp.camera.names import CameraModel
+    from sfmapp.pipelines.calibration.known_points import calibrate_from_target
+    from sfmapp.report.model import RunUsage
+    from sfmapp.workspace.usage import Stopwatch
+
+    watch = Stopwatch(whole_process=True)
+    with listening(args) as events:
+        result = calibrate_from_target(
+            args.photograph, args.output, point_source(args), sigma_px=args.sigma_px, events=events, watch=watch,
+            camera_model=None if args.camera_model is None else CameraModel[args.camera_model],
+        )  # fmt: skip
+    report = result.report
+    if args.json:
+        print_json({"exit_code": 0, "output": str(result.output), **report})
+    elif not args.quiet:
+        values = ", ".join(f"{p.name} {p.value:.6g} +- {p.sigma:.2g}" for p in report.parameters)
+        print(f"{report.fit.model}: {values}")
+        print_fit(report.fit)
+        print(took(result.output, RunUsage(**watch.read())))
+        print(f"calibration {result.output / 'calibration.json'}, report {result.output / 'report.html'}")
+    return 0

@@ -1,0 +1,61 @@
+"""``sfmapp locate``: where a photograph was taken, from points with known places in it."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sfmapp.cli.calibrate_target import POINTS, add_point_flags, point_source, print_fit
+from sfmapp.cli.common import add_output_flags, limit_library_threads, listening, load_numba_without_blas, print_json
+
+EXAMPLES = f"""\
+examples:
+  sfmapp locate photo.jpg --points points.csv --camera calibration.json -o where/
+  sfmapp locate photo.jpg --markers room.csv --dictionary APRILTAG_36H11 --camera camera.yaml -o where/
+  sfmapp measure marks.csv --pose where/ --plane 0,0,1,0
+
+{POINTS}
+Four points or more; three allow up to four poses. A camera that sfmapp has calibrated brings its sigmas along."""
+
+
+def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "locate", help="where a photograph was taken, from points with known places in it",
+        description="Find the pose of a calibrated camera from points with known places in one photograph, how sure it "
+        "is, which points are wrong, and whether a second pose explains them as well.",
+        epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("photograph", metavar="PHOTO", type=Path, help="a photograph")
+    parser.add_argument("-o", "--output", metavar="DIR", type=Path, required=True, help="output folder, new or empty")
+    parser.add_argument("--camera", metavar="FILE", required=True, help="a calibration file of any form")
+    add_point_flags(parser)
+    parser.add_argument(
+        "--method", choices=("auto", "p3p", "all"), default="auto",
+        help="p3p: samples of three points, of which some may be wrong; all: all points at once, none of them is; "
+        "default: p3p where there are more than four",
+    )  # fmt: skip
+    parser.add_argument(
+        "--max-error-px", metavar="PX", type=float, default=8.0,
+        help="farthest point that agrees with a pose while it is searched; default: 8",
+    )  # fmt: skip
+    add_output_flags(parser, has_log=True)
+    parser.set_defaults(run=_locate)
+
+
+def _locate(args: argparse.Namespace) -> int:
+    limit_library_threads()
+    load_numba_without_blas()
+    from sfmapp.pipelines.calibration.known_points import locate
+
+    with listening(args) as events:
+        result = locate(
+            args.photograph, args.output, point_source(args), args.camera, method=args.method,
+            max_error_px=args.max_error_px, sigma_px=args.sigma_px, events=events,
+        )  # fmt: skip
+    if args.json:
+        print_json({"exit_code": 0, "output": str(result.output), **result.report})
+    elif not args.quiet:
+        print_fit(result.report.fit)
+        print(f"pose {result.output / 'pose.json'}, report {result.output / 'report.html'}")
+    return 0
