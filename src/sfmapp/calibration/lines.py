@@ -281,11 +281,9 @@ def _folds(problem: Problem, arcs: Sequence[Arcs], num: int) -> list[tuple[list[
     """Lines to learn from and lines to ask, in num ways of which each asks others: those whose middle is in one of num
     kinds of fields of the pictures, so that the edges of one thing are on one side. Two kinds are a chessboard's."""
     kind = [_cells(problem, one) @ [1, 1 if num == 2 else 2] % num for one in arcs]
-    return [
-        tuple([one.take(k != n) if learn else one.take(k == n) for one, k in zip(arcs, kind, strict=True)]
-              for learn in (True, False))
-        for n in range(num)
-    ]  # fmt: skip
+    learn = [[one.take(k != n) for one, k in zip(arcs, kind, strict=True)] for n in range(num)]
+    ask = [[one.take(k == n) for one, k in zip(arcs, kind, strict=True)] for n in range(num)]
+    return list(zip(learn, ask, strict=True))
 
 
 def _try(problem: Problem, learn: list[Arcs], ask: list[Arcs], *, has_worlds: bool, seed: int) -> _Trial:
