@@ -48,21 +48,23 @@ def apart_rig(rng: np.random.Generator, num_shots: int, axes: Sequence[float] = 
     return RigFit((PINHOLE, PINHOLE), mounts, shots, boards)
 
 
-def views_of(truth: RigFit, rng: np.random.Generator, noise_px: float) -> list[RigView]:
-    """What the cameras see of the boards, with Gaussian noise."""
+def views_of(
+    truth: RigFit, rng: np.random.Generator, noise_px: float, board: np.ndarray = BOARD.points
+) -> list[RigView]:
+    """What the cameras see of boards with points (N, 3), with Gaussian noise."""
     views = []
     for c, camera in enumerate(truth.cameras):
         for t, rig_from_world in enumerate(truth.rig_from_world):
             for b, world_from_board in enumerate(truth.world_from_board):
                 rig_from_board = rigid3.compose(rig_from_world, world_from_board)
-                points = rigid3.apply(rigid3.compose(truth.cam_from_rig[c], rig_from_board), BOARD.points)
+                points = rigid3.apply(rigid3.compose(truth.cam_from_rig[c], rig_from_board), board)
                 if points[:, 2].min() < 0.1:
                     continue
                 xy = project(camera, points)
                 is_in = ((xy > 0) & (xy < [camera.width, camera.height])).all(1)
                 if is_in.sum() > _LEAST_POINTS:
                     noisy = xy[is_in] + noise_px * rng.standard_normal((int(is_in.sum()), 2))
-                    views.append(RigView(c, t, b, TargetView(f"cam{c}/{t:02d}.png", BOARD.points[is_in], noisy)))
+                    views.append(RigView(c, t, b, TargetView(f"cam{c}/{t:02d}.png", board[is_in], noisy)))
     return views
 
 

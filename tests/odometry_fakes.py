@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.images.sequence import Frame, GroundTruth, Sequence
+from sfmapp.images.sequence import Frame, GroundTruth, Imu, Sequence
+from sfmapp.odometry.inertial.scale import ScaleEstimate, ScaleRefusal
 from sfmapp.odometry.keyframe_images import KeyframeImages
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
@@ -42,7 +43,7 @@ class FakeSequence:
     source: str = "fake"
     rig: Rig = field(default_factory=lambda: Rig.single(simple_camera(CameraModel.PINHOLE, WIDTH, HEIGHT, 120.0)))
     frames_per_second: float | None = FPS
-    imu: None = None
+    imu: Imu | None = None
     ground_truth: GroundTruth | None = None
     orientation: int = 1
     length: int = 50
@@ -66,11 +67,13 @@ class FakeRunner:
     Attributes:
         lost: frames that get no pose.
         breaks_at: from this frame on everything is in a second map.
+        inertial: what a sensor has said of each map, if it may.
     """
 
     lost: range = range(0)
     breaks_at: int | None = None
     finds_nothing: bool = False
+    inertial: ScaleEstimate | ScaleRefusal | None = None
 
     def __call__(
         self,
@@ -81,6 +84,7 @@ class FakeRunner:
         threads: int,
         events: Events,
         markers: object = None,
+        with_imu: bool = True,
     ) -> OdometryResult:
         events.started("odometry", total=sequence.num_frames)
         assert sequence.ground_truth is not None
@@ -106,7 +110,10 @@ class FakeRunner:
         if any(frame in self.lost for frame in range(50)):
             events.warned("odometry", f"tracking is lost at frame {self.lost[0]}")
         events.finished("odometry")
-        return self._result(rows)
+        result = self._result(rows)
+        if with_imu and sequence.imu is not None:
+            result.maps = [replace(entry, inertial=self.inertial) for entry in result.maps]
+        return result
 
     def _track(self, frame: Frame, map_idx: int, rig: Rig, events: Events) -> NDArray[np.float32]:
         if map_idx >= len(self.maps):

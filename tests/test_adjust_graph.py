@@ -8,7 +8,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import C, L, P, X
+from gtsam.symbol_shorthand import A, C, D, L, P, X
 
 from sfmapp.adjust import solver
 from sfmapp.adjust.covariance import estimate_covariances
@@ -93,6 +93,48 @@ def test_same_minimum_and_covariances_as_plain_gtsam(monkeypatch, kind):
     joint = marginals.jointMarginalCovariance([X(0), L(5)])
     cross = found.matrix[6:12, -6:-3]
     np.testing.assert_allclose(cross, -joint.at(X(0), L(5)), atol=1e-6 * np.abs(cross).max())
+
+
+def test_marginals_with_variables_of_its_own_are_those_of_plain_gtsam():
+    """An offset that all positions share, and one for each camera that only its neighbours know: the latter eliminated,
+    or asked for."""
+    scene = make_scene(4, 8, 150, sigma_px=0.5)
+    fixed = replace(OPTIONS, refine_focal=False, refine_distortion=False)
+    graph = FactorGraph(start_of(scene), fixed, noise_px=0.5)
+    rng = np.random.default_rng(3)
+
+    def with_offset(measured):
+        def error(factor, values, slopes):
+            pose, common, own = (values.atPose3(factor.keys()[0]), *(values.atVector(k) for k in factor.keys()[1:]))
+            if slopes is not None:
+                slopes[0] = np.hstack([np.zeros((3, 3)), pose.rotation().matrix()])
+                slopes[1] = slopes[2] = np.eye(3)
+            return pose.translation() + common + own - measured
+
+        return error
+
+    graph.insert(A(0), np.zeros(3))
+    for i, center in enumerate(scene.ground_truth.centers):
+        graph.insert(D(i), np.zeros(3))
+        measured = with_offset(center + 0.05 * rng.normal(size=3))
+        graph.add(gtsam.CustomFactor(SIGMA(3, 0.05), [X(i), A(0), D(i)], measured), "position")
+        if i:
+            graph.add(gtsam.BetweenFactorVector(D(i - 1), D(i), np.zeros(3), SIGMA(3, 0.02)))
+    graph.add(gtsam.PriorFactorVector(A(0), np.zeros(3), SIGMA(3, 0.1)))
+    graph.add(gtsam.PriorFactorVector(D(0), np.zeros(3), SIGMA(3, 0.1)))
+    report = graph.optimize()
+    assert {f.kind for f in report.factors} >= {"reprojection", "position"}
+    marginals = gtsam.Marginals(*graph.to_gtsam())
+    for variables in ([A(0)], [A(0), D(5)]):
+        found = graph.marginal_covariance(images=[2], variables=variables)
+        for block, key in ((found.of_image(2), X(2)), *((found.of_variable(v), v) for v in variables)):
+            expected = marginals.marginalCovariance(key)
+            scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+            np.testing.assert_allclose(block / scale, expected / scale, atol=1e-6)
+        cross = marginals.jointMarginalCovariance([X(2), A(0)]).at(X(2), A(0))
+        np.testing.assert_allclose(found.matrix[:6, 6:9], -cross, atol=1e-6 * np.abs(cross).max())
+    with pytest.raises(InputError, match="asked for"):
+        found.of_variable(D(1))
 
 
 def test_the_report_tells_factors_by_kind_and_what_was_rejected():

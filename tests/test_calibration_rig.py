@@ -35,6 +35,15 @@ def as_fit(found: RigCalibration) -> RigFit:
     return RigFit(found.rig.cameras, found.rig.cam_from_rig, np.zeros((0, 7)), found.world_from_board)
 
 
+def views_with_idx(
+    truth: RigFit, rng: np.random.Generator, noise_px: float, points: np.ndarray
+) -> list[tuple[RigView, np.ndarray]]:
+    """Views of a board of another shape, and which of its points each sees."""
+    place = {tuple(point): n for n, point in enumerate(points[:, :2].tolist())}
+    views = views_of(truth, rng, noise_px, points)
+    return [(view, np.array([place[tuple(xy)] for xy in view.view.xyz[:, :2].tolist()])) for view in views]
+
+
 def position(views: Sequence[RigView], camera: int, shot: int) -> int:
     return next(i for i, view in enumerate(views) if (view.camera, view.shot) == (camera, shot))
 
@@ -142,6 +151,25 @@ def test_of_three_cameras_the_one_that_was_late_is_named() -> None:
     assert [(one.camera, one.shot) for one in found.odd] == [(0, 4)]
     assert found.cameras[0].sigmas == pytest.approx(0.0)
     assert found.num_shots == 7
+
+
+def test_a_bent_board_is_taken_into_account() -> None:
+    rng = np.random.default_rng(8)
+    truth = overlapping_rig(rng, (PINHOLE, FISHEYE), 10)
+    # 0.4 mm hollow across its columns
+    low, high = BOARD.points.min(0), BOARD.points.max(0)
+    v = 2.0 * (BOARD.points[:, 1] - low[1]) / (high[1] - low[1]) - 1.0
+    hollow = np.column_stack([BOARD.points[:, :2], 0.0004 * v * v])
+    views = [
+        replace(view, view=replace(view.view, xyz=BOARD.points[seen]))
+        for view, seen in views_with_idx(truth, rng, 0.2, hollow)
+    ]
+    found = calibrated(truth, views)
+    assert found.bend is not None
+    assert found.bend[0, 1] == pytest.approx(0.0004, abs=4.0 * np.sqrt(found.covariance[-2, -2]))
+    error = errors_of(as_fit(found), truth)
+    assert (np.abs(error) < 4.0 * np.sqrt(np.diag(found.covariance))[: len(error)]).all()
+    assert not found.odd
 
 
 def test_a_board_that_can_be_turned_is_read_from_one_end() -> None:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import odometry_sequences as played
+from inertial_flights import CAMERA as FLIGHT_CAMERA
+from inertial_flights import SCALE, Flight, seen_map, true_map
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.errors import InterruptedRunError
 from sfmapp.events import Events
+from sfmapp.geometry import rigid3
+from sfmapp.odometry.inertial.scale import ScaleEstimate, ScaleRefusal
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.refinement.final_adjustment import _left_open, adjust_finally
@@ -165,3 +170,58 @@ def test_a_refined_calibration_that_leaves_the_positions_open_is_a_contradiction
     assert "26%" in found.message
     assert _left_open(covariance, 20.0, told) == []
     assert len(_left_open(np.full((2, 6, 6), np.nan), 2.0, told)) == 1
+
+
+# ---- beside an inertial sensor
+
+
+def flown_map(flight: Flight, times: np.ndarray, sigma_px: float) -> tuple[KeyframeMap, np.ndarray]:
+    """Keyframes of a flight, and their true poses, in the map's own unit."""
+    seen = seen_map(flight, times, 1, sigma_px, num_points=200)
+    keyframes = played.keyframe_map(SimpleNamespace(observed=seen.model), Rig.single(FLIGHT_CAMERA))  # type: ignore[arg-type]
+    for keyframe, time_s in zip(keyframes.keyframes, times, strict=True):
+        keyframe.timestamp_s = float(time_s)
+    return keyframes, true_map(flight, times)
+
+
+def poses_of(keyframes: KeyframeMap) -> np.ndarray:
+    return np.array([k.rig_from_world for k in keyframes.keyframes])
+
+
+def test_an_inertial_sensor_holds_the_keyframes_and_tells_their_unit() -> None:
+    flight, times = Flight(1), np.arange(0, 5, 0.25)
+    options = replace(OPTIONS, refine_camera=False)
+    alone, truth = flown_map(flight, times, 1.0)
+    both, _ = flown_map(flight, times, 1.0)
+    told = played.Told()
+    before = adjust_finally(alone, options, Events())
+    final = adjust_finally(both, options, told.events, imu=flight.imu(1, 5.0))
+    assert isinstance(final.inertial, ScaleEstimate), final.inertial
+    assert final.covariance is not None
+    assert before.covariance is not None
+    lengths = rigid3.spread(poses_of(both)) / rigid3.spread(truth)
+    assert abs(np.log(final.inertial.scale * lengths / SCALE)) < 3.5 * final.inertial.sigma_relative < 0.1
+    errors = [played.gauge_errors(poses_of(k), truth, 7)[:, 3:] for k in (both, alone)]
+    assert (errors[0] ** 2).sum() < 0.5 * (errors[1] ** 2).sum()
+    variances = [np.trace(f.covariance[:, 3:, 3:], axis1=1, axis2=2).mean() for f in (final, before)]
+    assert variances[0] < 0.6 * variances[1]
+    assert 0.3 < (errors[0] ** 2).sum(1).mean() / variances[0] < 2.5
+    assert any("with inertial measurements" in message for message in told.messages("decided"))
+    assert final.adjustment is not None
+    assert "inertial" in {f.kind for f in final.adjustment.factors}
+    assert final.report.inertial == final.inertial.evidence
+
+
+def test_a_sensor_that_contradicts_the_keyframes_leaves_them_alone() -> None:
+    flight, times = Flight(1), np.arange(0, 4, 0.25)
+    options, imu = replace(OPTIONS, refine_camera=False), flight.imu(1, 4.0)
+    (alone, _), (both, _) = (flown_map(flight, times, 0.5) for _ in range(2))
+    before = adjust_finally(alone, options, Events())
+    final = adjust_finally(both, options, Events(), imu=replace(imu, accel=imu.accel[:, [1, 2, 0]]))
+    assert isinstance(final.inertial, ScaleRefusal)
+    assert final.inertial.contradiction is not None
+    assert "accelerometer has other axes" in final.inertial.reason
+    assert poses_of(both).tobytes() == poses_of(alone).tobytes()
+    assert final.covariance is not None
+    assert before.covariance is not None
+    assert final.covariance.tobytes() == before.covariance.tobytes()

@@ -4,95 +4,52 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import A, B, L, V, X
 
-from sfmapp.geometry import rigid3, similarity
-from sfmapp.images.sequence import Imu
-from sfmapp.odometry.inertial.faults import align_or_explain
-from sfmapp.odometry.inertial.gyroscope import GyroTrust, imu_rotation, imu_steps
-from sfmapp.odometry.inertial.scale import ScaleRefusal
-from sfmapp.odometry.inertial.visual_inertial import (
-    GRAVITY,
-    InertialAlignment,
-    _integrate,
-    _MapPose,
-    _midway,
-    _preintegration,
-    align_imu,
+from inertial_flights import (
+    ACCEL_BIAS,
+    GYRO_BIAS,
+    IMU_FROM_CAM,
+    MAP_FROM_WORLD,
+    SCALE,
+    Flight,
+    seen_map,
+    true_gravity,
+    true_map,
 )
-
-IMU_FROM_CAM = rigid3.from_matrix(rigid3.exp_so3([1.2, -1.1, 1.3]), [0.05, -0.03, 0.08])
-GYRO_BIAS, ACCEL_BIAS = np.array([-0.002, 0.02, 0.07]), np.array([-0.05, 0.12, 0.06])
-
-
-class Flight:
-    """A sensor on sums of sines, z up: positions with exact derivatives, rotations with differences."""
-
-    def __init__(self, seed: int, acceleration: float = 1.5, turning: float = 0.6) -> None:
-        rng = np.random.default_rng([seed, 21])
-        self._rates = rng.uniform(0.5, 5.0, (4, 3))
-        self._phases = rng.uniform(0, 6.28, (2, 4, 3))
-        self._sizes = acceleration / self._rates**2 * rng.uniform(0.3, 1.0, (4, 3))
-        self._angles = turning / self._rates * rng.uniform(0.3, 1.0, (4, 3))
-        self._drift = np.array([0.4, -0.2, 0.1])
-
-    def _sum(self, t: np.ndarray, sizes: np.ndarray, phases: np.ndarray, order: int) -> np.ndarray:
-        wave = self._rates * t[:, None, None] + phases + 0.5 * np.pi * order
-        return (sizes * self._rates**order * np.sin(wave)).sum(1)
-
-    def position(self, t: np.ndarray) -> np.ndarray:
-        return self._sum(t, self._sizes, self._phases[0], 0) + t[:, None] * self._drift
-
-    def velocity(self, t: np.ndarray) -> np.ndarray:
-        return self._sum(t, self._sizes, self._phases[0], 1) + self._drift
-
-    def rotation(self, t: np.ndarray) -> np.ndarray:
-        return rigid3.exp_so3(self._sum(t, self._angles, self._phases[1], 0))
-
-    def gyro(self, t: np.ndarray) -> np.ndarray:
-        h = 1e-5
-        return rigid3.log_so3(self.rotation(t - h).swapaxes(1, 2) @ self.rotation(t + h)) / (2 * h)
-
-    def accel(self, t: np.ndarray) -> np.ndarray:
-        force = self._sum(t, self._sizes, self._phases[0], 2) + np.array([0.0, 0.0, GRAVITY])
-        return np.einsum("nji,nj->ni", self.rotation(t), force)
-
-    def cam_from_world(self, t: np.ndarray) -> np.ndarray:
-        imu_from_world = rigid3.inverse(rigid3.from_matrix(self.rotation(t), self.position(t)))
-        return rigid3.compose(rigid3.inverse(IMU_FROM_CAM), imu_from_world)
-
-    def imu(self, seed: int, stop_s: float, noise: float = 1.0, rate_hz: float = 200.0) -> Imu:
-        """Measurements with the noise of a small sensor times a factor, and walking biases."""
-        rng = np.random.default_rng([seed, 22])
-        t = np.arange(-0.02, stop_s + 0.02, 1 / rate_hz)
-        densities = noise * np.array([1.7e-4, 2e-3, 1.9e-5, 3e-3])
-        white = rng.normal(size=(2, len(t), 3)) * densities[:2, None, None] * np.sqrt(rate_hz)
-        walk = np.cumsum(rng.normal(size=(2, len(t), 3)) * densities[2:, None, None] / np.sqrt(rate_hz), 1)
-        has_bias = float(noise > 0)
-        gyro = self.gyro(t) + white[0] + walk[0] + has_bias * GYRO_BIAS
-        accel = self.accel(t) + white[1] + walk[1] + has_bias * ACCEL_BIAS
-        return Imu(t, gyro, accel, IMU_FROM_CAM, *densities)
+from odometry_sequences import gauge_errors
+from sfmapp.adjust.covariance import similarity_basis
+from sfmapp.adjust.factors import gtsam_pose
+from sfmapp.geometry import rigid3
+from sfmapp.images.sequence import Imu
+from sfmapp.odometry.inertial import graph as inertial_graph
+from sfmapp.odometry.inertial.faults import align_or_explain
+from sfmapp.odometry.inertial.graph import InertialLink, Placement, midway, preintegration
+from sfmapp.odometry.inertial.gyroscope import GyroTrust, imu_rotation, imu_steps
+from sfmapp.odometry.inertial.integration import GRAVITY, integrate
+from sfmapp.odometry.inertial.scale import ScaleRefusal
+from sfmapp.odometry.inertial.seen_map import SeenMap
+from sfmapp.odometry.inertial.visual_inertial import InertialAlignment, align_imu
 
 
-# the map's world: another origin, heading, tilt and unit
-MAP_FROM_WORLD = similarity.from_parts(rigid3.exp_so3([0.9, -0.5, 2.0]), [3.0, -1.0, 0.5], 1 / 2.7)
+def aligned(seen: SeenMap, imu: Imu) -> InertialAlignment:
+    found = align_imu(seen, imu)
+    assert isinstance(found, InertialAlignment), found
+    return found
 
 
-def a_map(
-    flight: Flight, times: np.ndarray, seed: int, sigma_deg: float, sigma_m: float, scale: float = 2.7
-) -> np.ndarray:
-    """Noisy cam_from_map: sigma_m is in metres."""
-    rng = np.random.default_rng([seed, 23])
-    map_from_world = np.r_[MAP_FROM_WORLD[:7], 1 / scale]
-    poses = similarity.transform_poses(map_from_world, flight.cam_from_world(times))
-    size = np.r_[np.full(3, np.radians(sigma_deg)), np.full(3, sigma_m / scale)]
-    change = rng.normal(size=(len(times), 6)) * size
-    return rigid3.compose(rigid3.from_matrix(rigid3.exp_so3(change[:, :3]), change[:, 3:]), poses)
+def scale_error(found: InertialAlignment, truth: np.ndarray) -> float:
+    """Of the spread of the map in metres, relative, in its standard deviations."""
+    spread = found.scale * rigid3.spread(found.model.cam_from_world)
+    return float(np.log(spread / (SCALE * rigid3.spread(truth))) / found.sigma_relative)
 
 
-def true_gravity() -> np.ndarray:
-    return rigid3.rotation_matrix(MAP_FROM_WORLD) @ [0.0, 0.0, -GRAVITY]
+def tilt(found: InertialAlignment) -> float:
+    """Of the vertical, radians."""
+    return float(np.linalg.norm(np.cross(found.gravity_in_map, true_gravity())) / GRAVITY**2)
 
 
 # ---- gtsam's conventions and our integration
@@ -100,8 +57,6 @@ def true_gravity() -> np.ndarray:
 
 def test_gtsam_and_our_integration_follow_the_true_motion() -> None:
     """Gravity's sign, the order of biases, and slopes by the biases."""
-    import gtsam
-
     flight = Flight(1)
     imu = flight.imu(1, 3.0, noise=0.0, rate_hz=1000.0)
     steps = imu_steps(imu, 0.3137, 0.9)
@@ -111,13 +66,13 @@ def test_gtsam_and_our_integration_follow_the_true_motion() -> None:
     r, p, v = flight.rotation(ends), flight.position(ends), flight.velocity(ends)
     dt, down = ends[1] - ends[0], np.array([0.0, 0.0, -GRAVITY])
     delta = np.empty(60)
-    _integrate(steps, np.zeros(3), delta)
+    integrate(steps, np.zeros(3), delta)
     assert np.allclose(delta[:9].reshape(3, 3), r[0].T @ r[1], atol=1e-6)
     assert np.allclose(delta[9:12], r[0].T @ (v[1] - v[0] - down * dt), atol=2e-5)
     assert np.allclose(delta[12:15], r[0].T @ (p[1] - p[0] - v[0] * dt - 0.5 * down * dt**2), atol=1e-5)
     # gtsam on the manifold does the same sums
-    same = gtsam.PreintegratedCombinedMeasurementsManifold(_preintegration(imu), gtsam.imuBias.ConstantBias())
-    for step in _midway(steps, np.zeros(3)):
+    same = gtsam.PreintegratedCombinedMeasurementsManifold(preintegration(imu), gtsam.imuBias.ConstantBias())
+    for step in midway(steps, np.zeros(3)):
         same.integrateMeasurement(step[4:], step[1:4], step[0])
     assert np.allclose(same.deltaRij().matrix().ravel(), delta[:9], atol=1e-13)
     assert np.allclose(same.deltaVij(), delta[9:12], atol=1e-12)
@@ -125,8 +80,8 @@ def test_gtsam_and_our_integration_follow_the_true_motion() -> None:
     # a sensor with biases, told of them at the end: gtsam's accelerometer comes first
     gyro_bias, accel_bias = 1e-3 * GYRO_BIAS, 1e-2 * ACCEL_BIAS
     biased = steps + np.r_[0.0, gyro_bias, accel_bias]
-    sums = gtsam.PreintegratedCombinedMeasurements(_preintegration(imu), gtsam.imuBias.ConstantBias())
-    for step in _midway(biased, np.zeros(3)):
+    sums = gtsam.PreintegratedCombinedMeasurements(preintegration(imu), gtsam.imuBias.ConstantBias())
+    for step in midway(biased, np.zeros(3)):
         sums.integrateMeasurement(step[4:], step[1:4], step[0])
     state = gtsam.NavState(gtsam.Pose3(gtsam.Rot3(r[0]), p[0]), v[0])
     bias = gtsam.imuBias.ConstantBias(accel_bias, gyro_bias)
@@ -135,7 +90,7 @@ def test_gtsam_and_our_integration_follow_the_true_motion() -> None:
     assert np.allclose(after.pose().rotation().matrix(), r[1], atol=2e-5)
     assert np.allclose(after.pose().translation(), p[1], atol=2e-5)
     assert np.allclose(after.velocity(), v[1], atol=5e-5)
-    _integrate(biased, np.zeros(3), delta)
+    integrate(biased, np.zeros(3), delta)
     slopes = delta[15:].reshape(5, 3, 3)
     turn = delta[:9].reshape(3, 3) @ rigid3.exp_so3(slopes[0] @ gyro_bias)
     assert np.allclose(turn, r[0].T @ r[1], atol=2e-6)
@@ -146,22 +101,20 @@ def test_gtsam_and_our_integration_follow_the_true_motion() -> None:
 
 
 def test_gtsam_s_covariance_is_that_of_drawn_noise() -> None:
-    import gtsam
-
     flight = Flight(2)
     clean = flight.imu(2, 1.0, noise=0.0)
     noise = Imu(clean.timestamps_s, clean.gyro, clean.accel, IMU_FROM_CAM, 0.01, 0.1, 1e-8, 1e-8)
     steps = imu_steps(clean, 0.0, 0.5)
     assert steps is not None
-    sums = gtsam.PreintegratedCombinedMeasurements(_preintegration(noise), gtsam.imuBias.ConstantBias())
-    for step in _midway(steps, np.zeros(3)):
+    sums = gtsam.PreintegratedCombinedMeasurements(preintegration(noise), gtsam.imuBias.ConstantBias())
+    for step in midway(steps, np.zeros(3)):
         sums.integrateMeasurement(step[4:], step[1:4], step[0])
     rng = np.random.default_rng(5)
     exact, drawn, delta = np.empty(60), np.empty((1500, 9)), np.empty(60)
-    _integrate(steps, np.zeros(3), exact)
+    integrate(steps, np.zeros(3), exact)
     for n in range(len(drawn)):
         sigma = np.repeat([0.01, 0.1], 3) / np.sqrt(steps[:, :1])
-        _integrate(np.c_[steps[:, :1], steps[:, 1:] + sigma * rng.normal(size=(len(steps), 6))], np.zeros(3), delta)
+        integrate(np.c_[steps[:, :1], steps[:, 1:] + sigma * rng.normal(size=(len(steps), 6))], np.zeros(3), delta)
         drawn[n, :3] = rigid3.log_so3(exact[:9].reshape(3, 3).T @ delta[:9].reshape(3, 3))
         drawn[n, 3:6], drawn[n, 6:] = delta[12:15] - exact[12:15], delta[9:12] - exact[9:12]
     ours = np.std(drawn, 0)
@@ -169,38 +122,52 @@ def test_gtsam_s_covariance_is_that_of_drawn_noise() -> None:
     assert np.allclose(ours, theirs, rtol=0.12)
 
 
-def test_slopes_of_the_link_between_map_and_sensor() -> None:
-    import gtsam
+def test_slopes_of_a_factor_between_two_images() -> None:
+    """Where the sensor is, exactly, and every slope against differences."""
+    flight, times = Flight(3), np.array([1.0, 1.3])
+    imu = flight.imu(3, 2.0, noise=0.0, rate_hz=1000.0)
+    map_from_world = rigid3.rotation_matrix(MAP_FROM_WORLD)
+    place, rates = Placement(IMU_FROM_CAM, map_from_world.T), flight.gyro(times)
+    poses = [gtsam_pose(pose) for pose in true_map(flight, times)]
+    # the map's origin is not the world's
+    shift = -map_from_world.T @ MAP_FROM_WORLD[4:7] * SCALE
+    exact = np.array([np.log(SCALE), 0.0, 0.0, 0.0])
+    for n in range(2):
+        sensor = place.sensor(poses[n], flight.velocity(times)[n], exact, rates[n])
+        assert np.allclose(sensor.rotation().matrix(), flight.rotation(times)[n], atol=1e-12)
+        assert np.allclose(sensor.translation() + shift, flight.position(times)[n], atol=1e-12)
+    # an image that was taken later: the sensor was not there yet
+    later = [gtsam_pose(pose) for pose in true_map(flight, times + 1e-3)]
+    sensor = place.sensor(later[0], flight.velocity(times)[0], np.r_[exact[:3], 1e-3], rates[0])
+    assert np.allclose(sensor.rotation().matrix(), flight.rotation(times)[0], atol=1e-5)
+    assert np.allclose(sensor.translation() + shift, flight.position(times)[0], atol=1e-5)
 
-    rng = np.random.default_rng(3)
-    turn = rigid3.exp_so3(rng.normal(size=3))
-    imu = Flight(0).imu(0, 0.1)
-    pose = rigid3.from_matrix(rigid3.exp_so3(rng.normal(size=3)), rng.normal(size=3))
-    rate, velocity = rng.normal(size=3), rng.normal(size=3)
-    link, alignment = _MapPose(pose, imu, turn, rate), np.array([0.7, 0.0, 0.0, 0.0])
-    map_from_cam = rigid3.inverse(pose)
-    world_from_cam = rigid3.from_matrix(
-        turn @ rigid3.rotation_matrix(map_from_cam), np.exp(0.7) * turn @ map_from_cam[4:]
-    )
-    exact = rigid3.compose(world_from_cam, rigid3.inverse(IMU_FROM_CAM))
-    sensor = gtsam.Pose3(gtsam.Rot3(rigid3.rotation_matrix(exact)), exact[4:])
-    assert np.allclose(link.residual(sensor, alignment, velocity), 0, atol=1e-12)
-    # the picture was taken later: the sensor was not there yet
-    back = rigid3.from_matrix(rigid3.rotation_matrix(exact) @ rigid3.exp_so3(-0.01 * rate), exact[4:] - 0.01 * velocity)
-    early = gtsam.Pose3(gtsam.Rot3(rigid3.rotation_matrix(back)), back[4:])
-    assert np.allclose(link.residual(early, np.r_[alignment[:3], 0.01], velocity), 0, atol=1e-12)
-    sensor, alignment = sensor.retract(1e-2 * rng.normal(size=6)), np.array([0.72, 0.01, -0.02, 0.01])
-    by_pose, by_alignment, by_velocity = link.slopes(sensor, alignment, velocity)
-    for d, column in zip(1e-6 * np.eye(6), by_pose.T, strict=True):
-        change = link.residual(sensor.retract(d), alignment, velocity)
-        change -= link.residual(sensor.retract(-d), alignment, velocity)
-        assert np.allclose(change / 2e-6, column, atol=2e-4)
-    for d, column in zip(1e-6 * np.eye(4), by_alignment.T, strict=True):
-        change = link.residual(sensor, alignment + d, velocity) - link.residual(sensor, alignment - d, velocity)
-        assert np.allclose(change / 2e-6, column, atol=2e-3)
-    for d, column in zip(1e-6 * np.eye(3), by_velocity.T, strict=True):
-        change = link.residual(sensor, alignment, velocity + d) - link.residual(sensor, alignment, velocity - d)
-        assert np.allclose(change / 2e-6, column, atol=1e-6)
+    steps = imu_steps(imu, *times)
+    assert steps is not None
+    sums = gtsam.PreintegratedCombinedMeasurements(preintegration(flight.imu(3, 2.0)), gtsam.imuBias.ConstantBias())
+    for step in midway(steps, np.zeros(3)):
+        sums.integrateMeasurement(step[4:], step[1:4], step[0])
+    link, values, rng = InertialLink(sums, place, rates, 0.5), gtsam.Values(), np.random.default_rng(4)
+    keys = [X(0), V(0), B(0), X(1), V(1), B(1), A(0)]
+    for n in range(2):
+        values.insert(X(n), poses[n].retract(1e-3 * rng.normal(size=6)))
+        values.insert(V(n), flight.velocity(times)[n] + 0.01 * rng.normal(size=3))
+        values.insert(B(n), gtsam.imuBias.ConstantBias(0.01 * rng.normal(size=3), 1e-3 * rng.normal(size=3)))
+    values.insert(A(0), exact + np.array([0.01, 0.2, -0.1, 0.004]))
+    factor = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(15), keys, link.error)
+    matrix, right = factor.linearize(values).jacobian()
+    for n, (key, dim) in enumerate(zip(keys, (6, 3, 6, 6, 3, 6, 4), strict=True)):
+        first = [0, 6, 9, 15, 21, 24, 30][n]
+        for d in range(dim):
+            sides, h = [], 1e-6
+            for sign in (1.0, -1.0):
+                step = gtsam.VectorValues()
+                for other, size in zip(keys, (6, 3, 6, 6, 3, 6, 4), strict=True):
+                    step.insert(other, np.zeros(size) if other != key else sign * h * np.eye(size)[d])
+                sides.append(factor.unwhitenedError(values.retract(step)))
+            slope = (sides[0] - sides[1]) / (2 * h)
+            assert np.allclose(matrix[:, first + d], slope, atol=2e-4 * (1 + np.abs(slope).max())), (n, d)
+    assert np.allclose(-right, factor.unwhitenedError(values))
 
 
 # ---- the whole
@@ -208,104 +175,186 @@ def test_slopes_of_the_link_between_map_and_sensor() -> None:
 
 def test_exact_measurements_give_the_exact_alignment() -> None:
     flight, times = Flight(3), np.arange(0, 10, 0.25)
-    imu = flight.imu(3, 10.0, noise=1e-6, rate_hz=1000.0)
-    found = align_imu(times, a_map(flight, times, 3, 0.0, 0.0), imu, is_metric=False)
-    assert isinstance(found, InertialAlignment), found
-    assert found.scale == pytest.approx(2.7, rel=1e-3)
-    assert np.allclose(found.gravity_in_map, true_gravity(), atol=1e-2)
+    truth = true_map(flight, times)
+    found = aligned(seen_map(flight, times, 3, 0.0), flight.imu(3, 10.0, noise=1e-2, rate_hz=1000.0))
+    assert found.scale == pytest.approx(SCALE, rel=1e-4)
+    assert np.allclose(found.gravity_in_map, true_gravity(), atol=2e-3)
     assert np.allclose(found.gyro_bias, GYRO_BIAS, atol=1e-4)
     assert np.allclose(found.accel_bias, ACCEL_BIAS, atol=2e-3)
+    assert np.abs(gauge_errors(found.model.cam_from_world, truth, 7)).max() < 1e-4
     up = rigid3.rotation_matrix(found.world_from_map) @ -true_gravity()
-    assert np.allclose(up / GRAVITY, [0, 0, 1], atol=1e-3)
+    assert np.allclose(up / GRAVITY, [0, 0, 1], atol=2e-4)
     turn = rigid3.rotation_matrix(found.world_from_map) @ rigid3.rotation_matrix(MAP_FROM_WORLD)
-    assert np.allclose(found.velocity, flight.velocity(times[found.pose_idx]) @ turn.T, atol=5e-3)
+    assert np.allclose(found.velocity, flight.velocity(times[found.pose_idx]) @ turn.T, atol=2e-3)
     assert found.world_from_map[7] == found.scale
 
 
-@pytest.mark.parametrize("has_covariance", [False, True])
-def test_errors_are_as_large_as_their_sigmas(has_covariance: bool) -> None:
-    """Poses of 0.2 degrees and 2 cm, a small sensor: errors of scale and gravity over their sigmas of rms about 1."""
-    scores, residuals, sigmas = [], [], []
-    times = np.arange(0, 20, 0.25)
-    for seed in range(6 if has_covariance else 10):
+def test_errors_are_as_large_as_their_sigmas() -> None:
+    """Half a pixel, a small sensor: errors of scale, vertical, clock and poses over their sigmas, in bounds on both
+    sides; and the poses are better than those of the images alone."""
+    scores, squares, residuals, gains = [], [], [], []
+    times = np.arange(0, 8, 0.25)
+    for seed in range(12):
         flight = Flight(seed)
-        poses = a_map(flight, times, seed, 0.2, 0.02)
-        size = np.r_[np.full(3, np.radians(0.2)), np.full(3, 0.02 / 2.7)]
-        covariance = np.tile(np.diag(size**2), (len(times), 1, 1)) if has_covariance else None
-        found = align_imu(times, poses, flight.imu(seed, 20.0), is_metric=False, covariance=covariance)
-        assert isinstance(found, InertialAlignment), found
-        tilt = np.linalg.norm(np.cross(found.gravity_in_map, true_gravity())) / GRAVITY**2
-        scores.append([np.log(found.scale / 2.7) / found.sigma_relative, tilt / found.gravity_sigma_rad])
+        seen, truth = seen_map(flight, times, seed, 0.5, num_points=300), true_map(flight, times)
+        found = aligned(seen, flight.imu(seed, 8.0))
+        clock = found.clock_offset_s / found.clock_sigma_s
+        scores.append([scale_error(found, truth), tilt(found) / found.gravity_sigma_rad, clock])
+        ours, theirs = (gauge_errors(m.cam_from_world, truth, 7) for m in (found.model, seen.model))
+        pairs = zip(ours, found.pose_covariance, strict=True)
+        squares.append(np.mean([e @ np.linalg.solve(c, e) / 6 for e, c in pairs]))
+        gains.append(np.sqrt((ours[:, 3:] ** 2).sum() / (theirs[:, 3:] ** 2).sum()))
         residuals.append(found.residual)
-        sigmas.append(found.sigma_relative)
         assert np.abs(found.gyro_bias - GYRO_BIAS).max() < 2e-3
         assert np.abs(found.accel_bias - ACCEL_BIAS).max() < 0.1
-    rms = np.sqrt(np.mean(np.square(scores), 0))  # 1.1 and 1.05 over 40 draws
-    assert 0.5 < rms[0] < 1.6  # 6 and 10 draws: 30 and 22 % at one sigma
-    assert 0.5 < rms[1] < 1.6
-    assert 0.85 < np.mean(residuals) < (1.15 if has_covariance else 1.5)
-    assert 0.001 < np.median(sigmas) < 0.02
+    rms = np.sqrt(np.mean(np.square(scores), 0))
+    assert (rms > 0.6).all()  # 12 draws: 20 % at one sigma
+    assert (rms < 1.6).all()
+    assert 0.85 < np.mean(squares) < 1.2  # 1.0 to 1.1 over sets of 10 to 20
+    assert 0.85 < np.mean(residuals) < 1.1
+    assert np.median(gains) < 0.7  # 0.46 over 20
 
 
-def test_a_metric_map_keeps_its_scale() -> None:
-    times = np.arange(0, 12, 0.1)
+def test_the_minimum_and_its_sigmas_are_those_of_a_plain_gtsam_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sensor poses and landmarks in a world in metres, one factor an observation: no map beside it."""
+    monkeypatch.setattr(inertial_graph, "_CLOCK_SIGMA_S", 1e-7)  # gtsam's factor knows no offset
+    monkeypatch.setattr(inertial_graph, "_ENOUGH", 1e-7)
+    sums: list[object] = []
+    integrated = inertial_graph.InertialLink.__init__
+
+    def noted(self: InertialLink, measured: object, *rest: object) -> None:
+        sums.append(measured)
+        integrated(self, measured, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(inertial_graph.InertialLink, "__init__", noted)
+    times, sigma = np.arange(0, 3, 0.25), 0.5
+    flight = Flight(2)
+    seen = seen_map(flight, times, 2, sigma, num_points=60)
+    found = aligned(seen, flight.imu(2, 3.0))
+    count, model = len(times) - 1, found.model
+
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    world_from_map = rigid3.rotation_matrix(found.world_from_map)
+    place = Placement(IMU_FROM_CAM, world_from_map)
+    still = np.array([np.log(found.scale), 0.0, 0.0, 0.0])
+    body_from_cam = gtsam_pose(rigid3.inverse(IMU_FROM_CAM))
+    calibration = gtsam.Cal3_S2(320.0, 320.0, 0.0, 320.0, 240.0)
+    pixel = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
+    for k in range(count + 1):
+        start.insert(X(k), place.sensor(gtsam_pose(model.cam_from_world[k]), np.zeros(3), still, np.zeros(3)))
+        start.insert(V(k), found.velocity[k])
+        start.insert(B(k), gtsam.imuBias.ConstantBias(found.accel_bias, found.gyro_bias))
+    seen_by = np.bincount(model.tracks.obs_track_idx, minlength=60)
+    for t in np.flatnonzero(seen_by > 1).tolist():
+        start.insert(L(t), found.scale * world_from_map @ model.point_xyz[t])
+        for o in range(model.tracks.track_ptr[t], model.tracks.track_ptr[t + 1]):
+            at, xy = int(model.tracks.obs_image_idx[o]), model.tracks.obs_xy[o]
+            graph.push_back(
+                gtsam.GenericProjectionFactorCal3_S2(xy, pixel, X(at), L(t), calibration, body_from_cam)
+            )  # fmt: skip
+    for k, measured in enumerate(sums[-count:]):
+        graph.push_back(gtsam.CombinedImuFactor(X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1), measured))
+    bias = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([0.3, 0.1], 3))
+    hat = gtsam.imuBias.ConstantBias(np.zeros(3), sums[-1].biasHat().gyroscope())  # type: ignore[attr-defined]
+    graph.push_back(gtsam.PriorFactorConstantBias(B(0), hat, bias))
+    # the gauge: place and heading, of which nothing is known; a radian is nothing to speak of for the tilt
+    graph.push_back(gtsam.PriorFactorPose3(X(0), start.atPose3(X(0)), gtsam.noiseModel.Isotropic.Sigma(6, 1.0)))
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(1e-14)
+    parameters.setMaxIterations(100)
+    parameters.setLinearSolverType("MULTIFRONTAL_QR")
+    best = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
+    kinds = {f.kind: f.cost for f in found.adjustment.factors}
+    assert sum(kinds.values()) == pytest.approx(graph.error(best), rel=1e-6)
+    mount = rigid3.inverse(IMU_FROM_CAM)
+    theirs = np.array([rigid3.from_matrix(p.rotation().matrix(), p.translation()) for p in
+                       (best.atPose3(X(k)) for k in range(count + 1))])  # fmt: skip
+    cam_from_world = rigid3.compose(mount, rigid3.inverse(theirs))
+    spread = rigid3.spread(cam_from_world)
+    assert np.log(found.scale * rigid3.spread(model.cam_from_world) / spread) == pytest.approx(
+        0.0, abs=0.02 * found.sigma_relative
+    )
+    errors = gauge_errors(model.cam_from_world, cam_from_world, 7)
+    sigmas = np.sqrt(np.diagonal(found.pose_covariance, axis1=1, axis2=2))
+    assert np.abs(errors / sigmas).max() < 0.05
+    # marginals of all poses, brought to the gauge of the map's covariance
+    order, poses_first = gtsam.Ordering(), {X(k) for k in range(count + 1)}
+    for key in [*sorted(poses_first), *(key for key in best.keys() if key not in poses_first)]:  # noqa: SIM118
+        order.push_back(key)
+    root = np.linalg.inv(np.linalg.qr(graph.linearize(best).jacobian(order)[0], mode="r"))
+    joint = (root @ root.T)[: 6 * (count + 1), : 6 * (count + 1)]
+    adjoint = gtsam_pose(IMU_FROM_CAM).AdjointMap()  # the camera's tangent by the sensor's; ours is the negative
+    into = np.kron(np.eye(count + 1), adjoint)
+    joint = into @ joint @ into.T
+    basis, constraint = similarity_basis(cam_from_world)
+    grown = np.linalg.solve(constraint @ basis.T, constraint)
+    assert np.sqrt(grown[6] @ joint @ grown[6]) == pytest.approx(found.sigma_relative, rel=1e-3)
+    kept = np.eye(len(joint)) - basis.T @ grown
+    expected = (kept @ joint @ kept.T).reshape(count + 1, 6, count + 1, 6)
+    unit = np.r_[np.ones(3), np.full(3, rigid3.spread(model.cam_from_world) / spread)]
+    for k in range(count + 1):
+        theirs_k = expected[k, :, k] * np.outer(unit, unit)
+        scale = np.sqrt(np.outer(np.diag(theirs_k), np.diag(theirs_k)))
+        np.testing.assert_allclose(found.pose_covariance[k] / scale, theirs_k / scale, atol=2e-3)
+
+
+def test_a_pair_of_cameras_keeps_its_metre() -> None:
+    times = np.arange(0, 6, 0.25)
     flight = Flight(4)
-    found = align_imu(times, a_map(flight, times, 4, 0.1, 0.01, scale=1.0), flight.imu(4, 12.0), is_metric=True)
-    assert isinstance(found, InertialAlignment), found
-    assert found.scale == 1.0
-    assert found.sigma_relative == 0.0
-    assert np.linalg.norm(found.gravity_in_map - true_gravity()) < 5 * GRAVITY * found.gravity_sigma_rad
-    assert found.gravity_sigma_rad < np.radians(0.5)
-    assert np.diff(times[found.pose_idx]).min() >= 0.2 - 1e-9
+    seen = seen_map(flight, times, 4, 0.5, baseline_m=0.15, num_points=300)
+    found = aligned(seen, flight.imu(4, 6.0))
+    assert abs(np.log(found.scale)) < 4 * found.sigma_relative
+    assert found.sigma_relative < 0.003  # of the baseline alone
+    assert tilt(found) < 4 * found.gravity_sigma_rad < np.radians(1.0)
+    truth = true_map(flight, times, 1.0)
+    errors = gauge_errors(found.model.cam_from_world[::2], truth, 6)
+    squares = [e @ np.linalg.solve(c, e) / 6 for e, c in zip(errors, found.pose_covariance, strict=True)]
+    assert 0.4 < np.mean(squares) < 2.0
+    assert found.model.rig is not None
+    mounts = rigid3.compose(found.model.cam_from_world[1::2], rigid3.inverse(found.model.cam_from_world[::2]))
+    assert np.allclose(mounts, seen.model.rig.cam_from_rig[1], atol=1e-9)  # type: ignore[union-attr]
 
 
-def test_gaps_wrong_poses_and_a_slow_sensor_are_borne() -> None:
-    flight, times = Flight(5), np.arange(0, 20, 0.25)
-    poses = a_map(flight, times, 5, 0.1, 0.01)
-    poses[[10, 11, 12, 30]] = np.nan
-    poses[50, 4:] += 0.2
-    imu = flight.imu(5, 20.0)
-    hole = (imu.timestamps_s < 8.0) | (imu.timestamps_s > 8.7)
-    holed = Imu(imu.timestamps_s[hole], imu.gyro[hole], imu.accel[hole], IMU_FROM_CAM, 1.7e-4, 2e-3, 1.9e-5, 3e-3)
-    found = align_imu(times, poses, holed, is_metric=False)
-    assert isinstance(found, InertialAlignment), found
-    assert abs(np.log(found.scale / 2.7)) < 4 * found.sigma_relative
-    assert found.evidence["num_intervals"] < 75
-    # a pose that is exact by definition, one of which nothing is known
-    covariance = np.tile(np.diag(np.r_[np.full(3, np.radians(0.1)), np.full(3, 0.01 / 2.7)] ** 2), (len(times), 1, 1))
-    covariance[0], covariance[20] = 0.0, np.nan
-    exact = a_map(flight, times, 5, 0.0, 0.0)
-    poses[0], poses[50] = exact[0], exact[50]
-    found = align_imu(times, poses, imu, is_metric=False, covariance=covariance)
-    assert isinstance(found, InertialAlignment), found
-    assert 20 not in found.pose_idx
-    assert abs(np.log(found.scale / 2.7)) < 4 * found.sigma_relative
+def test_gaps_and_a_noisier_sensor_than_stated_are_borne() -> None:
+    flight, times = Flight(5), np.arange(0, 12, 0.25)
+    seen, truth = seen_map(flight, times, 5, 0.3, num_points=300), true_map(flight, times)
+    imu = flight.imu(5, 12.0)
+    hole = (imu.timestamps_s < 5.0) | (imu.timestamps_s > 5.7)
+    holed = replace(imu, timestamps_s=imu.timestamps_s[hole], gyro=imu.gyro[hole], accel=imu.accel[hole])
+    found = aligned(seen, holed)
+    assert abs(scale_error(found, truth)) < 4
+    assert found.evidence["num_intervals"] < 46
+    rough = replace(flight.imu(5, 12.0, noise=4.0), **{
+        name: getattr(imu, name) for name in ("gyro_noise", "accel_noise", "gyro_walk", "accel_walk")
+    })  # fmt: skip
+    wide, narrow = aligned(seen, rough), aligned(seen, imu)
+    assert wide.residual > 1.5
+    assert wide.sigma_relative > 1.5 * narrow.sigma_relative
+    assert abs(scale_error(wide, truth)) < 4
 
 
-def test_weak_motion_has_a_large_but_honest_sigma() -> None:
-    times = np.arange(0, 25, 0.25)
+def test_weak_motion_has_a_large_but_honest_sigma_and_none_is_refused() -> None:
+    times = np.arange(0, 12, 0.25)
     weak = Flight(1, acceleration=0.1, turning=0.05)
-    found = align_imu(times, a_map(weak, times, 1, 0.2, 0.02), weak.imu(1, 25.0), is_metric=False)
-    assert isinstance(found, InertialAlignment), found
-    assert 0.015 < found.sigma_relative < 0.1
-    assert abs(np.log(found.scale / 2.7)) < 3 * found.sigma_relative
-
-
-def test_motion_that_says_nothing_is_refused() -> None:
-    times = np.arange(0, 15, 0.25)
+    found = aligned(seen_map(weak, times, 1, 1.0, num_points=300), weak.imu(1, 12.0))
+    assert 0.004 < found.sigma_relative < 0.1
+    assert abs(scale_error(found, true_map(weak, times))) < 3
     slow = Flight(6, acceleration=0.004, turning=0.002)
-    refusal = align_imu(times, a_map(slow, times, 6, 0.1, 0.02), slow.imu(6, 15.0), is_metric=False)
+    refusal = align_imu(seen_map(slow, times, 6, 2.0, num_points=300), slow.imu(6, 12.0))
     assert isinstance(refusal, ScaleRefusal), refusal
     assert "scale" in refusal.reason
     assert refusal.contradiction is None
-    flight = Flight(7)
-    poses, imu = a_map(flight, times, 7, 0.1, 0.02), flight.imu(7, 15.0)
-    few = align_imu(times[:5], poses[:5], imu, is_metric=False)
-    assert isinstance(few, ScaleRefusal)
-    assert "intervals" in few.reason
-    # clocks that have nothing to do with each other
-    other = replace(imu, timestamps_s=imu.timestamps_s + 1e6)
-    refusal = align_imu(times, poses, other, is_metric=False)
+
+
+def test_too_few_measurements_and_clocks_of_other_days_are_refused() -> None:
+    flight, times = Flight(7), np.arange(0, 4, 0.25)
+    seen, imu = seen_map(flight, times, 7, 0.3, num_points=200), flight.imu(7, 4.0)
+    short = imu.timestamps_s < 1.6
+    few = replace(imu, timestamps_s=imu.timestamps_s[short], gyro=imu.gyro[short], accel=imu.accel[short])
+    refusal = align_imu(seen, few)
+    assert isinstance(refusal, ScaleRefusal)
+    assert "intervals" in refusal.reason
+    refusal = align_imu(seen, replace(imu, timestamps_s=imu.timestamps_s + 1e6))
     assert isinstance(refusal, ScaleRefusal)
     assert "clocks" in refusal.reason
 
@@ -313,25 +362,18 @@ def test_motion_that_says_nothing_is_refused() -> None:
 # ---- measurements that are not what they are taken for
 
 
-@pytest.mark.parametrize("has_covariance", [False, True])
-def test_clocks_apart_are_found_and_taken_into_account(has_covariance: bool) -> None:
+def test_clocks_apart_are_found_and_taken_into_account() -> None:
     """The scale is what it would be without, and both errors are inside three of their sigmas."""
-    times = np.arange(0, 15, 0.25)
-    covariance = noise(times) if has_covariance else None
+    times = np.arange(0, 8, 0.25)
     for seed, late_s in ((11, 0.02), (12, -0.05), (13, 0.2), (14, -0.75)):
         flight = Flight(seed)
-        poses, imu = a_map(flight, times, seed, 0.1, 0.01), flight.imu(seed, 15.0)
+        seen, imu = seen_map(flight, times, seed, 0.3, num_points=300), flight.imu(seed, 8.0)
         late = replace(imu, timestamps_s=imu.timestamps_s + late_s)
-        found = align_or_explain(times, poses, late, is_metric=False, covariance=covariance)
+        found = align_or_explain(seen, late)
         assert isinstance(found, InertialAlignment), found
-        assert abs(np.log(found.scale / 2.7)) < 3 * found.sigma_relative < 0.06
+        assert abs(scale_error(found, true_map(flight, times))) < 3.5
         assert abs(found.clock_offset_s - late_s) < 3.5 * found.clock_sigma_s < 0.01
         assert found.evidence["clock_offset_s"] == found.clock_offset_s
-
-
-def noise(times: np.ndarray) -> np.ndarray:
-    """Covariances of poses of 0.1 degrees and 1 cm."""
-    return np.tile(np.diag(np.r_[np.full(3, np.radians(0.1)), np.full(3, 0.01 / 2.7)] ** 2), (len(times), 1, 1))
 
 
 def faulty(imu: Imu, flight: Flight, fault: str) -> Imu:
@@ -363,24 +405,24 @@ def faulty(imu: Imu, flight: Flight, fault: str) -> Imu:
     ],
 )
 def test_what_contradicts_the_map_is_named_with_its_remedy(fault: str, cause: str, remedy: str) -> None:
-    flight, times = Flight(16), np.arange(0, 12, 0.25)
-    poses, imu = a_map(flight, times, 16, 0.1, 0.01), flight.imu(16, 12.0)
-    found = align_or_explain(times, poses, faulty(imu, flight, fault), is_metric=False, covariance=noise(times))
+    flight, times = Flight(16), np.arange(0, 6, 0.25)
+    imu = flight.imu(16, 6.0)
+    found = align_or_explain(seen_map(flight, times, 16, 0.5, num_points=150), faulty(imu, flight, fault))
     assert isinstance(found, ScaleRefusal), found
     assert found.contradiction is not None
     rows = found.contradiction.evidence["explained_by"]
     assert [cause in row["fault"] for row in rows] == [True]
     assert cause in found.contradiction.message
     assert remedy in found.contradiction.advice
-    assert rows[0]["residual"] < 5
+    # a sensor whose mounting is unknown sits elsewhere as well, and that is felt too
+    assert rows[0]["residual"] < (40 if fault == "mounting unknown" else 5)
 
 
 def test_a_fault_that_nothing_explains_is_no_less_refused() -> None:
-    flight, times = Flight(17), np.arange(0, 12, 0.25)
-    poses, imu = a_map(flight, times, 17, 0.1, 0.01), flight.imu(17, 12.0)
-    other = Flight(18).imu(18, 12.0)
-    wrong = replace(imu, accel=other.accel)
-    found = align_or_explain(times, poses, wrong, is_metric=False, covariance=noise(times))
+    flight, times = Flight(17), np.arange(0, 6, 0.25)
+    imu = flight.imu(17, 6.0)
+    wrong = replace(imu, accel=Flight(18).imu(18, 6.0).accel)
+    found = align_or_explain(seen_map(flight, times, 17, 0.5, num_points=150), wrong)
     assert isinstance(found, ScaleRefusal), found
     assert found.contradiction is not None
     assert "explained_by" not in found.contradiction.evidence
@@ -388,11 +430,11 @@ def test_a_fault_that_nothing_explains_is_no_less_refused() -> None:
 
 
 def test_same_input_same_bytes() -> None:
-    flight, times = Flight(8), np.arange(0, 8, 0.25)
-    poses, imu = a_map(flight, times, 8, 0.1, 0.01), flight.imu(8, 8.0)
-    first, second = (align_imu(times, poses, imu, is_metric=False) for _ in range(2))
-    assert isinstance(first, InertialAlignment)
-    assert isinstance(second, InertialAlignment)
+    flight, times = Flight(8), np.arange(0, 5, 0.25)
+    seen, imu = seen_map(flight, times, 8, 0.5, num_points=200), flight.imu(8, 5.0)
+    first, second = (aligned(seen, imu) for _ in range(2))
+    assert first.model.cam_from_world.tobytes() == second.model.cam_from_world.tobytes()
+    assert first.pose_covariance.tobytes() == second.pose_covariance.tobytes()
     assert first.world_from_map.tobytes() == second.world_from_map.tobytes()
     assert first.scale_estimate == second.scale_estimate
 

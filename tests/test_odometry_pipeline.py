@@ -22,10 +22,11 @@ from sfmapp.formats.colmap import read_model
 from sfmapp.formats.trajectory_input import read_tum
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu, SequenceOptions
-from sfmapp.odometry.inertial import faults as inertial_faults
+from sfmapp.odometry.inertial.scale import ScaleEstimate
 from sfmapp.odometry.inertial.visual_inertial import contradicted
 from sfmapp.odometry.records import _covariance_gap
 from sfmapp.odometry.refinement.final_adjustment import MAX_COVARIANCE_KEYFRAMES, FinalAdjustment
+from sfmapp.odometry.report import InertialEvidence
 from sfmapp.odometry.result import FrameState
 from sfmapp.pipelines.odometry import track as pipeline
 from sfmapp.pipelines.odometry.scale import parse_scale
@@ -348,18 +349,34 @@ def test_a_known_distance_makes_metres(source: str, tmp_path: Path, monkeypatch:
     assert model.summary()["mean_reprojection_error_px"] < 0.1
 
 
-def test_a_sensor_that_contradicts_the_map_is_red_and_gives_no_metres(tmp_path: Path, monkeypatch: Patch) -> None:
+def inertial_sequence() -> FakeSequence:
     sequence = FakeSequence()
     sequence.imu = Imu(np.zeros(2), np.zeros((2, 3)), np.zeros((2, 3)), rigid3.IDENTITY, 1e-4, 1e-3, 1e-5, 1e-3)
-    use(monkeypatch, sequence, FakeRunner())
-    refusal = contradicted("the accelerometer is upside down", "turn it", {"residual": 99.0})
-    monkeypatch.setattr(inertial_faults, "align_or_explain", lambda *_, **__: refusal)
+    return sequence
+
+
+def test_a_sensor_that_contradicts_the_map_is_red_and_gives_no_metres(tmp_path: Path, monkeypatch: Patch) -> None:
+    evidence = InertialEvidence(num_poses=9, num_intervals=8, residual=99.0)
+    refusal = contradicted("the accelerometer is upside down", "turn it", evidence)
+    use(monkeypatch, inertial_sequence(), FakeRunner(inertial=refusal))
     report = run(tmp_path / "out").report
     assert report["maps"][0]["unit"] == ""
     assert report["maps"][0]["scale_sigma"] is None
     assert any("upside down" in warning["message"] for warning in report["warnings"])
     red = [row for row in report["checks"] if row["light"] == "red"]
     assert [(row["name"], row["thresholds"]) for row in red] == [("contradiction: inertial measurements", "turn it")]
+
+
+def test_a_sensor_that_took_part_gives_metres_unless_others_are_asked_for(tmp_path: Path, monkeypatch: Patch) -> None:
+    evidence = InertialEvidence(num_poses=9, num_intervals=8, residual=1.1, clock_offset_s=0.03, clock_sigma_s=1e-4)
+    use(monkeypatch, inertial_sequence(), FakeRunner(inertial=ScaleEstimate(2.0, 0.004, "imu", evidence)))
+    report = run(tmp_path / "imu").report
+    assert (report["maps"][0]["scale_source"], report["maps"][0]["scale_sigma"]) == ("imu", 0.004)
+    assert report["maps"][0]["path_length"] == pytest.approx(24, rel=0.05)
+    assert any("stamped 30.0 ms late" in warning["message"] for warning in report["warnings"])
+    for source in ("arbitrary", "distance:0:40:3"):
+        report = run(tmp_path / source[:4], f"scale.source={source}").report
+        assert report["maps"][0]["scale_source"] == source.partition(":")[0].replace("arbitrary", "none")
 
 
 def test_a_scale_that_cannot_be_had_is_a_warning(tmp_path: Path, monkeypatch: Patch) -> None:

@@ -36,12 +36,15 @@ class ClusteredCovariances:
         image_idx: (n,) images. poses: (n, 6, 6) over ``x_cam <- exp(w) x_cam + v``; infinite where not determined.
         correlation: how many times larger their variance is, on the whole, than if the errors within each track were
             independent: 1 where they are.
+        noise_px: standard deviation of a pixel coordinate with which independent errors, under the same loss, would
+            leave them as large on the whole; infinite where not determined.
         observations_per_image: mean number of observations in an image.
     """
 
     image_idx: NDArray[np.int64]
     poses: Array
     correlation: float
+    noise_px: float
     observations_per_image: float
 
 
@@ -61,7 +64,7 @@ def clustered_covariances(reconstruction: Reconstruction, options: AdjustOptions
     used = (np.arange(8) < problem.block_dim[:, None]).ravel()
     information, scale = reduced_matrix(engine)[np.ix_(used, used)], engine.diagonal[used]
     inverse = constrained_inverse(information, scale, *gauge_of(problem, used, information, scale, has_factors=False))
-    num, correlation = len(scale), 1.0
+    num, correlation, noise_px = len(scale), 1.0, np.inf
     covariance = np.full((num, num), np.inf)
     num_tracks = int((np.diff(problem.point_ptr) > 1).sum())
     if inverse is not None and num_tracks > num:
@@ -73,10 +76,12 @@ def clustered_covariances(reconstruction: Reconstruction, options: AdjustOptions
         alone = np.einsum("ij,jk,ki,i->", inverse, independent, inverse, sizes, optimize=True)
         together = np.einsum("ij,jk,ki,i->", inverse, clustered, inverse, sizes, optimize=True)
         correlation = float(together / alone) if alone > 0 else 1.0
+        noise_px = float(np.sqrt(inflation * together / (np.diag(inverse) @ sizes)))
     full = np.zeros((len(used), len(used)))
     full[np.ix_(used, used)] = covariance
     image_idx, poses = pose_covariances(reconstruction, problem, full)
-    return ClusteredCovariances(image_idx, poses, correlation, problem.num_observations / len(problem.image_idx))
+    per_image = problem.num_observations / len(problem.image_idx)
+    return ClusteredCovariances(image_idx, poses, correlation, noise_px, per_image)
 
 
 def _spread(poses: Array) -> float:

@@ -42,6 +42,7 @@ from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.simd.pointers import offset, pointer
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _DEFAULTS = AdjustOptions()
@@ -145,24 +146,85 @@ def residual_variance(engine: Engine) -> float:
     return total / num_redundant if num_redundant > 0 else np.inf
 
 
-def reduced_matrix(engine: Engine) -> Array:
-    """The undamped reduced system as a full (B * 8, B * 8) matrix."""
-    blocks, tiles = engine.problem.num_blocks, engine.tiles[0]
+def reduced_matrix(engine: Engine, is_kept: Mask | None = None) -> Array:
+    """The undamped reduced system as a full matrix (N * 8, N * 8) over all blocks, or over those that are kept.
+
+    Args:
+        is_kept: (B,) blocks; the others, which each meet few, are eliminated too. LinAlgError where they are open.
+    """
+    tiles = engine.tiles[0]
     if engine.extras is not None:
         engine.extras.add_pairs(tiles, engine.tile_numbers(engine.extras.pairs))
     if len(engine.hash_keys) == 0:
-        keys = np.arange(blocks * blocks)
+        keys = np.arange(engine.problem.num_blocks**2)
         numbers = keys
     else:
         held = engine.hash_keys >= 0
         keys, numbers = engine.hash_keys[held], engine.hash_values[held]
-    a, b = np.divmod(keys, blocks)
+    a, b = np.divmod(keys, engine.problem.num_blocks)
     upper = a <= b
-    matrix = np.zeros((blocks, blocks, 8, 8))
-    matrix[a[upper], b[upper]] = tiles.reshape(-1, 8, 8)[numbers[upper]]
-    full = matrix.transpose(0, 2, 1, 3).reshape(blocks * 8, blocks * 8)
+    a, b, numbers = a[upper], b[upper], numbers[upper]
+    if is_kept is None:
+        is_kept = np.ones(engine.problem.num_blocks, bool)
+    num, both = int(is_kept.sum()), is_kept[a] & is_kept[b]
+    place = np.cumsum(is_kept) - 1
+    matrix = np.zeros((num, num, 8, 8))
+    matrix[place[a[both]], place[b[both]]] = tiles.reshape(-1, 8, 8)[numbers[both]]
+    full = matrix.transpose(0, 2, 1, 3).reshape(num * 8, num * 8)
     above = np.triu(full)
-    return above + np.triu(full, 1).T
+    full = above + np.triu(full, 1).T
+    if not is_kept.all():
+        full -= _through_others(engine, (a[~both], b[~both], numbers[~both]), is_kept)
+    return full
+
+
+def _through_others(engine: Engine, tiles: tuple[Ints, Ints, Ints], is_kept: Mask) -> Array:
+    """(N * 8, N * 8) what eliminating the blocks that are not kept takes off the information of the others.
+
+    Args:
+        tiles: (M,) blocks a <= b and the number of their tile, of all in which such a block has a part.
+    """
+    from scipy import sparse
+    from scipy.sparse.linalg import splu
+    from threadpoolctl import threadpool_limits
+
+    a, b, numbers = tiles
+    values = engine.tiles[0].reshape(-1, 8, 8)[numbers]
+    on_diagonal = a == b
+    # upper halves count
+    values[on_diagonal] = np.triu(values[on_diagonal]) + np.triu(values[on_diagonal], 1).transpose(0, 2, 1)
+    both = ~is_kept[a] & ~is_kept[b]
+    crossed = both & ~on_diagonal
+    place = np.where(is_kept, np.cumsum(is_kept) - 1, np.cumsum(~is_kept) - 1)
+
+    def gathered(rows: Ints, columns: Ints, blocks: Array, shape: tuple[int, int]) -> Any:
+        at = np.arange(8)
+        row = np.broadcast_to(place[rows][:, None, None] * 8 + at[:, None], blocks.shape)
+        column = np.broadcast_to(place[columns][:, None, None] * 8 + at, blocks.shape)
+        return sparse.csc_matrix((blocks.ravel(), (row.ravel(), column.ravel())), shape=shape)
+
+    num, gone = int(is_kept.sum()) * 8, int((~is_kept).sum()) * 8
+    turned = values[crossed].transpose(0, 2, 1)
+    own = gathered(a[both], b[both], values[both], (gone, gone))
+    own += gathered(b[crossed], a[crossed], turned, (gone, gone))
+    first = ~both & is_kept[b]  # the kept one comes second
+    cross = gathered(a[first], b[first], values[first], (gone, num))
+    second = ~both & ~is_kept[b]
+    cross += gathered(b[second], a[second], values[second].transpose(0, 2, 1), (gone, num))
+    scaling = sparse.diags(1.0 / np.sqrt(own.diagonal()))
+    try:
+        factor = splu(
+            sparse.csc_matrix(scaling @ own @ scaling), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )  # fmt: skip
+    except RuntimeError as error:
+        raise np.linalg.LinAlgError("variables are open") from error
+    scaled = sparse.csc_matrix(scaling @ cross)
+    met = np.flatnonzero(np.diff(scaled.indptr))
+    found = np.zeros((num, num))
+    with threadpool_limits(1, "blas"):  # of many small products
+        found[:, met] = scaled.T @ factor.solve(scaled[:, met].toarray())
+    return found
 
 
 def similarity_basis(poses: Array) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ one tangent (rotation, translation) is the negative of the other.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import gtsam
@@ -40,7 +40,7 @@ class ExtraFactors:
 
     Its keys are ``X(i)``, Pose3 world_from_cam of image i; ``K(c)``, Vector of the free parameters of camera c in the
     order of ``Camera.params``; ``L(t)``, Point3 of track t; and whatever ``values`` holds. ``points`` are further
-    tracks that are not to be eliminated.
+    tracks that are not to be eliminated; ``kinds`` are names of factors by their position, for the report.
 
     Attributes:
         mentioned: what of the reconstruction takes part for that reason, and the dimensions of its own variables.
@@ -52,8 +52,10 @@ class ExtraFactors:
 
     weight = 1.0
 
-    def __init__(self, graph: Any, values: Any = None, points: Sequence[int] = ()) -> None:
-        self._graph = graph
+    def __init__(
+        self, graph: Any, values: Any = None, points: Sequence[int] = (), kinds: Mapping[int, str] | None = None
+    ) -> None:
+        self._graph, self._kinds = graph, kinds or {}
         self.values = self.new_values = gtsam.Values() if values is None else values
         own = set(self.values.keys())
         indices: dict[str, list[int]] = {"x": [], "k": [], "l": []}
@@ -65,6 +67,7 @@ class ExtraFactors:
                     f"{gtsam.DefaultKeyFormatter(key)}"
                 )
             indices[chr(symbol.chr())].append(symbol.index())
+        self._zeros = self.values.zeroVectors()
         self._check_noise()
         self._own = sorted(own & set(graph.keyVector()))
         dims = [self._dim(key) for key in self._own]
@@ -125,10 +128,11 @@ class ExtraFactors:
             self._poses.append((key, int(problem.image_pose[n])))
 
     def _choose_known(self) -> None:
-        self.known = gtsam.NonlinearFactorGraph()
+        self.known, self._names = gtsam.NonlinearFactorGraph(), list[str]()
         for n in range(self._graph.size()):
             if set(self._graph.at(n).keys()) <= self._place.keys():
                 self.known.push_back(self._graph.at(n))
+                self._names.append(self._kinds.get(n, type(self._graph.at(n)).__name__))
         self.num_left_out = self._graph.size() - self.known.size()
         places = [self._indices(self.known.at(n).keys()) for n in range(self.known.size())]
         pairs = [np.stack(np.meshgrid(p, p, indexing="ij"), -1).reshape(-1, 2) for p in places]
@@ -148,6 +152,10 @@ class ExtraFactors:
     def block_keys(self) -> list[int]:
         """gtsam's keys of the blocks of the variables of its own."""
         return list(self._own)
+
+    def own_places(self) -> dict[int, Places]:
+        """Rows of the variables of its own among the unknowns of the blocks, by key."""
+        return {key: self._place[key] for key in self._own}
 
     def _indices(self, keys: Any) -> Places:
         return np.concatenate([self._place[key] for key in keys]).astype(np.int64)
@@ -171,7 +179,7 @@ class ExtraFactors:
             self.new_values = self.values.retract(delta)
 
     def _zero(self, key: int) -> Array:
-        zero: Array = self.values.zeroVectors().at(key)
+        zero: Array = self._zeros.at(key)
         return zero
 
     def accept(self) -> None:
@@ -227,8 +235,7 @@ class ExtraFactors:
                 distance = noise.noise().mahalanobisDistance(factor.unwhitenedError(values))
                 weight = noise.robust().weight(distance)
                 square = weight * distance**2
-            name = type(factor).__name__
-            found.setdefault(name, []).append((dim, error, square, weight < REJECTED_WEIGHT))
+            found.setdefault(self._names[n], []).append((dim, error, square, weight < REJECTED_WEIGHT))
         out = []
         for name, rows in sorted(found.items()):
             dims, errors, squares, rejected = (np.array(column) for column in zip(*rows, strict=True))

@@ -38,9 +38,9 @@ class MarginalCovariance:
     Attributes:
         matrix: (N, N) over six rows for each image, rotation w (radians) and translation v of
             ``x_cam <- exp(w) x_cam + v`` (gtsam's tangent of world_from_cam is its negative); the free parameters of
-            each camera, in the order of ``Camera.params``; and three rows for each point, in the world. Infinite where
-            ``is_determined`` is False.
-        image_idx, camera_idx, track_idx: in this order.
+            each camera, in the order of ``Camera.params``; three rows for each point, in the world; and gtsam's tangent
+            of each variable that was inserted. Infinite where ``is_determined`` is False.
+        image_idx, camera_idx, track_idx: in this order, the variables behind them.
         num_gauge: degrees of freedom that nothing but inner constraints holds (:mod:`sfmapp.adjust.covariance`): 7 in a
             free network, 0 where factors or constant images tell place and size.
         is_determined: False if the factors leave more open than that.
@@ -73,6 +73,10 @@ class MarginalCovariance:
         if not np.isfinite(found).all():
             return np.full((3, 3), np.inf)
         return rigid3.center_covariance(self._poses[np.flatnonzero(self.image_idx == image)[0]], found)
+
+    def of_variable(self, key: int) -> Array:
+        """(D, D) of a variable that was inserted. Raises InputError if it was not asked for."""
+        return self._of("variable", key)
 
     def _of(self, what: str, number: int) -> Array:
         place = self._places.get((what, number))
@@ -139,6 +143,7 @@ class FactorGraph:
         if not (np.isfinite(self.noise_px) and self.noise_px > 0.0):
             raise InputError(f"the noise of a pixel coordinate must be positive, found {noise_px}")
         self._factors: Any = None
+        self._kinds: dict[int, str] = {}
         self._values: Any = None
         self._plain: Any = None
 
@@ -160,8 +165,14 @@ class FactorGraph:
             self._values = gtsam.Values()
         return self._values
 
-    def add(self, factor: Any) -> None:
-        """Add a gtsam factor, or a NonlinearFactorGraph of them."""
+    def add(self, factor: Any, kind: str | None = None) -> None:
+        """Add a gtsam factor, or a NonlinearFactorGraph of them.
+
+        Args:
+            kind: what the report calls a single factor; None for the name of its class.
+        """
+        if kind is not None:
+            self._kinds[self.factors.size()] = kind
         self.factors.push_back(factor)
 
     def insert(self, key: int, value: Any) -> None:
@@ -234,26 +245,33 @@ class FactorGraph:
         images: Iterable[int | str] = (),
         cameras: Iterable[int] = (),
         points: Iterable[int] = (),
+        variables: Iterable[int] = (),
     ) -> MarginalCovariance:
         """The joint covariance of some variables at the present state, which should be the minimum.
 
         Args:
-            images: names or positions. cameras: positions. points: tracks. All must vary.
+            images: names or positions. cameras: positions. points: tracks. variables: keys that were inserted. All must
+                vary.
 
-        Time is that of one dense factor over all poses and intrinsics, memory that of two such matrices.
+        Time is that of one dense factor over all poses and intrinsics, memory that of two such matrices; variables that
+        were inserted and are not asked for are eliminated before that, sparsely.
 
         Raises:
             InputError: something is not there or does not vary.
         """
         image_idx = [self._image_position(image) for image in images]
-        camera_idx, track_idx = [int(c) for c in cameras], [int(t) for t in points]
+        camera_idx, track_idx, keys = [int(c) for c in cameras], [int(t) for t in points], [int(k) for k in variables]
         engine = self._engine(self._extras(track_idx), is_closing=False)
-        problem = engine.problem
-        rows, places = _rows_of(problem, image_idx, camera_idx, track_idx)
+        problem, extras = engine.problem, engine.extras
+        own = extras.own_places() if extras is not None else {}
+        rows, places = _rows_of(problem, image_idx, camera_idx, track_idx, {key: own.get(key) for key in keys})
         engine.linearize(0.0, map)
-        used = (np.arange(8) < problem.block_dim[:, None]).ravel()
-        information, scale = reduced_matrix(engine)[np.ix_(used, used)], engine.diagonal[used]
-        basis, constraint = gauge_of(problem, used, information, scale, has_factors=engine.extras is not None)
+        is_kept = np.ones(problem.num_blocks, bool)
+        is_kept[[place[0] // 8 for key, place in own.items() if key not in keys]] = False
+        has_row = np.arange(8) < problem.block_dim[:, None]
+        used, inner = (is_kept[:, None] & has_row).ravel(), has_row[is_kept].ravel()
+        information, scale = reduced_matrix(engine, is_kept)[np.ix_(inner, inner)], engine.diagonal[used]
+        basis, constraint = gauge_of(problem, used, information, scale, has_factors=extras is not None)
         wanted = rows[:, used]
         columns = constrained_columns(information, scale, basis, constraint, wanted.T)
         size = len(rows)
@@ -278,7 +296,7 @@ class FactorGraph:
             return None
         from sfmapp.adjust.factors import ExtraFactors
 
-        return ExtraFactors(self.factors, self.values, points)
+        return ExtraFactors(self.factors, self.values, points, self._kinds)
 
     def _engine(self, extras: Any, *, is_closing: bool) -> Engine:
         return make_engine(
@@ -306,7 +324,7 @@ class FactorGraph:
 
 
 def _rows_of(
-    problem: Problem, images: list[int], cameras: list[int], tracks: list[int]
+    problem: Problem, images: list[int], cameras: list[int], tracks: list[int], variables: dict[int, Ints | None]
 ) -> tuple[Array, dict[tuple[str, int], slice]]:
     """(N, B * 8) how each wanted quantity moves with the unknowns, and the rows of each."""
     parts: list[tuple[tuple[str, int], Ints, Array]] = []
@@ -325,6 +343,9 @@ def _rows_of(
         n = np.flatnonzero(problem.track_idx == t)
         block = problem.point_block[n[0]] if len(n) else -1
         parts.append((("point", t), block * 8 + np.arange(3), np.eye(3)))
+    for key, place in variables.items():
+        at = np.full(1, -1) if place is None else place
+        parts.append((("variable", key), at, np.eye(len(at))))
     places, first = {}, 0
     rows = np.zeros((sum(len(part[2]) for part in parts), problem.num_blocks * 8))
     for (what, number), at, matrix in parts:

@@ -479,7 +479,7 @@ def _told_of_frames(events: Events, on_frame: Callable[[FrameSnapshot], None] | 
 def _tracked_in_memory(source: FilePath | Sequence, options: Options, events: Events) -> OdometryResult:
     from sfmapp.errors import NoReconstructionError
     from sfmapp.odometry.run import run_odometry
-    from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps
+    from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps, takes_imu
 
     if isinstance(source, str | os.PathLike):
         raise UsageError("a sequence of files needs a folder for its results", "give one as the second argument")
@@ -488,10 +488,10 @@ def _tracked_in_memory(source: FilePath | Sequence, options: Options, events: Ev
     with one_blas_thread():
         found = run_odometry(
             source, options.odometry, seed=options.seed, threads=options.num_workers, events=events,
-            markers=None if request is None else request.detector(),
+            markers=None if request is None else request.detector(), with_imu=takes_imu(request, wanted is None),
         )  # fmt: skip
     if request is not None:
-        scale_maps(found, request, source.imu, events)
+        scale_maps(found, request, events)
     if not found.maps:
         raise NoReconstructionError(f"{len(found.frame_idx)} frames were given, but no map could be initialized")
     return _with_views(found)

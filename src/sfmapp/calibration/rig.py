@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import f as fisher
 
 from sfmapp.calibration.adjustment import observations_of, refine, residuals_of
 from sfmapp.calibration.epipolar_errors import epipolar_errors
@@ -27,8 +28,19 @@ from sfmapp.calibration.rig_adjustment import (
     rig_normal,
     rig_residuals,
 )
-from sfmapp.calibration.rig_shots import Cut, OddPhotograph, Photographs, explain, misfits, more_odd, placed, readmitted
+from sfmapp.calibration.rig_shots import (
+    Cut,
+    OddPhotograph,
+    Photographs,
+    doubtful,
+    explain,
+    misfits,
+    more_odd,
+    placed,
+    readmitted,
+)
 from sfmapp.calibration.rig_start import JoinedRig, SeenBoard, join_rig
+from sfmapp.calibration.solve import BENT_CHANCE, RESOLVED_SIGMAS, bend_basis, bend_depth
 from sfmapp.calibration.start import cauchy_weights, posed
 from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
@@ -40,7 +52,7 @@ Array = NDArray[np.float64]
 # A point is left aside that is further out than one in a million of Gaussian ones: exp(-5.25^2 / 2).
 _FAR_SIGMAS = 5.25
 # Rounds of looking for photographs that were not taken together, and of weighing cameras against each other.
-_MAX_ROUNDS, _WEIGHING = 12, 4
+_MAX_ROUNDS, _WEIGHING, _ROUGH = 12, 4, 10.0
 # What is known worse than this is not known: a turn in radians, a shift relative to the distance of the boards.
 _UNKNOWN = 0.2
 # of the smallest eigenvalue of the scaled equations over the largest: below is rounding
@@ -103,9 +115,12 @@ class RigCalibration:
         rig: cameras and their poses.
         world_from_board: (B, 7) boards that are fixed to each other, the first the identity.
         covariance: (S, S) of all that is shared: parameters of every camera, then turn (radians) and shift (unit of the
-            boards) of each camera but the first, about its own axes, then of each board but the first.
+            boards) of each camera but the first, about its own axes, then of each board but the first, then their
+            shapes.
         places: where in it.
         pairs: of cameras that see a board in common, and of those that motion alone joins.
+        bend: (B, 3) shapes of the boards, z = a u^2 + b v^2 + c u v over their points, u and v from -1 to 1; None where
+            they are flat as far as the photographs tell.
         odd: photographs that were not taken with the others of their shot.
         num_shots: moments at which two cameras and more see a board.
         noise_px, degrees_of_freedom: of a measured coordinate, over all cameras.
@@ -125,6 +140,7 @@ class RigCalibration:
     noise_px: float
     degrees_of_freedom: int
     widening: float = 1.0
+    bend: Array | None = None
     warnings: tuple[str, ...] = ()
 
     def pose_covariance(self, camera: int) -> Array:
@@ -136,13 +152,15 @@ class RigCalibration:
 
 
 def calibrate_rig(
-    names: Sequence[str], cameras: Sequence[Camera], is_held: Sequence[bool], views: Sequence[RigView]
-) -> RigCalibration:
+    names: Sequence[str], cameras: Sequence[Camera], is_held: Sequence[bool], views: Sequence[RigView], *,
+    bends: bool = True,
+) -> RigCalibration:  # fmt: skip
     """Refine cameras, their poses in the rig and the boards together.
 
     Args:
         names: of the cameras. cameras: where their parameters begin, or stay. is_held: which of them stay.
         views: boards in photographs. Shots are moments of exposure; boards are fixed to each other.
+        bends: look whether the boards are bent, and take that into account.
 
     Raises:
         InputError: nothing joins some of the cameras, or what joins them does not tell where they are.
@@ -157,7 +175,11 @@ def calibrate_rig(
     _refuse_apart(names, joined)
     begin = RigFit(tuple(cameras), joined.cam_from_rig, np.zeros((0, 7)), joined.world_from_board)
     fit, cut = _fit_of_what_belongs_together(begin, photos, is_held)
-    problem = RigProblem(photos.with_cut(cut).views, is_held)
+    bent = _bent(fit, photos, is_held, cut) if bends else None
+    if bent is not None:
+        photos = bent[1]
+        fit, cut = _fit_of_what_belongs_together(bent[0], photos, is_held)
+    problem = photos.with_cut(cut).problem(is_held)
     for _ in range(_WEIGHING):
         photos, noise = _weighed(fit, problem, photos, noise)
         fit = refine_rig(fit, problem, photos.weights)
@@ -202,16 +224,46 @@ def _refuse_apart(names: Sequence[str], joined: JoinedRig) -> None:
 
 def _fit_of_what_belongs_together(begin: RigFit, photos: Photographs, is_held: Sequence[bool]) -> tuple[RigFit, Cut]:
     """The refined rig, and the photographs that were not taken with the others of their shot."""
-    fit, cut = begin, Cut()
+    fit, cut, was_back = begin, Cut(), Cut()
     for _ in range(_MAX_ROUNDS):
-        now = (cut - readmitted(fit, photos, cut)) | more_odd(fit, photos, cut)
+        back = readmitted(fit, photos, cut) - was_back
+        was_back |= back
+        # at first poses are those of single photographs, and known that much worse
+        now = (cut - back) | more_odd(fit, photos, cut, _ROUGH if fit is begin else 1.0)
         is_settled = now == cut and fit is not begin
         cut = now
         fit = placed(fit, photos.with_cut(cut))[0]
         if is_settled:
             break
-        fit = refine_rig(fit, RigProblem(photos.with_cut(cut).views, is_held), photos.weights)
+        fit = refine_rig(fit, photos.with_cut(cut).problem(is_held), photos.weights)
     return fit, cut
+
+
+def _bent(fit: RigFit, photos: Photographs, is_held: Sequence[bool], cut: Cut) -> tuple[RigFit, Photographs] | None:
+    """The rig with boards that are bent, where the photographs show it by Fisher's test; None where they do not."""
+    views = photos.views
+    num_boards = len(fit.world_from_board)
+    shapes = []
+    for view in views:
+        whole = np.zeros((len(view.view.xy), 3 * num_boards))
+        same = [one.view for one in views if one.board == view.board]
+        whole[:, 3 * view.board : 3 * view.board + 3] = bend_basis(view.view, same)
+        shapes.append(whole)
+    curved = replace(photos, shapes=tuple(shapes))
+    problem = curved.with_cut(cut).problem(is_held)
+    flat = refine_rig(fit, photos.with_cut(cut).problem(is_held), photos.weights)
+    found = refine_rig(replace(flat, bend=np.zeros(3 * num_boards)), problem, photos.weights)
+    inverse = _Inverse(found, problem, photos.weights)
+    free = int((np.diag(inverse.shared) > 0).sum()) + 6 * problem.num_shots
+    freedom = 2 * sum(int((weight > 0).sum()) for weight in photos.weights) - free
+    if freedom < 1 or not 0.0 < found.cost < flat.cost or inverse.rank_gap < _SINGULAR:
+        return None
+    num = len(found.bend)
+    ratio = (flat.cost - found.cost) / num / (found.cost / freedom)
+    place = places_of(found).bend
+    sigmas = np.sqrt(np.diag(inverse.shared)[place] * 2.0 * found.cost / freedom)
+    is_resolved = bool((np.abs(found.bend) > RESOLVED_SIGMAS * sigmas).any())
+    return (found, curved) if is_resolved and fisher.sf(ratio, num, freedom) < BENT_CHANCE else None
 
 
 def _weighed(fit: RigFit, problem: RigProblem, photos: Photographs, noise: Array) -> tuple[Photographs, Array]:
@@ -281,10 +333,10 @@ def _result(
     found = RigCalibration(
         tuple(names), _cameras(fit, problem, photos, covariance, noise, odd), rig, fit.world_from_board, covariance,
         places, tuple(_pairs(fit, problem, photos, covariance, joined)), tuple(odd), len(shared_shots),
-        float(np.sqrt((noise**2).mean())), freedom, widening,
+        float(np.sqrt((noise**2).mean())), freedom, widening, fit.bend.reshape(-1, 3) if len(fit.bend) else None,
     )  # fmt: skip
     _refuse_unknown(found, inverse.rank_gap, np.linalg.norm(rigid3.inverse(photos.alone)[:, 4:], axis=1))
-    return replace(found, warnings=tuple(_warnings(found)))
+    return replace(found, warnings=(*_warnings(found), *doubtful(fit, photos, cut)))
 
 
 def _widening(costs: Array) -> float:
@@ -392,6 +444,9 @@ def _refuse_unknown(found: RigCalibration, rank_gap: float, distances: Array) ->
 
 def _warnings(found: RigCalibration) -> list[str]:
     warnings = [one.reason for one in found.odd]
+    if found.bend is not None:
+        depths = " and ".join(f"{1000.0 * bend_depth(one):.2f} mm" for one in found.bend)
+        warnings.append(f"bent boards, up to {depths} out of their planes: taken into account")
     if found.widening > 1.0:
         warnings.append(
             f"photographs of one shot differ by {found.widening:.1f} times what the noise of their points explains "

@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,7 @@ class RigFit:
         cam_from_rig: (C, 7), the first the identity.
         rig_from_world: (T, 7). The world is the frame of the first board.
         world_from_board: (B, 7), the first the identity.
+        bend: (3 B,) shapes of the boards, as :func:`sfmapp.calibration.solve.bend_basis` has them; empty for flat ones.
         cost: half the weighted squares of the residuals.
     """
 
@@ -72,6 +73,7 @@ class RigFit:
     cam_from_rig: Array
     rig_from_world: Array
     world_from_board: Array
+    bend: Array = field(default_factory=lambda: np.zeros(0))
     cost: float = math.inf
 
 
@@ -81,6 +83,7 @@ class RigProblem:
     Args:
         views: at least one; two views of a problem may share camera and shot where boards differ.
         is_held: (C,) cameras whose parameters stay.
+        shapes: of each view (N, 3 B), how the shapes of the boards move its points; None for flat boards.
 
     Attributes:
         order: (V,) position among ``views`` of each view, sorted by camera.
@@ -88,7 +91,9 @@ class RigProblem:
         obs: of each camera.
     """
 
-    def __init__(self, views: Sequence[RigView], is_held: Sequence[bool]) -> None:
+    def __init__(
+        self, views: Sequence[RigView], is_held: Sequence[bool], shapes: Sequence[Array] | None = None
+    ) -> None:
         camera = np.array([view.camera for view in views], np.int64)
         self.order: Ints = np.argsort(camera, kind="stable").astype(np.int64)
         self.camera: Ints = camera[self.order]
@@ -96,7 +101,13 @@ class RigProblem:
         self.board: Ints = np.array([views[i].board for i in self.order], np.int64)
         self.is_held = tuple(is_held)
         self.of_camera = [np.flatnonzero(self.camera == c) for c in range(len(self.is_held))]
-        self.obs = [observations_of([views[self.order[v]].view for v in mine]) for mine in self.of_camera]
+        self.obs = [
+            observations_of(
+                [views[self.order[v]].view for v in mine],
+                None if shapes is None else [shapes[self.order[v]] for v in mine],
+            )
+            for mine in self.of_camera
+        ]
         self.num_shots = int(self.shot.max()) + 1
         self.num_boards = int(self.board.max()) + 1
 
@@ -108,11 +119,13 @@ class RigProblem:
 @dataclass(frozen=True)
 class Places:
     """Where the unknowns stand that all shots share: parameters of every camera, then the poses of cameras but the
-    first, then those of boards but the first. A pose has a turn (radians) and a shift about the axes of its frame."""
+    first, then those of boards but the first, then shapes of boards. A pose has a turn (radians) and a shift about the
+    axes of its frame."""
 
     params: tuple[slice, ...]
     cam_from_rig: tuple[slice, ...]
     world_from_board: tuple[slice, ...]
+    bend: slice
     total: int
 
 
@@ -123,8 +136,9 @@ def places_of(fit: RigFit) -> Places:
     num_poses = len(fit.cameras) - 1 + len(fit.world_from_board) - 1
     starts = [ends[-1] + 6 * k for k in range(num_poses)]
     poses = tuple(slice(start, start + 6) for start in starts)
-    cut = len(fit.cameras) - 1
-    return Places(params, poses[:cut], poses[cut:], ends[-1] + 6 * num_poses)
+    cut, shapes = len(fit.cameras) - 1, ends[-1] + 6 * num_poses
+    total = shapes + len(fit.bend)
+    return Places(params, poses[:cut], poses[cut:], slice(shapes, total), total)
 
 
 def cam_from_board(fit: RigFit, problem: RigProblem, camera: int) -> Array:
@@ -138,7 +152,7 @@ def rig_residuals(fit: RigFit, problem: RigProblem) -> list[Array]:
     """(N, 2) measured minus projected pixels of each camera; NaN where the lens does not look."""
     out = [np.empty_like(obs.xy) for obs in problem.obs]
     for c, obs in enumerate(problem.obs):
-        residuals(_state(fit.cameras[c], cam_from_board(fit, problem, c)), obs, out[c])
+        residuals(_state(fit, c, cam_from_board(fit, problem, c)), obs, out[c])
     return out
 
 
@@ -159,10 +173,10 @@ def camera_normal(fit: RigFit, problem: RigProblem, obs: Observations, camera: i
     mine, places = problem.of_camera[camera], places_of(fit)
     model = fit.cameras[camera].model
     slots = np.full_like(param_of_slot(model), -1) if problem.is_held[camera] else param_of_slot(model)
-    own = empty_normal(len(fit.cameras[camera].params), len(mine))
+    own = empty_normal(len(fit.cameras[camera].params) + len(fit.bend), len(mine))
     poses = cam_from_board(fit, problem, camera)
-    cost = normal_equations(_state(fit.cameras[camera], poses), obs, slots, own)
-    shots, at = problem.shot[mine], places.params[camera]
+    cost = normal_equations(_state(fit, camera, poses), obs, slots, own)
+    shots, at = problem.shot[mine], np.r_[places.params[camera], places.bend]
     by_shot = adjoint(fit.cam_from_rig[camera])
     by_pose = np.zeros((len(mine), 6, places.total))
     if camera > 0:
@@ -176,7 +190,7 @@ def camera_normal(fit: RigFit, problem: RigProblem, obs: Observations, camera: i
     half[:, at] = own.cross
     crossed = np.einsum("vsi,vit->st", half, by_pose)
     moved = by_pose.swapaxes(1, 2) @ own.own
-    out.shared[at, at] += own.shared
+    out.shared[np.ix_(at, at)] += own.shared
     out.shared[:] += crossed + crossed.T + np.einsum("vsi,vit->st", moved, by_pose)
     out.right[at] += own.right
     out.right[:] += np.einsum("vis,vi->s", by_pose, own.own_right)
@@ -263,8 +277,9 @@ def shot_costs(fit: RigFit, problem: RigProblem, obs: Sequence[Observations]) ->
     return out
 
 
-def _state(camera: Camera, poses: Array) -> State:
-    return State(camera.canonical, rigid3.rotation_matrix(poses), np.ascontiguousarray(poses[:, 4:]), np.zeros(0))
+def _state(fit: RigFit, camera: int, poses: Array) -> State:
+    rotation, translation = rigid3.rotation_matrix(poses), np.ascontiguousarray(poses[:, 4:])
+    return State(fit.cameras[camera].canonical, rotation, translation, fit.bend)
 
 
 def _moved(fit: RigFit, shared: Array, own: Array) -> RigFit:
@@ -281,7 +296,7 @@ def _moved(fit: RigFit, shared: Array, own: Array) -> RigFit:
 
     return RigFit(
         cameras, moved(fit.cam_from_rig, places.cam_from_rig), _turned(fit.rig_from_world, own),
-        moved(fit.world_from_board, places.world_from_board),
+        moved(fit.world_from_board, places.world_from_board), fit.bend + shared[places.bend],
     )  # fmt: skip
 
 

@@ -21,6 +21,7 @@ from sfmapp.reporting import document_text
 Array = NDArray[np.float64]
 
 FORMAT = "sfmapp rig 1"
+_SHAPE = ("bend_uu", "bend_vv", "bend_uv")
 _POSE = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
 
 
@@ -42,6 +43,7 @@ def rig_head(found: RigCalibration) -> RigHead:
         pairs=[_pair(found, pair) for pair in found.pairs],
         warnings=list(found.warnings),
         world_from_board=found.world_from_board.tolist(),
+        bend=None if found.bend is None else found.bend.tolist(),
         unknowns=_unknowns(found),
         covariance=found.covariance.tolist(),
     )
@@ -65,7 +67,9 @@ def rig_cameras(found: RigCalibration) -> list[RigCameraSection]:
 def _unknowns(found: RigCalibration) -> list[str]:
     names = [f"cam{n}.{name}" for n, one in enumerate(found.cameras) for name in one.param_names]
     names += [f"cam{n}.{name}" for n in range(1, len(found.cameras)) for name in _POSE]
-    return names + [f"board{n}.{name}" for n in range(1, len(found.world_from_board)) for name in _POSE]
+    names += [f"board{n}.{name}" for n in range(1, len(found.world_from_board)) for name in _POSE]
+    shapes = [] if found.bend is None else [f"board{n}.{name}" for n in range(len(found.bend)) for name in _SHAPE]
+    return names + shapes
 
 
 def _pair(found: RigCalibration, pair: PairCalibration) -> RigPair:

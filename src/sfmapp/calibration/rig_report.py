@@ -70,6 +70,8 @@ class RigHead(Report):
         num_shots: moments at which cameras that see a board see it together.
         widening: by which the sigmas of poses are wider than the noise of the points alone makes them.
         world_from_board: (B, 7) of boards that are fixed to each other.
+        bend: (B, 3) shapes of boards that are not flat: z = a u^2 + b v^2 + c u v over their points, u and v from -1 to
+            1, metres; absent where they are flat as far as the photographs tell.
         unknowns: names of the rows of the covariance.
         covariance: (S, S) of everything; rows of what was held are 0.
     """
@@ -82,6 +84,7 @@ class RigHead(Report):
     pairs: Sequence[RigPair]
     warnings: Sequence[str]
     world_from_board: Sequence[Sequence[float]]
+    bend: Sequence[Sequence[float]] | None = None
     unknowns: Sequence[str]
     covariance: Sequence[Sequence[float]]
 

@@ -20,9 +20,15 @@ Array = NDArray[np.float64]
 Cut = frozenset[tuple[int, int]]
 """Cameras and shots: photographs that were not taken with the others of their shot."""
 
-# One shot in a million costs more than 6.9 for each degree of freedom (chi-squared, six of them), whose median is 0.89.
-# Lens models are never exact: where the typical shot costs more than noise does, so may every other.
-_ODD, _MEDIAN = 6.9, 0.89
+# Of noise one shot in a million costs more than 6.9 for each degree of freedom (chi-squared, six of them); the median
+# is 0.89, of n shots give or take 0.72 / sqrt(n).
+_NOISE, _MEDIAN, _MEDIAN_SIGMA = 6.9, 0.89, 0.72
+# What is no noise (a board that trembles, a lens that is not quite its model) lies in few of the six directions: of two
+# one shot in a million costs 20 times the median. It differs by factors from shot to shot: five sigmas of the logarithm
+# are believed.
+_STRIKING, _SPREAD = 20.0, 5.0
+# A shot that the rig was not fitted to costs more than one that it was: another chance at so many times the limit.
+_BACK = 3.0
 
 
 @dataclass(frozen=True)
@@ -34,12 +40,18 @@ class Photographs:
         alone: (V, 7) cam_from_board that each has by itself.
         weights: of each camera (N,) over the squared residuals of its points: 1 / noise^2, or 0.
         sizes: (width, height) of each camera.
+        shapes: of each view (N, 3 B), how the shapes of the boards move its points; None for flat boards.
     """
 
     views: tuple[RigView, ...]
     alone: Array
     weights: tuple[Array, ...]
     sizes: tuple[tuple[int, int], ...]
+    shapes: tuple[Array, ...] | None = None
+
+    def problem(self, is_held: Sequence[bool]) -> RigProblem:
+        """The views by camera. ``is_held``: (C,) cameras whose parameters stay."""
+        return RigProblem(self.views, is_held, self.shapes)
 
     def with_shots(self, shots: Sequence[int]) -> Photographs:
         """The same with other moments of exposure (V,)."""
@@ -67,7 +79,7 @@ class OddPhotograph:
 def placed(fit: RigFit, photos: Photographs) -> tuple[RigFit, Array]:
     """The rig with its best pose at every shot, all else held, and what each shot costs (T,): the squares of its
     residuals in those of the noise."""
-    problem = RigProblem(photos.views, [True] * len(fit.cameras))
+    problem = photos.problem([True] * len(fit.cameras))
     obs = problem.weighted(photos.weights)
     # from the photograph whose own pose suits the others best
     poses, cost = np.tile(rigid3.IDENTITY, (problem.num_shots, 1)), np.full(problem.num_shots, np.inf)
@@ -100,21 +112,35 @@ def misfits(fit: RigFit, photos: Photographs) -> Array:
     return np.where(num > 1, (together - np.where(np.isfinite(alone), alone, 0.0)) / freedom, 0.0)
 
 
-def limit_of(costs: Array) -> float:
-    """The most that is believed: of noise, or of what the typical shot (T,) costs; shots of one photograph have 0."""
+def striking(costs: Array) -> float:
+    """What shots cost at most that nothing is wrong with, from the costs of all (T,); 0 for those of one photograph."""
     known = costs[costs > 0]
-    typical = float(np.median(known)) if len(known) else 0.0
-    return _ODD * max(1.0, typical / _MEDIAN)
+    median = float(np.median(known)) if len(known) else 0.0
+    is_noise = median < _MEDIAN + 3.0 * _MEDIAN_SIGMA / np.sqrt(max(len(known), 1))
+    return _NOISE if is_noise else _STRIKING * median
 
 
-def more_odd(fit: RigFit, photos: Photographs, cut: Cut) -> Cut:
-    """Photographs that do not belong to their shots, beside those that were cut: at most one more of each shot.
+def limit_of(costs: Array) -> float:
+    """The most that is believed: more than :func:`striking` where costs (T,) are no noise, and differ much."""
+    least = striking(costs)
+    if least == _NOISE:
+        return least
+    known = np.log(costs[costs > 0])
+    middle = float(np.median(known))
+    # the median distance from the median is 0.6745 sigmas
+    spread = float(np.median(np.abs(known - middle))) / 0.6745
+    return max(least, float(np.exp(min(middle + _SPREAD * spread, 700.0))))
+
+
+def more_odd(fit: RigFit, photos: Photographs, cut: Cut, tolerance: float) -> Cut:
+    """Photographs that do not belong to their shots, beside those that were cut: at most one more of each shot, which
+    costs more than so many times what is believed.
 
     Of three and more it is the one without which the others agree best, of two the one of the later camera.
     """
     remaining = photos.with_cut(cut)
     costs = misfits(fit, remaining)
-    shots = np.flatnonzero(costs > limit_of(costs)).tolist()
+    shots = np.flatnonzero(costs > tolerance * limit_of(costs)).tolist()
     found: set[tuple[int, int]] = set()
     cameras_of = {t: sorted({v.camera for v in remaining.views if v.shot == t}) for t in shots}
     many = {t for t in shots if len(cameras_of[t]) > 2}
@@ -128,14 +154,29 @@ def more_odd(fit: RigFit, photos: Photographs, cut: Cut) -> Cut:
 
 
 def readmitted(fit: RigFit, photos: Photographs, cut: Cut) -> Cut:
-    """Of the photographs that were cut those that do belong to their shots: the rig was known worse when they were."""
-    limit = limit_of(misfits(fit, photos.with_cut(cut)))
+    """Of the photographs that were cut those that may belong to their shots: the rig was known worse when they were,
+    and is known worse without them."""
+    limit = _BACK * limit_of(misfits(fit, photos.with_cut(cut)))
     found: set[tuple[int, int]] = set()
     for camera in sorted({c for c, _ in cut}):
         mine = {key for key in cut if key[0] == camera}
         costs = misfits(fit, photos.with_cut(cut - mine))
         found |= {(c, t) for c, t in mine if costs[t] < limit}
     return frozenset(found)
+
+
+def doubtful(fit: RigFit, photos: Photographs, cut: Cut) -> list[str]:
+    """Shots that are used although their photographs agree much worse than those of the others."""
+    linked = photos.with_cut(cut)
+    costs = misfits(fit, linked)
+    found = []
+    for shot in np.flatnonzero(costs > striking(costs)).tolist():
+        names = " and ".join(dict.fromkeys(view.view.name for view in linked.views if view.shot == shot))
+        typical = costs[shot] / float(np.median(costs[costs > 0]))
+        found.append(
+            f"{names} agree worst, by {typical:.0f} times the typical squares: perhaps the board moved between them"
+        )
+    return found
 
 
 def explain(fit: RigFit, photos: Photographs, cut: Cut, names: Sequence[str]) -> list[OddPhotograph]:
@@ -168,7 +209,8 @@ def _cost_of(fit: RigFit, photos: Photographs, chosen: Sequence[tuple[int, int]]
         for camera in range(len(fit.cameras))
     )  # fmt: skip
     alone = photos.alone[[i for i, _ in chosen]]
-    return float(misfits(fit, Photographs(tuple(views), alone, weights, photos.sizes))[0])
+    shapes = None if photos.shapes is None else tuple(photos.shapes[i] for i, _ in chosen)
+    return float(misfits(fit, Photographs(tuple(views), alone, weights, photos.sizes, shapes))[0])
 
 
 def _positions(photos: Photographs, camera: int, shot: int) -> list[int]:

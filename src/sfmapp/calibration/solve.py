@@ -44,8 +44,8 @@ _NAMED, _WORSE = 0.01, 1.5
 _BLURRED = 1.5
 _OBLIQUE_DEG = 65.0
 # chance that a flat board is taken for a bent one
-_BENT = 1e-4
-_RESOLVED = 4.0
+BENT_CHANCE = 1e-4
+RESOLVED_SIGMAS = 4.0
 
 
 @dataclass(frozen=True)
@@ -294,19 +294,24 @@ def _bent(work: _Work, flat: Fit, is_used: Bools) -> tuple[Fit, Bools, Bend | No
     chance = float(fisher.sf(ratio, 3, dof))
     covariance = np.linalg.pinv(_bend_information(fit, bent_obs._replace(weight=now_used.astype(np.float64))))
     sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0) * cost_bent / dof)
-    is_resolved = bool((np.abs(fit.bend) > _RESOLVED * sigmas).any())
-    if not (chance < _BENT and is_resolved):
+    is_resolved = bool((np.abs(fit.bend) > RESOLVED_SIGMAS * sigmas).any())
+    if not (chance < BENT_CHANCE and is_resolved):
         return flat, is_used, None, f"flat as far as the views tell (F {ratio:.1f}, chance {chance:.2g})"
-    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)), -1).reshape(-1, 2)
-    u, v = grid.T
-    z = np.stack([u * u, v * v, u * v], 1) @ fit.bend
-    plane = np.stack([u, v, np.ones_like(u)], 1)
-    depth = float(np.abs(z - plane @ np.linalg.lstsq(plane, z, rcond=None)[0]).max())
+    depth = bend_depth(fit.bend)
     rms = float(np.sqrt(before / max(is_used.sum(), 1)))
     note = f"the board is bent: up to {1000.0 * depth:.2f} mm out of its plane (F {ratio:.0f}); taken into account"
     work.warnings.append(note)
     work.events.decided(STAGE, note)
     return fit, now_used, Bend(fit.bend, sigmas, depth, rms), note
+
+
+def bend_depth(coefficients: Array) -> float:
+    """How far a board of the shape (3,) is out of the plane that fits it best, in the unit of the board."""
+    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)), -1).reshape(-1, 2)
+    u, v = grid.T
+    z = np.stack([u * u, v * v, u * v], 1) @ coefficients
+    plane = np.stack([u, v, np.ones_like(u)], 1)
+    return float(np.abs(z - plane @ np.linalg.lstsq(plane, z, rcond=None)[0]).max())
 
 
 def _bend_information(fit: Fit, obs: Observations) -> Array:

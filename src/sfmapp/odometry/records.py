@@ -11,7 +11,8 @@ from sfmapp.contradictions import widened, widened_scale_sigma
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.keyframe_images import KeyframeImages
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
-from sfmapp.odometry.refinement.final_adjustment import MAX_COVARIANCE_KEYFRAMES, FinalAdjustment
+from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment
+from sfmapp.odometry.refinement.inertial_adjustment import MAX_COVARIANCE_KEYFRAMES
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.odometry.tracker import measure_pose
 
@@ -186,7 +187,7 @@ def _map_result(keyframes: KeyframeMap, final: FinalAdjustment, images: Keyframe
     return MapResult(
         model, frame_idx, image_idx, covariance, final.gauge, "stereo" if num_sensors > 1 else "none",
         widened_scale_sigma(final.scale_sigma, found), found, _covariance_gap(final, num), final.noise_covariance,
-        images.sightings(frame_idx, image_idx), final.adjustment,
+        images.sightings(frame_idx, image_idx), final.adjustment, final.inertial,
     )  # fmt: skip
 
 

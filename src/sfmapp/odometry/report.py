@@ -131,6 +131,7 @@ class AdjustmentReport(Report):
         covariance: absent where none was asked for.
         shutter: absent where it was not looked for.
         is_piecewise: the map is too large to be adjusted at once.
+        inertial: measurements of a sensor that took part, or why they did not; absent without one.
     """
 
     camera: CalibrationCheck
@@ -138,6 +139,7 @@ class AdjustmentReport(Report):
     covariance: SharedErrors | None = None
     shutter: ShutterReport | None = None
     is_piecewise: bool | None = None
+    inertial: ScaleEvidence | None = None
 
 
 # ------------------------------------------------------------------------------------------- the unit of length
@@ -212,8 +214,9 @@ class InertialEvidence(Report):
     Attributes:
         rotation_residual_deg, rotation_deg: of an interval: what gyroscope and map differ by, and how far it turns.
         condition: of the linear start.
-        position_sigma_map_units, rotation_sigma_deg: noise of the poses as they fit.
-        residual: chi2 over degrees of freedom. gravity_sigma_deg: of its direction.
+        position_sigma_map_units: noise of the positions as they fit to start with.
+        residual: what the measurements add to the cost, twice, over the degrees of freedom that they bring.
+        gravity_in_map: (3,) m/s^2, downwards. gravity_sigma_deg: of its direction.
         gyro_bias, accel_bias: (3,) rad/s and m/s^2.
         clock_offset_s, clock_sigma_s: to be added to a time of the frames for that of the measurements.
         explained_by: what may be wrong with the measurements, where they contradict the map.
@@ -227,7 +230,7 @@ class InertialEvidence(Report):
     position_sigma_map_units: float | None = None
     residual: float | None = None
     gravity_sigma_deg: float | None = None
-    rotation_sigma_deg: float | None = None
+    gravity_in_map: Sequence[float] | None = None
     gyro_bias: Sequence[float] | None = None
     accel_bias: Sequence[float] | None = None
     clock_offset_s: float | None = None

@@ -13,6 +13,7 @@ from sfmapp.adjust.options import AdjustReport
 from sfmapp.contradictions import Contradiction
 from sfmapp.images.sequence import RepeatedFrame
 from sfmapp.odometry.inertial.markers import MarkerSightings
+from sfmapp.odometry.inertial.scale import ScaleEstimate, ScaleRefusal
 from sfmapp.odometry.inertial.smoothing import SmoothedTrajectory
 from sfmapp.odometry.report import OdometryReport
 from sfmapp.scene.reconstruction import Reconstruction
@@ -50,6 +51,7 @@ class MapResult:
             (calibration, contradictions) is common to neighbouring keyframes. In the map's first unit of length.
         sightings: the markers in the keyframes, where they were looked for.
         adjustment: the closing adjustment; None for a map that was adjusted piece by piece, or read from files.
+        inertial: what an inertial sensor that took part in it says of the unit of length, or why it does not.
     """
 
     reconstruction: Reconstruction
@@ -64,6 +66,7 @@ class MapResult:
     noise_covariance: Array | None = None
     sightings: MarkerSightings = field(default_factory=MarkerSightings.none)
     adjustment: AdjustReport | None = None
+    inertial: ScaleEstimate | ScaleRefusal | None = None
 
 
 @dataclass

@@ -93,6 +93,7 @@ class Odometry:
         threads: int,
         events: Events,
         markers: MarkerDetector | None = None,
+        with_imu: bool = True,
     ) -> None:
         self.rig, self.options, self.seed, self.events = sequence.rig, options, seed, events
         self.given_rig, self.calibration = sequence.rig, EarlyCalibration(options.refine_camera)
@@ -104,6 +105,7 @@ class Odometry:
         self.recognition, self.keyframe_images = Recognition(seed), KeyframeImages(markers)
         self.tracked, self.motion = _Tracked(), MotionModel(sequence.imu)
         self.clock = StereoClock(self.rig)
+        self.imu = sequence.imu if with_imu else None
         self._begin_to_wait()
 
     def process(self, frame: Frame) -> FrameRecord:
@@ -410,7 +412,7 @@ class Odometry:
             maps[number] = local.keyframes
             self.events.started("adjustment", f"adjusting {local.newest + 1} keyframes together")
             straightened = self._straighten(local)
-            conclusion = adjust_finally(local.keyframes, self.options, self.events, self.given_rig)
+            conclusion = adjust_finally(local.keyframes, self.options, self.events, self.given_rig, self.imu)
             conclusion.contradictions.extend(self.clock.contradictions(local.keyframes))
             conclusion.contradictions.extend(local.witnesses.contradictions(local.keyframes))
             conclusions[number] = replace(conclusion, report=replace(conclusion.report, shutter=straightened))
@@ -461,6 +463,7 @@ def run_odometry(
     threads: int = 1,
     events: Events | None = None,
     markers: MarkerDetector | None = None,
+    with_imu: bool = True,
 ) -> OdometryResult:
     """Follow the camera through a sequence.
 
@@ -471,12 +474,15 @@ def run_odometry(
         events: told of every frame (``advanced`` with a FrameSnapshot) and of every change of the map (``decided`` with
             a MapSnapshot). The result does not depend on them.
         markers: looks for markers in the keyframes; what it finds is in the result's maps.
+        with_imu: inertial measurements of the sequence count in the closing adjustment.
 
     Raises:
         InterruptedRunError: on cancellation.
     """
     events = events or Events()
-    odometry = Odometry(sequence, options, seed=seed, threads=threads, events=events, markers=markers)
+    odometry = Odometry(
+        sequence, options, seed=seed, threads=threads, events=events, markers=markers, with_imu=with_imu
+    )  # fmt: skip
     events.started(STAGE, total=sequence.num_frames)
     for frame in odometry.clock.pair(sequence.frames(), events):
         odometry.process(frame)

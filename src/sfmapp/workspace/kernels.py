@@ -33,7 +33,7 @@ ODOMETRY_MODULES = (
     "sfmapp.odometry.loops.pose_graph",
 )
 DENSE_MODULES = ("sfmapp.dense.densify",)
-INERTIAL_MODULES = ("sfmapp.odometry.inertial.gyroscope", "sfmapp.odometry.inertial.visual_inertial")
+INERTIAL_MODULES = ("sfmapp.odometry.inertial.gyroscope", "sfmapp.odometry.inertial.integration")
 
 
 @contextmanager

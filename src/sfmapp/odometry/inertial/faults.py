@@ -1,7 +1,7 @@
 """Why inertial measurements contradict a map: axes, signs, units, gravity, mounting, told apart by trying them.
 
 Each reading of the gyroscope is held against the map's rotations, each reading of the accelerometer against its
-positions in the linear system of :mod:`sfmapp.odometry.inertial.visual_inertial`; the best few are aligned in full. One
+positions in the linear system of :mod:`sfmapp.odometry.inertial.integration`; the best few are aligned in full. One
 that turns a fit which contradicts the map into one that leaves no more than noise is what is the case, and is named
 with its remedy.
 """
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.inertial.gyroscope import (
@@ -24,20 +24,18 @@ from sfmapp.odometry.inertial.gyroscope import (
     other_readings,
     read_as_given,
 )
-from sfmapp.odometry.inertial.scale import ScaleRefusal
-from sfmapp.odometry.inertial.visual_inertial import (
+from sfmapp.odometry.inertial.integration import (
     ACCEL_BIAS_SIGMA,
     GRAVITY,
-    MAX_BIAS,
-    InertialAlignment,
     InertialOptions,
-    align_imu,
     choose_poses,
     constrain,
-    contradicted,
     linear_system,
     turns_of,
 )
+from sfmapp.odometry.inertial.scale import ScaleRefusal
+from sfmapp.odometry.inertial.seen_map import SeenMap
+from sfmapp.odometry.inertial.visual_inertial import MAX_BIAS, InertialAlignment, align_imu, contradicted
 from sfmapp.odometry.report import Fault, InertialEvidence
 
 if TYPE_CHECKING:
@@ -79,26 +77,15 @@ class _Case:
         return int(axes) + units + int(self.has_no_gravity)
 
 
-def align_or_explain(
-    timestamps_s: ArrayLike, cam_from_world: ArrayLike, imu: Imu, *, is_metric: bool,
-    covariance: ArrayLike | None = None, options: InertialOptions = _DEFAULTS,
-) -> InertialAlignment | ScaleRefusal:  # fmt: skip
+def align_or_explain(seen: SeenMap, imu: Imu, options: InertialOptions = _DEFAULTS) -> InertialAlignment | ScaleRefusal:
     """As ``align_imu`` does it; a refusal because of a contradiction names its cause if that is found."""
-    found = align_imu(timestamps_s, cam_from_world, imu, is_metric=is_metric, covariance=covariance, options=options)
-    if isinstance(found, InertialAlignment):
+    found = align_imu(seen, imu, options)
+    if isinstance(found, InertialAlignment) or found.contradiction is None:
         return found
-    # where nothing is known of the noise, a wrong sensor looks like a noisy map: its bias tells
-    bias = float(np.linalg.norm(found.evidence.get("accel_bias", [0.0])))
-    if found.contradiction is None and not bias > MAX_BIAS:
-        return found
-    times, poses = np.asarray(timestamps_s, np.float64), np.array(cam_from_world, np.float64)
-    if covariance is not None:
-        poses[~np.isfinite(np.asarray(covariance)).all((1, 2))] = np.nan
     tried: list[tuple[_Case, InertialAlignment | ScaleRefusal]] = []
-    for case in _cases(times, poses, imu, is_metric, options):
-        changed = _changed(times, poses, imu, case)
-        better = align_imu(times, poses, changed, is_metric=is_metric, covariance=covariance, options=options)
-        tried.append((case, better))
+    for case in _cases(seen.times_s, seen.poses, imu, seen.is_metric, options):
+        changed = _changed(seen.times_s, seen.poses, imu, case)
+        tried.append((case, align_imu(seen, changed, options)))
     return _told(found, _explaining(found, tried, options), imu)
 
 
@@ -130,8 +117,6 @@ def _explaining(
 
 def _told(refusal: ScaleRefusal, kept: list[tuple[_Case, float]], imu: Imu) -> ScaleRefusal:
     """The refusal with what explains it."""
-    if not kept and refusal.contradiction is None:
-        return refusal
     if not kept:
         advice = (
             "no order or sign of the axes, unit, missing gravity, mounting or offset of the clocks explains it: "
@@ -212,7 +197,9 @@ def _felt(times: Array, poses: Array, imu: Imu, reading: Reading, options: Inert
 
 def _with_gyro(imu: Imu, reading: Reading) -> Imu:
     """The measurements with the gyroscope, the mounting and the clock of a reading."""
-    mount = rigid3.from_matrix(reading.imu_from_cam, imu.imu_from_cam[4:])
+    turned = rigid3.inverse(imu.imu_from_cam)
+    given = turned if np.allclose(rigid3.rotation_matrix(turned), reading.imu_from_cam) else imu.imu_from_cam
+    mount = rigid3.from_matrix(reading.imu_from_cam, given[4:])
     gyro = reading.factor * imu.gyro @ reading.axes.T
     return replace(imu, timestamps_s=imu.timestamps_s - reading.offset_s, gyro=gyro, imu_from_cam=mount)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,10 +31,24 @@ _UNKNOWN_SHARE = 0.5
 _UNKNOWN_SHARE_OF_SCALE = 0.25
 
 
-def estimate_map_covariance(
-    model: Reconstruction, num_sensors: int, loss_scale_px: float
-) -> tuple[Array, str, SharedErrors]:
-    """(K, 6, 6) of the keyframes, NaN for those that no point holds, what they are relative to, and how they came.
+@dataclass(frozen=True)
+class MapCovariance:
+    """How sure the keyframes of a map are.
+
+    Attributes:
+        poses: (K, 6, 6), NaN for those that no point holds. gauge: what they are relative to.
+        shared: by how much errors that observations share make them larger.
+        noise_px: standard deviation of a pixel coordinate with which independent errors would leave them as large.
+    """
+
+    poses: Array
+    gauge: str
+    shared: SharedErrors
+    noise_px: float
+
+
+def estimate_map_covariance(model: Reconstruction, num_sensors: int, loss_scale_px: float) -> MapCovariance:
+    """Covariances of the keyframes, by the images alone.
 
     Args:
         model: adjusted, images S k + s as of ``KeyframeMap.reconstruction``.
@@ -54,7 +69,8 @@ def estimate_map_covariance(
     covariance[found.image_idx[of_first] // num_sensors] = shared * found.poses[of_first]
     covariance[~np.isfinite(covariance).all((1, 2))] = np.nan
     numbers = SharedErrors(within_tracks=found.correlation, between_tracks=shared)
-    return covariance, "centroid, mean rotation" + ("" if num_sensors > 1 else " and spread"), numbers
+    gauge = "centroid, mean rotation" + ("" if num_sensors > 1 else " and spread")
+    return MapCovariance(covariance, gauge, numbers, found.noise_px * math.sqrt(shared))
 
 
 def covariance_of_refinement(given: Reconstruction, refined: Reconstruction, num_sensors: int) -> Array:

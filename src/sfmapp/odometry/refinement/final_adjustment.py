@@ -12,7 +12,10 @@ from sfmapp.adjust.options import AdjustReport
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
+from sfmapp.images.sequence import Imu
 from sfmapp.mapping.structure import residual_scale_px
+from sfmapp.odometry.inertial.scale import ScaleEstimate, ScaleRefusal
+from sfmapp.odometry.inertial.visual_inertial import InertialAlignment
 from sfmapp.odometry.loops.sweep import is_too_large, sweep
 from sfmapp.odometry.map.backend import classify, make_job, take_over
 from sfmapp.odometry.map.covariance import covariance_of_refinement, estimate_map_covariance, scale_sigma_of_refinement
@@ -25,6 +28,7 @@ from sfmapp.odometry.refinement.calibration_check import (
     close_poses,
     question_calibration,
 )
+from sfmapp.odometry.refinement.inertial_adjustment import MAX_COVARIANCE_KEYFRAMES, adjust_with_imu
 from sfmapp.odometry.report import AdjustmentReport
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig
@@ -35,8 +39,6 @@ STAGE = "adjustment"
 # A rolling shutter has to explain this much, in units of the noise. Independent noise alone explains 1; errors of
 # patches are not independent, and exact cameras of rendered sequences show up to 30.
 MIN_EVIDENCE = 90.0
-# Covariances take two dense matrices over all poses.
-MAX_COVARIANCE_KEYFRAMES = 400
 _FIRST_STEPS, _MAX_STEPS, _TOLERANCE = 8, 30, 1e-4
 # A unit of length that is less sure than that is worth a word.
 _SCALE_OPEN = 0.02
@@ -60,6 +62,7 @@ class FinalAdjustment:
         scale_sigma: relative standard deviation of the unit of length of a rig; None without one.
         noise_covariance: (K, 6, 6) what the noise of the observations alone makes of ``covariance``.
         adjustment: the last of all keyframes together; None where they were too many.
+        inertial: what an inertial sensor said of the unit of length; None without one.
     """
 
     covariance: Array | None
@@ -69,20 +72,25 @@ class FinalAdjustment:
     scale_sigma: float | None = None
     noise_covariance: Array | None = None
     adjustment: AdjustReport | None = None
+    inertial: ScaleEstimate | ScaleRefusal | None = None
 
 
 def adjust_finally(
-    keyframes: KeyframeMap, options: OdometryOptions, events: Events, given: Rig | None = None
+    keyframes: KeyframeMap, options: OdometryOptions, events: Events, given: Rig | None = None, imu: Imu | None = None
 ) -> FinalAdjustment:
     """Adjust all keyframes and points of a map, in place, and the cameras where the images contradict them.
+
+    Images alone come first: they question the calibration, and tell which observations agree and how much their errors
+    have in common. Where there is an inertial sensor, and it agrees, the last adjustment is of both.
 
     Args:
         keyframes: with the rig that it was made with, which may be a refined one.
         options, events: the usual.
         given: the rig as it was given, which is questioned once more, by all there is; None for that of the keyframes.
+        imu: what was measured beside the frames; None: nothing, or nothing that is to count.
     """
     if is_too_large(keyframes):
-        return _adjust_large_map(keyframes, options, events)
+        return _adjust_large_map(keyframes, options, events, imu)
     everything = np.arange(len(keyframes.keyframes))
     job = make_job(keyframes, everything, everything > 0)
     model = job.model
@@ -107,16 +115,54 @@ def adjust_finally(
     report = AdjustmentReport(camera=answer.report, sigma_px=classify(model, job.num_elsewhere))
     take_over(job, keyframes)
     keyframes.rig = rig_of(model)
-    covariance, noise, gauge, contradictions = None, None, "", list(answer.contradictions)
-    if options.covariance and 1 < len(everything) <= MAX_COVARIANCE_KEYFRAMES:
-        noise, gauge, shared = estimate_map_covariance(model, num_sensors, LOSS_SIGMAS * sigma)
-        report = replace(report, covariance=shared)
-        covariance = noise + of_refinement
-        if answer.pose_covariance is not None:
-            covariance += answer.pose_covariance
-        if answer.is_refined:
-            contradictions += _left_open(covariance, rigid3.spread(model.cam_from_world), events)
-    return FinalAdjustment(covariance, gauge, report, contradictions, answer.scale_sigma, noise, adjustment)
+    found, final = (
+        None,
+        FinalAdjustment(None, "", report, list(answer.contradictions), answer.scale_sigma, None, adjustment),
+    )
+    if 1 < len(everything) <= MAX_COVARIANCE_KEYFRAMES and (options.covariance or imu is not None):
+        found = estimate_map_covariance(model, num_sensors, LOSS_SIGMAS * sigma)
+    if imu is not None:
+        final = _with_imu(final, keyframes, imu, (sigma, None if found is None else found.noise_px), events)
+    if found is None or not options.covariance:
+        return final
+    noise = found.poses if final.noise_covariance is None else final.noise_covariance
+    covariance = noise + of_refinement + (0.0 if answer.pose_covariance is None else answer.pose_covariance)
+    if answer.is_refined:
+        final.contradictions.extend(_left_open(covariance, rigid3.spread(model.cam_from_world), events))
+    return replace(
+        final, covariance=covariance, gauge=found.gauge, report=replace(final.report, covariance=found.shared),
+        noise_covariance=noise,
+    )  # fmt: skip
+
+
+def _with_imu(
+    final: FinalAdjustment, keyframes: KeyframeMap, imu: Imu, noise_px: tuple[float, float | None], events: Events
+) -> FinalAdjustment:
+    """What the images have brought, and what an inertial sensor makes of it.
+
+    Args:
+        noise_px: of an observation, and what that comes to with what errors have in common, where it is known.
+    """
+    sigma, together = noise_px
+    is_metric = final.scale_sigma is not None
+    found = adjust_with_imu(keyframes, imu, sigma, noise_px=together, scale_sigma=final.scale_sigma)
+    events.raise_if_cancelled()
+    report = replace(final.report, inertial=found.evidence)
+    if isinstance(found, InertialAlignment):
+        numbers = found.adjustment
+        events.decided(STAGE, f"closing adjustment with inertial measurements: {numbers.text}", **numbers)
+        return replace(
+            final,
+            report=report,
+            adjustment=numbers,
+            inertial=found.scale_estimate,
+            noise_covariance=found.pose_covariance,
+        )
+    contradictions = list(final.contradictions)
+    if is_metric and found.contradiction is not None:  # of a single camera the scale is told of, or why there is none
+        contradictions.append(found.contradiction)
+        events.warned(STAGE, found.contradiction.message, subject=found.contradiction.subject)
+    return replace(final, report=report, inertial=found, contradictions=contradictions)
 
 
 def _left_open(covariance: Array, size: float, events: Events) -> list[Contradiction]:
@@ -134,7 +180,9 @@ def _left_open(covariance: Array, size: float, events: Events) -> list[Contradic
     return [Contradiction("given calibration", message, "calibrate the camera, or move more and turn", evidence)]
 
 
-def _adjust_large_map(keyframes: KeyframeMap, options: OdometryOptions, events: Events) -> FinalAdjustment:
+def _adjust_large_map(
+    keyframes: KeyframeMap, options: OdometryOptions, events: Events, imu: Imu | None
+) -> FinalAdjustment:
     """The same piece by piece, without covariances; the cameras are questioned on the newest keyframes alone."""
     num = len(keyframes.keyframes)
     part = np.arange(num - _NUM_QUESTIONED, num)
@@ -148,7 +196,8 @@ def _adjust_large_map(keyframes: KeyframeMap, options: OdometryOptions, events: 
             _rescale(keyframes, rigid3.spread(answer.model.cam_from_world) / rigid3.spread(job.model.cam_from_world))
     sweep(keyframes, options, events)
     report = AdjustmentReport(camera=answer.report, is_piecewise=True)
-    return FinalAdjustment(None, "", report, answer.contradictions, answer.scale_sigma)
+    final = FinalAdjustment(None, "", report, answer.contradictions, answer.scale_sigma)
+    return final if imu is None else _with_imu(final, keyframes, imu, (sigma, None), events)
 
 
 def _question(

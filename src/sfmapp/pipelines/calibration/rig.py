@@ -105,8 +105,15 @@ def calibrate_cameras(
             given = [*cameras, *[None] * (len(seen) - len(cameras))]
             seen = [_with_lens(job, one, boards, text, model) for one, text in zip(seen, given, strict=True)]
             views = read_from_one_end(_views(seen, boards, shots), boards, [_lens(one) for one in seen])
-            found = calibrate_rig([one.name for one in seen], [_lens(one) for one in seen],
-                                  [one.is_held for one in seen], views)  # fmt: skip
+            # the shape of a board is seen only where it is known which of its points are which
+            bends = all(
+                boards[view.board].kind != "chessboard" or len(view.view.xy) == len(boards[view.board].points)
+                for view in views
+            )
+            found = calibrate_rig(
+                [one.name for one in seen], [_lens(one) for one in seen], [one.is_held for one in seen], views,
+                bends=bends,
+            )  # fmt: skip
         for warning in found.warnings:
             job.events.warned(STAGE, warning)
         with job.stage("files"):

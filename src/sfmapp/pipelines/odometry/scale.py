@@ -12,7 +12,7 @@ from sfmapp.contradictions import widened_scale_sigma
 from sfmapp.errors import UsageError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.images.sequence import Imu, Sequence
+from sfmapp.images.sequence import Sequence
 from sfmapp.odometry.inertial.markers import MarkerDetector, MarkerKind, parse_marker, scale_from_markers
 from sfmapp.odometry.inertial.scale import (
     KnownDistance,
@@ -102,13 +102,20 @@ def resolve_scale_request(scale_request: ScaleRequest | None, is_auto: bool, seq
     return scale_request
 
 
-def scale_maps(
-    result: OdometryResult, scale_request: ScaleRequest, imu: Imu | None, events: Events
-) -> list[ScaleReport]:
+def takes_imu(scale_request: ScaleRequest | None, is_auto: bool) -> bool:
+    """Whether inertial measurements count in the closing adjustment: unless metres come from elsewhere, or not at all.
+
+    Args:
+        scale_request, is_auto: as of :func:`resolve_scale_request`.
+    """
+    return is_auto or (scale_request is not None and scale_request.imu)
+
+
+def scale_maps(result: OdometryResult, scale_request: ScaleRequest, events: Events) -> list[ScaleReport]:
     """Put each map in metres that the request can be met for, in place; returns a row for each, with the evidence."""
     rows = []
     for m in range(len(result.maps)):
-        found = _estimate(result, m, scale_request, imu)
+        found = _estimate(result, m, scale_request)
         row = ScaleReport(map=m, source=found.source, evidence=found.evidence)
         if isinstance(found, ScaleEstimate):
             rescale(result, m, found)
@@ -157,9 +164,7 @@ def rescale(result: OdometryResult, map_idx: int, found: ScaleEstimate) -> None:
         result.smoothed[map_idx] = replace(smooth, cam_from_world=poses, covariance=covariance, velocity=velocity)
 
 
-def _estimate(
-    result: OdometryResult, m: int, scale_request: ScaleRequest, imu: Imu | None
-) -> ScaleEstimate | ScaleRefusal:
+def _estimate(result: OdometryResult, m: int, scale_request: ScaleRequest) -> ScaleEstimate | ScaleRefusal:
     entry = result.maps[m]
     if scale_request.marker is not None:
         return scale_from_markers(entry.reconstruction, entry.sightings, scale_request.marker.side)
@@ -167,8 +172,7 @@ def _estimate(
         return scale_from_camera_height(entry.reconstruction, entry.keyframe_image_idx, scale_request.camera_height)
     if scale_request.distance is not None:
         return _from_distance(result, m, scale_request.distance)
-    assert imu is not None
-    return _from_imu(result, m, imu)
+    return _from_imu(entry)
 
 
 def _from_distance(result: OdometryResult, m: int, scale_request: KnownDistance) -> ScaleEstimate | ScaleRefusal:
@@ -208,20 +212,14 @@ def _covariance_near(result: OdometryResult, entry: MapResult, position: int) ->
     return covariance if np.isfinite(covariance).all() else None
 
 
-def _from_imu(result: OdometryResult, m: int, imu: Imu) -> ScaleEstimate | ScaleRefusal:
-    from sfmapp.odometry.inertial.faults import align_or_explain
-
-    entry = result.maps[m]
-    times = result.timestamps_s[np.searchsorted(result.frame_idx, entry.keyframe_frame_idx)]
-    poses = entry.reconstruction.cam_from_world[entry.keyframe_image_idx]
-    covariance = entry.noise_covariance  # what calibration adds moves neighbours alike, and would excuse any residual
-    if covariance is not None and not np.isfinite(covariance).any():
-        covariance = None  # none could be had: the noise is judged by how the poses fit
-    found = align_or_explain(times, poses, imu, is_metric=False, covariance=covariance)
+def _from_imu(entry: MapResult) -> ScaleEstimate | ScaleRefusal:
+    found = entry.inertial
+    if found is None:
+        reason = "the map was made without the inertial measurements"
+        return ScaleRefusal("imu", reason, InertialEvidence(num_poses=0, num_intervals=0))
     if isinstance(found, ScaleRefusal):
         return found
-    sigma = math.hypot(found.sigma_relative, _bend(entry))
-    return ScaleEstimate(found.scale, sigma, "imu", found.evidence)
+    return replace(found, sigma_relative=math.hypot(found.sigma_relative, _bend(entry)))
 
 
 def _bend(entry: MapResult) -> float:

@@ -21,7 +21,7 @@ from sfmapp.images.video import VideoSequence
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
 from sfmapp.pipelines.odometry.results import write_odometry
-from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps
+from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps, takes_imu
 from sfmapp.pipelines.odometry.tracking import Tracking
 from sfmapp.report.model import OdometryRunReport
 from sfmapp.sequences.open import open_sequence
@@ -126,6 +126,7 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
             threads=run.threads,
             events=events.without_cancellation(),
             markers=None if run.scale_request is None else run.scale_request.detector(),
+            with_imu=takes_imu(run.scale_request, options.scale.source is None),
         )
         run.threads_cpu.sample()
     run.stages = replace(run.stages, odometry=result.report)
@@ -136,7 +137,7 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
     with run.measured("scale"):
         if run.scale_request is not None:
             without_cancellation = events.without_cancellation()
-            scaled = scale_maps(result, run.scale_request, watched.imu, without_cancellation)
+            scaled = scale_maps(result, run.scale_request, without_cancellation)
             run.stages = replace(run.stages, scale=scaled)
     result = replace(result, timestamps_s=watched.times_as_given(result))
     if isinstance(run.sequence, FileSequence | VideoSequence):  # frames in memory are all there
