@@ -91,11 +91,13 @@ _ADVICE = (
 )
 # Fields along the sides in which held-out lines count as one witness, and the most (log-likelihood) that one is worth.
 _WITNESS_CELLS, _MOST_OF_WITNESS = 12, 3.0
-# A distortion that is this many sigmas of the jackknife from zero needs only so many by held-out lines: of six board
-# photographs (1.1 to 2.7) and eleven without distortion or straight lines (-1.0 to 1.4) that keeps the latter out.
-_STEADY_SIGMAS, _STEADY_T = 6.0, 1.5
+# A distortion that is this many sigmas of the jackknife from zero needs only so many by held-out lines. Boards have 21
+# to 69 and 1.1 to 2.7; photographs without distortion or straight lines 17 at most with less than 1.5, random arcs 8.
+_STEADY_SIGMAS, _STEADY_T = 20.0, 1.5
 # Parts that straight lines alone are held out in; worlds are sought in halves, for each part would take a search.
 _PLUMB_FOLDS = 6
+# Least sigma, as a share, of a focal length that no third direction checks: right angles of houses are not exact.
+_UNCHECKED_FOCAL = 0.05
 # Cells along the sides of a photograph that are held out in turn, as the fields of a chessboard.
 _HELD_CELLS = 6
 
@@ -497,6 +499,8 @@ def _calibration(
         share = _DEFAULT_FOCAL * max(problem.width, problem.height) / radius
         covariance[LOG_FOCAL], covariance[:, LOG_FOCAL] = 0.0, 0.0
         covariance[LOG_FOCAL, LOG_FOCAL] = _DEFAULT_LOG_SIGMA**2
+    if focal.is_told and not center_told.is_told:
+        focal = replace(focal, widened=max(focal.widened, _UNCHECKED_FOCAL))
     for unknown, verdict in ((STRENGTH, strength), (LOG_FOCAL, focal)):
         sigma = math.sqrt(max(covariance[unknown, unknown], 1e-24))
         factor = max(verdict.widened / sigma, 1.0)
