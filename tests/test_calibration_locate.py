@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from sfmapp.camera.camera import Camera, project
 from sfmapp.camera.names import CameraModel
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
+from sfmapp.formats.colmap import read_model
 from sfmapp.formats.known_points import read_known_points, read_marker_places, read_marks
 from sfmapp.geometry import p3p, pnp, resection, rigid3
 from sfmapp.pipelines.calibration.known_points import MeasureSource, measure_marks
@@ -227,7 +229,7 @@ def test_sigmas_of_what_is_measured_hold() -> None:
     spread = np.diag([3.0, 3.0, 4.0, 4.0, 0.005, 0.005, 5e-4, 5e-4]) ** 2
     known = np.array([[-1.0, -0.7, 0.0], [1.0, -0.7, 0.0], [1.0, 0.7, 0.0], [-1.0, 0.7, 0.0]])
     normal = []
-    for trial in range(60):
+    for trial in range(40):
         rng = np.random.default_rng([9, trial])
         xyz, xy, pose = picture(rng, 14, CAMERA)
         off = CAMERA.with_params(CAMERA.params + np.sqrt(np.diag(spread)) * rng.normal(size=8))
@@ -248,8 +250,8 @@ def test_sigmas_of_what_is_measured_hold() -> None:
             row += [(edge.length.value - EDGE) / edge.length.sigma, (sheet.area.value - AREA) / sheet.area.sigma]
         normal.append(row)
     squares = (np.array(normal) ** 2).sum(0)
-    assert (squares > chi2.ppf(5e-4, 60)).all()
-    assert (squares < chi2.ppf(1.0 - 5e-4, 60)).all()
+    assert (squares > chi2.ppf(5e-4, 40)).all()
+    assert (squares < chi2.ppf(1.0 - 5e-4, 40)).all()
 
 
 def test_what_cannot_be_measured_is_refused() -> None:
@@ -364,6 +366,7 @@ def test_calibrate_locate_and_measure_by_command(desk, tmp_path, capsys) -> None
     assert values["fx"][1] < 30.0
     assert found["fit"]["num_used"] >= 30
     assert (out / "report.html").read_text(encoding="utf-8").count("data:image/jpeg") == 1
+    assert (out / "recording.rrd").stat().st_size > 10_000
     # the calibration is taken by the next command, with its covariance; two points that changed places are named
     where = tmp_path / "where"
     located = run(capsys, "locate", photo, "--points", folder / "points.csv", "--camera", out, "-o", where)
@@ -400,3 +403,25 @@ def test_commands_say_what_is_missing(desk, tmp_path, capsys) -> None:
     assert "sfmapp:" in capsys.readouterr().err
     with pytest.raises(UsageError, match="sigma_px"):
         measure_marks(points, MeasureSource(), sigma_px=-1.0)
+
+
+def test_a_photograph_is_located_in_a_reconstruction_that_it_is_not_of(photos, sample, tmp_path, capsys) -> None:
+    """Six of seven photographs are reconstructed, the seventh finds its place among them."""
+    names = sorted(path.name for path in photos.iterdir())
+    (tmp_path / "six").mkdir()
+    for name in names[:3] + names[4:]:
+        (tmp_path / "six" / name).write_bytes((photos / name).read_bytes())
+    assert main(["reconstruct", str(tmp_path / "six"), "-o", str(tmp_path / "out"), "-q", "--no-recording"]) == 0
+    model, _ = read_model(tmp_path / "out" / "sparse" / "0")
+    located = run(
+        capsys, "locate", photos / names[3], "--model", tmp_path / "out", "--camera", tmp_path / "out" / "sparse" / "0",
+        "-o", tmp_path / "where",
+    )["fit"]  # fmt: skip
+    assert located["num_used"] > 30
+    cameras = json.loads((sample / "cameras.json").read_text(encoding="utf-8"))["cameras"]
+    truth = {Path(entry["file"]).stem: np.array(entry["R_w2c"]) for entry in cameras}
+    ours = rigid3.rotation_matrix(np.array(located["pose"]["cam_from_world"]))
+    for i in model.registered_idx:
+        turn = ours @ rigid3.rotation_matrix(model.cam_from_world[i]).T
+        true_turn = truth[Path(names[3]).stem] @ truth[Path(model.image_names[i]).stem].T
+        assert rigid3.rotation_angle_deg(turn @ true_turn.T) < 0.5

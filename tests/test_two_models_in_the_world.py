@@ -42,7 +42,7 @@ def two_groups(sample: Path, photos: Path, folder: Path, num: int) -> dict[str, 
 def test_two_models_lie_in_one_frame(
     sample: Path, photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    places = two_groups(sample, photos, tmp_path / "photos", 6)
+    places = two_groups(sample, photos, tmp_path / "photos", 5)
     rng, rows = np.random.default_rng(0), ["image,latitude,longitude,height,sigma,sigma_up"]
     for name, place in places.items():
         at = PLACE.geodetic_from_enu(place + SIGMA_M * rng.normal(size=3))

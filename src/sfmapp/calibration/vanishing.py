@@ -15,6 +15,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.geometry.self_calibration import focal_from_vanishing_points
+
 Array = NDArray[np.float64]
 
 # What is known of lines before the photograph is seen: half of them belong to none of the directions.
@@ -195,12 +197,9 @@ def _search_frames(
 
 
 def focals_of_pairs(axes: Array, low: float, high: float) -> Array:
-    """Focal lengths for which two of the axes are at right angles, ``f^2 = -(p_x q_x + p_y q_y) / (p_z q_z)``."""
-    along = axes[:, :2] @ axes[:, :2].T
-    depth = np.outer(axes[:, 2], axes[:, 2])
-    square = -along / np.where(np.abs(depth) < 1e-12, np.nan, depth)
-    square = square[np.triu_indices(len(axes), 1)]
-    focals: Array = np.sqrt(square[square > 0])
+    """Focal lengths between two bounds for which two of the axes are at right angles."""
+    i, j = np.triu_indices(len(axes), 1)
+    focals = focal_from_vanishing_points(axes[i], axes[j])
     return focals[(focals > low) & (focals < high)]
 
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from sfmapp.calibration.point_reports import FitReport
     from sfmapp.pipelines.calibration.known_points import PointSource
 
+_NAMES_SHOWN = 10
+
 POINTS = """\
 a table of points has a line for each:  [name] X Y Z u v
   separated by commas, semicolons, tabs or spaces, with names of the columns in the first line or without; a unit in
@@ -54,6 +56,7 @@ def add_way(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--camera-model", choices=MODEL_NAMES, metavar="NAME",
         help="default: PINHOLE, from 20 points on OPENCV or a fisheye; PINHOLE_SKEW finds the skew as well",
     )  # fmt: skip
+    parser.add_argument("--no-recording", action="store_true", help="do not write recording.rrd")
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_calibrate)
 
@@ -75,7 +78,7 @@ def point_source(args: argparse.Namespace) -> PointSource:
     """What the flags say of the points."""
     from sfmapp.pipelines.calibration.known_points import PointSource
 
-    return PointSource(args.points, args.markers, args.dictionary, args.opencv_pixels)
+    return PointSource(args.points, args.markers, args.dictionary, is_opencv=args.opencv_pixels)
 
 
 def print_fit(fit: FitReport) -> None:
@@ -84,9 +87,11 @@ def print_fit(fit: FitReport) -> None:
         f"{fit.num_used} of {len(fit.points)} points agree, rms {fit.rms_px:.3f} px, noise of a mark "
         f"{fit.noise_px:.3g} px ({fit.noise_source})"
     )
-    for point in fit.points:
-        if not point.is_used:
-            print(f"  WRONG: {point.name}: {point.reason}")
+    wrong = [point for point in fit.points if not point.is_used]
+    for point in wrong[:_NAMES_SHOWN]:
+        print(f"  WRONG: {point.name}: {point.reason}")
+    if len(wrong) > _NAMES_SHOWN:
+        print(f"  and {len(wrong) - _NAMES_SHOWN} more, which the report names")
     for warning in fit.warnings:
         print(f"  {warning}")
     pose, axes = fit.pose, "xyz"
@@ -109,7 +114,8 @@ def _calibrate(args: argparse.Namespace) -> int:
     watch = Stopwatch(whole_process=True)
     with listening(args) as events:
         result = calibrate_from_target(
-            args.photograph, args.output, point_source(args), sigma_px=args.sigma_px, events=events, watch=watch,
+            args.photograph, args.output, point_source(args), sigma_px=args.sigma_px, recording=not args.no_recording,
+            events=events, watch=watch,
             camera_model=None if args.camera_model is None else CameraModel[args.camera_model],
         )  # fmt: skip
     report = result.report

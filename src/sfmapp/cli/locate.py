@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from sfmapp.cli.calibrate_target import POINTS, add_point_flags, point_source, print_fit
@@ -12,6 +13,7 @@ EXAMPLES = f"""\
 examples:
   sfmapp locate photo.jpg --points points.csv --camera calibration.json -o where/
   sfmapp locate photo.jpg --markers room.csv --dictionary APRILTAG_36H11 --camera camera.yaml -o where/
+  sfmapp locate photo.jpg --model out/ --camera out/sparse/0 -o where/
   sfmapp measure marks.csv --pose where/ --plane 0,0,1,0
 
 {POINTS}
@@ -31,6 +33,9 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--camera", metavar="FILE", required=True, help="a calibration file of any form")
     add_point_flags(parser)
     parser.add_argument(
+        "--model", metavar="DIR", type=Path, help="in place of a table: a folder of reconstruct whose place it shows"
+    )
+    parser.add_argument(
         "--method", choices=("auto", "p3p", "all"), default="auto",
         help="p3p: samples of three points, of which some may be wrong; all: all points at once, none of them is; "
         "default: p3p where there are more than four",
@@ -46,11 +51,15 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _locate(args: argparse.Namespace) -> int:
     limit_library_threads()
     load_numba_without_blas()
+    from sfmapp.errors import UsageError
     from sfmapp.pipelines.calibration.known_points import locate
 
+    source = replace(point_source(args), model=args.model)
+    if args.model is not None and (args.points is not None or args.markers is not None):
+        raise UsageError("expected one of --points, --markers and --model, found two")
     with listening(args) as events:
         result = locate(
-            args.photograph, args.output, point_source(args), args.camera, method=args.method,
+            args.photograph, args.output, source, args.camera, method=args.method,
             max_error_px=args.max_error_px, sigma_px=args.sigma_px, events=events,
         )  # fmt: skip
     if args.json:

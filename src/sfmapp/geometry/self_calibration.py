@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 _FLAT = np.diag([1.0, 1.0, 0.0])
 # A focal length is told if one that is so many times as long, or as short, leaves E so many times as unequal.
 _CHANGE, _TELLING, _ROUNDING = 1.2, 3.0, 1e-6
+# product of the last numbers of vanishing points of unit length, below which one of them is at infinity
+_INFINITE = 1e-12
 _MAX_STEPS, _CONVERGED = 30, 1e-12
 
 
@@ -146,18 +148,18 @@ def focal_from_homographies(homographies: Sequence[Array], center: Array) -> flo
     return float(np.sqrt(square)) if np.isfinite(square) and square > 0.0 else None
 
 
-def focal_from_vanishing_points(first: Array, second: Array, center: Array) -> Array:
+def focal_from_vanishing_points(first: Array, second: Array) -> Array:
     """(N,) focal lengths, pixels, for which the directions of vanishing points are at right angles (HZ example 8.27).
 
     Args:
-        first, second: (N, 2) pixels.
-        center: (2,) principal point.
+        first, second: (N, 3) homogeneous, pixels from the principal point.
 
     Returns:
         NaN where there is none. Directions that are parallel to the picture have their vanishing point at infinity, and
         tell nothing: a building seen from straight ahead.
     """
-    square = -((first - center) * (second - center)).sum(1)
+    depth = first[:, 2] * second[:, 2]
+    square = -(first[:, :2] * second[:, :2]).sum(1) / np.where(np.abs(depth) < _INFINITE, np.nan, depth)
     found: Array = np.sqrt(np.where(square > 0.0, square, np.nan))
     return found
 

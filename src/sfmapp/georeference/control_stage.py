@@ -133,7 +133,7 @@ def _control_model(
     if alignment.world_from_model is None and positions is not None and marked.is_placed.any():
         alignment = Alignment(similarity.IDENTITY, marked.is_placed, "")  # it lies in the frame already
     if alignment.world_from_model is None:
-        events.decided(STAGE, f"model {number} is not brought to ground control: {alignment.problem}")
+        events.decided(STAGE, f"model {number} is not georeferenced by its ground control: {alignment.problem}")
         return _unmoved(number, control, marked, survey, alignment.problem), None
     first = model.copy()
     moved = alignment.world_from_model

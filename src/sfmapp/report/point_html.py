@@ -20,6 +20,8 @@ Pixels = NDArray[np.uint8]
 _WIDTH = 1400
 # the longest residual that counts is drawn so long, pixels of the page, unless that would shrink it
 _LONGEST = 40.0
+# names and rows of so many points, the wrong ones first; the rest is in report.json
+_MAX_NAMES, _MAX_ROWS = 150, 500
 _GOOD, _WRONG, _EXPECTED = (40, 200, 90), (230, 60, 50), (250, 190, 40)
 
 
@@ -51,6 +53,8 @@ def draw_residuals(rgb: Pixels, orientation: int, points: Sequence[PointReport])
             if not point.is_used:
                 _circle(canvas, target, 5, _EXPECTED)
         _circle(canvas, at, 6, color)
+        if len(points) > _MAX_NAMES:
+            continue
         place = (int(np.clip(at[0] + 9, 0, canvas.shape[1] - 60)), int(np.clip(at[1] - 7, 14, canvas.shape[0] - 4)))
         cv2.putText(canvas, point.name[:24], place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 3, cv2.LINE_AA)
         cv2.putText(canvas, point.name[:24], place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
@@ -165,7 +169,8 @@ def _held(report: TargetReport) -> str:
 
 def _points(points: Sequence[PointReport]) -> str:
     rows = []
-    for point in points:
+    ranked = sorted(points, key=lambda point: point.is_used) if len(points) > _MAX_ROWS else points
+    for point in ranked[:_MAX_ROWS]:
         off: tuple[str | None, ...] = (None, None)
         if point.expected_px is not None:
             off = tuple(f"{m - e:+.3f}" for m, e in zip(point.marked_px, point.expected_px, strict=True))
@@ -174,7 +179,8 @@ def _points(points: Sequence[PointReport]) -> str:
         kind = "t" if point.is_used else "t red"
         rows.append([(kind, point.name), *mark, ("", off[0]), ("", off[1]), ("", left_out), ("w", point.reason)])
     head = [("t", "point"), ("", "u"), ("", "v"), ("", "residual u"), ("", "v"), ("", "left out, px"), ("t", "")]
-    return "<h2>Points</h2>" + table(head, rows)
+    more = f"<p class=dim>{len(points) - _MAX_ROWS} more in report.json</p>" if len(points) > _MAX_ROWS else ""
+    return "<h2>Points</h2>" + table(head, rows) + more
 
 
 def _files(report: TargetReport) -> str:

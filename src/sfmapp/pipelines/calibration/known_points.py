@@ -38,10 +38,12 @@ from sfmapp.formats.text_input import read_json_object
 from sfmapp.images.folder import describe_images
 from sfmapp.images.image_set import ImageOptions, ImageRecord
 from sfmapp.images.pixels import read_gray, read_rgb
+from sfmapp.pipelines.calibration.model_points import find_model_points
 from sfmapp.pipelines.calibration.results import write_camera
 from sfmapp.report.point_html import draw_residuals, render_location_html, render_target_html
 from sfmapp.reporting import document_text
-from sfmapp.workspace.job import Job
+from sfmapp.viewer.calibration_recording import record_calibration
+from sfmapp.workspace.job import FAILED, WRITTEN, Job
 from sfmapp.workspace.layout import CALIBRATE, LOCATE, REPORT
 from sfmapp.workspace.usage import Stopwatch
 
@@ -57,12 +59,14 @@ class PointSource:
     Attributes:
         points: a table of ``[name] X Y Z u v``. markers: one of ``id corner X Y Z``.
         dictionary: of the markers.
+        model: a folder of ``sfmapp reconstruct`` whose points the photograph shows; for ``locate``.
         is_opencv: pixels of the table count the centre of the first pixel as 0, as OpenCV does, not as a half.
     """
 
     points: Path | None = None
     markers: Path | None = None
     dictionary: str | None = None
+    model: Path | None = None
     is_opencv: bool = False
 
 
@@ -93,8 +97,8 @@ class _Points:
 
 def calibrate_from_target(
     photograph: str | os.PathLike[str], output: str | os.PathLike[str], source: PointSource, *,
-    camera_model: CameraModel | None = None, sigma_px: float | None = None, events: Events | None = None,
-    watch: Stopwatch | None = None,
+    camera_model: CameraModel | None = None, sigma_px: float | None = None, recording: bool = True,
+    events: Events | None = None, watch: Stopwatch | None = None,
 ) -> TargetResult:  # fmt: skip
     """Calibrate from one photograph, and write ``calibration.json``, ``pose.json``, files for others and a report.
 
@@ -102,6 +106,7 @@ def calibrate_from_target(
         photograph: a file. output: a new folder, an empty one, or that of an earlier call.
         source: of its points.
         camera_model, sigma_px: as in :func:`sfmapp.calibration.target.calibrate_target`.
+        recording: write ``recording.rrd``.
 
     Raises:
         UsageError: options that contradict each other, or an output that holds something else.
@@ -123,6 +128,8 @@ def calibrate_from_target(
         picture = draw_residuals(read_rgb(record), record.orientation, report.fit.points)
         _write(folder, picture[0], render_target_html(report, picture), document_text(report))
         _tell(report.fit.warnings, job.events)
+        if recording:
+            _record(job, record, fit)
         job.workspace.save()
         return TargetResult(folder, report, fit)
 
@@ -152,7 +159,11 @@ def locate(
     given, covariance = _read_camera(camera, record)
     with Job.opened(LOCATE, photograph, output, None, events=events) as job:
         job.note_inputs({record.name: record.digest})
-        points = _read_points(record, source, job.events)
+        if source.model is None:
+            points = _read_points(record, source, job.events)
+        else:
+            names, xyz, xy = find_model_points(source.model, record, given, job.events)
+            points = _Points(PhotographFacts(record.name, names, "units"), xyz, xy)
         found = locate_camera(
             points.xyz, points.xy, given, method=method, max_error_px=max_error_px, sigma_px=sigma_px,
             camera_covariance=covariance,
@@ -246,6 +257,20 @@ def _plane(text: str, known: Mapping[str, Array]) -> tuple[Plane, str]:
     return Plane.of_equation(
         np.array(values[:3]), values[3]
     ), f"{values[0]:g} X + {values[1]:g} Y + {values[2]:g} Z = {values[3]:g}"
+
+
+def _record(job: Job, record: ImageRecord, fit: TargetFit) -> None:
+    """The photograph, and the target in front of the camera as a rectangle along its two widest directions."""
+    xyz = fit.points[0]
+    middle = xyz.mean(0)
+    axes = np.linalg.svd(xyz - middle)[2][:2]
+    low, high = ((xyz - middle) @ axes.T).min(0), ((xyz - middle) @ axes.T).max(0)
+    outline = middle + np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) @ axes
+    made = fit.calibration(record.name)
+    told = record_calibration(job.workspace.recording, made, outline, {record.name: str(record.path)}, record.name)
+    job.workspace.note(recording=FAILED if told.problem else WRITTEN)
+    if told.problem:
+        job.events.warned("recording", f"no recording: {told.problem}")
 
 
 # ------------------------------------------------------------------------------------------------------------- reading
