@@ -143,7 +143,7 @@ def _pose_model(number: int, mapper: Mapper, known: KnownPoses) -> PosedModel | 
     optimized = adjusting_of(mapper).to_optimize()
     optimized.add(pose_graph(known, fit.sigma, fit.is_inlier))
     optimized.optimize()
-    if growth_of_cost(rigid, model, mapper.noise_px) > MAX_COST_PER_NUMBER * 6 * int(fit.is_inlier.sum()):
+    if growth_of_cost(rigid, model, mapper.noise.sigma_px) > MAX_COST_PER_NUMBER * 6 * int(fit.is_inlier.sum()):
         _restore(model, rigid)
         return replace(judged, row=replace(judged.row, is_adjusted=False))
     return judged
