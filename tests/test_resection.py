@@ -64,3 +64,23 @@ def test_too_little_is_no_pose():
     assert resection.estimate_pose(xyz, np.full_like(x, np.nan), 1e-2) is None
     line = np.outer(np.linspace(-1, 1, 50), [1.0, 0.5, 0.2]) + np.array([0.0, 0.0, 5.0])
     resection.estimate_pose(line, line[:, :2] / line[:, 2:], 1e-3)  # any answer but a crash
+
+
+@pytest.mark.parametrize("is_plane", [False, True])
+def test_points_of_a_plane_are_as_good_as_others_with_wrong_ones_among_them(is_plane):
+    """OpenCV's loop ends in an EPnP pose, which loses planes: without another end a fifth of these are not found."""
+    turned = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        xyz = np.column_stack([rng.uniform(-2, 2, (60, 2)), np.zeros(60) if is_plane else rng.uniform(-1, 1, 60)])
+        pose = rigid3.from_matrix(rigid3.exp_so3(rng.normal(0, 0.6, 3)), np.array([0.1, -0.2, rng.uniform(4, 8)]))
+        in_camera = rigid3.apply(pose, xyz)
+        normalized = in_camera[:, :2] / in_camera[:, 2:] + rng.normal(0, 1e-3, (60, 2))
+        is_wrong = rng.random(60) < 0.3
+        normalized[is_wrong] = rng.uniform(-0.5, 0.5, (int(is_wrong.sum()), 2))
+        found = resection.estimate_pose(xyz, normalized, 4e-3)
+        assert found is not None
+        assert found.num_inliers >= 0.8 * (~is_wrong).sum()
+        turned.append(pose_error(found.cam_from_world, pose)[0])
+    # a pixel of noise in a thousand of focal length; a far plane may be seen as tilted the other way
+    assert np.median(turned) < 0.5 and np.sum(np.array(turned) > 5.0) <= 1

@@ -32,6 +32,9 @@ class Resection:
         return int(self.is_inlier.sum())
 
 
+# A pose of all inliers that fewer of them agree with than this share of a sample's is no refinement of it.
+_LEAST_KEPT = 0.8
+
 PoseMethod = Literal["p3p", "all"]
 """``p3p``: RANSAC over three points, for correspondences of which many may be wrong; ``all``: every point at once, with
 three points or more of which none is wrong (:mod:`sfmapp.geometry.pnp`)."""
@@ -71,7 +74,7 @@ def estimate_pose(
         is_inlier = p3p.squared_errors(pose, xyz, normalized) <= max_error**2  # False for NaN
         return Resection(pose, is_inlier) if is_inlier.sum() >= 4 else None
     try:
-        found, rotation_vector, translation, _ = cv2.solvePnPRansac(
+        found, rotation_vector, translation, sampled = cv2.solvePnPRansac(
             np.ascontiguousarray(xyz[valid]), np.ascontiguousarray(normalized[valid]), np.eye(3), None,
             flags=cv2.SOLVEPNP_P3P, reprojectionError=max_error, confidence=confidence, iterationsCount=max_iterations,
         )  # fmt: skip
@@ -84,6 +87,10 @@ def estimate_pose(
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.linalg.norm(in_camera[:, :2] / in_camera[:, 2:] - normalized, axis=1)
     is_inlier = (in_camera[:, 2] > 0) & (error <= max_error)  # False for NaN
+    if is_inlier.sum() < _LEAST_KEPT * len(sampled):  # the loop ends in EPnP over its inliers, which can lose a plane
+        rays = np.concatenate([normalized, np.ones((len(normalized), 1))], 1)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        return estimate_pose(xyz, rays, max_error, confidence=confidence, max_iterations=max_iterations)
     return Resection(pose, is_inlier) if is_inlier.sum() >= 4 else None
 
 
