@@ -85,8 +85,26 @@ def rows_of(folder: Path) -> list[Row]:
         "bundle_adjustment": adjustment_rows,
         "dense": dense_rows,
         "odometry": odometry_rows,
+        "calibration": calibration_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
+
+
+def calibration_rows(folder: Path) -> Iterator[Row]:
+    """``sfmapp calibrate board`` against OpenCV."""
+    report = read(folder, "calibration")
+    about = (False, report["date"][:10], report["commit"])
+    for row in report.get("photographs", []):
+        case, theirs = f"chessboards, {row['camera']} camera", row["opencv_held_out_px_own_points"]
+        ours = row["held_out_px"]
+        yield Row("calibration", case, "rms of views held out", "px", "less", ours, "OpenCV", theirs, *about)
+    for row in report.get("degraded", []):
+        case = f"{row['board']}, {row['case']}"
+        yield Row("calibration", case, "points found", "count", "more", row["found"], "OpenCV", row["opencv"], *about)
+    for row in report.get("speed", []):
+        if "opencv_cpu_s" in row:
+            ours, theirs = row["cpu_s"], row["opencv_cpu_s"]
+            yield Row("calibration", row["what"], "CPU time", "s", "less", ours, "OpenCV", theirs, *about)
 
 
 def sparse_rows(folder: Path) -> Iterator[Row]:
@@ -202,6 +220,16 @@ def promises(folder: Path) -> Iterator[Promise]:
     bends = [run["straight"]["bend_px"] for run in runs if run.get("straight")]
     text = "lines are straight to half a pixel in undistorted pictures"
     yield Promise("lens_families", text, sum(bend < 0.5 for bend in bends), len(runs), report["date"][:10])
+    report = read(folder, "calibration")
+    rows, date = report["trials"], report["date"][:10]
+    good = sum(0.9 <= row["nees"] <= 1.1 and row["projections_covered"] >= 0.93 for row in rows)
+    yield Promise(
+        "calibration", "sigmas of a calibration are those of its errors (NEES, coverage)", good, len(rows), date
+    )
+    if taken := report.get("next"):
+        good = sum(row["times_as_fast"] >= 2.0 for row in taken)
+        text = "suggested views make projections sure twice as fast as others"
+        yield Promise("calibration", text, good, len(taken), date)
     report = read(folder, "dense")
     digests = {run["digest"] for run in report["runs"] if run["case"] == "fountain" and "digest" in run}
     text = "one and two threads make the same patches"

@@ -46,14 +46,14 @@ def poses_of(seed: int, num: int = 8) -> np.ndarray:
 
 def test_the_same_camera_differs_by_chance_alone() -> None:
     chances = []
-    for seed in range(16):
+    for seed in range(10):
         a, _ = calibrated(CAMERA, poses_of(1), 100 + seed)
         b, _ = calibrated(CAMERA, poses_of(2), 200 + seed)
         found = compare(a, b)
         assert found.degrees_of_freedom <= 16
         chances.append(found.chance)
-    # uniform between 0 and 1: the mean of 16 is 0.5 +- 0.07
-    assert 0.3 < np.mean(chances) < 0.7
+    # uniform between 0 and 1: the mean of 10 is 0.5 +- 0.09
+    assert 0.23 < np.mean(chances) < 0.77
     assert min(chances) > 1e-3
 
 

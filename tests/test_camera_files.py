@@ -228,7 +228,7 @@ def test_a_fit_that_is_good_needs_no_resampling() -> None:
         ("c.json", '{"K": [[5, 1, 2], [0, 5, 2], [0, 0, 1]]}', "no skew"),
         ("c.json", '{"K": [[5, 0, 2], [0, 5, 2], [0, 0, 1]], "distortion_model": "fov"}', "distortion model"),
         ("c.json", '{"intrinsics": [5, 5, 2, 2], "camera_model": "omni"}', "camera_model pinhole"),
-        ("c.json", '{"K": [[5, 0, 2], [0, 5, 2], [0, 0, 1]], "D": [9, 9, -9, 9, -9]}', "no inverse"),
+        ("c.json", '{"K": [[5, 0, 2], [0, 5, 2], [0, 0, 1]], "D": [9, 9, -9, 9, -9]}', "cannot be inverted"),
         ("c.json", '{"K": [[5, 0, 2], [0, 5, 2], [0, 0, 1]], "T_BS": [1, 2]}', "T_BS: expected 4 x 4"),
         ("c.xml", '<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "without document types"),
         ("c.xml", "<a><b></a>", "expected XML"),

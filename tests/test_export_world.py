@@ -165,7 +165,7 @@ def test_what_cannot_be(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert "US survey foot" in refused("--to", "laz", "--crs", "EPSG:2229")
     assert "degree" in refused("--to", "laz", "--crs", "EPSG:4326")
     assert "--crs" in refused("--to", "laz", "--crs", "EPSG:999999")
-    assert "of no use for colmap-bin" in refused("--to", "colmap-bin", "--crs", "EPSG:32633")
+    assert "does not go with colmap-bin" in refused("--to", "colmap-bin", "--crs", "EPSG:32633")
     (run / "georeference.json").unlink()
     assert "in no frame of the world" in refused("--to", "kml")
     assert "in no frame of the world" in refused("--to", "ply", "--crs", "EPSG:32633")

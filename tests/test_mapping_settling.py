@@ -15,6 +15,8 @@ from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import make_engine
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3
+from sfmapp.mapping import structure
+from sfmapp.mapping.keypoint_noise import keypoint_noise
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.settling import Round, adjust_until_settled
@@ -61,6 +63,25 @@ def test_what_has_settled_is_near_the_minimum_long_before_single_points_are(seed
     assert short.termination == long.termination == "converged"
     assert short.num_iterations < 0.6 * long.num_iterations
     assert sigmas_between(settled, minimum) < 0.5 < sigmas_between(start, minimum)
+
+
+@pytest.mark.parametrize("views", [4, 14])
+def test_noise_is_that_of_the_keypoints_however_short_the_tracks_are(views: int) -> None:
+    """The median of the residuals is low by what the fit has taken of them, which of short tracks is half."""
+    found = []
+    for seed in range(4):
+        model = make_scene(40 + seed, views, 300, sigma_px=SIGMA_PX).observed
+        FactorGraph(model, ROBUST, noise_px=1.0).optimize()
+        robust = keypoint_noise(model, ROBUST, Varying(), 0.01)
+        median_px = structure.residual_scale_px(model)
+        FactorGraph(model, replace(ROBUST, loss="trivial"), noise_px=1.0).optimize()
+        squares = keypoint_noise(model, replace(ROBUST, loss="trivial"), Varying(), 0.01)
+        found.append([*robust, *squares, median_px])
+    sigma, weight, of_squares, same, of_median = np.mean(found, 0) / SIGMA_PX
+    assert of_squares == same == pytest.approx(1.0, rel=0.04)
+    assert 0.9 < sigma < 1.1  # 1.045 where tracks are long: Cauchy's loss at two deviations wastes 9 % of the variance
+    assert 0.72 < weight < 0.9  # 0.78 there
+    assert of_median < 0.75
 
 
 def rounds_of(*changed: int, termination: str = "converged"):

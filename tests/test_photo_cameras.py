@@ -473,7 +473,7 @@ def test_the_command_line_takes_one_of_both(tmp_path: Path, capsys: pytest.Captu
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("missing.yaml", None, "found nothing"),
+        ("missing.yaml", None, "found no such file"),
         ("calib.json", json.dumps({"name": "left"}), "expected a calibration"),
         ("cameras.json", json.dumps({"cameras": []}), "expected a list of objects under cameras"),
         ("cameras.txt", "1 OPENCV 400 300 1 2\n", "OPENCV"),

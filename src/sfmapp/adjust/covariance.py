@@ -100,7 +100,7 @@ class Covariances:
 def _place(varied: NDArray[np.integer], wanted: int, what: str) -> int:
     found = np.flatnonzero(varied == wanted)
     if not len(found):
-        raise InputError(f"{what} {wanted} has no covariance: it did not vary, or nothing was observed of it")
+        raise InputError(f"{what} {wanted} has no covariance: it was held constant, or has no observations")
     return int(found[0])
 
 

@@ -81,7 +81,7 @@ class MarginalCovariance:
     def _of(self, what: str, number: int) -> Array:
         place = self._places.get((what, number))
         if place is None:
-            raise InputError(f"{what} {number} is none of those whose covariance was asked for")
+            raise InputError(f"{what} {number} is not one whose covariance was asked for")
         return self.matrix[place, place]
 
 
@@ -309,10 +309,10 @@ class FactorGraph:
             self.reconstruction, self.options, self._varying, prior_cameras=self._prior_cameras, is_closing=False
         )
         if not engine.problem.num_observations:
-            raise InputError("the reconstruction has no observation to take the noise from")
+            raise InputError("the reconstruction has no observations to estimate the noise from")
         variance = residual_variance(engine)
         if not np.isfinite(variance):
-            raise InputError("the observations are too few to tell their noise; give noise_px")
+            raise InputError("too few observations to estimate their noise; give noise_px")
         return max(_MIN_NOISE_PX, float(np.sqrt(variance)))
 
     def _plain_graph(self) -> Any:
@@ -350,7 +350,7 @@ def _rows_of(
     rows = np.zeros((sum(len(part[2]) for part in parts), problem.num_blocks * 8))
     for (what, number), at, matrix in parts:
         if not len(at) or at[0] < 0:
-            raise InputError(f"{what} {number} has no covariance: it is not there or does not vary")
+            raise InputError(f"{what} {number} has no covariance: it does not exist or is constant")
         places[what, number] = slice(first, first + len(at))
         rows[first : first + len(at), at] = matrix
         first += len(at)

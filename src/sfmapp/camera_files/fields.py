@@ -66,7 +66,7 @@ def is_calibration_path(given: str) -> bool:
     if os.path.exists(given):
         return True
     if "," not in given and any(c in given for c in "./\\"):
-        raise InputError(f"camera {given}: expected a calibration file, found nothing")
+        raise InputError(f"camera {given}: expected a calibration file, found no such file")
     return False
 
 
@@ -194,7 +194,7 @@ def camera_of_fields(place: str, fields: dict[str, Any], image_size: Size) -> Ca
     if coefficients.any() and is_without_distortion(sections):
         raise InputError(
             f"{place}: expected no coefficients of a lens without distortion, found {coefficients}",
-            "name the distortion model, or take the coefficients away",
+            "name the distortion model, or remove the coefficients",
         )
     return camera_from_opencv(place, size, intrinsics, coefficients, lens == LensType.FISHEYE)
 

@@ -162,7 +162,9 @@ def _nearest_opencv(place: str, lens: FullLens) -> tuple[list[float], float, flo
     with np.errstate(all="ignore"):
         good = np.abs(lens.project(rays) - pixels).max(1) < 1e-3
     if good.sum() < 0.9 * len(good):
-        raise InputError(f"{place}: the lens has no inverse in a picture of {width}x{height}: {lens.coefficients}")
+        raise InputError(
+            f"{place}: the distortion cannot be inverted within {width}x{height} pixels: {lens.coefficients}"
+        )
     x, y, pixels = rays[good, 0], rays[good, 1], pixels[good]
     r2 = x * x + y * y
     zero, one = np.zeros_like(x), np.ones_like(x)

@@ -101,7 +101,7 @@ def _from_list(place: str, fields: Fields, image_sizes: Sequence[Size]) -> Calib
         names = ", ".join(list(cameras)[:4])
         raise InputError(
             f"{place}: expected one camera for all frames, found {len(cameras)} different ones: {names}",
-            "leave the one in the file that took them",
+            "keep only the one that took them",
         )
     (section,) = cameras.values()
     return _of_cameras(place, [camera_of_fields(place, section, image_sizes[0])], image_sizes)

@@ -26,7 +26,7 @@ def orb_slam_fields(place: str, fields: dict[str, Any]) -> dict[str, Any]:
         raise InputError(
             f"{place}: expected the camera of the images, found the one of images that ORB-SLAM rectifies with LEFT.K "
             "and LEFT.D",
-            "write K and distortion_coefficients of LEFT into a file, or give the calibration that they are from",
+            "write K and distortion_coefficients of LEFT into a file, or give the calibration that they come from",
         )
     shared = _below(fields, "Camera.")
     first = shared | _below(fields, "Camera1.")

@@ -83,7 +83,7 @@ def _validate(args: argparse.Namespace) -> int:
     from sfmapp.report.validation import CloudValidation, Validation
 
     if args.distance is not None and args.ground_truth_cloud is None:
-        raise UsageError("--distance is of no use without --ground-truth-cloud")
+        raise UsageError("--distance needs --ground-truth-cloud")
     with listening(args) as events:
         result: Validation | CloudValidation
         if args.ground_truth_cloud is not None:

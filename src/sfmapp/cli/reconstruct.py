@@ -141,7 +141,7 @@ def _reconstruct(args: argparse.Namespace) -> int:
     if args.images is None or args.output is None:
         args.parser.error("IMAGES and -o OUT are needed")
     if args.texture and not args.mesh:
-        args.parser.error("--texture is of no use without --mesh")
+        args.parser.error("--texture needs --mesh")
     if args.texture:
         args.set.append("surface.texture=true")
     options = _options(args)
@@ -249,7 +249,7 @@ def _print_control(report: ReconstructionReport) -> None:
     found = report.stages.control
     for model in found.models if found is not None else ():
         if model.reason:
-            print(f"  model {model.model} is not brought to ground control: {model.reason}")
+            print(f"  model {model.model} is not georeferenced by its ground control: {model.reason}")
         elif model.summary is not None:
             one = model.summary
             print(

@@ -66,10 +66,10 @@ def adjust_with_positions(
     Returns:
         None where photographs and positions contradict each other: the model is then to be taken back.
     """
-    model, noise_px = mapper.reconstruction, mapper.noise_px
+    model, noise = mapper.reconstruction, mapper.noise
     # what photographs alone make of one more adjustment is no doing of the positions: those hold but the gauge here
     loose = fit.sigma * _LOOSE
-    mapper.adjust_with(position_graph(measured.image_idx, measured.places, loose, noise_px, level))
+    mapper.adjust_with(position_graph(measured.image_idx, measured.places, loose, level), noise)
     before = model.copy()
     if measured.is_stated.any():  # what the shape of the model makes of residuals is no reason to doubt them yet
         fit = _with_factors(fit, measured, np.where(measured.is_stated, 1.0, fit.factor))
@@ -78,14 +78,15 @@ def adjust_with_positions(
         used, factor = fit.is_inlier, np.array(fit.factor)
         places, sigma = measured.places[used], fit.sigma[used] * drift.inflation
         images = measured.image_idx[used]
-        mapper.adjust_with(position_graph(images, places, sigma, noise_px, level))
+        graph = position_graph(images, places, sigma, level)
+        mapper.adjust_with(graph, noise)
         if not model.is_registered[measured.image_idx].all():
             return None
-        covariance = _center_covariances(mapper, position_graph(images, places, sigma, 1.0, level))
+        covariance = _center_covariances(mapper, graph)
         fit = _judged(fit, model.centers[measured.image_idx], measured, covariance, drift.inflation)
         if np.array_equal(fit.is_inlier, used) and np.allclose(fit.factor, factor, rtol=_SETTLED):
             break
-    cost = growth_of_cost(before, model, noise_px)
+    cost = growth_of_cost(before, model, noise.sigma_px)
     if cost > MAX_COST_PER_NUMBER * 3 * int(fit.is_inlier.sum()):
         return None
     return Adjusted(finished(fit, model, measured, level, drift), covariance)

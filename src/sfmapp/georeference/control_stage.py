@@ -39,10 +39,6 @@ Array = NDArray[np.float64]
 STAGE = "control"
 # 95 % of lengths of two dimensions, and of one, in standard deviations.
 _HORIZONTAL_95, _VERTICAL_95 = 2.448, 1.960
-# Of normal noise, Cauchy's loss at two standard deviations makes normal equations (of its second derivative) that are
-# 0.55 of what squares make, and errors of 1.09 times their variance: beside other factors it counts like squares whose
-# noise has 1.09 * 0.55 of its variance.
-_ROBUST_NOISE = 0.778
 # Positions and survey may name one datum and mean two, and a base may be put down anywhere: in metres.
 _LEAST_COMMON_M = 10.0
 
@@ -133,7 +129,7 @@ def _control_model(
     if alignment.world_from_model is None and positions is not None and marked.is_placed.any():
         alignment = Alignment(similarity.IDENTITY, marked.is_placed, "")  # it lies in the frame already
     if alignment.world_from_model is None:
-        events.decided(STAGE, f"model {number} is not brought to ground control: {alignment.problem}")
+        events.decided(STAGE, f"model {number} is not georeferenced by its ground control: {alignment.problem}")
         return _unmoved(number, control, marked, survey, alignment.problem), None
     first = model.copy()
     moved = alignment.world_from_model
@@ -172,7 +168,7 @@ def _positions_of(number: int, mapper: Mapper, report: GeoreferenceReport | None
 
 def adjusting_of(mapper: Mapper, positions: Positions | None = None) -> Adjusting:
     """How a finished map is adjusted with control, and with positions: as it was in the end without."""
-    options, varying, noise_px = mapper.closing_options()
+    options, varying, noise = mapper.closing_options()
     free = [
         free_params(
             camera, options.refine_focal, options.refine_distortion,
@@ -182,8 +178,8 @@ def adjusting_of(mapper: Mapper, positions: Positions | None = None) -> Adjustin
     ]  # fmt: skip
 
     def graph(is_robust: bool) -> FactorGraph:
-        chosen = options.robust(noise_px) if is_robust else options
-        unit = noise_px * (1.0 if chosen is options else _ROBUST_NOISE)
+        chosen = mapper.robust(options) if is_robust else options
+        unit = noise.sigma_px if chosen.loss == "trivial" else noise.robust_px
         made = FactorGraph(
             mapper.reconstruction, chosen, varying=varying, prior_cameras=mapper.prior_cameras, noise_px=unit
         )

@@ -92,7 +92,7 @@ def read_poses(options: PoseOptions, names: Sequence[str]) -> PoseFile:
     if num < 2:
         raise InputError(
             f"{found.path}: expected poses of two photographs or more, found one of {len(names)}",
-            "one pose tells neither scale nor place of a model",
+            "one pose determines neither scale nor position of a model",
         )
     return PoseFile(found.path, poses, len(found.names) - num, options)
 
@@ -110,7 +110,7 @@ def pose_models(mappers: Sequence[Mapper], known: PoseFile, events: Events) -> P
         found = _pose_model(number, mapper, known.of_images(image_idx))
         models.append(found if isinstance(found, PosedModel) else found.row)
         if isinstance(found, PosedModel):
-            events.decided(STAGE, f"model {number} is not brought to the known poses: {found.reason}")
+            events.decided(STAGE, f"model {number} is not aligned with the known poses: {found.reason}")
             continue
         rows |= _rows(number, mapper, found)
         events.decided(STAGE, _placed_text(found.row), **found.row)
@@ -143,7 +143,7 @@ def _pose_model(number: int, mapper: Mapper, known: KnownPoses) -> PosedModel | 
     optimized = adjusting_of(mapper).to_optimize()
     optimized.add(pose_graph(known, fit.sigma, fit.is_inlier))
     optimized.optimize()
-    if growth_of_cost(rigid, model, mapper.noise_px) > MAX_COST_PER_NUMBER * 6 * int(fit.is_inlier.sum()):
+    if growth_of_cost(rigid, model, mapper.noise.sigma_px) > MAX_COST_PER_NUMBER * 6 * int(fit.is_inlier.sum()):
         _restore(model, rigid)
         return replace(judged, row=replace(judged.row, is_adjusted=False))
     return judged
@@ -255,7 +255,7 @@ def judge_held_poses(mapper: Mapper, known: PoseFile, events: Events) -> PosesRe
         events.warned(
             STAGE,
             f"{len(refuted)} of {len(judged_idx)} known poses that were held contradict the photographs: wrong poses, "
-            "or a wrong lens; all were held all the same",
+            "or a wrong lens; all were held nevertheless",
         )
         found = {i: replace(one, is_used=True) for i, one in found.items()}
     elif len(refuted):

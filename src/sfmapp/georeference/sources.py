@@ -122,7 +122,7 @@ def _along_track(found: PositionFile, records: Sequence[ImageRecord], offset_s: 
     track = np.array(found.track)
     if not any(record.timestamp is not None for record in records):
         raise InputError(
-            f"{found.path}: a track is matched by time, and no photograph says when it was taken",
+            f"{found.path}: a track is matched by time, and no photograph has a time",
             "give a file with names of images in place of times",
         )
     times = np.array([math.nan if record.timestamp is None else record.timestamp + offset_s for record in records])
@@ -138,7 +138,7 @@ def _along_track(found: PositionFile, records: Sequence[ImageRecord], offset_s: 
         taken = [record.timestamp for record in records if record.timestamp is not None]
         raise InputError(
             f"{found.path}: the track is from {_clock(track[0, 0])} to {_clock(track[-1, 0])}, the photographs by "
-            f"their clock from {_clock(min(taken))} to {_clock(max(taken))}: none of them lies on it",
+            f"their clock from {_clock(min(taken))} to {_clock(max(taken))}: none falls into it",
             "give the seconds to add to the photographs' clock: --set gps.time_offset_s=...; a track counts in UTC, "
             "cameras mostly in local time",
         )
@@ -297,7 +297,7 @@ def _check_place(latitude: float, longitude: float, place: str) -> None:
     if abs(latitude) > 90 or abs(longitude) > 180:
         raise InputError(
             f"{place}: expected latitude and longitude in degrees, found {latitude:g}, {longitude:g}",
-            "give degrees of WGS84; coordinates of other systems may stand in a geo.txt, with their EPSG code",
+            "give degrees of WGS84; coordinates in other systems go into a geo.txt, with their EPSG code",
         )
 
 

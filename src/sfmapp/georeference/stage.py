@@ -140,7 +140,7 @@ def _place(number: int, mapper: Mapper, tags: Tags, events: Events) -> _Model | 
         _restore(mapper, rigid)
         events.warned(
             STAGE,
-            f"model {number}: photographs and positions contradict each other in its shape; it was moved as a whole, "
+            f"model {number}: photographs and positions disagree about its shape; it was moved as a whole, "
             "and its shape left as the photographs have it",
         )
         adjusted = Adjusted(finished(fit, model, measured, level, drift), {})

@@ -105,7 +105,8 @@ def map_images(
 
         mapped, look_alikes = tell_apart(mapped, correspondences, map_again, events)
         models = mapped.models
-        adjustments = [mapped.mapper_of(model).polish() for model in models]
+        finished = [mapped.mapper_of(model) for model in models]
+        adjustments = [mapper.polish() for mapper in finished]
         for model in models:
             model.point_rgb = track_colors(model.tracks, features)
         contradictions = contradictions_of(models, correspondences)
@@ -114,7 +115,7 @@ def map_images(
             for model, found, apart, adjustment in zip(models, contradictions, mapped.apart, adjustments, strict=True)
         ]
         if closing is not None:
-            closing([mapped.mapper_of(model) for model in models])
+            closing(finished)  # which know where the closing loss bends
     report = MappingReport(
         tracks=track_report,
         focal=mapped.focal_report,

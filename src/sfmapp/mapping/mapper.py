@@ -20,6 +20,7 @@ from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.mapping import structure
 from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_initial_pairs
+from sfmapp.mapping.keypoint_noise import KeypointNoise, keypoint_noise
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
 from sfmapp.mapping.report import CameraSigmas, ImageSigmas, InitialPairReport, Uncertainty
@@ -359,16 +360,37 @@ class Mapper:
         )
         return made
 
-    def adjust_with(self, extra_factors: Any) -> None:
+    def adjust_with(self, extra_factors: Any, noise: KeypointNoise) -> None:
         """Adjust a finished map once more as :meth:`polish` does, with gtsam factors over ``X(i)`` beside the
-        reprojections, and settle its points."""
+        reprojections, whose sigmas are true ones, and settle its points.
+
+        Args:
+            noise: that of the map before there were such factors, by which both are weighed.
+        """
         options, chosen = self._polishing()
         options = replace(options, initial_damping=1e-6, relative_cost_tolerance=1e-6)
-        report = adjust_bundle(
-            self.reconstruction, options, varying=self._everything(centers=chosen), prior_cameras=self.prior_cameras,
-            extra_factors=extra_factors,
-        )  # fmt: skip
+        # priors on intrinsics count against residuals of a pixel, here as before, so that factors alone make a change
+        unit, priors = noise.robust_px, list(self.prior_cameras)
+        if options.principal_point_sigma_px is not None:
+            options = replace(options, principal_point_sigma_px=unit * options.principal_point_sigma_px)
+        if options.distortion_sigma is not None:
+            options = replace(options, distortion_sigma=unit * options.distortion_sigma)
+        for c, camera in enumerate(priors):
+            if camera.focal_sigma is not None:
+                priors[c] = replace(camera, focal_sigma=unit * camera.focal_sigma)
+        graph = FactorGraph(
+            self.reconstruction, options, varying=self._everything(centers=chosen), prior_cameras=priors, noise_px=unit
+        )
+        graph.add(extra_factors)
+        report = graph.optimize()
+        factors = [
+            replace(f, normalized_residual=unit * f.normalized_residual) if f.kind == "intrinsics prior" else f
+            for f in report.factors
+        ]
+        report = replace(report, factors=factors)  # in the deviations that cameras claim
         self.events.decided(STAGE, f"closing adjustment: {report.text}", **report)
+        if report.termination == "iterations":
+            self.events.warned(STAGE, f"the closing adjustment did not settle in {report.num_iterations} steps")
         self._settle_points()
 
     def covariances_with(self, extra_factors: Any) -> Covariances | None:
@@ -385,14 +407,20 @@ class Mapper:
     def _polishing(self) -> tuple[AdjustOptions, NDArray[np.bool_]]:
         """Options of the last adjustment, and the cameras (C,) bool whose principal points are free in it."""
         chosen = self._free_principal_points()
-        options = self.adjust_options.robust(self.loss_scale_px or self._residual_scale_px)
-        options = replace(options, max_iterations=100, initial_damping=1e-8, relative_cost_tolerance=1e-5)
+        options = replace(
+            self.robust(self.adjust_options), max_iterations=100, initial_damping=1e-8, relative_cost_tolerance=1e-5
+        )
         return self.with_free_centers(options, chosen) if chosen.any() else options, chosen
 
+    def robust(self, options: AdjustOptions) -> AdjustOptions:
+        """The options with the loss of the closing adjustment, unless another one was asked for."""
+        return options.robust(self.loss_scale_px or self._residual_scale_px)
+
     @property
-    def noise_px(self) -> float:
-        """Standard deviation of the keypoints by the residuals, pixels."""
-        return self._residual_scale_px
+    def noise(self) -> KeypointNoise:
+        """Of the keypoints, by what the closing adjustment has left."""
+        options, varying = self._closing_freedoms()
+        return keypoint_noise(self.reconstruction, self.robust(options), varying, MIN_NOISE_PX)
 
     @property
     def _residual_scale_px(self) -> float:
@@ -484,20 +512,20 @@ class Mapper:
             },
         )
 
-    def closing_options(self) -> tuple[AdjustOptions, Varying, float]:
-        """How the finished map is adjusted as a factor graph, what varies, and the noise of its keypoints in pixels, by
-        the residuals and what an adjustment leaves of them."""
-        reconstruction, chosen = self.reconstruction, self._free_principal_points()
+    def closing_options(self) -> tuple[AdjustOptions, Varying, KeypointNoise]:
+        """How the finished map is adjusted as a factor graph, with squares (:meth:`robust` makes it the closing loss),
+        what varies, and the noise of its keypoints."""
+        return *self._closing_freedoms(), self.noise
+
+    def _closing_freedoms(self) -> tuple[AdjustOptions, Varying]:
+        """Options of an adjustment as a factor graph, with priors that are what they say, and what varies in it."""
+        chosen = self._free_principal_points()
         options = replace(self.adjust_options, max_iterations=100, initial_damping=1e-6, relative_cost_tolerance=1e-7)
         if chosen.any():
-            cameras = [c for c, is_chosen in zip(reconstruction.cameras, chosen, strict=True) if is_chosen]
+            cameras = [c for c, is_chosen in zip(self.reconstruction.cameras, chosen, strict=True) if is_chosen]
             sigma_px = self.options.principal_point_sigma * max(max(c.width, c.height) for c in cameras)
             options = replace(options, refine_principal_point=True, principal_point_sigma_px=sigma_px)
-        numbers = 2 * int(reconstruction.obs_is_inlier.sum())
-        unknowns = 3 * int(reconstruction.is_triangulated.sum()) + 6 * int(reconstruction.is_registered.sum())
-        left = max(numbers - unknowns, 1)
-        noise_px = structure.residual_scale_px(reconstruction, MIN_NOISE_PX) * float(np.sqrt(numbers / left))
-        return options, self._everything(centers=chosen), noise_px
+        return options, self._everything(centers=chosen)
 
     def _settle_points(self) -> None:
         """Measure the noise; filter accordingly, and triangulate again what was lost or has become possible."""

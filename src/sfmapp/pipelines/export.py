@@ -104,7 +104,7 @@ def export_model(
         raise UsageError(f"unknown export format {target!r}, expected one of {', '.join(EXPORTS)}")
     if (crs is not None or is_dense) and target not in CLOUDS:
         what = f"--crs {crs}" if crs is not None else "--dense"
-        raise UsageError(f"{what} is of no use for {target}", f"it is for {', '.join(CLOUDS)}")
+        raise UsageError(f"{what} does not go with {target}", f"it is for {', '.join(CLOUDS)}")
     if isinstance(output, Reconstruction):
         source = _in_memory(output, keypoints)
     else:

@@ -177,7 +177,7 @@ def _left_open(covariance: Array, size: float, events: Events) -> list[Contradic
     )
     events.warned(STAGE, message)
     evidence = {"position_sigma_share": min(share, 1e6), "max_position_sigma_share": _MAX_OPEN_SHARE}
-    return [Contradiction("given calibration", message, "calibrate the camera, or move more and turn", evidence)]
+    return [Contradiction("given calibration", message, "calibrate the camera, or move and turn more", evidence)]
 
 
 def _adjust_large_map(

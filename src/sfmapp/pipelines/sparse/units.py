@@ -138,8 +138,8 @@ def _between_images(mapper: Mapper, known: KnownLength) -> ScaleBar | str:
     length = float(np.linalg.norm(line))
     if not length > 1e-9 * rigid3.spread(model.cam_from_world[model.is_registered]):
         return f"{known.text}: both were taken from one place"
-    options, varying, noise_px = mapper.closing_options()
-    graph = FactorGraph(model, options, varying=varying, prior_cameras=mapper.prior_cameras, noise_px=noise_px)
+    options, varying, noise = mapper.closing_options()
+    graph = FactorGraph(model, options, varying=varying, prior_cameras=mapper.prior_cameras, noise_px=noise.sigma_px)
     joint = graph.marginal_covariance(images=[a, b])
     moves = rigid3.center_jacobian(model.cam_from_world[[a, b]])
     slope = np.concatenate([-moves[0].T @ line, moves[1].T @ line]) / length
