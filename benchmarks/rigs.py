@@ -1,7 +1,7 @@
 """Rigs and focal lengths without a board: errors against exact truth, OpenCV's rig beside ours on the same corners.
 
-    python benchmarks/rigs.py                    # results/rigs.json and results/rigs.md
-    python benchmarks/rigs.py --trials 20 -o /tmp/new/rigs.json
+    python benchmarks/rigs.py                    # results/rigs.md
+    python benchmarks/rigs.py --trials 20 -o /tmp/new/rigs.md
 
 Synthetic rigs are begun with intrinsics that are 0.1 % off, at a noise of 0.05 to 0.5 px that differs from trial to
 trial. NEES is the squared error in terms of the stated covariance, by its dimension: 1 where sigmas are right. Real
@@ -53,7 +53,7 @@ LEAST_MATCHES = 50
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=150, help="of each synthetic rig")
-    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "rigs.json")
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "rigs.md")
     arguments = parser.parse_args()
     data = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))
     report = describe_machine()
@@ -63,8 +63,7 @@ def main() -> None:
     sets = ("fountain-P11", "herz-jesus-P8")
     report["focal"] = [turning(data / "pano-sponza-rot"), *(of_pairs(data / name) for name in sets)]
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    arguments.output.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    arguments.output.with_suffix(".md").write_text(tables(report), encoding="utf-8")
+    arguments.output.write_text(tables(report), encoding="utf-8")
     print(tables(report))
 
 

@@ -37,6 +37,16 @@ def photos(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def reconstructed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The workspace of a reconstruction of ``photos``, to be read only: copy it to write into it."""
+    import sfmapp
+
+    out = tmp_path_factory.mktemp("reconstructed") / "out"
+    sfmapp.reconstruct(photos, out, record=False)
+    return out
+
+
+@pytest.fixture(scope="session")
 def sample() -> Path:
     """Folder of the bundled sample, with images/ and cameras.json."""
     from sfmapp.errors import InputError

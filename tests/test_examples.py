@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import runpy
+import shutil
 import sys
 from pathlib import Path
 
@@ -32,10 +33,8 @@ def numbers(text: str, pattern: str) -> list[float]:
 
 
 @pytest.fixture(scope="module")
-def workspace(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("workspace") / "out"
-    sfmapp.reconstruct(photos, out, record=False)
-    return out
+def workspace(reconstructed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return Path(shutil.copytree(reconstructed, tmp_path_factory.mktemp("workspace") / "out"))
 
 
 def test_there_are_eleven_and_each_is_short_and_says_how_to_run_it() -> None:

@@ -650,14 +650,12 @@ def test_no_photograph_at_all_is_an_error(tmp_path: Path) -> None:
         sfmapp.undistort(tmp_path, tmp_path / "out", ONE, images=tmp_path / "empty")
 
 
-def test_a_workspace_of_reconstruct_needs_no_more_than_its_name(photos: Path, tmp_path: Path) -> None:
-    assert main(["reconstruct", str(photos), "-o", str(tmp_path / "out"), "--threads", "1", "--no-recording"]) == 0
-    assert main(["undistort", str(tmp_path / "out"), "-o", str(tmp_path / "flat"), "--threads", "1"]) == 0
+def test_a_workspace_of_reconstruct_needs_no_more_than_its_name(reconstructed: Path, tmp_path: Path) -> None:
+    assert main(["undistort", str(reconstructed), "-o", str(tmp_path / "flat"), "--threads", "1"]) == 0
     import pycolmap
 
     before, after = (
-        pycolmap.Reconstruction(path)
-        for path in (tmp_path / "out" / "sparse" / "0", tmp_path / "flat" / "sparse" / "0")
+        pycolmap.Reconstruction(path) for path in (reconstructed / "sparse" / "0", tmp_path / "flat" / "sparse" / "0")
     )
     assert after.num_reg_images() == before.num_reg_images() == 7
     assert after.compute_num_observations() > 0.95 * before.compute_num_observations()

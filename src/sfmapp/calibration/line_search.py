@@ -47,6 +47,10 @@ Array = NDArray[np.float64]
 STRENGTHS = np.concatenate([np.arange(-0.9, -0.3, 0.02), np.arange(-0.3, 0.4001, 0.01)])
 # A line is straight below this many sigmas, and belongs to a direction below that many.
 STRAIGHT_SIGMAS, MEMBER_SIGMAS = 1.5, 3.0
+# The bend of a line that counts half, in sigmas: half of one, for the mean of edge points at a knot is better than one.
+_BEND_SCALE = 0.5
+# Peaks of the votes below this share of the highest are no candidates, and most that are.
+_RIVAL_VOTES, _MOST_STRENGTHS = 0.8, 3
 # Principal points of cameras lie about the middle by this share of the longer side (one sigma): what is assumed of it
 # where lines do not tell, and what their telling has to beat.
 CENTER_SHARE = 0.02
@@ -96,29 +100,31 @@ def plain_problem(width: int, height: int, pixel_scale: float) -> Problem:
 
 def strength_votes(problem: Problem, arcs: Arcs) -> Array:
     """For each of :data:`STRENGTHS` how many lines are straight, each counting less the more it bends."""
-    limit = 2.0 * STRAIGHT_SIGMAS * SIGMA_PX * problem.pixel_scale
+    limit = _BEND_SCALE * SIGMA_PX * problem.pixel_scale
     votes = np.empty(len(STRENGTHS))
     for k, strength in enumerate(STRENGTHS):
         camera = np.array([strength, 0.0, 0.0, 0.0])
         bend = straightness_px(problem.lens(camera), arcs)
-        votes[k] = np.maximum(1.0 - (bend / limit) ** 2, 0.0).sum()
+        votes[k] = (1.0 / (1.0 + (bend / limit) ** 2)).sum()
     return votes
 
 
 def likely_strengths(votes: Array) -> Array:
-    """The strengths that lines vote for, the best first: peaks of the votes that reach nine tenths of the highest."""
+    """The strengths that lines vote for, the best first: the highest peaks of the votes."""
     padded = np.concatenate([[-np.inf], votes, [-np.inf]])
-    peaks = np.flatnonzero((votes >= padded[:-2]) & (votes > padded[2:]) & (votes > 0.9 * votes.max()))
-    return STRENGTHS[peaks[np.argsort(-votes[peaks], kind="stable")][:2]]
+    peaks = np.flatnonzero((votes >= padded[:-2]) & (votes > padded[2:]) & (votes > _RIVAL_VOTES * votes.max()))
+    return STRENGTHS[peaks[np.argsort(-votes[peaks], kind="stable")][:_MOST_STRENGTHS]]
 
 
-def solve_plumb(problem: Problem, arcs: Sequence[Arcs], strength: float) -> Solution:
-    """Distortion and its centre from straight lines alone, from a start."""
+def solve_plumb(problem: Problem, arcs: Sequence[Arcs], strengths: Array) -> Solution:
+    """Distortion and its centre from straight lines alone: the best of what several starts come to."""
     free = np.array([True, False, True, True]) & problem.is_free
-    camera = np.zeros(NUM_CAMERA)
-    camera[STRENGTH] = strength
+    # what else than its bend a line may be off by does not matter here
+    sharp = replace(problem, is_free=free, pixel_scale=problem.pixel_scale / 3.0)
     photos = [Lines(one, None, np.full(len(one), -1)) for one in arcs]
-    return solve(replace(problem, is_free=free), camera, photos)
+    solved = [solve(sharp, np.array([strength, 0.0, 0.0, 0.0]), photos) for strength in strengths]
+    cost = [sum(float(losses(problem, one.camera, arc, None).sum()) for arc in arcs) for one in solved]
+    return solved[int(np.argmin(cost))]
 
 
 def find_worlds(problem: Problem, arcs: Sequence[Arcs], strengths: Array, seed: int) -> list[Found]:
@@ -233,7 +239,7 @@ def sharpened(problem: Problem, solution: Solution) -> Problem:
 
 def losses(problem: Problem, camera: Array, arcs: Arcs, world: World | None) -> Array:
     """(N,) what each line has against a camera, and a world in its photograph: its bend, and that it meets nothing."""
-    bend = straightness_px(problem.lens(camera), arcs) / (0.5 * SIGMA_PX * problem.pixel_scale)
+    bend = straightness_px(problem.lens(camera), arcs) / (_BEND_SCALE * SIGMA_PX * problem.pixel_scale)
     loss: Array = 0.5 * bend**2 / (1.0 + bend**2 / 9.0)
     if world is None:
         return loss

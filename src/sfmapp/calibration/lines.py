@@ -75,6 +75,8 @@ _SEEN_SIGMAS = 3.0
 _LEAST_MET_SIGMAS = 5.0
 # A line is bent by a distortion from this rms distance on; a distortion lambda R^2 that is no better known is unknown.
 _BENT_PX, _WORST_STRENGTH = 0.3, 0.05
+# A bend that the means of edge points, good to a twentieth of a pixel, show.
+_TELLING_PX = 0.1
 # A focal length that is no better known than this share is not called known, nor one whose halves differ by more than
 # so many sigmas (and one per cent), nor one with a rival of nearly its likelihood (a ratio of e to this).
 _WORST_FOCAL, _MOST_APART_SIGMAS, _RIVAL_GAIN = 0.05, 3.0, 12.0
@@ -87,6 +89,15 @@ _ADVICE = (
     "photograph a built place across a corner of a house or a room, with long lines out to the borders of the picture; "
     "several photographs of one camera are used together"
 )
+# Fields along the sides in which held-out lines count as one witness, and the most (log-likelihood) that one is worth.
+_WITNESS_CELLS, _MOST_OF_WITNESS = 12, 3.0
+# A distortion that is this many sigmas of the jackknife from zero needs only so many by held-out lines. Boards have 21
+# to 69 and 1.1 to 2.7; photographs without distortion or straight lines 17 at most with less than 1.5, random arcs 8.
+_STEADY_SIGMAS, _STEADY_T = 20.0, 1.5
+# Parts that straight lines alone are held out in; worlds are sought in halves, for each part would take a search.
+_PLUMB_FOLDS = 6
+# Least sigma, as a share, of a focal length that no third direction checks: right angles of houses are not exact.
+_UNCHECKED_FOCAL = 0.05
 # Cells along the sides of a photograph that are held out in turn, as the fields of a chessboard.
 _HELD_CELLS = 6
 
@@ -154,19 +165,17 @@ def calibrate_from_arcs(
         )
     shown = [arcs[k] for k in used]
     votes = np.sum([strength_votes(problem, one) for one in shown], axis=0)
-    search = _search(problem, shown, likely_strengths(votes), seed)
-    trials = [
-        _try_half(problem, *halves, has_worlds=search is not None, seed=seed) for halves in _halves(problem, shown)
-    ]
+    search = _search(problem, shown, likely_strengths(votes)[:2], seed)
+    trials = [_try(problem, *parts, has_worlds=search is not None, seed=seed) for parts in _folds(problem, shown, 2)]
     held_out = _held_out(trials, search)
     focal = _judge_focal(search, trials, held_out)
     if search is not None and focal.is_told:
         problem, solution = search.problem, search.best.solution
     else:  # a world that does not convince says nothing of the distortion either
-        solution = solve_plumb(problem, shown, float(likely_strengths(votes)[0]))
-        trials = [_try_half(problem, *halves, has_worlds=False, seed=seed) for halves in _halves(problem, shown)]
+        solution = solve_plumb(problem, shown, likely_strengths(votes))
+        trials = [_try(problem, *parts, has_worlds=False, seed=seed) for parts in _folds(problem, shown, _PLUMB_FOLDS)]
         held_out = _held_out(trials, None)
-    strength = _judge_strength(solution, trials)
+    strength = _judge_strength(problem, solution, trials)
     solution, center = _final(problem, solution, strength)
     if not (focal.is_told or strength.is_told or strength.is_none):
         raise InputError(
@@ -174,7 +183,7 @@ def calibrate_from_arcs(
             f"{strength.reason}; focal length: {focal.reason}",
             _ADVICE,
         )
-    calibration = _calibration(problem, solution, strength, focal, [names[k] for k in used])
+    calibration = _calibration(problem, solution, (strength, focal, center), [names[k] for k in used])
     report = LinesReport(
         mode="directions" if focal.is_told else "plumb lines",
         parameters=_parameters(problem, solution, calibration, (strength, focal, center)),
@@ -263,30 +272,28 @@ class _Trial:
     variance: float
 
 
-def _cells(problem: Problem, arcs: Arcs) -> NDArray[np.int64]:
+def _cells(problem: Problem, arcs: Arcs, num: int = _HELD_CELLS) -> NDArray[np.int64]:
     """(N, 2) the field of the picture that the middle of each line is in."""
     middle = arcs.points.mean(1) / [problem.width, problem.height]
-    cells: NDArray[np.int64] = np.clip((middle * _HELD_CELLS).astype(np.int64), 0, _HELD_CELLS - 1)
+    cells: NDArray[np.int64] = np.clip((middle * num).astype(np.int64), 0, num - 1)
     return cells
 
 
-def _halves(problem: Problem, arcs: Sequence[Arcs]) -> list[tuple[list[Arcs], list[Arcs]]]:
-    """Lines to learn from and lines to ask, both ways round: the white and the black fields of the pictures, so that
-    the edges of one thing are on one side."""
-    white = [_cells(problem, one).sum(1) % 2 == 0 for one in arcs]
-    halves = [
-        [one.take(w) for one, w in zip(arcs, white, strict=True)],
-        [one.take(~w) for one, w in zip(arcs, white, strict=True)],
-    ]
-    return [(halves[0], halves[1]), (halves[1], halves[0])]
+def _folds(problem: Problem, arcs: Sequence[Arcs], num: int) -> list[tuple[list[Arcs], list[Arcs]]]:
+    """Lines to learn from and lines to ask, in num ways of which each asks others: those whose middle is in one of num
+    kinds of fields of the pictures, so that the edges of one thing are on one side. Two kinds are a chessboard's."""
+    kind = [_cells(problem, one) @ [1, 1 if num == 2 else 2] % num for one in arcs]
+    learn = [[one.take(k != n) for one, k in zip(arcs, kind, strict=True)] for n in range(num)]
+    ask = [[one.take(k == n) for one, k in zip(arcs, kind, strict=True)] for n in range(num)]
+    return list(zip(learn, ask, strict=True))
 
 
-def _try_half(problem: Problem, learn: list[Arcs], ask: list[Arcs], *, has_worlds: bool, seed: int) -> _Trial:
-    """Calibrate from one half of the lines and ask the other."""
+def _try(problem: Problem, learn: list[Arcs], ask: list[Arcs], *, has_worlds: bool, seed: int) -> _Trial:
+    """Calibrate from some of the lines and ask the others."""
     votes = np.sum([strength_votes(problem, one) for one in learn], axis=0)
     strengths = likely_strengths(votes)
-    found = find_worlds(problem, learn, strengths, seed) if has_worlds else []
-    camera = found[0].solution.camera if found else solve_plumb(problem, learn, float(strengths[0])).camera
+    found = find_worlds(problem, learn, strengths[:2], seed) if has_worlds else []
+    camera = found[0].solution.camera if found else solve_plumb(problem, learn, strengths).camera
     lens = problem.lens(camera)
     plain = replace(lens, strength=0.0)
     plain_camera, plain_worlds = _without_distortion(problem, learn, camera, found)
@@ -297,7 +304,7 @@ def _try_half(problem: Problem, learn: list[Arcs], ask: list[Arcs], *, has_world
         predicted.append(straightness_px(plain, Arcs(on_lines(lens, one.points), one.length_px, one.rms_px)))
         before.append(straightness_px(plain, one))
         after.append(straightness_px(lens, one))
-        witness.append(k * _HELD_CELLS**2 + _cells(problem, one) @ [1, _HELD_CELLS])
+        witness.append(k * _WITNESS_CELLS**2 + _cells(problem, one, _WITNESS_CELLS) @ [1, _WITNESS_CELLS])
         world = found[0].solution.photos[k].world if found else None
         gained.append(losses(problem, plain_camera, one, plain_worlds[k]) - losses(problem, camera, one, world))
         if world is not None:
@@ -412,29 +419,45 @@ def _judge_focal(search: _Search | None, trials: Sequence[_Trial], held_out: Hel
         f"{held_out.num_met} of {held_out.num_lines} held-out lines meet the vanishing points of the others "
         f"({held_out.num_expected:.0f} would by chance)"
     )
-    return _Judged(True, reason, widened=apart / 2.0)
+    # halves that lie on one side of the whole show that it hangs on few lines
+    whole = math.log(search.best.focal)
+    return _Judged(True, reason, widened=max(apart / 2.0, *(abs(log - whole) for log in logs)))
 
 
-def _judge_strength(solution: Solution, trials: Sequence[_Trial]) -> _Judged:
+def _judge_strength(problem: Problem, solution: Solution, trials: Sequence[_Trial]) -> _Judged:
     strength, sigma = float(solution.camera[STRENGTH]), float(np.sqrt(solution.covariance[STRENGTH, STRENGTH]))
-    apart = abs(trials[0].strength - trials[1].strength)
-    sigma = max(sigma, apart / 2.0)
+    # the jackknife's sigma (of two halves, half of what they are apart)
+    each = np.array([trial.strength for trial in trials])
+    spread = math.sqrt((len(each) - 1) / len(each) * float(((each - each.mean()) ** 2).sum()))
+    sigma = max(sigma, spread)
     if sigma > _WORST_STRENGTH:
         return _Judged(False, f"too few long lines away from the middle: open by {sigma:.2f} of the corner's radius")
     if abs(strength) < _SEEN_SIGMAS * sigma:
         return _Judged(
             False, f"none is visible: the corner moves by less than {200 * sigma:.1f} % of its radius", is_none=True,
-            widened=apart / 2.0,
+            widened=spread,
         )  # fmt: skip
-    t = _t_of_gains(trials)
-    if t < _SEEN_SIGMAS:
+    t = _t_of_gains(problem, trials)
+    # few lines long enough to show a bend cannot make many sigmas of it, but agree whichever of them are left out
+    is_steady = len(each) == _PLUMB_FOLDS and abs(strength) > _STEADY_SIGMAS * sigma and t > _STEADY_T
+    if t < _SEEN_SIGMAS and not is_steady:
         return _Judged(False, f"held-out lines do not prefer it to none ({t:.1f} sigmas)")
-    return _Judged(True, f"held-out lines prefer it to none ({t:.0f} sigmas)", widened=apart / 2.0)
+    reason = f"held-out lines prefer it to none ({t:.1f} sigmas)"
+    if is_steady:
+        reason += f", and it is the same to {sigma:.3f} whichever {_PLUMB_FOLDS}th of the lines is left out"
+    return _Judged(True, reason, widened=spread)
 
 
-def _t_of_gains(trials: Sequence[_Trial]) -> float:
-    """By how many of its sigmas the distortion that the others found is better for held-out lines than none."""
-    each = np.concatenate([np.bincount(trial.witness, trial.gained) for trial in trials])
+def _t_of_gains(problem: Problem, trials: Sequence[_Trial]) -> float:
+    """By how many of its sigmas the distortion that the others found is better than none for held-out lines that it
+    bends by enough to tell."""
+    gained = []
+    for trial in trials:
+        is_bent = trial.predicted_px > _TELLING_PX * problem.pixel_scale
+        each = np.bincount(trial.witness[is_bent], trial.gained[is_bent])
+        gained.append(each[each != 0.0])
+    # no single thing in the picture convinces alone
+    each = np.clip(np.concatenate(gained), -_MOST_OF_WITNESS, _MOST_OF_WITNESS)
     return float(each.sum() / math.sqrt(max((each**2).sum(), 1e-12)))
 
 
@@ -446,7 +469,10 @@ def _final(problem: Problem, solution: Solution, strength: _Judged) -> tuple[Sol
     covariance stays that with everything free and the prior of the principal point."""
     has_worlds = solution.photos[0].world is not None
     sigmas = np.sqrt(np.diag(solution.covariance))
-    free = np.array([strength.is_told, has_worlds, *(sigmas[CENTER_X:] < 0.5 * problem.prior_sigma[CENTER_X:])])
+    counts = [np.bincount(photo.member[photo.member >= 0], minlength=3)[:3] for photo in solution.photos]
+    has_third = not has_worlds or any(count.min() >= _LEAST_OF_DIRECTION for count in counts)
+    is_told = (sigmas[CENTER_X:] < 0.5 * problem.prior_sigma[CENTER_X:]) & has_third
+    free = np.array([strength.is_told, has_worlds, *is_told])
     camera = np.where(free, solution.camera, [0.0, solution.camera[LOG_FOCAL], 0.0, 0.0])
     solved = solve(replace(problem, is_free=free), camera, solution.photos)
     full = replace(problem, is_free=np.array([True, has_worlds, True, True]))
@@ -466,9 +492,10 @@ def _final(problem: Problem, solution: Solution, strength: _Judged) -> tuple[Sol
 
 
 def _calibration(
-    problem: Problem, solution: Solution, strength: _Judged, focal: _Judged, names: Sequence[str]
+    problem: Problem, solution: Solution, judged: tuple[_Judged, _Judged, _Judged], names: Sequence[str]
 ) -> CameraCalibration:
     """SIMPLE_DIVISION with the covariance of its parameters f, cx, cy, k."""
+    strength, focal, center_told = judged
     radius = problem.radius_px
     covariance = solution.covariance.copy()
     if focal.is_told:
@@ -477,9 +504,11 @@ def _calibration(
         share = _DEFAULT_FOCAL * max(problem.width, problem.height) / radius
         covariance[LOG_FOCAL], covariance[:, LOG_FOCAL] = 0.0, 0.0
         covariance[LOG_FOCAL, LOG_FOCAL] = _DEFAULT_LOG_SIGMA**2
-    for unknown, judged in ((STRENGTH, strength), (LOG_FOCAL, focal)):
+    if focal.is_told and not center_told.is_told:
+        focal = replace(focal, widened=max(focal.widened, _UNCHECKED_FOCAL))
+    for unknown, verdict in ((STRENGTH, strength), (LOG_FOCAL, focal)):
         sigma = math.sqrt(max(covariance[unknown, unknown], 1e-24))
-        factor = max(judged.widened / sigma, 1.0)
+        factor = max(verdict.widened / sigma, 1.0)
         covariance[unknown] *= factor
         covariance[:, unknown] *= factor
     focal_px, k = share * radius, float(solution.camera[STRENGTH]) * share**2
@@ -504,7 +533,7 @@ def _calibration(
     freedom = max(num - spent - NUM_CAMERA - 3 * len(views), 1)
     return CameraCalibration(
         camera, jacobian @ covariance @ jacobian.T, _method(solution, focal, len(names)), math.sqrt(square / freedom),
-        freedom, tuple(views), warnings=tuple(_warnings(strength, focal)),
+        freedom, tuple(views), warnings=tuple(_warnings(strength, focal, center_told)),
     )  # fmt: skip
 
 
@@ -514,8 +543,13 @@ def _method(solution: Solution, focal: _Judged, num: int) -> str:
     return f"{kind} of {lines} lines in {num} photograph{'s' * (num > 1)}"
 
 
-def _warnings(strength: _Judged, focal: _Judged) -> list[str]:
+def _warnings(strength: _Judged, focal: _Judged, center: _Judged) -> list[str]:
     warnings = []
+    if focal.is_told and not center.is_told:
+        warnings.append(
+            "the focal length rests on two directions that are taken to be at right angles, and on a principal point "
+            "in the middle: no third direction recedes that would show otherwise"
+        )
     if not focal.is_told:
         warnings.append(f"the focal length is a default, not measured: {focal.reason}")
     if not (strength.is_told or strength.is_none):
