@@ -333,6 +333,16 @@ def test_gaps_and_a_noisier_sensor_than_stated_are_borne() -> None:
     assert abs(scale_error(wide, truth)) < 4
 
 
+def test_points_of_uncertain_depth_do_not_leap() -> None:
+    """Flights on which a step that is hardly damped takes a point behind a camera."""
+    times = np.arange(0, 8, 0.25)
+    for seed in (7, 16):
+        flight = Flight(seed, acceleration=0.5, turning=0.3)
+        found = aligned(seen_map(flight, times, seed, 2.0), flight.imu(seed, 8.0))
+        assert found.residual < 1.5
+        assert abs(scale_error(found, true_map(flight, times))) < 3
+
+
 def test_weak_motion_has_a_large_but_honest_sigma_and_none_is_refused() -> None:
     times = np.arange(0, 12, 0.25)
     weak = Flight(1, acceleration=0.1, turning=0.05)

@@ -419,7 +419,9 @@ def _judge_focal(search: _Search | None, trials: Sequence[_Trial], held_out: Hel
         f"{held_out.num_met} of {held_out.num_lines} held-out lines meet the vanishing points of the others "
         f"({held_out.num_expected:.0f} would by chance)"
     )
-    return _Judged(True, reason, widened=apart / 2.0)
+    # halves that lie on one side of the whole show that it hangs on few lines
+    whole = math.log(search.best.focal)
+    return _Judged(True, reason, widened=max(apart / 2.0, *(abs(log - whole) for log in logs)))
 
 
 def _judge_strength(problem: Problem, solution: Solution, trials: Sequence[_Trial]) -> _Judged:
@@ -467,7 +469,10 @@ def _final(problem: Problem, solution: Solution, strength: _Judged) -> tuple[Sol
     covariance stays that with everything free and the prior of the principal point."""
     has_worlds = solution.photos[0].world is not None
     sigmas = np.sqrt(np.diag(solution.covariance))
-    free = np.array([strength.is_told, has_worlds, *(sigmas[CENTER_X:] < 0.5 * problem.prior_sigma[CENTER_X:])])
+    counts = [np.bincount(photo.member[photo.member >= 0], minlength=3)[:3] for photo in solution.photos]
+    has_third = not has_worlds or any(count.min() >= _LEAST_OF_DIRECTION for count in counts)
+    is_told = (sigmas[CENTER_X:] < 0.5 * problem.prior_sigma[CENTER_X:]) & has_third
+    free = np.array([strength.is_told, has_worlds, *is_told])
     camera = np.where(free, solution.camera, [0.0, solution.camera[LOG_FOCAL], 0.0, 0.0])
     solved = solve(replace(problem, is_free=free), camera, solution.photos)
     full = replace(problem, is_free=np.array([True, has_worlds, True, True]))
