@@ -200,7 +200,7 @@ def test_an_image_that_its_own_pairs_contradict_is_taken_back():
         attempts: dict = {}
         mapper = mapper_with(model, place.correspondences, MappingOptions(), pool, attempts=attempts)
         structure.filter_observations(model, MappingOptions(), pool)
-        assert mapper._drop_contradicted_images()
+        assert mapper.drop_contradicted_images()
     assert model.is_registered.tolist() == [True, True, False, True, True, True]
     assert "contradict its pose" in attempts[2].reason
 

@@ -422,7 +422,7 @@ def test_faces_and_photographs_of_one_name_are_refused(tmp_path: Path) -> None:
     (tmp_path / "images" / "view_1.png").rename(tmp_path / "images" / "view_0_left.png")
     model.image_names[1] = "view_0_left.png"
     write_model(tmp_path / "sparse" / "0", model)
-    with pytest.raises(InputError, match=r"view_0_left\.png: a photograph has the name"):
+    with pytest.raises(InputError, match=r"view_0_left\.png: a photograph and a face of a cube have the same name"):
         sfmapp.undistort(tmp_path, tmp_path / "out", ONE)
     assert not (tmp_path / "out" / "images").exists()
 
