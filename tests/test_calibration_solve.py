@@ -17,11 +17,12 @@ from sfmapp.calibration.result import CameraCalibration
 from sfmapp.calibration.solve import inlier_fit, solve_views
 from sfmapp.calibration.start import first_fit, to_model
 from sfmapp.calibration.uncertainty import frame_covariance, image_grid, projection_covariance
-from sfmapp.calibration.zhang import closed_form, homography, plane_pose
+from sfmapp.calibration.zhang import closed_form, plane_pose
 from sfmapp.camera.camera import Camera, pixels_to_rays, project
 from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.dlt import find_homography
 
 BOARD = parse_board("chessboard:9x6:0.025")
 SIZE = (1280, 960)
@@ -38,7 +39,7 @@ def test_a_homography_is_exact() -> None:
     h = np.array([[1.2, 0.1, 300.0], [-0.2, 0.9, 200.0], [1e-4, -2e-4, 1.0]])
     xy = rng.uniform(0, 9, (12, 2))
     mapped = np.concatenate([xy, np.ones((12, 1))], 1) @ h.T
-    np.testing.assert_allclose(homography(xy, mapped[:, :2] / mapped[:, 2:]), h, rtol=1e-9)
+    np.testing.assert_allclose(find_homography(xy, mapped[:, :2] / mapped[:, 2:]), h, rtol=1e-9)
 
 
 def test_zhangs_closed_form_is_exact() -> None:

@@ -16,7 +16,7 @@ from sfmapp.calibration.boards import Board
 from sfmapp.calibration.lattice import Lattice, find_lattice
 from sfmapp.calibration.markers import dictionary_of
 from sfmapp.calibration.symmetry import symmetric_points
-from sfmapp.calibration.zhang import homography
+from sfmapp.geometry.dlt import find_homography
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -213,7 +213,7 @@ def _predicted(source: Array, target: Array, board: Board) -> tuple[Ints, Array,
             continue
         if len(near) < 8:  # one marker beside it: more from further away keep the plane from tipping
             near = np.flatnonzero(distance < 2.01 * board.spacing)
-        h = homography(source[near], target[near])
+        h = find_homography(source[near], target[near])
         mapped = np.concatenate([source[near], np.ones((len(near), 1))], 1) @ h.T
         errors.append(np.sqrt(((mapped[:, :2] / mapped[:, 2:] - target[near]) ** 2).sum(1).mean()))
         at = h @ [*point, 1.0]
@@ -246,7 +246,7 @@ def _april_grid(gray: Pixels, board: Board) -> tuple[Ints, Array]:
             idx += [first + k for k in range(4)]
             xy += list(np.roll(quad, turn, axis=0))
         source, target = board.points[idx, :2], np.array(xy)
-        h = homography(source, target)
+        h = find_homography(source, target)
         mapped = np.concatenate([source, np.ones((len(idx), 1))], 1) @ h.T
         error = float(np.median(np.hypot(*(mapped[:, :2] / mapped[:, 2:] - target).T)))
         if error < best_error:
@@ -363,7 +363,7 @@ def _fits_neighbors(board: Board, idx: Ints, xy: Array) -> NDArray[np.bool_]:
     steps = np.linalg.norm(_axes(board, idx[where], pixels), axis=2).min(1)
     stray = _STRAY if board.kind in ("chessboard", "circles", "acircles") else _STRAY_BESIDE_MARKERS
     for n, point in enumerate(where):
-        h = homography(plane[near[n]], pixels[near[n]])
+        h = find_homography(plane[near[n]], pixels[near[n]])
         at = h @ [*plane[n], 1.0]
         off = np.hypot(*(at[:2] / at[2] - pixels[n])) if at[2] != 0 else np.inf
         is_good[point] = off < max(stray * steps[n], 1.5)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sfmapp.calibration.adjustment import TargetView
 from sfmapp.camera.camera import Camera, pixels_to_rays
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.dlt import find_homography, homogeneous, normalizing
 
 Array = NDArray[np.float64]
 
@@ -38,31 +39,6 @@ class ClosedForm:
     singular_values: Array
 
 
-def homography(source: Array, target: Array) -> Array:
-    """(3, 3) homography from points (N, 2) of a plane to pixels (N, 2), N >= 4, by the normalised DLT.
-
-    Hartley and Zisserman, "Multiple View Geometry", 2nd ed., algorithm 4.2. Its last number is 1.
-    """
-    a, ta = _normalized(source)
-    b, tb = _normalized(target)
-    one = np.concatenate([a, np.ones((len(a), 1))], 1)
-    zero = np.zeros_like(one)
-    rows = np.concatenate([
-        np.concatenate([one, zero, -b[:, :1] * one], 1),
-        np.concatenate([zero, one, -b[:, 1:] * one], 1),
-    ])  # fmt: skip
-    h = np.linalg.svd(rows, full_matrices=False)[2][-1].reshape(3, 3)
-    found: Array = np.linalg.inv(tb) @ h @ ta
-    return found / found[2, 2] if found[2, 2] != 0 else found
-
-
-def _normalized(xy: Array) -> tuple[Array, Array]:
-    middle = xy.mean(0)
-    scale = np.sqrt(2.0) / max(float(np.sqrt(((xy - middle) ** 2).sum(1).mean())), 1e-300)
-    matrix = np.array([[scale, 0.0, -scale * middle[0]], [0.0, scale, -scale * middle[1]], [0.0, 0.0, 1.0]])
-    return (xy - middle) * scale, matrix
-
-
 def closed_form(views: Sequence[TargetView], size: tuple[int, int], *, has_skew: bool = False) -> ClosedForm:
     """K from B = K^-T K^-1, which every homography constrains twice.
 
@@ -75,7 +51,7 @@ def closed_form(views: Sequence[TargetView], size: tuple[int, int], *, has_skew:
                       [0.0, 0.0, 1.0]])  # fmt: skip
     rows, noise = [], []
     for view in views:
-        h = homography(view.xyz[:, :2], view.xy)
+        h = find_homography(view.xyz[:, :2], view.xy)
         mapped = view.xyz[:, :2] @ h[:, :2].T + h[:, 2]
         error = np.sqrt(((mapped[:, :2] / mapped[:, 2:] - view.xy) ** 2).sum(1).mean())
         noise.append(2.0 * error / max(size) / np.sqrt(len(view.xy)))
@@ -124,8 +100,8 @@ def plane_pose(camera: Camera, xyz: Array, xy: Array) -> Array | None:
     is_known = np.isfinite(rays).all(1)
     if is_known.sum() < 4:
         return None
-    d, (plane, normalize) = rays[is_known], _normalized(xyz[is_known, :2])
-    one = np.concatenate([plane, np.ones((len(plane), 1))], 1)
+    d, normalize = rays[is_known], normalizing(xyz[is_known, :2])
+    one = homogeneous(xyz[is_known, :2]) @ normalize.T
     rows = np.einsum("nij,nk->nijk", rigid3.skew(d), one).reshape(-1, 9)
     h = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, 3)
     if np.sign((d * (one @ h.T)).sum(1)).sum() < 0:

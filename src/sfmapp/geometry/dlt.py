@@ -88,7 +88,7 @@ def find_projection(
         solution, _, _, singular_values = np.linalg.lstsq(rows[:, :11], -rows[:, 11], rcond=None)
         entries = np.append(solution, 1.0)
     else:
-        _, values, vt = np.linalg.svd(rows)
+        values, vt = _right_vectors(rows)
         singular_values = np.pad(values, (0, 12 - len(values)))
         entries = vt[11]
     matrix = np.linalg.solve(of_xy, entries.reshape(3, 4)) @ of_xyz
@@ -105,7 +105,7 @@ def find_projections(xyz: Array, xy: Array) -> Array:
     scaled as that of :class:`LinearProjection`. What a bad sample gives is a matrix that fits nothing."""
     of_xyz, of_xy = normalizing(xyz.reshape(-1, 3)), normalizing(xy.reshape(-1, 2))
     rows = projection_rows(homogeneous(xyz) @ of_xyz.T, homogeneous(xy) @ of_xy[:2].T)
-    entries = np.linalg.svd(rows)[2][:, 11]
+    entries = _right_vectors(rows)[1][:, 11]
     return _scaled(np.linalg.solve(of_xy, entries.reshape(-1, 3, 4)) @ of_xyz)
 
 
@@ -117,11 +117,27 @@ def find_homographies(source: Array, target: Array) -> Array:
     rows = np.zeros((*points.shape[:2], 2, 9))
     rows[..., 0, :3] = rows[..., 1, 3:6] = points
     rows[..., 6:] = -pixels[..., None] * points[..., None, :]
-    entries = np.linalg.svd(rows.reshape(len(rows), -1, 9))[2][:, 8]
+    entries = _right_vectors(rows.reshape(len(rows), -1, 9))[1][:, 8]
     found = np.linalg.solve(of_target, entries.reshape(-1, 3, 3)) @ of_source
     weight = (found[:, 2] * homogeneous(source)[:, 0]).sum(1)
     scaled: Array = found * (np.where(weight < 0.0, -1.0, 1.0) / np.linalg.norm(found, axis=(1, 2)))[:, None, None]
     return scaled
+
+
+def find_homography(source: Array, target: Array) -> Array:
+    """(3, 3) map of N >= 4 points of a plane (N, 2) to their pixels (N, 2); its last number is 1, or 0.
+
+    The normalised DLT (Hartley and Zisserman, algorithm 4.2).
+    """
+    found: Array = find_homographies(source[None], target[None])[0]
+    return found / found[2, 2] if found[2, 2] != 0 else found
+
+
+def _right_vectors(rows: Array) -> tuple[Array, Array]:
+    """Singular values (..., min(M, N)) and all right singular vectors (..., N, N) of systems (..., M, N)."""
+    # left vectors are not used, and there are as many as rows
+    _, values, vt = np.linalg.svd(rows, full_matrices=rows.shape[-2] < rows.shape[-1])
+    return values, vt
 
 
 def _scaled(matrix: Array) -> Array:

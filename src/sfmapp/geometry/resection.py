@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import p3p, pnp, rigid3
+from sfmapp.geometry.dlt import homogeneous
 
 Array = NDArray[np.float64]
 
@@ -88,18 +89,22 @@ def estimate_pose(
         error = np.linalg.norm(in_camera[:, :2] / in_camera[:, 2:] - normalized, axis=1)
     is_inlier = (in_camera[:, 2] > 0) & (error <= max_error)  # False for NaN
     if is_inlier.sum() < _LEAST_KEPT * len(sampled):  # the loop ends in EPnP over its inliers, which can lose a plane
-        rays = np.concatenate([normalized, np.ones((len(normalized), 1))], 1)
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        return estimate_pose(xyz, rays, max_error, confidence=confidence, max_iterations=max_iterations)
+        return estimate_pose(xyz, _rays(normalized), max_error, confidence=confidence, max_iterations=max_iterations)
     return Resection(pose, is_inlier) if is_inlier.sum() >= 4 else None
+
+
+def _rays(normalized: Array) -> Array:
+    """(N, 3) unit rays of points (N, 2) of the normalised image plane, or of rays."""
+    rays = normalized if normalized.shape[1] == 3 else homogeneous(normalized)
+    unit: Array = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return unit
 
 
 def _pose_of_all(xyz: Array, normalized: Array, max_error: float) -> Resection | None:
     valid = ~np.isnan(normalized[:, 0])
     if valid.sum() < 4:
         return None
-    rays = normalized if normalized.shape[1] == 3 else np.concatenate([normalized, np.ones((len(normalized), 1))], 1)
-    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = _rays(normalized)
     poses = pnp.poses_of_points(xyz[valid], rays[valid])
     if not len(poses):
         return None

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from sfmapp.calibration.boards import Board
 from sfmapp.calibration.detection import Detection, detect_board
-from sfmapp.calibration.zhang import homography
 from sfmapp.errors import InputError
 from sfmapp.events import Events
+from sfmapp.geometry.dlt import find_homography
 from sfmapp.images.folder import load_images
 from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import read_gray
@@ -211,7 +211,7 @@ def choose_frames(pictures: Sequence[BoardPicture], size: tuple[int, int], board
 
 def _outline(detection: Detection, board: Board) -> NDArray[np.float64]:
     """(4, 2) pixels of the corners of the whole board, by the plane that the found points lie in."""
-    h = homography(board.points[detection.idx, :2], detection.xy)
+    h = find_homography(board.points[detection.idx, :2], detection.xy)
     low, high = board.points[:, :2].min(0), board.points[:, :2].max(0)
     corners = np.array([[low[0], low[1], 1.0], [high[0], low[1], 1.0], [*high, 1.0], [low[0], high[1], 1.0]])
     mapped = corners @ h.T
