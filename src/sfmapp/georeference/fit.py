@@ -137,20 +137,30 @@ def fit_similarity(
             slope = -rigid3.skew(up[None])[0][:2] / level.sigma_rad
             information[:3, :3] += slope.T @ slope
             gradient[:3] += slope.T @ up[:2] / level.sigma_rad
-        # a scale of its own for every unknown: metres, radians and shares
-        root = np.sqrt(np.maximum(np.diag(information), 1e-300))
-        scaled = information / np.outer(root, root)
-        if np.linalg.cond(scaled) > 1e12:
+        solved = newton_step(information, gradient)
+        if solved is None:
             return None
-        covariance = np.linalg.inv(scaled) / np.outer(root, root)
-        step = -covariance @ gradient
+        step, covariance, length = solved
         rotation = rigid3.exp_so3(step[:3]) @ rotation
         scale *= float(np.exp(np.clip(step[3], -1.0, 1.0)))
         mean = mean + step[4:]
-        if np.abs(step * root).max() < 1e-6:
+        if length < 1e-6:
             break
     leverage = np.einsum("nai,ij,naj->na", jacobian, covariance, jacobian) * weight
     return Similarity(rotation, scale, origin, mean, covariance, 1.0 - leverage)
+
+
+def newton_step(information: Array, gradient: Array) -> tuple[Array, Array, float] | None:
+    """The step (N,), the covariance (N, N) and the largest part of the step in units of what its unknown alone would be
+    known to; None where the information does not determine the unknowns."""
+    # a scale of its own for every unknown: metres, radians and shares
+    root = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled = information / np.outer(root, root)
+    if np.linalg.cond(scaled) > 1e12:
+        return None
+    covariance = np.linalg.inv(scaled) / np.outer(root, root)
+    step = -covariance @ gradient
+    return step, covariance, float(np.abs(step * root).max())
 
 
 def robust_fit(

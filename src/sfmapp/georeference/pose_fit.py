@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.georeference.fit import student
+from sfmapp.georeference.fit import newton_step, student
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -182,17 +182,15 @@ def _fit(
         jacobian[:, 3:, :3] = -np.eye(3)  # residuals turn cam_from_world, the step world_from_cam
         information = np.einsum("nai,na,naj->ij", jacobian, weight, jacobian)
         gradient = np.einsum("nai,na,na->i", jacobian, weight, residual)
-        root = np.sqrt(np.maximum(np.diag(information), 1e-300))
-        scaled = information / np.outer(root, root)
-        if np.linalg.cond(scaled) > 1e12:
+        solved = newton_step(information, gradient)
+        if solved is None:
             return None
-        covariance = np.linalg.inv(scaled) / np.outer(root, root)
-        step = -covariance @ gradient
+        step, covariance, length = solved
         growth = float(np.exp(np.clip(step[3], -1.0, 1.0)))
         turn = rigid3.exp_so3(step[:3])
         moved = similarity.from_parts(turn, origin + step[4:] - growth * turn @ origin, growth)
         world_from_model = similarity.compose(moved, world_from_model)
-        if np.abs(step * root).max() < 1e-6:
+        if length < 1e-6:
             break
     poses = similarity.transform_poses(world_from_model, cam_from_model)
     leverage = np.einsum("nai,ij,naj->na", jacobian, covariance, jacobian) * weight
