@@ -12,12 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.calibration.documents import read_document, write_document
 from sfmapp.calibration.result import CameraCalibration, ViewFit
 from sfmapp.errors import InputError
-from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.colmap_model import checked_camera
-from sfmapp.formats.text_input import read_json_object
-from sfmapp.reporting import Report, document_text, from_plain
+from sfmapp.reporting import Report
 
 FORMAT = "sfmapp calibration 1"
 # of the largest eigenvalue: what is less below zero is rounding
@@ -107,8 +106,7 @@ def _view(view: ViewFit) -> CalibrationView:
 
 def write_calibration(path: Path, calibration: CameraCalibration) -> None:
     """Write ``calibration.json``. Raises InputError if it cannot be written."""
-    with replaced_file(path) as beside:
-        beside.write_text(document_text(document_of(calibration)), encoding="utf-8", errors="backslashreplace")
+    write_document(path, document_of(calibration))
 
 
 def read_calibration_file(path: Path) -> CameraCalibration:
@@ -118,17 +116,10 @@ def read_calibration_file(path: Path) -> CameraCalibration:
         InputError: it cannot be read, or is no such file: what was expected, and found.
     """
     path = path / "calibration.json" if path.is_dir() else path
-    fields = read_json_object(path)
-    if fields.get("format") != FORMAT:
-        raise InputError(
-            f"{path}: expected a calibration that sfmapp has written (format {FORMAT!r}), found "
-            f"{fields.get('format', 'no format')!r}",
-            "give OUT or OUT/calibration.json of sfmapp calibrate: other files do not say how sure they are",
-        )
-    try:
-        document = from_plain(CalibrationDocument, fields)
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from error
+    document = read_document(
+        path, CalibrationDocument, FORMAT, "a calibration that sfmapp has written",
+        "give OUT or OUT/calibration.json of sfmapp calibrate: other files do not say how sure they are",
+    )  # fmt: skip
     camera = checked_camera(path, 0, document.model, document.width, document.height, document.params)
     num = len(camera.params)
     frame = document.frame_covariance

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.calibration.documents import read_document, write_document
 from sfmapp.calibration.locate import Location
 from sfmapp.calibration.measure import MeasuredFigure
 from sfmapp.calibration.one_view import POSE, Noise, OneView
@@ -18,11 +19,10 @@ from sfmapp.camera.camera import Camera
 from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.camera.names import MODEL_NAMES
 from sfmapp.errors import InputError
-from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.colmap_model import checked_camera
-from sfmapp.formats.text_input import finite_array, read_json_object
+from sfmapp.formats.text_input import finite_array
 from sfmapp.geometry import rigid3
-from sfmapp.reporting import Report, document_text, from_plain
+from sfmapp.reporting import Report
 
 Array = NDArray[np.float64]
 
@@ -356,8 +356,7 @@ def write_pose(
         covariance=covariance.tolist(), sigma_px=sigma_px, unit=facts.unit,
         places=dict(zip(facts.names, xyz.tolist(), strict=True)),
     )  # fmt: skip
-    with replaced_file(path) as beside:
-        beside.write_text(document_text(document), encoding="utf-8", errors="backslashreplace")
+    write_document(path, document)
 
 
 def read_pose(path: Path) -> KnownPose:
@@ -367,17 +366,10 @@ def read_pose(path: Path) -> KnownPose:
         InputError: it cannot be read, or is no such file.
     """
     path = path / POSE_FILE if path.is_dir() else path
-    fields = read_json_object(path)
-    if fields.get("format") != FORMAT:
-        raise InputError(
-            f"{path}: expected the pose of a photograph (format {FORMAT!r}), found "
-            f"{fields.get('format', 'no format')!r}",
-            "give OUT or OUT/pose.json of sfmapp locate, or of sfmapp calibrate target",
-        )
-    try:
-        document = from_plain(PoseDocument, fields)
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from error
+    document = read_document(
+        path, PoseDocument, FORMAT, "the pose of a photograph",
+        "give OUT or OUT/pose.json of sfmapp locate, or of sfmapp calibrate target",
+    )  # fmt: skip
     if document.model not in MODEL_NAMES:
         raise InputError(f"{path}: expected a camera model, found {document.model!r}", ", ".join(MODEL_NAMES))
     camera = checked_camera(path, 0, document.model, document.width, document.height, document.params)

@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.calibration.documents import write_document
 from sfmapp.calibration.rig import PairCalibration, RigCalibration
 from sfmapp.calibration.rig_report import RigCameraSection, RigHead, RigPair
 from sfmapp.camera_files.rig_writing import pose_rows
-from sfmapp.formats.atomic import replaced_file
 from sfmapp.geometry import rigid3
-from sfmapp.reporting import document_text
 
 Array = NDArray[np.float64]
 
@@ -27,9 +26,7 @@ _POSE = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
 
 def write_rig(path: Path, found: RigCalibration) -> None:
     """Write ``rig.json``. Raises InputError if it cannot be written."""
-    text = document_text({**rig_head(found), **{f"cam{n}": one for n, one in enumerate(rig_cameras(found))}})
-    with replaced_file(path) as beside:
-        beside.write_text(text, encoding="utf-8", errors="backslashreplace")
+    write_document(path, {**rig_head(found), **{f"cam{n}": one for n, one in enumerate(rig_cameras(found))}})
 
 
 def rig_head(found: RigCalibration) -> RigHead:

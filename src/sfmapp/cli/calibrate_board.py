@@ -13,7 +13,8 @@ from sfmapp.cli.common import (
     limit_library_threads,
     listening,
     load_numba_without_blas,
-    print_json,
+    options_of,
+    tell_result,
     took,
 )
 
@@ -55,9 +56,7 @@ def add_way(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def _board(args: argparse.Namespace) -> int:
     limit_library_threads()
-    from sfmapp.workspace.options import load_options
-
-    options = load_options([], [] if args.threads is None else [f"threads={args.threads}"])
+    options = options_of({"threads": args.threads})
     load_numba_without_blas()
     from sfmapp.calibration.boards import parse_board
     from sfmapp.camera.names import CameraModel
@@ -72,10 +71,7 @@ def _board(args: argparse.Namespace) -> int:
             args.source, args.output, parse_board(args.board), options,
             asked=asked, events=events, watch=watch,
         )  # fmt: skip
-    if args.json:
-        print_json({"exit_code": 0, "output": str(result.output), **result.report})
-    elif not args.quiet:
-        _print(result)
+    tell_result(args, result, lambda: _print(result))
     return 0
 
 

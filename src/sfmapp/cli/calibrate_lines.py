@@ -10,7 +10,8 @@ from sfmapp.cli.common import (
     limit_library_threads,
     listening,
     load_numba_without_blas,
-    print_json,
+    options_of,
+    tell_result,
     took,
 )
 
@@ -53,10 +54,7 @@ def add_way(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def _calibrate(args: argparse.Namespace) -> int:
     limit_library_threads()
-    from sfmapp.workspace.options import load_options
-
-    flags = {"images.mask_path": args.mask_path, "seed": args.seed}
-    options = load_options([], [f"{name}={value}" for name, value in flags.items() if value is not None])
+    options = options_of({"images.mask_path": args.mask_path, "seed": args.seed})
     load_numba_without_blas()
     from sfmapp.pipelines.calibration.lines import calibrate_lines
     from sfmapp.workspace.usage import Stopwatch
@@ -64,10 +62,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     watch = Stopwatch(whole_process=True)
     with listening(args) as events:
         result = calibrate_lines(args.photos, args.output, options, events=events, watch=watch)
-    if args.json:
-        print_json({"exit_code": 0, "output": str(result.output), **result.report})
-    elif not args.quiet:
-        _print(result)
+    tell_result(args, result, lambda: _print(result))
     return 0
 
 

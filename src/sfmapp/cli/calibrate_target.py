@@ -12,13 +12,14 @@ from sfmapp.cli.common import (
     limit_library_threads,
     listening,
     load_numba_without_blas,
-    print_json,
+    tell_result,
     took,
 )
 
 if TYPE_CHECKING:
     from sfmapp.calibration.point_reports import FitReport
-    from sfmapp.pipelines.calibration.known_points import PointSource
+    from sfmapp.pipelines.calibration.known_points import PointSource, TargetResult
+    from sfmapp.report.model import RunUsage
 
 _NAMES_SHOWN = 10
 
@@ -118,13 +119,14 @@ def _calibrate(args: argparse.Namespace) -> int:
             events=events, watch=watch,
             camera_model=None if args.camera_model is None else CameraModel[args.camera_model],
         )  # fmt: skip
-    report = result.report
-    if args.json:
-        print_json({"exit_code": 0, "output": str(result.output), **report})
-    elif not args.quiet:
-        values = ", ".join(f"{p.name} {p.value:.6g} +- {p.sigma:.2g}" for p in report.parameters)
-        print(f"{report.fit.model}: {values}")
-        print_fit(report.fit)
-        print(took(result.output, RunUsage(**watch.read())))
-        print(f"calibration {result.output / 'calibration.json'}, report {result.output / 'report.html'}")
+    tell_result(args, result, lambda: _print(result, RunUsage(**watch.read())))
     return 0
+
+
+def _print(result: TargetResult, run: RunUsage) -> None:
+    report = result.report
+    values = ", ".join(f"{p.name} {p.value:.6g} +- {p.sigma:.2g}" for p in report.parameters)
+    print(f"{report.fit.model}: {values}")
+    print_fit(report.fit)
+    print(took(result.output, run))
+    print(f"calibration {result.output / 'calibration.json'}, report {result.output / 'report.html'}")

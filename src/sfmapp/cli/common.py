@@ -6,9 +6,9 @@ import argparse
 import contextlib
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from sfmapp.cli.progress import make_listener
 from sfmapp.cli.signals import signals_stop
@@ -17,6 +17,17 @@ if TYPE_CHECKING:
     from sfmapp.contradictions import Contradiction
     from sfmapp.events import Events
     from sfmapp.report.model import RunUsage
+    from sfmapp.reporting import Report
+    from sfmapp.workspace.options import Options
+
+    class Told(Protocol):
+        """What a command has found: where it is written, and what there is to say of it."""
+
+        @property
+        def output(self) -> Path: ...
+
+        @property
+        def report(self) -> Report: ...
 
 
 def add_output_flags(parser: argparse.ArgumentParser, *, has_log: bool = False) -> None:
@@ -51,6 +62,14 @@ def print_json(value: Any) -> None:
     print(to_json(value), flush=True)
 
 
+def tell_result(args: argparse.Namespace, result: Told, tell: Callable[[], None]) -> None:
+    """The end of a command with a report: as JSON, in words by ``tell``, or not at all, as the flags ask."""
+    if args.json:
+        print_json({"exit_code": 0, "output": str(result.output), **result.report})
+    elif not args.quiet:
+        tell()
+
+
 def took(output: Path, run: RunUsage) -> str:
     """What a run took, in words, or that there was nothing to do in its folder."""
     if run.is_up_to_date:
@@ -82,6 +101,13 @@ def load_numba_without_blas() -> None:
     finally:
         if absent is None:
             del sys.modules["scipy.linalg"]
+
+
+def options_of(flags: Mapping[str, str | None]) -> Options:
+    """Options as flags of the command line set them, by the names of options; None for a flag that is not there."""
+    from sfmapp.workspace.options import load_options
+
+    return load_options([], [f"{name}={value}" for name, value in flags.items() if value is not None])
 
 
 def list_options(args: argparse.Namespace) -> int:

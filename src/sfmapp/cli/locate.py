@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sfmapp.cli.calibrate_target import POINTS, add_point_flags, point_source, print_fit
-from sfmapp.cli.common import add_output_flags, limit_library_threads, listening, load_numba_without_blas, print_json
+from sfmapp.cli.common import add_output_flags, limit_library_threads, listening, load_numba_without_blas, tell_result
+
+if TYPE_CHECKING:
+    from sfmapp.pipelines.calibration.known_points import LocateResult
 
 EXAMPLES = f"""\
 examples:
@@ -62,9 +66,10 @@ def _locate(args: argparse.Namespace) -> int:
             args.photograph, args.output, source, args.camera, method=args.method,
             max_error_px=args.max_error_px, sigma_px=args.sigma_px, events=events,
         )  # fmt: skip
-    if args.json:
-        print_json({"exit_code": 0, "output": str(result.output), **result.report})
-    elif not args.quiet:
-        print_fit(result.report.fit)
-        print(f"pose {result.output / 'pose.json'}, report {result.output / 'report.html'}")
+    tell_result(args, result, lambda: _print(result))
     return 0
+
+
+def _print(result: LocateResult) -> None:
+    print_fit(result.report.fit)
+    print(f"pose {result.output / 'pose.json'}, report {result.output / 'report.html'}")

@@ -11,7 +11,8 @@ from sfmapp.cli.common import (
     limit_library_threads,
     listening,
     load_numba_without_blas,
-    print_json,
+    options_of,
+    tell_result,
     took,
 )
 
@@ -69,10 +70,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def _undistort(args: argparse.Namespace) -> int:
     limit_library_threads()
-    from sfmapp.workspace.options import load_options
-
-    flags = {"threads": args.threads, "images.mask_path": args.mask_path}
-    options = load_options([], [f"{name}={value}" for name, value in flags.items() if value is not None])
+    options = options_of({"threads": args.threads, "images.mask_path": args.mask_path})
     load_numba_without_blas()
     from sfmapp.pipelines.undistort import undistort
     from sfmapp.scene.undistortion import Layout
@@ -83,10 +81,7 @@ def _undistort(args: argparse.Namespace) -> int:
         result = undistort(
             args.source, args.output, options, images=args.images, layout=layout, events=events, watch=watch
         )
-    if args.json:
-        print_json({"exit_code": 0, "output": str(result.output), **result.report})
-    elif not args.quiet:
-        _print(result.output, result.report)
+    tell_result(args, result, lambda: _print(result.output, result.report))
     return 0
 
 

@@ -29,11 +29,10 @@ from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
 from sfmapp.pipelines.calibration.pictures import BoardPictures, look_at_pictures
-from sfmapp.pipelines.calibration.results import write_camera
+from sfmapp.pipelines.calibration.results import write_camera, write_recording
 from sfmapp.report.calibration_html import render_board_html
 from sfmapp.report.model import CalibrateReport
-from sfmapp.viewer.calibration_recording import record_calibration
-from sfmapp.workspace.job import FAILED, WRITTEN, Job
+from sfmapp.workspace.job import Job
 from sfmapp.workspace.layout import CALIBRATE, REPORT
 from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
@@ -160,11 +159,7 @@ def _fit_of(solution: Solution, views: Sequence[TargetView]) -> Fit:
 
 def _record(job: Job, board: Board, pictures: BoardPictures, made: CameraCalibration) -> None:
     paths = {one.name: str(one.path) for one in pictures.pictures if one.path is not None}
-    outline = _outline(board)
-    told = record_calibration(job.workspace.recording, made, outline, paths, Path(job.source).name)
-    job.workspace.note(recording=FAILED if told.problem else WRITTEN)
-    if told.problem:
-        job.events.warned("recording", f"no recording: {told.problem}")
+    write_recording(job, made, _outline(board), paths, Path(job.source).name)
 
 
 def _outline(board: Board) -> NDArray[np.float64]:

@@ -39,13 +39,13 @@ from sfmapp.images.folder import describe_images
 from sfmapp.images.image_set import ImageOptions, ImageRecord
 from sfmapp.images.pixels import read_gray, read_rgb
 from sfmapp.pipelines.calibration.model_points import find_model_points
-from sfmapp.pipelines.calibration.results import write_camera
+from sfmapp.pipelines.calibration.results import write_camera, write_recording
 from sfmapp.report.point_html import draw_residuals, render_location_html, render_target_html
 from sfmapp.reporting import document_text
-from sfmapp.viewer.calibration_recording import record_calibration
-from sfmapp.workspace.job import FAILED, WRITTEN, Job
+from sfmapp.workspace.job import Job
 from sfmapp.workspace.layout import CALIBRATE, LOCATE, REPORT
 from sfmapp.workspace.usage import Stopwatch
+from sfmapp.workspace.workspace import Workspace
 
 Array = NDArray[np.float64]
 
@@ -126,7 +126,7 @@ def calibrate_from_target(
         report = target_report(fit, points.facts, files)
         write_pose(folder / POSE_FILE, fit.view, fit.whole_covariance, fit.noise.sigma_px, points.facts, points.xyz)
         picture = draw_residuals(read_rgb(record), record.orientation, report.fit.points)
-        _write(folder, picture[0], render_target_html(report, picture), document_text(report))
+        _write(job.workspace, picture[0], render_target_html(report, picture), document_text(report))
         _tell(report.fit.warnings, job.events)
         if recording:
             _record(job, record, fit)
@@ -172,7 +172,7 @@ def locate(
         report = location_report(found, points.facts, points.xy)
         write_pose(folder / POSE_FILE, found.view, found.covariance, found.noise.sigma_px, points.facts, points.xyz)
         picture = draw_residuals(read_rgb(record), record.orientation, report.fit.points)
-        _write(folder, picture[0], render_location_html(report, picture), document_text(report))
+        _write(job.workspace, picture[0], render_location_html(report, picture), document_text(report))
         _tell(report.fit.warnings, job.events)
         job.workspace.save()
         return LocateResult(folder, report, found)
@@ -266,11 +266,7 @@ def _record(job: Job, record: ImageRecord, fit: TargetFit) -> None:
     axes = np.linalg.svd(xyz - middle)[2][:2]
     low, high = ((xyz - middle) @ axes.T).min(0), ((xyz - middle) @ axes.T).max(0)
     outline = middle + np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) @ axes
-    made = fit.calibration(record.name)
-    told = record_calibration(job.workspace.recording, made, outline, {record.name: str(record.path)}, record.name)
-    job.workspace.note(recording=FAILED if told.problem else WRITTEN)
-    if told.problem:
-        job.events.warned("recording", f"no recording: {told.problem}")
+    write_recording(job, fit.calibration(record.name), outline, {record.name: str(record.path)}, record.name)
 
 
 # ------------------------------------------------------------------------------------------------------------- reading
@@ -347,9 +343,8 @@ def _tell(warnings: Sequence[str], events: Events) -> None:
         events.warned(CALIBRATE, warning)
 
 
-def _write(folder: Path, picture: bytes, page: str, report: str) -> None:
-    with replaced_file(folder / PICTURE) as beside:
+def _write(workspace: Workspace, picture: bytes, page: str, report: str) -> None:
+    with replaced_file(workspace.folder / PICTURE) as beside:
         beside.write_bytes(picture)
-    for name, text in ((PAGE, page), (REPORT, report)):
-        with replaced_file(folder / name) as beside:
-            beside.write_text(text, encoding="utf-8", errors="backslashreplace")
+    workspace.write_text(PAGE, page)
+    workspace.write_text(REPORT, report)

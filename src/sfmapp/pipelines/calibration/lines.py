@@ -91,8 +91,7 @@ def calibrate_lines(
         lines = LinesReport(**{**found.report, "files": files})
         report = CalibrateLinesReport(lines=lines, skipped=skipped, run=job.facts())
         job.workspace.write_json(REPORT, report)
-        with replaced_file(job.workspace.folder / HTML) as beside:
-            beside.write_text(lines_page(report, found.calibration, shown), encoding="utf-8")
+        job.workspace.write_text(HTML, lines_page(report, found.calibration, shown))
         job.workspace.save()
         return LinesResult(job.workspace.folder, found.calibration, report)
 

@@ -4,12 +4,28 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sfmapp.calibration.file import write_calibration
 from sfmapp.calibration.report import CameraFileReport
 from sfmapp.calibration.result import CameraCalibration
 from sfmapp.camera_files.writing import write_camera_files
+from sfmapp.viewer.calibration_recording import record_calibration
+from sfmapp.workspace.job import FAILED, WRITTEN, Job
 
 CALIBRATION = "calibration.json"
+
+
+def write_recording(
+    job: Job, made: CameraCalibration, outline: NDArray[np.float64], photographs: dict[str, str], title: str
+) -> None:
+    """Write ``recording.rrd``, or warn why there is none; arguments as of
+    :func:`~sfmapp.viewer.calibration_recording.record_calibration`."""
+    told = record_calibration(job.workspace.recording, made, outline, photographs, title)
+    job.workspace.note(recording=FAILED if told.problem else WRITTEN)
+    if told.problem:
+        job.events.warned("recording", f"no recording: {told.problem}")
 
 
 def write_camera(folder: Path, calibration: CameraCalibration, name: str = "camera") -> list[CameraFileReport]:
