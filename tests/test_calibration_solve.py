@@ -34,11 +34,12 @@ def seen(camera: Camera, num: int, noise_px: float, seed: int, bend: float = 0.0
     return board_views(camera, BOARD, board_poses(rng, BOARD, num, camera), noise_px, rng, bend)
 
 
-def test_a_homography_is_exact() -> None:
+@pytest.mark.parametrize("num", [4, 12])
+def test_a_homography_is_exact(num: int) -> None:
     rng = np.random.default_rng(0)
     h = np.array([[1.2, 0.1, 300.0], [-0.2, 0.9, 200.0], [1e-4, -2e-4, 1.0]])
-    xy = rng.uniform(0, 9, (12, 2))
-    mapped = np.concatenate([xy, np.ones((12, 1))], 1) @ h.T
+    xy = rng.uniform(0, 9, (num, 2))
+    mapped = np.concatenate([xy, np.ones((num, 1))], 1) @ h.T
     np.testing.assert_allclose(find_homography(xy, mapped[:, :2] / mapped[:, 2:]), h, rtol=1e-9)
 
 
