@@ -368,12 +368,19 @@ def test_a_sensor_that_contradicts_the_map_is_red_and_gives_no_metres(tmp_path: 
 
 
 def test_a_sensor_that_took_part_gives_metres_unless_others_are_asked_for(tmp_path: Path, monkeypatch: Patch) -> None:
-    evidence = InertialEvidence(num_poses=9, num_intervals=8, residual=1.1, clock_offset_s=0.03, clock_sigma_s=1e-4)
+    evidence = InertialEvidence(
+        num_poses=9, num_intervals=8, residual=1.1, clock_offset_s=0.03, clock_sigma_s=1e-4,
+        mounting_turn_deg=[0.1, -0.2, 0.1], mounting_turn_sigma_deg=[0.01] * 3,
+        mounting_shift_m=[0.0, 0.05, 0.001], mounting_shift_sigma_m=[0.004] * 3,
+    )  # fmt: skip
     use(monkeypatch, inertial_sequence(), FakeRunner(inertial=ScaleEstimate(2.0, 0.004, "imu", evidence)))
     report = run(tmp_path / "imu").report
     assert (report["maps"][0]["scale_source"], report["maps"][0]["scale_sigma"]) == ("imu", 0.004)
     assert report["maps"][0]["path_length"] == pytest.approx(24, rel=0.05)
     assert any("stamped 30.0 ms late" in warning["message"] for warning in report["warnings"])
+    (away,) = (warning["message"] for warning in report["warnings"] if "mounting" in warning["message"])
+    assert "0.050 +- 0.004" in away
+    assert "turned" not in away  # no calibration is better than that
     for source in ("arbitrary", "distance:0:40:3"):
         report = run(tmp_path / source[:4], f"scale.source={source}").report
         assert report["maps"][0]["scale_source"] == source.partition(":")[0].replace("arbitrary", "none")

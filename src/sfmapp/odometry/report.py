@@ -219,6 +219,8 @@ class InertialEvidence(Report):
         gravity_in_map: (3,) m/s^2, downwards. gravity_sigma_deg: of its direction.
         gyro_bias, accel_bias: (3,) rad/s and m/s^2.
         clock_offset_s, clock_sigma_s: to be added to a time of the frames for that of the measurements.
+        mounting_turn_deg: (3,) how the sensor is turned from the given mounting, about its own axes; mounting_shift_m:
+            (3,) how far it is from its given place, along the camera's axes; and their standard deviations.
         explained_by: what may be wrong with the measurements, where they contradict the map.
     """
 
@@ -235,6 +237,10 @@ class InertialEvidence(Report):
     accel_bias: Sequence[float] | None = None
     clock_offset_s: float | None = None
     clock_sigma_s: float | None = None
+    mounting_turn_deg: Sequence[float] | None = None
+    mounting_turn_sigma_deg: Sequence[float] | None = None
+    mounting_shift_m: Sequence[float] | None = None
+    mounting_shift_sigma_m: Sequence[float] | None = None
     explained_by: Sequence[Fault] | None = None
 
 

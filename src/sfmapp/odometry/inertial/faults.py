@@ -48,6 +48,8 @@ _MAX_POSES = 100
 # Readings that are aligned in full; how much more one may leave than the best to be named beside it; and the share of
 # that which one with more faults has to leave, or a unit that nothing tells would be named with every missing gravity.
 _NUM_TRIED, _ALIKE, _BY_ONE_MORE = 4, 2.0, 0.7
+# Rotation matrices of which the difference has a smaller part of their norm are within four degrees: one fault.
+_ALIKE_TURN = 0.05
 _ROUNDS = 5  # of the linear system: enough to tell right from wrong
 # Costs are halved squares: what costs so much more than the best is out of the question.
 _MAX_COST = 20.0
@@ -109,10 +111,20 @@ def _explaining(
     accepted.sort(key=lambda row: (row[0].num_faults, row[1]))
     kept: list[tuple[_Case, float]] = []
     for case, left in accepted:
+        if any(_is_same(case, other) for other, _ in kept):
+            continue
         least = min((other for _, other in kept), default=np.inf)
         if left < (_BY_ONE_MORE * least if kept and case.num_faults > kept[0][0].num_faults else _ALIKE * least):
             kept.append((case, left))
     return kept
+
+
+def _is_same(case: _Case, other: _Case) -> bool:
+    """Whether two readings differ by no more than a turn of the mounting that the alignment finds by itself."""
+    if case.has_no_gravity != other.has_no_gravity or not np.allclose(case.gyro.imu_from_cam, other.gyro.imu_from_cam):
+        return False
+    pairs = ((case.gyro.factor * case.gyro.axes, other.gyro.factor * other.gyro.axes), (case.matrix, other.matrix))
+    return all(np.linalg.norm(a - b) < _ALIKE_TURN * np.linalg.norm(a) for a, b in pairs)
 
 
 def _told(refusal: ScaleRefusal, kept: list[tuple[_Case, float]], imu: Imu) -> ScaleRefusal:

@@ -6,10 +6,13 @@ Scaramuzza, "On-manifold preintegration for real-time visual-inertial odometry",
 frame and its own unit of length: how it lies in the world, its scale, its vertical and the offset between the clocks,
 is one more variable that all inertial factors share, as in Mur-Artal and Tardos, "Visual-inertial monocular SLAM with
 map reuse", RA-L 2017, and Qin and Shen, "Online temporal calibration for monocular visual-inertial systems", IROS 2018.
+So is where the sensor sits on the camera, about where it is said to: Kelly and Sukhatme, "Visual-inertial sensor
+fusion: localization, mapping and sensor-to-sensor self-calibration", IJRR 2011.
 
 Variables beside the poses ``X(i)``: ``V(i)`` (3) m/s of the sensor in the z-up world; ``B(i)``
 gtsam.imuBias.ConstantBias; ``A(0)`` (4) the logarithm of the metres in a map unit, two angles of tilt, and the seconds
-after its time at which an image was taken.
+after its time at which an image was taken; ``M(0)`` (6) how the sensor sits other than given: a turn about its own axes
+in radians, and a way along the camera's axes in metres.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import A, B, V, X
+from gtsam.symbol_shorthand import A, B, M, V, X
 from numpy.typing import NDArray
 
 from sfmapp.adjust.covariance import similarity_basis
@@ -46,6 +49,9 @@ Ints = NDArray[np.int64]
 # What the gyroscope leaves of the offset between the clocks is a millisecond where the rotations tell it; where they do
 # not, cameras and sensors that are meant to be synchronous are within half a hundred.
 _CLOCK_SIGMA_S = 0.05
+# Mountings come from a calibration, a drawing or a ruler. By the worst of these the chip is anywhere in a housing of a
+# few centimetres, on a board that is screwed in to a degree.
+_TURN_SIGMA, _ARM_SIGMA_M = 0.02, 0.03
 # Nothing to speak of is known of the scale (its logarithm) and the tilt beforehand; this only keeps them from running
 # away.
 _OPEN = 10.0
@@ -69,7 +75,8 @@ class Solved(NamedTuple):
         report: of the adjustment.
         alignment: (4,) see :mod:`sfmapp.odometry.inertial.graph`; world_from_map: (3, 3) rotation, tilt included.
         covariance: (4, 4) of the alignment, the scale that of the spread of the keyframes and the tilt against their
-            mean rotation; poses: (K, 6, 6) of the keyframes in the gauge of centroid, mean rotation and spread. All are
+            mean rotation; mounting: (6,), mounting_covariance: (6, 6) likewise.
+        poses: (K, 6, 6) of the keyframes in the gauge of centroid, mean rotation and spread. All are
             infinite where the motion leaves anything open.
         linked: (J,) keyframes between which something was integrated.
         velocity: (J, 3), bias: (J, 6) accel and gyro; bias_sigma: (6,) at the middle one.
@@ -82,6 +89,8 @@ class Solved(NamedTuple):
     alignment: Array
     world_from_map: Array
     covariance: Array
+    mounting: Array
+    mounting_covariance: Array
     poses: Array
     linked: Ints
     velocity: Array
@@ -171,6 +180,7 @@ class _Graph:
         values, start, world_from_map = gtsam.Values(), self._start, self._place.world_from_map
         scale = 1.0 if self._seen.is_metric else 1.0 / start.inverse_scale
         values.insert(A(0), np.array([np.log(scale), 0.0, 0.0, 0.0]))
+        values.insert(M(0), np.zeros(6))
         map_from_cam = rigid3.inverse(self._seen.poses)
         turned = world_from_map @ rigid3.rotation_matrix(map_from_cam)
         center = scale * map_from_cam[:, 4:] @ world_from_map.T + turned @ self._place.arm
@@ -203,7 +213,9 @@ class _Graph:
             first, second = interval.first, interval.second
             link = InertialLink(sums, self._place, self._rates[[first, second]], weight)
             a, b = self._image(first), self._image(second)
-            graph.add(gtsam.CustomFactor(noise, [X(a), V(a), B(a), X(b), V(b), B(b), A(0)], link.error), "inertial")
+            graph.add(
+                gtsam.CustomFactor(noise, [X(a), V(a), B(a), X(b), V(b), B(b), A(0), M(0)], link.error), "inertial"
+            )
             if first not in started:  # the first of a chain of intervals
                 sigmas = np.repeat([ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3)
                 prior = gtsam.imuBias.ConstantBias(np.zeros(3), self._gyro_bias)
@@ -213,7 +225,8 @@ class _Graph:
         return graph
 
     def _hold(self, graph: FactorGraph) -> None:
-        """What is known of the alignment beforehand, and a length in the map that holds its unit where that is free."""
+        """What is known beforehand of the alignment and the mounting, and a length that holds the map's unit where that
+        is free."""
         seen, center = self._seen, np.zeros(4)
         sigmas = np.array([_OPEN, _OPEN, _OPEN, _CLOCK_SIGMA_S])
         if seen.scale_sigma is not None:
@@ -225,26 +238,29 @@ class _Graph:
             length = gtsam.noiseModel.Isotropic.Sigma(1, 1e-3 * away[far])
             graph.add(gtsam.RangeFactorPose3(X(0), X(self._image(far)), away[far], length))
         graph.add(gtsam.PriorFactorVector(A(0), center, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+        mounted = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([_TURN_SIGMA, _ARM_SIGMA_M], 3))
+        graph.add(gtsam.PriorFactorVector(M(0), np.zeros(6), mounted), "mounting")
 
     def read(self, report: AdjustReport, residual: float) -> Solved:
         """Estimates and marginals."""
         values, images = self._values, [self._image(k) for k in range(len(self._seen.times_s))]
         middle = B(self._image(self.linked[len(self.linked) // 2]))
         num, bias_sigma = len(self._seen.times_s), np.full(6, np.inf)
-        covariance, poses = np.full((4, 4), np.inf), np.full((num, 6, 6), np.inf)
+        covariance, poses, of_mounting = (np.full(n, np.inf) for n in ((4, 4), (num, 6, 6), (6, 6)))
         try:
-            marginals = self._graph.marginal_covariance(images=images[1:], variables=[A(0), middle])
+            marginals = self._graph.marginal_covariance(images=images[1:], variables=[A(0), M(0), middle])
             if marginals.is_determined:
-                covariance, poses = self._in_gauge(marginals.matrix[:-6, :-6])
+                covariance, poses = self._in_gauge(marginals.matrix[:-12, :-12])
+                of_mounting = marginals.of_variable(M(0))
                 bias_sigma = np.sqrt(np.diag(marginals.of_variable(middle)))
         except np.linalg.LinAlgError:
             pass  # open: a variable of the sensor itself
         bias = np.array([values.atConstantBias(B(self._image(k))).vector() for k in self.linked])
-        alignment = values.atVector(A(0))
+        alignment, mounting = values.atVector(A(0)), values.atVector(M(0))
         return Solved(
-            self._graph.reconstruction, report, alignment, self._place.turned(alignment).matrix(), covariance, poses,
-            self.linked, np.array([values.atVector(V(self._image(k))) for k in self.linked]), bias,
-            bias_sigma, residual,
+            self._graph.reconstruction, report, alignment, self._place.turned(alignment).matrix(), covariance,
+            mounting, of_mounting, poses, self.linked,
+            np.array([values.atVector(V(self._image(k))) for k in self.linked]), bias, bias_sigma, residual,
         )  # fmt: skip
 
     def _in_gauge(self, joint: Array) -> tuple[Array, Array]:
@@ -311,33 +327,40 @@ class Placement:
         """gtsam.Rot3 of the map in the world, tilt included."""
         return gtsam.Rot3.Expmap(np.array([alignment[1], alignment[2], 0.0])).compose(self._world_from_map)
 
-    def sensor(self, pose: Any, velocity: Array, alignment: Array, rate: Array) -> Any:
+    def sensor(self, pose: Any, velocity: Array, alignment: Array, mounting: Array, rate: Array) -> Any:
         """At the time of an image, which was taken some milliseconds of the offset later; over these the sensor turns
         at its rate (3,) in rad/s and moves at its velocity (3,)."""
         later = self.turned(alignment)
         turned, offset = later.compose(pose.rotation()), alignment[3]
-        center = np.exp(alignment[0]) * later.rotate(pose.translation()) + turned.rotate(self.arm)
-        rotation = turned.compose(self._cam_from_imu).compose(gtsam.Rot3.Expmap(-offset * rate))
+        center = np.exp(alignment[0]) * later.rotate(pose.translation()) + turned.rotate(self.arm + mounting[3:])
+        mounted = self._cam_from_imu.compose(gtsam.Rot3.Expmap(mounting[:3]))
+        rotation = turned.compose(mounted).compose(gtsam.Rot3.Expmap(-offset * rate))
         return gtsam.Pose3(rotation, center - offset * velocity)
 
-    def slopes(self, pose: Any, velocity: Array, alignment: Array, rate: Array) -> tuple[Array, Array, Array]:
-        """Of the sensor's tangent, (6, 6) by the pose's, (6, 3) by the velocity and (6, 4) by the alignment."""
-        sensor, later = self.sensor(pose, velocity, alignment, rate), self.turned(alignment).matrix()
+    def slopes(
+        self, pose: Any, velocity: Array, alignment: Array, mounting: Array, rate: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Of the sensor's tangent, (6, 6) by the pose's, (6, 3) by the velocity, (6, 4) by the alignment and (6, 6) by
+        the mounting."""
+        sensor, later = self.sensor(pose, velocity, alignment, mounting, rate), self.turned(alignment).matrix()
         back, turned = sensor.rotation().matrix().T, later @ pose.rotation().matrix()
         scale, offset = np.exp(alignment[0]), alignment[3]
         by_pose, by_velocity, by_alignment = np.zeros((6, 6)), np.zeros((6, 3)), np.zeros((6, 4))
         by_pose[:3, :3] = back @ turned
-        by_pose[3:, :3] = -back @ turned @ _skew(self.arm)
+        by_pose[3:, :3] = -back @ turned @ _skew(self.arm + mounting[3:])
         by_pose[3:, 3:] = scale * back @ turned
         by_velocity[3:] = -offset * back
         of_tilt = gtsam.Rot3.ExpmapDerivative(-np.array([alignment[1], alignment[2], 0.0]))[:, :2]
         center = sensor.translation() + offset * velocity
         by_alignment[:3, 1:3] = back @ of_tilt
         by_alignment[:3, 3] = -rate
-        by_alignment[3:, 0] = back @ (center - turned @ self.arm)
+        by_alignment[3:, 0] = back @ (center - turned @ (self.arm + mounting[3:]))
         by_alignment[3:, 1:3] = -back @ _skew(center) @ of_tilt
         by_alignment[3:, 3] = -back @ velocity
-        return by_pose, by_velocity, by_alignment
+        by_mounting = np.zeros((6, 6))
+        by_mounting[:3, :3] = gtsam.Rot3.Expmap(offset * rate).matrix() @ gtsam.Rot3.ExpmapDerivative(mounting[:3])
+        by_mounting[3:, 3:] = back @ turned
+        return by_pose, by_velocity, by_alignment, by_mounting
 
 
 def _skew(v: Array) -> Array:
@@ -361,11 +384,11 @@ class InertialLink:
         self._place, self._rates, self._weight = place, rates, weight
 
     def error(self, factor: Any, values: Any, slopes: Any) -> Array:
-        """The residual (15,), and its slopes by X, V, B of the first image, of the second, and A."""
+        """The residual (15,), and its slopes by X, V, B of the first image, of the second, A and M."""
         keys = factor.keys()
-        alignment, inner, states = values.atVector(keys[6]), gtsam.Values(), []
+        shared, inner, states = (values.atVector(keys[6]), values.atVector(keys[7])), gtsam.Values(), []
         for n, (x, v, b) in enumerate((keys[:3], keys[3:6])):
-            state = (values.atPose3(x), values.atVector(v), alignment, self._rates[n])
+            state = (values.atPose3(x), values.atVector(v), *shared, self._rates[n])
             states.append(state)
             inner.insert(_SENSOR[2 * n], self._place.sensor(*state))
             inner.insert(_SENSOR[2 * n + 1], state[1])
@@ -374,13 +397,14 @@ class InertialLink:
             return np.asarray(self._weight * self._factor.whitenedError(inner), np.float64)
         linear = self._factor.linearize(inner)
         matrix, right = linear.jacobian()
-        by_alignment = np.zeros((15, 4))
+        by_alignment, by_mounting = np.zeros((15, 4)), np.zeros((15, 6))
         for n, columns in enumerate((slice(0, 9), slice(9, 18))):
             by_sensor, by_velocity = matrix[:, columns][:, :6], matrix[:, columns][:, 6:]
-            of_pose, of_velocity, of_alignment = self._place.slopes(*states[n])
+            of_pose, of_velocity, of_alignment, of_mounting = self._place.slopes(*states[n])
             slopes[3 * n] = self._weight * by_sensor @ of_pose
             slopes[3 * n + 1] = self._weight * (by_velocity + by_sensor @ of_velocity)
             slopes[3 * n + 2] = self._weight * matrix[:, 18 + 6 * n : 24 + 6 * n]
             by_alignment += by_sensor @ of_alignment
-        slopes[6] = self._weight * by_alignment
+            by_mounting += by_sensor @ of_mounting
+        slopes[6], slopes[7] = self._weight * by_alignment, self._weight * by_mounting
         return np.asarray(-self._weight * right, np.float64)

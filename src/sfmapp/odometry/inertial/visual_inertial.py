@@ -171,7 +171,13 @@ def _read(solved: Solved, evidence: InertialEvidence) -> InertialAlignment:
         evidence, residual=solved.residual,
         gravity_sigma_deg=float(np.degrees(gravity_sigma)) if np.isfinite(gravity_sigma) else None,
         gyro_bias=bias[3:].tolist(), accel_bias=bias[:3].tolist(), gravity_in_map=gravity.tolist(),
+        mounting_turn_deg=np.degrees(solved.mounting[:3]).tolist(), mounting_shift_m=solved.mounting[3:].tolist(),
     )  # fmt: skip
+    if np.isfinite(solved.mounting_covariance).all():
+        sigma = np.sqrt(np.diag(solved.mounting_covariance))
+        evidence = replace(
+            evidence, mounting_turn_sigma_deg=np.degrees(sigma[:3]).tolist(), mounting_shift_sigma_m=sigma[3:].tolist()
+        )
     return InertialAlignment(
         solved.model, solved.poses, solved.report, scale, float(np.sqrt(variance[0])),
         similarity.from_parts(up, np.zeros(3), scale), gravity, gravity_sigma, solved.linked,

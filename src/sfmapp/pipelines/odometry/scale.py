@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +34,8 @@ from sfmapp.odometry.result import MapResult, OdometryResult
 STAGE = "scale"
 # Clocks that differ by less are as good as one: exposures alone shift them by so much.
 _WORTH_SAYING_S = 5e-3
+# Mountings as calibrations give them are good to this.
+_WORTH_SAYING_DEG, _WORTH_SAYING_M = 0.5, 0.01
 Array = NDArray[np.float64]
 
 
@@ -122,8 +125,9 @@ def scale_maps(result: OdometryResult, scale_request: ScaleRequest, events: Even
             row = replace(row, metres_per_unit=found.scale, sigma_relative=found.sigma_relative)
             text = f"map {m} is in metres, from {found.source.replace('_', ' ')}, to {100 * found.sigma_relative:.2g} %"
             events.decided(STAGE, text, **row)
-            if apart := _clocks_apart(found.evidence):
-                events.warned(STAGE, f"map {m}: {apart}")
+            for apart in (_clocks_apart(found.evidence), _mounted_otherwise(found.evidence)):
+                if apart:
+                    events.warned(STAGE, f"map {m}: {apart}")
         else:
             row = replace(row, reason=found.reason)
             if found.contradiction is not None:
@@ -143,6 +147,28 @@ def _clocks_apart(evidence: ScaleEvidence) -> str:
         return ""
     side = "late" if offset > 0 else "early"
     return f"the inertial measurements are stamped {1e3 * abs(offset):.1f} ms {side}; this is taken into account"
+
+
+def _mounted_otherwise(evidence: ScaleEvidence) -> str:
+    """How the sensor sits on the camera, where that is clearly not what was given; empty elsewhere."""
+    if not isinstance(evidence, InertialEvidence):
+        return ""
+    turn = _if_clear(evidence.mounting_turn_deg, evidence.mounting_turn_sigma_deg, _WORTH_SAYING_DEG)
+    way = _if_clear(evidence.mounting_shift_m, evidence.mounting_shift_sigma_m, _WORTH_SAYING_M)
+    parts = [f"turned by ({turn}) degrees"] * bool(turn) + [f"({way}) m away"] * bool(way)
+    if not parts:
+        return ""
+    return (
+        f"the inertial sensor is {' and '.join(parts)} from where the given mounting (T_BS, imu_from_cam) has it; "
+        "this is taken into account"
+    )
+
+
+def _if_clear(value: Iterable[float] | None, sigma: Iterable[float] | None, least: float) -> str:
+    """Components with their standard deviations, if any is larger than three of these and than what is worth saying."""
+    if value is None or sigma is None or not any(abs(v) > max(least, 3 * s) for v, s in zip(value, sigma, strict=True)):
+        return ""
+    return ", ".join(f"{v:.3f} +- {s:.3f}" for v, s in zip(value, sigma, strict=True))
 
 
 def rescale(result: OdometryResult, map_idx: int, found: ScaleEstimate) -> None:
