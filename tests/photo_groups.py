@@ -39,8 +39,9 @@ class Place:
 
 
 def make_place(
-    seed: int, num_groups: int, *, images: int = 6, points: int = 500, overlap: float = 0.25, between: float = 0.3
-) -> Place:
+    seed: int, num_groups: int, *, images: int = 6, points: int = 500, overlap: float = 0.25, between: float = 0.3,
+    depth: float = 1.5,
+) -> Place:  # fmt: skip
     """Draw a place.
 
     Args:
@@ -50,6 +51,7 @@ def make_place(
         points: on the piece of the facade that a group looks at.
         overlap: share of the width of its pictures that a group shares with the next.
         between: share of the true matches that are found between groups.
+        depth: of the facade, in metres to either side.
     """
     rng = np.random.default_rng([seed, 0x6509])
     cameras, poses, group, centers_x, x0 = [], [], [], [], 0.0
@@ -66,7 +68,7 @@ def make_place(
         group += [g] * images
     low, high = -1.0, centers_x[-1][1] + 1.0
     num = int(points * (high - low) / (2 * np.mean([b - a for a, b in centers_x])))
-    xyz = np.stack([rng.uniform(low, high, num), rng.uniform(-3, 3, num), rng.uniform(-1.5, 1.5, num)], 1)
+    xyz = np.stack([rng.uniform(low, high, num), rng.uniform(-3, 3, num), rng.uniform(-depth, depth, num)], 1)
     scene = _observe(cameras, np.array(poses), np.array(group, np.int32), xyz, rng)
     return _place(scene, np.array(group), between, rng)
 

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from photo_groups import Place, make_place, thinned
+from photo_groups import WIDTH, Place, make_place, thinned
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.events import Event, Events
@@ -81,6 +81,31 @@ def test_points_that_two_models_see_tell_how_they_lie_to_each_other(seed):
     # ten metres away and half a pixel over a focal length of a thousand: 5 mm for one point, hundreds average it
     assert 1e-6 < np.linalg.norm(similarity.apply(error, ground_truth) - ground_truth, axis=1).max() < 0.05
     assert error[7] == pytest.approx(1.0, abs=5e-3)
+
+
+def mirrored(model: Reconstruction, chosen: np.ndarray) -> None:
+    """Pictures of some images mirrored from left to right, and the model of what they then show, in place."""
+    seen = chosen[model.tracks.obs_image_idx]
+    model.tracks.obs_xy[seen, 0] = WIDTH - model.tracks.obs_xy[seen, 0]
+    turn = np.diag([-1.0, 1.0, 1.0])
+    rotation = turn @ rigid3.rotation_matrix(model.cam_from_world) @ turn
+    model.cam_from_world[:] = rigid3.from_matrix(rotation, model.cam_from_world[:, 4:] @ turn)
+    model.point_xyz[:, 0] *= -1.0
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("depth", [0.02, 1.5])
+def test_a_group_of_mirrored_photographs_is_told_from_a_right_one(seed, depth):
+    place = make_place(seed, 2, points=300, overlap=0.3, depth=depth)
+    with ThreadPoolExecutor(1) as pool:
+        target, source = halves(place, pool)
+    assert find_joint(target, source, place.correspondences, MappingOptions()).reason == ""
+    mirrored(source, place.group == 1)
+    joint = find_joint(target, source, place.correspondences, MappingOptions())
+    if depth < 0.1:  # it is the plane, seen from its back: nothing else speaks against that
+        assert joint.num_agreeing > 0.7 * joint.num_links
+        assert "seen mirrored" in joint.reason
+    assert joint.reason
 
 
 def test_models_that_see_nothing_in_common_stay_apart_and_say_so():

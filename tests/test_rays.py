@@ -159,6 +159,19 @@ def test_three_rays_allow_the_true_pose(seed: int) -> None:
         assert np.linalg.det(r) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("same", [(0, 1), (0, 2), (1, 2)])
+def test_two_points_may_be_seen_along_one_ray(same: tuple[int, int]) -> None:
+    # a keypoint that matches two points: a division by zero ended the run in one of four such samples
+    rotations, translations = np.empty((4, 3, 3)), np.empty((4, 3))
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        xyz, rays = rng.normal(size=(3, 3)), unit(rng.normal((0.0, 0.0, 3.0), 1.0, (3, 3)))
+        rays[same[1]] = rays[same[0]]
+        count = p3p.poses_of_three(xyz, rays, rotations, translations)
+        for r, t in zip(rotations[:count], translations[:count], strict=True):
+            np.testing.assert_allclose(unit(xyz @ r.T + t), rays, atol=1e-5)
+
+
 @pytest.mark.parametrize("seed", range(10))
 def test_in_front_the_poses_are_those_of_opencv(seed: int) -> None:
     rng = np.random.default_rng(seed)

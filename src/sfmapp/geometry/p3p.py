@@ -112,10 +112,10 @@ def poses_of_three(xyz: Array, rays: Array, rotations: Array, translations: Arra
         if abs(roots[k].imag) > 1e-4 * max(1.0, abs(v)) or v <= 0.0 or abs(cos_c - v * cos_a) < 1e-12:
             continue
         u = ((d - 1.0) * v * v - 2.0 * d * cos_b * v + 1.0 + d) / (2.0 * (cos_c - v * cos_a))
-        first2 = b2 / (1.0 + v * v - 2.0 * v * cos_b)
-        if u <= 0.0 or not first2 > 0.0:
+        between = 1.0 + v * v - 2.0 * v * cos_b  # nothing where two points are seen along one ray
+        if u <= 0.0 or not between > 0.0:
             continue
-        distance[0] = math.sqrt(first2)
+        distance[0] = math.sqrt(b2 / between)
         distance[1], distance[2] = u * distance[0], v * distance[0]
         if not _polish(distance, cosines, sides):
             continue

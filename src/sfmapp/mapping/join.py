@@ -10,7 +10,7 @@ knows) with a vote on the scale; all are scored, and the best refined, by reproj
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from sfmapp.camera.camera import bearings, pixels_to_rays
 from sfmapp.camera.lens import across_seam, project
 from sfmapp.geometry import resection, rigid3, similarity
+from sfmapp.geometry.sidedness import triangles_kept
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.mapping.merge import merge, num_linking_points
 from sfmapp.mapping.near_views import missing_between
@@ -46,6 +47,8 @@ SCALE_TOLERANCE = 0.05
 NUM_REFINED = 3
 # Links that must agree, as a share of all: the rest are mismatches, of which weak pairs have many.
 MIN_LINK_SHARE = 0.4
+# Truncated squared error of a link that agrees, of 1 at most.
+AGREEING_COST = 0.5
 # Share of the matches which agree with each model that must still do so in the union: a wrong one is torn.
 MIN_KEPT = 0.95
 
@@ -75,7 +78,7 @@ class _Checks(NamedTuple):
             source in images of the target.
         xyz: (C, 3) points in the world of their model. xy: (C, 2) pixels.
         image_idx: (C,) the images; rotation: (C, 3, 3), translation: (C, 3), canonical: (C, 17) theirs.
-        num_links: L.
+        link_tracks: (L, 2) of each link, in the target and in the source.
         point_target, point_source: (B, 3) points of the links that are triangulated on both sides, in either world.
     """
 
@@ -89,9 +92,14 @@ class _Checks(NamedTuple):
     translation: Array
     canonical: Array
     ray: Array
-    num_links: int
+    link_tracks: Ints
     point_target: Array
     point_source: Array
+
+    @property
+    def num_links(self) -> int:
+        """L."""
+        return len(self.link_tracks)
 
     @property
     def is_forward(self) -> Bools:
@@ -133,6 +141,9 @@ def find_joint(
     num_agreeing, reason = int(agreeing[chosen]), ""
     if num_agreeing < needed:
         reason = f"{num_agreeing} of {checks.num_links} common points agree on one place, at least {needed} are needed"
+    else:
+        agrees = _agrees(refined[chosen], checks, tolerance_px)
+        reason = _seen_from_behind(target, source, correspondences, checks.link_tracks[agrees])
     return Joint(refined[chosen], checks.num_links, num_agreeing, reason)
 
 
@@ -256,7 +267,7 @@ def _checks(target: Reconstruction, source: Reconstruction, correspondences: Cor
             _coarse_rays(viewer, c, viewer.tracks.obs_xy[obs])
             for (_, _, viewer, obs), c in zip(parts, camera, strict=True)
         ]),
-        len(track_target),
+        np.stack([track_target, track_source], 1),
         target.point_xyz[track_target[both]], source.point_xyz[track_source[both]],
     )  # fmt: skip
 
@@ -280,26 +291,32 @@ def _links(model: Reconstruction, sides: tuple[Bools, Bools], correspondences: C
     for side in range(2):
         seen[side, tracks.obs_track_idx[sides[side][tracks.obs_image_idx]]] = True
     shared = np.flatnonzero(seen.all(axis=0))
-    found = [np.stack([shared, shared], 1)]
+    between = [tracks.obs_track_idx[obs] for obs in _matches_between(model, sides, correspondences)]
+    links = np.unique(np.concatenate([np.stack([shared, shared], 1), *between]).astype(np.int64), axis=0)
+    return links[:, 0], links[:, 1]
+
+
+def _matches_between(
+    model: Reconstruction, sides: tuple[Bools, Bools], correspondences: Correspondences
+) -> Iterator[Ints]:
+    """Of each verified pair between the sides the observations (K, 2) that match, on the first side and on the
+    second."""
     pairs = correspondences.pair_image_idx
     for a, b in ((0, 1), (1, 0)):
         for p in np.flatnonzero(sides[a][pairs[:, 0]] & sides[b][pairs[:, 1]]):
             matches = correspondences.matches_of_pair(int(p))
-            track = np.stack([_tracks_of(model, int(pairs[p, s]), matches[:, s]) for s in (0, 1)], 1)
-            apart = (track >= 0).all(axis=1) & (track[:, 0] != track[:, 1])
-            found.append(track[apart][:, [a, b]])
-    links = np.unique(np.concatenate(found), axis=0)
-    return links[:, 0], links[:, 1]
+            obs = np.stack([_observed(model, int(pairs[p, s]), matches[:, s]) for s in (0, 1)], 1)
+            yield obs[(obs >= 0).all(axis=1)][:, [a, b]]
 
 
-def _tracks_of(model: Reconstruction, image_idx: int, feature_idx: NDArray[np.int32]) -> Ints:
-    """(K,) tracks of keypoints of an image, -1 where they are in none."""
+def _observed(model: Reconstruction, image_idx: int, feature_idx: NDArray[np.int32]) -> Ints:
+    """(K,) observations of keypoints of an image, -1 where they are in no track."""
     tracks = model.tracks
     obs = tracks.observations_of_image(image_idx)
     features = tracks.obs_feature_idx[obs]
-    track_of = np.full(1 + max(features.max(initial=0), feature_idx.max(initial=0)), -1, np.int64)
-    track_of[features] = tracks.obs_track_idx[obs]
-    return track_of[feature_idx]
+    obs_of = np.full(1 + max(features.max(initial=0), feature_idx.max(initial=0)), -1, np.int64)
+    obs_of[features] = obs
+    return obs_of[feature_idx]
 
 
 def _observations(model: Reconstruction, track: Ints, side: Bools) -> tuple[Ints, Ints]:
@@ -310,6 +327,41 @@ def _observations(model: Reconstruction, track: Ints, side: Bools) -> tuple[Ints
     obs = np.arange(len(owner)) - np.repeat(np.cumsum(length) - length, length) + np.repeat(ptr[track], length)
     kept = side[model.tracks.obs_image_idx[obs]]
     return obs[kept], owner[kept]
+
+
+# ------------------------------------------------------------------ same side
+
+
+def _agrees(sim: Array, checks: _Checks, tolerance_px: float) -> Bools:
+    """(L,) links that agree with a similarity, as :func:`_score_all` counts them."""
+    error = np.nan_to_num((_residuals(sim, checks) ** 2).sum(1) / tolerance_px**2, nan=1.0)
+    mean = np.add.reduceat(np.minimum(error, 1.0), checks.group_ptr[:-1]) / np.diff(checks.group_ptr)
+    cost = np.ones(checks.num_links)
+    np.minimum.at(cost, checks.group_link, mean)
+    agrees: Bools = cost < AGREEING_COST
+    return agrees
+
+
+def _seen_from_behind(
+    target: Reconstruction, source: Reconstruction, correspondences: Correspondences, link_tracks: Ints
+) -> str:
+    """Why links (K, 2) that agree with a similarity are of something and of its mirror image; empty if they are not.
+
+    A mirrored group of photographs fits a plane from its back, by all its points; only that nobody can see through it
+    speaks against that. Right views keep triangles, mirrored ones turn as many: chance lies between.
+    """
+    sides = (target.is_registered, source.is_registered & ~target.is_registered)
+    tracks, num = target.tracks, target.tracks.num_tracks
+    agreeing = link_tracks @ [num, 1]
+    kept = total = points = 0
+    for obs in _matches_between(target, sides, correspondences):
+        obs = obs[np.isin(tracks.obs_track_idx[obs].astype(np.int64) @ [num, 1], agreeing)]
+        same, all_of_pair = triangles_kept(tracks.obs_xy[obs[:, 0]], tracks.obs_xy[obs[:, 1]])
+        kept, total, points = kept + same, total + all_of_pair, points + len(obs)
+    # neighbouring triangles share their points: as many of them as there are points are independent at most
+    if total and kept / total < 0.5 - 0.5 / math.sqrt(points):
+        return f"the one is seen mirrored by the other: {kept} of {total} triangles of common points keep their side"
+    return ""
 
 
 # ----------------------------------------------------------------- hypotheses
@@ -501,7 +553,7 @@ def _score_all(
     """
     group_ptr, group_link, group_is_forward = checks.group_ptr, checks.group_link, checks.group_is_forward
     xyz, xy, rotation, translation = checks.xyz, checks.xy, checks.rotation, checks.translation
-    canonical, link_cost = checks.canonical, np.empty(checks.num_links)
+    canonical, link_cost = checks.canonical, np.empty(len(checks.link_tracks))
     for h in range(len(scales)):
         link_cost[:] = 1.0
         for g in range(len(group_link)):
@@ -519,7 +571,7 @@ def _score_all(
         cost[h] = link_cost.sum()
         count = 0
         for value in link_cost:
-            if value < 0.5:
+            if value < AGREEING_COST:
                 count += 1
         agreeing[h] = count
 
