@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfmapp.geometry import epipolar, rigid3
+from sfmapp.geometry import epipolar, fundamental, rigid3
 
 K1 = np.array([[900.0, 0, 512], [0, 905.0, 380], [0, 0, 1]])
 K2 = np.array([[1100.0, 0, 500], [0, 1090.0, 400], [0, 0, 1]])
@@ -44,7 +44,7 @@ def test_exact_points_give_the_exact_fundamental_matrix() -> None:
     xn1, xn2 = make_points(40, POSE, np.random.default_rng(0))
     xy1, xy2 = to_pixels(K1, xn1), to_pixels(K2, xn2)
     ground_truth = epipolar.fundamental_from_essential(epipolar.essential_from_pose(POSE), K1, K2)
-    f = epipolar.fundamental_from_points(xy1, xy2)
+    f = fundamental.fundamental_from_points(xy1, xy2)
     np.testing.assert_allclose(aligned(f, ground_truth), ground_truth, atol=1e-7)
     assert abs(np.linalg.det(f / np.linalg.norm(f))) < 1e-15
     assert epipolar.sampson_errors(f, xy1, xy2).max() < 1e-12
@@ -56,7 +56,7 @@ def test_exact_points_give_the_exact_fundamental_matrix() -> None:
 
 def test_too_few_points_are_refused() -> None:
     with pytest.raises(ValueError, match="at least 8"):
-        epipolar.fundamental_from_points(np.zeros((7, 2)), np.zeros((7, 2)))
+        fundamental.fundamental_from_points(np.zeros((7, 2)), np.zeros((7, 2)))
 
 
 def test_sampson_error_matches_opencv_and_the_definition() -> None:
@@ -82,10 +82,10 @@ def test_weights_turn_the_algebraic_into_the_sampson_error() -> None:
         xn1, xn2 = make_points(60, POSE, rng)
         xy1, xy2 = to_pixels(K1, xn1), to_pixels(K2, xn2)
         noisy1, noisy2 = xy1 + rng.normal(0, 0.5, xy1.shape), xy2 + rng.normal(0, 0.5, xy2.shape)
-        f = epipolar.fundamental_from_points(noisy1, noisy2)
+        f = fundamental.fundamental_from_points(noisy1, noisy2)
         plain.append(np.sqrt(epipolar.sampson_errors(f, xy1, xy2).mean()))
         for _ in range(3):
-            f = epipolar.fundamental_from_points(noisy1, noisy2, epipolar.sampson_weights(f, noisy1, noisy2))
+            f = fundamental.fundamental_from_points(noisy1, noisy2, fundamental.sampson_weights(f, noisy1, noisy2))
         weighted.append(np.sqrt(epipolar.sampson_errors(f, xy1, xy2).mean()))
     assert np.mean(weighted) <= 1.02 * np.mean(plain)
     # 60 points bear on 7 numbers: the error at the true points is about sigma sqrt(7 / 60)

@@ -42,7 +42,7 @@ def test_a_plane_gives_back_the_motion() -> None:
     normal, distance = np.array([0.2, -0.1, 0.97]), 5.0
     normal /= np.linalg.norm(normal)
     h = K @ (rigid3.rotation_matrix(pose) + np.outer(pose[4:], normal) / distance) @ np.linalg.inv(K)
-    poses = homography.poses_from_homography(h, K, K)
+    poses = homography.motions_from_homography(h, K, K).poses
     assert 1 <= len(poses) <= 4
     errors = [
         max(np.abs(rigid3.rotation_matrix(p) - rigid3.rotation_matrix(pose)).max(), np.abs(p[4:] - pose[4:]).max())
@@ -53,7 +53,7 @@ def test_a_plane_gives_back_the_motion() -> None:
 
 def test_a_rotation_has_no_translation_to_give() -> None:
     rotation = rigid3.exp_so3([0.05, -0.2, 0.1])
-    assert len(homography.poses_from_homography(K @ rotation @ np.linalg.inv(K), K, K)) == 0
+    assert len(homography.motions_from_homography(K @ rotation @ np.linalg.inv(K), K, K).poses) == 0
 
 
 def test_rotation_from_rays_is_exact_and_proper() -> None:

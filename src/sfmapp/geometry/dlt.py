@@ -7,6 +7,7 @@ Sutherland 1974). Points and pixels are normalised first, without which the syst
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,13 +42,15 @@ class LinearProjection:
         return int((self.singular_values[:11] > self.noise_level).sum())
 
 
-def normalizing(points: Array) -> Array:
+def normalizing(points: Array, weights: Array | None = None) -> Array:
     """(D + 1, D + 1) similarity that brings the middle of points (N, D) to the origin and their mean squared distance
-    from it to D. Points that are all one keep their scale."""
+    from it to D. Points that are all one keep their scale. The weights (N,) only weigh the statistics."""
     num_axes = points.shape[1]
-    middle = points.mean(0)
-    spread = float(np.sqrt(((points - middle) ** 2).sum(1).mean() / num_axes))
-    scale = 1.0 / spread if spread > 0.0 else 1.0
+    w = np.ones(len(points)) if weights is None else weights
+    total = max(float(w.sum()), 1e-300)
+    middle = w @ points / total
+    rms = math.sqrt(float(w @ ((points - middle) ** 2).sum(1)) / total)
+    scale = math.sqrt(num_axes) / rms if rms > 0.0 else 1.0
     out = np.diag([scale] * num_axes + [1.0])
     out[:num_axes, num_axes] = -scale * middle
     return out
@@ -109,15 +112,20 @@ def find_projections(xyz: Array, xy: Array) -> Array:
     return _scaled(np.linalg.solve(of_xy, entries.reshape(-1, 3, 4)) @ of_xyz)
 
 
+def homography_rows(xy1: Array, xy: Array) -> Array:
+    """(..., 2 N, 9) system A with A h = 0, of points of a plane (..., N, 3) and their pixels (..., N, 2)."""
+    rows = np.zeros((*xy1.shape[:-1], 2, 9))
+    rows[..., 0, :3] = rows[..., 1, 3:6] = xy1
+    rows[..., 6:] = -xy[..., None] * xy1[..., None, :]
+    return rows.reshape(*xy1.shape[:-2], -1, 9)
+
+
 def find_homographies(source: Array, target: Array) -> Array:
     """(S, 3, 3) maps of S samples of M >= 4 points of a plane (S, M, 2) to their pixels (S, M, 2), of unit norm, by the
     homogeneous system 2 M x 9; the weights of the first point are positive."""
     of_source, of_target = normalizing(source.reshape(-1, 2)), normalizing(target.reshape(-1, 2))
-    points, pixels = homogeneous(source) @ of_source.T, homogeneous(target) @ of_target[:2].T
-    rows = np.zeros((*points.shape[:2], 2, 9))
-    rows[..., 0, :3] = rows[..., 1, 3:6] = points
-    rows[..., 6:] = -pixels[..., None] * points[..., None, :]
-    entries = _right_vectors(rows.reshape(len(rows), -1, 9))[1][:, 8]
+    rows = homography_rows(homogeneous(source) @ of_source.T, homogeneous(target) @ of_target[:2].T)
+    entries = _right_vectors(rows)[1][:, 8]
     found = np.linalg.solve(of_target, entries.reshape(-1, 3, 3)) @ of_source
     weight = (found[:, 2] * homogeneous(source)[:, 0]).sum(1)
     scaled: Array = found * (np.where(weight < 0.0, -1.0, 1.0) / np.linalg.norm(found, axis=(1, 2)))[:, None, None]

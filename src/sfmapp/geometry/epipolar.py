@@ -20,44 +20,6 @@ from sfmapp.geometry import rigid3
 Array = NDArray[np.float64]
 
 
-def normalizing_transform(xy: Array, weights: Array | None = None) -> Array:
-    """(3, 3) similarity that moves the centroid of pixels (N, 2) to 0 and their rms distance to sqrt 2.
-
-    Hartley, "In defense of the eight-point algorithm", PAMI 1997. The weights (N,) only weigh the statistics.
-    """
-    w = np.ones(len(xy)) if weights is None else weights
-    total = max(float(w.sum()), 1e-300)
-    mean = w @ xy / total
-    rms = math.sqrt(float(w @ ((xy - mean) ** 2).sum(1)) / total)
-    s = math.sqrt(2.0) / rms if rms > 0 else 1.0
-    return np.array([[s, 0.0, -s * mean[0]], [0.0, s, -s * mean[1]], [0.0, 0.0, 1.0]])
-
-
-def fundamental_from_points(xy1: Array, xy2: Array, weights: Array | None = None) -> Array:
-    """Normalised eight-point algorithm (HZ algorithm 11.1): F (3, 3) of rank two and unit norm.
-
-    Args:
-        xy1, xy2: (N, 2) corresponding pixels, N >= 8.
-        weights: (N,) factor on the squared algebraic residual of each; 1 / (Sampson's denominator) makes the minimum
-            that of Sampson's error once the weights have settled.
-    """
-    if len(xy1) < 8:
-        raise ValueError(f"the eight-point algorithm takes at least 8 points, got {len(xy1)}")
-    t1, t2 = normalizing_transform(xy1, weights), normalizing_transform(xy2, weights)
-    a = xy1 * t1[0, 0] + t1[:2, 2]
-    b = xy2 * t2[0, 0] + t2[:2, 2]
-    one = np.ones(len(a))
-    design = np.stack([b[:, 0] * a[:, 0], b[:, 0] * a[:, 1], b[:, 0], b[:, 1] * a[:, 0], b[:, 1] * a[:, 1], b[:, 1],
-                       a[:, 0], a[:, 1], one], 1)  # fmt: skip
-    weighted = design if weights is None else design * weights[:, None]
-    # the eigenvector of the 9 x 9 normal matrix: the points are normalised, so squaring costs no digits that matter
-    f = np.linalg.eigh(design.T @ weighted)[1][:, 0].reshape(3, 3)
-    u, s, vt = np.linalg.svd(f)
-    f = t2.T @ (u[:, :2] * s[:2]) @ vt[:2] @ t1
-    unit: Array = f / np.linalg.norm(f)
-    return unit
-
-
 def essential_from_fundamental(fundamental: Array, k1: Array, k2: Array) -> Array:
     """The essential matrix nearest to ``K2^T F K1``: singular values (1, 1, 0) over sqrt 2, so of unit norm."""
     return nearest_essential(k2.T @ fundamental @ k1)
@@ -138,16 +100,6 @@ def sampson_errors(matrix: Array, xy1: Array, xy2: Array) -> Array:
     kernel = _ray_sampson_errors if xy1.shape[1] == 3 else _sampson_errors
     kernel(np.ascontiguousarray(matrix, np.float64), *_contiguous(xy1, xy2), out)
     return out
-
-
-def sampson_weights(fundamental: Array, xy1: Array, xy2: Array) -> Array:
-    """(N,) weights, largest 1, that turn algebraic residuals of F into Sampson's; for fundamental_from_points."""
-    line2 = xy1 @ fundamental[:2, :2].T + fundamental[:2, 2]
-    line1 = xy2 @ fundamental[:2, :2] + fundamental[2, :2]
-    denominator = (line2**2).sum(1) + (line1**2).sum(1)
-    weights = 1.0 / np.maximum(denominator, max(1e-12 * float(denominator.max()), 1e-300))
-    relative: Array = weights / weights.max()
-    return relative
 
 
 @numba.njit(cache=True, nogil=True)

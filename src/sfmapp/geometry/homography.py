@@ -1,14 +1,21 @@
-"""Plane-induced and rotation-only maps between two views.
+"""Plane-induced and rotation-only maps between two views: estimated, refined, taken apart.
 
-``x2 ~ H x1`` for homogeneous pixels (N, 2) float64.
+``x2 ~ H x1`` for homogeneous pixels (N, 2) float64. HZ stands for Hartley and Zisserman, "Multiple View Geometry",
+2004.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.dlt import homogeneous, homography_rows, normalizing
+from sfmapp.geometry.fit import FitInfo, count_free, inverse_or_none, matched_points, minimize
 
 Array = NDArray[np.float64]
 
@@ -33,20 +40,222 @@ def _one_way(h: Array, source: Array, target: Array) -> Array:
     return np.where(in_front, ((mapped[:, :2] / w - target) ** 2).sum(1), np.inf)
 
 
-def poses_from_homography(homography: Array, k1: Array, k2: Array) -> Array:
-    """(K, 7) poses cam2_from_cam1 with unit translation that a plane and H allow, K <= 4; none for a pure rotation.
+class PlaneMotions(NamedTuple):
+    """Motions that a homography allows, K <= 4: two, each with both signs of the normal and of the translation.
+
+    Attributes:
+        poses: (K, 7) cam2_from_cam1 with unit translation.
+        normals: (K, 3) unit normals of the plane in the frame of camera 1.
+        distances: (K,) of camera 1 from the plane, in units of the translation.
+    """
+
+    poses: Array
+    normals: Array
+    distances: Array
+
+    def possible(self, xn1: Array) -> PlaneMotions:
+        """Those that have most of the points (N, 2), normalised, in front of both cameras: two, as a rule, between
+        which only a third view or a second plane decides."""
+        x1 = homogeneous(xn1)
+        along = x1 @ self.normals.T
+        depth1 = self.distances / np.where(along == 0.0, np.nan, along)
+        z_row = rigid3.rotation_matrix(self.poses).reshape(-1, 3, 3)[:, 2]
+        depth2 = depth1 * (x1 @ z_row.T) + self.poses[:, 6]
+        keep = ((depth1 > 0) & (depth2 > 0)).mean(0) > 0.5
+        return PlaneMotions(self.poses[keep], self.normals[keep], self.distances[keep])
+
+
+def motions_from_homography(homography: Array, k1: Array, k2: Array) -> PlaneMotions:
+    """Motions and planes with ``H ~ K2 (R + t n^T / d) K1^-1``; none for a pure rotation.
 
     Malis and Vargas, "Deeper understanding of the homography decomposition", INRIA 6303, 2007, as in OpenCV.
     """
     import cv2
 
-    _, rotations, translations, _ = cv2.decomposeHomographyMat(np.linalg.inv(k2) @ homography @ k1, np.eye(3))
-    poses = []
-    for rotation, translation in zip(rotations, translations, strict=True):
+    _, rotations, translations, normals = cv2.decomposeHomographyMat(np.linalg.inv(k2) @ homography @ k1, np.eye(3))
+    poses, planes, distances = [], [], []
+    for rotation, translation, normal in zip(rotations, translations, normals, strict=True):
         norm = np.linalg.norm(translation)
         if norm > 1e-9 and np.linalg.det(rotation) > 0:
             poses.append(rigid3.from_matrix(rotation, translation[:, 0] / norm))
-    return np.array(poses).reshape(-1, 7)
+            planes.append(normal[:, 0])
+            distances.append(1.0 / norm)
+    return PlaneMotions(
+        np.array(poses).reshape(-1, 7), np.array(planes).reshape(-1, 3), np.array(distances).reshape(-1)
+    )
+
+
+def fit_homography(
+    xy1: ArrayLike, xy2: ArrayLike, *, is_inhomogeneous: bool = False, noise_px: float | None = None
+) -> tuple[Array, FitInfo]:
+    """H of N >= 4 points by the normalised direct linear transform (HZ algorithm 4.2).
+
+    Args:
+        xy1, xy2: (N, 2) corresponding pixels.
+        is_inhomogeneous: solve 2N x 8 by least squares with the last entry of the normalised matrix held at one, and
+            not 2N x 9 under |h| = 1. It fails where the middle of picture 1 is mapped to the horizon (HZ 4.1.2).
+        noise_px: standard deviation of a coordinate; None: as the residuals of more than four points tell.
+
+    Returns:
+        H (3, 3), whose last entry is 1 unless it is 0, and what is known of it; ``num_free`` is above 1 where three of
+        four points lie on a line.
+
+    Raises:
+        ValueError: fewer than four points, or some that are not finite.
+    """
+    a, b = matched_points(xy1, xy2, 4, "a homography")
+    t1, t2 = normalizing(a), normalizing(b)
+    na, nb = homogeneous(a) @ t1.T, homogeneous(b) @ t2[:2].T
+    rows = homography_rows(na, nb)
+    _, values, vt = np.linalg.svd(rows, full_matrices=len(rows) < 9)
+    values = np.pad(values, (0, 9 - len(values)))
+    entries = vt[8]
+    if is_inhomogeneous:
+        entries = np.append(np.linalg.lstsq(rows[:, :8], -rows[:, 8], rcond=None)[0], 1.0)
+    h = np.linalg.solve(t2, entries.reshape(3, 3)) @ t1
+    sigma = _noise(h, a, b, noise_px)
+    # noise of both pictures enters a row with the weight of its point, and the slope of the map
+    unit = 0.0 if math.isnan(sigma) else sigma * math.hypot(t1[0, 0], t2[0, 0]) / math.sqrt(2.0)
+    slopes = [_squared_row_slopes(v.reshape(3, 3), na, nb) for v in vt]
+    noise = unit * np.sqrt(np.array(slopes)) + 1e-12 * values[0]
+    info = FitInfo(
+        np.ones(len(a), np.bool_), 1, float(values[0] / max(values[7], 1e-300)), values,
+        max(count_free(values, noise), 1), sigma,
+    )  # fmt: skip
+    return (h / h[2, 2] if h[2, 2] != 0 else h), info
+
+
+def _squared_row_slopes(h: Array, points: Array, pixels: Array) -> float:
+    """Sum of the squared derivatives of the two equations of each point by its four coordinates."""
+    by_target = 2.0 * ((points @ h[2]) ** 2).sum()
+    by_source = ((h[:2, None, :2] - pixels.T[:, :, None] * h[2, :2]) ** 2).sum()
+    return float(by_target + by_source)
+
+
+def _noise(h: Array, xy1: Array, xy2: Array, noise_px: float | None) -> float:
+    """Standard deviation of a coordinate, from what eight numbers leave of the distances in four dimensions."""
+    if noise_px is not None:
+        return noise_px
+    if len(xy1) <= 4:
+        return math.nan
+    with np.errstate(divide="ignore", invalid="ignore"):
+        left, weight = _left_and_weight(h, xy1, xy2)
+    variance = float(np.einsum("ni,nij,nj->", left, weight, left)) / (2 * len(xy1) - 8)
+    return math.sqrt(variance) if math.isfinite(variance) else math.nan
+
+
+def _left_and_weight(h: Array, at: Array, xy2: Array) -> tuple[Array, Array]:
+    """Of points at (N, 2): what is left in picture 2 (N, 2), and the inverse of its covariance (N, 2, 2) where both
+    pictures have unit noise."""
+    mapped = homogeneous(at) @ h.T
+    seen = mapped[:, :2] / mapped[:, 2:]
+    slopes = (h[:2, :2] - seen[:, :, None] * h[2, :2]) / mapped[:, 2:, None]
+    weight: Array = np.asarray(np.linalg.inv(np.eye(2) + slopes @ slopes.swapaxes(1, 2)), np.float64)
+    return xy2 - seen, weight
+
+
+class _Plane(NamedTuple):
+    """A homography under way: unit norm, in normalised pixels, and where each point (N, 2) truly is in picture 1."""
+
+    h: Array
+    at: Array
+
+
+def refine_homography(
+    homography: Array, xy1: ArrayLike, xy2: ArrayLike, *, noise_px: float | None = None, max_iterations: int = 30
+) -> tuple[Array, FitInfo]:
+    """H of least squared reprojection error in both pictures, the gold standard (HZ algorithm 4.3), and its covariance.
+
+    The places of the points are unknowns too, eliminated in every step. There is no robust weight: give inliers.
+
+    Args:
+        homography: (3, 3) start. xy1, xy2: (N, 2) corresponding pixels, N >= 4.
+        noise_px: standard deviation of a coordinate; None: as the residuals of more than four points tell.
+
+    Returns:
+        H (3, 3) of unit norm; the (9, 9) covariance of its entries, of rank eight (HZ 5.2.3), None where the points
+        leave H open or the noise is not known.
+
+    Raises:
+        ValueError: fewer than four points, or some that are not finite.
+    """
+    a, b = matched_points(xy1, xy2, 4, "the refinement of a homography")
+    t1, t2 = normalizing(a), normalizing(b)
+    scale = t2[0, 0] / t1[0, 0]  # a pixel of picture 2 in units of one of picture 1, after both were normalised
+    na, nb = a * t1[0, 0] + t1[:2, 2], b * t2[0, 0] + t2[:2, 2]
+
+    def linearize(state: _Plane) -> tuple[float, Array, Array]:
+        left1, (left2, by_h, by_at) = na - state.at, _plane_slopes(state, nb)
+        left2, by_h, by_at = left2 / scale, by_h / scale, by_at / scale
+        own = np.linalg.inv(np.eye(2) + by_at.swapaxes(1, 2) @ by_at)
+        toward = left1 + np.einsum("nij,ni->nj", by_at, left2)
+        rest = left2 - np.einsum("nij,njk,nk->ni", by_at, own, toward)
+        reduced = by_h - by_at @ own @ by_at.swapaxes(1, 2) @ by_h
+        cost = float((left1**2).sum() + (left2**2).sum())
+        return cost, np.einsum("nij,nik->jk", by_h, reduced), -np.einsum("nij,ni->j", by_h, rest)
+
+    def move(state: _Plane, step: Array) -> _Plane:
+        left1, (left2, by_h, by_at) = na - state.at, _plane_slopes(state, nb)
+        left2, by_h, by_at = left2 / scale, by_h / scale, by_at / scale
+        own = np.linalg.inv(np.eye(2) + by_at.swapaxes(1, 2) @ by_at)
+        toward = left1 + np.einsum("nij,ni->nj", by_at, left2 - by_h @ step)
+        h = state.h + (_tangent(state.h) @ step).reshape(3, 3)
+        return _Plane(h / np.linalg.norm(h), state.at + np.einsum("nij,nj->ni", own, toward))
+
+    start = t2 @ homography @ np.linalg.inv(t1)
+    best, hessian, taken = minimize(_Plane(start / np.linalg.norm(start), na), linearize, move, max_iterations)
+    h = np.linalg.solve(t2, best.h) @ t1
+    norm = float(np.linalg.norm(h))
+    h = h / norm
+    sigma = noise_px
+    if sigma is None:
+        degrees = 2 * len(a) - 8
+        sigma = math.sqrt(linearize(best)[0] / degrees) / t1[0, 0] if degrees else math.nan
+    by_step = np.linalg.solve(t2, _tangent(best.h).T.reshape(8, 3, 3)) @ t1
+    by_step = by_step.reshape(8, 9).T / norm
+    by_step -= np.outer(h.ravel(), h.ravel() @ by_step)
+    cofactor = inverse_or_none(hessian)
+    covariance = None
+    if cofactor is not None and not math.isnan(sigma):
+        covariance = (sigma * t1[0, 0]) ** 2 * by_step @ cofactor @ by_step.T
+    values = np.sqrt(np.maximum(np.linalg.eigvalsh(hessian)[::-1], 0.0))
+    info = FitInfo(
+        np.ones(len(a), np.bool_), taken, float(values[0] / max(values[-1], 1e-300)), values, 1, sigma, covariance
+    )
+    return h, info
+
+
+def _plane_slopes(state: _Plane, xy2: Array) -> tuple[Array, Array, Array]:
+    """What is left in picture 2 (N, 2), and the slopes of the mapped points by H (N, 2, 8) and by their places."""
+    mapped = homogeneous(state.at) @ state.h.T
+    seen = mapped[:, :2] / mapped[:, 2:]
+    rows = homography_rows(homogeneous(state.at), seen).reshape(-1, 2, 9) / mapped[:, 2:, None]
+    by_at = (state.h[:2, :2] - seen[:, :, None] * state.h[2, :2]) / mapped[:, 2:, None]
+    return xy2 - seen, rows @ _tangent(state.h), by_at
+
+
+def _tangent(h: Array) -> Array:
+    """(9, 8) orthonormal directions in which a matrix of unit norm can move."""
+    basis: Array = np.linalg.svd(h.reshape(1, 9))[2][1:].T
+    return basis
+
+
+def guided_homography(
+    homography: Array, xy1: Array, xy2: Array, threshold_px: float, rounds: int = 5
+) -> tuple[Array, FitInfo]:
+    """H refined on its inliers, and on those of what comes out, until they no longer change (HZ algorithm 4.6)."""
+    inlier = transfer_errors(homography, xy1, xy2) < threshold_px**2
+    h, info = homography, FitInfo(inlier, 0, math.nan, np.zeros(0), 0)
+    for taken in range(1, rounds + 1):
+        if inlier.sum() < 4:
+            break
+        h, found = refine_homography(h, xy1[inlier], xy2[inlier])
+        info = replace(found, is_inlier=inlier, num_iterations=taken)
+        now = transfer_errors(h, xy1, xy2) < threshold_px**2
+        if (now == inlier).all():
+            break
+        inlier = now
+    return h, info
 
 
 def rotation_from_rays(xn1: Array, xn2: Array, weights: Array) -> Array:

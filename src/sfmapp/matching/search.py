@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.geometry import epipolar
+from sfmapp.geometry import epipolar, fundamental
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -99,7 +99,7 @@ def polish_fundamental(f: Array, xy1: Array, xy2: Array, threshold: float, round
         if inlier.sum() < 8:
             break
         a, b = xy1[inlier], xy2[inlier]
-        refined = epipolar.fundamental_from_points(a, b, epipolar.sampson_weights(f, a, b))
+        refined = fundamental.fundamental_from_points(a, b, fundamental.sampson_weights(f, a, b))
         refined_inlier = epipolar.sampson_errors(refined, xy1, xy2) < threshold**2
         if refined_inlier.sum() < inlier.sum():
             break

@@ -290,7 +290,7 @@ def _estimate_pose(
         groups.append(epipolar.decompose_essential(
             epipolar.essential_from_fundamental(result.fundamental, poses.k1, poses.k2)))  # fmt: skip
     if inliers.h.sum() > 0.5 * mask.sum():  # a plane leaves F undetermined, and with it the pose that F suggests
-        groups.append(homography.poses_from_homography(result.homography, poses.k1, poses.k2))
+        groups.append(homography.motions_from_homography(result.homography, poses.k1, poses.k2).poses)
     for a, b in searched:
         essential = _find_essential(a, b, 0.5 * poses.scale, ransac)
         if essential is not None:
