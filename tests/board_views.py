@@ -77,7 +77,7 @@ def render_board(
     camera: Camera, board: Board, pose: np.ndarray, *, blur_px: float = 0.0, noise: float = 0.0, seed: int = 0
 ) -> np.ndarray:
     """(H, W) uint8: the board as the camera sees it, on grey, two samples a pixel each way."""
-    px_per_m = 40.0 / board.spacing * (2.0 if board.kind == "aprilgrid" else 1.0)
+    px_per_m = {"aprilgrid": 80.0, "circles": 160.0, "acircles": 160.0}.get(board.kind, 40.0) / board.spacing
     sheet, origin = board_texture(board, px_per_m)
     over = 2
     rays = rays_of(camera.model, camera.width, camera.height, tuple(camera.params), over)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.calibration.boards import Board
+from sfmapp.calibration.circles import disk_bias, find_circle_lattice, grid_of, place_on
 from sfmapp.calibration.lattice import Lattice, find_lattice
 from sfmapp.calibration.markers import dictionary_of
 from sfmapp.calibration.symmetry import symmetric_points
@@ -35,6 +36,10 @@ _NEIGHBORS = 9
 _AROUND = 14
 # of a marker's side: OpenCV's patterns and Kalibr's
 _TAG_BORDERS = (2, 1)
+# how far around a circle is its own, in steps of the board: not quite half of the way to the next; and grey values that
+# tell a disk from its ground
+_ROOM = {"circles": 0.47, "acircles": 0.66}
+_FAINT = 8.0
 
 
 @dataclass(frozen=True)
@@ -258,6 +263,17 @@ def _april_grid(gray: Pixels, board: Board) -> tuple[Ints, Array]:
 
 
 def _circles(gray: Pixels, board: Board) -> tuple[Ints, Array]:
+    lattice = find_circle_lattice(gray, len(board.points))
+    found = None if lattice is None else place_on(lattice, grid_of(board))
+    if found is None or len(found[0]) < len(board.points):
+        whole = _opencvs_circles(gray, board)
+        if whole is not None:
+            return np.arange(len(whole)), whole
+    return (np.zeros(0, np.int64), np.zeros((0, 2))) if found is None else found
+
+
+def _opencvs_circles(gray: Pixels, board: Board) -> Array | None:
+    """(N, 2) the centres of a whole grid as OpenCV's finder sees it."""
     import cv2
 
     size = (board.columns, board.rows)
@@ -273,39 +289,61 @@ def _circles(gray: Pixels, board: Board) -> tuple[Ints, Array]:
             is_found, centers = cv2.findCirclesGrid(picture, size, flags=flags | more, blobDetector=detector)
             if is_found:
                 xy = centers.reshape(-1, 2).astype(np.float64)
-                idx = np.arange(len(xy))
-                if _is_mirrored(board, idx, xy):
-                    if board.kind == "acircles":  # the shift of every other row tells left from right
-                        return np.zeros(0, np.int64), np.zeros((0, 2))
-                    xy = xy.reshape(board.rows, board.columns, 2)[:, ::-1].reshape(-1, 2)
-                return idx, np.ascontiguousarray(xy)
-    return np.zeros(0, np.int64), np.zeros((0, 2))
+                if not _is_mirrored(board, np.arange(len(xy)), xy):
+                    return np.ascontiguousarray(xy)
+                if board.kind == "acircles":  # the shift of every other row tells left from right
+                    return None
+                return np.ascontiguousarray(xy.reshape(board.rows, board.columns, 2)[:, ::-1].reshape(-1, 2))
+    return None
 
 
 def _disk_centers(gray: Pixels, board: Board, idx: Ints, xy: Array) -> Array:
-    """Centres of mass of the disks near pixels (N, 2): each weighted by how far it is from the ground around it."""
+    """Images of the centres of the disks near pixels (N, 2): their centres of mass, less what perspective and lens move
+    these by."""
     axes = _axes(board, idx, xy)
-    found = np.full_like(xy, np.nan)
-    for i, at in enumerate(xy):
-        reach = 0.46 * np.abs(axes[i]).sum(0) * (1.0 if board.kind == "circles" else 1.25)
-        x, y = at
+    found, area = np.full_like(xy, np.nan), np.full(len(xy), np.nan)
+    for i in range(len(xy)):
+        at = xy[i]
         for _ in range(3):
-            left, right = int(np.ceil(x - reach[0])), int(np.floor(x + reach[0]))
-            top, bottom = int(np.ceil(y - reach[1])), int(np.floor(y + reach[1]))
-            if left < 0 or top < 0 or right >= gray.shape[1] or bottom >= gray.shape[0] or right - left < 2:
+            mass = _mass(gray, at, axes[i], _ROOM[board.kind])
+            if mass is None:
                 break
-            patch = gray[top : bottom + 1, left : right + 1].astype(np.float64)
-            dark, light = np.percentile(patch, 2.0), np.percentile(patch, 98.0)
-            border = np.median(np.concatenate([patch[0], patch[-1], patch[:, 0], patch[:, -1]]))
-            ground, disk = (light, dark) if abs(border - light) < abs(border - dark) else (dark, light)
-            if ground == disk:
-                break
-            weight = np.clip(((patch - ground) / (disk - ground) - 0.15) / 0.7, 0.0, 1.0)
-            total = weight.sum()
-            x = float((weight.sum(0) * np.arange(left, right + 1)).sum() / total)
-            y = float((weight.sum(1) * np.arange(top, bottom + 1)).sum() / total)
-            found[i] = x, y
+            at, area[i] = mass
+            found[i] = at
+    is_found = np.isfinite(found).all(1)
+    if is_found.sum() >= 6:
+        plane = board.points[idx[is_found], :2] / board.spacing
+        determinants = np.abs(np.linalg.det(_axes(board, idx[is_found], found[is_found])))
+        radius = np.sqrt(np.median(area[is_found] / determinants) / np.pi)
+        found[is_found] -= disk_bias(plane, found[is_found], float(radius))
     return found
+
+
+def _mass(gray: Pixels, at: Array, axes: Array, room: float) -> tuple[Array, float] | None:
+    """Centre of mass of the disk near a pixel and its area, pixels, each pixel weighted by how far it is from the
+    ground around; None where it is cut by the border or nothing stands out.
+
+    Args:
+        axes: (2, 2) pixels along the board's sides, rows. room: how far the nearest neighbour leaves it, in steps.
+    """
+    reach = room * np.sqrt((axes**2).sum(0))
+    low, high = np.ceil(at - reach).astype(int), np.floor(at + reach).astype(int)
+    if low.min() < 0 or high[0] >= gray.shape[1] or high[1] >= gray.shape[0] or (high - low).min() < 2:
+        return None
+    values = gray[low[1] : high[1] + 1, low[0] : high[0] + 1].astype(np.float64)
+    x, y = np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)
+    on_board = np.stack(np.meshgrid(x - at[0], y - at[1]), -1) @ np.linalg.inv(axes)
+    away = np.hypot(on_board[..., 0], on_board[..., 1]) / room
+    ring, middle = values[(away > 0.85) & (away < 1.0)], values[away < 0.25]
+    if not len(ring) or not len(middle):
+        return None
+    ground, disk = float(np.median(ring)), float(np.median(middle))
+    if abs(disk - ground) < _FAINT:
+        return None
+    weight = np.where(away < 1.0, np.clip(((values - ground) / (disk - ground) - 0.15) / 0.7, 0.0, 1.0), 0.0)
+    total = float(weight.sum())
+    found = np.array([(weight.sum(0) * x).sum(), (weight.sum(1) * y).sum()]) / total
+    return found, total
 
 
 # --------------------------------------------------------------------------------------------------------- measurement

@@ -127,7 +127,6 @@ def _mean_sigma(made: CameraCalibration, sums: _Sums, distance: float) -> float:
 def _candidates(camera: Camera, board: Board) -> list[tuple[Array, TargetView, str]]:
     """Poses of a board of which enough is in the picture, what would be seen, and how to say it."""
     middle, extent = board.points.mean(0), float(np.ptp(board.points, axis=0).max())
-    whole = board.kind in ("circles", "acircles")
     found = []
     for u, v, fill, tilt in product(_PLACES, _PLACES, _FILLS, _TILTS_DEG):
         ray = pixels_to_rays(camera, np.array([[u * camera.width, v * camera.height]]))[0]
@@ -140,7 +139,7 @@ def _candidates(camera: Camera, board: Board) -> list[tuple[Array, TargetView, s
         xy = project(camera, rigid3.apply(pose, board.points))
         with np.errstate(invalid="ignore"):
             inside = ((xy > _MARGIN_PX) & (xy < np.array([camera.width, camera.height]) - _MARGIN_PX)).all(1)
-        if inside.mean() < (1.0 if whole else _INSIDE):
+        if inside.mean() < _INSIDE:
             continue
         view = TargetView("", board.points[inside], xy[inside])
         found.append((pose, view, _hint(u, v, fill, tilt)))

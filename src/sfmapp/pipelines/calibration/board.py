@@ -147,8 +147,8 @@ def _hull(xy: NDArray[np.float64]) -> list[list[float]]:
 
 
 def _facts(board: Board, num: int, sharpness_px: float) -> ViewFacts:
-    # which part of a chessboard it is that a picture shows cannot be told
-    return ViewFacts(sharpness_px, board.kind != "chessboard" or num == len(board.points))
+    # without markers it cannot be told which part of a board a picture shows
+    return ViewFacts(sharpness_px, board.kind in ("charuco", "aprilgrid") or num == len(board.points))
 
 
 def _fit_of(solution: Solution, views: Sequence[TargetView]) -> Fit:
