@@ -19,10 +19,11 @@ from sfmapp.events import Events
 from sfmapp.formats.colmap import read_model
 from sfmapp.formats.ground_truth import read_ground_truth
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.georeference.held_poses import judge_held_poses
 from sfmapp.georeference.pose_fit import known_poses, robust_pose_fit
 from sfmapp.georeference.pose_options import PoseOptions
 from sfmapp.georeference.pose_report import PosesReport
-from sfmapp.georeference.pose_stage import PoseFile, judge_held_poses, pose_models
+from sfmapp.georeference.pose_stage import PoseFile, pose_models
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.scene.synthetic import SyntheticScene, make_scene, synthetic_camera, true_correspondences
@@ -172,6 +173,33 @@ def test_a_held_pose_that_photographs_refute_is_let_go(pool: Executor) -> None:
     assert (model.cam_from_world[mapper.held] == wrong[mapper.held]).all()
     assert np.linalg.norm(rigid3.center(model.cam_from_world[5]) - rigid3.center(truth[5])) < 0.03
     assert model.is_triangulated.all()
+
+
+def held_report(scene: SyntheticScene, poses: np.ndarray, pool: Executor) -> PosesReport:
+    mapper = finished_map(scene, pool)
+    mapper.reconstruction.cam_from_world[:] = poses
+    mapper.reconstruction.point_xyz[:] = scene.ground_truth.point_xyz
+    mapper.held = np.ones(NUM, bool)
+    return judge_held_poses(mapper, pose_file(poses, fixed=True), Events())
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_poses_that_are_all_a_little_off_are_contradicted_where_they_are_held(pool: Executor, seed: int) -> None:
+    """No pose stands out, and all look as good as each other; but points made of them do not agree."""
+    scene = scene_of(seed)
+    right = held_report(scene, scene.ground_truth.cam_from_world, pool)
+    assert not right.contradictions
+    assert max(row.sigmas for row in right.images if row.sigmas is not None) < 4.7
+    wrong = held_report(scene, noisy_poses(scene, seed), pool)
+    (found,) = wrong.contradictions
+    assert found.subject == "held poses"
+    assert "sigmas" in found.message
+    assert float(str(found.evidence["held_out_residual_ratio"])) < 0.5
+    # 0.3 degrees and 0.02 units, as eight poses tell it
+    assert found.rotation_sigma_deg == pytest.approx(SIGMA_DEG, rel=0.5)
+    names = found.evidence["images"]
+    assert isinstance(names, list)
+    assert names
 
 
 def write_cameras(path: Path, sample: Path, num: int, wrong: int | None) -> dict[str, np.ndarray]:

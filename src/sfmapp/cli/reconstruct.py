@@ -330,5 +330,7 @@ def _print_summary(output: Path, report: ReconstructionReport) -> None:
     _print_poses(report)
     _print_units(report)
     print_contradictions(found for one in report.models for found in one.contradictions)
+    if report.stages.poses is not None:
+        print_contradictions(report.stages.poses.contradictions)
     print(took(output, run))
     print(f"model {output / 'sparse' / '0'}, report {output / 'report.html'}; look at it: sfmapp view {output}")

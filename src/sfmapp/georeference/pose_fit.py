@@ -69,6 +69,7 @@ class PoseFit:
         residual: (m, 6).
         sigma: (2,) of known places along each axis and of rotations about each axis, as found.
         squares: (m,) of normalised residuals: 6 on average for right poses.
+        own: (m, 6, 6) covariances of the model's own poses; zeros where they are not known.
     """
 
     world_from_model: Array
@@ -77,6 +78,7 @@ class PoseFit:
     residual: Array
     sigma: Array
     squares: Array
+    own: Array
 
 
 def pose_residuals(cam_from_world: Array, known: Array) -> Array:
@@ -127,7 +129,7 @@ def robust_pose_fit(cam_from_model: Array, known: KnownPoses, own: Array | None 
             break
     squares = _squares(residual, own, sigma)
     is_inlier = squares <= MAX_POSE_CHI2 if is_redundant else np.ones(num, bool)
-    return PoseFit(world_from_model, covariance, is_inlier, residual, sigma, squares)
+    return PoseFit(world_from_model, covariance, is_inlier, residual, sigma, squares, own)
 
 
 def _squares(residual: Array, own: Array, sigma: Array) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from sfmapp.contradictions import Contradiction
 from sfmapp.reporting import Report
 
 
@@ -17,7 +18,8 @@ class KnownPoseRow(Report):
         off: distance between the known place and that by photographs alone, in the unit of the file; off_deg: angle
             between the rotations. Absent where no model lies in the frame of the file.
         sigmas: length of this residual in standard deviations over all six numbers; 99.9 % of right ones are below
-            4.74.
+            4.74. Of a pose that is held, in those of what photographs tell, five times what independent errors make of
+            it, and of what was stated.
     """
 
     name: str
@@ -64,6 +66,7 @@ class PosesReport(Report):
         num_known: photographs with a pose in the file; num_strange: poses in it of no photograph.
         models: as in the report, the largest first.
         images: those with a known pose.
+        contradictions: evidence against them that could not be resolved.
     """
 
     path: str
@@ -72,3 +75,4 @@ class PosesReport(Report):
     num_strange: int
     models: Sequence[PosedModel]
     images: Sequence[KnownPoseRow]
+    contradictions: Sequence[Contradiction] = ()

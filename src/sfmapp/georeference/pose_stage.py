@@ -1,8 +1,8 @@
-"""Models in the frame of poses that are known beforehand: priors of the last adjustment, or held as they are.
+"""Models in the frame of poses that are known beforehand, which are priors of the last adjustment.
 
 For each model a robust similarity to the known poses, which are judged by it: their residuals have the errors of the
 known pose, and those of the model as photographs alone made it. A pose that is refuted is named and left aside, the
-others take part in the adjustment. Poses that are held are judged by the same photographs adjusted without them.
+others take part in the adjustment. Poses that are held are judged in :mod:`sfmapp.georeference.held_poses`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
 
+from sfmapp.contradictions import Contradiction
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.ground_truth import read_ground_truth
@@ -25,7 +26,6 @@ from sfmapp.georeference.adjustment import MAX_COST_PER_NUMBER, growth_of_cost
 from sfmapp.georeference.control_stage import adjusting_of
 from sfmapp.georeference.pose_fit import (
     GROUPS,
-    MIN_REDUNDANT_POSES,
     KnownPoses,
     PoseFit,
     known_poses,
@@ -41,7 +41,7 @@ Mask = NDArray[np.bool_]
 
 STAGE = "poses"
 # Where fewer poses agree, they and the photographs contradict each other, and nothing tells which of them is right.
-_MIN_AGREEING = 0.6
+MIN_AGREEING = 0.6
 # A scale that is four sigmas from nothing is known.
 _MAX_SCALE_SIGMA = 0.25
 # Huber's loss bends here, of six numbers together: of right poses one in thirty is beyond. Wrong ones were left out.
@@ -112,13 +112,13 @@ def pose_models(mappers: Sequence[Mapper], known: PoseFile, events: Events) -> P
         if isinstance(found, PosedModel):
             events.decided(STAGE, f"model {number} is not aligned with the known poses: {found.reason}")
             continue
-        rows |= _rows(number, mapper, found)
+        rows |= pose_rows(number, mapper, found)
         events.decided(STAGE, _placed_text(found.row), **found.row)
-    return _report(known, models, rows, events)
+    return poses_report(known, models, rows, events)
 
 
 @dataclass(frozen=True)
-class _Judged:
+class Judged:
     """Known poses, their fit to what photographs alone made of them, and what is said of it."""
 
     known: KnownPoses
@@ -126,19 +126,19 @@ class _Judged:
     row: PosedModel
 
 
-def _pose_model(number: int, mapper: Mapper, known: KnownPoses) -> PosedModel | _Judged:
+def _pose_model(number: int, mapper: Mapper, known: KnownPoses) -> PosedModel | Judged:
     """A model brought to known poses, or why it is not."""
     model, num = mapper.reconstruction, len(known.image_idx)
     if num < 2:
         reason = f"{num} of its photographs have a known pose, two are needed"
         return PosedModel(model=number, reason=reason, num_known=num, num_used=0)
     first = model.copy()
-    scale, fit = _brought(mapper, known)
+    scale, fit = brought(mapper, known)
     reason = "their places are all within rounding of each other" if fit is None else _fault(fit, num)
     if fit is None or reason:
         _restore(model, first)
         return PosedModel(model=number, reason=reason, num_known=num, num_used=0)
-    judged = _Judged(known, fit, _row(number, known, fit, scale))
+    judged = Judged(known, fit, posed_row(number, known, fit, scale))
     rigid = model.copy()
     optimized = adjusting_of(mapper).to_optimize()
     optimized.add(pose_graph(known, fit.sigma, fit.is_inlier))
@@ -149,7 +149,7 @@ def _pose_model(number: int, mapper: Mapper, known: KnownPoses) -> PosedModel | 
     return judged
 
 
-def _brought(mapper: Mapper, known: KnownPoses) -> tuple[float, PoseFit | None]:
+def brought(mapper: Mapper, known: KnownPoses) -> tuple[float, PoseFit | None]:
     """Bring a model into the frame of known poses, in place: by what scale, and how it fits there, its own errors
     reckoned with; None if it cannot be."""
     model = mapper.reconstruction
@@ -186,7 +186,7 @@ def _own_covariances(mapper: Mapper, known: KnownPoses) -> Array | None:
 
 def _fault(fit: PoseFit, num: int) -> str:
     """Why a similarity to known poses is not to be used; empty if it is."""
-    if fit.is_inlier.mean() < _MIN_AGREEING:
+    if fit.is_inlier.mean() < MIN_AGREEING:
         return (
             f"only {fit.is_inlier.sum()} of {num} agree with the photographs: wrong poses, another convention than "
             "that of the format, or a wrong model"
@@ -227,69 +227,6 @@ def pose_graph(known: KnownPoses, sigma: Array, is_used: Mask) -> Any:
     return graph
 
 
-# ---------------------------------------------------------------------------------------------------------- held poses
-
-
-def judge_held_poses(mapper: Mapper, known: PoseFile, events: Events) -> PosesReport:
-    """Hold known poses that a finished map was made of against the same photographs adjusted without them; those that
-    are clearly refuted are let go, and the map is adjusted once more."""
-    held = mapper.held
-    assert held is not None
-    rows = {int(i): _taken_back(int(i), mapper) for i in np.flatnonzero(known.is_known & ~held)}
-    image_idx = np.flatnonzero(held)
-    free = replace(mapper, reconstruction=mapper.reconstruction.copy(), held=None)
-    free.polish()
-    judged_idx = image_idx[free.reconstruction.is_registered[image_idx]]
-    of_images = known.of_images(judged_idx)
-    _, fit = _brought(free, of_images)
-    names, num = mapper.reconstruction.image_names, int(known.is_known.sum())
-    for i in image_idx.tolist():
-        rows[i] = KnownPoseRow(name=names[i], model=0, is_used=True, reason="")
-    row = PosedModel(model=0, reason="", num_known=num, num_used=len(image_idx))
-    if fit is None or len(judged_idx) < MIN_REDUNDANT_POSES:
-        return _report(known, [row], rows, events)
-    refuted = judged_idx[~fit.is_inlier]
-    judged = _Judged(of_images, fit, _row(0, of_images, fit, 1.0))
-    found = _rows(0, mapper, judged)
-    if len(refuted) > (1.0 - _MIN_AGREEING) * len(judged_idx):
-        events.warned(
-            STAGE,
-            f"{len(refuted)} of {len(judged_idx)} known poses that were held contradict the photographs: wrong poses, "
-            "or a wrong lens; all were held nevertheless",
-        )
-        found = {i: replace(one, is_used=True) for i, one in found.items()}
-    elif len(refuted):
-        _let_go(mapper, free.reconstruction, refuted)
-    row = replace(
-        judged.row, num_known=num, num_used=int(mapper.held.sum()) if mapper.held is not None else 0, scale=None,
-        scale_sigma_share=None, is_adjusted=None,
-    )  # fmt: skip
-    return _report(known, [row], rows | found, events)
-
-
-def _let_go(mapper: Mapper, free: Reconstruction, refuted: NDArray[np.int64]) -> None:
-    """Free some of the poses that were held, which begin where the photographs put them, and adjust the map again.
-
-    Args:
-        free: the map adjusted without known poses, in their frame.
-    """
-    assert mapper.held is not None
-    mapper.held[refuted] = False
-    mapper.reconstruction.cam_from_world[refuted] = free.cam_from_world[refuted]
-    mapper.triangulate_images(refuted.tolist())
-    mapper.finish()
-
-
-def _taken_back(image: int, mapper: Mapper) -> KnownPoseRow:
-    """An image whose known pose its matches have contradicted before all else."""
-    model = mapper.reconstruction
-    pose = "" if model.is_registered[image] else ", and no other was found"
-    reason = f"most of its verified matches contradict the known pose{pose}"
-    return KnownPoseRow(
-        name=model.image_names[image], model=0 if model.is_registered[image] else None, is_used=False, reason=reason
-    )
-
-
 # ------------------------------------------------------------------------------------------------------- what is said
 
 
@@ -300,7 +237,8 @@ def _unplaced(image: int, mappers: Sequence[Mapper]) -> KnownPoseRow:
     return KnownPoseRow(name=name, model=number, is_used=False, reason=reason)
 
 
-def _row(number: int, known: KnownPoses, fit: PoseFit, scale: float) -> PosedModel:
+def posed_row(number: int, known: KnownPoses, fit: PoseFit, scale: float) -> PosedModel:
+    """What is said of a model that lies in the frame of known poses."""
     sigma, sigma_rad = fit.sigma
     factor = np.where(known.is_stated, fit.sigma / known.sigma, 1.0)
     return PosedModel(
@@ -317,7 +255,8 @@ def _row(number: int, known: KnownPoses, fit: PoseFit, scale: float) -> PosedMod
     )
 
 
-def _rows(number: int, mapper: Mapper, judged: _Judged) -> dict[int, KnownPoseRow]:
+def pose_rows(number: int, mapper: Mapper, judged: Judged) -> dict[int, KnownPoseRow]:
+    """What is said of each known pose, by photograph."""
     rows = {}
     fit = judged.fit
     length, angle = (np.linalg.norm(fit.residual[:, group], axis=1) for group in GROUPS)
@@ -341,13 +280,19 @@ def _placed_text(row: PosedModel) -> str:
     )
 
 
-def _report(
-    known: PoseFile, models: Sequence[PosedModel], rows: dict[int, KnownPoseRow], events: Events
+def poses_report(
+    known: PoseFile,
+    models: Sequence[PosedModel],
+    rows: dict[int, KnownPoseRow],
+    events: Events,
+    contradictions: Sequence[Contradiction] = (),
 ) -> PosesReport:
+    """What is said of the poses of a file, by photograph; those that are left aside are warned of."""
     for row in rows.values():
         if row.model is not None and not row.is_used and row.reason:
             events.warned(STAGE, f"known pose of {row.name} is left aside: {row.reason}")
     return PosesReport(
         path=str(known.path), is_fixed=known.options.fixed, num_known=int(known.is_known.sum()),
         num_strange=known.num_strange, models=models, images=[rows[i] for i in sorted(rows)],
+        contradictions=list(contradictions),
     )  # fmt: skip

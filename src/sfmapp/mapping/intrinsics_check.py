@@ -64,7 +64,12 @@ class HeldOut:
 
 
 def hold_out(
-    model: Reconstruction, held: AdjustOptions, freed: Reconstruction, free: AdjustOptions, every: int = 2
+    model: Reconstruction,
+    held: AdjustOptions,
+    freed: Reconstruction,
+    free: AdjustOptions,
+    every: int = 2,
+    held_images: NDArray[np.bool_] | None = None,
 ) -> HeldOut:
     """Adjust with parameters held and free to a share of the tracks, and judge both by as many others.
 
@@ -73,14 +78,18 @@ def hold_out(
         freed: a copy of it whose cameras may change, with priors around their values; it is adjusted.
         held, free: options of the two adjustments.
         every: the share is one in so many.
+        held_images: (I,) bool, whose poses are held in the one and free in the other; None: all are free in both.
     """
     number = np.arange(model.tracks.num_tracks) % every
     fit, judge = model.is_triangulated & (number == 0), model.is_triangulated & (number == every // 2)
     if min(fit.sum(), judge.sum()) < MIN_TRACKS:
         return HeldOut(1.0, 0.0, model)
     lengths = []
-    for trial, options, priors in ((model.copy(), held, None), (freed, free, list(freed.cameras))):
-        adjust_bundle(trial, options, varying=Varying(points=fit), prior_cameras=priors)
+    images = None if held_images is None else ~held_images
+    for trial, options, priors, free_images in (
+        (model.copy(), held, None, images), (freed, free, list(freed.cameras), None)
+    ):  # fmt: skip
+        adjust_bundle(trial, options, varying=Varying(points=fit, images=free_images), prior_cameras=priors)
         nothing = np.zeros(len(trial.image_names), bool), np.zeros(len(trial.cameras), bool)
         adjust_bundle(trial, held, varying=Varying(points=judge, images=nothing[0], cameras=nothing[1]))
         lengths.append(np.linalg.norm(trial.residuals_px(), axis=1))

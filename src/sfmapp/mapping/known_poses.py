@@ -152,8 +152,7 @@ def _triangulate(mapper: Mapper) -> int:
             model, np.arange(model.tracks.num_tracks), mapper.options, mapper.pool, mapper.options.max_pose_error_px
         )
         mapper.adjust_globally()
-        mapper.held = None
-        is_refuted = mapper.drop_contradicted_images()
+        is_refuted = mapper.drop_contradicted_images(held_too=True)
         mapper.held = held & model.is_registered
         if not is_refuted:
             break

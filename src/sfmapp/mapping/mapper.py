@@ -559,8 +559,9 @@ class Mapper:
             reason = f"{counts[i]} of {visible[i]} observations hold after the adjustment: too few to trust the pose"
             self._take_back(i, int(visible[i]), int(counts[i]), reason)
 
-    def drop_contradicted_images(self) -> bool:
+    def drop_contradicted_images(self, *, held_too: bool = False) -> bool:
         """Take back images that most of their own verified matches contradict, the worst first; True if there are any.
+        Those that are held stay, unless ``held_too``.
 
         What contradicts one image of a pair contradicts the other: once the wrong one is gone, nothing speaks against
         its neighbours any more.
@@ -577,7 +578,7 @@ class Mapper:
                 for w in (weight, against)
             )
             share = bad / np.maximum(total, 1)
-            if self.held is not None:
+            if self.held is not None and not held_too:
                 share[self.held] = 0.0
             worst = int(np.argmax(share))
             if share[worst] <= 0.5:

@@ -203,7 +203,8 @@ def check_poses(poses: PosesReport | None) -> list[Check]:
     light: Light = "red" if largest.reason else "amber" if refuted else "green"
     value = largest.reason or f"{largest.num_used} of {largest.num_known} agree with the photographs"
     thresholds = "green: photographs refute none; amber: see Known poses"
-    return [Check(name="known poses", value=value, light=light, thresholds=thresholds)]
+    own = Check(name="known poses", value=value, light=light, thresholds=thresholds)
+    return [own, *(check_contradictions(poses.contradictions) if poses.contradictions else ())]
 
 
 def _apart(models: Sequence[ModelEntry]) -> list[str]:

@@ -69,7 +69,7 @@ def read_known_poses(run: Run, image_set: ImageSet) -> PoseFile | None:
 
 def held_poses(run: Run, poses: PoseFile) -> HeldPoses:
     """Known poses that stay, and what judges them in the end."""
-    from sfmapp.georeference.pose_stage import judge_held_poses
+    from sfmapp.georeference.held_poses import judge_held_poses
     from sfmapp.mapping.known_poses import HeldPoses
 
     def judge(mapper: Mapper) -> None:
