@@ -219,8 +219,8 @@ def test_errors_are_as_large_as_their_sigmas() -> None:
 def test_the_minimum_and_its_sigmas_are_those_of_a_plain_gtsam_graph(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sensor poses and landmarks in a world in metres, one factor an observation: no map beside it."""
     monkeypatch.setattr(inertial_graph, "_CLOCK_SIGMA_S", 1e-7)  # gtsam's factor knows no offset
-    monkeypatch.setattr(inertial_graph, "_TURN_SIGMA", 1e-7)  # and no other mounting
-    monkeypatch.setattr(inertial_graph, "_ARM_SIGMA_M", 1e-7)
+    monkeypatch.setattr(inertial_graph, "_CALIBRATED", (1e-7, 1e-7))  # and no other mounting
+    monkeypatch.setattr(inertial_graph, "_MAX_PULL", np.inf)
     monkeypatch.setattr(inertial_graph, "_ENOUGH", 1e-7)
     sums: list[object] = []
     integrated = inertial_graph.InertialLink.__init__

@@ -49,9 +49,13 @@ Ints = NDArray[np.int64]
 # What the gyroscope leaves of the offset between the clocks is a millisecond where the rotations tell it; where they do
 # not, cameras and sensors that are meant to be synchronous are within half a hundred.
 _CLOCK_SIGMA_S = 0.05
-# Mountings come from a calibration, a drawing or a ruler. By the worst of these the chip is anywhere in a housing of a
-# few centimetres, on a board that is screwed in to a degree.
-_TURN_SIGMA, _ARM_SIGMA_M = 0.02, 0.03
+# Mountings come from a calibration or a drawing, good to some millimetres and a third of a degree. Where measurements
+# pull harder than that allows, it was a guess: the chip anywhere in a housing of a few centimetres, on a board that is
+# screwed in to a degree. The pull is chi-squared with six degrees of freedom; a twentieth of good mountings, which lose
+# little by it, count as guesses.
+_CALIBRATED = (0.005, 0.005)  # radians, metres
+_GUESSED = (0.02, 0.03)
+_MAX_PULL = 12.6
 # Nothing to speak of is known of the scale (its logarithm) and the tilt beforehand; this only keeps them from running
 # away.
 _OPEN = 10.0
@@ -121,6 +125,8 @@ def solve_graph(
     excess, tolerance, residuals = 1.0, _ENOUGH / max(before, 1.0), list[float]()
     for _ in range(_ROUNDS):
         report = graph.optimize(excess, tolerance)
+        if graph.doubts_mounting(report):
+            report = graph.optimize(excess, tolerance)
         residuals.append(min(max(2.0 * (report.final_cost - before) / num_free, 0.0), _MOST))
         if not 1.0 + 2.0 * np.sqrt(2.0 / num_free) < residuals[-1] <= max_residual:
             break
@@ -150,6 +156,7 @@ class _Graph:
         self._seen, self._imu, self._intervals = seen, imu, intervals
         self._start, self._gyro_bias = start, gyro_bias
         self.linked = np.unique([(i.first, i.second) for i in intervals])
+        self._mounting_sigmas = _CALIBRATED
         self.num_chains = len(self.linked) - len(intervals)
         rates = np.stack([np.interp(seen.times_s, imu.timestamps_s, column) for column in imu.gyro.T], 1) - gyro_bias
         self._place = Placement(imu.imu_from_cam, upright(start.gravity))
@@ -164,6 +171,14 @@ class _Graph:
         report = self._graph.optimize()
         self._values = self._graph.values
         return report
+
+    def doubts_mounting(self, report: AdjustReport) -> bool:
+        """Whether the mounting, held as a calibrated one, is pulled too hard; from then on it is held as a guess."""
+        pull = sum(2.0 * factors.cost for factors in report.factors if factors.kind == "mounting")
+        if self._mounting_sigmas == _GUESSED or pull <= _MAX_PULL:
+            return False
+        self._mounting_sigmas = _GUESSED
+        return True
 
     def _image(self, keyframe: int) -> int:
         return int(keyframe) * self._seen.num_sensors
@@ -238,7 +253,7 @@ class _Graph:
             length = gtsam.noiseModel.Isotropic.Sigma(1, 1e-3 * away[far])
             graph.add(gtsam.RangeFactorPose3(X(0), X(self._image(far)), away[far], length))
         graph.add(gtsam.PriorFactorVector(A(0), center, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
-        mounted = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([_TURN_SIGMA, _ARM_SIGMA_M], 3))
+        mounted = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(self._mounting_sigmas, 3))
         graph.add(gtsam.PriorFactorVector(M(0), np.zeros(6), mounted), "mounting")
 
     def read(self, report: AdjustReport, residual: float) -> Solved:
