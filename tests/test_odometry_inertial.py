@@ -304,20 +304,23 @@ def test_the_minimum_and_its_sigmas_are_those_of_a_plain_gtsam_graph(monkeypatch
 
 
 def test_a_pair_of_cameras_keeps_its_metre() -> None:
-    times = np.arange(0, 6, 0.25)
-    flight = Flight(4)
-    seen = seen_map(flight, times, 4, 0.5, baseline_m=0.15, num_points=300)
-    found = aligned(seen, flight.imu(4, 6.0))
-    assert abs(np.log(found.scale)) < 4 * found.sigma_relative
-    assert found.sigma_relative < 0.003  # of the baseline alone
-    assert tilt(found) < 4 * found.gravity_sigma_rad < np.radians(1.0)
-    truth = true_map(flight, times, 1.0)
-    errors = gauge_errors(found.model.cam_from_world[::2], truth, 6)
-    squares = [e @ np.linalg.solve(c, e) / 6 for e, c in zip(errors, found.pose_covariance, strict=True)]
-    assert 0.4 < np.mean(squares) < 2.0
-    assert found.model.rig is not None
-    mounts = rigid3.compose(found.model.cam_from_world[1::2], rigid3.inverse(found.model.cam_from_world[::2]))
-    assert np.allclose(mounts, seen.model.rig.cam_from_rig[1], atol=1e-9)  # type: ignore[union-attr]
+    times, squares = np.arange(0, 6, 0.25), []
+    for seed in range(4, 10):
+        flight = Flight(seed)
+        seen = seen_map(flight, times, seed, 0.5, baseline_m=0.15, num_points=200)
+        found = aligned(seen, flight.imu(seed, 6.0))
+        assert abs(np.log(found.scale)) < 4 * found.sigma_relative
+        assert found.sigma_relative < 0.003  # of the baseline alone
+        assert tilt(found) < 4 * found.gravity_sigma_rad < np.radians(1.0)
+        errors = gauge_errors(found.model.cam_from_world[::2], true_map(flight, times, 1.0), 6)
+        squares.append(
+            np.mean([e @ np.linalg.solve(c, e) / 6 for e, c in zip(errors, found.pose_covariance, strict=True)])
+        )
+        assert found.model.rig is not None
+        mounts = rigid3.compose(found.model.cam_from_world[1::2], rigid3.inverse(found.model.cam_from_world[::2]))
+        assert np.allclose(mounts, seen.model.rig.cam_from_rig[1], atol=1e-9)  # type: ignore[union-attr]
+    # poses of a flight err together: 0.89 over twelve flights, which differ by 0.35
+    assert 0.6 < np.mean(squares) < 1.3
 
 
 def test_gaps_and_a_noisier_sensor_than_stated_are_borne() -> None:
