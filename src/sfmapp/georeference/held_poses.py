@@ -35,8 +35,8 @@ from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
 
-# Freed poses leave this share of the residuals of points that they were not fitted to, or less. Surveyed ones (2 to 6 mm
-# and 0.03 degrees off) leave 0.7 to 1 on the shared sets; 1 cm and 0.05 degrees at ten metres leave 0.16.
+# Freed poses leave this share of the residuals of points that they were not fitted to, or less. Surveyed ones (2 to
+# 6 mm and 0.03 degrees off) leave 0.7 to 1 on the shared sets; 1 cm and 0.05 degrees at ten metres leave 0.16.
 CLEAR_RATIO = 0.5
 _NUM_NAMED, _FEWEST_NAMED = 5, 3
 
