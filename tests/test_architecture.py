@@ -72,7 +72,8 @@ INNER_FLOORS = {
         ("export_world",),
         ("calibration", "dense", "odometry"),
         ("sparse",),
-        ("stored_pixels",),
+        ("calibrated_model",),
+        ("lens_fit", "stored_pixels"),
     ),
 }
 LEVEL = {room: level for level, floor in enumerate(FLOORS) for room in floor}

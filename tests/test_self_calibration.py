@@ -11,7 +11,7 @@ from odometry_fakes import FakeRunner, FakeSequence
 from sfmapp.events import Events
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.result import OdometryResult
-from sfmapp.pipelines.odometry.lens_fit import fit_lens
+from sfmapp.pipelines.lens_fit import fit_lens
 from sfmapp.pipelines.odometry.self_calibrate import MAX_FOCAL_SIGMA, SETTLED_SIGMA, widen
 from sfmapp.report.model import CalibrationReport, LensEvidence
 from sfmapp.scene.reconstruction import Reconstruction

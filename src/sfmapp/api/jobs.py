@@ -231,7 +231,8 @@ def densify(
     Args:
         source: a workspace of ``reconstruct``, or the folder of a COLMAP model.
         output: workspace of the results; None: ``source`` itself, or the folder ``sfmapp`` of a COLMAP model.
-        options: of these, ``dense`` and, for masks, ``images``.
+        options: of these, ``dense`` and, for masks, ``images``; ``images.camera`` is a calibration in place of the
+            cameras of the model, whose poses and points are adjusted to it.
         images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
         maps: write depth and normals of each view as well.
         record: write ``dense/recording.rrd``.
@@ -380,9 +381,11 @@ def undistort(
     a cube that it shows some of, mounted together as a rig. The same call again resumes one that was cut off.
 
     Args:
-        source: the workspace of a reconstruction or of odometry on a folder of frames, or the folder of a COLMAP model.
+        source: the workspace of a reconstruction or of odometry on a folder of frames, or the folder of a COLMAP model;
+            with a calibration also photographs alone: a folder, a glob or a list.
         output: a new folder, an empty one, or that of an earlier call.
-        options: of these, the masks (``images.mask_path``).
+        options: of these, the masks (``images.mask_path``), and ``images.camera``: a calibration in place of the
+            cameras of the model, whose poses and points are adjusted to it.
         images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
         blank_pixels: from 0 for pictures without a blank pixel to 1 for all that the photographs show.
         max_size: largest side of the pictures in pixels; None for no limit.
@@ -401,6 +404,7 @@ def undistort(
 
     Example:
         >>> sfmapp.undistort("out/", "splat/")  # for trainers of Gaussian splats
+        >>> sfmapp.undistort("photos/", "straight/", sfmapp.load_options(settings=["images.camera=cam/"]))
     """
     from sfmapp.pipelines import undistort as pipeline
     from sfmapp.scene.undistortion import Layout

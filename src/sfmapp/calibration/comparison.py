@@ -68,21 +68,10 @@ def compare(a: CameraCalibration, b: CameraCalibration) -> Comparison:
     Raises:
         InputError: they are for pictures of different sizes, or hardly any ray is in both.
     """
-    if (a.camera.width, a.camera.height) != (b.camera.width, b.camera.height):
-        raise InputError(
-            f"expected two calibrations for pictures of one size, found {a.camera.width}x{a.camera.height} and "
-            f"{b.camera.width}x{b.camera.height}",
-            "compare calibrations of the same mode of the camera",
-        )
-    xy = image_grid(a.camera, _GRID)
+    xy, difference, rotation = projection_difference(a.camera, b.camera)
+    is_known = np.isfinite(difference).all(1)
     rays = pixels_to_rays(a.camera, xy)
-    is_known = np.isfinite(rays).all(1) & np.isfinite(pixels_to_rays(b.camera, xy)).all(1)
-    if is_known.sum() < len(xy) // 4:
-        raise InputError("expected cameras that see the same, found hardly a place of the picture where both have rays")
-    rotation = _best_rotation(b.camera, rays[is_known], xy[is_known])
     turned = rays @ rotation.T
-    difference = project(b.camera, turned) - xy
-    is_known &= np.isfinite(difference).all(1)
     # a change of a parameter moves the projection of the first away from, and of the second towards, the difference
     roots = [_derivative(one.camera, own[is_known]) @ _root(one.covariance) for one, own in ((a, rays), (b, turned))]
     # the difference is this matrix times numbers of variance 1: its singular values say along what it varies
@@ -94,9 +83,34 @@ def compare(a: CameraCalibration, b: CameraCalibration) -> Comparison:
     dof = int(is_large.sum())
     sigma = np.full(len(xy), np.nan)
     sigma[is_known] = np.sqrt((spread**2).sum(2).mean(1))
-    difference[~is_known] = np.nan
     angle = float(rigid3.rotation_angle_deg(rotation))
     return Comparison(xy, difference, sigma, angle, statistic, dof, float(chi2.sf(statistic, dof)))
+
+
+def projection_difference(a: Camera, b: Camera) -> tuple[Array, Array, Array]:
+    """Where two cameras put the same rays, after the best turn of the one against the other.
+
+    Returns:
+        (N, 2) pixels of the first all over its picture; (N, 2) where the second puts what the first sees there, less
+        that place, NaN where one of them has no ray; (3, 3) the turn of rays of the first.
+
+    Raises:
+        InputError: they are for pictures of different sizes, or hardly any ray is in both.
+    """
+    if (a.width, a.height) != (b.width, b.height):
+        raise InputError(
+            f"expected two calibrations for pictures of one size, found {a.width}x{a.height} and {b.width}x{b.height}",
+            "compare calibrations of the same mode of the camera",
+        )
+    xy = image_grid(a, _GRID)
+    rays = pixels_to_rays(a, xy)
+    is_known = np.isfinite(rays).all(1) & np.isfinite(pixels_to_rays(b, xy)).all(1)
+    if is_known.sum() < len(xy) // 4:
+        raise InputError("expected cameras that see the same, found hardly a place of the picture where both have rays")
+    rotation = _best_rotation(b, rays[is_known], xy[is_known])
+    difference = project(b, rays @ rotation.T) - xy
+    difference[~(is_known & np.isfinite(difference).all(1))] = np.nan
+    return xy, difference, rotation
 
 
 def _root(covariance: Array) -> Array:

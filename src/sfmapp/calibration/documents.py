@@ -20,17 +20,20 @@ def write_document(path: Path, document: Mapping[str, Any]) -> None:
         beside.write_text(document_text(document), encoding="utf-8", errors="backslashreplace")
 
 
-def read_document(path: Path, kind: type[R], form: str, expected: str, advice: str) -> R:
+def read_document(
+    path: Path, kind: type[R], form: str, expected: str, advice: str, fields: Mapping[str, Any] | None = None
+) -> R:  # fmt: skip
     """A document that :func:`write_document` has written.
 
     Args:
         form: what its field ``format`` has to say.
         expected: what it is, for the error.
+        fields: what the file holds, where it has been read already.
 
     Raises:
         InputError: it cannot be read, or is another: what was expected and found, and the advice.
     """
-    fields = read_json_object(path)
+    fields = read_json_object(path) if fields is None else fields
     if fields.get("format") != form:
         found = fields.get("format", "no format")
         raise InputError(f"{path}: expected {expected} (format {form!r}), found {found!r}", advice)

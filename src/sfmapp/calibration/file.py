@@ -8,17 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.calibration.documents import read_document, write_document
 from sfmapp.calibration.result import CameraCalibration, ViewFit
+from sfmapp.camera_files.opencv_lens import CalibratedCamera
+from sfmapp.camera_files.photographs import GivenCameras, read_given_cameras
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_model import checked_camera
+from sfmapp.formats.text_input import read_json_object
 from sfmapp.reporting import Report
 
-FORMAT = "sfmapp calibration 1"
+CALIBRATION, FORMAT = "calibration.json", "sfmapp calibration 1"
 # of the largest eigenvalue: what is less below zero is rounding
 _ROUNDING = 1e-9
 
@@ -115,10 +119,41 @@ def read_calibration_file(path: Path) -> CameraCalibration:
     Raises:
         InputError: it cannot be read, or is no such file: what was expected, and found.
     """
-    path = path / "calibration.json" if path.is_dir() else path
+    return _read(path / CALIBRATION if path.is_dir() else path, None)
+
+
+def find_calibration(given: str) -> CameraCalibration | None:
+    """The calibration that sfmapp has written in what a user gives for a camera, as :func:`read_calibration_file` reads
+    it; None where that is another program's file, or parameters.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    path = Path(given) / CALIBRATION if Path(given).is_dir() else Path(given)
+    if path.suffix.lower() != ".json" or not path.is_file():
+        return None
+    fields = read_json_object(path)
+    return _read(path, fields) if fields.get("format") == FORMAT else None
+
+
+def read_given_camera(given: str) -> tuple[GivenCameras, CameraCalibration | None]:
+    """The cameras of what a user gives for one, read once, and with it what sfmapp knows of its own: how sure it is.
+
+    Raises:
+        InputError: the file cannot be read, or holds no camera.
+        UsageError: neither a file nor a camera.
+    """
+    calibration = find_calibration(given)
+    if calibration is None:
+        return read_given_cameras(given), None
+    camera = CalibratedCamera(calibration.camera)
+    return GivenCameras(given, {"": lambda _: camera}), calibration
+
+
+def _read(path: Path, fields: Mapping[str, Any] | None) -> CameraCalibration:
     document = read_document(
         path, CalibrationDocument, FORMAT, "a calibration that sfmapp has written",
-        "give OUT or OUT/calibration.json of sfmapp calibrate: other files do not say how sure they are",
+        "give OUT or OUT/calibration.json of sfmapp calibrate: other files do not say how sure they are", fields,
     )  # fmt: skip
     camera = checked_camera(path, 0, document.model, document.width, document.height, document.params)
     num = len(camera.params)

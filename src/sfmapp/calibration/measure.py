@@ -170,7 +170,8 @@ def place_by_homography(
     of_plane = dlt.normalizing(plane_xy)
     points = dlt.homogeneous(plane_xy) @ of_plane.T
     entries = (dlt.find_homographies(plane_xy[None], pixels[None])[0] @ np.linalg.inv(of_plane)).ravel()
-    # the middle of the points is in the picture, so the last entry, its weight, is not zero
+    if not abs(entries[8]) > 0.0:  # the middle of the points is in the picture, unless no homography shows it
+        raise _not_told()
     entries = entries / entries[8]
     for _ in range(_MAX_STEPS):
         seen, slopes = _mapped(entries, points)
@@ -182,10 +183,7 @@ def place_by_homography(
     rows = slopes.reshape(-1, 8)
     cofactor = inverse(rows.T @ rows) if np.isfinite(rows).all() else None
     if cofactor is None:
-        raise InputError(
-            "the known points do not tell the plane: three of them lie on a line, or two at one place",
-            "use four corners of something as large as what is measured",
-        )
+        raise _not_told()
     degrees = 2 * len(points) - 8
     left = float(((pixels - seen) ** 2).sum())
     if sigma_px is None:
@@ -303,3 +301,10 @@ def _quantity(placed: PlacedMarks, index: NDArray[np.int64], value: float, slope
     of_marks = placed.sigma_px**2 * float((by_marks**2).sum())
     total = of_marks + float(by_shared @ placed.shared @ by_shared)
     return Quantity(value, float(np.sqrt(total)), of_marks / total if total > 0.0 else 1.0)
+
+
+def _not_told() -> InputError:
+    return InputError(
+        "the known points do not tell the plane: three of them lie on a line, or two at one place",
+        "use four corners of something as large as what is measured",
+    )

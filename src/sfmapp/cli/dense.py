@@ -12,6 +12,7 @@ from sfmapp.cli.common import (
     list_options,
     listening,
     load_numba_without_blas,
+    print_contradictions,
     print_json,
     took,
 )
@@ -25,11 +26,13 @@ examples:
   sfmapp dense out/
   sfmapp dense colmap/sparse/0 --images colmap/images -o out/
   sfmapp dense out/ --set dense.level=0 --region -1 -1 0 1 1 2 --maps
+  sfmapp dense colmap/sparse/0 --images colmap/images -o out/ --camera cam/calibration.json
 
 SOURCE is a workspace of sfmapp reconstruct, or a COLMAP model (binary or text, any of our camera models) with the
-folder of its photographs. Its poses were estimated with its cameras: to use another calibration, make the model with
-sfmapp reconstruct --camera FILE. Writes OUT/dense/fused.ply (positions, normals, colours, number of views, score,
-sigma) and patches.npz; the same command again resumes a run that was cut off, and does nothing where all is done."""
+folder of its photographs. --camera FILE puts a calibration in place of its cameras: poses and points, which were found
+with the old ones, are adjusted to it (OUT/sparse/0), and what the photographs say against it is told. Writes
+OUT/dense/fused.ply (positions, normals, colours, number of views, score, sigma) and patches.npz; the same command again
+resumes a run that was cut off, and does nothing where all is done."""
 
 
 MESH_EXAMPLES = """\
@@ -102,6 +105,10 @@ def _add_dense_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--ground-sampling", metavar="D", help="instead of --level: size of a pixel on the surface, in world units"
     )
+    group.add_argument(
+        "--camera", metavar="MODEL,...|FILE",
+        help="a calibration in place of the cameras of the model, whose poses and points are adjusted to it",
+    )  # fmt: skip
     group.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black pixels are ignored")
     group.add_argument(
         "--region", metavar=("X", "Y", "Z", "X", "Y", "Z"), nargs=6,
@@ -129,6 +136,7 @@ def _dense(args: argparse.Namespace) -> int:
     flags = {
         "dense.level": args.level,
         "dense.ground_sampling": args.ground_sampling,
+        "images.camera": args.camera,
         "images.mask_path": args.mask_path,
         "dense.region": None if args.region is None else ",".join(args.region),
         "dense.max_memory_mb": args.max_memory,
@@ -181,7 +189,7 @@ def _mesh(args: argparse.Namespace) -> int:
 
 def dense_result(output: Path, report: DenseReport) -> dict[str, object]:
     """What ``--json`` prints of a cloud; the rest is in report.json."""
-    names = ("num_patches", "mean_views", "median_score", "median_sigma", "median_size", "shares", "run")
+    names = ("num_patches", "mean_views", "median_score", "median_sigma", "median_size", "shares", "calibration", "run")
     paths = {"cloud": str(output / "dense" / "fused.ply"), "patches": str(output / "dense" / "patches.npz")}
     return {"output": str(output), **paths, **{name: report[name] for name in names if name in report}}
 
@@ -189,6 +197,9 @@ def dense_result(output: Path, report: DenseReport) -> dict[str, object]:
 def print_dense(output: Path, report: DenseReport) -> None:
     """A cloud in three lines."""
     num_views = report.views.num_views if report.views is not None else 0
+    if report.calibration is not None:
+        print(report.calibration.text)
+        print_contradictions(report.calibration.contradictions)
     print(
         f"{report.num_patches} patches from {num_views} views, each in {report.mean_views:.1f}"
         f" of them, score {report.median_score:.3f}, sigma {report.median_sigma:.3g},"

@@ -12,6 +12,7 @@ from sfmapp.cli.common import (
     listening,
     load_numba_without_blas,
     options_of,
+    print_contradictions,
     tell_result,
     took,
 )
@@ -25,9 +26,11 @@ examples:
   sfmapp undistort colmap/sparse/0 --images colmap/images -o splat/ --max-size 1600
   sfmapp undistort out/ -o splat/ --blank-pixels 1 --mask-path masks/
   sfmapp undistort panoramas/ -o faces/ --max-size 1024
+  sfmapp undistort photos/ -o straight/ --camera cam/calibration.json
 
 SOURCE is a workspace of sfmapp reconstruct, one of sfmapp odometry on a folder of frames (its keyframes), or a COLMAP
-model with the folder of its photographs. Writes
+model with the folder of its photographs. With --camera it may be photographs alone (a folder, a glob, a list): then
+no model is written, but the pinhole that they share, as cameras.txt, opencv.yaml and for others. Writes
   DIR/images/NAME       the photographs, in the format that they have: JPEG with quality 97, all others without loss, 16
                         bits and alpha kept; copied as they are where there is no distortion; never with a tag to turn
                         them
@@ -49,6 +52,11 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )  # fmt: skip
     parser.add_argument("source", metavar="SOURCE", type=Path, help="a workspace, or a COLMAP model")
     parser.add_argument("-o", "--output", metavar="DIR", type=Path, required=True, help="output folder, new or empty")
+    parser.add_argument(
+        "--camera", metavar="MODEL,...|FILE",
+        help="a calibration of any form: of photographs without a model, or in place of the cameras of the model, "
+        "whose poses and points are adjusted to it",
+    )  # fmt: skip
     parser.add_argument("--images", metavar="DIR", type=Path, help="folder of the photographs of a COLMAP model")
     parser.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black pixels are ignored")
     parser.add_argument(
@@ -70,7 +78,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def _undistort(args: argparse.Namespace) -> int:
     limit_library_threads()
-    options = options_of({"threads": args.threads, "images.mask_path": args.mask_path})
+    options = options_of({"threads": args.threads, "images.mask_path": args.mask_path, "images.camera": args.camera})
     load_numba_without_blas()
     from sfmapp.pipelines.undistort import undistort
     from sfmapp.scene.undistortion import Layout
@@ -92,9 +100,12 @@ def _print(output: Path, report: UndistortReport) -> None:
     copied = f", {report.num_copied} of them copied as they were" if report.num_copied else ""
     faces = f", {report.num_faces} of them faces of cubes" if report.num_faces else ""
     masks = f", {report.num_masks} masks" if report.num_masks else ""
-    print(
-        f"{report.num_images} photographs without distortion ({shown}){faces}{copied}{masks},"
-        f" {report.num_points} points, {report.num_observations} observations ({report.num_dropped} dropped)"
-    )
+    if report.calibration is not None:
+        print(report.calibration.text)
+        print_contradictions(report.calibration.contradictions)
+    has_model = (output / "sparse" / "0").is_dir()
+    points = f", {report.num_points} points, {report.num_observations} observations ({report.num_dropped} dropped)"
+    print(f"{report.num_images} photographs without distortion ({shown}){faces}{copied}{masks}{points * has_model}")
     print(took(output, report.run))
-    print(f"photographs {output / 'images'}, model {output / 'sparse' / '0'}")
+    made = output / "sparse" / "0" if has_model else output / "cameras.txt"
+    print(f"photographs {output / 'images'}" + (f", {'model' if has_model else 'camera'} {made}" * made.exists()))

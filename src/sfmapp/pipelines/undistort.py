@@ -1,6 +1,8 @@
 """Photographs without their distortion and a PINHOLE model beside them, as COLMAP's undistorter lays them out. One that
 shows what is beside and behind the camera becomes the faces of a cube.
 
+A calibration may take the place of the model's cameras; with one, photographs need no model, and get none.
+
 ``images/`` holds the photographs under their names, ``masks/NAME.png`` what is to be ignored, and the model is in
 ``sparse/0``, where the trainers of Gaussian splats and nerfstudio look for it, and in ``sparse`` as well, where COLMAP
 itself has it and OpenMVS reads it.
@@ -10,10 +12,10 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -21,17 +23,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sfmapp
+from sfmapp.camera.camera import Camera
+from sfmapp.camera_files.writing import write_camera_files
 from sfmapp.dense.photographs import Photographs, find_photographs
 from sfmapp.dense.undistort import resample
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.colmap import MODEL_FILES, read_model
+from sfmapp.images.folder import load_images
 from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import decode_file, read_file, read_mask_file
 from sfmapp.images.rewrite import encode, encode_mask, without_turn
-from sfmapp.pipelines.dense.source import DenseSource, find_source, model_digest
-from sfmapp.report.model import UndistortedCamera, UndistortNumbers, UndistortReport
+from sfmapp.pipelines.calibrated_model import with_calibration
+from sfmapp.pipelines.dense.source import DenseSource, find_source, is_of_model, model_digest
+from sfmapp.report.model import CalibratedModelReport, UndistortedCamera, UndistortNumbers, UndistortReport
 from sfmapp.reporting import NamedReason
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.undistortion import (
@@ -75,17 +81,25 @@ class _Job(Job):
         photographs: that are there.
         undistortions: of each the pictures that are made of it.
         lost: (name, reason) of photographs that could not be read.
+        calibration: what is to be said of a calibration that has replaced the cameras of the model.
     """
 
     photographs: Photographs = field(init=False)
     undistortions: list[list[Undistortion]] = field(init=False)
     lost: list[tuple[str, str]] = field(default_factory=list)
+    calibration: CalibratedModelReport | None = None
 
     @property
     def names(self) -> list[str]:
         """Of the pictures."""
         pairs = zip(self.photographs.records, self.undistortions, strict=True)
         return [each.name_of(record.name) for record, group in pairs for each in group]
+
+    @property
+    def kept(self) -> list[int]:
+        """Positions of the photographs that were written."""
+        lost = {name for name, _ in self.lost}
+        return [i for i, record in enumerate(self.photographs.records) if record.name not in lost]
 
 
 def undistort(
@@ -104,9 +118,11 @@ def undistort(
 
     Args:
         source: the workspace of a reconstruction, of which the largest model is taken, or of odometry on a folder of
-            frames, of which the keyframes are, or the folder of a COLMAP model.
+            frames, of which the keyframes are, or the folder of a COLMAP model; with a calibration also photographs
+            alone: a folder, a glob or a list.
         output: a new folder, an empty one, or that of an earlier call.
-        options: of these, the masks (``images.mask_path``) and ``threads``.
+        options: of these, the masks (``images.mask_path``), ``threads``, and ``images.camera``: a calibration that
+            takes the place of the cameras of the model, whose poses and points are adjusted to it.
         images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
         layout: how the pictures are cut; None: without a blank pixel, and of any size.
         events: progress, warnings and cancellation.
@@ -117,8 +133,10 @@ def undistort(
         InputError: no model, or none of its photographs.
         NoReconstructionError: the workspace holds no model.
     """
-    layout = layout or Layout()
-    where = find_source(source, output, images, options or Options(), UNDISTORT)
+    layout, options = layout or Layout(), options or Options()
+    if options.images.camera is not None and not is_of_model(Path(source)):
+        return _undistort_alone(source, output, options, layout, images, events, watch)
+    where = find_source(source, output, images, options, UNDISTORT)
     _check_target(where)
     model, keypoints = read_model(where.model, events)
     if not len(model.registered_idx):
@@ -129,23 +147,65 @@ def undistort(
             model, where.images, job.options.images,
             is_upright=where.is_upright, with_copies=True, threads=job.threads, events=job.events,
         )  # fmt: skip
-        if layout.front_only:
-            warn_of_sides(job.photographs.cameras, STAGE, "leave out --front-only", job.events)
-        _plan(job, layout)
-        key = stage_key(
-            (__name__,), layout, where.is_upright, model_digest(where.model),
-            [input_key(record) for record in job.photographs.records], job.photographs.missing,
-        )  # fmt: skip
-        known = _known_numbers(job, key)
-        numbers = known
-        if numbers is None:
-            _begin(job, key)
-            _write_photographs(job)
-            numbers = _write_model(job, model, keypoints)
-            job.workspace.finish(STAGE, job.watch.read(), report=numbers)
-            job.workspace.save()
-        report = UndistortReport(**numbers, run=job.took(is_up_to_date=known is not None))
-        return UndistortResult(job.workspace.folder, report)
+        if where.camera is not None:
+            model, job.photographs, job.calibration = with_calibration(
+                model, job.photographs, str(where.images), where.camera, job.events, threads=job.threads
+            )
+        made_of = [where.is_upright, model_digest(where.model), job.photographs.missing]
+        return _make(job, layout, made_of, MODEL_FILES, lambda: _write_model(job, model, keypoints))
+
+
+def _undistort_alone(
+    source: str | os.PathLike[str], output: str | os.PathLike[str], options: Options, layout: Layout,
+    images: str | os.PathLike[str] | None, events: Events | None, watch: Stopwatch | None,
+) -> UndistortResult:  # fmt: skip
+    """Photographs of a calibrated camera, of which there is no model.
+
+    Raises:
+        UsageError: a folder of photographs beside them, or an output that holds something else.
+        InputError: there are none, or the camera is not theirs.
+    """
+    if images is not None:
+        raise UsageError(
+            f"{source}: expected a model beside the photographs in {images}, found none",
+            "leave out --images: SOURCE is the folder of the photographs",
+        )
+    with _Job.opened(UNDISTORT, source, output, options, events=events, watch=watch) as job:
+        found, _ = load_images(source, job.options.images, job.events, threads=job.threads)
+        if not found.images:
+            raise InputError(f"{source}: expected photographs or a model, found neither")
+        job.note_inputs({})
+        cameras = tuple(found.cameras[record.camera_idx] for record in found.images)
+        job.photographs = Photographs(np.arange(len(cameras)), tuple(found.images), cameras, (), ())
+        return _make(job, layout, [], (), lambda: _numbers(job, _write_cameras(job)))
+
+
+def _make(
+    job: _Job, layout: Layout, made_of: Sequence[object], files: Sequence[str], write: Callable[[], UndistortNumbers]
+) -> UndistortResult:
+    """Write the pictures, and with ``write`` what belongs to them, unless an earlier run has.
+
+    Args:
+        made_of: what the result depends on beside photographs, cameras and layout.
+        files: of the model, that an earlier run has to have left.
+    """
+    if layout.front_only:
+        warn_of_sides(job.photographs.cameras, STAGE, "leave out --front-only", job.events)
+    _plan(job, layout)
+    cameras = [(camera.model.name, *camera.params.tolist()) for camera in job.photographs.cameras]
+    key = stage_key(
+        (__name__,), layout, cameras, [input_key(record) for record in job.photographs.records], list(made_of)
+    )
+    known = _known_numbers(job, key, files)
+    numbers = known
+    if numbers is None:
+        _begin(job, key)
+        _write_photographs(job)
+        numbers = write()
+        job.workspace.finish(STAGE, job.watch.read(), report=numbers)
+        job.workspace.save()
+    report = UndistortReport(**numbers, run=job.took(is_up_to_date=known is not None))
+    return UndistortResult(job.workspace.folder, report)
 
 
 def _plan(job: _Job, layout: Layout) -> None:
@@ -206,11 +266,11 @@ def _begin(job: _Job, key: str) -> None:
     workspace.begin(STAGE, key, names=job.names)
 
 
-def _known_numbers(job: _Job, key: str) -> UndistortNumbers | None:
+def _known_numbers(job: _Job, key: str, files: Sequence[str]) -> UndistortNumbers | None:
     """What an earlier run has written, if all of it is there."""
     folder = job.workspace.folder
     wanted = [folder / IMAGES / name for name in job.names]
-    wanted += [folder / "sparse" / "0" / name for name in MODEL_FILES]
+    wanted += [folder / "sparse" / "0" / name for name in files]
     if not job.workspace.is_current(STAGE, key) or not all(path.is_file() for path in wanted):
         return None
     return job.workspace.manifest.stage(STAGE).report
@@ -301,25 +361,50 @@ def _lay_out(how: Undistortion, pixels: NDArray[Any]) -> tuple[NDArray[Any], NDA
 
 def _write_model(job: _Job, model: Reconstruction, keypoints: list[NDArray[np.float64]]) -> UndistortNumbers:
     """Write the model of the photographs that were written, and tell of it."""
-    photographs, lost = job.photographs, {name for name, _ in job.lost}
-    kept = [i for i, record in enumerate(photographs.records) if record.name not in lost]
+    photographs, kept = job.photographs, job.kept
     undistortions = [job.undistortions[i] for i in kept]
     flat, moved = undistort_reconstruction(model, keypoints, photographs.image_idx[kept], undistortions)
     job.workspace.write_models([flat], moved)
     for name in MODEL_FILES:
         _share(job.workspace.model() / name, job.workspace.folder / "sparse" / name)
-    pictures = [(each.name_of(photographs.records[i].name), each) for i in kept for each in job.undistortions[i]]
+    return replace(
+        _numbers(job, flat.cameras),
+        num_points=int(flat.is_triangulated.sum()),
+        num_observations=flat.tracks.num_observations,
+        num_dropped=int(model.obs_is_inlier.sum()) - flat.tracks.num_observations,
+    )
+
+
+def _write_cameras(job: _Job) -> list[Camera]:
+    """Write the pinhole of pictures without a model for other programs, where they share one; all of them."""
+    every = [each.camera for i in job.kept for each in job.undistortions[i]]
+    keys = [(camera.width, camera.height, *camera.params.tolist()) for camera in every]
+    cameras = [*dict(zip(keys, every, strict=True)).values()]
+    if len(cameras) == 1:
+        write_camera_files(job.workspace.folder, cameras[0], "camera")
+    else:
+        sizes = ", ".join(f"{camera.width}x{camera.height}" for camera in cameras[:_NAMES_SHOWN])
+        job.events.warned(STAGE, f"no cameras.txt: the pictures are of {len(cameras)} cameras ({sizes})")
+    return cameras
+
+
+def _numbers(job: _Job, cameras: Sequence[Camera]) -> UndistortNumbers:
+    """What was written of pictures."""
+    pictures = [
+        (each.name_of(job.photographs.records[i].name), each) for i in job.kept for each in job.undistortions[i]
+    ]
     masks = [job.workspace.folder / MASKS / f"{name}.png" for name, _ in pictures]
     return UndistortNumbers(
         num_images=len(pictures),
         num_faces=sum(each.face is not None for _, each in pictures),
         num_copied=sum(each.is_identity for _, each in pictures),
         num_masks=sum(path.is_file() for path in masks),
-        cameras=[UndistortedCamera(width=c.width, height=c.height, params=c.params.tolist()) for c in flat.cameras],
-        num_points=int(flat.is_triangulated.sum()),
-        num_observations=flat.tracks.num_observations,
-        num_dropped=int(model.obs_is_inlier.sum()) - flat.tracks.num_observations,
-        missing=[NamedReason(name=name, reason=reason) for name, reason in (*photographs.missing, *job.lost)],
+        cameras=[UndistortedCamera(width=c.width, height=c.height, params=c.params.tolist()) for c in cameras],
+        num_points=0,
+        num_observations=0,
+        num_dropped=0,
+        missing=[NamedReason(name=name, reason=reason) for name, reason in (*job.photographs.missing, *job.lost)],
+        calibration=job.calibration,
     )
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sfmapp.dense.report import LevelReport, WaveReport
+from sfmapp.report.document import check_contradictions
 from sfmapp.report.model import CoverageReport, DenseHistograms, DensePart, DenseRunReport
 from sfmapp.report.page import check_table, failure_box, log_table, render_page, table, usage_table
 from sfmapp.report.plots import Curve, bars_svg, plot_svg
@@ -33,6 +34,10 @@ def render_dense_html(report: DenseRunReport, pictures: Sequence[PictureRow]) ->
     run = report.run
     facts = "; ".join([run.source, f"sfmapp {run.versions['sfmapp']}", run.started])
     body = [f'<p class="dim">{escape(facts)}</p>', failure_box(report.outcome)]
+    made = report.stages.dense
+    if made is not None and made.calibration is not None:
+        body.append(f"<p>{escape(made.calibration.text)}</p>")
+        body.append(check_table(check_contradictions(made.calibration.contradictions)))
     if report.dense is not None:
         body.append(dense_section(report.dense, pictures))
     body.append(usage_table(report.usage, run))

@@ -238,6 +238,7 @@ class DenseReport(CloudNumbers):
     """What densification did, as far as it came."""
 
     outcome: Outcome
+    calibration: CalibratedModelReport | None = None
     views: ViewsReport | None = None
     clusters: Sequence[ClusterReport] = ()
     num_patches: int = 0
@@ -317,6 +318,62 @@ class DenseRunReport(Report):
     dense: DensePart | None = None
 
 
+class LensChange(Report):
+    """A lens of a model that a calibration replaced.
+
+    Attributes:
+        before, after: models of the lens.
+        focal_px: of the calibration, at the axis.
+        told_focal_px, told_sigma_px: what photographs of it tell by themselves; absent where they are few.
+        rms_px, max_px: over the picture, how far both project the same rays apart, after the best turn; absent where
+            they hardly see the same.
+        sigma_px: standard deviation of a coordinate of that by the calibration, rms over the picture; absent where it
+            does not say.
+    """
+
+    before: str
+    after: str
+    focal_px: float
+    told_focal_px: float | None = None
+    told_sigma_px: float | None = None
+    rms_px: float | None = None
+    max_px: float | None = None
+    sigma_px: float | None = None
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        if self.rms_px is None:
+            return f"{self.before} to {self.after}, which see hardly the same"
+        sigma = "" if self.sigma_px is None else f", sigma of the calibration {self.sigma_px:.2f}"
+        return f"{self.before} to {self.after}: {self.rms_px:.2f} px rms apart, {self.max_px:.2f} at most{sigma}"
+
+
+class CalibratedModelReport(Report):
+    """A model whose lenses a calibration replaced, with poses and points adjusted to it.
+
+    Attributes:
+        file: what was given.
+        noise_before_px, noise_px: robust standard deviation of a coordinate of the residuals, before and after.
+        contradictions: what speaks against the calibration.
+    """
+
+    file: str
+    lenses: Sequence[LensChange]
+    noise_before_px: float
+    noise_px: float
+    contradictions: Sequence[Contradiction]
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        lenses = "; ".join(lens.text for lens in self.lenses)
+        return (
+            f"cameras of {self.file} in place of the model's ({lenses}); poses and points adjusted, residuals "
+            f"{self.noise_before_px:.2f} to {self.noise_px:.2f} px"
+        )
+
+
 class UndistortedCamera(Report):
     """A pinhole; ``params``: fx, fy, cx, cy."""
 
@@ -333,6 +390,7 @@ class UndistortNumbers(Report):
         num_faces: how many of them are faces of a cube.
         num_copied: files that had no distortion.
         num_dropped: observations outside of the pictures, or in photographs that are missing.
+        calibration: the cameras of the model were replaced; absent where they were not.
     """
 
     num_images: int
@@ -344,6 +402,7 @@ class UndistortNumbers(Report):
     num_observations: int
     num_dropped: int
     missing: Sequence[NamedReason]
+    calibration: CalibratedModelReport | None = None
 
 
 class UndistortReport(UndistortNumbers):

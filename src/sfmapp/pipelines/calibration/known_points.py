@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.calibration.file import FORMAT, read_calibration_file
+from sfmapp.calibration.file import read_given_camera
 from sfmapp.calibration.locate import MAX_ERROR_PX, Location, Method, locate_camera
 from sfmapp.calibration.marker_points import find_marker_points
 from sfmapp.calibration.measure import PlacedMarks, Plane, measure, place_by_homography, place_on_plane
@@ -34,7 +34,6 @@ from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.known_points import read_known_points, read_marker_places, read_marks
-from sfmapp.formats.text_input import read_json_object
 from sfmapp.images.folder import describe_images
 from sfmapp.images.image_set import ImageOptions, ImageRecord
 from sfmapp.images.pixels import read_gray, read_rgb
@@ -321,11 +320,10 @@ def _read_points(record: ImageRecord, source: PointSource, events: Events) -> _P
 def _read_camera(given: str, record: ImageRecord) -> tuple[Camera, Array | None]:
     """The camera of a photograph, and the covariance of its parameters where its file has one for pictures as large."""
     photograph = Photograph(record.name, (record.width, record.height), record.orientation)
-    camera = read_given_cameras(given).of_photographs(str(record.path.parent), [photograph])[0].camera
-    path = Path(given) / "calibration.json" if Path(given).is_dir() else Path(given)
-    if path.suffix.lower() != ".json" or not path.is_file() or read_json_object(path).get("format") != FORMAT:
+    cameras, calibration = read_given_camera(given)
+    camera = cameras.of_photographs(str(record.path.parent), [photograph])[0].camera
+    if calibration is None:
         return camera, None
-    calibration = read_calibration_file(path)
     is_same = calibration.camera.model == camera.model and np.allclose(calibration.camera.params, camera.params)
     return camera, calibration.covariance if is_same else None
 

@@ -7,14 +7,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.calibration.file import write_calibration
+from sfmapp.calibration.file import CALIBRATION, write_calibration
 from sfmapp.calibration.report import CameraFileReport
 from sfmapp.calibration.result import CameraCalibration
 from sfmapp.camera_files.writing import write_camera_files
 from sfmapp.viewer.calibration_recording import record_calibration
 from sfmapp.workspace.job import FAILED, WRITTEN, Job
-
-CALIBRATION = "calibration.json"
 
 
 def write_recording(

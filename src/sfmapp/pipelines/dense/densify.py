@@ -24,7 +24,7 @@ from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.pipelines.dense import results as dense_results
 from sfmapp.pipelines.dense.results import STAGE
-from sfmapp.pipelines.dense.source import DenseJob, dense_job, find_source, model_digest, plan_source
+from sfmapp.pipelines.dense.source import DenseJob, calibrate_source, dense_job, find_source, model_digest, plan_source
 from sfmapp.report.model import DenseReport, Outcome
 from sfmapp.workspace.kernels import compile_dense_kernels
 from sfmapp.workspace.keys import input_key, stage_key
@@ -63,7 +63,8 @@ def dense(
     Args:
         source: a workspace, or the folder of a COLMAP model.
         output: workspace of the results; None: ``source`` itself, or the folder ``sfmapp`` of a COLMAP model.
-        options: ``dense`` and, for masks, ``images`` count here.
+        options: ``dense`` and, for masks, ``images`` count here. ``images.camera``, a calibration, replaces the cameras
+            of the model, whose poses and points are adjusted to it; the model that comes of it is in the workspace.
         images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
         maps: write depth and normal maps of every view as well.
         record: write ``dense/recording.rrd``, the patches growing wave by wave.
@@ -87,6 +88,7 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
     key = ""
     try:
         with job.stage("views"):
+            report = replace(report, calibration=calibrate_source(job))
             plan, views = plan_source(job)
             report = replace(report, views=views)
         clusters = make_clusters(plan, job.options.dense.cell_px, job.options.dense.max_memory_mb)

@@ -49,7 +49,7 @@ RECORDING = "dense/recording.rrd"
 PICTURE_PX = 640
 Document: TypeAlias = ReconstructionReport | DenseRunReport
 # whose messages in the report of a workspace are ours to replace
-_OWN_STAGES = frozenset((STAGE, "views", "maps", "mesh", "texture", "recording"))
+_OWN_STAGES = frozenset((STAGE, "calibration", "views", "maps", "mesh", "texture", "recording"))
 
 
 def earlier_dense(job: DenseJob, key: str, files: Sequence[str]) -> DenseReport | None:

@@ -15,9 +15,11 @@ from sfmapp.dense.report import ViewsReport
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, is_model_file, read_model
+from sfmapp.pipelines.calibrated_model import with_calibration
 from sfmapp.pipelines.stored_pixels import has_stored_pixels
+from sfmapp.report.model import CalibratedModelReport
 from sfmapp.workspace.job import Job
-from sfmapp.workspace.layout import DENSE, ODOMETRY, RECONSTRUCT, UNDISTORT, USUAL_FOLDERS
+from sfmapp.workspace.layout import DENSE, MANIFEST, ODOMETRY, RECONSTRUCT, UNDISTORT, USUAL_FOLDERS
 from sfmapp.workspace.manifest import Manifest, image_root, missing_photographs, read_manifest
 from sfmapp.workspace.options import Options, options_from_dict, options_to_dict
 from sfmapp.workspace.usage import Stopwatch
@@ -37,6 +39,7 @@ class DenseSource:
         command: that wrote it or is to make it.
         is_upright: the model counts pixels in photographs turned as EXIF says.
         options: those given, with the masks of the run that made the model unless others are named.
+        camera: calibration whose cameras are to replace those of the model; None: they stay.
     """
 
     model: Path
@@ -45,6 +48,7 @@ class DenseSource:
     command: str
     is_upright: bool
     options: Options
+    camera: str | None = None
 
 
 @dataclass
@@ -84,6 +88,29 @@ def dense_job(
     )
 
 
+def calibrate_source(job: DenseJob) -> CalibratedModelReport | None:
+    """Put the model with the cameras of a calibration into the workspace, where everything else takes it from; None
+    where no calibration was given.
+
+    Raises:
+        InputError: the calibration or the model cannot be read, or do not belong together.
+    """
+    where = job.known
+    if where.camera is None:
+        return None
+    model, keypoints = read_model(where.model, job.events)
+    photographs = find_photographs(
+        model, where.images, job.options.images,
+        is_upright=where.is_upright, with_copies=True, threads=job.threads, events=job.events,
+    )  # fmt: skip
+    found, _, report = with_calibration(
+        model, photographs, str(where.images), where.camera, job.events, threads=job.threads
+    )  # fmt: skip
+    job.workspace.write_models([found], keypoints, job.events)
+    job.where = dataclasses.replace(where, model=job.workspace.model(), camera=None)
+    return report
+
+
 def plan_source(job: DenseJob) -> tuple[DensePlan, ViewsReport]:
     """What is planned with the views of the model, and the report of it.
 
@@ -100,6 +127,11 @@ def plan_source(job: DenseJob) -> tuple[DensePlan, ViewsReport]:
         is_upright=where.is_upright, threads=job.threads, events=job.events,
     )  # fmt: skip
     return plan_views(model, photographs, job.options.dense, job.events)
+
+
+def is_of_model(source: Path) -> bool:
+    """Whether it is a workspace or the folder of a COLMAP model, and not one of photographs."""
+    return (source / MANIFEST).is_file() or has_model(source) or has_model(source / "sparse" / "0")
 
 
 def find_source(
@@ -125,15 +157,18 @@ def find_source(
     """
     folder = Path(source)
     # what undistort has written is a COLMAP model with its photographs where COLMAP has them
-    if (folder / "run.json").is_file() and read_manifest(folder).command != UNDISTORT:
+    if (folder / MANIFEST).is_file() and read_manifest(folder).command != UNDISTORT:
         return _in_workspace(folder, output, images, options, asked_for)
     if not has_model(folder):
         if not has_model(folder / "sparse" / "0"):
             what = "no such folder" if not folder.is_dir() else "neither of them"
-            raise InputError(f"{folder}: expected a workspace of sfmapp or a COLMAP model, found {what}")
+            advice = "photographs alone are straightened with --camera FILE" if asked_for == UNDISTORT else ""
+            raise InputError(f"{folder}: expected a workspace of sfmapp or a COLMAP model, found {what}", advice)
         folder = folder / "sparse" / "0"
     target = folder / INSIDE if output is None else Path(output)
-    return DenseSource(folder, _image_folder(folder, images), target, DENSE, False, options)
+    return DenseSource(
+        folder, _image_folder(folder, images), target, DENSE, False, options, options.images.camera
+    )  # fmt: skip
 
 
 def _in_workspace(
@@ -153,6 +188,7 @@ def _in_workspace(
             DENSE,
             False,
             options,
+            options.images.camera,
         )
     if command not in (RECONSTRUCT, DENSE):
         raise UsageError(
@@ -172,10 +208,18 @@ def _in_workspace(
         if not has_model(model):
             raise NoReconstructionError(f"{folder} holds no model", "run sfmapp reconstruct first")
     earlier = options_from_dict({"images": manifest.options.get("images", {})}).images
+    camera = options.images.camera
+    if is_own and camera not in (None, earlier.camera):
+        raise UsageError(
+            f"{folder} holds a model that was made without {camera}, which stays as it is",
+            f"have the results elsewhere: sfmapp {asked_for} {folder} --camera {camera} -o OUT",
+        )
     if options.images.mask_path is None and earlier.mask_path is not None:
         images_options = dataclasses.replace(options.images, mask_path=earlier.mask_path)
         options = dataclasses.replace(options, images=images_options)
-    return DenseSource(model, found, target, command if is_own else DENSE, is_upright, options)
+    return DenseSource(
+        model, found, target, command if is_own else DENSE, is_upright, options, None if is_own else camera
+    )  # fmt: skip
 
 
 def _photograph_folder(folder: Path, manifest: Manifest) -> Path:

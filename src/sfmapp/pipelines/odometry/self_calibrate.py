@@ -17,7 +17,7 @@ from sfmapp.geometry import rigid3
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.images.sequence import Frame, Sequence
 from sfmapp.odometry.result import OdometryResult
-from sfmapp.pipelines.odometry.lens_fit import LensFit, fit_lens
+from sfmapp.pipelines.lens_fit import LensFit, fit_lens
 from sfmapp.pipelines.sparse.reconstruct import RunResult, reconstruct
 from sfmapp.report.document import named_params
 from sfmapp.report.model import CalibrationReport, ReconstructionReport
