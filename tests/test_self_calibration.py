@@ -12,7 +12,7 @@ from sfmapp.events import Events
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.pipelines.lens_fit import fit_lens
-from sfmapp.pipelines.odometry.self_calibrate import MAX_FOCAL_SIGMA, SETTLED_SIGMA, widen
+from sfmapp.pipelines.odometry.self_calibrate import MAX_FOCAL_SIGMA, SETTLED_SIGMA, focal_of_pairs, widen
 from sfmapp.report.model import CalibrationReport, LensEvidence
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import Layout, make_scene, perturb, synthetic_camera
@@ -43,6 +43,16 @@ def test_a_lens_is_found_within_its_sigmas_and_not_called_settled_where_it_is_no
         assert error < 0.05
         if distortion == 0:  # zero, unless the images clearly show some
             assert found.camera.params[3] == 0.0
+
+
+@pytest.mark.parametrize("layout", ["ring", "grid", "forward"])
+def test_pairs_of_images_tell_the_focal_length_without_the_model(layout: Layout) -> None:
+    model = bent(1, layout)
+    found = focal_of_pairs(model, fit_lens(model).camera)
+    assert found is not None
+    assert abs(found.focal - FOCAL) < 3.0 * found.sigma
+    # a ring is a turntable, which tells next to nothing, and says so
+    assert (found.sigma < 0.01 * FOCAL) == (layout != "ring")
 
 
 def found_camera(is_settled: bool, focal_sigma_relative: float) -> CalibrationReport:

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from sfmapp.geometry import epipolar, rigid3
+from sfmapp.geometry.fundamental import eight_point
 from sfmapp.geometry.self_calibration import (
+    combine_focals,
     focal_from_fundamental,
     focal_from_homographies,
     focal_from_vanishing_points,
     focals_from_fundamental,
+    focals_from_matches,
     refine_turning_camera,
 )
 
@@ -95,3 +98,73 @@ def test_focal_length_from_vanishing_points() -> None:
     # one at infinity, and a pair that no focal length brings to a right angle
     first, second = np.array([[1.0, 0.0, 0.0], [5.0, 5.0, 1.0]]), np.array([[0.0, 5.0, 1.0], [9.0, 9.0, 1.0]])
     assert np.isnan(focal_from_vanishing_points(first, second)).all()
+
+
+def matches(rng: np.random.Generator, focals: tuple[float, float], pose: np.ndarray, num: int = 200) -> tuple:
+    """Pixels of points 3 to 9 away, in both pictures."""
+    xyz = rng.uniform([-3, -2, 3], [3, 2, 9], (num, 3))
+    there = rigid3.apply(pose, xyz)
+    return tuple(f * p[:, :2] / p[:, 2:] + CENTER1 for f, p in zip(focals, (xyz, there), strict=True))
+
+
+@pytest.mark.parametrize("is_shared", [True, False])
+def test_the_sigmas_of_focal_lengths_from_matches_are_right(is_shared: bool) -> None:
+    rng = np.random.default_rng(3)
+    z = []
+    for trial in range(60):
+        f1, f2 = rng.uniform(400, 900, 2)
+        focals = (f1, f1) if is_shared else (f1, f2)
+        turn, shift = rng.uniform(-0.4, 0.4, 3), rng.uniform(-1.5, 1.5, 3) * [1, 1, 0.5]
+        xy1, xy2 = matches(rng, focals, rigid3.from_matrix(rigid3.exp_so3(turn), shift))
+        xy1 = xy1 + 0.4 * rng.standard_normal(xy1.shape)
+        xy2 = xy2 + 0.4 * rng.standard_normal(xy2.shape)
+        start, num_wrong = eight_point(xy1, xy2)[0], 20 * (trial % 2)
+        xy2[:num_wrong] += rng.uniform(-60, 60, (num_wrong, 2))
+        found = focals_from_matches(
+            xy1, xy2, CENTER1, CENTER1, SIZE, is_shared=is_shared, fundamental=start
+        )  # fmt: skip
+        if found is None:
+            continue
+        assert found.noise_px == pytest.approx(0.4, rel=0.3)
+        z.append(np.log(found.focals / focals[: len(found.focals)]) / np.sqrt(np.diag(found.covariance)))
+    assert len(z) > 54
+    assert (np.abs(z) < 3.5).all()
+    assert 0.8 < np.std(z) < 1.2
+
+
+def test_matches_of_motions_that_tell_no_focal_length_tell_none() -> None:
+    rng = np.random.default_rng(4)
+    turn = rigid3.exp_so3(np.array([0.0, 0.4, 0.0]))
+    middle = np.array([0.0, 0.0, 6.0])
+    for pose in (
+        rigid3.from_matrix(np.eye(3), np.array([1.0, 0.2, 0.1])),  # it did not turn
+        rigid3.from_matrix(turn, middle - turn @ middle),  # a turntable
+    ):
+        for _ in range(5):
+            xy1, xy2 = matches(rng, (600.0, 600.0), pose)
+            noisy = [xy + 0.5 * rng.standard_normal(xy.shape) for xy in (xy1, xy2)]
+            found = focals_from_matches(noisy[0], noisy[1], CENTER1, CENTER1, SIZE)
+            assert found is None or found.sigmas[0] > 0.04 * found.focals[0]
+    # a camera that only turned leaves F open; what is told all the same is of the turn, and right
+    for _ in range(5):
+        xy1, xy2 = matches(rng, (600.0, 600.0), rigid3.from_matrix(turn, np.zeros(3)))
+        noisy = [xy + 0.5 * rng.standard_normal(xy.shape) for xy in (xy1, xy2)]
+        found = focals_from_matches(noisy[0], noisy[1], CENTER1, CENTER1, SIZE)
+        assert found is None or abs(found.focals[0] - 600.0) < 4.0 * found.sigmas[0]
+
+
+def test_pairs_of_one_camera_tell_more_together() -> None:
+    rng = np.random.default_rng(5)
+    told = []
+    for _ in range(12):
+        turn, shift = rng.uniform(-0.4, 0.4, 3), rng.uniform(-1.5, 1.5, 3)
+        pair = matches(rng, (600.0, 600.0), rigid3.from_matrix(rigid3.exp_so3(turn), shift))
+        noisy = [xy + 0.5 * rng.standard_normal(xy.shape) for xy in pair]
+        found = focals_from_matches(noisy[0], noisy[1], CENTER1, CENTER1, SIZE)
+        told += [] if found is None else [found]
+    together = combine_focals(told)
+    assert together is not None
+    assert together.num_pairs >= 10
+    assert abs(together.focal - 600.0) < 3.0 * together.sigma
+    assert together.sigma < min(one.sigmas[0] for one in told) * 1.1
+    assert combine_focals([]) is None

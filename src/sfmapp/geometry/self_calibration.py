@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.epipolar import sampson_errors
+from sfmapp.geometry.fit import FitInfo
+from sfmapp.geometry.fundamental import fundamental_from_points, rank_two, refine_fundamental
 from sfmapp.geometry.homography import rotation_from_rays
 
 Array = NDArray[np.float64]
@@ -25,6 +28,9 @@ _CHANGE, _TELLING, _ROUNDING = 1.2, 3.0, 1e-6
 # product of the last numbers of vanishing points of unit length, below which one of them is at infinity
 _INFINITE = 1e-12
 _MAX_STEPS, _CONVERGED = 30, 1e-12
+# F has seven numbers; with twice as many matches their noise is known from what is left. Matches farther off than three
+# standard deviations are wrong ones; that deviation follows from the median of the lengths of normal numbers.
+_NUM_FREE, _MIN_MATCHES, _LIMIT, _MAD, _MAX_ROUNDS = 7, 14, 3.0, 1.4826, 20
 
 
 def focals_from_fundamental(fundamental: Array, center1: Array, center2: Array) -> tuple[float, float] | None:
@@ -94,6 +100,134 @@ def focal_from_fundamental(
     if np.sqrt(np.maximum(above(beside) / below(beside), 0.0)).min() < max(_TELLING * unequal[best], _ROUNDING):
         return None
     return float(np.sqrt(w[best])) * size, float(unequal[best])
+
+
+@dataclass(frozen=True)
+class FocalsOfPair:
+    """Focal lengths that the matches of two photographs tell.
+
+    Attributes:
+        focals: (1,) that both share, or (2,) pixels.
+        covariance: of their logarithms: the noise of the matches, as far as F's own covariance carries it.
+        noise_px: standard deviation of a matched coordinate.
+        is_inlier: (N,) matches that count.
+    """
+
+    focals: Array
+    covariance: Array
+    noise_px: float
+    is_inlier: NDArray[np.bool_]
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations of the focal lengths, pixels."""
+        found: Array = self.focals * np.sqrt(np.diag(self.covariance))
+        return found
+
+
+def focals_from_matches(
+    xy1: Array, xy2: Array, center1: Array, center2: Array, size: float, *, is_shared: bool = True,
+    fundamental: Array | None = None,
+) -> FocalsOfPair | None:  # fmt: skip
+    """Focal lengths from matches, with the sigmas that their noise asks for.
+
+    F is fitted with its covariance, and both are carried to the focal lengths: what they change by, one standard
+    deviation of F to each side along each of its axes.
+
+    Args:
+        xy1, xy2: (N, 2) pixels; with an F to start from some of the matches may be wrong.
+        center1, center2: (2,) principal points. Their errors are not in the sigmas.
+        size: longer side of the pictures.
+        is_shared: both have one focal length (:func:`focal_from_fundamental`); False: each its own
+            (:func:`focals_from_fundamental`). These say which motions tell nothing.
+        fundamental: (3, 3) F that is near, x2^T F x1 = 0, of a search by samples perhaps; None: that of all matches.
+
+    Returns:
+        None where the matches leave F open, or where an F within one standard deviation tells no focal lengths: a
+        motion that is, as far as the noise lets it be seen, one of those that tell nothing.
+    """
+    scaled = np.diag([size, size, 1.0])
+    start = None if fundamental is None else scaled @ _centered(fundamental, center1, center2) @ scaled
+    fit = _fit_fundamental((xy1 - center1) / size, (xy2 - center2) / size, start)
+    if fit is None:
+        return None
+    matrix, info = fit
+    middle = np.zeros(2)
+
+    def logs(f: Array) -> Array | None:
+        if is_shared:
+            one = focal_from_fundamental(f, middle, middle, 1.0)
+            return None if one is None else np.log([one[0]])
+        both = focals_from_fundamental(f, middle, middle)
+        return None if both is None else np.log(both)
+
+    found = logs(matrix)
+    assert info.covariance is not None
+    values, axes = np.linalg.eigh(info.covariance)
+    steps = (axes[:, -_NUM_FREE:] * np.sqrt(np.maximum(values[-_NUM_FREE:], 0.0))).T.reshape(-1, 3, 3)
+    beside = [logs(rank_two(matrix + sign * step)) for step in steps for sign in (1.0, -1.0)]
+    if found is None or any(one is None for one in beside):
+        return None
+    sides = np.array(beside).reshape(len(steps), 2, -1)
+    slopes = 0.5 * (sides[:, 0] - sides[:, 1])
+    # what bends is part of what is not known: the mean of both sides differs from the middle
+    bends = 0.5 * (sides[:, 0] + sides[:, 1]) - found
+    covariance = slopes.T @ slopes + 0.5 * bends.T @ bends
+    return FocalsOfPair(size * np.exp(found), covariance, size * info.sigma_px, info.is_inlier)
+
+
+def _fit_fundamental(xy1: Array, xy2: Array, start: Array | None) -> tuple[Array, FitInfo] | None:
+    """F of the matches that agree with it, with its covariance; None where they are few or leave it open."""
+    if len(xy1) < _MIN_MATCHES:
+        return None
+    matrix = fundamental_from_points(xy1, xy2) if start is None else rank_two(start)
+    is_inlier = np.zeros(len(xy1), bool)
+    for _ in range(_MAX_ROUNDS):
+        lengths = np.sqrt(sampson_errors(matrix, xy1, xy2))
+        before, is_inlier = is_inlier, lengths <= _LIMIT * max(_MAD * float(np.median(lengths)), 1e-15)
+        if is_inlier.sum() < _MIN_MATCHES:
+            return None
+        if (is_inlier == before).all():
+            break
+        matrix, info = refine_fundamental(matrix, xy1[is_inlier], xy2[is_inlier])
+    return None if info.covariance is None else (matrix, replace(info, is_inlier=is_inlier))
+
+
+@dataclass(frozen=True)
+class SharedFocal:
+    """The focal length of one camera, from several pairs of its photographs.
+
+    Attributes:
+        focal, sigma: pixels; the sigma is as wide as the pairs differ.
+        num_pairs: that tell it, and agree.
+    """
+
+    focal: float
+    sigma: float
+    num_pairs: int
+
+
+def combine_focals(pairs: Sequence[FocalsOfPair]) -> SharedFocal | None:
+    """What pairs of photographs of one camera tell together; None without any.
+
+    The weighted mean of the logarithms, in which pairs count that are within three sigmas of the weighted median: a
+    motion near to one that tells nothing has a long tail. Pairs that share photographs are not independent, so the
+    sigma is no smaller than that of the best pair over the root of half of their number, nor than they differ by.
+    """
+    if not pairs:
+        return None
+    logs = np.array([np.log(pair.focals[0]) for pair in pairs])
+    sigmas = np.array([math.sqrt(max(pair.covariance[0, 0], 1e-16)) for pair in pairs])
+    weights = sigmas**-2
+    order = np.argsort(logs)
+    share = np.cumsum(weights[order]) / weights.sum()
+    middle = logs[order[int(np.searchsorted(share, 0.5))]]
+    near = np.abs(logs - middle) <= 3.0 * np.hypot(sigmas, sigmas.min())
+    total = weights[near].sum()
+    mean = float((weights[near] * logs[near]).sum() / total)
+    excess = float((weights[near] * (logs[near] - mean) ** 2).sum()) / max(1, near.sum() - 1)
+    sigma = math.sqrt(2.0 / total * max(1.0, excess)) if near.sum() > 1 else float(sigmas[near][0])
+    return SharedFocal(math.exp(mean), math.exp(mean) * sigma, int(near.sum()))
 
 
 def _traces(f: Array) -> tuple[np.polynomial.Polynomial, np.polynomial.Polynomial]:

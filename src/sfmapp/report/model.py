@@ -626,11 +626,20 @@ class LensEvidence(Report):
     independent_sigma: float
 
 
+class PairFocal(Report):
+    """The focal length that fundamental matrices of pairs of frames tell, without the reconstruction; pixels."""
+
+    focal_px: float
+    sigma_px: float
+    num_pairs: int
+
+
 class CalibrationReport(CameraParams):
     """The camera that a self-calibration found; ``text``: in words.
 
     Attributes:
         sigma: standard deviations of the parameters by name; ``focal_sigma_relative``: of the focal length.
+        pairs: what pairs of frames say of the focal length; absent where their motion tells none.
         is_settled: it is known as well as odometry needs.
         frames: names of those that were reconstructed.
     """
@@ -644,6 +653,7 @@ class CalibrationReport(CameraParams):
     num_points: int
     mean_reprojection_error_px: float
     text: str
+    pairs: PairFocal | None = None
 
 
 class OdometryStages(Report):

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.camera.names import CameraModel
 from sfmapp.contradictions import Contradiction, widened
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.epipolar import essential_from_pose, fundamental_from_essential
+from sfmapp.geometry.self_calibration import SharedFocal, combine_focals, focals_from_matches
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.images.sequence import Frame, Sequence
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.pipelines.lens_fit import LensFit, fit_lens
 from sfmapp.pipelines.sparse.reconstruct import RunResult, reconstruct
 from sfmapp.report.document import named_params
-from sfmapp.report.model import CalibrationReport, ReconstructionReport
+from sfmapp.report.model import CalibrationReport, PairFocal
+from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.sequences.open import HOW_TO_CALIBRATE, open_sequence
 from sfmapp.workspace.options import Options
 
@@ -41,6 +47,11 @@ MAX_FOCAL_SIGMA, SETTLED_SIGMA, MIN_SHARE = 0.03, 0.0067, 0.6
 # A second term of distortion has to make the reprojection error smaller by this share: noise alone, of a few thousand
 # observations, would give it some thousandths; a wide lens whose first term is not enough, more than half.
 _MIN_GAIN = 0.05
+# Matches of a pair that is asked for the focal length: several for each of the seven numbers of F, so that their noise
+# is known.
+_MIN_MATCHES = 40
+# The focal lengths of the reconstruction and of pairs contradict each other from so many sigmas on: once in 400.
+_SIGMAS = 3.0
 ADVICE = HOW_TO_CALIBRATE.partition("; or let ")[0]
 
 
@@ -65,7 +76,7 @@ def self_calibrated(source: str, options: Options, events: Events) -> tuple[Opti
             f"begin where the camera moves (--start), or {ADVICE}",
         )
     run = _reconstruct(source, frames, options, events)
-    found = _verdict(source, run.report, fit_lens(run.reconstruction), [frame.name for frame in frames])
+    found = _verdict(source, run, fit_lens(run.reconstruction), [frame.name for frame in frames])
     text = ",".join([found.model, *(f"{value!r}" for value in found.params.values())])
     events.finished(STAGE, found.text)
     if not found.is_settled:
@@ -174,10 +185,46 @@ def _reconstruct(source: str, frames: list[Frame], options: Options, events: Eve
     return runs[1] if len(errors) > 1 and errors[1] < (1 - _MIN_GAIN) * errors[0] else runs[0]
 
 
-def _verdict(source: str, report: ReconstructionReport, lens: LensFit, names: list[str]) -> CalibrationReport:
+def focal_of_pairs(model: Reconstruction, camera: Camera) -> SharedFocal | None:
+    """What the fundamental matrices of pairs of images tell of the focal length of their one camera.
+
+    Nothing of the model counts for it but where the search for F begins: all matches of tracks take part, whether the
+    model agrees with them or not. Pixels are laid out without the distortion of the camera.
+
+    Returns:
+        None where no pair tells it.
+    """
+    tracks, center = model.tracks, camera.canonical[2:4]
+    flat = pixels_to_normalized(camera, np.asarray(tracks.obs_xy, np.float64)) * camera.focal + center
+    size = float(max(camera.width, camera.height))
+    pinhole = np.array([[camera.focal, 0.0, center[0]], [0.0, camera.focal, center[1]], [0.0, 0.0, 1.0]])
+    told = []
+    registered = model.registered_idx.tolist()
+    for i, j in combinations(registered, 2):
+        first, second = (tracks.observations_of_image(image) for image in (i, j))
+        _, a, b = np.intersect1d(tracks.obs_track_idx[first], tracks.obs_track_idx[second], return_indices=True)
+        if len(a) < _MIN_MATCHES:
+            continue
+        pose = rigid3.compose(model.cam_from_world[j], rigid3.inverse(model.cam_from_world[i]))
+        start = fundamental_from_essential(essential_from_pose(pose), pinhole, pinhole)
+        xy1, xy2 = flat[first[a]], flat[second[b]]
+        is_known = np.isfinite(xy1).all(1) & np.isfinite(xy2).all(1)
+        one = focals_from_matches(xy1[is_known], xy2[is_known], center, center, size, fundamental=start)
+        if one is not None:
+            told.append(one)
+    return combine_focals(told)
+
+
+def _verdict(source: str, run: RunResult, lens: LensFit, names: list[str]) -> CalibrationReport:
     """The camera of a good reconstruction and how good it is."""
+    reconstruction, report = run
     model, camera = report.models[0], lens.camera
-    relative = lens.focal_sigma_relative
+    relative, pairs = lens.focal_sigma_relative, focal_of_pairs(reconstruction, camera)
+    if pairs is not None:
+        # two ways to the same number: where they disagree, neither is as sure as it says
+        apart = abs(math.log(pairs.focal / camera.focal))
+        if apart > _SIGMAS * math.hypot(relative, pairs.sigma / pairs.focal):
+            relative = math.hypot(relative, apart)
     problem = ""
     if model.num_registered < max(MIN_FRAMES, MIN_SHARE * len(names)):
         problem = f"only {model.num_registered} of {len(names)} frames could be joined"
@@ -193,11 +240,16 @@ def _verdict(source: str, report: ReconstructionReport, lens: LensFit, names: li
         f"{camera.model.name}, f {camera.focal:.1f} px \N{PLUS-MINUS SIGN}{relative * camera.focal:.1f}, from "
         f"{model.num_registered} frames, reprojection error {model.mean_reprojection_error_px:.2f} px"
     )
+    if pairs is not None:
+        of_pairs = f"{pairs.focal:.1f} px \N{PLUS-MINUS SIGN}{pairs.sigma:.1f}"
+        text += f"; {pairs.num_pairs} pairs of frames alone: {of_pairs}"
     return CalibrationReport(
         model=camera.model.name, params=named_params(camera), sigma=lens.sigma, focal_sigma_relative=float(relative),
         is_settled=bool(relative <= SETTLED_SIGMA), fit=lens.evidence, frames=names,
         num_registered=model.num_registered, num_points=model.num_points,
         mean_reprojection_error_px=model.mean_reprojection_error_px, text=text,
+        pairs=None if pairs is None else PairFocal(
+            focal_px=pairs.focal, sigma_px=pairs.sigma, num_pairs=pairs.num_pairs),
     )  # fmt: skip
 
 
