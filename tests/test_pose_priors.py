@@ -19,11 +19,16 @@ from sfmapp.events import Events
 from sfmapp.formats.colmap import read_model
 from sfmapp.formats.ground_truth import read_ground_truth
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.geometry.geodesy import LocalFrame
 from sfmapp.georeference.held_poses import judge_held_poses
+from sfmapp.georeference.options import GpsOptions
 from sfmapp.georeference.pose_fit import known_poses, robust_pose_fit
 from sfmapp.georeference.pose_options import PoseOptions
+from sfmapp.georeference.pose_positions import with_positions
 from sfmapp.georeference.pose_report import PosesReport
 from sfmapp.georeference.pose_stage import PoseFile, pose_models
+from sfmapp.images.image_set import ImageRecord, ImageSet
+from sfmapp.images.position import Position
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.scene.synthetic import SyntheticScene, make_scene, synthetic_camera, true_correspondences
@@ -200,6 +205,51 @@ def test_poses_that_are_all_a_little_off_are_contradicted_where_they_are_held(po
     names = found.evidence["images"]
     assert isinstance(names, list)
     assert names
+
+
+def positioned(scene: SyntheticScene, metres: float, seed: int, wrong: int = 0) -> ImageSet:
+    """Photographs with positions to two centimetres of a scene whose unit has so many metres; some far away."""
+    rng, place = np.random.default_rng([seed, 7]), LocalFrame(48.2, 16.4, 170.0)
+    at = metres * rigid3.center(scene.ground_truth.cam_from_world) + 0.02 * rng.normal(size=(NUM, 3))
+    at[:wrong] += 300.0 * rng.normal(size=(wrong, 3))
+    positions = [
+        Position(latitude, longitude, height, "ellipsoidal", 0.02, 0.02, True)
+        for latitude, longitude, height in place.geodetic_from_enu(at).tolist()
+    ]
+    records = [
+        ImageRecord(name, Path(name), 1000, 750, position=position)
+        for name, position in zip(scene.observed.image_names, positions, strict=True)
+    ]
+    return ImageSet(tuple(records), tuple(scene.observed.cameras))
+
+
+@pytest.mark.parametrize(
+    ("metres", "wrong", "said"),
+    [(1.0, 0, ""), (1.1, 0, "sigmas from a metre"), (0.3048, 0, ""), (1.0, 5, "said to be good to 0.02 m")],
+)
+def test_positions_are_held_against_known_poses(pool: Executor, metres: float, wrong: int, said: str) -> None:
+    for seed in range(3):
+        scene = scene_of(seed)
+        mapper = finished_map(scene, pool, seed)
+        report = pose_models([mapper], pose_file(noisy_poses(scene, seed)), Events())
+        before = mapper.reconstruction.cam_from_world.copy()
+        image_set = positioned(scene, metres, seed, wrong)
+        report = with_positions(report, [mapper.reconstruction], image_set, GpsOptions(), Events())
+        assert (mapper.reconstruction.cam_from_world == before).all()
+        found = report.models[0].positions
+        assert found is not None
+        assert found.unit_m is not None
+        assert found.unit_sigma_m is not None
+        assert [said in one.message for one in report.contradictions] == [True] * bool(said)
+        if not wrong:
+            assert found.num_agreeing == NUM
+            # cameras some four units from the middle, known to 2 cm, and poses that make the unit as good
+            assert abs(found.unit_m / metres - 1.0) < 4 * np.hypot(found.unit_sigma_m / metres, 0.02 / 4)
+            assert "one unit is" in found.sentence
+    few = ImageSet(image_set.images[:2], image_set.cameras)
+    found = with_positions(report, [mapper.reconstruction], few, GpsOptions(), Events()).models[0].positions
+    assert found is not None
+    assert "three are needed" in found.sentence
 
 
 def write_cameras(path: Path, sample: Path, num: int, wrong: int | None) -> dict[str, np.ndarray]:

@@ -284,6 +284,8 @@ def _print_poses(report: ReconstructionReport) -> None:
                 f"  model {model.model} {how} {model.num_used} of {model.num_known} known poses, which are good to"
                 f" {model.sigma:.2g} and {model.sigma_deg:.2g} degrees by the photographs"
             )
+        if model.positions is not None:
+            print(f"  model {model.model}: {model.positions.sentence}")
     for image in found.images:
         if not image.is_used and image.model is not None and image.reason:
             print(f"  {image.name}: {image.reason}; it was left aside")

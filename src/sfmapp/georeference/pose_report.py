@@ -31,6 +31,44 @@ class KnownPoseRow(Report):
     sigmas: float | None = None
 
 
+class PositionsBeside(Report):
+    """Measured positions of photographs (EXIF) held against a model in the frame of known poses, where they are not
+    used: known poses bring their frame, and only positions tell where on Earth that is.
+
+    Attributes:
+        num_positions, num_agreeing: photographs of the model with one, and those that one similarity explains.
+        reason: why they cannot be compared; empty if they can.
+        unit_m: metres by positions of one unit of the frame; unit_sigma_m: its standard deviation.
+        rms_residual_m: of those that agree, horizontally and in height; heights may be unknown.
+        sigma_m: standard deviation of a position along east and north, as stated unless the residuals refute it.
+        stated_sigma_m: as stated; absent where nobody did.
+    """
+
+    num_positions: int
+    num_agreeing: int = 0
+    reason: str = ""
+    unit_m: float | None = None
+    unit_sigma_m: float | None = None
+    rms_residual_m: tuple[float, float | None] | None = None
+    sigma_m: float | None = None
+    stated_sigma_m: float | None = None
+
+    @property
+    def sentence(self) -> str:
+        """What was found, for people."""
+        begin = (
+            f"positions of {self.num_positions} photographs are not used beside known poses, which bring their frame"
+        )
+        if self.reason or self.rms_residual_m is None:
+            return f"{begin}; they cannot be compared: {self.reason}"
+        flat, up = self.rms_residual_m
+        height = "" if up is None else f" and {up:.2g} m in height"
+        return (
+            f"{begin}; compared, {self.num_agreeing} agree with it, within {flat:.2g} m{height}, and one unit is "
+            f"{self.unit_m:.4g} +- {self.unit_sigma_m:.2g} m"
+        )
+
+
 class PosedModel(Report):
     """How a model lies in the frame of known poses, or why it does not.
 
@@ -43,6 +81,7 @@ class PosedModel(Report):
         scale: the unit of the file over that which photographs alone gave the model; absent where poses are held.
         scale_sigma_share: standard deviation of the scale as a share of it.
         is_adjusted: poses took part in the adjustment; False: the model was moved as a whole.
+        positions: what measured positions say beside; absent where there are none.
     """
 
     model: int
@@ -55,6 +94,7 @@ class PosedModel(Report):
     scale: float | None = None
     scale_sigma_share: float | None = None
     is_adjusted: bool | None = None
+    positions: PositionsBeside | None = None
 
 
 class PosesReport(Report):

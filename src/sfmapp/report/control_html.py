@@ -82,6 +82,8 @@ def poses_section(report: PosesReport) -> str:
                 f"and {model.sigma_deg:.2g} degrees about each"
             )
         lines.append(f"model {model.model}: {text}")
+        if model.positions is not None:
+            lines.append(f"model {model.model}: {model.positions.sentence}")
     rows = [
         [
             ("t green" if image.is_used else "t red", image.name),

@@ -150,7 +150,11 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
         given = (image_set, run.features, run.correspondences, options.mapping)
         if run.poses is not None and options.poses.fixed:
             models, mapped = map_known_poses(
-                *given, adjust_options=options.adjust, threads=threads, events=events, poses=held_poses(run, run.poses)
+                *given,
+                adjust_options=options.adjust,
+                threads=threads,
+                events=events,
+                poses=held_poses(run, run.poses, image_set),
             )
         else:
             models, mapped = map_images(

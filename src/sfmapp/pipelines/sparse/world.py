@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,7 @@ from sfmapp.formats.control_points import ControlPoints, read_control_points
 from sfmapp.pipelines.sparse.run import Run
 
 if TYPE_CHECKING:
+    from sfmapp.georeference.pose_report import PosesReport
     from sfmapp.georeference.pose_stage import PoseFile
     from sfmapp.images.image_set import ImageSet
     from sfmapp.mapping.known_poses import HeldPoses
@@ -67,15 +68,23 @@ def read_known_poses(run: Run, image_set: ImageSet) -> PoseFile | None:
     return read_poses(options.poses, image_set.names)
 
 
-def held_poses(run: Run, poses: PoseFile) -> HeldPoses:
+def held_poses(run: Run, poses: PoseFile, image_set: ImageSet) -> HeldPoses:
     """Known poses that stay, and what judges them in the end."""
     from sfmapp.georeference.held_poses import judge_held_poses
     from sfmapp.mapping.known_poses import HeldPoses
 
     def judge(mapper: Mapper) -> None:
-        run.stages = replace(run.stages, poses=judge_held_poses(mapper, poses, run.events))
+        report = judge_held_poses(mapper, poses, run.events)
+        run.stages = replace(run.stages, poses=_beside_positions(run, report, [mapper], image_set))
 
     return HeldPoses(poses.cam_from_world, judge)
+
+
+def _beside_positions(run: Run, report: PosesReport, mappers: Sequence[Mapper], image_set: ImageSet) -> PosesReport:
+    """The report on known poses, with what positions of the photographs say beside these."""
+    from sfmapp.georeference.pose_positions import with_positions
+
+    return with_positions(report, [mapper.reconstruction for mapper in mappers], image_set, run.options.gps, run.events)
 
 
 def closing(run: Run, image_set: ImageSet) -> Callable[[list[Mapper]], None] | None:
@@ -85,7 +94,8 @@ def closing(run: Run, image_set: ImageSet) -> Callable[[list[Mapper]], None] | N
         from sfmapp.georeference.pose_stage import pose_models
 
         def bring_to_poses(mappers: list[Mapper]) -> None:
-            run.stages = replace(run.stages, poses=pose_models(mappers, poses, run.events))
+            report = pose_models(mappers, poses, run.events)
+            run.stages = replace(run.stages, poses=_beside_positions(run, report, mappers, image_set))
 
         return bring_to_poses
     has_positions = any(record.position is not None for record in image_set.images)
