@@ -89,7 +89,7 @@ ALLOWED = {
     "argparse": {"cli", "evaluation", "viewer"},
 }
 # modules that "sfmapp --help" may not load
-HEAVY = ("numpy", "numba", "cv2", "av", "gtsam", "pycolmap", "rerun", "scipy", "PIL", "pyproj", "rich")
+HEAVY = ("numpy", "numba", "cv2", "av", "gtsam", "pycolmap", "rerun", "scipy", "PIL", "pyproj", "rich", "email")
 
 
 @cache

@@ -18,6 +18,8 @@ from sfmapp.cli.main import main
 from sfmapp.cli.progress import JsonLines, PlainLines
 from sfmapp.events import Event, Events
 
+# what takes time and memory to load, and what an ordinary reconstruction does without
+NOT_NEEDED = ("gtsam", "http.client", "pyproj", "rerun", "scipy.linalg", "scipy.sparse", "scipy.special")
 MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 
 
@@ -30,8 +32,12 @@ def command(*args: object, **kwargs: object) -> subprocess.CompletedProcess[str]
 def finished(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Output of a run by the command itself; not to be changed."""
     output = tmp_path_factory.mktemp("cli") / "out"
-    done = command("reconstruct", photos, "-o", output, "--no-recording")
+    listed = os.environ | {"PYTHONPROFILEIMPORTTIME": "1"}
+    done = command("reconstruct", photos, "-o", output, "--no-recording", env=listed)
     assert done.returncode == 0, done.stderr
+    loaded = set(re.findall(r"\| +([\w.]+)$", done.stderr, re.MULTILINE))
+    assert "sfmapp.mapping.mapper" in loaded
+    assert [name for name in NOT_NEEDED if name in loaded] == []
     assert "7 of 7 images registered" in done.stdout
     assert re.search(r"took \d+\.\d s, \d+\.\d CPU s, \d+ MB", done.stdout)
     for stage in ("images:", "features:", "pairs:", "matching:", "mapping:"):

@@ -6,10 +6,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.mapping import structure
-from sfmapp.mapping.merge import find_merge, merge, num_linking_points
+from sfmapp.mapping.merge import binomial_tails, find_merge, merge, num_linking_points
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene
@@ -103,3 +104,13 @@ def test_points_whose_distances_have_nothing_to_do_with_each_other_join_nothing(
         source.point_xyz[common] = center + away * (shuffled / distance)[:, None]
         by_chance += find_merge(target, source) is not None
     assert by_chance == 0
+
+
+@pytest.mark.parametrize("share", [1e-6, 0.05, 0.3, 0.9999, 1.0])
+@pytest.mark.parametrize("num", [0, 1, 7, 5000])
+def test_binomial_tails_are_those_of_scipy(num: int, share: float) -> None:
+    expected = binom.sf(np.arange(num + 1) - 1, num, share)
+    found = binomial_tails(num, share)
+    can_be_told = expected > 1e-200
+    assert found[can_be_told] == pytest.approx(expected[can_be_told], rel=1e-8)
+    assert (found[~can_be_told] < 1e-199).all()

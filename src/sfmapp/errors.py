@@ -7,8 +7,10 @@ exit code. A message names the file or option, what was expected and what was fo
 from __future__ import annotations
 
 import errno
+from typing import TYPE_CHECKING
 
-from sfmapp.reporting import Report
+if TYPE_CHECKING:
+    from sfmapp.reporting import Report
 
 _NO_SPACE = "free some space, or choose another place, and run the same command again"
 _NOT_ALLOWED = "check the permissions, or choose another place"

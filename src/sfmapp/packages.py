@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import metadata, util
+from importlib import util
 
 from sfmapp.errors import InputError
+
+# How many threads the linear algebra beneath numpy and scipy uses, read when it is loaded.
+BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 
 # by what is imported: the distribution that brings it, and what needs it
 _DISTRIBUTIONS = {
@@ -56,6 +59,8 @@ def _missing(module: str) -> MissingPackageError:
 
 def _requirement(distribution: str) -> str:
     """The distribution with the versions that sfmapp asks for."""
+    from importlib import metadata  # which brings all of email, and is needed for failures alone
+
     try:
         known = metadata.requires("sfmapp") or []
     except metadata.PackageNotFoundError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Literal, Protocol
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.kernels import BlockArrays, ImageArrays, LensArrays, PointArrays, Sums, find_slot
+from sfmapp.packages import BLAS_THREADS
 from sfmapp.simd.f64x8 import assign8, subtract8
 
 Array = NDArray[np.float64]
@@ -276,11 +278,13 @@ def one_blas_thread() -> Iterator[None]:
     """Hold the linear algebra of numpy and scipy to one thread: our workers use the cores, and the order of sums, to
     the last bit of results, must not depend on how many they are.
 
-    What is loaded later is not held, so scipy's own BLAS is loaded before.
+    What is loaded later is not held, so scipy's own BLAS is loaded before, which takes 0.1 s and 25 MB, unless the
+    environment holds it, as that of commands does.
     """
-    import scipy.linalg  # noqa: F401
     from threadpoolctl import threadpool_limits
 
+    if any(os.environ.get(name) != "1" for name in BLAS_THREADS):
+        import scipy.linalg  # noqa: F401
     with threadpool_limits(1, "blas"):
         yield
 
@@ -314,9 +318,6 @@ class LapackSystem:
     """
 
     def __init__(self, block_dim: Ints, keys: Ints, numbers: Ints) -> None:
-        from scipy.linalg import lapack
-
-        self._lapack = lapack
         self._pairs = np.stack([*np.divmod(keys, len(block_dim)), numbers], 1)
         self._first = np.cumsum(block_dim) - block_dim
         self._dim, self._used = block_dim, np.arange(8) < block_dim[:, None]
@@ -324,27 +325,42 @@ class LapackSystem:
         self._matrix = np.zeros((size, size))
 
     def solve(self, tiles: Array, rhs: Array) -> Array | None:
-        _gather_upper(tiles, self._pairs, self._first, self._dim, self._matrix)
-        diagonal = self._matrix.diagonal().copy()
-        # the upper triangle by rows is the lower one by columns, which LAPACK works on in place
-        factor, info = self._lapack.dpotrf(self._matrix.T, lower=1, clean=0, overwrite_a=1)
-        if info != 0 or not (factor.diagonal() ** 2 > _NO_PIVOT * diagonal).all():
+        _gather_lower(tiles, self._pairs, self._first, self._dim, self._matrix)
+        try:
+            factor: Array = np.linalg.cholesky(self._matrix).astype(np.float64, copy=False)
+        except np.linalg.LinAlgError:
             return None
-        found, _ = self._lapack.dpotrs(factor, rhs.reshape(-1, 8)[self._used], lower=1)
+        if not (factor.diagonal() ** 2 > _NO_PIVOT * self._matrix.diagonal()).all():
+            return None
+        found = rhs.reshape(-1, 8)[self._used]
+        _substitute(factor, found)
         step = np.zeros((len(self._dim), 8))
         step[self._used] = found
         return step.ravel()
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _gather_upper(tiles: Array, pairs: Ints, first: Ints, block_dim: Ints, matrix: Array) -> None:
-    """Fill the upper triangle of matrix (N, N) from tiles; pairs (M, 3) are block a <= b and number of the tile."""
+def _gather_lower(tiles: Array, pairs: Ints, first: Ints, block_dim: Ints, matrix: Array) -> None:
+    """Fill the lower triangle of matrix (N, N) from tiles; pairs (M, 3) are block a <= b and number of the tile."""
     matrix[:] = 0.0
     for n in range(pairs.shape[0]):
         a, b, tile = pairs[n]
         for j in range(block_dim[a]):
             for k in range(block_dim[b]):
-                matrix[first[a] + j, first[b] + k] = tiles[tile * 64 + 8 * j + k]
+                matrix[first[b] + k, first[a] + j] = tiles[tile * 64 + 8 * j + k]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _substitute(factor: Array, x: Array) -> None:
+    """Solve L L^T x = b in place: factor (N, N) is L, x (N,) comes as b."""
+    for i in range(x.shape[0]):
+        for k in range(i):
+            x[i] -= factor[i, k] * x[k]
+        x[i] /= factor[i, i]
+    for i in range(x.shape[0] - 1, -1, -1):
+        x[i] /= factor[i, i]
+        for k in range(i):
+            x[k] -= factor[i, k] * x[i]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

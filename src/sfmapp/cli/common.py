@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from sfmapp.cli.progress import make_listener
 from sfmapp.cli.signals import signals_stop
+from sfmapp.packages import BLAS_THREADS
 
 if TYPE_CHECKING:
     from sfmapp.contradictions import Contradiction
@@ -88,7 +89,7 @@ def print_contradictions(found: Iterable[Contradiction]) -> None:
 def limit_library_threads() -> None:
     """Before numpy is imported: our own workers use the cores; a thread pool in the linear algebra beneath each of them
     would only compete with them for the cores, and would make sums depend on their number."""
-    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+    for name in BLAS_THREADS:
         os.environ.setdefault(name, "1")
 
 

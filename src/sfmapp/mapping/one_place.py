@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from sfmapp.camera.camera import Camera, bearings
 from sfmapp.geometry import homography, rigid3
@@ -68,6 +66,9 @@ def find_one_place(
     correspondences: Correspondences, tracks: Tracks, cameras: Sequence[Camera], image_camera_idx: NDArray[np.int32]
 ) -> OnePlace | None:
     """What the pairs tell together where nearly all of them are rotations; None where they are not."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     counts = correspondences.num_inliers
     is_rotation = np.isin(correspondences.config, (TwoViewConfig.PANORAMIC, TwoViewConfig.PLANAR_OR_PANORAMIC))
     pairs = np.flatnonzero(is_rotation & (counts > 0))
