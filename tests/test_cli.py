@@ -19,7 +19,7 @@ from sfmapp.cli.progress import JsonLines, PlainLines
 from sfmapp.events import Event, Events
 
 # what takes time and memory to load, and what an ordinary reconstruction does without
-NOT_NEEDED = ("gtsam", "http.client", "pyproj", "rerun", "scipy.linalg", "scipy.sparse", "scipy.special")
+NOT_NEEDED = ("gtsam", "http.client", "pyproj", "rerun", "scipy.linalg", "scipy.sparse", "scipy.spatial")
 MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 
 

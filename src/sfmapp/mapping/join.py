@@ -581,6 +581,10 @@ def compile_kernels() -> None:
     from sfmapp.scene.synthetic import make_scene, true_correspondences
 
     scene = make_scene(0, 6, 120)
-    halves = [scene.observed.copy() for _ in range(2)]
-    halves[0].cam_from_world[3:] = halves[1].cam_from_world[:3] = np.nan
-    find_joint(halves[0], halves[1], true_correspondences(scene, min_matches=1), MappingOptions(min_pose_inliers=3))
+    target, source = scene.observed.copy(), scene.observed.copy()
+    target.cam_from_world[3:] = source.cam_from_world[:3] = np.nan
+    # the steps of find_joint that run kernels; its last one would load scipy.spatial, 0.1 s that few runs need
+    checks = _checks(target, source, true_correspondences(scene, min_matches=1))
+    hypotheses = [_from_triples(checks), *(_from_image(checks, i, target, source, 4.0) for i in _bridges(checks))]
+    _scores(np.concatenate(hypotheses), checks, 4.0)
+    _refined(hypotheses[0][0], checks, 4.0)
