@@ -31,6 +31,7 @@ FLOORS = (
     ("dense",),
     ("georeference",),
     ("calibration",),
+    ("twoview",),
     ("mapping",),
     ("adjust",),
     ("matching",),

@@ -132,7 +132,10 @@ def _looseness(pose: Array, xn1: Array, xn2: Array, noise: float) -> str:
         # a difference of costs of this many sigmas tells one hypothesis from the other
         is_as_good = other_cost - cost < _SIGMAS**2 * noise**2
         if is_as_good and not _agrees(refined, pose, xn1, xn2, noise):
-            return "the scene turned inside out, with the camera gone the other way, fits as well"
+            return (
+                "another pose, with the scene turned inside out and the camera gone the other way, fits as well: a "
+                "plane or a narrow field of view leaves both"
+            )
     return ""
 
 

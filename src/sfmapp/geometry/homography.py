@@ -219,10 +219,8 @@ def refine_homography(
     if cofactor is not None and not math.isnan(sigma):
         covariance = (sigma * t1[0, 0]) ** 2 * by_step @ cofactor @ by_step.T
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(hessian)[::-1], 0.0))
-    info = FitInfo(
-        np.ones(len(a), np.bool_), taken, float(values[0] / max(values[-1], 1e-300)), values, 1, sigma, covariance
-    )
-    return h, info
+    condition = float(values[0] / max(values[-1], 1e-300))
+    return h, FitInfo(np.ones(len(a), np.bool_), taken, condition, values, 1, sigma, covariance)
 
 
 def _plane_slopes(state: _Plane, xy2: Array) -> tuple[Array, Array, Array]:

@@ -95,8 +95,9 @@ def triangulate_pair(
         is_known = is_finite & (condition < 1e7)
         covariance = np.full((len(xyz), 3, 3), np.inf)
         covariance[is_known] = noise_px**2 * np.linalg.inv(normal[is_known])
-    x1 = homogeneous(xyz)
-    in_front = np.isfinite(xyz).all(1) & (x1 @ p1[2] > 0) & (x1 @ p2[2] > 0)
+    is_there: Mask = np.asarray(np.isfinite(xyz).all(1), np.bool_)
+    x1 = homogeneous(np.where(is_there[:, None], xyz, 0.0))
+    in_front = is_there & (x1 @ p1[2] > 0) & (x1 @ p2[2] > 0)
     return xyz, PointsInfo(in_front, taken, np.asarray(condition, np.float64), covariance)
 
 

@@ -25,7 +25,7 @@ from sfmapp.images.headers import Header, UnusableImage, read_header
 from sfmapp.images.image_set import ImageOptions, ImageRecord, ImageSet
 from sfmapp.images.pixels import mask_fit
 from sfmapp.images.report import CameraPrior, ImageFacts, ImageProblem, ImagesReport
-from sfmapp.images.sources import Found, find_images, natural_key, printable
+from sfmapp.images.sources import Found, find_files, find_images, natural_key, printable
 from sfmapp.images.xmp import with_xmp
 from sfmapp.reporting import NamedReason
 
@@ -49,7 +49,7 @@ class _Scan:
 
 
 def load_images(
-    source: str | os.PathLike[str], options: ImageOptions, events: Events, *, threads: int | None = None
+    source: str | os.PathLike[str] | Sequence[str], options: ImageOptions, events: Events, *, threads: int | None = None
 ) -> tuple[ImageSet, ImagesReport]:
     """List, check and describe the photographs of a source.
 
@@ -57,7 +57,7 @@ def load_images(
         source: a folder (searched recursively; hidden files and folders are left out, and those that sfmapp and other
             programs made of photographs), a glob pattern (``**`` goes into folders), or a ``.txt`` file with a path per
             line (relative to the list, or absolute; ``#`` begins a comment). Files without an ending are photographs
-            if they begin as one.
+            if they begin as one. Or the files themselves, in a list or tuple.
         options: what to read and what is known about the cameras.
         events: told about progress, every file that is skipped, and how cameras were assigned.
         threads: how many files are read at a time; None: as many as there are processors, 8 at most.
@@ -71,7 +71,10 @@ def load_images(
         InterruptedRunError: a stop was asked for.
     """
     start = time.monotonic()
-    found = find_images(os.fspath(source), options.mask_path)
+    if isinstance(source, str | os.PathLike):
+        name, found = os.fspath(source), find_images(os.fspath(source), options.mask_path)
+    else:
+        name, found = ", ".join(source), find_files(source)
     events.started(STAGE, f"reading {len(found.paths)} files", total=len(found.paths))
     scans: list[_Scan] = []
     skipped = list(found.skipped)
@@ -100,7 +103,7 @@ def load_images(
         raise InputError(
             f"no mask in {options.mask_path} fits any image", f"expected for example {options.mask_path}/{name}.png"
         )
-    report = _report(os.fspath(source), found, image_set, scans, entries, problems, duplicates, start)
+    report = _report(name, found, image_set, scans, entries, problems, duplicates, start)
     passed_over = f", results of sfmapp in {_some(found.results)} passed over" if found.results else ""
     events.finished(
         STAGE, f"{len(images)} images, {len(cameras)} cameras, {len(skipped)} files skipped{passed_over}", **report

@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -195,6 +196,20 @@ def _take(found: Found, path: Path) -> None:
         found.paths.append(path)
     else:  # thumbnails and backups are called such things
         found.skipped.append((name, f"holds a {content} picture but ends in {ending}: rename it if it is a photograph"))
+
+
+def find_files(paths: Sequence[str]) -> Found:
+    """Files that are named one by one; twice the same is one.
+
+    Raises:
+        InputError: one of them does not exist, or is a folder.
+    """
+    for path in paths:
+        if not os.path.isfile(path):
+            found = "a folder" if os.path.isdir(path) else "no such file"
+            raise InputError(f"{path}: expected a photograph, found {found}")
+    absolute = list(dict.fromkeys(Path(os.path.abspath(path)) for path in paths))
+    return Found(Path(os.path.commonpath([path.parent for path in absolute])), absolute)
 
 
 def _find_in_list(list_path: Path) -> Found:

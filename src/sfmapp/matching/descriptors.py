@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,6 +39,39 @@ def mutual_neighbors(best1: Best, best2: Best, max_ratio: float, max_distance: f
     columns = best1.partner[rows]
     keep = good2[columns] & (best2.partner[columns] == rows)
     return np.stack([rows[keep], columns[keep]], 1).astype(np.int32)
+
+
+@dataclass(frozen=True)
+class NeighborSteps:
+    """What each test leaves of the nearest neighbours of the keypoints of image 1 in image 2.
+
+    Attributes:
+        nearest: (N, 2) int32 positions, before any test. ratio: (K, 2) after the ratio test and the bound on the
+            distance. mutual: (M, 2) after the same from the other side, each the other's nearest: what is matched.
+        is_unknown: the descriptors are of a kind whose neighbours were not looked at.
+    """
+
+    nearest: Indices
+    ratio: Indices
+    mutual: Indices
+    is_unknown: bool = False
+
+    @classmethod
+    def unknown(cls) -> NeighborSteps:
+        """Nothing is known."""
+        nothing = np.zeros((0, 2), np.int32)
+        return cls(nothing, nothing, nothing, True)
+
+
+def neighbor_steps(
+    descriptors1: NDArray[np.uint8], descriptors2: NDArray[np.uint8], max_ratio: float, max_distance: float
+) -> NeighborSteps:
+    """:func:`match_sift`, with what it had on the way."""
+    best1, best2 = largest_products(descriptors1, descriptors2)
+    has_one = best1.partner >= 0
+    good = has_one & _passes_ratio(best1, max_ratio, max_distance)
+    positions = np.stack([np.arange(len(has_one)), best1.partner], 1).astype(np.int32)
+    return NeighborSteps(positions[has_one], positions[good], mutual_neighbors(best1, best2, max_ratio, max_distance))
 
 
 def _passes_ratio(best: Best, max_ratio: float, max_distance: float) -> NDArray[np.bool_]:

@@ -29,6 +29,11 @@ FUNNEL = (
     ("observations", "observations"),
 )
 
+_PAIRS = (
+    '<p class="dim">Two of them, step by step, and why a model would or would not begin with them: '
+    "<code>sfmapp pair OUT IMAGE IMAGE</code> writes a page.</p>"
+)
+
 
 def render_html(
     report: ReconstructionReport, model: Reconstruction | None, dense_pictures: Sequence[PictureRow] = ()
@@ -57,7 +62,7 @@ def render_html(
     if report.dense is not None:
         body.append(dense_section(report.dense, dense_pictures))
     body.append(_failed(report.images) + _skipped(report.skipped))
-    body.append("<h2>Images</h2>" + _images(report.images))
+    body.append("<h2>Images</h2>" + _images(report.images) + _PAIRS)
     body.append("<h2>Cameras</h2>" + _cameras(report.cameras))
     if report.stages.mapping is not None:
         entries = enumerate(report.stages.mapping.models)

@@ -27,12 +27,13 @@ from sfmapp.report.model import (
     RefineReport,
     UndistortReport,
 )
+from sfmapp.report.pair_html import PairReport
 from sfmapp.report.validation import CloudValidation, Validation
 from sfmapp.reporting import Report, field_types
 
 # by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry, refine,
-# calibrate and locate; calibration.json; validation/report.json and validation/cloud.json; what evaluate, undistort,
-# export and measure print with --json; and georeference.json
+# calibrate, locate and pair; calibration.json; validation/report.json and validation/cloud.json; what evaluate,
+# undistort, export and measure print with --json; and georeference.json
 KINDS: Mapping[str, type[Report]] = {
     "reconstruct": ReconstructionReport,
     "dense": DenseRunReport,
@@ -50,6 +51,7 @@ KINDS: Mapping[str, type[Report]] = {
     "calibrate-target": TargetReport,
     "locate": LocationReport,
     "measure": MeasureReport,
+    "pair": PairReport,
 }
 _SIMPLE = {bool: "boolean", int: "integer", float: "number", str: "string", type(None): "null"}
 

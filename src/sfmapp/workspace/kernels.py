@@ -20,6 +20,7 @@ from sfmapp.reporting import Usage
 STAGE = "kernels"
 # in the order in which a run needs them
 MODULES = ("sfmapp.features.extract", "sfmapp.matching.stage", "sfmapp.mapping.incremental")
+PAIR_MODULES = MODULES[:2]
 ODOMETRY_MODULES = (
     "sfmapp.odometry.frontend.small_image",
     "sfmapp.odometry.frontend.corners",
@@ -37,10 +38,13 @@ INERTIAL_MODULES = ("sfmapp.odometry.inertial.gyroscope", "sfmapp.odometry.inert
 
 
 @contextmanager
-def kernels_compiling(events: Events, usage: dict[str, Usage]) -> Iterator[None]:
-    """Compile those of a reconstruction in a thread beside the block; adds what it took to ``usage``."""
+def kernels_compiling(
+    events: Events, usage: dict[str, Usage], modules: tuple[str, ...] = MODULES
+) -> Iterator[None]:  # fmt: skip
+    """Compile those of a reconstruction, or of some modules, in a thread beside the block; adds what it took to
+    ``usage``."""
     thread = threading.Thread(
-        target=lambda: usage.update({STAGE: _compile(events, MODULES)}), name=STAGE, daemon=True
+        target=lambda: usage.update({STAGE: _compile(events, modules)}), name=STAGE, daemon=True
     )  # fmt: skip
     thread.start()
     try:

@@ -12,6 +12,7 @@ __all__ = [
     "LOCK",
     "MANIFEST",
     "ODOMETRY",
+    "PAIR",
     "RECONSTRUCT",
     "REFINE",
     "REPORT",
@@ -22,7 +23,7 @@ __all__ = [
 FORMAT = f"{FORMAT_NAME} 1"
 # the commands that write workspaces; manifests of before the second one name none
 RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "refine", "dense", "undistort"
-CALIBRATE, LOCATE = "calibrate", "locate"
+CALIBRATE, LOCATE, PAIR = "calibrate", "locate", "pair"
 LOCK, REPORT = ".lock", "report.json"
 # where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0
 USUAL_FOLDERS = ("images", "../images", "../../images")

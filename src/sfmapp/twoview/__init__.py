@@ -1,0 +1,1 @@
+"""Two photographs, told step by step: why they give a reconstruction, or why not."""
