@@ -1,6 +1,6 @@
 """Synthetic surveys with ground control: do intervals of points left out hold the truth as often as they say?
 
-    python benchmarks/control_surveys.py --num 200        writes results/control_surveys.md
+    python benchmarks/control_surveys.py --num 200        writes results/control_surveys.json and .md
 
 A flight over terrain and a walk round a monument, with half a pixel of noise, a wrong lens to begin with, marks of 0.7
 pixels and five control points of 2 cm (3 cm in height), without and with one coordinate that is wrong by a metre.
@@ -9,18 +9,20 @@ pixels and five control points of 2 cm (3 cm in height), without and with one co
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from machine import RESULTS, describe_machine
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.adjust.options import AdjustOptions
-from sfmapp.adjust.problem import free_params
+from sfmapp.adjust.problem import Varying, free_params
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.formats.control_points import LOCAL, ControlPoints
@@ -28,6 +30,8 @@ from sfmapp.geometry import rigid3, similarity
 from sfmapp.georeference.control import align_to_survey, survey_in_frame
 from sfmapp.georeference.control_adjustment import Adjusting, ControlSolution, adjust_to_control
 from sfmapp.georeference.marks import check_marks
+from sfmapp.mapping.keypoint_noise import keypoint_noise
+from sfmapp.mapping.mapper import MIN_NOISE_PX
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import make_tracks
 
@@ -175,7 +179,6 @@ def _control(poses: Array, places: Array, normals: Array, rng: np.random.Generat
 
 # ---------------------------------------------------------------------------------------------------------- measurement
 
-RESULTS = Path(__file__).parent / "results"
 OPTIONS = AdjustOptions(relative_cost_tolerance=1e-7, initial_damping=1e-6, max_iterations=100)
 
 
@@ -183,6 +186,7 @@ def solve(survey: SyntheticSurvey) -> ControlSolution:
     """What comes of the model that photographs make, brought to its control points."""
     model, control = survey.model.copy(), survey.control
     adjust_bundle(model, OPTIONS)
+    noise = keypoint_noise(model, OPTIONS, Varying(), MIN_NOISE_PX)
     marked, surveyed = check_marks(model, control), survey_in_frame(control)
     found = align_to_survey(marked.place, surveyed.place)
     if found.world_from_model is None:
@@ -191,7 +195,7 @@ def solve(survey: SyntheticSurvey) -> ControlSolution:
     model.point_xyz[:] = similarity.apply(found.world_from_model, model.point_xyz)
 
     def graph() -> FactorGraph:
-        return FactorGraph(model, OPTIONS, noise_px=SIGMA_PX)
+        return FactorGraph(model, OPTIONS, noise_px=noise.sigma_px)
 
     adjusting = Adjusting(graph, graph, [free_params(camera, *OPTIONS.refine) for camera in model.cameras])
     return adjust_to_control(model, control, marked, surveyed, found.is_inlier, adjusting)
@@ -232,10 +236,7 @@ def main() -> None:
     parser.add_argument("--num", type=int, default=200, help="surveys of each kind")
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
-    lines = [
-        "| survey | surveys | left-out points | within 95 % horizontally | vertically | the wrong named, no other |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows: list[dict[str, Any]] = []
     start = time.process_time()
     for layout in ("grid", "orbit"):
         for is_wrong in (False, True):
@@ -243,14 +244,32 @@ def main() -> None:
                 found = list(pool.map(lambda seed: measure(seed, layout, is_wrong), range(args.num)))  # noqa: B023
             num = sum(row.num for row in found)
             flat, up = (sum(getattr(row, name) for row in found) / num for name in ("horizontal", "vertical"))
-            right = sum(row.is_right for row in found)
-            name = f"{layout}{', one point wrong by a metre' if is_wrong else ''}"
-            lines.append(
-                f"| {name} | {args.num} | {num} | {100 * flat:.1f} % | {100 * up:.1f} % | {right} of {args.num} |"
-            )
-            print(lines[-1], flush=True)
-    text = f"# Ground control: {args.num} surveys of each kind, {time.process_time() - start:.0f} CPU seconds\n\n"
-    (RESULTS / "control_surveys.md").write_text(text + "\n".join(lines) + "\n", encoding="utf-8")
+            rows.append(
+                {
+                    "survey": f"{layout}{', one point wrong by a metre' if is_wrong else ''}", "surveys": args.num,
+                    "left_out": num, "horizontal": 100 * flat, "vertical": 100 * up,
+                    "named": sum(row.is_right for row in found),
+                }
+            )  # fmt: skip
+            print(rows[-1], flush=True)
+    write_results(rows, args.num, time.process_time() - start)
+
+
+def write_results(rows: list[dict[str, Any]], num: int, cpu_s: float) -> None:
+    """The table as JSON and as Markdown."""
+    (RESULTS / "control_surveys.json").write_text(
+        json.dumps(describe_machine() | {"cpu_s": round(cpu_s), "rows": rows}, indent=1) + "\n", encoding="utf-8"
+    )
+    lines = [
+        f"# Ground control: {num} surveys of each kind, {cpu_s:.0f} CPU seconds",
+        "",
+        "| survey | surveys | left-out points | within 95 % horizontally | vertically | the wrong named, no other |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        shares, named = f"{row['horizontal']:.1f} % | {row['vertical']:.1f} %", f"{row['named']} of {row['surveys']}"
+        lines.append(f"| {row['survey']} | {row['surveys']} | {row['left_out']} | {shares} | {named} |")
+    (RESULTS / "control_surveys.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

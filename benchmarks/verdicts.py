@@ -30,6 +30,8 @@ SPARSE = (
     ("ground_truth.auc.5", "AUC@5", "%", "more"),
 )
 
+SURVEYED = ("horizontal", "vertical", "scale", "rotation", "mean")
+
 
 @dataclass(frozen=True)
 class Row:
@@ -208,6 +210,16 @@ def promises(folder: Path) -> Iterator[Promise]:
     report = read(folder, "surveys")
     found, wrong = (sum(row[name] for row in report["rows"]) for name in ("found", "wrong"))
     yield Promise("surveys", "a grossly wrong position is found", found, wrong, report["date"][:10])
+    shares = [row[n] for row in report["rows"] if row["kind"] == "all" for n in SURVEYED]
+    text = "95 % intervals of positions hold 93 to 97 % of the truth"
+    yield Promise("surveys", text, sum(93 <= share <= 97 for share in shares), len(shares), report["date"][:10])
+    report = read(folder, "control_surveys")
+    shares = [row[name] for row in report["rows"] for name in ("horizontal", "vertical")]
+    text = "those of control points that were left out do"
+    yield Promise("control_surveys", text, sum(93 <= share <= 97 for share in shares), len(shares), report["date"][:10])
+    named, num = (sum(row[name] for row in report["rows"]) for name in ("named", "surveys"))
+    text = "a control point that is wrong by a metre is named, and no other"
+    yield Promise("control_surveys", text, named, num, report["date"][:10])
     report = read(folder, "odometry")
     same = [row["same_bytes"] for row in report["rows"]]
     yield Promise("odometry", "two runs write the same bytes", sum(same), len(same), report["date"][:10])
