@@ -95,6 +95,24 @@ def test_a_flat_block_says_that_it_does_not_tell_the_focal_length(seed):
     assert error < 150
     assert error < 3 * found["sigma"]["f"] < 3 * 222.3
     assert worst_error_in_sigmas(result, scene) < 3
+    assert result.row["contradictions"] == []
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_prior_that_photographs_put_elsewhere_without_telling_themselves_is_a_contradiction(seed):
+    # EXIF is off by five of its sigmas, and photographs of something flat tell less than it claims to know
+    scene = nadir_block(seed, flat_lens(0.0, 0.0, 0.0, 0.0), relief=0.2, tilt_deg=1.0, jitter=0.3)
+    result = map_with(scene, replace(flat_prior(2600.0), focal_sigma=78.0))
+    found = result.cameras[0]["focal_evidence"]
+    assert found["is_determined"] is False
+    assert found["tension"] > 2.0
+    (contradiction,) = result.row["contradictions"]
+    assert "sigmas apart" in contradiction["message"]
+    assert contradiction["message"] in result.warnings
+    # in between, with a sigma that reaches from one to the other
+    error = result.model.cameras[0].focal - 2222
+    assert 50 < error < 3 * result.cameras[0]["sigma"]["f"] < 3 * 222.3
+    assert worst_error_in_sigmas(result, scene) < 3
 
 
 def test_a_block_with_relief_tells_it_against_a_prior_that_is_off():

@@ -9,7 +9,7 @@ there it is the adjusted value that is not believed, and the prior has the say t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.names import CameraModel
+from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.images.exif import DEFAULT_FOCAL, DEFAULT_FOCAL_SIGMA
 from sfmapp.mapping import structure
@@ -184,11 +185,15 @@ class FocalSigmas:
         independent_px: from independent errors of the keypoints.
         data_px: with what correlated errors and an unmodelled lens may add.
         prior_px: of the prior.
+        alone_px: the focal length without the prior, asked for where there was doubt.
+        known_px: the prior.
     """
 
     independent_px: float
     data_px: float
     prior_px: float
+    alone_px: float | None = None
+    known_px: float = 0.0
 
     @property
     def is_determined(self) -> bool:
@@ -200,10 +205,26 @@ class FocalSigmas:
         """Of both together."""
         return float((self.data_px**-2 + self.prior_px**-2) ** -0.5)
 
+    @property
+    def tension(self) -> float:
+        """Between photographs and prior, in standard deviations of both; 0 where it was not asked for."""
+        if self.alone_px is None or not np.isfinite(self.data_px):
+            return 0.0
+        return float(abs(self.alone_px - self.known_px) / np.hypot(self.data_px, self.prior_px))
+
+    @property
+    def widening(self) -> float:
+        """By which standard deviations grow where two values of one thing do not agree (the ratio of Birge, Phys. Rev.
+        40, 1932: residuals come out as they should)."""
+        return max(1.0, self.tension)
+
     def report(self) -> FocalEvidence:
         """For the report; an infinite sigma is None."""
         own = self.data_px if np.isfinite(self.data_px) else None
-        return FocalEvidence(data_sigma_px=own, prior_sigma_px=self.prior_px, is_determined=self.is_determined)
+        return FocalEvidence(
+            data_sigma_px=own, prior_sigma_px=self.prior_px, is_determined=self.is_determined,
+            photographs_px=self.alone_px, tension=self.tension if self.alone_px is not None else None,
+        )  # fmt: skip
 
 
 def focal_sigmas(
@@ -226,10 +247,58 @@ def focal_sigmas(
     if all(s.independent_px <= SURE_FOCAL * model.cameras[c].focal for c, s in sigmas.items()):
         return sigmas, None
     richer = _with_richer_lens(mapped.mapper_of(model))
-    return {
-        c: replace(s, data_px=float(np.hypot(s.data_px, richer.cameras[c].focal - model.cameras[c].focal)))
-        for c, s in sigmas.items()
-    }, richer
+    known = [c for c in sigmas if mapped.cameras[c].focal_source != "default"]
+    alone = _without_priors(mapped.mapper_of(model), known) if known else model
+    for c, s in sigmas.items():
+        # what more terms of the lens do, not how far a prior has pulled the focal length meanwhile
+        off = min(abs(richer.cameras[c].focal - plain.cameras[c].focal) for plain in (model, alone))
+        sigmas[c] = replace(s, data_px=float(np.hypot(s.data_px, off)))
+        if c in known:
+            sigmas[c] = replace(sigmas[c], alone_px=alone.cameras[c].focal, known_px=mapped.cameras[c].focal)
+    return sigmas, richer
+
+
+def _without_priors(mapper: Mapper, cameras: Sequence[int]) -> Reconstruction:
+    """The model adjusted without what was known of the focal lengths of some cameras."""
+    trial, priors = mapper.reconstruction.copy(), list(mapper.prior_cameras)
+    for c in cameras:
+        priors[c] = replace(priors[c], focal_sigma=None)
+    options = replace(mapper.robust(mapper.adjust_options), initial_damping=1e-7, relative_cost_tolerance=1e-7)
+    adjust_bundle(trial, options, prior_cameras=priors)
+    return trial
+
+
+def contradiction_of_priors(
+    model: Reconstruction, open_: Mapping[int, FocalSigmas], spread: float, turn: float
+) -> list[Contradiction]:
+    """Focal lengths that photographs and what was known before put apart, where neither overrules the other: nothing,
+    or one contradiction of the worst.
+
+    Args:
+        open_: as of :func:`lean_on_priors`.
+        spread, turn: standard deviations that their disagreement adds to poses, as a share of their spread, in degrees.
+    """
+    apart = {c: s for c, s in open_.items() if s.tension > DOUBTFUL_SIGMAS}
+    if not apart:
+        return []
+    c, worst = max(apart.items(), key=lambda item: item[1].tension)
+    source = "EXIF has" if model.cameras[c].focal_source.startswith("exif") else "what was given is"
+    more = f" (and of {len(apart) - 1} more)" if len(apart) > 1 else ""
+    return [
+        Contradiction(
+            "focal length",
+            f"the photographs put the focal length of camera {c}{more} at {worst.alone_px:.0f} +- {worst.data_px:.0f} "
+            f"px, {source} {worst.known_px:.0f} +- {worst.prior_px:.0f} px: {worst.tension:.1f} sigmas apart; the "
+            f"model has {model.cameras[c].focal:.0f} px",
+            "calibrate the camera, or add photographs from nearer by and to other sides of things",
+            {
+                "photographs_px": worst.alone_px or 0.0, "photographs_sigma_px": worst.data_px,
+                "known_px": worst.known_px, "known_sigma_px": worst.prior_px, "tension": worst.tension,
+                "limit": DOUBTFUL_SIGMAS,
+            },
+            rotation_sigma_deg=turn, position_sigma_share=spread,
+        )
+    ]  # fmt: skip
 
 
 def _with_richer_lens(mapper: Mapper) -> Reconstruction:

@@ -21,7 +21,15 @@ from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.mapping import structure
-from sfmapp.mapping.focal_priors import FocalSigmas, MapFrom, Mapped, as_unknown, focal_sigmas, lean_on_priors
+from sfmapp.mapping.focal_priors import (
+    FocalSigmas,
+    MapFrom,
+    Mapped,
+    as_unknown,
+    contradiction_of_priors,
+    focal_sigmas,
+    lean_on_priors,
+)
 from sfmapp.mapping.mapper import MAX_UNCERTAINTY_IMAGES, STAGE
 from sfmapp.mapping.report import CameraSigmas, FocalEvidence, ImageSigmas, Uncertainty
 from sfmapp.scene.reconstruction import Reconstruction
@@ -125,10 +133,11 @@ def check_intrinsics(
         The uncertainty as of :meth:`Mapper.uncertainty`, with what the held parameters add to it, and the
         contradictions that stand.
     """
-    uncertainty = _with_open_focals(mapped, model)
+    uncertainty, contradictions = _with_open_focals(mapped, model)
+    for apart in contradictions:
+        events.warned(STAGE, apart.message)
     used = np.unique(model.image_camera_idx[model.is_registered])
     fixed = np.array([c in used and camera.is_fixed for c, camera in enumerate(model.cameras)], bool)
-    contradictions: list[Contradiction] = []
     if fixed.any():
         found, spread, turn = _held_against_free(mapped, model, fixed, map_from)
         if found.is_clear:
@@ -142,25 +151,30 @@ def check_intrinsics(
     return uncertainty, contradictions
 
 
-def _with_open_focals(mapped: Mapped, model: Reconstruction) -> Uncertainty:
-    """The uncertainty of a model whose focal lengths come to lie nearer their priors where nothing else tells them."""
+def _with_open_focals(mapped: Mapped, model: Reconstruction) -> tuple[Uncertainty, list[Contradiction]]:
+    """The uncertainty of a model whose focal lengths come to lie nearer their priors where nothing else tells them, and
+    what speaks against these."""
     uncertainty = mapped.mapper_of(model).uncertainty()
     sigmas, richer = focal_sigmas(mapped, model, uncertainty)
     bend = difference(model, richer) if richer is not None else (0.0, 0.0)
     before = model.copy()
     open_ = lean_on_priors(mapped, model, sigmas)
+    contradictions: list[Contradiction] = []
     if open_:
         uncertainty = mapped.mapper_of(model).uncertainty()
         spread, turn = difference(model, before)
         # the change of the focal length that moved the cameras so far, against its sigma
         moved = max(abs(model.cameras[c].focal - before.cameras[c].focal) / s.posterior_px for c, s in open_.items())
-        share = min(1.0 / max(moved, 1e-3), 10.0)
+        widest = max(s.widening for s in open_.values())
+        share = widest * min(1.0 / max(moved, 1e-3), 10.0)
         uncertainty = widened_uncertainty(uncertainty, model, share * spread, share * turn)
+        contradictions = contradiction_of_priors(model, open_, share * spread, share * turn)
     if open_:  # a scene that does not tell the focal length does not tell a lens from a bend of the whole either
         uncertainty = widened_uncertainty(uncertainty, model, *bend)
     if uncertainty.cameras is None:
-        return uncertainty
-    return replace(uncertainty, cameras=[_with_evidence(e, mapped, sigmas, open_) for e in uncertainty.cameras])
+        return uncertainty, contradictions
+    rows = [_with_evidence(e, mapped, sigmas, open_) for e in uncertainty.cameras]
+    return replace(uncertainty, cameras=rows), contradictions
 
 
 def _with_evidence(
@@ -169,7 +183,7 @@ def _with_evidence(
     """A camera's parameters with what the photographs tell of its focal length."""
     c, sigma = entry.camera, dict(entry.sigma)
     if c in open_:
-        sigma |= {name: open_[c].posterior_px for name in sigma if name[0] == "f"}
+        sigma |= {name: open_[c].widening * open_[c].posterior_px for name in sigma if name[0] == "f"}
     evidence = sigmas[c].report() if c in sigmas else FocalEvidence()
     return replace(entry, sigma=sigma, focal=replace(evidence, is_prior_left_out=c in mapped.without_prior))
 

@@ -125,12 +125,16 @@ class FocalEvidence(Report):
         prior_sigma_px: that of what was known before.
         is_determined: they tell more than was known.
         is_prior_left_out: they refute what was known.
+        photographs_px: focal length by the photographs alone, where there was doubt about it.
+        tension: how far that is from what was known, in standard deviations of both.
     """
 
     data_sigma_px: float | None = None
     prior_sigma_px: float | None = None
     is_determined: bool | None = None
     is_prior_left_out: bool | None = None
+    photographs_px: float | None = None
+    tension: float | None = None
 
 
 class CameraSigmas(Report):
