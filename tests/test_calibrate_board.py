@@ -41,7 +41,8 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_photographs_to_a_camera_that_commands_take(photographs: Path, tmp_path: Path) -> None:
     output = tmp_path / "out"
     assert main([
-        "calibrate", "board", str(photographs), "-o", str(output), "--board", BOARD.text(), "--model", "opencv", "-q",
+        "calibrate", "board", str(photographs), "-o", str(output), "--board", BOARD.text(),
+        "--camera-model", "opencv", "-q",
     ]) == 0  # fmt: skip
     made = read_calibration_file(output)
     assert (np.abs(made.camera.params - CAMERA.params) < 4.5 * made.sigmas).all()
@@ -81,3 +82,23 @@ def test_frames_are_picked_that_differ_and_are_sharp() -> None:
     assert [one.unused is None for one in chosen] == [True, False, True, False]
     assert "like frame 000000" in str(chosen[1].unused)
     assert "blurred" in str(chosen[3].unused)
+
+
+def test_a_board_that_nobody_named_is_told_from_the_photographs(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    output = tmp_path / "out"
+    command = ["calibrate", "board", str(photographs), "-o", str(output), "--camera-model", "opencv", "--no-recording"]
+    assert main(command) == 0
+    report = json.loads((output / "report.json").read_text())
+    check_schema("calibrate-board", report)
+    board = report["board"]
+    assert (board["board"], board["unit"]) == ("chessboard:9x6:1", "squares")
+    assert board["guess"]["is_sure"]
+    assert board["guess"]["num_agree"] >= 3
+    assert board["guess"]["num_other"] == 0
+    made = read_calibration_file(output)
+    assert (np.abs(made.camera.params - CAMERA.params) < 4.5 * made.sigmas).all()
+    assert "lengths in squares" in capsys.readouterr().out
+    assert main(["calibrate", "board", str(photographs / "wal*.png"), "-o", str(tmp_path / "wall")]) == 3
+    assert "no markers, no chessboard, no grid of circles" in capsys.readouterr().err

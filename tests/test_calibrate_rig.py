@@ -44,7 +44,7 @@ def test_photographs_to_a_rig_that_odometry_takes(photographs: Path, tmp_path: P
     output, held = tmp_path / "out", ",".join(["PINHOLE", *(str(value) for value in RIGHT.params)])
     assert main([
         "calibrate", "rig", str(photographs / "left"), str(photographs / "right"), "-o", str(output), "--board",
-        BOARD.text(), "--model", "pinhole", "--camera", "free", "--camera", held, "-q",
+        BOARD.text(), "--camera-model", "pinhole", "--camera", "free", "--camera", held, "-q",
     ]) == 0  # fmt: skip
     report = json.loads((output / "report.json").read_text())
     check_schema("calibrate-rig", report)

@@ -38,6 +38,7 @@ class Board:
         spacing: between neighbours (corners, circles), side of a square of a ChArUco board, or of a tag; metres.
         marker: side of a marker of a ChArUco board in metres; gap between tags as a share of their side.
         dictionary: of markers, a name of OpenCV's.
+        unit: of lengths; ``squares`` (or whatever the pattern repeats by) of a board whose size nobody has said.
     """
 
     kind: Kind
@@ -46,6 +47,7 @@ class Board:
     spacing: float
     marker: float = 0.0
     dictionary: str = ""
+    unit: str = "m"
 
     def __post_init__(self) -> None:
         least = 1 if self.kind == "aprilgrid" else 2
@@ -75,6 +77,11 @@ class Board:
             c, r = xy[..., 0], xy[..., 1]
         flat = np.stack([c.ravel(), r.ravel(), np.zeros(c.size)], 1)
         return flat * self.spacing
+
+    @property
+    def tells_part(self) -> bool:
+        """Whether a part of it says which part it is: by its markers."""
+        return self.kind in ("charuco", "aprilgrid")
 
     @property
     def size(self) -> tuple[float, float]:

@@ -58,17 +58,17 @@ class LensTrialReport(Report):
 
 
 class BendReport(Report):
-    """A board that is not flat: z = a u^2 + b v^2 + c u v, u and v from -1 to 1 over its points.
+    """A board that is not flat: z = a u^2 + b v^2 + c u v, u and v from -1 to 1 over its points; in the board's unit.
 
     Attributes:
-        coefficients_m, sigmas_m: a, b, c.
-        depth_m: largest distance from a plane.
+        coefficients, sigmas: a, b, c.
+        depth: largest distance from a plane.
         rms_if_flat_px: of the residuals as if it were flat.
     """
 
-    coefficients_m: Sequence[float]
-    sigmas_m: Sequence[float]
-    depth_m: float
+    coefficients: Sequence[float]
+    sigmas: Sequence[float]
+    depth: float
     rms_if_flat_px: float
 
 
@@ -100,11 +100,31 @@ class NextViewReport(Report):
     outline: Sequence[Sequence[float]]
 
 
+class BoardGuessReport(Report):
+    """How a board was told from the photographs.
+
+    Attributes:
+        num_agree: photographs that show it; num_part: that may show a part of it; num_other: that show another;
+            num_nothing: that show none.
+        is_sure: three and more agree, and none shows another.
+        notes: what to know of it.
+    """
+
+    num_agree: int
+    num_part: int
+    num_other: int
+    num_nothing: int
+    is_sure: bool
+    notes: Sequence[str]
+
+
 class BoardReport(Report):
     """What calibrating from a board came to.
 
     Attributes:
-        board: as ``--board`` has it.
+        board: as ``--board`` has it; unit: of its lengths, metres (``m``) or ``squares`` where nobody said how large
+            they are.
+        guess: how the board was told; absent where it was given.
         params, sigmas: by name, pixels and pure numbers.
         correlations: (P, P).
         rms_px: root mean square length of the residuals; noise_px: sigma of a coordinate, by degrees of freedom.
@@ -117,6 +137,8 @@ class BoardReport(Report):
     """
 
     board: str
+    unit: str
+    guess: BoardGuessReport | None = None
     model: str
     width: int
     height: int

@@ -104,6 +104,7 @@ class _Work:
     facts: list[ViewFacts]
     size: tuple[int, int]
     events: Events
+    unit: str = "m"
     warnings: list[str] = field(default_factory=list)
     wrong: list[ViewFit] = field(default_factory=list)
 
@@ -111,6 +112,7 @@ class _Work:
 def solve_views(
     views: Sequence[TargetView], size: tuple[int, int], model: CameraModel | None = None, *,
     facts: Sequence[ViewFacts] | None = None, bends: bool = True, threads: int = 1, events: Events | None = None,
+    unit: str = "m",
 ) -> Solution:  # fmt: skip
     """Calibrate a camera from views of flat targets.
 
@@ -122,12 +124,13 @@ def solve_views(
         bends: look whether the target is bent.
         threads: how many lens models are tried at a time.
         events: decisions and warnings.
+        unit: of the targets, for messages.
 
     Raises:
         InputError: fewer than three views, or views that do not tell the focal length; it says which and why.
     """
     facts = [ViewFacts()] * len(views) if facts is None else list(facts)
-    work = _Work(list(views), list(facts), size, events or Events())
+    work = _Work(list(views), list(facts), size, events or Events(), unit)
     if len(views) < LEAST_VIEWS:
         raise InputError(
             f"expected at least {LEAST_VIEWS} photographs of the board, found {len(views)}: two planes leave the "
@@ -299,7 +302,8 @@ def _bent(work: _Work, flat: Fit, is_used: Bools) -> tuple[Fit, Bools, Bend | No
         return flat, is_used, None, f"flat as far as the views tell (F {ratio:.1f}, chance {chance:.2g})"
     depth = bend_depth(fit.bend)
     rms = float(np.sqrt(before / max(is_used.sum(), 1)))
-    note = f"the board is bent: up to {1000.0 * depth:.2f} mm out of its plane (F {ratio:.0f}); taken into account"
+    text = f"{1000.0 * depth:.2f} mm" if work.unit == "m" else f"{depth:.4f} {work.unit}"
+    note = f"the board is bent: up to {text} out of its plane (F {ratio:.0f}); taken into account"
     work.warnings.append(note)
     work.events.decided(STAGE, note)
     return fit, now_used, Bend(fit.bend, sigmas, depth, rms), note
@@ -334,7 +338,7 @@ def _result(work: _Work, fit: Fit, is_used: Bools) -> CameraCalibration:
         raise InputError(
             f"expected views that hold all {len(fit.camera.params)} parameters of {fit.camera.model.name}, found "
             f"{len(work.views)} that leave some open",
-            "take more photographs, out to the corners of the picture, or a lens model with fewer parameters: --model",
+            "take more photographs, out to the corners of the picture, or a lens with fewer parameters: --camera-model",
         )
     covariance, noise, dof = found
     bends = None if not len(fit.bend) else [bend_basis(view, work.views) for view in work.views]

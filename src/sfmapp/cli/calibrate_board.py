@@ -42,9 +42,12 @@ def add_way(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     )  # fmt: skip
     parser.add_argument("source", metavar="INPUT", help="a folder, a glob pattern or a list of photographs, or a video")
     parser.add_argument("-o", "--output", metavar="OUT", type=Path, required=True, help="output folder, new or empty")
-    parser.add_argument("--board", metavar="BOARD", required=True, help="what is photographed; see below")
     parser.add_argument(
-        "--model", type=str.upper, choices=MODEL_NAMES, metavar="MODEL",
+        "--board", metavar="BOARD",
+        help="what is photographed; see below. Default: what several photographs agree on, with lengths in squares",
+    )  # fmt: skip
+    parser.add_argument(
+        "--camera-model", dest="model", type=str.upper, choices=MODEL_NAMES, metavar="MODEL",
         help="lens model, one of COLMAP's and others; default: by views that are held out",
     )  # fmt: skip
     parser.add_argument("--flat", action="store_true", help="do not look whether the board is bent")
@@ -68,7 +71,7 @@ def _board(args: argparse.Namespace) -> int:
     asked = BoardOptions(model, bends=not args.flat, recording=not args.no_recording)
     with listening(args) as events:
         result = calibrate_board(
-            args.source, args.output, parse_board(args.board), options,
+            args.source, args.output, None if args.board is None else parse_board(args.board), options,
             asked=asked, events=events, watch=watch,
         )  # fmt: skip
     tell_result(args, result, lambda: _print(result))
@@ -78,6 +81,9 @@ def _board(args: argparse.Namespace) -> int:
 def _print(result: CalibrationResult) -> None:
     made = result.calibration
     report = result.report.board
+    if report.guess is not None:
+        sure = "" if report.guess.is_sure else "not surely "
+        print(f"board {report.board}: {sure}told by {report.guess.num_agree} photographs; lengths in {report.unit}")
     print(
         f"{report.model} of {report.num_views} views, {report.width}x{report.height}: rms {report.rms_px:.3f} px, "
         f"noise {report.noise_px:.3f} px a coordinate"

@@ -31,7 +31,7 @@ two axes.
 
 examples:
   sfmapp calibrate rig left/ right/ -o rig/ --board chessboard:9x6:0.025
-  sfmapp calibrate rig 'calib/left*.jpg' 'calib/right*.jpg' -o rig/ --board chessboard:9x6:0.025 --model OPENCV
+  sfmapp calibrate rig 'calib/left*.jpg' 'calib/right*.jpg' -o rig/ --board chessboard:9x6:0.025 --camera-model OPENCV
   sfmapp odometry walk/ -o out/ --camera rig/rig.json
 
 writes
@@ -61,7 +61,7 @@ def add_way(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help="intrinsics that stay, once for each INPUT in order; free: find them, as without --camera",
     )  # fmt: skip
     parser.add_argument(
-        "--model", type=str.upper, choices=MODEL_NAMES, metavar="MODEL",
+        "--camera-model", dest="model", type=str.upper, choices=MODEL_NAMES, metavar="MODEL",
         help="lens model, one of COLMAP's and others; default: for each camera by views that are held out",
     )  # fmt: skip
     parser.add_argument("--threads", metavar="N", help="number of workers, default: all cores")

@@ -22,7 +22,7 @@ _STRONG = 0.9
 def render_board_html(report: CalibrateReport, made: CameraCalibration) -> str:
     """The page of a report; ``made``: the calibration that it is of, with its residuals."""
     board = report.board
-    body = [_headline(report), _notes(board), _parameters(board), _next(board, made), _maps(made)]
+    body = [_headline(report), _notes(board), _parameters(board), _next(board, made), _maps(made, board.unit)]
     body += [_pictures(board), _lenses(board), _correlations(board), _files(board)]
     return render_page(f"sfmapp calibrate: {report.run.source}", body)
 
@@ -43,8 +43,17 @@ def _headline(report: CalibrateReport) -> str:
 
 
 def _notes(board: BoardReport) -> str:
-    lines = [*board.warnings, *([] if board.bend else [f"shape of the board: {board.bend_note}"])]
+    lines = [*_guess_lines(board), *board.warnings, *([] if board.bend else [f"shape of the board: {board.bend_note}"])]
     return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
+
+
+def _guess_lines(board: BoardReport) -> list[str]:
+    guess = board.guess
+    if guess is None:
+        return []
+    text = f"the board was told from the photographs: {guess.num_agree} agree, {guess.num_part} may show a part of it"
+    text += f", {guess.num_other} show another" if guess.num_other else ""
+    return [f"{text}; lengths are in {board.unit}", *guess.notes]
 
 
 def _parameters(board: BoardReport) -> str:
@@ -68,7 +77,7 @@ def _next(board: BoardReport, made: CameraCalibration) -> str:
     return f'<h2>What to photograph next</h2><p>{now}</p><div class="row large">{beside}</div>'
 
 
-def _maps(made: CameraCalibration) -> str:
+def _maps(made: CameraCalibration, unit: str) -> str:
     used = [view for view in made.views if view.is_used.any()]
     xy, residuals = (np.concatenate([getattr(view, name) for view in used]) for name in ("xy", "residuals"))
     is_used = np.concatenate([view.is_used for view in used])
@@ -82,9 +91,8 @@ def _maps(made: CameraCalibration) -> str:
     for distance, text in ((near, "nearest point"), (middle, "median distance of the points"), (far, "farthest point")):
         if distance is not None:
             sigma = projection_sigma(made, grid, distance)
-            figures.append(
-                (heat_svg(made.camera, sigma, _GRID, "px"), f"Sigma of a projection at {distance:.3g} m, the {text}")
-            )
+            where = f"Sigma of a projection at {distance:.3g} {unit}, the {text}"
+            figures.append((heat_svg(made.camera, sigma, _GRID, "px"), where))
     figures.append(
         (heat_svg(made.camera, projection_sigma(made, grid), _GRID, "px"), "Sigma of a projection at infinity")
     )

@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.calibration.adjustment import Fit, TargetView
+from sfmapp.calibration.board_guess import BoardGuess
 from sfmapp.calibration.boards import Board
 from sfmapp.calibration.planning import NextView, mean_sigma, next_views
 from sfmapp.calibration.report import (
     BendReport,
+    BoardGuessReport,
     BoardPictureReport,
     BoardReport,
     CameraFileReport,
@@ -75,7 +77,7 @@ class CalibrationResult:
 def calibrate_board(
     source: str | os.PathLike[str],
     output: str | os.PathLike[str],
-    board: Board,
+    board: Board | None = None,
     options: Options | None = None,
     *,
     asked: BoardOptions | None = None,
@@ -87,14 +89,15 @@ def calibrate_board(
     Args:
         source: a folder, a glob pattern or a list of photographs, or a video.
         output: a new folder, an empty one, or that of an earlier call.
-        board: what they show.
+        board: what they show; None: what several of them agree on, in squares.
         options: of these, those of images and ``threads``.
         asked: for the lens model and the rest; None for the defaults.
         events: progress, decisions, warnings and cancellation.
         watch: started when the run began.
 
     Raises:
-        InputError: nothing to read, fewer than three photographs with a board, or views that leave the camera open.
+        InputError: nothing to read, fewer than three photographs with a board, views that leave the camera open, or no
+            board that photographs agree on.
         UsageError: an output that holds something else.
     """
     asked = asked or BoardOptions()
@@ -102,7 +105,7 @@ def calibrate_board(
         with job.stage("detection"):
             pictures = look_at_pictures(job, board)
         job.note_inputs(pictures.digests)
-        used = pictures.used
+        used, board = pictures.used, pictures.board
         if not used:
             raise InputError(
                 f"{job.source}: expected a board {board.text()} in the photographs, found none in "
@@ -120,6 +123,7 @@ def calibrate_board(
                 bends=asked.bends,
                 threads=job.threads,
                 events=job.events,
+                unit=board.unit,
             )
         with job.stage("plan"):
             made = solution.calibration
@@ -128,7 +132,7 @@ def calibrate_board(
             coming = next_views(made, _fit_of(solution, counted), counted, board)
         with job.stage("files"):
             files = write_camera(job.workspace.folder, made)
-            report = CalibrateReport(board=_report(board, pictures, solution, coming, files), run=job.facts())
+            report = CalibrateReport(board=_report(pictures, solution, coming, files), run=job.facts())
             job.workspace.write_json(REPORT, report)
             job.workspace.write_text("report.html", render_board_html(report, made))
         if asked.recording:
@@ -148,7 +152,7 @@ def _hull(xy: NDArray[np.float64]) -> list[list[float]]:
 
 def _facts(board: Board, num: int, sharpness_px: float) -> ViewFacts:
     # without markers it cannot be told which part of a board a picture shows
-    return ViewFacts(sharpness_px, board.kind in ("charuco", "aprilgrid") or num == len(board.points))
+    return ViewFacts(sharpness_px, board.tells_part or num == len(board.points))
 
 
 def _fit_of(solution: Solution, views: Sequence[TargetView]) -> Fit:
@@ -168,14 +172,22 @@ def _outline(board: Board) -> NDArray[np.float64]:
     return np.array([[low[0], low[1], 0.0], [high[0], low[1], 0.0], [high[0], high[1], 0.0], [low[0], high[1], 0.0]])
 
 
+def _guess_report(guess: BoardGuess | None) -> BoardGuessReport | None:
+    if guess is None:
+        return None
+    return BoardGuessReport(
+        num_agree=guess.num_agree, num_part=guess.num_part, num_other=guess.num_other, num_nothing=guess.num_nothing,
+        is_sure=guess.is_sure, notes=guess.notes,
+    )  # fmt: skip
+
+
 def _report(
-    board: Board,
     pictures: BoardPictures,
     solution: Solution,
     coming: Sequence[NextView],
     files: Sequence[CameraFileReport],
 ) -> BoardReport:
-    made, bend = solution.calibration, solution.bend
+    board, made, bend = pictures.board, solution.calibration, solution.bend
     fits = {view.name: view for view in made.views}
     rows = []
     for one in pictures.pictures:
@@ -196,6 +208,8 @@ def _report(
     linear = solution.closed_form
     return BoardReport(
         board=board.text(),
+        unit=board.unit,
+        guess=_guess_report(pictures.guess),
         model=made.camera.model.name,
         width=made.camera.width,
         height=made.camera.height,
@@ -226,9 +240,9 @@ def _report(
         bend=None
         if bend is None
         else BendReport(
-            coefficients_m=bend.coefficients.tolist(),
-            sigmas_m=bend.sigmas.tolist(),
-            depth_m=bend.depth,
+            coefficients=bend.coefficients.tolist(),
+            sigmas=bend.sigmas.tolist(),
+            depth=bend.depth,
             rms_if_flat_px=bend.rms_before_px,
         ),
         bend_note=solution.bend_note,

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.calibration.board_guess import BoardGuess, PictureSigns, guess_board, signs_of
 from sfmapp.calibration.boards import Board
 from sfmapp.calibration.detection import Detection, detect_board
 from sfmapp.errors import InputError
@@ -25,11 +28,14 @@ from sfmapp.sequences.open import open_sequence
 from sfmapp.workspace.job import Job
 
 Pixels = NDArray[np.uint8]
+P = TypeVar("P")
 
 STAGE = "detection"
 VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm"})
 # of a video: of so many pieces the sharpest frame is looked into, and so many of these are kept
 _PIECES, _KEPT = 120, 30
+# of photographs, to guess the board: so many, and more up to so many as long as it is not sure
+_LOOKED_INTO = (0, 6, 12, 24, 48)
 # frames are alike whose boards are nearer than this share of the picture's diagonal, all corners together
 _ALIKE = 0.04
 # a frame whose edges are this many times as wide as the sharpest tenth's is blurred
@@ -58,11 +64,14 @@ class BoardPictures:
     """All that were looked into.
 
     Attributes:
+        board: that they show; guess: how it was told, None where it was given.
         size: width and height of those that count, as stored.
         pictures: in their order.
         digests: of the files, by name.
     """
 
+    board: Board
+    guess: BoardGuess | None
     size: tuple[int, int]
     pictures: tuple[BoardPicture, ...]
     digests: dict[str, str]
@@ -77,21 +86,28 @@ def is_video(source: str) -> bool:
     return is_stream(source) or Path(source).suffix.lower() in VIDEOS
 
 
-def look_at_pictures(job: Job, board: Board) -> BoardPictures:
-    """Find the board in the photographs, or in frames of the video, that the job's source is.
+def look_at_pictures(job: Job, board: Board | None) -> BoardPictures:
+    """Find the board in the photographs, or in frames of the video, that the job's source is. ``board``: None: the one
+    that several of them agree on.
 
     Raises:
-        InputError: nothing can be read.
+        InputError: nothing can be read, or photographs agree on no board.
     """
     return _look_at_video(job, board) if is_video(job.source) else _look_at_photographs(job, board)
 
 
-def _look_at_photographs(job: Job, board: Board) -> BoardPictures:
+def _look_at_photographs(job: Job, given: Board | None) -> BoardPictures:
     images, _ = load_images(job.source, job.options.images, job.events, threads=job.threads)
     if not images.images:
         raise InputError(f"{job.source}: expected photographs of the board, found none that can be read")
     counts = Counter((record.width, record.height) for record in images.images)
     size = counts.most_common(1)[0][0]
+    guess = None
+    if given is None:
+        alike = [record for record in images.images if (record.width, record.height) == size]
+        guess = _guessed(job, alike, lambda record: read_gray(record))
+    board = given if guess is None else guess.board
+    assert board is not None
 
     def look(record: ImageRecord) -> BoardPicture:
         if (record.width, record.height) != size:
@@ -105,7 +121,49 @@ def _look_at_photographs(job: Job, board: Board) -> BoardPictures:
         return BoardPicture(record.name, found, found.problem, record.path)
 
     pictures = _in_threads(look, images.images, job.threads, job.events)
-    return BoardPictures(size, tuple(pictures), {record.name: record.digest for record in images.images})
+    return BoardPictures(board, guess, size, tuple(pictures), {record.name: record.digest for record in images.images})
+
+
+def _guessed(job: Job, pictures: Sequence[P], gray_of: Callable[[P], Pixels]) -> BoardGuess:
+    """The board that some of the pictures agree on: a few spread over all of them, more where these are not sure."""
+    order = sorted(range(len(pictures)), key=lambda n: (_van_der_corput(n), n))
+
+    def look(n: int) -> PictureSigns | None:
+        job.events.raise_if_cancelled()
+        try:
+            return signs_of(gray_of(pictures[n]))
+        except InputError:
+            return None  # what cannot be read is told where the board is looked for
+
+    signs: list[PictureSigns] = []
+    guess, failed = None, None
+    with ThreadPoolExecutor(job.threads) as pool:
+        for first, last in itertools.pairwise(_LOOKED_INTO):
+            signs += [one for one in pool.map(look, order[first:last]) if one is not None]
+            try:
+                guess = guess_board(signs, job.source)
+            except InputError as error:
+                guess, failed = None, error
+            if (guess is not None and guess.is_sure) or last >= len(pictures):
+                break
+    if guess is None:
+        assert failed is not None
+        raise failed
+    text = f"the board is {guess.text}; lengths are in {guess.board.unit}"
+    job.events.decided(STAGE, text)
+    if not guess.is_sure:
+        job.events.warned(STAGE, f"not sure: {text}; say what the board is by --board if it is another")
+    for note in guess.notes:
+        job.events.warned(STAGE, note)
+    return guess
+
+
+def _van_der_corput(n: int) -> float:
+    """The numbers from 0 on in an order whose beginnings are spread over all of them (base 2)."""
+    value, share = 0.0, 0.5
+    while n:
+        value, share, n = value + share * (n & 1), 0.5 * share, n >> 1
+    return value
 
 
 def _nothing(problem: str) -> Detection:
@@ -136,7 +194,7 @@ def _in_threads(
 # -------------------------------------------------------------------------------------------------------------- videos
 
 
-def _look_at_video(job: Job, board: Board) -> BoardPictures:
+def _look_at_video(job: Job, given: Board | None) -> BoardPictures:
     """The sharpest frame of each piece of a video, and of those with a board some that differ."""
     sequence = open_sequence(job.source, SequenceOptions(mono=True), job.events, require_camera=False)
     total = sequence.num_frames
@@ -156,13 +214,16 @@ def _look_at_video(job: Job, board: Board) -> BoardPictures:
     if not sharpest:
         raise InputError(f"{job.source}: expected a video of the board, found no frame that can be read")
     size = sharpest[0].images[0].shape[::-1]
+    guess = _guessed(job, sharpest, lambda frame: frame.images[0]) if given is None else None
+    board = given if guess is None else guess.board
+    assert board is not None
     with ThreadPoolExecutor(job.threads) as pool:
         found = list(pool.map(lambda frame: detect_board(frame.images[0], board), sharpest))
     pictures = [BoardPicture(frame.name, one, one.problem) for frame, one in zip(sharpest, found, strict=True)]
     chosen = choose_frames(pictures, (int(size[0]), int(size[1])), board)
     num = sum(picture.unused is None for picture in chosen)
     job.events.finished(STAGE, f"{num} frames were picked of {len(chosen)} that were looked into")
-    return BoardPictures((int(size[0]), int(size[1])), tuple(chosen), {})
+    return BoardPictures(board, guess, (int(size[0]), int(size[1])), tuple(chosen), {})
 
 
 def _sharpness(gray: Pixels) -> float:

@@ -185,8 +185,8 @@ def _with_lens(job: Job, one: _Seen, boards: Sequence[Board], given: str | None,
 
 
 def _views(seen: Sequence[_Seen], boards: Sequence[Board], shots: Sequence[dict[int, int]]) -> list[RigView]:
-    """Every board in every photograph. Photographs without a partner, and chessboards that are seen in part, of which
-    nobody knows which part, have shots of their own: they tell of the lens."""
+    """Every board in every photograph. Photographs without a partner, and boards without markers that are seen in
+    part, of which nobody knows which part, have shots of their own: they tell of the lens."""
     shot_of = {(camera, n): t for t, shot in enumerate(shots) for camera, n in shot.items()}
     views, alone = [], len(shots)
     for c, one in enumerate(seen):
@@ -195,7 +195,7 @@ def _views(seen: Sequence[_Seen], boards: Sequence[Board], shots: Sequence[dict[
                 if picture.unused is not None:
                     continue
                 idx = picture.detection.idx
-                is_known = board.kind != "chessboard" or len(idx) == len(board.points)
+                is_known = board.tells_part or len(idx) == len(board.points)
                 shot = shot_of.get((c, n)) if is_known else None
                 if shot is None:
                     shot, alone = alone, alone + 1
