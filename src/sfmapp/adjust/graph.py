@@ -215,10 +215,12 @@ class FactorGraph:
         """The plain gtsam.NonlinearFactorGraph, one factor per observation, and its Values at the present state.
 
         Its variables are those of this graph, all landmarks among them, and ``C(c)``, the calibrations. What is
-        constant is held by priors of 1e-7. Hundreds of thousands of observations take gigabytes.
+        constant is held by priors of 1e-7. One focal length beside a free principal point, which none of gtsam's
+        calibrations has, is two that are tied; gtsam.Marginals, which factorises by Cholesky, may take what the tie
+        leaves for open, where QR does not. Hundreds of thousands of observations take gigabytes.
 
         Raises:
-            UsageError: gtsam has no such camera model, or none that has one focal length and a free principal point.
+            UsageError: gtsam has no such camera model.
         """
         self._plain = self._plain_graph()
         return self._plain.graph, self._plain.values

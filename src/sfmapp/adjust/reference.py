@@ -1,9 +1,10 @@
 """The same adjustment as a plain gtsam graph, one factor per observation: slow, short, and written by somebody else.
 
 Poses are ``X(i)`` (world_from_cam of image i, on a rig of that of sensor 0), points ``L(t)`` by track, cameras
-``C(c)``: Cal3Bundler for models with one focal length, otherwise Cal3DS2 or Cal3Fisheye. What is not free, or is in
-gtsam's model and not in ours, is held by a prior; so is the place ``V(i)`` of an image on its rig, and the vector
-``K(c)`` of the free parameters of a camera that other factors mention.
+``C(c)``: Cal3Bundler for models with one focal length, unless their principal point is free, which that holds;
+otherwise Cal3DS2 or Cal3Fisheye. What is not free, or is in gtsam's model and not in ours, is held by a prior, and two
+focal lengths of gtsam's that are one of ours are tied to each other; so is the place ``V(i)`` of an image on its rig,
+and the vector ``K(c)`` of the free parameters of a camera that other factors mention.
 """
 
 from __future__ import annotations
@@ -35,6 +36,9 @@ Array = NDArray[np.float64]
 _BUNDLER, _FULL = (0, 4, 5), (0, 1, -1, 2, 3, 4, 5, 6, 7)
 # Standard deviation of what must not move, in its own unit: far below any effect, and Cholesky keeps its digits.
 _HELD = 1e-7
+# Of the difference of two focal lengths that are one, in pixels: a thousandth of what is ever known of it, and no more
+# stiff than Cholesky can bear, which has to tell the two apart from what it leaves of their sum.
+_TIED = 1e-4
 
 
 def adjust_with_gtsam(
@@ -56,7 +60,9 @@ def adjust_with_gtsam(
     if problem.num_observations == 0:
         return AdjustReport(termination="nothing", solver="none")
     first = graph.error(values)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, _points_first(values), _parameters(options))
+    optimizer = gtsam.LevenbergMarquardtOptimizer(
+        graph, values, _points_first(values), _parameters(options, plain.has_ties)
+    )
     result = optimizer.optimize()
     final = graph.error(result)
     if final < first:
@@ -108,6 +114,11 @@ class PlainGraph:
             extras.attach(problem)
             self._add_extras(extras)
 
+    @property
+    def has_ties(self) -> bool:
+        """Two focal lengths of gtsam's are one of ours."""
+        return any(len(lens.ties) for lens in self._lenses)
+
     def _add_poses(self) -> list[int]:
         """Poses, and what holds the constant ones and those on a rig; returns the keys of the images' own poses."""
         problem, graph, values = self.problem, self.graph, self.values
@@ -129,8 +140,9 @@ class PlainGraph:
     def _add_cameras(self) -> None:
         for c, lens in zip(self.problem.camera_idx.tolist(), self._lenses, strict=True):
             self.values.insert(C(c), lens.calibration)
-            if len(lens.held):
-                self.graph.add(_linear(self.values, {C(c): lens.held}, np.zeros(len(lens.held)), _HELD))
+            for rows, sigma in ((lens.held, _HELD), (lens.ties, _TIED)):
+                if len(rows):
+                    self.graph.add(_linear(self.values, {C(c): rows}, np.zeros(len(rows)), sigma))
 
     def _add_points(self) -> None:
         problem, held = self.problem, gtsam.noiseModel.Isotropic.Sigma(3, _HELD)
@@ -202,6 +214,7 @@ class Lens:
         slots: canonical slot of each of gtsam's parameters, -1 for none.
         free: positions of the free ones, in the order of ``Camera.params``.
         held: (n, len(slots)) rows of the identity, of what is constant.
+        ties: (n, len(slots)) differences of what is one parameter of ours.
     """
 
     def __init__(self, problem: Problem, index: int, camera: Camera) -> None:
@@ -211,7 +224,8 @@ class Lens:
         fx, fy, cx, cy, *d = problem.canonical[index, :8]
         self.factor: Any
         self.slots: tuple[int, ...] = _FULL
-        if names[0] == "f" and camera.family == BROWN:
+        is_centered = not any(names[p] in ("cx", "cy") for p in problem.free.params[index])
+        if names[0] == "f" and camera.family == BROWN and is_centered:
             self.slots = _BUNDLER
             self.calibration = gtsam.Cal3Bundler(fx, d[0], d[1], cx, cy)
             self.factor = gtsam.GeneralSFMFactor2Cal3Bundler
@@ -221,18 +235,15 @@ class Lens:
             self.calibration = gtsam.Cal3Fisheye(fx, fy, 0.0, cx, cy, *d)
             self.factor = gtsam.GeneralSFMFactor2Cal3Fisheye
         spread = canonical_from_params(camera.model)
-        self.free: list[int] = []
-        for p in problem.free.params[index]:
-            at = [n for n, slot in enumerate(self.slots) if slot >= 0 and spread[slot, p]]
-            # two that must stay equal are too stiff for gtsam's damping: the step that it finds is a fraction
-            if len(at) != 1:
-                what = "focal length" if names[p] == "f" else "principal point"
-                raise UsageError(
-                    f"the gtsam backend cannot refine the {what} of a {camera.model.name} camera",
-                    "use a model with two focal lengths, such as OPENCV, or adjust.backend=schur",
-                )
-            self.free += at
-        self.held = np.delete(np.eye(len(self.slots)), self.free, 0)
+        at = [
+            [n for n, slot in enumerate(self.slots) if slot >= 0 and spread[slot, p]]
+            for p in problem.free.params[index]
+        ]
+        self.free: list[int] = [places[0] for places in at]
+        self._followers = [(n, places[0]) for places in at for n in places[1:]]
+        identity = np.eye(len(self.slots))
+        self.ties = np.array([identity[n] - identity[first] for n, first in self._followers]).reshape(-1, len(identity))
+        self.held = np.delete(identity, [n for places in at for n in places], 0)
 
     def canonical_at(self, value: Any, before: Array) -> Array:
         """Canonical row of another calibration of the same kind; ``before`` belongs to this one."""
@@ -241,6 +252,8 @@ class Lens:
         for slot, change in zip(self.slots, delta, strict=True):
             if slot >= 0:
                 out[slot] += change
+        for n, first in self._followers:
+            out[self.slots[n]] = out[self.slots[first]]
         if self.slots == _BUNDLER:
             out[1] = out[0]
         return out
@@ -279,10 +292,13 @@ def _points_first(values: Any) -> Any:
     return ordering
 
 
-def _parameters(options: AdjustOptions) -> Any:
+def _parameters(options: AdjustOptions, has_ties: bool) -> Any:
+    """``has_ties``: damping in shares of the diagonal would hold what is tied, however softly the data hold it, and
+    Cholesky would lose what is left of it; QR does not."""
     parameters = gtsam.LevenbergMarquardtParams.CeresDefaults()
+    parameters.setDiagonalDamping(not has_ties)
     parameters.setMaxIterations(options.max_iterations)
     parameters.setRelativeErrorTol(options.relative_cost_tolerance)
     parameters.setAbsoluteErrorTol(0.0)
-    parameters.setLinearSolverType("SEQUENTIAL_CHOLESKY")
+    parameters.setLinearSolverType("SEQUENTIAL_QR" if has_ties else "SEQUENTIAL_CHOLESKY")
     return parameters

@@ -288,8 +288,7 @@ def contradiction_of_priors(
         Contradiction(
             "focal length",
             f"the photographs put the focal length of camera {c}{more} at {worst.alone_px:.0f} +- {worst.data_px:.0f} "
-            f"px, {source} {worst.known_px:.0f} +- {worst.prior_px:.0f} px: {worst.tension:.1f} sigmas apart; the "
-            f"model has {model.cameras[c].focal:.0f} px",
+            f"px, {source} {worst.known_px:.0f} +- {worst.prior_px:.0f} px: {worst.tension:.1f} sigmas apart",
             "calibrate the camera, or add photographs from nearer by and to other sides of things",
             {
                 "photographs_px": worst.alone_px or 0.0, "photographs_sigma_px": worst.data_px,

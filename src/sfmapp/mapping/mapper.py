@@ -45,9 +45,6 @@ ELSEWHERE = 2.0
 MAX_CHANGED = 1e-3
 # Synthetic keypoints may be exact; no detector's are better than this.
 MIN_NOISE_PX = 0.02
-_NO_CENTERS = (
-    "principal points stay as they were: adjust.backend=gtsam has no calibration with one focal length that frees them"
-)
 # Uncertainties cost an inverse of eight unknowns per image: half a second and 50 MB for this many.
 MAX_UNCERTAINTY_IMAGES = 200
 
@@ -336,8 +333,6 @@ class Mapper:
         A pixel may be ten standard deviations of precise keypoints: with squares alone, the few observations near the
         limit decide what many others tell little of, such as the lens.
         """
-        if self._wanted_principal_points().any() and not self._free_principal_points().any():
-            self.events.warned(STAGE, _NO_CENTERS)
         self.loss_scale_px = self._residual_scale_px
         return adjust_until_settled(self._polish_once, STAGE, self.events)
 
@@ -442,23 +437,16 @@ class Mapper:
             )
 
     def _free_principal_points(self) -> NDArray[np.bool_]:
-        """(C,) bool: cameras whose principal point is refined. None by gtsam's backend, whose calibrations with one
-        focal length hold it fixed."""
-        return self._wanted_principal_points() & (self.adjust_options.backend == "schur")
-
-    def _wanted_principal_points(self) -> NDArray[np.bool_]:
-        """(C,) bool: cameras whose principal point MappingOptions has refined."""
+        """(C,) bool: cameras whose principal point is refined."""
         reconstruction, mode = self.reconstruction, self.options.refine_principal_point
         registered = reconstruction.image_camera_idx[reconstruction.is_registered]
         shared = np.bincount(registered, minlength=len(reconstruction.cameras)) >= 3
         unknown = np.array([mode == "always" or c.focal_source == "default" for c in reconstruction.cameras], bool)
-        wanted: NDArray[np.bool_] = shared & unknown & (mode != "never")
-        return wanted
+        free: NDArray[np.bool_] = shared & unknown & (mode != "never")
+        return free
 
     def with_free_centers(self, options: AdjustOptions, chosen: NDArray[np.bool_]) -> AdjustOptions:
         """The options with free principal points under the prior of MappingOptions, for cameras chosen (C,) bool."""
-        if self.adjust_options.backend != "schur":
-            return options
         cameras = self.reconstruction.cameras
         size = max(max(c.width, c.height) for c, is_chosen in zip(cameras, chosen, strict=True) if is_chosen)
         # the adjustment counts residuals in pixels; the prior is weighed against them at their true noise
