@@ -88,6 +88,7 @@ def rows_of(folder: Path) -> list[Row]:
         "dense": dense_rows,
         "odometry": odometry_rows,
         "calibration": calibration_rows,
+        "two_views": two_view_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
 
@@ -107,6 +108,30 @@ def calibration_rows(folder: Path) -> Iterator[Row]:
         if "opencv_cpu_s" in row:
             ours, theirs = row["cpu_s"], row["opencv_cpu_s"]
             yield Row("calibration", row["what"], "CPU time", "s", "less", ours, "OpenCV", theirs, *about)
+
+
+def two_view_rows(folder: Path) -> Iterator[Row]:
+    """Robust estimators against OpenCV's USAC, pycolmap and PoseLib: ours refined where we refine, the main path's where
+    the cost is compared."""
+    report = read(folder, "two_views")
+    about = (False, report["date"][:10], report["commit"])
+    peers = ("OpenCV", "pycolmap", "PoseLib")
+    for case, row in report["medians"].items():
+        for peer in peers:
+            ours = row["F sfmapp, refined"], row["E sfmapp"]
+            for what, value in zip(("F", "E"), ours, strict=True):
+                quantity = f"{what}, distance of exact points"
+                yield Row("two_views", case, quantity, "px", "less", value, peer, row[f"{what} {peer}"], *about)
+    graf = report["graf"]
+    for peer in peers:
+        yield Row("two_views", "graf", "H", "px", "less", graf["sfmapp, refined"], peer, graf[peer], *about)
+    speed = {(row["what"], row["program"]): row for row in report["speed"]}
+    for (what, program), row in speed.items():
+        if program in peers:
+            mine = speed[what, "sfmapp"]
+            for quantity, unit, key in (("CPU time", "ms", "cpu_ms"), ("median error", row["unit"], "median_error")):
+                case = f"{what}, 1,000 matches, half wrong"
+                yield Row("two_views", case, quantity, unit, "less", mine[key], program, row[key], *about)
 
 
 def sparse_rows(folder: Path) -> Iterator[Row]:

@@ -93,6 +93,29 @@ def test_the_refined_matrix_is_as_sure_as_it_says_and_at_the_bound() -> None:
     assert 0.47 < np.mean(sigmas) < 0.53
 
 
+def test_wrong_matches_pull_less_where_they_are_expected() -> None:
+    """A tenth of the matches off by 5 to 30 px: the covariance still holds, where least squares is lost."""
+    rng = np.random.default_rng(8)
+    xy1, xy2 = cloud(100)
+    unit = F / np.linalg.norm(F)
+    scaled, errors, sigmas = [], [], []
+    for _ in range(60):
+        a, b = xy1 + rng.normal(0, 0.5, xy1.shape), xy2 + rng.normal(0, 0.5, xy2.shape)
+        b[:10] += rng.uniform(5, 30, (10, 1)) * rng.choice([-1, 1], (10, 2))
+        robust, info = refine_fundamental(F, a, b, is_robust=True)
+        assert info.covariance is not None
+        deviation = (robust * np.sign((robust * unit).sum()) - unit).ravel()
+        scaled.append(deviation @ np.linalg.pinv(info.covariance, rcond=1e-12, hermitian=True) @ deviation)
+        sigmas.append(info.sigma_px)
+        plain, _ = refine_fundamental(F, a, b)
+        errors.append([np.sqrt(epipolar.sampson_errors(f, xy1, xy2).mean()) for f in (robust, plain)])
+    robust_error, plain_error = np.median(errors, 0)
+    assert robust_error < 0.25
+    assert plain_error > 3.0 * robust_error
+    assert 0.45 < np.mean(sigmas) < 0.68
+    assert 4.0 < np.median(scaled) < 12.0
+
+
 def flat(num: int) -> tuple[np.ndarray, np.ndarray]:
     xyz = np.random.default_rng(4).uniform([-2, -1.5, 5], [2, 1.5, 5], (num, 3))
     xyz[:, 2] += 0.2 * xyz[:, 0]

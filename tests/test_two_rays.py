@@ -170,6 +170,9 @@ def test_guided_refinement_drops_what_does_not_fit() -> None:
     h, info = homography.guided_homography(start, a, b, 6.0)
     assert not info.is_inlier[:15].any()
     assert info.is_inlier[15:].all()
+    robust, told = homography.refine_homography(truth, a, b, is_robust=True)
+    assert homography.transfer_errors(robust, xy1, xy2).max() < 1.0
+    assert 0.4 < told.sigma_px < 0.8
     theirs = cv2.findHomography(a[15:], b[15:], 0)[0]
     errors = [np.sqrt(homography.transfer_errors(each, xy1, xy2).mean()) for each in (h, theirs)]
     assert errors[0] < 1.1 * errors[1]

@@ -102,12 +102,33 @@ def minimize(
         if not new_cost < cost:
             damping *= 10.0
             continue
-        has_converged = cost - new_cost <= 1e-12 * cost
+        has_converged = cost - new_cost <= 1e-9 * cost
         state, cost, hessian, gradient = candidate, new_cost, new_hessian, new_gradient
         damping = max(0.1 * damping, 1e-12)
         if has_converged:
             break
     return state, hessian, taken
+
+
+def robust_sigma(squared: Array, degrees: int) -> float:
+    """Standard deviation of one of the ``degrees`` (1 or 2) coordinates of residuals with these squared lengths (N,),
+    by their median: up to half of them may be wrong."""
+    # medians of chi-square of one and of two degrees of freedom
+    return math.sqrt(float(np.median(squared)) / {1: 0.4549, 2: 1.3863}[degrees])
+
+
+def cauchy(squared: Array, scale: float) -> tuple[float, Array]:
+    """Cost and weights (N,) of residuals with these squared lengths: ``s^2 log(1 + r^2 / s^2)`` each; plain squares
+    where the scale is infinite."""
+    if math.isinf(scale):
+        return float(squared.sum()), np.ones(len(squared))
+    ratio = squared / scale**2
+    return float(scale**2 * np.log1p(ratio).sum()), 1.0 / (1.0 + ratio)
+
+
+CAUCHY_SIGMAS = 2.385
+"""Scale of Cauchy's loss in standard deviations: with normal noise it costs five per cent of the information (Holland
+and Welsch, "Robust regression using iteratively reweighted least-squares", 1977)."""
 
 
 def inverse_or_none(matrix: Array) -> Array | None:

@@ -15,7 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.dlt import homogeneous, normalizing
 from sfmapp.geometry.epipolar import sampson_errors
-from sfmapp.geometry.fit import FitInfo, count_free, inverse_or_none, matched_points, minimize
+from sfmapp.geometry.fit import (
+    CAUCHY_SIGMAS,
+    FitInfo,
+    cauchy,
+    count_free,
+    inverse_or_none,
+    matched_points,
+    minimize,
+    robust_sigma,
+)
 
 Array = NDArray[np.float64]
 
@@ -201,16 +210,17 @@ def sampson_jacobian(matrix: Array, slopes: Array, xy1: Array, xy2: Array) -> tu
 
 
 def refine_fundamental(
-    fundamental: Array, xy1: ArrayLike, xy2: ArrayLike, *, noise_px: float | None = None, max_iterations: int = 30
-) -> tuple[Array, FitInfo]:
+    fundamental: Array, xy1: ArrayLike, xy2: ArrayLike, *, noise_px: float | None = None, is_robust: bool = False,
+    max_iterations: int = 30,
+) -> tuple[Array, FitInfo]:  # fmt: skip
     """F of least squared Sampson distance over its seven degrees of freedom, with its covariance.
 
-    To first order in the noise that is the maximum likelihood estimate (HZ 11.4.3). There is no robust weight: give
-    inliers.
+    To first order in the noise that is the maximum likelihood estimate (HZ 11.4.3).
 
     Args:
         fundamental: (3, 3) start. xy1, xy2: (N, 2) corresponding pixels, N >= 8.
         noise_px: standard deviation of a coordinate; None: as the residuals of more than eight points tell.
+        is_robust: some of the points may be wrong: Cauchy's loss, its scale by the median residual at the start.
 
     Returns:
         F (3, 3) of unit norm; the (9, 9) covariance of its entries, of rank seven, by first-order propagation (HZ
@@ -223,21 +233,30 @@ def refine_fundamental(
     t1, t2 = normalizing(a), normalizing(b)
     start = _factors(np.linalg.solve(t2.T, fundamental) @ np.linalg.inv(t1))
 
+    squared = sampson_errors(fundamental, a, b)
+    scale = CAUCHY_SIGMAS * robust_sigma(squared, 1) if is_robust else math.inf
+
     def linearize(state: _Factors) -> tuple[float, Array, Array]:
         residual, jacobian = sampson_jacobian(t2.T @ state.matrix @ t1, t2.T @ state.slopes @ t1, a, b)
-        return float(residual @ residual), jacobian.T @ jacobian, jacobian.T @ residual
+        cost, weights = cauchy(residual**2, scale)
+        weighted = jacobian.T * weights
+        return cost, weighted @ jacobian, weighted @ residual
 
     best, hessian, taken = minimize(start, linearize, _Factors.moved, max_iterations)
     f = t2.T @ best.matrix @ t1
     norm = float(np.linalg.norm(f))
     f = f / norm
-    sigma = _noise(sampson_errors(f, a, b), noise_px)
+    squared = sampson_errors(f, a, b)
+    sigma = robust_sigma(squared, 1) if is_robust and noise_px is None else _noise(squared, noise_px)
     by_step = (t2.T @ best.slopes @ t1).reshape(7, 9).T / norm
     by_step -= np.outer(f.ravel(), f.ravel() @ by_step)
     cofactor = inverse_or_none(hessian)
     covariance = None
     if cofactor is not None and not math.isnan(sigma):
-        covariance = sigma**2 * by_step @ cofactor @ by_step.T
+        _, jacobian = sampson_jacobian(t2.T @ best.matrix @ t1, t2.T @ best.slopes @ t1, a, b)
+        # with weights, what the noise does to the gradient is not what the cost bends by (Huber 1967)
+        pull = jacobian * cauchy(squared, scale)[1][:, None]
+        covariance = sigma**2 * by_step @ cofactor @ (pull.T @ pull) @ cofactor @ by_step.T
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(hessian)[::-1], 0.0))
     info = FitInfo(
         np.ones(len(a), np.bool_), taken, float(values[0] / max(values[-1], 1e-300)), values, 1, sigma, covariance

@@ -15,7 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.dlt import homogeneous, homography_rows, normalizing
-from sfmapp.geometry.fit import FitInfo, count_free, inverse_or_none, matched_points, minimize
+from sfmapp.geometry.fit import (
+    CAUCHY_SIGMAS,
+    FitInfo,
+    cauchy,
+    count_free,
+    inverse_or_none,
+    matched_points,
+    minimize,
+    robust_sigma,
+)
 
 Array = NDArray[np.float64]
 
@@ -162,15 +171,17 @@ class _Plane(NamedTuple):
 
 
 def refine_homography(
-    homography: Array, xy1: ArrayLike, xy2: ArrayLike, *, noise_px: float | None = None, max_iterations: int = 30
-) -> tuple[Array, FitInfo]:
+    homography: Array, xy1: ArrayLike, xy2: ArrayLike, *, noise_px: float | None = None, is_robust: bool = False,
+    max_iterations: int = 30,
+) -> tuple[Array, FitInfo]:  # fmt: skip
     """H of least squared reprojection error in both pictures, the gold standard (HZ algorithm 4.3), and its covariance.
 
-    The places of the points are unknowns too, eliminated in every step. There is no robust weight: give inliers.
+    The places of the points are unknowns too, eliminated in every step.
 
     Args:
         homography: (3, 3) start. xy1, xy2: (N, 2) corresponding pixels, N >= 4.
         noise_px: standard deviation of a coordinate; None: as the residuals of more than four points tell.
+        is_robust: some of the points may be wrong: Cauchy's loss, its scale by the median residual at the start.
 
     Returns:
         H (3, 3) of unit norm; the (9, 9) covariance of its entries, of rank eight (HZ 5.2.3), None where the points
@@ -181,46 +192,83 @@ def refine_homography(
     """
     a, b = matched_points(xy1, xy2, 4, "the refinement of a homography")
     t1, t2 = normalizing(a), normalizing(b)
-    scale = t2[0, 0] / t1[0, 0]  # a pixel of picture 2 in units of one of picture 1, after both were normalised
-    na, nb = a * t1[0, 0] + t1[:2, 2], b * t2[0, 0] + t2[:2, 2]
-
-    def linearize(state: _Plane) -> tuple[float, Array, Array]:
-        left1, (left2, by_h, by_at) = na - state.at, _plane_slopes(state, nb)
-        left2, by_h, by_at = left2 / scale, by_h / scale, by_at / scale
-        own = np.linalg.inv(np.eye(2) + by_at.swapaxes(1, 2) @ by_at)
-        toward = left1 + np.einsum("nij,ni->nj", by_at, left2)
-        rest = left2 - np.einsum("nij,njk,nk->ni", by_at, own, toward)
-        reduced = by_h - by_at @ own @ by_at.swapaxes(1, 2) @ by_h
-        cost = float((left1**2).sum() + (left2**2).sum())
-        return cost, np.einsum("nij,nik->jk", by_h, reduced), -np.einsum("nij,ni->j", by_h, rest)
-
-    def move(state: _Plane, step: Array) -> _Plane:
-        left1, (left2, by_h, by_at) = na - state.at, _plane_slopes(state, nb)
-        left2, by_h, by_at = left2 / scale, by_h / scale, by_at / scale
-        own = np.linalg.inv(np.eye(2) + by_at.swapaxes(1, 2) @ by_at)
-        toward = left1 + np.einsum("nij,ni->nj", by_at, left2 - by_h @ step)
-        h = state.h + (_tangent(state.h) @ step).reshape(3, 3)
-        return _Plane(h / np.linalg.norm(h), state.at + np.einsum("nij,nj->ni", own, toward))
-
+    problem = _GoldStandard(a * t1[0, 0] + t1[:2, 2], b * t2[0, 0] + t2[:2, 2], t2[0, 0] / t1[0, 0])
     start = t2 @ homography @ np.linalg.inv(t1)
-    best, hessian, taken = minimize(_Plane(start / np.linalg.norm(start), na), linearize, move, max_iterations)
+    first = _Plane(start / np.linalg.norm(start), problem.xy1)
+    if (
+        is_robust
+    ):  # at first the points of picture 1 are where they were seen: both pictures' noise is left in picture 2
+        at_rest = problem.moved(first, np.zeros(8))
+        problem = problem._replace(loss=CAUCHY_SIGMAS * robust_sigma(problem.squared(at_rest), 2))
+    best, hessian, taken = minimize(first, problem.linearize, problem.moved, max_iterations)
     h = np.linalg.solve(t2, best.h) @ t1
     norm = float(np.linalg.norm(h))
     h = h / norm
+    squared = problem.squared(best)
     sigma = noise_px
-    if sigma is None:
-        degrees = 2 * len(a) - 8
-        sigma = math.sqrt(linearize(best)[0] / degrees) / t1[0, 0] if degrees else math.nan
+    if sigma is None and is_robust:
+        sigma = robust_sigma(squared, 2) / t1[0, 0]
+    elif sigma is None:
+        sigma = math.sqrt(float(squared.sum()) / (2 * len(a) - 8)) / t1[0, 0] if len(a) > 4 else math.nan
     by_step = np.linalg.solve(t2, _tangent(best.h).T.reshape(8, 3, 3)) @ t1
     by_step = by_step.reshape(8, 9).T / norm
     by_step -= np.outer(h.ravel(), h.ravel() @ by_step)
     cofactor = inverse_or_none(hessian)
     covariance = None
     if cofactor is not None and not math.isnan(sigma):
-        covariance = (sigma * t1[0, 0]) ** 2 * by_step @ cofactor @ by_step.T
+        # with weights, what the noise does to the gradient is not what the cost bends by (Huber 1967)
+        _, pull, _ = problem.normal(best, cauchy(squared, problem.loss)[1] ** 2)
+        covariance = (sigma * t1[0, 0]) ** 2 * by_step @ cofactor @ pull @ cofactor @ by_step.T
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(hessian)[::-1], 0.0))
     condition = float(values[0] / max(values[-1], 1e-300))
     return h, FitInfo(np.ones(len(a), np.bool_), taken, condition, values, 1, sigma, covariance)
+
+
+class _GoldStandard(NamedTuple):
+    """Least reprojection error in both pictures, in normalised pixels of picture 1.
+
+    Attributes:
+        xy1, xy2: (N, 2) normalised pixels. scale: a pixel of picture 2 in units of one of picture 1, both normalised.
+        loss: of Cauchy; infinite for plain squares.
+    """
+
+    xy1: Array
+    xy2: Array
+    scale: float
+    loss: float = math.inf
+
+    def _left(self, state: _Plane) -> tuple[Array, Array, Array, Array, Array]:
+        """What is left in both pictures (N, 2), its slopes by H (N, 2, 8) and by the places (N, 2, 2), and the inverse
+        (N, 2, 2) of the places' own normal matrices."""
+        left2, by_h, by_at = (each / self.scale for each in _plane_slopes(state, self.xy2))
+        own: Array = np.asarray(np.linalg.inv(np.eye(2) + by_at.swapaxes(1, 2) @ by_at), np.float64)
+        return self.xy1 - state.at, left2, by_h, by_at, own
+
+    def squared(self, state: _Plane) -> Array:
+        """(N,) over both pictures."""
+        left1, left2, *_ = self._left(state)
+        total: Array = (left1**2).sum(1) + (left2**2).sum(1)
+        return total
+
+    def normal(self, state: _Plane, weights: Array) -> tuple[Array, Array, Array]:
+        """Squared errors (N,), normal matrix (8, 8) and gradient (8,) with the places of the points eliminated."""
+        left1, left2, by_h, by_at, own = self._left(state)
+        toward = left1 + np.einsum("nij,ni->nj", by_at, left2)
+        rest = left2 - np.einsum("nij,njk,nk->ni", by_at, own, toward)
+        reduced = by_h - by_at @ own @ by_at.swapaxes(1, 2) @ by_h
+        weighted = (by_h * weights[:, None, None]).reshape(-1, 8)
+        squared = (left1**2).sum(1) + (left2**2).sum(1)
+        return squared, weighted.T @ reduced.reshape(-1, 8), -weighted.T @ rest.ravel()
+
+    def linearize(self, state: _Plane) -> tuple[float, Array, Array]:
+        cost, weights = cauchy(self.squared(state), self.loss)
+        return cost, *self.normal(state, weights)[1:]
+
+    def moved(self, state: _Plane, step: Array) -> _Plane:
+        left1, left2, by_h, by_at, own = self._left(state)
+        toward = left1 + np.einsum("nij,ni->nj", by_at, left2 - by_h @ step)
+        h = state.h + (_tangent(state.h) @ step).reshape(3, 3)
+        return _Plane(h / np.linalg.norm(h), state.at + np.einsum("nij,nj->ni", own, toward))
 
 
 def _plane_slopes(state: _Plane, xy2: Array) -> tuple[Array, Array, Array]:
