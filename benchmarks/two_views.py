@@ -410,8 +410,8 @@ def write(report: dict[str, Any]) -> None:
     distances = ", ".join(f"{program} {found[program]:.2f}" for program in H)
     lines += [
         "## H, graf 1 to 3", "",
-        f"{found['num_right']:.0f} of {found['num_matches']:.0f} matches are on the true plane. Mean distance from the truth",
-        f"over what both pictures see, px: {distances}", "",
+        f"{found['num_right']:.0f} of {found['num_matches']:.0f} matches are on the true plane. Mean distance from the",
+        f"truth over what both pictures see, px: {distances}", "",
         f"## CPU time, {NUM_MATCHES} matches, half of them wrong, {NUM_SCENES} scenes", "",
         "| | program | CPU ms | median error | worst error |", "|---|---|---|---|---|",
     ]  # fmt: skip

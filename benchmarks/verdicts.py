@@ -111,8 +111,8 @@ def calibration_rows(folder: Path) -> Iterator[Row]:
 
 
 def two_view_rows(folder: Path) -> Iterator[Row]:
-    """Robust estimators against OpenCV's USAC, pycolmap and PoseLib: ours refined where we refine, the main path's where
-    the cost is compared."""
+    """Robust estimators against OpenCV's USAC, pycolmap and PoseLib: refined on photographs, those of the main path
+    where CPU time is compared."""
     report = read(folder, "two_views")
     about = (False, report["date"][:10], report["commit"])
     peers = ("OpenCV", "pycolmap", "PoseLib")
