@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import Delaunay
 
 from sfmapp.geometry.sidedness import triangles_kept
 
@@ -17,6 +18,14 @@ def test_a_projective_view_of_a_plane_keeps_every_triangle_and_its_mirror_image_
     kept, total = triangles_kept(xy, seen)
     assert kept == total > 300
     assert triangles_kept(xy, seen * [-1.0, 1.0]) == (0, total)
+
+
+def test_triangles_are_those_of_qhull():
+    xy = np.random.default_rng(2).normal(0, 1000, (2000, 2))
+    kept, total = triangles_kept(xy, xy)
+    # but for some at the hull, where triangles are slivers, and in ties of single precision
+    assert kept == total
+    assert total == pytest.approx(len(Delaunay(xy).simplices), rel=0.01)
 
 
 def test_points_that_have_nothing_to_do_with_each_other_keep_half():

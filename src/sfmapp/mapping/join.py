@@ -583,7 +583,7 @@ def compile_kernels() -> None:
     scene = make_scene(0, 6, 120)
     target, source = scene.observed.copy(), scene.observed.copy()
     target.cam_from_world[3:] = source.cam_from_world[:3] = np.nan
-    # the steps of find_joint that run kernels; its last one would load scipy.spatial, 0.1 s that few runs need
+    # the steps of find_joint that run kernels
     checks = _checks(target, source, true_correspondences(scene, min_matches=1))
     hypotheses = [_from_triples(checks), *(_from_image(checks, i, target, source, 4.0) for i in _bridges(checks))]
     _scores(np.concatenate(hypotheses), checks, 4.0)
