@@ -37,9 +37,9 @@ def workspace(reconstructed: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     return Path(shutil.copytree(reconstructed, tmp_path_factory.mktemp("workspace") / "out"))
 
 
-def test_there_are_eleven_and_each_is_short_and_says_how_to_run_it() -> None:
+def test_there_are_twelve_and_each_is_short_and_says_how_to_run_it() -> None:
     paths = sorted(EXAMPLES.glob("*.py"))
-    assert [int(path.name[:2]) for path in paths] == list(range(1, 12))
+    assert [int(path.name[:2]) for path in paths] == list(range(1, 13))
     for path in paths:
         text = path.read_text(encoding="utf-8")
         assert len(text.splitlines()) < 40, path.name
@@ -156,3 +156,24 @@ def test_export_to_nerfstudio(photos: Path, tmp_path: Path, capsys: pytest.Captu
     frames = json.loads((tmp_path / "nerf" / "transforms.json").read_text())["frames"]
     assert len(frames) == 7
     assert all((tmp_path / "nerf" / frame["file_path"]).is_file() for frame in frames)
+
+
+def test_calibrated_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import cv2
+
+    from board_views import board_poses, render_board
+    from sfmapp.calibration.boards import parse_board
+
+    board = "chessboard:9x6:0.025"
+    camera = sfmapp.Camera(sfmapp.CameraModel.SIMPLE_RADIAL, 320, 240, [262.5, 161.0, 119.0, -0.1])
+    for half in ("now", "before"):
+        (tmp_path / half).mkdir()
+    for n, pose in enumerate(board_poses(np.random.default_rng(5), parse_board(board), 12, camera, 40.0)):
+        picture = render_board(camera, parse_board(board), pose, noise=2.0, seed=n)
+        cv2.imwrite(str(tmp_path / ("now", "before")[n % 2] / f"{n:02d}.png"), picture)
+    sfmapp.calibrate_board(tmp_path / "before", tmp_path / "old", board)
+    run(12, tmp_path / "now", board, tmp_path / "cam", tmp_path / "old")
+    out = capsys.readouterr().out
+    middle, corner = numbers(out, r"middle is projected to ([\d.]+) px\s.*corner is projected to ([\d.]+) px")
+    assert 0.0 < middle < corner < 3.0
+    assert "the same camera" in out

@@ -1,8 +1,9 @@
 """Photographs and video into cameras, points and surfaces, on an ordinary CPU, from pip alone.
 
-Three levels. One call: ``reconstruct``, ``track_sequence``, ``densify``, ``make_mesh``, and what is done with their
-results. The stages, in memory: ``load_images``, ``extract_features``, ``match_images``, ``map_images``. The parts:
-``adjust_bundle``, ``FactorGraph``, ``triangulate``, ``estimate_pose``, ``verify_pair``.
+Three levels. One call: ``reconstruct``, ``track_sequence``, ``densify``, ``make_mesh``, what is done with their
+results, and what is known before: ``calibrate_board`` and its like. The stages, in memory: ``load_images``,
+``extract_features``, ``match_images``, ``map_images``. The parts: ``adjust_bundle``, ``FactorGraph``, ``triangulate``,
+``estimate_pose``, ``verify_pair``.
 
 Conventions: a pose ``cam_from_world`` is a quaternion x, y, z, w and a translation, x_cam = R x_world + t, with camera
 axes x right, y down, z forward. The centre of the top-left pixel is (0.5, 0.5). ``events``, ``threads`` and ``seed``
@@ -18,6 +19,14 @@ from sfmapp.kernel_cache import provide_kernel_cache
 if TYPE_CHECKING:
     from sfmapp.adjust.graph import FactorGraph
     from sfmapp.adjust.options import AdjustOptions
+    from sfmapp.api.calibration import (
+        calibrate_board,
+        calibrate_lines,
+        calibrate_rig,
+        calibrate_target,
+        compare_cameras,
+        locate,
+    )
     from sfmapp.api.geometry import adjust_bundle, estimate_pose, triangulate, verify_pair
     from sfmapp.api.images import load_images
     from sfmapp.api.jobs import (
@@ -93,6 +102,11 @@ __all__ = [
     "Tracks",
     "UsageError",
     "adjust_bundle",
+    "calibrate_board",
+    "calibrate_lines",
+    "calibrate_rig",
+    "calibrate_target",
+    "compare_cameras",
     "densify",
     "estimate_pose",
     "evaluate",
@@ -101,6 +115,7 @@ __all__ = [
     "load",
     "load_images",
     "load_options",
+    "locate",
     "make_mesh",
     "map_images",
     "match_images",
@@ -146,6 +161,11 @@ _HOMES = {
     "Tracks": "scene.tracks",
     "UsageError": "errors",
     "adjust_bundle": "api.geometry",
+    "calibrate_board": "api.calibration",
+    "calibrate_lines": "api.calibration",
+    "calibrate_rig": "api.calibration",
+    "calibrate_target": "api.calibration",
+    "compare_cameras": "api.calibration",
     "densify": "api.jobs",
     "estimate_pose": "api.geometry",
     "evaluate": "api.jobs",
@@ -154,6 +174,7 @@ _HOMES = {
     "load": "api.reconstruction",
     "load_images": "api.images",
     "load_options": "workspace.options",
+    "locate": "api.calibration",
     "make_mesh": "api.jobs",
     "map_images": "api.stages",
     "match_images": "api.stages",

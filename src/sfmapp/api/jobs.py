@@ -97,7 +97,7 @@ def reconstruct(
         >>> reconstruction, report = sfmapp.reconstruct("photos/", "out/")
         >>> reconstruction.points.xyz, reconstruction.image("a.jpg").cam_from_world
     """
-    options = _with(options, threads, seed)
+    options = options_with(options, threads, seed)
     if output is not None:
         from sfmapp.pipelines.sparse import reconstruct as pipeline
 
@@ -158,7 +158,7 @@ def track_sequence(
         >>> frames = sfmapp.ArraySequence(grab(), camera, fps=20)
         >>> sfmapp.track_sequence(frames, on_frame=lambda frame: steer(frame.cam_from_world))
     """
-    options, events = _with(options, threads, seed), events or Events()
+    options, events = options_with(options, threads, seed), events or Events()
     with _told_of_frames(events, on_frame):
         if output is None:
             return TrackResult(_tracked_in_memory(source, options, events), None)
@@ -208,7 +208,12 @@ def refine(
     from sfmapp.pipelines.odometry import refine as pipeline
 
     found, report = pipeline.refine(
-        output, refined, _with(options, threads, seed), photos=photos, free_intrinsics=free_intrinsics, events=events
+        output,
+        refined,
+        options_with(options, threads, seed),
+        photos=photos,
+        free_intrinsics=free_intrinsics,
+        events=events,
     )
     return TrackResult(_with_views(found), report)
 
@@ -254,7 +259,7 @@ def densify(
     """
     from sfmapp.pipelines.dense.densify import dense
 
-    return dense(source, output, _with(options, threads), images=images, maps=maps, record=record, events=events)
+    return dense(source, output, options_with(options, threads), images=images, maps=maps, record=record, events=events)
 
 
 def make_mesh(
@@ -290,7 +295,7 @@ def make_mesh(
     """
     from sfmapp.pipelines.dense.mesh import mesh_cloud, mesh_workspace
 
-    options = _with(options, threads)
+    options = options_with(options, threads)
     if Path(source).is_dir():
         if output is not None:
             raise UsageError(f"the mesh of {source} is written into it", "leave the output folder out")
@@ -410,7 +415,9 @@ def undistort(
     from sfmapp.scene.undistortion import Layout
 
     layout = Layout(blank_pixels, max_size, front_only)
-    return pipeline.undistort(source, output, _with(options, threads), images=images, layout=layout, events=events)
+    return pipeline.undistort(
+        source, output, options_with(options, threads), images=images, layout=layout, events=events
+    )
 
 
 def export(
@@ -455,7 +462,7 @@ def export(
     return export_model(source, target, path, images=images, keypoints=keypoints, crs=crs, is_dense=is_dense)
 
 
-def _with(options: Options | None, threads: int | None, seed: int | None = None) -> Options:
+def options_with(options: Options | None, threads: int | None, seed: int | None = None) -> Options:
     """The options with what was given beside them."""
     options = options or Options()
     if threads is not None:

@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from sfmapp.calibration.one_view import (
     MIN_DEGREES,
@@ -42,6 +41,8 @@ MAX_ERROR_PX = 8.0
 
 # Chance that a second pose is given up although it is the true one.
 _GIVEN_UP = 1e-3
+# twice the logarithm of the likelihood ratio, beyond which that happens: chi-square of the six numbers of a pose
+_RATIO = 22.457744484825323
 # So many of the best poses are tried without the points that contradict them.
 _CLEANED = 3
 # Poses that differ by less are one: a millionth of a turn.
@@ -195,7 +196,7 @@ def _others(views: list[OneView], noise: Noise, sigma_px: float | None) -> tuple
 
     The residuals of the wrong pose are smaller by chance by what its six numbers can take of the noise.
     """
-    view, limit = views[0], float(chi2.isf(_GIVEN_UP, POSE))
+    view = views[0]
     degrees = view.degrees_of_freedom
     floor = noise.sigma_px**2 * max(degrees, 1.0) * 1e-6
     found: list[OtherPose] = []
@@ -204,7 +205,7 @@ def _others(views: list[OneView], noise: Noise, sigma_px: float | None) -> tuple
             ratio = (other.squares - view.squares) / noise.sigma_px**2
         else:
             ratio = degrees * float(np.log((other.squares + floor) / (view.squares + floor)))
-        if ratio < limit:
+        if ratio < _RATIO:
             shift = rigid3.center(other.cam_from_world) - rigid3.center(view.cam_from_world)
             rms = float(np.sqrt(other.squares / max(view.is_used.sum(), 1)))
             found.append(

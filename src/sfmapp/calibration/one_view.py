@@ -6,16 +6,21 @@ contradict; both need the slopes of all residuals, which are few here, so everyt
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as fisher
 
+from sfmapp.camera import lens
 from sfmapp.camera.camera import Camera, project_jacobian
+from sfmapp.camera.models import canonical_from_params
 from sfmapp.camera.names import CameraModel
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.damped import solve_damped, turn_columns
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -132,29 +137,128 @@ def fit_view(
         noise_px: standard deviation of a coordinate, against which a prior is weighed.
     """
     free = np.zeros(len(camera.params), bool) if is_free is None else np.asarray(is_free, bool)
-    best = _linearized(camera, cam_from_world, points, is_used, free, prior, noise_px)
-    damping = 1e-3
+    params, rotation = camera.params.copy(), rigid3.rotation_matrix(cam_from_world)
+    translation = np.array(cam_from_world[4:], np.float64)
+    problem = _Problem(
+        np.ascontiguousarray(canonical_from_params(camera.model)), camera.family, np.flatnonzero(free),
+        np.ascontiguousarray(points[0][is_used]), np.ascontiguousarray(points[1][is_used]),
+        camera.params.copy() if prior is None else np.array(prior.params),
+        np.zeros((0, len(params))) if prior is None else np.array(prior.rows), float(noise_px),
+        float(camera.width) if camera.model == CameraModel.EQUIRECTANGULAR else 0.0,
+    )  # fmt: skip
+    _descend(problem, params, rotation, translation)
+    fitted = camera.with_params(params) if free.any() else camera
+    pose = rigid3.from_matrix(rotation, translation)
+    return _linearized(fitted, pose, points, is_used, free, prior, noise_px)
+
+
+class _Problem(NamedTuple):
+    """What a fit is to: M points and Q pieces of knowledge of P parameters, F of which are free.
+
+    Attributes:
+        canonical_from: (FAMILY, P) the canonical row of parameters. family: of lenses.
+        free: (F,) positions of the free parameters.
+        xyz, xy: (M, 3), (M, 2).
+        middle, rows: (P,), (Q, P) of the prior.
+        noise_px: of a coordinate.
+        period: width of a panorama, whose left and right borders are one line; 0 for none.
+    """
+
+    canonical_from: Array
+    family: int
+    free: NDArray[np.int64]
+    xyz: Array
+    xy: Array
+    middle: Array
+    rows: Array
+    noise_px: float
+    period: float
+
+
+@numba.njit(cache=True, nogil=True)
+def _descend(problem: _Problem, params: Array, rotation: Array, translation: Array) -> None:
+    """Levenberg and Marquardt's method over the free parameters and the pose, in place."""
+    num = problem.free.shape[0] + POSE
+    h, g, new_h, new_g = np.empty((num, num)), np.empty(num), np.empty((num, num)), np.empty(num)
+    factor, step = np.empty((num, num)), np.empty(num)
+    new_params, new_rotation, new_translation = params.copy(), rotation.copy(), translation.copy()
+    column = np.empty((3, 1))
+    damping, cost = 1e-3, _linearize(problem, params, rotation, translation, h, g)
     for _ in range(_MAX_STEPS):
-        if not np.isfinite(best.cost):
-            break
-        step = _step(best, prior, damping)
-        tried = None
-        if step is not None:
-            params = best.camera.params.copy()
-            params[free] += step[:-POSE]
-            tried = _linearized(
-                best.camera.with_params(params), moved(best.cam_from_world, step[-POSE:]), points, is_used, free, prior,
-                noise_px,
-            )  # fmt: skip
-        if tried is not None and tried.cost <= best.cost:
-            gain, best, damping = best.cost - tried.cost, tried, max(damping * 0.1, 1e-15)
-            if gain <= _TOLERANCE * best.cost:
-                break
+        if not np.isfinite(cost):
+            return
+        new_cost = np.inf
+        if solve_damped(h, g, damping, factor, step):
+            for k in range(num - POSE):
+                new_params[problem.free[k]] = params[problem.free[k]] + step[k]
+            turn_columns(step[num - 6 : num - 3], rotation, new_rotation)
+            turn_columns(step[num - 6 : num - 3], translation.reshape(3, 1), column)
+            for k in range(3):
+                new_translation[k] = column[k, 0] + step[num - 3 + k]
+            new_cost = _linearize(problem, new_params, new_rotation, new_translation, new_h, new_g)
+        if new_cost <= cost:
+            gain, cost, damping = cost - new_cost, new_cost, max(damping * 0.1, 1e-15)
+            params[:], rotation[:], translation[:] = new_params, new_rotation, new_translation
+            h, new_h, g, new_g = new_h, h, new_g, g
+            if gain <= _TOLERANCE * cost:
+                return
         elif damping > 1e12:
-            break
+            return
         else:
             damping = max(damping * 10.0, 1e-6)
-    return best
+
+
+@numba.njit(cache=True, nogil=True)
+def _linearize(problem: _Problem, params: Array, rotation: Array, translation: Array, h: Array, g: Array) -> float:
+    """Cost, half the sum of squares, and the lower triangle of its Gauss-Newton system; infinite where the lens does
+    not see a point."""
+    free, xyz, xy = problem.free, problem.xyz, problem.xy
+    num_free = free.shape[0]
+    num = num_free + POSE
+    row, out, slope = np.empty(lens.ROW), np.empty(lens.JACOBIAN), np.empty((2, num))
+    for i in range(lens.FAMILY):
+        row[i] = 0.0
+        for k in range(params.shape[0]):
+            row[i] += problem.canonical_from[i, k] * params[k]
+    row[lens.FAMILY] = problem.family
+    h[:], g[:] = 0.0, 0.0
+    cost, weight = 0.0, 1.0 / problem.noise_px**2
+    for n in range(xyz.shape[0]):
+        x = rotation[0, 0] * xyz[n, 0] + rotation[0, 1] * xyz[n, 1] + rotation[0, 2] * xyz[n, 2] + translation[0]
+        y = rotation[1, 0] * xyz[n, 0] + rotation[1, 1] * xyz[n, 1] + rotation[1, 2] * xyz[n, 2] + translation[1]
+        z = rotation[2, 0] * xyz[n, 0] + rotation[2, 1] * xyz[n, 1] + rotation[2, 2] * xyz[n, 2] + translation[2]
+        lens.project_jacobian(row, x, y, z, out)
+        for c in range(2):
+            a, b, d = out[2 + 3 * c], out[3 + 3 * c], out[4 + 3 * c]
+            for k in range(num_free):
+                slope[c, k] = 0.0
+                for i in range(lens.FAMILY):
+                    slope[c, k] += out[8 + 2 * i + c] * problem.canonical_from[i, free[k]]
+            # of a turn w the point moves by w x p
+            slope[c, num_free] = y * d - z * b
+            slope[c, num_free + 1] = z * a - x * d
+            slope[c, num_free + 2] = x * b - y * a
+            slope[c, num_free + 3], slope[c, num_free + 4], slope[c, num_free + 5] = a, b, d
+            residual = xy[n, c] - out[c]
+            if c == 0 and problem.period > 0.0:
+                residual -= problem.period * np.round(residual / problem.period)
+            if not np.isfinite(residual):
+                return np.inf
+            cost += weight * residual * residual
+            for i in range(num):
+                g[i] -= weight * slope[c, i] * residual
+                for j in range(i + 1):
+                    h[i, j] += weight * slope[c, i] * slope[c, j]
+    for q in range(problem.rows.shape[0]):
+        off = 0.0
+        for k in range(params.shape[0]):
+            off += problem.rows[q, k] * (params[k] - problem.middle[k])
+        cost += off * off
+        for i in range(num_free):
+            g[i] += problem.rows[q, free[i]] * off
+            for j in range(i + 1):
+                h[i, j] += problem.rows[q, free[i]] * problem.rows[q, free[j]]
+    return 0.5 * cost
 
 
 def moved(cam_from_world: Array, step: Array) -> Array:
@@ -182,24 +286,6 @@ def _linearized(
     squares = float((residual[is_used] ** 2).sum())
     cost = 0.5 * (squares / noise_px**2 + pull) if np.isfinite(squares) else np.inf
     return OneView(camera, pose, is_free, residual, slope, is_used, information, cost, noise_px)
-
-
-def _step(view: OneView, prior: Prior | None, damping: float) -> Array | None:
-    rows = view.slope[view.is_used].reshape(-1, view.num_unknown) / view.noise_px
-    right = rows.T @ (view.residual[view.is_used].ravel() / view.noise_px)
-    if prior is not None:
-        right[:-POSE] -= prior.rows[:, view.is_free].T @ (prior.rows @ (view.camera.params - prior.params))
-    normal = view.information
-    diagonal = np.diag(normal).copy()
-    if not (np.isfinite(normal).all() and (diagonal > 0.0).all()):
-        return None
-    scale = 1.0 / np.sqrt(diagonal)
-    try:
-        scaled = normal * scale[:, None] * scale + damping * np.eye(len(scale))
-        solved: Array = scale * np.linalg.solve(scaled, scale * right)
-    except np.linalg.LinAlgError:
-        return None
-    return solved if np.isfinite(solved).all() else None
 
 
 # ------------------------------------------------------------------------------------------------------ how sure it is
@@ -296,7 +382,9 @@ def deletion_statistics(view: OneView, given_px: float | None = None) -> tuple[A
 
 def wrong_limit(num_points: int, degrees: float, *, is_noise_given: bool) -> float:
     """The F statistic beyond which a point of ``num_points`` is wrong: a false alarm in a thousand pictures."""
-    return float(fisher.isf(_FALSE_ALARM / num_points, 2, 1e9 if is_noise_given else max(degrees, 1.0)))
+    chance, degrees = _FALSE_ALARM / num_points, 1e9 if is_noise_given else max(degrees, 1.0)
+    # with two degrees above, the distribution function of F has a closed form: (1 + 2 x / d)^(-d / 2) is left
+    return 0.5 * degrees * math.expm1(-2.0 * math.log(chance) / degrees)
 
 
 def without_wrong_points(view: OneView, refit: Refit, given_px: float | None) -> OneView:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -54,6 +54,8 @@ _SURELY_BETTER = 3.0
 _PERSPECTIVE = ("BROWN", "RATIONAL", "SKEW", "DIVISION")
 # Samples of the points that starts are taken from: with 40 % of them wrong, 23 of 500 samples of six have none.
 _MAX_SAMPLES = 500
+# So many first of them are enough if this is the chance that none was without a wrong point.
+_FIRST_SAMPLES, _MISSED = (30, 90), 1e-4
 # Share of the longer side within which principal points lie of the middle: phones and cars have two per cent.
 _CENTER_SHARE = 0.02
 # On a plane the rest has to be said as well: pixels are square to some tenths of a per cent, and p1 and p2, which move
@@ -274,6 +276,31 @@ def _samples(count: int, size: int) -> NDArray[np.int64]:
     return np.argsort(draw.random((_MAX_SAMPLES, count)), axis=1)[:, :size]
 
 
+def _agreeing_points(places: Array, xy: Array, size: int, find: Callable[[Array, Array], Array]) -> Bools:
+    """(N,) points that agree with the best of maps (S, 3, D + 1) of samples of them, and of all.
+
+    Args:
+        places: (N, D). xy: (N, 2).
+        size: of a sample.
+        find: maps of samples (S, size, D) and (S, size, 2).
+    """
+    chosen = _samples(len(xy), size)
+    of_all = find(places[None], xy[None])
+    for num in (*_FIRST_SAMPLES, len(chosen)):
+        part = chosen[:num]
+        maps = np.concatenate([find(places[part], xy[part]), of_all])
+        seen = dlt.homogeneous(places) @ maps.swapaxes(1, 2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            squares = ((seen[..., :2] / seen[..., 2:] - xy) ** 2).sum(2)
+        # the sign of a homography is that of its first point, and all have to have it; of a projection it is open
+        is_seen = np.isfinite(squares) & ((seen[..., 2] > 0.0) | (places.shape[1] == 3))
+        is_used = _agreeing(np.where(is_seen, squares, np.inf), size)
+        # the chance that each of these samples had a wrong point
+        if (1.0 - is_used.mean() ** size) ** len(part) < _MISSED:
+            break
+    return is_used
+
+
 def _agreeing(squares: Array, size: int) -> Bools:
     """(N,) the points that agree with the best of S hypotheses, from their squared errors (S, N): the one with the
     least median (Rousseeuw and Leroy, "Robust Regression and Outlier Detection", 1987)."""
@@ -289,15 +316,7 @@ def _agreeing(squares: Array, size: int) -> Bools:
 
 def _start_in_space(points: Points, size: tuple[int, int]) -> _Start:
     xyz, xy = points
-    chosen = _samples(len(xy), dlt.MIN_POINTS)
-    matrices = np.concatenate(
-        [dlt.find_projections(xyz[chosen], xy[chosen]), dlt.find_projections(xyz[None], xy[None])]
-    )
-    seen = dlt.homogeneous(xyz) @ matrices.swapaxes(1, 2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        squares = ((seen[..., :2] / seen[..., 2:] - xy) ** 2).sum(2)
-    squares[~np.isfinite(squares)] = np.inf
-    is_used = _agreeing(squares, dlt.MIN_POINTS)
+    is_used = _agreeing_points(xyz, xy, dlt.MIN_POINTS, dlt.find_projections)
     linear = dlt.find_projection(xyz[is_used], xy[is_used])
     behind = (dlt.homogeneous(xyz[is_used]) @ linear.matrix[2] <= 0.0).mean()
     if behind > 0.5 and linear.rank < 11:  # of a target that is too flat to tell its front from its back
@@ -322,15 +341,7 @@ def _start_on_plane(points: Points, size: tuple[int, int]) -> _Start:
     xyz, xy = points
     middle, axes = _plane_of(xyz)
     flat = (xyz - middle) @ axes.T
-    chosen = _samples(len(xy), 4)
-    maps = np.concatenate(
-        [dlt.find_homographies(flat[chosen][..., :2], xy[chosen]), dlt.find_homographies(flat[None, :, :2], xy[None])]
-    )
-    seen = dlt.homogeneous(flat[:, :2]) @ maps.swapaxes(1, 2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        squares = ((seen[..., :2] / seen[..., 2:] - xy) ** 2).sum(2)
-    squares[~(np.isfinite(squares) & (seen[..., 2] > 0.0))] = np.inf
-    is_used = _agreeing(squares, 4)
+    is_used = _agreeing_points(flat[:, :2], xy, 4, dlt.find_homographies)
     found = views_of_plane(flat[is_used, :2], xy[is_used] - np.array(size) / 2.0)
     if not found:
         return _start_by_focal(simple_camera(CameraModel.SIMPLE_PINHOLE, *size, 1.0), points, is_used)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.damped import solve_damped, turn_columns
 
 Array = NDArray[np.float64]
 
@@ -295,45 +296,9 @@ def _linearize_pose(
 
 
 @numba.njit(cache=True, nogil=True)
-def _solve_damped(h: Array, g: Array, damping: float, factor: Array, step: Array) -> bool:
-    """Cholesky solution of (H + damping diag(H)) step = -g from the lower triangle of H; False if it is singular."""
-    n = g.shape[0]
-    for i in range(n):
-        for j in range(i + 1):
-            total = h[i, j] * (1.0 + damping) if i == j else h[i, j]
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            if i == j:
-                if total <= 1e-15 * h[i, i] or total <= 0.0:
-                    return False
-                factor[i, i] = math.sqrt(total)
-            else:
-                factor[i, j] = total / factor[j, j]
-    for i in range(n):
-        total = -g[i]
-        for k in range(i):
-            total -= factor[i, k] * step[k]
-        step[i] = total / factor[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            step[i] -= factor[k, i] * step[k]
-        step[i] /= factor[i, i]
-    return True
-
-
-@numba.njit(cache=True, nogil=True)
 def _move_pose(r: Array, t: Array, tangent: Array, step: Array, new_r: Array, new_t: Array) -> None:
     """exp(w) R by Rodrigues' formula column by column, and t moved in its tangent plane and back to the sphere."""
-    wx, wy, wz = step[0], step[1], step[2]
-    angle = math.sqrt(wx * wx + wy * wy + wz * wz)
-    a = math.sin(angle) / angle if angle > 1e-9 else 1.0
-    b = 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2 if angle > 1e-9 else 0.5
-    for k in range(3):
-        x, y, z = r[0, k], r[1, k], r[2, k]
-        cx, cy, cz = wy * z - wz * y, wz * x - wx * z, wx * y - wy * x
-        new_r[0, k] = x + a * cx + b * (wy * cz - wz * cy)
-        new_r[1, k] = y + a * cy + b * (wz * cx - wx * cz)
-        new_r[2, k] = z + a * cz + b * (wx * cy - wy * cx)
+    turn_columns(step, r, new_r)
     norm = 0.0
     for k in range(3):
         new_t[k] = t[k] + tangent[k, 0] * step[3] + tangent[k, 1] * step[4]
@@ -353,7 +318,7 @@ def _refine_pose(rotations: Array, ts: Array, xn1: Array, xn2: Array, scale2: fl
     damping = 1e-4
     for _ in range(max_iterations):
         new, new_cost = 1 - now, math.inf
-        if _solve_damped(h[now], g[now], damping, factor, step):
+        if solve_damped(h[now], g[now], damping, factor, step):
             _move_pose(rotations[now], ts[now], tangent[now], step, rotations[new], ts[new])
             _tangent_plane(ts[new], tangent[new])
             new_cost = _linearize_pose(rotations[new], ts[new], xn1, xn2, scale2, tangent[new], h[new], g[new])

@@ -18,6 +18,8 @@ from sfmapp.geometry import rigid3
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+_FIRST_TRIALS = 256
+
 
 def find_pose(xyz: Array, rays: Array, max_error: float, confidence: float, max_trials: int) -> Array | None:
     """``cam_from_world`` (7,) by RANSAC, the same at every call; None if no sample has a solution.
@@ -28,9 +30,14 @@ def find_pose(xyz: Array, rays: Array, max_error: float, confidence: float, max_
         confidence: wanted probability that one sample without a wrong pair was drawn.
         max_trials: bound on the number of samples.
     """
-    samples = np.random.default_rng([0, len(xyz)]).integers(0, len(xyz), (max_trials, 3))
     points, directions = (np.ascontiguousarray(a, np.float64) for a in (xyz, rays))
-    found, rotation, translation = _search(points, directions, max_error * max_error, confidence, samples)
+    # to draw ten thousand takes longer than to search a few dozen, which are the first of these
+    for num in (min(_FIRST_TRIALS, max_trials), max_trials):
+        samples = np.random.default_rng([0, len(xyz)]).integers(0, len(xyz), (num, 3))
+        trials, rotation, translation = _search(points, directions, max_error * max_error, confidence, samples)
+        found = trials > 0
+        if trials < num:
+            break
     return rigid3.from_matrix(rotation, translation) if found else None
 
 
@@ -43,7 +50,8 @@ def squared_errors(cam_from_world: Array, xyz: Array, rays: Array) -> Array:
 
 
 @numba.njit(cache=True, nogil=True)
-def _search(xyz: Array, rays: Array, limit: float, confidence: float, samples: Ints) -> tuple[bool, Array, Array]:
+def _search(xyz: Array, rays: Array, limit: float, confidence: float, samples: Ints) -> tuple[int, Array, Array]:
+    """Trials until enough were drawn, all of them if that was not reached, 0 without a pose; rotation, translation."""
     rotation, translation = np.eye(3), np.zeros(3)
     found, best_cost, needed, trial = False, math.inf, samples.shape[0], 0
     rotations, translations = np.empty((4, 3, 3)), np.empty((4, 3))
@@ -73,7 +81,7 @@ def _search(xyz: Array, rays: Array, limit: float, confidence: float, samples: I
                 if share > 0.0:
                     wanted = math.log(1.0 - confidence) / math.log1p(-share) if share < 1.0 else 0.0
                     needed = min(needed, trial + int(min(wanted, 1e9)))
-    return found, rotation, translation
+    return trial if found else 0, rotation, translation
 
 
 @numba.njit(cache=True, nogil=True)

@@ -12,12 +12,15 @@ lie on a plane or not.
 from __future__ import annotations
 
 import itertools
+import math
 from functools import cache
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.damped import solve_damped, turn_columns
 
 Array = NDArray[np.float64]
 
@@ -51,7 +54,7 @@ def poses_of_points(xyz: Array, rays: Array) -> Array:
     moved = np.einsum("nij,nk->nijk", across, local).reshape(-1, 3, 9)
     shift = -np.linalg.solve(total, moved.sum(0))
     rows = (moved + across @ shift).reshape(-1, 9)
-    rotations = _minima(np.asarray(np.linalg.qr(rows, mode="r")) if len(rows) > 9 else rows)
+    rotations = _minima(np.ascontiguousarray(np.linalg.qr(rows, mode="r") if len(rows) > 9 else rows))
     translations = rotations.reshape(-1, 9) @ shift.T
     seen = np.einsum("kij,nj->kni", rotations, local) + translations[:, None]
     is_ahead = ((seen * rays).sum(2) > 0.0).all(1)
@@ -90,33 +93,62 @@ def _minima(rows: Array) -> Array:
     return kept_rotations
 
 
+@numba.njit(cache=True, nogil=True)
 def _descend(rows: Array, starts: Array, max_steps: int) -> tuple[Array, Array, Array]:
-    """Levenberg and Marquardt's method from all starts (K, 3, 3) at once: rotations, values (K,), last steps (K,)."""
-    rotation = starts.copy()
-    damping, last = np.full(len(rotation), 1e-3), np.full(len(rotation), np.inf)
-    left, slope = _linearized(rows, rotation)
-    error = (left**2).sum(1)
-    for _ in range(max_steps):
-        normal, gradient = slope.swapaxes(1, 2) @ slope, np.einsum("kij,ki->kj", slope, left)
-        scale = np.trace(normal, axis1=1, axis2=2)[:, None, None] / 3.0 + 1e-300
-        step = -np.linalg.solve(normal + damping[:, None, None] * scale * np.eye(3), gradient[:, :, None])[..., 0]
-        tried = rigid3.exp_so3(step) @ rotation
-        new_left, new_slope = _linearized(rows, tried)
-        new_error = (new_left**2).sum(1)
-        is_better = new_error <= error
-        rotation[is_better], left[is_better] = tried[is_better], new_left[is_better]
-        slope[is_better], error[is_better] = new_slope[is_better], new_error[is_better]
-        damping = np.clip(np.where(is_better, 0.1 * damping, 10.0 * damping), 1e-12, 1e12)
-        last = np.linalg.norm(step, axis=1)
-        if last.max() < _SETTLED:
-            break
-    return rotation, error, last
+    """Levenberg and Marquardt's method from each start (K, 3, 3): rotations, values (K,), last steps (K,)."""
+    num = starts.shape[0]
+    rotations, errors, lasts = starts.copy(), np.empty(num), np.full(num, np.inf)
+    h, g, new_h, new_g = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
+    factor, step, tried = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    for k in range(num):
+        rotation, damping = rotations[k], 1e-3
+        error = _linearize(rows, rotation, h, g)
+        for _ in range(max_steps):
+            # a multiple of the unit matrix: along a valley the own diagonal would be no damping at all
+            scale = (h[0, 0] + h[1, 1] + h[2, 2]) / 3.0 + 1e-300
+            for i in range(3):
+                h[i, i] += damping * scale
+            is_solved = solve_damped(h, g, 0.0, factor, step)
+            for i in range(3):
+                h[i, i] -= damping * scale
+            if is_solved:
+                lasts[k] = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+                turn_columns(step, rotation, tried)
+                new_error = _linearize(rows, tried, new_h, new_g)
+            if is_solved and new_error <= error:
+                rotation[:], error = tried, new_error
+                h, new_h, g, new_g = new_h, h, new_g, g
+                damping = max(0.1 * damping, 1e-12)
+            else:
+                damping = min(10.0 * damping, 1e12)
+            if lasts[k] < _SETTLED:
+                break
+        errors[k] = error
+    return rotations, errors, lasts
 
 
-def _linearized(rows: Array, rotation: Array) -> tuple[Array, Array]:
-    """Errors (K, M) of rotations and their slopes (K, M, 3) by a turn w, R <- exp(w) R."""
-    turned = rigid3.skew(np.eye(3))[None] @ rotation[:, None]  # (K, 3, 3, 3)
-    return rotation.reshape(-1, 9) @ rows.T, rows @ turned.reshape(-1, 3, 9).swapaxes(1, 2)
+@numba.njit(cache=True, nogil=True)
+def _linearize(rows: Array, r: Array, h: Array, g: Array) -> float:
+    """Squared error of a rotation, and its Gauss-Newton system by a turn w, R <- exp(w) R."""
+    h[:], g[:] = 0.0, 0.0
+    error, slope = 0.0, np.empty(3)
+    for m in range(rows.shape[0]):
+        left = 0.0
+        slope[:] = 0.0
+        for k in range(3):
+            a, b, c = rows[m, k], rows[m, 3 + k], rows[m, 6 + k]
+            x, y, z = r[0, k], r[1, k], r[2, k]
+            left += a * x + b * y + c * z
+            # (a, b, c) . (w x column) = w . (column x (a, b, c))
+            slope[0] += y * c - z * b
+            slope[1] += z * a - x * c
+            slope[2] += x * b - y * a
+        error += left * left
+        for i in range(3):
+            g[i] += slope[i] * left
+            for j in range(3):
+                h[i, j] += slope[i] * slope[j]
+    return error
 
 
 def _distinct(rotations: Array, errors: Array, angle: float) -> list[int]:

@@ -1,0 +1,53 @@
+"""Steps of Levenberg and Marquardt's method for a few unknowns, in kernels."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@numba.njit(cache=True, nogil=True)
+def solve_damped(h: Array, g: Array, damping: float, factor: Array, step: Array) -> bool:
+    """Cholesky solution of (H + damping diag(H)) step = -g from the lower triangle of H; False if it is singular."""
+    n = g.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            total = h[i, j] * (1.0 + damping) if i == j else h[i, j]
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i == j:
+                if total <= 1e-15 * h[i, i] or total <= 0.0:
+                    return False
+                factor[i, i] = math.sqrt(total)
+            else:
+                factor[i, j] = total / factor[j, j]
+    for i in range(n):
+        total = -g[i]
+        for k in range(i):
+            total -= factor[i, k] * step[k]
+        step[i] = total / factor[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            step[i] -= factor[k, i] * step[k]
+        step[i] /= factor[i, i]
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def turn_columns(w: Array, columns: Array, out: Array) -> None:
+    """exp(w) times each column of a matrix (3, K), by Rodrigues' formula."""
+    wx, wy, wz = w[0], w[1], w[2]
+    angle = math.sqrt(wx * wx + wy * wy + wz * wz)
+    a = math.sin(angle) / angle if angle > 1e-9 else 1.0
+    b = 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2 if angle > 1e-9 else 0.5
+    for k in range(columns.shape[1]):
+        x, y, z = columns[0, k], columns[1, k], columns[2, k]
+        cx, cy, cz = wy * z - wz * y, wz * x - wx * z, wx * y - wy * x
+        out[0, k] = x + a * cx + b * (wy * cz - wz * cy)
+        out[1, k] = y + a * cy + b * (wz * cx - wx * cz)
+        out[2, k] = z + a * cz + b * (wx * cy - wy * cx)
