@@ -12,6 +12,7 @@ __all__ = [
     "LOCK",
     "MANIFEST",
     "ODOMETRY",
+    "PAGE",
     "PAIR",
     "RECONSTRUCT",
     "REFINE",
@@ -24,6 +25,7 @@ FORMAT = f"{FORMAT_NAME} 1"
 # the commands that write workspaces; manifests of before the second one name none
 RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "refine", "dense", "undistort"
 CALIBRATE, LOCATE, PAIR = "calibrate", "locate", "pair"
-LOCK, REPORT = ".lock", "report.json"
+# a report for programs, and the page for people beside it
+LOCK, REPORT, PAGE = ".lock", "report.json", "report.html"
 # where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0
 USUAL_FOLDERS = ("images", "../images", "../../images")

@@ -35,7 +35,7 @@ from sfmapp.pipelines.calibration.results import write_camera, write_recording
 from sfmapp.report.calibration_html import render_board_html
 from sfmapp.report.model import CalibrateReport
 from sfmapp.workspace.job import Job
-from sfmapp.workspace.layout import CALIBRATE, REPORT
+from sfmapp.workspace.layout import CALIBRATE, PAGE, REPORT
 from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
 
@@ -134,7 +134,7 @@ def calibrate_board(
             files = write_camera(job.workspace.folder, made)
             report = CalibrateReport(board=_report(pictures, solution, coming, files), run=job.facts())
             job.workspace.write_json(REPORT, report)
-            job.workspace.write_text("report.html", render_board_html(report, made))
+            job.workspace.write_text(PAGE, render_board_html(report, made))
         if asked.recording:
             with job.stage("recording"):
                 _record(job, board, pictures, made)

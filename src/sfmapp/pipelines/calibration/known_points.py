@@ -42,13 +42,13 @@ from sfmapp.pipelines.calibration.results import write_camera, write_recording
 from sfmapp.report.point_html import draw_residuals, render_location_html, render_target_html
 from sfmapp.reporting import document_text
 from sfmapp.workspace.job import Job
-from sfmapp.workspace.layout import CALIBRATE, LOCATE, REPORT
+from sfmapp.workspace.layout import CALIBRATE, LOCATE, PAGE, REPORT
 from sfmapp.workspace.usage import Stopwatch
 from sfmapp.workspace.workspace import Workspace
 
 Array = NDArray[np.float64]
 
-PICTURE, PAGE = "residuals.jpg", "report.html"
+PICTURE = "residuals.jpg"
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from sfmapp.report.lines_html import CalibrateLinesReport, line_picture, lines_p
 from sfmapp.reporting import NamedReason
 from sfmapp.scene.undistortion import Layout, plan_undistortion
 from sfmapp.workspace.job import Job
-from sfmapp.workspace.layout import CALIBRATE, REPORT
+from sfmapp.workspace.layout import CALIBRATE, PAGE, REPORT
 from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
 
@@ -33,7 +33,6 @@ Pixels = NDArray[np.uint8]
 
 # folders of pictures in the output
 LINES, UNDISTORTED = "lines", "undistorted"
-HTML = "report.html"
 # More photographs than this tell what the first of them tell already: these are spread over all.
 MOST_PHOTOGRAPHS = 24
 
@@ -91,7 +90,7 @@ def calibrate_lines(
         lines = LinesReport(**{**found.report, "files": files})
         report = CalibrateLinesReport(lines=lines, skipped=skipped, run=job.facts())
         job.workspace.write_json(REPORT, report)
-        job.workspace.write_text(HTML, lines_page(report, found.calibration, shown))
+        job.workspace.write_text(PAGE, lines_page(report, found.calibration, shown))
         job.workspace.save()
         return LinesResult(job.workspace.folder, found.calibration, report)
 

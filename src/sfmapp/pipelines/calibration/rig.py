@@ -30,7 +30,7 @@ from sfmapp.pipelines.calibration.shots import match_shots
 from sfmapp.report.model import CalibrateRigReport
 from sfmapp.report.rig_html import render_rig_html
 from sfmapp.workspace.job import Job
-from sfmapp.workspace.layout import CALIBRATE, REPORT
+from sfmapp.workspace.layout import CALIBRATE, PAGE, REPORT
 from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
 
@@ -125,7 +125,7 @@ def calibrate_cameras(
         )  # fmt: skip
         report = CalibrateRigReport(rig=rig, run=job.facts())
         job.workspace.write_json(REPORT, report)
-        job.workspace.write_text("report.html", render_rig_html(report, found))
+        job.workspace.write_text(PAGE, render_rig_html(report, found))
         job.workspace.save()
         return RigResult(job.workspace.folder, found, report)
 

@@ -37,7 +37,7 @@ from sfmapp.report.model import (
 from sfmapp.reporting import R, Step, document_text, from_plain
 from sfmapp.scene.mesh import Mesh
 from sfmapp.surface.report import MeshReport
-from sfmapp.workspace.layout import DENSE, REPORT
+from sfmapp.workspace.layout import DENSE, PAGE, REPORT
 from sfmapp.workspace.manifest import raise_as_before
 
 STAGE: Literal["dense"] = "dense"
@@ -266,9 +266,9 @@ def _write_report(
         document = replace(document, dense=None)
     workspace.write_text(REPORT, document_text(document))
     if isinstance(document, DenseRunReport):
-        workspace.write_text("report.html", render_dense_html(document, pictures))
+        workspace.write_text(PAGE, render_dense_html(document, pictures))
     else:
-        workspace.write_text("report.html", render_html(document, read_model(job.known.model)[0], pictures))
+        workspace.write_text(PAGE, render_html(document, read_model(job.known.model)[0], pictures))
 
 
 def _with(stages: Stages, section: DenseReport | MeshRunReport | FailedReport) -> Stages:

@@ -44,7 +44,7 @@ from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.sequences.open import open_sequence
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.kernels import kernels_compiling
-from sfmapp.workspace.layout import ODOMETRY, REFINE
+from sfmapp.workspace.layout import ODOMETRY, PAGE, REFINE
 from sfmapp.workspace.manifest import Manifest, read_manifest
 from sfmapp.workspace.options import Options, options_from_dict
 from sfmapp.workspace.usage import Stopwatch
@@ -271,7 +271,7 @@ def _write(
         warnings=job.log.warnings,
         decisions=job.log.decisions,
     )
-    workspace.write_text("report.html", render_refine_html(report, after, ground_truth, fits["after"]))
+    workspace.write_text(PAGE, render_refine_html(report, after, ground_truth, fits["after"]))
     workspace.write_text("report.json", document_text(report))
     workspace.note(usage=job.usage)
     workspace.save()

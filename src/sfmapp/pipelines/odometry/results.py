@@ -44,7 +44,7 @@ from sfmapp.report.odometry_document import (
 from sfmapp.report.odometry_html import render_odometry_html
 from sfmapp.reporting import document_text
 from sfmapp.workspace.job import FAILED, NOT_WANTED, WRITTEN
-from sfmapp.workspace.layout import MANIFEST, ODOMETRY, REPORT
+from sfmapp.workspace.layout import MANIFEST, ODOMETRY, PAGE, REPORT
 from sfmapp.workspace.manifest import read_manifest
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
         _finish_recording(run, result, against)
     report = make_report(run, result, facts, against, failure)
     page = render_odometry_html(report, result, facts, ground_truth, against)
-    run.save_first(lambda: workspace.write_text("report.html", page))
+    run.save_first(lambda: workspace.write_text(PAGE, page))
     # the last measurement that can still be written down
     report = replace(report, run=replace(report.run, **run.watch.read()))
     run.save_first(lambda: workspace.write_text(REPORT, document_text(report)))

@@ -28,7 +28,7 @@ from sfmapp.report.html import render_html
 from sfmapp.report.model import ImageReport, Outcome, ReconstructionReport
 from sfmapp.reporting import NamedReason, document_text
 from sfmapp.workspace.job import FAILED, NO_MODEL, NOT_WANTED, WRITTEN
-from sfmapp.workspace.layout import REPORT
+from sfmapp.workspace.layout import PAGE, REPORT
 from sfmapp.workspace.manifest import raise_as_before
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def earlier_report(run: Run, keys: StageKeys) -> ReconstructionReport | None:
     if not workspace.is_current("mapping", keys.mapping):
         return None
     has_recording = workspace.recording.is_file() or workspace.manifest.recording in (NO_MODEL, FAILED)
-    if (run.recorder is not None and not has_recording) or not (workspace.folder / "report.html").is_file():
+    if (run.recorder is not None and not has_recording) or not (workspace.folder / PAGE).is_file():
         return None
     entry = workspace.manifest.stage("mapping")
     raise_as_before(entry)
@@ -80,7 +80,7 @@ def write_results(
         workspace.note(recording=_record(run, models))
     report = _make_report(run, models, failure)
     page = render_html(report, models[0] if models else None)
-    run.save_first(lambda: workspace.write_text("report.html", page))
+    run.save_first(lambda: workspace.write_text(PAGE, page))
     took = run.watch.read()  # the last measurement that can still be written down
     report = replace(report, run=replace(report.run, **took))
     run.save_first(lambda: workspace.write_text(REPORT, document_text(report)))
