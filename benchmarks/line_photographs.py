@@ -77,10 +77,10 @@ def main() -> None:
         print(rows[-1], flush=True)
     machine = describe_machine()
     lines = [
-        f"sfmapp {machine['versions']['sfmapp']} at {machine['commit']}; {machine['date']}. Columns: benchmarks/README.md.",
+        f"sfmapp {machine['versions']['sfmapp']} at {machine['commit']}, {machine['date']}",
         "",
-        f"{len(chosen)} photographs: a focal length is told of {told}, right within {SIGMAS:g} sigmas of {right}; of the "
-        f"other {len(chosen) - told} none is told.",
+        f"{len(chosen)} photographs: a focal length is told of {told}, right within {SIGMAS:g} sigmas of {right}; of "
+        f"the other {len(chosen) - told} none is told.",
         "",
         "| photograph | focal length px | found | off | sigmas | what is said | CPU s |",
         "|---|---|---|---|---|---|---|",

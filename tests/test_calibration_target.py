@@ -171,6 +171,26 @@ def test_two_points_that_changed_places_are_named() -> None:
     assert {(point.index, point.swapped_with) for point in fit.wrong} == {(4, 9), (9, 4)}
 
 
+def test_a_wrong_point_does_not_take_the_place_of_those_that_the_distortion_moved() -> None:
+    """Of 500 such pictures of the benchmark the one whose start, without distortion, left five good points aside."""
+    rng = np.random.default_rng([1, 40, 4, 486])
+    size = (1280, 720)
+    camera = Camera(CameraModel.OPENCV, *size, np.array([900.0, 910.0, 630.0, 370.0, -0.2, 0.05, 0.001, -0.002]))
+    while True:
+        xyz = rng.uniform(-1.0, 1.0, (40, 3)) * [1.6, 1.0, 0.8]
+        pose = rigid3.from_matrix(rigid3.exp_so3(0.5 * rng.normal(size=3)), np.array([*0.1 * rng.normal(size=2), 3.5]))
+        xy = project(camera, rigid3.apply(pose, xyz))
+        if np.isfinite(xy).all() and (xy > 0).all() and (xy < size).all():
+            break
+    xy = xy + 0.5 * rng.normal(size=xy.shape)
+    wrong, turn = rng.choice(40, 4, replace=False), rng.uniform(0.0, 2.0 * np.pi, 4)
+    xy[wrong] += rng.uniform(10.0, 60.0, (4, 1)) * np.stack([np.cos(turn), np.sin(turn)], 1)
+    fit = calibrate_target(xyz, xy, size, camera_model=CameraModel.OPENCV)
+    assert sorted(one.index for one in fit.wrong) == sorted(wrong)
+    off = errors(fit, camera, pose)
+    assert float(off @ np.linalg.solve(fit.covariance, off)) / len(off) < 2.5
+
+
 def test_a_tilted_plane_tells_the_focal_length_through_the_distortion() -> None:
     inside = []
     for trial in range(20):

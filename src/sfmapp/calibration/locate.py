@@ -6,7 +6,6 @@ wrong, by all points at once where not, and every pose that explains them nearly
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -22,6 +21,7 @@ from sfmapp.calibration.one_view import (
     deletion_statistics,
     fit_view,
     inverse,
+    misfit_under,
     noise_of,
     with_noise,
     without_wrong_points,
@@ -128,7 +128,7 @@ def locate_camera(
         given = sigma_px if camera_covariance is None else None
         # from each pose that may be true: seen from the wrong one of two, good points look wrong
         cleaned = [without_wrong_points(one, refit, given) for one in views[:_CLEANED]]
-        best = min(cleaned, key=_misfit_under(min(one.squares / max(one.degrees_of_freedom, 1.0) for one in cleaned)))
+        best = min(cleaned, key=misfit_under(min(one.squares / max(one.degrees_of_freedom, 1.0) for one in cleaned)))
         if not np.array_equal(best.is_used, view.is_used):
             views = _minima(best, points, refit)
     view = views[0]
@@ -173,17 +173,6 @@ def _minima(view: OneView, points: tuple[Array, Array], refit: Refit) -> list[On
         if np.isfinite(other.cost) and min(_turn_deg(other, one) for one in found) > _SAME_DEG:
             found.append(other)
     return sorted(found, key=lambda one: one.cost)
-
-
-def _misfit_under(variance: float) -> Callable[[OneView], float]:
-    """Of a fit, the sum of the squared residuals of all points, each no more than three sigmas of a noise allow."""
-    limit = 18.0 * max(variance, np.finfo(float).tiny)
-
-    def misfit(view: OneView) -> float:
-        squares = (view.residual**2).sum(1)
-        return float(np.minimum(np.where(np.isfinite(squares), squares, np.inf), limit).sum())
-
-    return misfit
 
 
 def _turn_deg(view: OneView, other: OneView) -> float:

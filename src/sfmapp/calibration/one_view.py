@@ -416,6 +416,17 @@ def without_wrong_points(view: OneView, refit: Refit, given_px: float | None) ->
     return view
 
 
+def misfit_under(variance: float) -> Callable[[OneView], float]:
+    """Of a fit, the sum of the squared residuals of all points, each no more than three sigmas of a noise allow."""
+    limit = 18.0 * max(variance, np.finfo(float).tiny)
+
+    def misfit(view: OneView) -> float:
+        squares = (view.residual**2).sum(1)
+        return float(np.minimum(np.where(np.isfinite(squares), squares, np.inf), limit).sum())
+
+    return misfit
+
+
 def with_noise(view: OneView, noise: Noise) -> Array | None:
     """(F + 6, F + 6) covariance of the free parameters and the pose; None if the points leave one of them open."""
     prior = view.prior_information

@@ -25,6 +25,7 @@ from sfmapp.calibration.one_view import (
     Prior,
     deletion_statistics,
     fit_view,
+    misfit_under,
     noise_of,
     with_noise,
     without_wrong_points,
@@ -406,10 +407,18 @@ def _fit_lens(
             view.camera, view.cam_from_world, points, is_used, is_free=is_free, prior=prior, noise_px=noise_px
         )  # fmt: skip
 
-    view = fit_view(
-        camera, start.cam_from_world, points, start.is_used, is_free=is_free, prior=prior, noise_px=noise_px
-    )
-    view = without_wrong_points(view, refit, sigma_px)
+    def cleaned(is_used: Bools) -> OneView:
+        view = fit_view(
+            camera, start.cam_from_world, points, is_used, is_free=is_free, prior=prior, noise_px=noise_px
+        )  # fmt: skip
+        return without_wrong_points(view, refit, sigma_px)
+
+    view = cleaned(start.is_used)
+    if not view.is_used.all():
+        # a start without distortion may leave aside what the distortion moved, and keep a wrong point in its place:
+        # what begins with all points, and loses the wrong ones one by one, does not
+        views = [view, cleaned(np.ones(len(points[1]), bool))]
+        view = min(views, key=misfit_under(min(one.squares / max(one.degrees_of_freedom, 1.0) for one in views)))
     if prior is not None and sigma_px is None:  # it is weighed against the noise, which is known now
         noise_px = noise_of(view, None, points[1]).sigma_px
         view = without_wrong_points(refit(view, view.is_used), refit, None)
