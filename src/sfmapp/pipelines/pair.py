@@ -26,13 +26,12 @@ from sfmapp.twoview.view import View
 from sfmapp.viewer.pair_recording import record_pair
 from sfmapp.workspace.job import FAILED, WRITTEN, Job
 from sfmapp.workspace.kernels import PAIR_MODULES, kernels_compiling
-from sfmapp.workspace.layout import PAIR, RECONSTRUCT, REPORT
+from sfmapp.workspace.layout import PAGE, PAIR, RECONSTRUCT, REPORT
 from sfmapp.workspace.manifest import image_root, missing_photographs, read_manifest
 from sfmapp.workspace.options import Options, options_from_dict
 from sfmapp.workspace.usage import Stopwatch
 from sfmapp.workspace.workspace import Workspace
 
-HTML = "report.html"
 # in the workspace of a reconstruction, a folder for each pair that was looked at
 PAIRS = "pairs"
 
@@ -198,6 +197,6 @@ def _tell(job: Job, source: _Source) -> PairResult:
             job.events.warned("recording", f"no recording: {told.problem}")
     report = PairReport(story=story.report, run=job.facts())
     job.workspace.write_json(REPORT, report)
-    job.workspace.write_text(HTML, pair_page(report, story, (first, second)))
+    job.workspace.write_text(PAGE, pair_page(report, story, (first, second)))
     job.workspace.save()
     return PairResult(job.workspace.folder, report, story)
