@@ -81,6 +81,13 @@ def test_what_is_wrong_is_refused_with_its_line(tmp_path, text, expected):
     with pytest.raises(InputError, match=expected) as refused:
         read(tmp_path, text)
     assert "gcp_list.txt" in str(refused.value)
+    assert refused.value.advice
+
+
+def test_a_table_without_its_comment_is_told_how_tables_begin(tmp_path):
+    with pytest.raises(InputError, match="line 2: expected at least 6 words") as refused:
+        read(tmp_path, TABLE.replace("# crs: ", ""))
+    assert "# crs: EPSG" in refused.value.advice
 
 
 def test_a_name_that_two_photographs_have_is_no_name(tmp_path):

@@ -275,12 +275,13 @@ def test_coordinates_come_to_the_frame_by_their_system() -> None:
 @pytest.mark.parametrize(
     ("crs", "expected"),
     [
-        ("EPSG:2229", "in US survey foot"), ("EPSG:99999", "line 1: expected a coordinate system"),
+        ("EPSG:2229", "in US survey feet"), ("EPSG:99999", "line 1: expected a coordinate system"),
         ("Gauss Krueger", "line 1: expected a coordinate system"), ("WGS84 UTM 61N", "zone from 1 to 60"),
-        ("EPSG:4326", "longitude, latitude in degrees"),
+        ("EPSG:4326", "line 3: expected longitude, latitude in degrees"),
     ],
 )  # fmt: skip
 def test_systems_that_will_not_do(crs: str, expected: str) -> None:
     with pytest.raises(InputError, match=expected) as refused:
         survey_in_frame(of_file(crs, np.full((5, 3), 5e5) + np.arange(15).reshape(5, 3)))
     assert "gcp_list.txt" in str(refused.value)
+    assert refused.value.advice

@@ -30,6 +30,7 @@ COLUMNS = ("name", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z", "image", "px"
 _LARGEST_BYTES = 2**26
 _EXAMPLE = "EPSG:25832, WGS84 UTM 32N, +proj=utm +zone=32 +datum=WGS84, or local"
 _LINE = "a line is: x y z px py image [name]"
+_TABLE = "a table begins with a line '# crs: EPSG:...', then the names of its columns: " + ", ".join(COLUMNS)
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,8 @@ def _read_odm(
         words = text.split("\t") if text.count("\t") >= 5 else text.split()
         if len(words) < 6:
             raise InputError(
-                f"{path}, line {line}: expected at least 6 words, found {len(words)}: {text[:80]!r}", _LINE
+                f"{path}, line {line}: expected at least 6 words, found {len(words)}: {text[:80]!r}",
+                _TABLE if "," in text else _LINE,
             )
         x, y, z, px, py = _numbers(path, line, words[:5], ("x", "y", "z", "px", "py"))
         name = words[6].strip() if len(words) > 6 else name_of.setdefault((x, y, z), f"point{len(name_of) + 1}")
@@ -157,7 +159,7 @@ def _system(path: Path, line: int, text: str) -> str:
     return LOCAL if text.lower() == LOCAL else text
 
 
-def _numbers(path: Path, line: int, fields: Sequence[str], names: Sequence[str]) -> list[float]:
+def _numbers(path: Path, line: int, fields: Sequence[str], names: Sequence[str], advice: str = _LINE) -> list[float]:
     """Finite numbers of a line, by what they are."""
     out = []
     for name, field in zip(names, fields, strict=True):
@@ -166,7 +168,7 @@ def _numbers(path: Path, line: int, fields: Sequence[str], names: Sequence[str])
         except ValueError:
             value = np.nan
         if not np.isfinite(value):
-            raise InputError(f"{path}, line {line}: expected a number for {name}, found {field.strip()[:40]!r}", _LINE)
+            raise InputError(f"{path}, line {line}: expected a number for {name}, found {field.strip()[:40]!r}", advice)
         out.append(value)
     return out
 
@@ -218,18 +220,20 @@ def _table_row(
     defaults: tuple[tuple[float, float, float], float],
 ) -> _Row:
     if len(fields) != len(head):
-        raise InputError(f"{path}, line {line}: expected {len(head)} fields, found {len(fields)}")
+        raise InputError(f"{path}, line {line}: expected {len(head)} fields, found {len(fields)}", _TABLE)
 
     def group(names: tuple[str, ...]) -> tuple[float, ...] | None:
         """Numbers of columns; None where all are empty or not there."""
         held = [fields[head[name]] if name in head else "" for name in names]
-        return tuple(_numbers(path, line, held, names)) if any(held) else None
+        return tuple(_numbers(path, line, held, names, _TABLE)) if any(held) else None
 
     name, image = fields[head["name"]], fields[head["image"]]
     if not name or not image:
-        raise InputError(f"{path}, line {line}: expected names of a point and of a photograph, found an empty field")
+        raise InputError(
+            f"{path}, line {line}: expected names of a point and of a photograph, found an empty field", _TABLE
+        )
     xyz, sigmas, sigma = group(("x", "y", "z")), group(("sigma_x", "sigma_y", "sigma_z")), group(("sigma_px",))
-    px, py = _numbers(path, line, [fields[head["px"]], fields[head["py"]]], ("px", "py"))
+    px, py = _numbers(path, line, [fields[head["px"]], fields[head["py"]]], ("px", "py"), _TABLE)
     if xyz is not None and sigmas is None:
         sigmas = defaults[0]
     for value, unit in [*((s, "m") for s in sigmas or ()), *((s, "px") for s in sigma or ())]:
@@ -331,7 +335,8 @@ def _place(path: Path, name: str, rows: Sequence[_Row]) -> _Row:
     known = [row for row in rows if row.xyz is not None]
     if not known:
         raise InputError(
-            f"{path}, line {rows[0].line}: expected coordinates of point {name!r} in one of its rows, found none"
+            f"{path}, line {rows[0].line}: expected coordinates of point {name!r} in one of its rows, found none",
+            "fill x, y and z where the point is first marked",
         )
     for row in known[1:]:
         if (row.xyz, row.sigma_m) != (known[0].xyz, known[0].sigma_m):

@@ -65,7 +65,9 @@ def survey_in_frame(control: ControlPoints, frame: LocalFrame | None = None) -> 
     system = coordinate_system(control.crs, place)
     if not system.is_geographic:
         system.check_metres(place)
-    geodetic = system.geodetic(control.xyz, str(control.path))
+    # a point is in the file with its first mark, or before
+    lines = [control.obs_line[control.observations_of(p)].min(initial=10**9) for p in range(control.num_points)]
+    geodetic = system.geodetic(control.xyz, [f"{control.path}, line {line}" for line in lines])
     if frame is None:
         frame = LocalFrame(*map(float, geodetic.mean(0)))
     # sigmas are along the axes of the system, which meridian convergence turns against east and north

@@ -9,6 +9,7 @@ WGS84 in degrees needs no pyproj.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -59,8 +60,9 @@ class CoordinateSystem:
         """
         found = [unit for unit in (self.unit, self.height_unit) if unit != "metre"]
         if found:
+            units = found[0].replace("foot", "feet") if "foot" in found[0] else f"{found[0]}s"
             raise InputError(
-                f"{place}: expected a coordinate system in metres, found {self.code} ({self.name}) in {found[0]}s",
+                f"{place}: expected a coordinate system in metres, found {self.code} ({self.name}) in {units}",
                 "choose a projected system in metres, such as the UTM zone of the place",
             )
 
@@ -74,8 +76,11 @@ class CoordinateSystem:
         text: str = (found if found.is_compound else found.to_2d()).to_wkt("WKT1_GDAL")
         return text
 
-    def geodetic(self, coordinates: ArrayLike, place: str = "coordinates") -> Array:
+    def geodetic(self, coordinates: ArrayLike, place: str | Sequence[str] = "coordinates") -> Array:
         """Geodetic positions (N, 3) on WGS84, latitude, longitude and height, of coordinates (N, 3).
+
+        Args:
+            place: begins a message: where they are from; N of them for coordinates that are each from a line of a file.
 
         Raises:
             InputError: coordinates are outside of the system's domain, or a geoid is needed that is not installed.
@@ -172,22 +177,26 @@ def _transformer(source: str, target: str, heights: HeightReference) -> Any:
         ) from None
 
 
-def _checked(values: Array, system: CoordinateSystem, place: str) -> Array:
+def _row_of(place: str | Sequence[str], row: int) -> str:
+    return f"{place}, row {row + 1}" if isinstance(place, str) else place[row]
+
+
+def _checked(values: Array, system: CoordinateSystem, place: str | Sequence[str]) -> Array:
     wrong = np.flatnonzero(~np.isfinite(values).all(1))
     if len(wrong):
         raise InputError(
-            f"{place}: row {wrong[0] + 1} has no place in {system.code} ({system.name})",
+            f"{_row_of(place, wrong[0])}: expected a place in {system.code} ({system.name}), found none there",
             "check the code and the order, which is easting, northing, height; heights above a geoid need its grid: "
             "pyproj sync",
         )
     return values
 
 
-def _check_degrees(values: Array, place: str) -> None:
+def _check_degrees(values: Array, place: str | Sequence[str]) -> None:
     wrong = np.flatnonzero(~((np.abs(values[:, 0]) <= 180) & (np.abs(values[:, 1]) <= 90) & np.isfinite(values[:, 2])))
     if len(wrong):
         found = ", ".join(f"{value:g}" for value in values[wrong[0]])
         raise InputError(
-            f"{place}: expected longitude, latitude in degrees and a height, found {found} in row {wrong[0] + 1}",
+            f"{_row_of(place, wrong[0])}: expected longitude, latitude in degrees and a height, found {found}",
             "check the order, and the coordinate system",
         )

@@ -189,7 +189,7 @@ def _read_geo(path: Path, lines: Sequence[str]) -> dict[str, Position]:
         name, *rest = fields
         values = _numbers(rest, place)
         height = values[2] if len(values) > 2 else math.nan
-        geodetic = system.geodetic([[values[0], values[1], 0.0 if math.isnan(height) else height]], place)[0]
+        geodetic = system.geodetic([[values[0], values[1], 0.0 if math.isnan(height) else height]], [place])[0]
         sigma, sigma_up = (values[6], values[7]) if len(values) == 8 else (None, None)
         attitude = (values[3], values[4], values[5]) if len(values) > 5 else None
         _add(
@@ -289,7 +289,10 @@ def _numbers(fields: Sequence[str], place: str) -> list[float]:
     except ValueError:
         values = [math.inf]
     if not all(map(math.isfinite, values)):
-        raise InputError(f"{place}: expected numbers, found {', '.join(fields)[:80]}")
+        raise InputError(
+            f"{place}: expected numbers, found {', '.join(fields)[:80]}",
+            "correct the line, or begin it with # to skip it",
+        )
     return values
 
 
@@ -303,7 +306,10 @@ def _check_place(latitude: float, longitude: float, place: str) -> None:
 
 def _sigma(value: float | None, place: str) -> float | None:
     if value is not None and not 0 < value < 1e6:
-        raise InputError(f"{place}: expected a standard deviation above 0 in metres, found {value:g}")
+        raise InputError(
+            f"{place}: expected a standard deviation above 0 in metres, found {value:g}",
+            "give what the receiver states, or leave the field empty where it is not known",
+        )
     return value
 
 

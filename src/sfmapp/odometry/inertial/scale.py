@@ -110,7 +110,9 @@ def parse_length(text: str) -> Length:
     except ValueError:
         value = np.nan
     if not (np.isfinite(value) and value > 0):
-        raise UsageError(f"a length is a positive number of metres, got {text!r}")
+        raise UsageError(
+            f"--scale: expected a length above zero in metres, found {text!r}", "give it as a number, such as 0.16"
+        )
     mantissa, _, exponent = text.strip().lower().partition("e")
     digits = len(mantissa.partition(".")[2])
     return Length(value, float(0.5 * 10.0 ** (int(exponent or 0) - digits) / np.sqrt(3.0)))
