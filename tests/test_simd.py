@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from typing import Any
 
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 
 from sfmapp.simd import bilinear, f32x16, f64x8, i16x32
 from sfmapp.simd.bits import count_bits
-from sfmapp.simd.pointers import offset, pointer
+from sfmapp.simd.pointers import Pointer, offset, pointer
+from sfmapp.simd.shared import shared_filler, shared_function
 
 SHIFTS = [0, 1, 3, 7, 13]  # elements from the start of an array: addresses of any alignment
 GUARD = -12345.0
@@ -321,3 +323,35 @@ def test_bits_are_counted(size: int) -> None:
     out = np.empty(size, np.uint64)
     _count(words, out)
     np.testing.assert_array_equal(out, np.bitwise_count(words))
+
+
+# -------------------------------------------------------------------------------------- what is compiled once for all
+
+
+def _scaled(numbers: Pointer, given: Pointer, out: Pointer) -> None:
+    for n in range(3):
+        out[n] = numbers[n] * given[n]
+
+
+_scale, _fill_scaled = shared_function("sfmapp_test_scale", _scaled), shared_filler("sfmapp_test_fill", _scaled)
+
+
+@numba.njit(nogil=True)
+def _scale_both(factors: Any, x: Any, out: Any) -> float:
+    a, b, c = _scale(factors, x[0], x[1], x[2])
+    _fill_scaled(factors, x[0], x[1], x[2], out)
+    return 100 * a + 10 * b + c
+
+
+def test_what_is_shared_is_bound_by_the_first_call_in_whichever_thread() -> None:
+    factors, x, out = np.array([1.0, 2.0, 3.0]), np.array([3.0, 2.0, 1.0]), np.zeros((8, 3))
+    _scale_both.compile("(float64[::1], float64[::1], float64[::1])")  # type: ignore[attr-defined]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda n: _scale_both(factors, x, out[n]), range(8)))
+    assert found == [343.0] * 8
+    assert (out == [3.0, 4.0, 3.0]).all()
+
+
+def test_what_is_shared_takes_no_array_with_gaps() -> None:
+    with pytest.raises(numba.TypingError):
+        _scale_both(np.arange(6.0)[::2], np.arange(3.0), np.zeros(3))

@@ -10,7 +10,8 @@ lengths, so that the pixel is (fx x' + cx, fy y' + cy), in three kernels:
         each of the twelve numbers of distortion those of x' and y'. Entries that stay zero are not written.
 
 The two families of ordinary photographs also have kernels on the normalised plane (x, y) = (X/Z, Y/Z), which the
-adjustment and the triangulation spend their time in; the others are reached through one call.
+adjustment and the triangulation spend their time in; the others are reached through one call, and compiled once for
+all kernels: copies in every kernel that may meet them made a fourth of the machine code of a reconstruction.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ from sfmapp.camera import (
     skew,
     thin_prism_fisheye,
 )
+from sfmapp.simd.pointers import Pointer
+from sfmapp.simd.shared import shared_filler, shared_function
 
 Array = NDArray[np.float64]
 
@@ -50,49 +53,101 @@ NARROW = math.cos(1.536)
 _NEAREST = 1e-12
 
 
+# --------------------------------------------------- families but the first two: one compiled copy for all kernels
+
+
+def _image_by_others(row: Pointer, given: Pointer, out: Pointer) -> None:
+    """(x', y') of a ray (x, y, z)."""
+    c, x, y, z = numba.carray(row, (ROW,)), given[0], given[1], given[2]
+    family = c[FAMILY]
+    if family == RATIONAL:
+        image = rational.project(c, x, y, z)
+    elif family in (THIN_PRISM_FISHEYE, RAD_TAN_THIN_PRISM_FISHEYE):
+        image = thin_prism_fisheye.project(c, family == THIN_PRISM_FISHEYE, x, y, z)
+    elif family == FOV:
+        image = fov.project(c, x, y, z)
+    elif family == DIVISION:
+        image = division.project(c, x, y, z)
+    elif family == EUCM:
+        image = eucm.project(c, x, y, z)
+    elif family == EQUIRECTANGULAR:
+        image = equirectangular.project(x, y, z)
+    elif family == SKEW:
+        image = skew.project(c, x, y, z)
+    else:
+        image = math.nan, math.nan
+    out[0], out[1] = image
+
+
+def _ray_by_others(row: Pointer, given: Pointer, out: Pointer) -> None:
+    """The unit ray of an image point (x', y')."""
+    c, xd, yd = numba.carray(row, (ROW,)), given[0], given[1]
+    family = c[FAMILY]
+    if family == RATIONAL:
+        ray = rational.unproject(c, xd, yd)
+    elif family in (THIN_PRISM_FISHEYE, RAD_TAN_THIN_PRISM_FISHEYE):
+        ray = thin_prism_fisheye.unproject(c, family == THIN_PRISM_FISHEYE, xd, yd)
+    elif family == FOV:
+        ray = fov.unproject(c, xd, yd)
+    elif family == DIVISION:
+        ray = division.unproject(c, xd, yd)
+    elif family == EUCM:
+        ray = eucm.unproject(c, xd, yd)
+    elif family == EQUIRECTANGULAR:
+        ray = equirectangular.unproject(xd, yd)
+    elif family == SKEW:
+        ray = skew.unproject(c, xd, yd)
+    else:
+        ray = math.nan, math.nan, math.nan
+    out[0], out[1], out[2] = ray
+
+
+def _jacobian_by_others(row: Pointer, given: Pointer, out: Pointer) -> None:
+    """The ``ray_jacobian`` of a ray (x, y, z) that has an image."""
+    c, J, x, y, z = numba.carray(row, (ROW,)), numba.carray(out, (JACOBIAN,)), given[0], given[1], given[2]
+    family = c[FAMILY]
+    if family == RATIONAL:
+        rational.ray_jacobian(c, x, y, z, J)
+    elif family in (THIN_PRISM_FISHEYE, RAD_TAN_THIN_PRISM_FISHEYE):
+        thin_prism_fisheye.ray_jacobian(c, family == THIN_PRISM_FISHEYE, x, y, z, J)
+    elif family == FOV:
+        fov.ray_jacobian(c, x, y, z, J)
+    elif family == DIVISION:
+        division.ray_jacobian(c, x, y, z, J)
+    elif family == EUCM:
+        eucm.ray_jacobian(c, x, y, z, J)
+    elif family == EQUIRECTANGULAR:
+        equirectangular.ray_jacobian(x, y, z, J)
+    elif family == SKEW:
+        skew.ray_jacobian(c, x, y, z, J)
+
+
+_image_elsewhere = shared_function("sfmapp_lens_image", _image_by_others)
+_ray_elsewhere = shared_function("sfmapp_lens_ray", _ray_by_others)
+_jacobian_elsewhere = shared_filler("sfmapp_lens_jacobian", _jacobian_by_others)
+
+# ------------------------------------------------------------------------------------------------ any of the families
+
+
 @numba.njit(cache=True, nogil=True)
 def _image_of_ray(c: Array, x: float, y: float, z: float) -> tuple[float, float]:
     """The image (x', y') of a ray by any of the families but the perspective one."""
-    family = c[FAMILY]
-    if family == RADIAL_FISHEYE:
+    if c[FAMILY] == RADIAL_FISHEYE:
         return radial_fisheye.project(c, x, y, z)
-    if family == RATIONAL:
-        return rational.project(c, x, y, z)
-    if family in (THIN_PRISM_FISHEYE, RAD_TAN_THIN_PRISM_FISHEYE):
-        return thin_prism_fisheye.project(c, family == THIN_PRISM_FISHEYE, x, y, z)
-    if family == FOV:
-        return fov.project(c, x, y, z)
-    if family == DIVISION:
-        return division.project(c, x, y, z)
-    if family == EUCM:
-        return eucm.project(c, x, y, z)
-    if family == EQUIRECTANGULAR:
-        return equirectangular.project(x, y, z)
-    if family == SKEW:
-        return skew.project(c, x, y, z)
-    return math.nan, math.nan
+    if c[FAMILY] == BROWN:
+        return math.nan, math.nan
+    xd, yd, _ = _image_elsewhere(c, x, y, z)
+    return xd, yd
 
 
 @numba.njit(cache=True, nogil=True)
 def _ray_of_image(c: Array, xd: float, yd: float) -> tuple[float, float, float]:
     """The unit ray of an image point (x', y') by any of the families."""
-    family = c[FAMILY]
-    if family == RADIAL_FISHEYE:
+    if c[FAMILY] == RADIAL_FISHEYE:
         return radial_fisheye.unproject(c, xd, yd)
-    if family == RATIONAL:
-        return rational.unproject(c, xd, yd)
-    if family in (THIN_PRISM_FISHEYE, RAD_TAN_THIN_PRISM_FISHEYE):
-        return thin_prism_fisheye.unproject(c, family == THIN_PRISM_FISHEYE, xd, yd)
-    if family == FOV:
-        return fov.unproject(c, xd, yd)
-    if family == DIVISION:
-        return division.unproject(c, xd, yd)
-    if family == EUCM:
-        return eucm.unproject(c, xd, yd)
-    if family == EQUIRECTANGULAR:
-        return equirectangular.unproject(xd, yd)
-    if family == SKEW:
-        return skew.unproject(c, xd, yd)
+    if c[FAMILY] != BROWN:
+        x, y, z = _ray_elsewhere(c, xd, yd, 0.0)
+        return x, y, z
     x, y = brown.undistort(c, xd, yd)
     norm = 1.0 / math.sqrt(x * x + y * y + 1.0)
     return x * norm, y * norm, norm
@@ -169,20 +224,8 @@ def project_jacobian(c: Array, x: float, y: float, z: float, J: Array) -> None:
             return
         if family == RADIAL_FISHEYE:
             radial_fisheye.ray_jacobian(c, x, y, z, J)
-        elif family == RATIONAL:
-            rational.ray_jacobian(c, x, y, z, J)
-        elif family in (THIN_PRISM_FISHEYE, RAD_TAN_THIN_PRISM_FISHEYE):
-            thin_prism_fisheye.ray_jacobian(c, family == THIN_PRISM_FISHEYE, x, y, z, J)
-        elif family == FOV:
-            fov.ray_jacobian(c, x, y, z, J)
-        elif family == DIVISION:
-            division.ray_jacobian(c, x, y, z, J)
-        elif family == EUCM:
-            eucm.ray_jacobian(c, x, y, z, J)
-        elif family == EQUIRECTANGULAR:
-            equirectangular.ray_jacobian(x, y, z, J)
         else:
-            skew.ray_jacobian(c, x, y, z, J)
+            _jacobian_elsewhere(c, x, y, z, J)
     xd, yd, fx, fy = J[0], J[1], c[0], c[1]
     for k in range(15, 3, -1):  # from behind, for the four first make room
         J[8 + 2 * k], J[9 + 2 * k] = fx * J[2 * k], fy * J[2 * k + 1]
