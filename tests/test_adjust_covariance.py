@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nadir_block import nadir_block
 from sfmapp.adjust.covariance import errors_in_gauge, estimate_covariances
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying
+from sfmapp.adjust.selected_inverse import estimate_pose_covariances
 from sfmapp.adjust.solver import adjust_bundle
-from sfmapp.camera.camera import CameraModel
+from sfmapp.camera.camera import CameraModel, simple_camera
+from sfmapp.georeference.factors import position_graph
 from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera
 
 OPTIONS = AdjustOptions(relative_cost_tolerance=1e-10, max_iterations=100)
@@ -165,3 +168,25 @@ def test_places_that_are_loosely_known_hold_a_precise_model_as_loosely(sigma: fl
         # a turn and the place of a camera go together; what the photographs tell is a thousandth of this
         expected = slope[i] @ of_similarity @ slope[i].T
         np.testing.assert_allclose(found, expected, atol=0.02 * np.trace(expected))
+
+
+def test_poses_from_the_sparse_factor_are_those_of_the_whole_inverse():
+    scene = nadir_block(0, simple_camera(CameraModel.SIMPLE_RADIAL, 1000, 750, 850.0), relief=2.0, tilt_deg=2.0)
+    model, centers = scene.observed, scene.ground_truth.centers
+    for sigma in (0.02, 3.0):  # RTK, and a phone, which holds the whole 1e10 times as loosely as points hold its shape
+        graph = position_graph(np.arange(len(centers)), centers, np.full((len(centers), 3), sigma), None)
+        images, poses = estimate_pose_covariances(model, AdjustOptions(), extra_factors=graph)
+        whole = estimate_covariances(model, AdjustOptions(), extra_factors=graph)
+        np.testing.assert_array_equal(images, whole.image_idx)
+        scale = np.sqrt(np.einsum("nii->ni", whole.poses))
+        scale = scale[:, :, None] * scale[:, None, :]
+        np.testing.assert_allclose(poses / scale, whole.poses / scale, atol=1e-8)
+
+
+def test_what_is_open_has_no_covariance_by_the_sparse_factor():
+    scene = nadir_block(1, simple_camera(CameraModel.SIMPLE_RADIAL, 1000, 750, 850.0), relief=2.0, tilt_deg=2.0)
+    assert estimate_pose_covariances(scene.observed, AdjustOptions()) is None
+    # two places leave a turn about their line
+    centers = scene.ground_truth.centers[:2]
+    graph = position_graph(np.arange(2), centers, np.full((2, 3), 1.0), None)
+    assert estimate_pose_covariances(scene.observed, AdjustOptions(), extra_factors=graph) is None

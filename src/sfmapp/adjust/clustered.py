@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.covariance import constrained_inverse, gauge_of, pose_covariances, reduced_matrix
+from sfmapp.adjust.covariance import constrained_inverse, diagonal_blocks, gauge_of, pose_covariances, reduced_matrix
 from sfmapp.adjust.kernels import POINT, SCRATCH, ImageArrays, LensArrays, PointArrays, RobustLoss, linearize
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.solver import Engine, make_engine
@@ -79,7 +79,7 @@ def clustered_covariances(reconstruction: Reconstruction, options: AdjustOptions
         noise_px = float(np.sqrt(inflation * together / (np.diag(inverse) @ sizes)))
     full = np.zeros((len(used), len(used)))
     full[np.ix_(used, used)] = covariance
-    image_idx, poses = pose_covariances(reconstruction, problem, full)
+    image_idx, poses = pose_covariances(reconstruction, problem, diagonal_blocks(full))
     per_image = problem.num_observations / len(problem.image_idx)
     return ClusteredCovariances(image_idx, poses, correlation, noise_px, per_image)
 

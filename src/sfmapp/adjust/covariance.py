@@ -152,6 +152,24 @@ def reduced_matrix(engine: Engine, is_kept: Mask | None = None) -> Array:
     Args:
         is_kept: (B,) blocks; the others, which each meet few, are eliminated too. LinAlgError where they are open.
     """
+    a, b, values = upper_tiles(engine)
+    if is_kept is None:
+        is_kept = np.ones(engine.problem.num_blocks, bool)
+    num, both = int(is_kept.sum()), is_kept[a] & is_kept[b]
+    place = np.cumsum(is_kept) - 1
+    matrix = np.zeros((num, num, 8, 8))
+    matrix[place[a[both]], place[b[both]]] = values[both]
+    full = matrix.transpose(0, 2, 1, 3).reshape(num * 8, num * 8)
+    above = np.triu(full)
+    full = above + np.triu(full, 1).T
+    if not is_kept.all():
+        full -= _through_others((a[~both], b[~both], values[~both]), is_kept)
+    return full
+
+
+def upper_tiles(engine: Engine) -> tuple[Ints, Ints, Array]:
+    """Blocks a <= b (M,) that meet in the undamped reduced system, and their tiles (M, 8, 8), of which upper halves
+    count where a block meets itself."""
     tiles = engine.tiles[0]
     if engine.extras is not None:
         engine.extras.add_pairs(tiles, engine.tile_numbers(engine.extras.pairs))
@@ -163,33 +181,20 @@ def reduced_matrix(engine: Engine, is_kept: Mask | None = None) -> Array:
         keys, numbers = engine.hash_keys[held], engine.hash_values[held]
     a, b = np.divmod(keys, engine.problem.num_blocks)
     upper = a <= b
-    a, b, numbers = a[upper], b[upper], numbers[upper]
-    if is_kept is None:
-        is_kept = np.ones(engine.problem.num_blocks, bool)
-    num, both = int(is_kept.sum()), is_kept[a] & is_kept[b]
-    place = np.cumsum(is_kept) - 1
-    matrix = np.zeros((num, num, 8, 8))
-    matrix[place[a[both]], place[b[both]]] = tiles.reshape(-1, 8, 8)[numbers[both]]
-    full = matrix.transpose(0, 2, 1, 3).reshape(num * 8, num * 8)
-    above = np.triu(full)
-    full = above + np.triu(full, 1).T
-    if not is_kept.all():
-        full -= _through_others(engine, (a[~both], b[~both], numbers[~both]), is_kept)
-    return full
+    return a[upper], b[upper], tiles.reshape(-1, 8, 8)[numbers[upper]]
 
 
-def _through_others(engine: Engine, tiles: tuple[Ints, Ints, Ints], is_kept: Mask) -> Array:
+def _through_others(tiles: tuple[Ints, Ints, Array], is_kept: Mask) -> Array:
     """(N * 8, N * 8) what eliminating the blocks that are not kept takes off the information of the others.
 
     Args:
-        tiles: (M,) blocks a <= b and the number of their tile, of all in which such a block has a part.
+        tiles: as of :func:`upper_tiles`, all in which such a block has a part.
     """
     from scipy import sparse
     from scipy.sparse.linalg import splu
     from threadpoolctl import threadpool_limits
 
-    a, b, numbers = tiles
-    values = engine.tiles[0].reshape(-1, 8, 8)[numbers]
+    a, b, values = tiles
     on_diagonal = a == b
     # upper halves count
     values[on_diagonal] = np.triu(values[on_diagonal]) + np.triu(values[on_diagonal], 1).transpose(0, 2, 1)
@@ -336,7 +341,7 @@ def _collect(
     determined: bool,
 ) -> Covariances:
     p = engine.problem
-    image_idx, poses = pose_covariances(reconstruction, p, covariance)
+    image_idx, poses = pose_covariances(reconstruction, p, diagonal_blocks(covariance))
     cameras = np.flatnonzero(p.camera_block >= 0)
     intrinsics = []
     for c in cameras:
@@ -366,11 +371,21 @@ def _collect(
     )
 
 
+def diagonal_blocks(covariance: Array) -> Array:
+    """(B, 8, 8) of a covariance over all blocks (B * 8, B * 8)."""
+    at = np.arange(len(covariance) // 8)
+    blocks: Array = covariance.reshape(len(at), 8, len(at), 8)[at, :, at]
+    return blocks
+
+
 def pose_covariances(
-    reconstruction: Reconstruction, problem: Problem, covariance: Array
+    reconstruction: Reconstruction, problem: Problem, blocks: Array
 ) -> tuple[NDArray[np.int64], Array]:
     """Images (n,) that vary, all of their frames included, and (n, 6, 6): through the adjoint of its place on the rig
     where an image has not the pose of its block.
+
+    Args:
+        blocks: (B, 8, 8) covariances of the blocks.
     """
     rig, moving = reconstruction.rig, problem.image_block >= 0
     block = np.full(len(reconstruction.image_names), -1)
@@ -381,8 +396,7 @@ def pose_covariances(
         on_rig = (rig.frame_idx >= 0) & reconstruction.is_registered
         block[on_rig] = of_frame[rig.frame_idx[on_rig]]
     images = np.flatnonzero(block >= 0)
-    at = block[images][:, None] * 8 + np.arange(6)
-    out: Array = covariance[at[:, :, None], at[:, None, :]]
+    out: Array = blocks[block[images], :6, :6].copy()
     for n in np.flatnonzero(rig.is_mounted[images]) if rig is not None else ():
         assert rig is not None
         mount = rig.cam_from_rig[rig.sensor_idx[images[n]]]

@@ -136,12 +136,13 @@ def _judged(
 
 
 def _center_covariances(mapper: Mapper, graph: object) -> dict[int, Array]:
-    """(3, 3) of the centres of images, in the frame, by image; empty for large models."""
-    found = mapper.covariances_with(graph)
-    if found is None or not found.is_determined:
+    """(3, 3) of the centres of images, in the frame, by image; empty where they cannot be had."""
+    found = mapper.pose_covariances_with(graph)
+    if found is None:
         return {}
-    of_centers = rigid3.center_covariance(mapper.reconstruction.cam_from_world[found.image_idx], found.poses)
-    return dict(zip(found.image_idx.tolist(), of_centers, strict=True))
+    images, poses = found
+    of_centers = rigid3.center_covariance(mapper.reconstruction.cam_from_world[images], poses)
+    return dict(zip(images.tolist(), of_centers, strict=True))
 
 
 def growth_of_cost(before: Reconstruction, after: Reconstruction, noise_px: float) -> float:

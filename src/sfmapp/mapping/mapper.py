@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.covariance import Covariances, estimate_covariances
+from sfmapp.adjust.covariance import estimate_covariances
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.problem import Varying
+from sfmapp.adjust.selected_inverse import estimate_pose_covariances
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.models import PARAM_NAMES
@@ -388,16 +389,17 @@ class Mapper:
             self.events.warned(STAGE, f"the closing adjustment did not settle in {report.num_iterations} steps")
         self._settle_points()
 
-    def covariances_with(self, extra_factors: Any) -> Covariances | None:
-        """Covariances at the minimum of :meth:`adjust_with`, with factors whose sigmas are true ones; None for large
-        models."""
-        if self.reconstruction.is_registered.sum() > MAX_UNCERTAINTY_IMAGES:
-            return None
+    def pose_covariances_with(self, extra_factors: Any) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+        """Images (n,) and covariances (n, 6, 6) of their poses at the minimum of :meth:`adjust_with`, with factors
+        whose sigmas are true ones; None where they cannot be had."""
         chosen = self._free_principal_points()
         options = self.with_free_centers(self.adjust_options, chosen) if chosen.any() else self.adjust_options
-        return estimate_covariances(
-            self.reconstruction, options, prior_cameras=self.prior_cameras, extra_factors=extra_factors
-        )
+        given = {"prior_cameras": self.prior_cameras, "extra_factors": extra_factors}
+        selected = estimate_pose_covariances(self.reconstruction, options, **given)
+        if selected is not None or self.reconstruction.is_registered.sum() > MAX_UNCERTAINTY_IMAGES:
+            return selected
+        found = estimate_covariances(self.reconstruction, options, **given)
+        return (found.image_idx, found.poses) if found.is_determined else None
 
     def _polishing(self) -> tuple[AdjustOptions, NDArray[np.bool_]]:
         """Options of the last adjustment, and the cameras (C,) bool whose principal points are free in it."""
