@@ -1,6 +1,6 @@
 """Cameras and poses from points with known places: errors against their sigmas, and beside OpenCV and pycolmap.
 
-    python benchmarks/known_points.py --num 500       writes results/known_points.md
+    python benchmarks/known_points.py --num 500       writes results/known_points.md and .json
 
 Pictures of 1280 x 720 with a distortion of -0.2 and 0.05, a target half as deep as wide, marks of half a pixel; wrong
 marks are off by 10 to 60 pixels. Times are CPU milliseconds on one thread, the least of three rounds.
@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import time
 from collections.abc import Callable
-from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from machine import RESULTS, describe_machine
 from sfmapp.calibration.locate import locate_camera
 from sfmapp.calibration.target import calibrate_target
 from sfmapp.camera.camera import Camera, project
@@ -31,7 +33,6 @@ Array = NDArray[np.float64]
 Trial = tuple[Array, Array, Array]
 Answer = tuple[Array, Array] | None
 
-RESULTS = Path(__file__).parent / "results"
 SIZE, SIGMA_PX = (1280, 720), 0.5
 CAMERA = Camera(CameraModel.OPENCV, *SIZE, np.array([900.0, 910.0, 630.0, 370.0, -0.2, 0.05, 0.001, -0.002]))
 GUESS = np.array([[900.0, 0.0, 640.0], [0.0, 900.0, 360.0], [0.0, 0.0, 1.0]])
@@ -153,17 +154,27 @@ def timed(solve: Callable[[Array, Array], Answer], trials: list[Trial]) -> tuple
     return answers, min(rounds)
 
 
-def sigmas_hold(errors: list[Array], covariances: list[Array]) -> str:
+def sigmas_hold(errors: list[Array], covariances: list[Array]) -> dict[str, float]:
     """NEES by its degrees of freedom with the interval of 99.8 % that it should lie in, and the share within three
-    sigmas."""
+    sigmas; nothing of a program that has no sigmas."""
+    if not covariances[0].size:
+        return {}
     size, num = len(errors[0]), len(errors)
     nees = sum(float(e @ np.linalg.solve(c, e)) for e, c in zip(errors, covariances, strict=True)) / (size * num)
     low, high = (float(chi2.ppf(p, size * num)) / (size * num) for p in (1e-3, 1.0 - 1e-3))
     share = np.mean([np.abs(e) < 3.0 * np.sqrt(np.diag(c)) for e, c in zip(errors, covariances, strict=True)])
-    return f"{nees:.3f} ({low:.3f} to {high:.3f}) | {100.0 * share:.2f} %"
+    return {"nees": nees, "nees_low": low, "nees_high": high, "within_3_sigmas": float(share)}
 
 
-def camera_rows(num_trials: int, num: int, num_wrong: int) -> list[str]:
+def sigmas_text(row: dict[str, Any]) -> str:
+    if row.get("nees") is None:
+        return " | "
+    return (
+        f"{row['nees']:.3f} ({row['nees_low']:.3f} to {row['nees_high']:.3f}) | {100.0 * row['within_3_sigmas']:.2f} %"
+    )
+
+
+def camera_rows(num_trials: int, num: int, num_wrong: int) -> list[dict[str, Any]]:
     """Ours and OpenCV's on the same pictures."""
     trials = [make_trial((1, num, num_wrong, k), num, num_wrong, 0.8) for k in range(num_trials)]
     rows = []
@@ -174,16 +185,16 @@ def camera_rows(num_trials: int, num: int, num_wrong: int) -> list[str]:
         focal = np.sqrt(np.mean([(e[:2] ** 2).mean() for e in errors]))
         worst = np.max([np.abs(e[:2]).max() for e in errors])
         center = np.sqrt(np.mean([(e[2:4] ** 2).mean() for e in errors]))
-        held = sigmas_hold(errors, [a[1] for a, _ in kept]) if kept[0][0][1].size else " | "
-        rows.append(
-            f"| {num} points, {num_wrong} wrong | {name} | {len(kept)} of {num_trials} | {focal:.2f} | {worst:.1f} | "
-            f"{center:.2f} | {held} | {cpu_ms:.1f} |"
-        )
+        rows.append({
+            "case": f"{num} points, {num_wrong} wrong", "program": name, "answers": len(kept),
+            "focal_rms_px": float(focal), "focal_worst_px": float(worst), "center_rms_px": float(center),
+            **sigmas_hold(errors, [a[1] for a, _ in kept]), "cpu_ms": cpu_ms,
+        })  # fmt: skip
         print(rows[-1], flush=True)
     return rows
 
 
-def pose_rows(num_trials: int, num: int, num_wrong: int, depth: float) -> list[str]:
+def pose_rows(num_trials: int, num: int, num_wrong: int, depth: float) -> list[dict[str, Any]]:
     """Ours, OpenCV's and pycolmap's on the same pictures; gross: rotations off by more than two degrees."""
     trials = [make_trial((2, num, num_wrong, int(10 * depth), k), num, num_wrong, depth) for k in range(num_trials)]
     peers: list[tuple[str, Callable[[Array, Array], Answer]]] = [("sfmapp", our_pose)]
@@ -201,23 +212,20 @@ def pose_rows(num_trials: int, num: int, num_wrong: int, depth: float) -> list[s
         errors = [pose_error(a[0], pose) for a, pose in kept]
         good = [k for k, e in enumerate(errors) if np.degrees(np.linalg.norm(e[:3])) <= TURNED_DEG]
         turn = np.degrees(np.sqrt(np.mean([(errors[k][:3] ** 2).sum() for k in good])))
-        held = sigmas_hold([errors[k] for k in good], [kept[k][0][1] for k in good]) if kept[0][0][1].size else " | "
-        kind = "plane" if depth == 0.0 else "space"
-        rows.append(
-            f"| {num} points in {'a ' * (kind == 'plane')}{kind}, {num_wrong} wrong | {name} | {len(good)} | "
-            f"{len(kept) - len(good)} | {num_trials - len(kept)} | {turn:.4f} | {held} | {cpu_ms:.2f} |"
-        )
+        kind = "a plane" if depth == 0.0 else "space"
+        rows.append({
+            "case": f"{num} points in {kind}, {num_wrong} wrong", "program": name, "good": len(good),
+            "gross": len(kept) - len(good), "no_answer": num_trials - len(kept), "rotation_rms_deg": float(turn),
+            **sigmas_hold([errors[k] for k in good], [kept[k][0][1] for k in good]), "cpu_ms": cpu_ms,
+        })  # fmt: skip
         print(rows[-1], flush=True)
     return rows
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--num", type=int, default=500, help="pictures of each kind")
-    args = parser.parse_args()
-    cv2.setNumThreads(1)
+def tables(report: dict[str, Any]) -> str:
+    """The results for a person."""
     lines = [
-        f"# Known points: {args.num} pictures of each kind",
+        f"# Known points: {report['num']} pictures of each kind",
         "",
         "Marks of half a pixel; wrong ones are off by 10 to 60. Where nothing is wrong, OpenCV minimises the same.",
         "",
@@ -227,8 +235,11 @@ def main() -> None:
         "(99.8 %) | within 3 sigmas | CPU ms |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
-    for num, num_wrong in ((40, 0), (40, 4), (20, 0)):
-        lines += camera_rows(args.num, num, num_wrong)
+    for row in report["cameras"]:
+        lines.append(
+            f"| {row['case']} | {row['program']} | {row['answers']} | {row['focal_rms_px']:.2f} | "
+            f"{row['focal_worst_px']:.1f} | {row['center_rms_px']:.2f} | {sigmas_text(row)} | {row['cpu_ms']:.1f} |"
+        )
     lines += [
         "",
         "## Poses of a known camera (`sfmapp locate`)",
@@ -239,9 +250,26 @@ def main() -> None:
         "| within 3 sigmas | CPU ms |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
+    for row in report["poses"]:
+        lines.append(
+            f"| {row['case']} | {row['program']} | {row['good']} | {row['gross']} | {row['no_answer']} | "
+            f"{row['rotation_rms_deg']:.4f} | {sigmas_text(row)} | {row['cpu_ms']:.2f} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--num", type=int, default=500, help="pictures of each kind")
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    report = {**describe_machine(), "num": args.num, "cameras": [], "poses": []}
+    for num, num_wrong in ((40, 0), (40, 4), (20, 0)):
+        report["cameras"] += camera_rows(args.num, num, num_wrong)
     for num, num_wrong, depth in ((20, 0, 0.8), (20, 0, 0.0), (20, 6, 0.8), (20, 6, 0.0), (6, 0, 0.8)):
-        lines += pose_rows(args.num, num, num_wrong, depth)
-    (RESULTS / "known_points.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        report["poses"] += pose_rows(args.num, num, num_wrong, depth)
+    (RESULTS / "known_points.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    (RESULTS / "known_points.md").write_text(tables(report), encoding="utf-8")
 
 
 if __name__ == "__main__":

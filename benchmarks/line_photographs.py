@@ -1,7 +1,7 @@
 """Calibration from lines of real photographs of built places whose focal length is known: how often it is told, and
 how often what is told is right within its sigmas.
 
-    python benchmarks/line_photographs.py [--each N]       writes results/line_photographs.md
+    python benchmarks/line_photographs.py [--each N]       writes results/line_photographs.md and .json
 
 The truth is that of the laser-registered cameras (fountain, herz, entry), of COLMAP's model (lund-door) and of KITTI's
 calibration. Photographs of one camera are independent of each other here: one at a time.
@@ -14,15 +14,15 @@ import json
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
-from machine import describe_machine
+from machine import RESULTS, describe_machine
 from sfmapp.calibration.lines import LinePicture, calibrate_from_lines
 from sfmapp.errors import InputError
 
-RESULTS = Path(__file__).parent / "results" / "line_photographs.md"
 # so many standard deviations a right answer may be off
 SIGMAS = 3.0
 
@@ -50,43 +50,53 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--each", type=int, default=8, help="photographs of each place; default: 8")
     args = parser.parse_args()
-    data, rows = Path(os.environ["SFMAPP_DATA"]), []
-    told, right = 0, 0
+    data = Path(os.environ["SFMAPP_DATA"])
+    report = {**describe_machine(), "photographs": []}
     chosen = places(data, args.each)
     for path, focal in chosen:
         start = time.process_time()
-        name = f"{path.relative_to(data).parts[0]} {path.name}"
-        try:
-            found = calibrate_from_lines([LinePicture(path.name, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))])
-        except InputError as error:
-            why = str(error).partition("focal length: ")[2] or str(error)
-            rows.append(f"| {name} | {focal:.0f} | refused | | | {why} | {time.process_time() - start:.0f} |")
-            print(rows[-1], flush=True)
-            continue
-        bend, length, _ = found.report.parameters
-        answer, off = "unknown", ""
-        if length.verdict == "measured":
-            sigmas = (length.value - focal) / length.sigma
-            told, right = told + 1, right + (abs(sigmas) <= SIGMAS)
-            answer = f"{length.value:.0f} +- {length.sigma:.0f}"
-            off = f"{100.0 * (length.value / focal - 1.0):+.1f} % | {sigmas:+.1f}"
-        rows.append(
-            f"| {name} | {focal:.0f} | {answer} | {off or ' | '} | distortion {bend.value:.3f} +- {bend.sigma:.3f}, "
-            f"{bend.verdict}; {length.reason} | {time.process_time() - start:.0f} |"
-        )
-        print(rows[-1], flush=True)
-    machine = describe_machine()
+        row = {"photograph": f"{path.relative_to(data).parts[0]} {path.name}", "truth_px": focal, **told_of(path)}
+        report["photographs"].append({**row, "cpu_s": time.process_time() - start})
+        print(report["photographs"][-1], flush=True)
+    (RESULTS / "line_photographs.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    (RESULTS / "line_photographs.md").write_text(table(report), encoding="utf-8")
+
+
+def told_of(path: Path) -> dict[str, Any]:
+    """What is said of the focal length in a photograph: with its sigma, or why it is not told."""
+    picture = LinePicture(path.name, np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8))
+    try:
+        found = calibrate_from_lines([picture])
+    except InputError as error:
+        return {"is_refused": True, "why": str(error).partition("focal length: ")[2] or str(error)}
+    length = found.report.parameters[1]
+    told = {"focal_px": length.value, "sigma_px": length.sigma} if length.verdict == "measured" else {}
+    return {"is_refused": False, **told, "why": length.reason}
+
+
+def table(report: dict[str, Any]) -> str:
+    """The results for a person."""
+    rows = report["photographs"]
+    told = [row for row in rows if "focal_px" in row]
+    right = [row for row in told if abs(row["focal_px"] - row["truth_px"]) <= SIGMAS * row["sigma_px"]]
+    refused = sum(row["is_refused"] for row in rows)
     lines = [
-        f"sfmapp {machine['versions']['sfmapp']} at {machine['commit']}, {machine['date']}",
+        f"sfmapp {report['versions']['sfmapp']} at {report['commit']}, {report['date']}",
         "",
-        f"{len(chosen)} photographs: a focal length is told of {told}, right within {SIGMAS:g} sigmas of {right}; of "
-        f"the other {len(chosen) - told} none is told.",
+        f"{len(rows)} photographs, one at a time: a focal length is told of {len(told)}, within {SIGMAS:g} sigmas of "
+        f"{len(right)}; {refused} are refused, and of {len(rows) - len(told) - refused} it is said that it is unknown.",
         "",
-        "| photograph | focal length px | found | off | sigmas | what is said | CPU s |",
+        "| photograph | focal length px | found | off | sigmas | why | CPU s |",
         "|---|---|---|---|---|---|---|",
-        *rows,
     ]
-    RESULTS.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    for row in rows:
+        answer = "refused | | " if row["is_refused"] else "unknown | | "
+        if "focal_px" in row:
+            off = row["focal_px"] - row["truth_px"]
+            answer = f"{row['focal_px']:.0f} +- {row['sigma_px']:.0f} | {100.0 * off / row['truth_px']:+.1f} % | "
+            answer += f"{off / row['sigma_px']:+.1f}"
+        lines.append(f"| {row['photograph']} | {row['truth_px']:.0f} | {answer} | {row['why']} | {row['cpu_s']:.0f} |")
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

@@ -63,6 +63,7 @@ def main() -> None:
     sets = ("fountain-P11", "herz-jesus-P8")
     report["focal"] = [turning(data / "pano-sponza-rot"), *(of_pairs(data / name) for name in sets)]
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
+    arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     arguments.output.write_text(tables(report), encoding="utf-8")
     print(tables(report))
 

@@ -89,6 +89,8 @@ def rows_of(folder: Path) -> list[Row]:
         "odometry": odometry_rows,
         "calibration": calibration_rows,
         "two_views": two_view_rows,
+        "known_points": known_point_rows,
+        "rigs": rig_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
 
@@ -132,6 +134,36 @@ def two_view_rows(folder: Path) -> Iterator[Row]:
             for quantity, unit, key in (("CPU time", "ms", "cpu_ms"), ("median error", row["unit"], "median_error")):
                 case = f"{what}, 1,000 matches, half wrong"
                 yield Row("two_views", case, quantity, unit, "less", mine[key], program, row[key], *about)
+
+
+def known_point_rows(folder: Path) -> Iterator[Row]:
+    """``sfmapp calibrate target`` and ``locate`` against OpenCV and pycolmap."""
+    report = read(folder, "known_points")
+    about = (False, report["date"][:10], report["commit"])
+    for kind, error, unit in (("cameras", "focal_rms_px", "px"), ("poses", "rotation_rms_deg", "deg")):
+        ours = {row["case"]: row for row in report[kind] if row["program"] == "sfmapp"}
+        what = "rms error of focal lengths" if kind == "cameras" else "rms error of rotations"
+        for row in report[kind]:
+            mine, peer = ours[row["case"]], row["program"].partition(",")[0]
+            if row is mine:
+                continue
+            case = f"{row['case']}, {row['program']}"
+            yield Row("known_points", case, what, unit, "less", mine[error], peer, row[error], *about)
+            yield Row("known_points", case, "CPU time", "ms", "less", mine["cpu_ms"], peer, row["cpu_ms"], *about)
+            if kind == "poses" and mine["gross"] + row["gross"]:
+                grosses = mine["gross"], peer, row["gross"]
+                yield Row("known_points", case, "grossly wrong poses", "count", "less", *grosses, *about)
+
+
+def rig_rows(folder: Path) -> Iterator[Row]:
+    """``sfmapp calibrate rig`` against OpenCV, on the pairs of its samples."""
+    report = read(folder, "rigs")
+    rms = report["opencv"]["epipolar_rms_px"]["all"]
+    case, text = f"{report['opencv']['pairs']} pairs of chessboards", "epipolar rms"
+    yield Row(
+        "rigs", case, text, "px", "less", rms["sfmapp"], "OpenCV", rms["OpenCV"], False, report["date"][:10],
+        report["commit"],
+    )  # fmt: skip
 
 
 def sparse_rows(folder: Path) -> Iterator[Row]:
@@ -257,6 +289,22 @@ def promises(folder: Path) -> Iterator[Promise]:
     bends = [run["straight"]["bend_px"] for run in runs if run.get("straight")]
     text = "lines are straight to half a pixel in undistorted pictures"
     yield Promise("lens_families", text, sum(bend < 0.5 for bend in bends), len(runs), report["date"][:10])
+    report = read(folder, "known_points")
+    rows = [row for kind in ("cameras", "poses") for row in report[kind] if row.get("nees") is not None]
+    good = sum(row["nees_low"] <= row["nees"] <= row["nees_high"] for row in rows)
+    text = "sigmas from known points are those of the errors (NEES in its 99.8 %)"
+    yield Promise("known_points", text, good, len(rows), report["date"][:10])
+    report = read(folder, "line_photographs")
+    told = [row for row in report["photographs"] if "focal_px" in row]
+    right = sum(abs(row["focal_px"] - row["truth_px"]) <= 3.0 * row["sigma_px"] for row in told)
+    text = "a focal length that lines of a real photograph tell is within three sigmas"
+    yield Promise("line_photographs", text, right, len(told), report["date"][:10])
+    report = read(folder, "rigs")
+    rows, date = report["synthetic"], report["date"][:10]
+    good = sum(0.9 <= row["nees"] <= 1.1 for row in rows)
+    yield Promise("rigs", "sigmas of a rig are those of its errors (NEES 0.9 to 1.1)", good, len(rows), date)
+    odd = report["odd"]
+    yield Promise("rigs", "a board that moved between exposures is named", odd["moved"], odd["trials"], date)
     report = read(folder, "calibration")
     rows, date = report["trials"], report["date"][:10]
     good = sum(0.9 <= row["nees"] <= 1.1 and row["projections_covered"] >= 0.93 for row in rows)

@@ -232,3 +232,11 @@ def test_rig_json_is_read_back(tmp_path: Path) -> None:
     for one, two in zip(read.cameras, found.rig.cameras, strict=True):
         assert one.model == two.model
         assert one.params == pytest.approx(two.params)
+
+
+def test_a_board_that_moved_between_exposures_is_named_although_it_pulled_the_rig_its_way() -> None:
+    """Ten shots, one of them swapped and in one the board moved by millimetres: all look bad while these count."""
+    rigs = pytest.importorskip("rigs", reason="benchmarks/ is not part of an installed package")
+    found = rigs.odd_shots(3)
+    assert (found["swapped"], found["moved"], found["others_named"]) == (3, 3, 0)
+    assert found["worst_pose_error_sigmas"] < 4.0

@@ -38,6 +38,7 @@ from sfmapp.calibration.rig_shots import (
     more_odd,
     placed,
     readmitted,
+    worst_shot,
 )
 from sfmapp.calibration.rig_start import JoinedRig, SeenBoard, join_rig
 from sfmapp.calibration.solve import BENT_CHANCE, RESOLVED_SIGMAS, bend_basis, bend_depth
@@ -236,7 +237,27 @@ def _fit_of_what_belongs_together(begin: RigFit, photos: Photographs, is_held: S
         if is_settled:
             break
         fit = refine_rig(fit, photos.with_cut(cut).problem(is_held), photos.weights)
+    for _ in range(_MAX_ROUNDS):
+        found = _without_worst(fit, photos, is_held, cut)
+        if found is None:
+            break
+        fit, cut = found
     return fit, cut
+
+
+def _without_worst(fit: RigFit, photos: Photographs, is_held: Sequence[bool], cut: Cut) -> tuple[RigFit, Cut] | None:
+    """The rig without the shot that agrees worst, and the cut with it, where that shot does not belong to a rig that it
+    had no part in; None where it does.
+
+    A shot pulls the rig its way, among few shots so far that all of them look no better than it does.
+    """
+    tried = cut | worst_shot(fit, photos, cut)
+    if tried == cut:
+        return None
+    problem = photos.with_cut(tried)
+    begin = placed(fit, problem)[0]
+    other = refine_rig(begin, problem.problem(is_held), photos.weights)
+    return None if readmitted(other, photos, tried) & (tried - cut) else (other, tried)
 
 
 def _bent(fit: RigFit, photos: Photographs, is_held: Sequence[bool], cut: Cut) -> tuple[RigFit, Photographs] | None:

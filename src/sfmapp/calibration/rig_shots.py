@@ -140,8 +140,20 @@ def more_odd(fit: RigFit, photos: Photographs, cut: Cut, tolerance: float) -> Cu
     """
     remaining = photos.with_cut(cut)
     costs = misfits(fit, remaining)
-    shots = np.flatnonzero(costs > tolerance * limit_of(costs)).tolist()
-    found: set[tuple[int, int]] = set()
+    return _odd_of(fit, photos, cut, np.flatnonzero(costs > tolerance * limit_of(costs)).tolist())
+
+
+def worst_shot(fit: RigFit, photos: Photographs, cut: Cut) -> Cut:
+    """The photograph that does not belong to its shot, if any does not: of the shot that costs most, where that is more
+    than noise."""
+    costs = misfits(fit, photos.with_cut(cut))
+    worst = int(np.argmax(costs))
+    return _odd_of(fit, photos, cut, [worst]) if costs[worst] > _NOISE else Cut()
+
+
+def _odd_of(fit: RigFit, photos: Photographs, cut: Cut, shots: Sequence[int]) -> Cut:
+    """One photograph of each of some shots: see :func:`more_odd`."""
+    remaining, found = photos.with_cut(cut), set[tuple[int, int]]()
     cameras_of = {t: sorted({v.camera for v in remaining.views if v.shot == t}) for t in shots}
     many = {t for t in shots if len(cameras_of[t]) > 2}
     found |= {(cameras_of[t][-1], t) for t in shots if t not in many}
