@@ -102,6 +102,39 @@ def test_lens_and_focal_length_of_a_built_world_are_found(seed: int) -> None:
     assert found.report.held_out.num_met > 3 * found.report.held_out.num_expected
 
 
+def horizontal(yaw_deg: float) -> np.ndarray:
+    """A direction at right angles to the vertical, which is y."""
+    yaw = math.radians(yaw_deg)
+    return np.array([math.cos(yaw), 0.0, math.sin(yaw)])
+
+
+@pytest.mark.parametrize(("yaws", "is_told"), [((0, 90, 35, 125), True), ((0, 90, 55), True), ((10, 40, 75), False)])
+def test_further_horizontal_directions_do_no_harm(yaws: tuple[float, ...], is_told: bool) -> None:
+    """An Atlanta world: the blocks of a town stand at several angles. In the last no two are at a right one, and it is
+    no error to leave the focal length open there."""
+    directions = [np.array([0.0, 1.0, 0.0]), *map(horizontal, yaws)]
+    _, bend, focal, _ = told([seen_lines(division_camera(), directions, ACROSS, 72, 0)])
+    assert bend.verdict == "measured"
+    assert abs(bend.value - STRENGTH) < min(0.05 * abs(STRENGTH), 4.0 * bend.sigma)
+    assert focal.verdict == "measured" or not is_told
+    if focal.verdict == "measured":
+        assert abs(focal.value - FOCAL) < min(0.02 * FOCAL, 4.0 * focal.sigma)
+
+
+def test_several_photographs_of_one_camera_are_surer_than_one() -> None:
+    views = [
+        seen_lines(division_camera(), AXES, rigid3.exp_so3([0.1 * k, 0.6 * (-1) ** k, 0.05 * k]), 40, 20 + k)
+        for k in range(1, 4)
+    ]
+    _, _, alone, _ = told(views[:1])
+    found, bend, focal, _ = told(views)
+    assert len(found.report.photographs) == 3
+    assert (bend.verdict, focal.verdict) == ("measured", "measured")
+    assert abs(bend.value - STRENGTH) < min(0.05 * abs(STRENGTH), 4.0 * bend.sigma)
+    assert abs(focal.value - FOCAL) < min(0.02 * FOCAL, 4.0 * focal.sigma)
+    assert alone.verdict != "measured" or focal.sigma < alone.sigma
+
+
 def test_a_frontal_view_tells_the_lens_and_not_the_focal_length() -> None:
     found, bend, focal, _ = told([seen_lines(division_camera(), AXES, np.eye(3), 40, 3)])
     assert (bend.verdict, focal.verdict) == ("measured", "unknown")
