@@ -60,6 +60,7 @@ def test_photographs_to_a_rig_that_odometry_takes(photographs: Path, tmp_path: P
     assert "not used" in next(one for one in rig["photographs"][1]["pictures"] if one["name"] == "4.png")["problem"]
     assert all(one.get("max_px") is None or one["max_px"] < 1e-6 for one in rig["files"])
     assert "<h2>Pairs</h2>" in (output / "report.html").read_text()
+    assert (output / "recording.rrd").stat().st_size > 10_000
     for name in ("rig.json", "camchain.yaml", "stereo.yaml"):
         sequence = open_sequence(photographs, SequenceOptions(camera=str(output / name)), Events())
         np.testing.assert_allclose(sequence.rig.cam_from_rig[1], pair["second_from_first"], atol=1e-12)

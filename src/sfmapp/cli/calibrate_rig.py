@@ -38,7 +38,7 @@ writes
   OUT/rig.json           cameras, poses and the covariance of everything; give it to --camera of odometry
   OUT/camchain.yaml, OUT/stereo.yaml, OUT/rig_config.json   for Kalibr, OpenCV and COLMAP
   OUT/CAMERA/            calibration.json of each camera, and its files for other programs
-  OUT/report.html, OUT/report.json"""
+  OUT/report.html, OUT/report.json, OUT/recording.rrd"""
 
 
 def add_way(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -48,6 +48,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--max-error-px", metavar="PX", type=float, default=8.0,
         help="farthest point that agrees with a pose while it is searched; default: 8",
     )  # fmt: skip
+    parser.add_argument("--no-recording", action="store_true", help="do not write recording.rrd")
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_locate)
 
@@ -56,15 +57,15 @@ def _locate(args: argparse.Namespace) -> int:
     limit_library_threads()
     load_numba_without_blas()
     from sfmapp.errors import UsageError
-    from sfmapp.pipelines.calibration.known_points import locate
+    from sfmapp.pipelines.calibration.known_points import PoseSearch, locate
 
     source = replace(point_source(args), model=args.model)
     if args.model is not None and (args.points is not None or args.markers is not None):
         raise UsageError("expected one of --points, --markers and --model, found two")
     with listening(args) as events:
         result = locate(
-            args.photograph, args.output, source, args.camera, method=args.method,
-            max_error_px=args.max_error_px, sigma_px=args.sigma_px, events=events,
+            args.photograph, args.output, source, args.camera, search=PoseSearch(args.method, args.max_error_px),
+            sigma_px=args.sigma_px, recording=not args.no_recording, events=events,
         )  # fmt: skip
     tell_result(args, result, lambda: _print(result))
     return 0

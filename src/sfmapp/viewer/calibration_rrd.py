@@ -12,8 +12,8 @@ from sfmapp.images.pixels import read_gray
 from sfmapp.viewer.calibration_replay import CalibrationReplay
 from sfmapp.viewer.rrd_file import recording_file
 
-_SHOWN_PX = 1024
-_ENLARGED = 50.0
+SHOWN_PX = 1024
+ENLARGED = 50.0
 
 
 def write_calibration_rrd(replay: CalibrationReplay, output: Path) -> None:
@@ -23,7 +23,7 @@ def write_calibration_rrd(replay: CalibrationReplay, output: Path) -> None:
 
     with recording_file(output, "sfmapp_calibrate", replay.title) as recording:
         width, height = (int(side) for side in replay.size)
-        scale = min(1.0, _SHOWN_PX / max(width, height))
+        scale = min(1.0, SHOWN_PX / max(width, height))
         recording.log("/", rr.ViewCoordinates.RDF, static=True)
         recording.log(
             "camera",
@@ -48,6 +48,6 @@ def write_calibration_rrd(replay: CalibrationReplay, output: Path) -> None:
             colors = np.where(used[:, None], [[42, 157, 74]], [[209, 55, 44]]).astype(np.uint8)
             recording.log("camera/points", rr.Points2D(xy, colors=colors, radii=2.0))
             known = np.nan_to_num(residuals)
-            recording.log("camera/residuals", rr.Arrows2D(origins=xy, vectors=_ENLARGED * known, colors=colors))
+            recording.log("camera/residuals", rr.Arrows2D(origins=xy, vectors=ENLARGED * known, colors=colors))
             rms = float(np.sqrt((known[used] ** 2).sum(1).mean())) / scale if used.any() else 0.0
             recording.log("plots/rms_px", rr.Scalars(rms))

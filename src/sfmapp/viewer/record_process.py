@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 def main(kind: str, folder: str, output: str, threads: str) -> None:
-    """Draw what lies in folder: the replay of a run, a dense result, a calibration, or a pair."""
+    """Draw what lies in folder: the replay of a run, a dense result, a calibration, a rig, or a pair."""
     if kind == "dense":
         from sfmapp.viewer.dense_replay import DenseReplay
         from sfmapp.viewer.dense_rrd import write_dense_rrd
@@ -23,6 +23,12 @@ def main(kind: str, folder: str, output: str, threads: str) -> None:
         from sfmapp.viewer.calibration_rrd import write_calibration_rrd
 
         write_calibration_rrd(CalibrationReplay.load(Path(folder)), Path(output))
+        return
+    if kind == "rig":
+        from sfmapp.viewer.rig_replay import RigReplay
+        from sfmapp.viewer.rig_rrd import write_rig_rrd
+
+        write_rig_rrd(RigReplay.load(Path(folder)), Path(output))
         return
     if kind == "pair":
         from sfmapp.viewer.pair_replay import PairReplay

@@ -31,7 +31,7 @@ from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
 from sfmapp.pipelines.calibration.pictures import BoardPictures, look_at_pictures
-from sfmapp.pipelines.calibration.results import write_camera, write_recording
+from sfmapp.pipelines.calibration.results import outline_of, write_camera, write_recording
 from sfmapp.report.calibration_html import render_board_html
 from sfmapp.report.model import CalibrateReport
 from sfmapp.workspace.job import Job
@@ -163,13 +163,7 @@ def _fit_of(solution: Solution, views: Sequence[TargetView]) -> Fit:
 
 def _record(job: Job, board: Board, pictures: BoardPictures, made: CameraCalibration) -> None:
     paths = {one.name: str(one.path) for one in pictures.pictures if one.path is not None}
-    write_recording(job, made, _outline(board), paths, Path(job.source).name)
-
-
-def _outline(board: Board) -> NDArray[np.float64]:
-    """(4, 3) corners of the points of a board."""
-    low, high = board.points.min(0), board.points.max(0)
-    return np.array([[low[0], low[1], 0.0], [high[0], low[1], 0.0], [high[0], high[1], 0.0], [low[0], high[1], 0.0]])
+    write_recording(job, made, outline_of(board.points), paths, Path(job.source).name)
 
 
 def _guess_report(guess: BoardGuess | None) -> BoardGuessReport | None:

@@ -26,6 +26,7 @@ from sfmapp.calibration.point_reports import (
     target_report,
     write_pose,
 )
+from sfmapp.calibration.result import CameraCalibration, ViewFit
 from sfmapp.calibration.target import TargetFit, calibrate_target
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.names import CameraModel
@@ -67,6 +68,18 @@ class PointSource:
     dictionary: str | None = None
     model: Path | None = None
     is_opencv: bool = False
+
+
+@dataclass(frozen=True)
+class PoseSearch:
+    """How a pose is searched; as in :func:`sfmapp.calibration.locate.locate_camera`."""
+
+    method: Method = "auto"
+    max_error_px: float = MAX_ERROR_PX
+
+    def __post_init__(self) -> None:
+        if not self.max_error_px > 0.0:
+            raise UsageError(f"max_error_px is {self.max_error_px:g}, expected more than 0 pixels")
 
 
 @dataclass(frozen=True)
@@ -128,23 +141,25 @@ def calibrate_from_target(
         _write(job.workspace, picture[0], render_target_html(report, picture), document_text(report))
         _tell(report.fit.warnings, job.events)
         if recording:
-            _record(job, record, fit)
+            _record(job, record, fit.calibration(record.name), fit.points[0])
         job.workspace.save()
         return TargetResult(folder, report, fit)
 
 
 def locate(
     photograph: str | os.PathLike[str], output: str | os.PathLike[str], source: PointSource, camera: str, *,
-    method: Method = "auto", max_error_px: float = MAX_ERROR_PX, sigma_px: float | None = None,
+    search: PoseSearch | None = None, sigma_px: float | None = None, recording: bool = True,
     events: Events | None = None,
 ) -> LocateResult:  # fmt: skip
-    """Find where a photograph was taken, and write ``pose.json`` and a report.
+    """Find where a photograph was taken, and write ``pose.json``, a recording and a report.
 
     Args:
         photograph: a file. output: a new folder, an empty one, or that of an earlier call.
         source: of its points.
         camera: a calibration file of any form. What ``sfmapp calibrate`` has written brings its covariance.
-        method, max_error_px, sigma_px: as in :func:`sfmapp.calibration.locate.locate_camera`.
+        search: of the pose; None for the usual one. sigma_px: standard deviation of a marked coordinate; None: as the
+            residuals tell.
+        recording: write ``recording.rrd``.
 
     Raises:
         UsageError: options that contradict each other, or an output that holds something else.
@@ -152,8 +167,7 @@ def locate(
         NoReconstructionError: no pose agrees with the points, or they leave it open.
     """
     _check_sigma(sigma_px)
-    if not max_error_px > 0.0:
-        raise UsageError(f"max_error_px is {max_error_px:g}, expected more than 0 pixels")
+    search = search or PoseSearch()
     record = _describe(photograph)
     given, covariance = _read_camera(camera, record)
     with Job.opened(LOCATE, photograph, output, None, events=events) as job:
@@ -164,7 +178,7 @@ def locate(
             names, xyz, xy = find_model_points(source.model, record, given, job.events)
             points = _Points(PhotographFacts(record.name, names, "units"), xyz, xy)
         found = locate_camera(
-            points.xyz, points.xy, given, method=method, max_error_px=max_error_px, sigma_px=sigma_px,
+            points.xyz, points.xy, given, method=search.method, max_error_px=search.max_error_px, sigma_px=sigma_px,
             camera_covariance=covariance,
         )  # fmt: skip
         folder = job.workspace.folder
@@ -173,6 +187,14 @@ def locate(
         picture = draw_residuals(read_rgb(record), record.orientation, report.fit.points)
         _write(job.workspace, picture[0], render_location_html(report, picture), document_text(report))
         _tell(report.fit.warnings, job.events)
+        if recording:
+            view = ViewFit(record.name, found.view.cam_from_world, points.xy, found.view.residual, found.view.is_used)
+            num = len(given.params)
+            seen = CameraCalibration(
+                given, found.covariance[:num, :num], found.method, found.noise.sigma_px,
+                round(found.view.degrees_of_freedom), (view,),
+            )  # fmt: skip
+            _record(job, record, seen, points.xyz)
         job.workspace.save()
         return LocateResult(folder, report, found)
 
@@ -258,14 +280,13 @@ def _plane(text: str, known: Mapping[str, Array]) -> tuple[Plane, str]:
     ), f"{values[0]:g} X + {values[1]:g} Y + {values[2]:g} Z = {values[3]:g}"
 
 
-def _record(job: Job, record: ImageRecord, fit: TargetFit) -> None:
-    """The photograph, and the target in front of the camera as a rectangle along its two widest directions."""
-    xyz = fit.points[0]
+def _record(job: Job, record: ImageRecord, made: CameraCalibration, xyz: Array) -> None:
+    """The photograph, and the points in front of the camera as a rectangle along their two widest directions."""
     middle = xyz.mean(0)
     axes = np.linalg.svd(xyz - middle)[2][:2]
     low, high = ((xyz - middle) @ axes.T).min(0), ((xyz - middle) @ axes.T).max(0)
     outline = middle + np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) @ axes
-    write_recording(job, fit.calibration(record.name), outline, {record.name: str(record.path)}, record.name)
+    write_recording(job, made, outline, {record.name: str(record.path)}, record.name)
 
 
 # ------------------------------------------------------------------------------------------------------------- reading

@@ -25,10 +25,11 @@ from sfmapp.camera_files.rig_writing import write_rig_files
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
 from sfmapp.pipelines.calibration.pictures import BoardPictures, is_video, look_at_pictures
-from sfmapp.pipelines.calibration.results import write_camera
+from sfmapp.pipelines.calibration.results import note_recording, outline_of, write_camera
 from sfmapp.pipelines.calibration.shots import match_shots
 from sfmapp.report.model import CalibrateRigReport
 from sfmapp.report.rig_html import render_rig_html
+from sfmapp.viewer.rig_recording import ShownView, record_rig
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.layout import CALIBRATE, PAGE, REPORT
 from sfmapp.workspace.options import Options
@@ -118,6 +119,7 @@ def calibrate_cameras(
             job.events.warned(STAGE, warning)
         with job.stage("files"):
             files = _write(job.workspace.folder, found)
+            _record(job, seen, views, found)
         rig = RigReport(
             boards=[board.text() for board in boards], shots=told, cameras=rig_cameras(found), result=rig_head(found),
             photographs=[_photographs(one, fit.views) for one, fit in zip(seen, found.cameras, strict=True)],
@@ -218,6 +220,27 @@ def _write(folder: Path, found: RigCalibration) -> list[CameraFileReport]:
             for one in write_camera(folder / name, camera, name)
         ]  # fmt: skip
     return written
+
+
+def _record(job: Job, seen: Sequence[_Seen], views: Sequence[RigView], found: RigCalibration) -> None:
+    """Cameras and boards for rerun; a failure is a warning."""
+    # a photograph shows several boards, whose fits are told apart by their points
+    of_points = {(view.camera, view.view.xy.tobytes()): view for view in views}
+    shown = []
+    for c, made in enumerate(found.cameras):
+        for fit in made.views:
+            view = of_points.get((c, fit.xy.tobytes()))
+            if view is not None:
+                shown.append(ShownView(c, view.shot, outline_of(view.view.xyz), fit))
+    paths = {
+        (c, picture.name): str(picture.path)
+        for c, one in enumerate(seen)
+        for picture in one.of_board[0].pictures
+        if picture.path is not None
+    }
+    cameras = list(zip(found.names, found.cameras, strict=True))
+    told = record_rig(job.workspace.recording, found.rig, cameras, shown, paths, " and ".join(found.names))
+    note_recording(job, told)
 
 
 def _photographs(one: _Seen, fits: Sequence[ViewFit]) -> RigPhotographs:

@@ -1,0 +1,55 @@
+"""What a recording of a rig is drawn from, on its way to the process that draws it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.viewer.handover import load_fields, save_fields
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class RigReplay:
+    """What is drawn.
+
+    Attributes:
+        title: shown in the viewer.
+        names: of C cameras. sizes, focals, centers: (C, 2) each, pixels. cam_from_rig: (C, 7).
+        camera, shot: (V,) of V boards in photographs, in the order of shots.
+        corners: (V, 4, 3) outline of each board in the frame of the rig.
+        ptr: (V + 1) int64, points of view v are ``ptr[v]:ptr[v + 1]``.
+        xy, residuals: (N, 2) pixels. is_used: (N,) bool.
+        paths: of the V photographs, empty for none.
+        problems: why a photograph is not used with the others of its shot, empty for nothing.
+    """
+
+    title: str
+    names: list[str]
+    sizes: Array
+    focals: Array
+    centers: Array
+    cam_from_rig: Array
+    camera: Ints
+    shot: Ints
+    corners: Array
+    ptr: Ints
+    xy: Array
+    residuals: Array
+    is_used: NDArray[np.bool_]
+    paths: list[str]
+    problems: list[str]
+
+    def save(self, folder: Path) -> None:
+        """Write it to a folder, for the process that draws."""
+        save_fields(folder, "rig", self)
+
+    @classmethod
+    def load(cls, folder: Path) -> RigReplay:
+        """What :meth:`save` wrote."""
+        return cls(**load_fields(folder, "rig"))
