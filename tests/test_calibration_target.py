@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from sfmapp.calibration.adjustment import TargetView
 from sfmapp.calibration.one_view import resolution_sigma
 from sfmapp.calibration.target import TargetFit, calibrate_target
+from sfmapp.calibration.targets import calibrate_targets
 from sfmapp.camera.camera import Camera, project
 from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.camera.names import CameraModel
@@ -254,6 +256,34 @@ def test_few_points_are_never_surer_than_a_hand() -> None:
     assert resolution_sigma(np.round(xy)) == pytest.approx(12.0**-0.5)
     assert resolution_sigma(np.round(xy) + 0.5) == pytest.approx(12.0**-0.5)
     assert resolution_sigma(np.round(xy, 2)) == pytest.approx(0.01 * 12.0**-0.5)
+
+
+def test_several_photographs_tell_one_camera_within_their_sigmas() -> None:
+    rng = np.random.default_rng(8)
+    nees, alone = [], []
+    for _ in range(12):
+        views = []
+        for name in ("a", "b", "c"):
+            xyz, xy, _ = picture(rng, 30, OPENCV)
+            xy = xy + 0.5 * rng.normal(size=xy.shape)
+            xy[:2] += rng.uniform(15, 40, (2, 2))
+            views.append(TargetView(name, xyz, xy))
+        # a few points more, which tell no camera by themselves
+        xyz, xy, _ = picture(rng, 5, OPENCV)
+        views.append(TargetView("few", xyz, xy + 0.5 * rng.normal(size=xy.shape)))
+        made = calibrate_targets(views, SIZE, camera_model=OPENCV.model)
+        assert [view.name for view in made.views] == ["a", "b", "c", "few"]
+        assert not any(view.is_used[:2].any() for view in made.views[:3])
+        off = made.camera.params - OPENCV.params
+        nees.append(float(off @ np.linalg.solve(made.covariance, off)))
+        alone.append(calibrate_target(views[0].xyz, views[0].xy, SIZE, camera_model=OPENCV.model).focal_sigma_px)
+        assert made.sigmas[0] < alone[-1]
+    num = 12 * len(OPENCV.params)
+    assert chi2.ppf(1e-4, num) < sum(nees) < chi2.ppf(1.0 - 1e-4, num)
+    with pytest.raises(InputError, match="found none"):
+        calibrate_targets([], SIZE)
+    with pytest.raises(InputError, match="at least 6"):
+        calibrate_targets(views[3:], SIZE)
 
 
 def test_opencv_finds_the_same_minimum() -> None:
