@@ -647,7 +647,8 @@ def fill_rows(poses: Array, image_pose: Int32s, image_mount: Int32s, mounts: Arr
         row[6] = 2 * (x * z - y * w)
         row[7] = 2 * (y * z + x * w)
         row[8] = 1 - 2 * (x * x + y * y)
-        row[9:12] = poses[image_pose[i], 4:7]
+        for k in range(3):
+            row[9 + k] = poses[image_pose[i], 4 + k]
         if image_mount[i] >= 0:
             mount = mounts[image_mount[i]]
             for k in range(4):
@@ -703,7 +704,8 @@ def retract(
         new_poses[i, 4], new_poses[i, 5], new_poses[i, 6] = t0, t1, t2
     fill_rows(new_poses, image_pose, images.mount, images.mounts, new.rows)
     canonical, _, camera_block, _, free_ptr, free_slot, free_column = lenses
-    new.canonical[:] = canonical
     for k in range(canonical.shape[0]):
+        for n in range(canonical.shape[1]):
+            new.canonical[k, n] = canonical[k, n]
         for n in range(free_ptr[k], free_ptr[k + 1]):
             new.canonical[k, free_slot[n]] += step[camera_block[k] * 8 + free_column[n]]

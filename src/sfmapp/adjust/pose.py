@@ -25,6 +25,7 @@ from sfmapp.adjust.kernels import (
     total_loss,
 )
 from sfmapp.camera.lens import ROW
+from sfmapp.simd.copying import copy_into
 from sfmapp.simd.f64x8 import add2
 from sfmapp.simd.pointers import pointer
 
@@ -200,8 +201,12 @@ def _refine(
             predicted = 0.0
             for k in range(size):
                 predicted += 0.5 * step[k] * (damping * H[9 * k] * step[k] - g[k])
-            poses[:], canonical[:], rows[:] = new_poses, new_canonical, new_rows
-            H[:], g[:], residuals2[:] = new_H, new_g, new_residuals2
+            copy_into(poses, new_poses)
+            copy_into(canonical, new_canonical)
+            copy_into(rows, new_rows)
+            copy_into(H, new_H)
+            copy_into(g, new_g)
+            copy_into(residuals2, new_residuals2)
             done = decrease <= tolerance * cost
             cost = new_cost
             gain = decrease / predicted if predicted > 0.0 else 0.0

@@ -298,10 +298,10 @@ class Engine:
         The greatest such move is the length of the step in the metric of the reduced system. Robust losses let go of
         single observations long after that, step by step, which moves a few points and nothing else.
         """
-        num_redundant = self.degrees_of_freedom
-        if sigmas == 0.0 or num_redundant <= 0 or decrease > _POINTS_SETTLED * cost:
+        if sigmas == 0.0 or decrease > _POINTS_SETTLED * cost:
             return False
-        return self.shape_decrease <= sigmas**2 * cost / num_redundant
+        num_redundant = self.degrees_of_freedom
+        return num_redundant > 0 and self.shape_decrease <= sigmas**2 * cost / num_redundant
 
     @property
     def degrees_of_freedom(self) -> int:

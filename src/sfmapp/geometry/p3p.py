@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
+from sfmapp.simd.copying import copy_into
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -76,7 +77,8 @@ def _search(xyz: Array, rays: Array, limit: float, confidence: float, samples: I
                     break
             if cost < best_cost:
                 best_cost, found = cost, True
-                rotation[:], translation[:] = r, t
+                copy_into(rotation, r)
+                copy_into(translation, t)
                 share = (inliers / xyz.shape[0]) ** 3
                 if share > 0.0:
                     wanted = math.log(1.0 - confidence) / math.log1p(-share) if share < 1.0 else 0.0

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.epipolar import choose_in_front, ray_depths, sampson_errors
+from sfmapp.simd.copying import copy_into
 
 Array = NDArray[np.float64]
 
@@ -250,7 +251,8 @@ def _refine(basis: Array, xn1: Array, xn2: Array, scale2: float, angles: Array) 
                 return
             continue
         has_converged = cost - new_cost < 1e-6 * cost
-        angles[:], now[:] = trial, new
+        copy_into(angles, trial)
+        copy_into(now, new)
         cost = new_cost
         damping = max(damping * 0.1, 1e-9)
         if has_converged:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.lens import across_seam, project, undistort, unproject
+from sfmapp.simd.copying import copy_into
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -265,8 +266,8 @@ def triangulate_tracks(
                 )  # fmt: skip
                 if inliers > best_count or (inliers == best_count > 1 and cost < best_cost):
                     best_count, best_cost = inliers, cost
-                    best_xyz[:] = xyz
-                    best_used[:k] = used[:k]
+                    copy_into(best_xyz, xyz)
+                    copy_into(best_used, used)
         if best_count < 2 or (k > 2 and not _refine(best_xyz, centers, rays, best_used, k)):
             continue
         inliers, _ = _mark_inliers(
@@ -275,7 +276,7 @@ def triangulate_tracks(
         )  # fmt: skip
         if inliers < 2 or _min_cosine(best_xyz, centers, best_used, k, max_cosine) > max_cosine:
             continue
-        point_xyz[t] = best_xyz
+        copy_into(point_xyz[t], best_xyz)
         for m in range(k):
             obs_is_inlier[obs[m]] = best_used[m]
         count += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -193,6 +194,9 @@ def reprojection_residuals(
         p = obs_track_idx[o]
         x0, x1, x2 = point_xyz[p, 0], point_xyz[p, 1], point_xyz[p, 2]
         z = rotation[i, 2, 0] * x0 + rotation[i, 2, 1] * x1 + rotation[i, 2, 2] * x2 + translation[i, 2]
+        if math.isnan(z):  # while a map grows, most have no pose or no point yet, which a lens would find out slowly
+            out[o, 0] = out[o, 1] = math.nan
+            continue
         x = rotation[i, 0, 0] * x0 + rotation[i, 0, 1] * x1 + rotation[i, 0, 2] * x2 + translation[i, 0]
         y = rotation[i, 1, 0] * x0 + rotation[i, 1, 1] * x1 + rotation[i, 1, 2] * x2 + translation[i, 1]
         k = image_camera_idx[i]
