@@ -182,8 +182,8 @@ def _control(poses: Array, places: Array, normals: Array, rng: np.random.Generat
 OPTIONS = AdjustOptions(relative_cost_tolerance=1e-7, initial_damping=1e-6, max_iterations=100)
 
 
-def solve(survey: SyntheticSurvey) -> ControlSolution:
-    """What comes of the model that photographs make, brought to its control points."""
+def solve(survey: SyntheticSurvey) -> tuple[Reconstruction, ControlSolution]:
+    """The model that photographs make, brought to its control points, and what came of these."""
     model, control = survey.model.copy(), survey.control
     adjust_bundle(model, OPTIONS)
     noise = keypoint_noise(model, OPTIONS, Varying(), MIN_NOISE_PX)
@@ -198,7 +198,7 @@ def solve(survey: SyntheticSurvey) -> ControlSolution:
         return FactorGraph(model, OPTIONS, noise_px=noise.sigma_px)
 
     adjusting = Adjusting(graph, graph, [free_params(camera, *OPTIONS.refine) for camera in model.cameras])
-    return adjust_to_control(model, control, marked, surveyed, found.is_inlier, adjusting)
+    return model, adjust_to_control(model, control, marked, surveyed, found.is_inlier, adjusting)
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ def measure(seed: int, layout: Layout, is_wrong: bool) -> Row:
         xyz = survey.control.xyz.copy()
         xyz[wrong, seed % 3] += 1.0
         survey = replace(survey, control=replace(survey.control, xyz=xyz))
-    solution = solve(survey)
+    _, solution = solve(survey)
     found = [one for p, one in enumerate(solution.left_out) if one is not None and solution.is_used[p]]
     named = np.flatnonzero(~solution.is_used).tolist()
     return Row(
