@@ -84,9 +84,10 @@ def poses_section(report: PosesReport) -> str:
         lines.append(f"model {model.model}: {text}")
         if model.positions is not None:
             lines.append(f"model {model.model}: {model.positions.sentence}")
+    wrong = {str(name) for found in report.contradictions for name in _names(found.evidence.get("images"))}
     rows = [
         [
-            ("t green" if image.is_used else "t red", image.name),
+            ("t green" if image.is_used and image.name not in wrong else "t red", image.name),
             *(("", None if value is None else f"{value:.3g}") for value in (image.off, image.off_deg, image.sigmas)),
             ("w", image.reason),
         ]
@@ -95,6 +96,10 @@ def poses_section(report: PosesReport) -> str:
     head = [("t", "photograph"), ("", "off"), ("", "degrees"), ("", "sigmas"), ("t", "")]
     texts = "".join(f"<li>{escape(line)}</li>" for line in lines)
     return f'<h2>Known poses</h2><p class="dim">{escape(report.path)}</p><ul>{texts}</ul>' + table(head, rows)
+
+
+def _names(value: object) -> Sequence[object]:
+    return value if isinstance(value, list) else ()
 
 
 def _points(points: Sequence[ControlPointRow]) -> str:

@@ -150,9 +150,13 @@ def camera_rows(image_set: ImageSet, model: Reconstruction | None, uncertainty: 
 
 
 def make_checks(
-    models: Sequence[ModelEntry], images: Sequence[ImageReport], cameras: Sequence[CameraReport]
+    models: Sequence[ModelEntry],
+    images: Sequence[ImageReport],
+    cameras: Sequence[CameraReport],
+    also: Sequence[Contradiction] = (),
 ) -> list[Check]:
-    """Traffic lights over the largest model and the contradictions of all, each with its thresholds in words."""
+    """Traffic lights over the largest model and the contradictions of all, and those found ``also``, each with its
+    thresholds in words."""
     summary, num_models = models[0], len(models)
     share = 100 * summary.num_registered / max(1, summary.num_images)
     features = float(np.median([image.funnel.features or 0 for image in images])) if images else 0.0
@@ -173,7 +177,7 @@ def make_checks(
     for camera in cameras:
         if camera.refined and camera.focal_sigma_px:
             checks.append(_check_focal(camera, camera.refined, camera.focal_sigma_px))
-    return checks + check_contradictions(found for model in models for found in model.contradictions)
+    return checks + check_contradictions([*(found for model in models for found in model.contradictions), *also])
 
 
 def check_control(control: ControlReport | None) -> list[Check]:
@@ -200,11 +204,11 @@ def check_poses(poses: PosesReport | None) -> list[Check]:
         return []
     refuted = sum(not image.is_used and image.model is not None for image in poses.images)
     largest = poses.models[0]
-    light: Light = "red" if largest.reason else "amber" if refuted else "green"
-    value = largest.reason or f"{largest.num_used} of {largest.num_known} agree with the photographs"
+    light: Light = "red" if largest.reason or poses.contradictions else "amber" if refuted else "green"
+    how = "held" if poses.is_fixed else "agree with the photographs"
+    value = largest.reason or f"{largest.num_used} of {largest.num_known} {how}"
     thresholds = "green: photographs refute none; amber: see Known poses"
-    own = Check(name="known poses", value=value, light=light, thresholds=thresholds)
-    return [own, *(check_contradictions(poses.contradictions) if poses.contradictions else ())]
+    return [Check(name="known poses", value=value, light=light, thresholds=thresholds)]
 
 
 def _apart(models: Sequence[ModelEntry]) -> list[str]:

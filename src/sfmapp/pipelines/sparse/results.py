@@ -123,7 +123,7 @@ def _make_report(
         ModelEntry(**model.summary(), contradictions=row.contradictions, apart=row.apart)
         for model, row in zip(models, mapped, strict=True)
     ]
-    images = _image_rows(run, failure)
+    images, poses = _image_rows(run, failure), run.stages.poses
     cameras = camera_rows(
         run.image_set, models[0] if models else None, mapped[0].uncertainty if mapped else Uncertainty()
     )
@@ -133,9 +133,9 @@ def _make_report(
         run=run.facts(),
         models=entries,
         checks=[
-            *make_checks(entries, images, cameras),
+            *make_checks(entries, images, cameras, poses.contradictions if poses is not None else ()),
             *check_control(run.stages.control),
-            *check_poses(run.stages.poses),
+            *check_poses(poses),
         ]
         if models
         else [],
