@@ -32,6 +32,7 @@ FLOORS = (
     ("georeference",),
     ("calibration",),
     ("twoview",),
+    ("panorama",),
     ("mapping",),
     ("adjust",),
     ("matching",),

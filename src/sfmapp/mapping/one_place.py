@@ -59,7 +59,8 @@ class OnePlace:
             )
             return text, f"a burst holds no depth: {_MOVE}"
         text = f"{many} were taken turning on the spot, by up to {self.turn_deg:.0f} degrees from one to another"
-        return text, f"turning on the spot gives no depth: {_MOVE}"
+        advice = f"turning on the spot gives no depth: {_MOVE}; or have sfmapp panorama make one picture of them"
+        return text, advice
 
 
 def find_one_place(

@@ -28,12 +28,13 @@ from sfmapp.report.model import (
     UndistortReport,
 )
 from sfmapp.report.pair_html import PairReport
+from sfmapp.report.panorama_html import PanoramaReport
 from sfmapp.report.validation import CloudValidation, Validation
 from sfmapp.reporting import Report, field_types
 
 # by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry, refine,
-# calibrate, locate and pair; calibration.json; validation/report.json and validation/cloud.json; what evaluate,
-# undistort, export and measure print with --json; and georeference.json
+# calibrate, locate, pair and panorama; calibration.json; validation/report.json and validation/cloud.json; what
+# evaluate, undistort, export and measure print with --json; and georeference.json
 KINDS: Mapping[str, type[Report]] = {
     "reconstruct": ReconstructionReport,
     "dense": DenseRunReport,
@@ -52,6 +53,7 @@ KINDS: Mapping[str, type[Report]] = {
     "locate": LocationReport,
     "measure": MeasureReport,
     "pair": PairReport,
+    "panorama": PanoramaReport,
 }
 _SIMPLE = {bool: "boolean", int: "integer", float: "number", str: "string", type(None): "null"}
 

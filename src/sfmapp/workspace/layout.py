@@ -14,6 +14,7 @@ __all__ = [
     "ODOMETRY",
     "PAGE",
     "PAIR",
+    "PANORAMA",
     "RECONSTRUCT",
     "REFINE",
     "REPORT",
@@ -24,7 +25,7 @@ __all__ = [
 FORMAT = f"{FORMAT_NAME} 1"
 # the commands that write workspaces; manifests of before the second one name none
 RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "refine", "dense", "undistort"
-CALIBRATE, LOCATE, PAIR = "calibrate", "locate", "pair"
+CALIBRATE, LOCATE, PAIR, PANORAMA = "calibrate", "locate", "pair", "panorama"
 # a report for programs, and the page for people beside it
 LOCK, REPORT, PAGE = ".lock", "report.json", "report.html"
 # where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0

@@ -12,22 +12,18 @@ from typing import TYPE_CHECKING, NamedTuple
 from sfmapp.adjust.solver import import_ahead
 from sfmapp.errors import NoReconstructionError, TooFewImagesError
 from sfmapp.events import Events
-from sfmapp.features.extract import extract_features
 from sfmapp.formats.colmap import read_model
 from sfmapp.georeference.sources import with_positions
 from sfmapp.images.load import Images, load_images, name_of
-from sfmapp.matching.pairs import select_pairs
-from sfmapp.matching.stage import match_images
 from sfmapp.pipelines.sparse import results
 from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
 from sfmapp.pipelines.sparse.known_lengths import parse_known_lengths
+from sfmapp.pipelines.sparse.matches import find_matches
 from sfmapp.pipelines.sparse.run import Run
 from sfmapp.pipelines.sparse.world import closing, has_factors, held_poses, read_control, read_known_poses
 from sfmapp.viewer.listener import RecordingListener
-from sfmapp.workspace.kernels import kernels_compiling
 from sfmapp.workspace.layout import RECONSTRUCT
 from sfmapp.workspace.options import Options
-from sfmapp.workspace.store import Store
 from sfmapp.workspace.usage import Stopwatch
 
 if TYPE_CHECKING:
@@ -123,31 +119,9 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
     if len(image_set.images) < 2:
         raise _too_few_photographs(image_set)
     import_ahead(len(image_set.images), with_factors=has_factors(run, image_set))
-    feature_keys = [keys.of_features(record.name) for record in image_set.images]
-    with (
-        kernels_compiling(events, run.usage),
-        Store(run.workspace.database, image_set, feature_keys, keys.matching) as store,
-    ):
-        with run.stage("features", keys.features):
-            run.features, extracted = extract_features(
-                image_set, options.features, threads=threads, events=events,
-                known=store.known_features(), on_features=store.put_features,
-            )  # fmt: skip
-            run.stages = replace(run.stages, features=extracted)
-        with run.stage("pairs", keys.pairs):
-            pairs, selected = select_pairs(
-                image_set, run.features, options.pairs, seed=options.seed, threads=threads, events=events
-            )
-            run.stages = replace(run.stages, pairs=selected)
-        with run.stage("matching", keys.matching):
-            run.correspondences, matched = match_images(
-                image_set, run.features, pairs, options.matching, seed=options.seed, threads=threads, events=events,
-                known=store.known_pairs(pairs), on_pair=store.put_pair,
-            )  # fmt: skip
-            store.flush()
-            run.stages = replace(run.stages, matching=matched)
+    correspondences = find_matches(run, image_set, keys)
     with run.stage("mapping"):
-        given = (image_set, run.features, run.correspondences, options.mapping)
+        given = (image_set, run.features, correspondences, options.mapping)
         if run.poses is not None and options.poses.fixed:
             models, mapped = map_known_poses(
                 *given,

@@ -1,0 +1,217 @@
+"""The panorama in small: what each photograph shows of it, how bright it is beside the others, and where seams run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.events import Events
+from sfmapp.panorama.canvas import Canvas, View
+from sfmapp.panorama.pictures import Pictures
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+STAGE = "seams"
+# pixels of the small panorama
+_PIXELS, _PIXELS_EACH = 4e5, 4e4
+# every so many pixels it is asked where a photograph is
+_STRIDE = 8
+# grey levels that tell of brightness: neither black nor clipped
+_DARK, _BRIGHT = 8.0, 247.0
+# Overlaps of fewer pixels of the small panorama say nothing.
+_FEWEST = 30
+# What is believed of exposures beforehand: within a factor of two, and the disagreement of an overlap within 5 %.
+_GAIN_SIGMA, _OVERLAP_SIGMA = math.log(2.0), 0.05
+_MOST_GAIN = 8.0
+# Colours are compared in means over so many pixels, so that a hair's breadth of parallax is no motion.
+_BLUR, _CLOSING = (5, 5), (9, 9)
+# What differs by so many grey levels, and by so many times the usual difference, has moved.
+_LEAST_DIFFERENCE, _UNUSUAL = 12.0, 4.0
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A photograph in the small panorama.
+
+    Attributes:
+        left, top: of its part. colors: (h, w, 3) float32. inside: (h, w) where it shows something.
+        depth: (h, w) float32, how far from its borders, from 0 to 1 in the middle.
+    """
+
+    left: int
+    top: int
+    colors: Floats
+    inside: Mask
+    depth: Floats
+
+
+def small_canvas(canvas: Canvas, num_images: int) -> Canvas:
+    """The canvas to look for gains and seams on."""
+    pixels = max(_PIXELS, _PIXELS_EACH * num_images)
+    return canvas.scaled(min(1.0, math.sqrt(pixels / (canvas.width * canvas.height))))
+
+
+def show_all(views: Sequence[View], pictures: Pictures, canvas: Canvas, events: Events) -> list[Shown]:
+    """Each photograph on a small canvas."""
+    events.started(STAGE, f"{len(views)} photographs in small", total=len(views))
+    out = []
+    for k, view in enumerate(views):
+        out.append(_show(view, pictures[k], canvas))
+        events.advanced(STAGE)
+    return out
+
+
+def _show(view: View, picture: NDArray[np.uint8], canvas: Canvas) -> Shown:
+    import cv2
+
+    columns, rows = (
+        np.arange(0, size + _STRIDE, _STRIDE, dtype=np.float64) + 0.5 * _STRIDE
+        for size in (canvas.width, canvas.height)
+    )
+    inside = view.pixels(canvas.rays(columns, rows).reshape(-1, 3))[1].reshape(len(rows), len(columns))
+    top, bottom = _reach(inside, 1, canvas.height)
+    left, right = _reach(inside, 0, canvas.width)
+    x, y = np.arange(left, right, dtype=np.float64) + 0.5, np.arange(top, bottom, dtype=np.float64) + 0.5
+    xy, mask = view.pixels(canvas.rays(x, y).reshape(-1, 3))
+    mask = mask.reshape(len(y), len(x))
+    factor = min(1.0, canvas.scale / view.camera.focal)
+    size = max(1, round(view.camera.width * factor)), max(1, round(view.camera.height * factor))
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    shape = np.array([view.camera.width, view.camera.height])
+    place = np.nan_to_num(xy, nan=-1e3) * (np.array(size) / shape) - 0.5
+    place = place.astype(np.float32).reshape(len(y), len(x), 2)
+    colors = cv2.remap(small, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
+    depth = np.clip((2.0 * np.minimum(xy, shape - xy) / shape).min(1), 0.0, 1.0)
+    depth = np.where(mask.ravel(), depth, 0.0).astype(np.float32).reshape(mask.shape)
+    return Shown(left, top, colors, mask, depth)
+
+
+def _reach(inside: Mask, axis: int, size: int) -> tuple[int, int]:
+    """First and last pixel along a side, with a stride more; everything if nothing was found."""
+    at = np.flatnonzero(inside.any(axis))
+    if not len(at):
+        return 0, size
+    return max(0, int(at[0] - 1) * _STRIDE), min(size, int(at[-1] + 2) * _STRIDE)
+
+
+def find_gains(shown: Sequence[Shown]) -> tuple[Array, Array]:
+    """(K, 3) factors for the colours of each photograph, and (K, 3) how far overlaps stay apart, as a logarithm.
+
+    The stored values of a photograph are a power of the light (about 1 / 2.2): a factor of the light is a factor of
+    them, and the median of their ratio over an overlap does not see what moved in it. Least squares over all overlaps
+    (Brown and Lowe, IJCV 2007, section 6), on logarithms, so that no photograph can be dimmed to agree.
+    """
+    num = len(shown)
+    pairs, ratios, weights = [], [], []
+    for i in range(num):
+        for j in range(i + 1, num):
+            both = _overlap(shown[i], shown[j])
+            if both is None:
+                continue
+            a, b = both
+            usable = ((a > _DARK) & (a < _BRIGHT) & (b > _DARK) & (b < _BRIGHT)).all(1)
+            if usable.sum() < _FEWEST:
+                continue
+            pairs.append((i, j))
+            ratios.append(np.median(np.log(b[usable] / a[usable]), axis=0))
+            weights.append(min(float(usable.sum()) / 1000.0, 1.0) / _OVERLAP_SIGMA**2)
+    if not pairs:
+        return np.ones((num, 3)), np.zeros((num, 3))
+    i, j = np.array(pairs).T
+    ratio, weight = np.array(ratios), np.array(weights)
+    normal = np.eye(num) / _GAIN_SIGMA**2
+    right = np.zeros((num, 3))
+    np.add.at(normal, (i, i), weight)
+    np.add.at(normal, (j, j), weight)
+    np.add.at(normal, (i, j), -weight)
+    np.add.at(normal, (j, i), -weight)
+    np.add.at(right, i, weight[:, None] * ratio)
+    np.add.at(right, j, -weight[:, None] * ratio)
+    logs = np.asarray(np.linalg.solve(normal, right), np.float64)
+    logs -= np.median(logs, axis=0)
+    left = np.abs(ratio + logs[j] - logs[i])
+    worst = np.zeros((num, 3))
+    np.maximum.at(worst, i, left)
+    np.maximum.at(worst, j, left)
+    return np.clip(np.exp(logs), 1.0 / _MOST_GAIN, _MOST_GAIN), worst
+
+
+def _overlap(a: Shown, b: Shown) -> tuple[Array, Array] | None:
+    """(N, 3) colours of both where both show something."""
+    left, top = max(a.left, b.left), max(a.top, b.top)
+    right = min(a.left + a.inside.shape[1], b.left + b.inside.shape[1])
+    bottom = min(a.top + a.inside.shape[0], b.top + b.inside.shape[0])
+    if right <= left or bottom <= top:
+        return None
+    parts = [(slice(top - each.top, bottom - each.top), slice(left - each.left, right - each.left)) for each in (a, b)]
+    both = a.inside[parts[0]] & b.inside[parts[1]]
+    if not both.any():
+        return None
+    return a.colors[parts[0]][both].astype(np.float64), b.colors[parts[1]][both].astype(np.float64)
+
+
+def find_seams(shown: Sequence[Shown], gains: Array, canvas: Canvas) -> NDArray[np.int16]:
+    """(H, W) which photograph is shown where, -1 for none, with no seam through what moved.
+
+    Each pixel is of the photograph whose borders are farthest away. Where photographs differ in a connected region, it
+    is shown by one of them that has all of it, so that what moved is there whole or not at all (Uyttendaele, Eden and
+    Szeliski, "Eliminating ghosting and exposure artifacts in image mosaics", CVPR 2001).
+    """
+    import cv2
+
+    label = np.full((canvas.height, canvas.width), -1, np.int16)
+    best = np.zeros(label.shape, np.float32)
+    colors = np.zeros((*label.shape, 3), np.float32)
+    own = [each.colors * gain.astype(np.float32) for each, gain in zip(shown, gains, strict=True)]
+    for k, each in enumerate(shown):
+        at = _place(each)
+        is_better = each.inside & (each.depth + 1e-6 > best[at])
+        label[at][is_better], best[at][is_better] = k, each.depth[is_better] + 1e-6
+        colors[at][is_better] = own[k][is_better]
+    difference = np.zeros(label.shape, np.float32)
+    for each, mine in zip(shown, own, strict=True):
+        at = _place(each)
+        apart = np.abs(cv2.blur(mine, _BLUR) - cv2.blur(colors[at], _BLUR)).max(2)
+        # the blur reaches beyond the borders of a photograph
+        inner = cv2.erode(each.inside.astype(np.uint8), np.ones(_BLUR, np.uint8), borderValue=0) > 0
+        np.maximum(difference[at], np.where(inner, apart, 0.0), out=difference[at])
+    seen = difference[label >= 0]
+    usual = float(np.median(seen)) if len(seen) else 0.0
+    moved = (difference > _LEAST_DIFFERENCE + _UNUSUAL * usual).astype(np.uint8)
+    moved = cv2.morphologyEx(moved, cv2.MORPH_CLOSE, np.ones(_CLOSING, np.uint8))
+    moved = cv2.dilate(moved, np.ones(_BLUR, np.uint8))
+    _, region, stats, _ = cv2.connectedComponentsWithStats(moved, connectivity=8)
+    for n, (left, top, width, height, _) in enumerate(stats.tolist()[1:], 1):
+        part = slice(top, top + height), slice(left, left + width)
+        mask = region[part] == n
+        if len(np.unique(label[part][mask])) > 1:
+            whole = _best_of_all(shown, (left, top), mask)
+            if whole >= 0:
+                label[part][mask] = whole
+    return label
+
+
+def _place(each: Shown) -> tuple[slice, slice]:
+    height, width = each.inside.shape
+    return slice(each.top, each.top + height), slice(each.left, each.left + width)
+
+
+def _best_of_all(shown: Sequence[Shown], corner: tuple[int, int], mask: Mask) -> int:
+    """The photograph that shows all of a region, farthest from its borders on the average; -1 for none."""
+    left, top = corner
+    height, width = mask.shape
+    best, found = 0.0, -1
+    for k, each in enumerate(shown):
+        y, x = top - each.top, left - each.left
+        if y < 0 or x < 0 or y + height > each.inside.shape[0] or x + width > each.inside.shape[1]:
+            continue
+        at = slice(y, y + height), slice(x, x + width)
+        if each.inside[at][mask].all() and (mean := float(each.depth[at][mask].mean())) > best:
+            best, found = mean, k
+    return found

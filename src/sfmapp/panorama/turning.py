@@ -1,0 +1,308 @@
+"""The stage that finds how a camera was turned: correspondences in, rotations and lenses with their sigmas out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.names import CameraModel
+from sfmapp.errors import NoReconstructionError
+from sfmapp.events import Events
+from sfmapp.mapping.tracks import USELESS_CONFIGS, build_tracks
+from sfmapp.matching.options import MatchingOptions
+from sfmapp.matching.two_view import error_threshold_px
+from sfmapp.panorama import pairs as turns
+from sfmapp.panorama.adjustment import Turned, TurnedFit, adjust_turns, rays_of_tracks, refinable
+from sfmapp.panorama.level import level
+from sfmapp.panorama.pairs import MatchedPixels, Turn
+from sfmapp.panorama.report import LensChoice, TurningReport
+from sfmapp.panorama.turning_report import judge_pairs, report_of
+from sfmapp.scene.correspondences import Correspondences
+from sfmapp.scene.features import Features
+from sfmapp.scene.tracks import Tracks
+
+if TYPE_CHECKING:
+    from sfmapp.images.image_set import ImageSet
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+STAGE = "rotations"
+# Before the distortion of the lens is known, matches in the corners may be off by that much more.
+_LOOSE = 4.0
+# Of all verified matches rotations are to explain three quarters: 96 % of a panorama of alike columns that match each
+# other wrongly, and 61 % of two planes, one behind the other, before which the camera moved.
+_LEAST_SHARE = 0.75
+# coefficients of distortion that are tried
+_MOST_DISTORTION = 2
+_ADVICE = (
+    "photographs taken from different places belong into sfmapp reconstruct; for a panorama turn the camera on the "
+    "spot, about its lens, and let each photograph overlap the next by a third"
+)
+
+
+@dataclass(frozen=True)
+class TurnedPhotographs:
+    """Photographs from one place.
+
+    Attributes:
+        image_idx: (K,) positions in the image set, ascending.
+        cameras: those of the set, refined.
+        camera_idx: (K,) positions in ``cameras``.
+        rotations: (K, 3, 3) cam_from_world; in the world y is down, and z looks at the middle of the panorama.
+        sigma_deg: (K, 3) about the axes of each camera.
+    """
+
+    image_idx: Ints
+    cameras: list[Camera]
+    camera_idx: Ints
+    rotations: Array
+    sigma_deg: Array
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """What is worked on.
+
+    Attributes:
+        pair_idx: (P,) pairs of the correspondences with enough matches. pixels: of each.
+        thresholds: of each, pixels.
+        image_camera_idx: (I,). priors: cameras as they were known.
+    """
+
+    correspondences: Correspondences
+    features: Sequence[Features]
+    pair_idx: Ints
+    pixels: list[MatchedPixels]
+    thresholds: list[float]
+    image_camera_idx: Ints
+    priors: list[Camera]
+    seed: int
+
+
+@dataclass(frozen=True)
+class _Round:
+    """Photographs that hang together, the pairs that hold them; ``tracks`` and below count among ``members``."""
+
+    members: Ints
+    groups: list[Ints]
+    used: Ints
+    tracks: Tracks
+    camera_idx: Ints
+    fit: TurnedFit
+
+
+def find_rotations(
+    image_set: ImageSet, features: Sequence[Features], correspondences: Correspondences, options: MatchingOptions, *,
+    seed: int, events: Events,
+) -> tuple[TurnedPhotographs, TurningReport]:  # fmt: skip
+    """Find the largest group of photographs that were taken from one place, their rotations and lenses.
+
+    Args:
+        image_set: the photographs. features: of each. correspondences: verified matches.
+        options: of the matching, for its threshold.
+        seed: of the draws.
+
+    Raises:
+        NoReconstructionError: no two photographs are a rotation apart, or most matches contradict that.
+    """
+    events.started(STAGE, f"rotations of {len(image_set.images)} photographs", total=4)
+    evidence = _evidence(image_set, features, correspondences, options, seed)
+    if not evidence.pixels:
+        raise NoReconstructionError("no two photographs have verified matches with each other", _ADVICE)
+    start = _start_cameras(evidence)
+    events.advanced(STAGE)
+    rough = _adjusted(evidence, start, _LOOSE, 1)
+    events.advanced(STAGE)
+    fine, choices = _chosen(evidence, rough)
+    events.advanced(STAGE)
+    verdicts = judge_pairs(evidence.pixels, evidence.thresholds, fine.members, fine.fit, seed)
+    total = sum(each.num_matches for each in verdicts.values())
+    share = sum(each.num_turned for each in verdicts.values()) / max(total, 1)
+    if share < _LEAST_SHARE:
+        raise NoReconstructionError(
+            f"the camera did not turn on the spot: rotations explain {share:.0%} of {total} verified matches between "
+            f"{len(fine.members)} photographs",
+            _ADVICE,
+        )
+    orientation = [image_set.images[i].orientation for i in fine.members]
+    found = TurnedPhotographs(
+        fine.members, fine.fit.state.cameras, fine.camera_idx,
+        level(fine.fit.state.rotations, orientation), fine.fit.rotation_sigma_deg,
+    )  # fmt: skip
+    report = report_of(
+        image_set, (fine.members, fine.groups), found.rotations, fine.fit, fine.tracks, verdicts,
+        (evidence.priors, start), choices,
+    )  # fmt: skip
+    events.advanced(STAGE)
+    events.finished(
+        STAGE, f"{len(found.image_idx)} of {len(image_set.images)} photographs turned on the spot", **report
+    )
+    return found, report
+
+
+def _evidence(
+    image_set: ImageSet, features: Sequence[Features], correspondences: Correspondences, options: MatchingOptions,
+    seed: int,
+) -> _Evidence:  # fmt: skip
+    useful = ~np.isin(correspondences.config, USELESS_CONFIGS)
+    pair_idx = np.flatnonzero(useful & (correspondences.num_inliers >= turns.MIN_MATCHES))
+    cameras = [_with_distortion(camera) for camera in image_set.cameras]
+    whose = np.array([record.camera_idx for record in image_set.images], np.int64)
+    pixels, thresholds = [], []
+    for p in pair_idx:
+        i, j = (int(k) for k in correspondences.pair_image_idx[p])
+        matches = correspondences.matches_of_pair(int(p))
+        both = tuple(features[k].keypoints[matches[:, side], :2].astype(np.float64) for side, k in enumerate((i, j)))
+        pixels.append(MatchedPixels((i, j), (int(whose[i]), int(whose[j])), (both[0], both[1])))
+        thresholds.append(error_threshold_px(cameras[whose[i]], cameras[whose[j]], options))
+    return _Evidence(correspondences, features, pair_idx, pixels, thresholds, whose, cameras, seed)
+
+
+def _with_distortion(camera: Camera) -> Camera:
+    """A camera whose model has the coefficients that may be refined, where it is one of the plainest."""
+    if camera.is_fixed or camera.model not in (CameraModel.SIMPLE_PINHOLE, CameraModel.SIMPLE_RADIAL):
+        return camera
+    params = np.zeros(5)
+    params[: len(camera.params)] = camera.params
+    return replace(camera, model=CameraModel.RADIAL, params=params)
+
+
+def _start_cameras(evidence: _Evidence) -> list[Camera]:
+    """Cameras with focal lengths from their own pairs."""
+    out = []
+    for c, camera in enumerate(evidence.priors):
+        own = [k for k, pair in enumerate(evidence.pixels) if pair.cameras == (c, c)]
+        homographies = [evidence.correspondences.homography[evidence.pair_idx[k]] for k in own]
+        threshold = evidence.thresholds[own[0]] if own else 1.0
+        out.append(turns.find_focal(camera, [evidence.pixels[k] for k in own], homographies, threshold, evidence.seed))
+    return out
+
+
+def _adjusted(evidence: _Evidence, cameras: list[Camera], loose: float, distortion: int) -> _Round:
+    """From cameras to rotations: pairs that are rotations, the largest group that they join, averaged, adjusted.
+
+    Raises:
+        NoReconstructionError: no pair is a rotation.
+    """
+    thresholds = [loose * each for each in evidence.thresholds]
+    found = turns.measure_turns(evidence.pixels, cameras, thresholds, evidence.seed)
+    used = np.array([k for k, turn in enumerate(found) if _is_turn(turn)], np.int64)
+    if not len(used):
+        best = max(found, key=lambda turn: turn.share)
+        raise NoReconstructionError(
+            f"the camera did not turn on the spot: of the matches of no pair of photographs a rotation explains more "
+            f"than {best.share:.0%}",
+            _ADVICE,
+        )
+    counts = np.array([int(found[k].is_inlier.sum()) for k in used])
+    rotations = np.array([found[k].rotation for k in used])
+    kept = turns.consistent([evidence.pixels[k].images for k in used], rotations, counts)
+    used, counts, rotations = used[kept], counts[kept], rotations[kept]
+    images = np.array([evidence.pixels[k].images for k in used]).reshape(-1, 2)
+    members, groups = turns.largest_component(len(evidence.image_camera_idx), images)
+    position = np.full(len(evidence.image_camera_idx), -1)
+    position[members] = np.arange(len(members))
+    inside = position[images[:, 0]] >= 0
+    used, counts, rotations, images = used[inside], counts[inside], rotations[inside], position[images[inside]]
+    turned, agrees = turns.average_rotations(len(members), images, rotations, counts)
+    used = used[agrees]
+    masks = {int(k): found[k].is_inlier for k in used}
+    tracks = _tracks(evidence, members, masks)
+    camera_idx = evidence.image_camera_idx[members]
+    state = Turned(cameras, turned, rays_of_tracks(cameras, turned, tracks, camera_idx))
+    free = [refinable(camera, distortion=distortion) for camera in cameras]
+    fit = adjust_turns(state, tracks, camera_idx, free, evidence.priors)
+    return _Round(members, groups, used, tracks, camera_idx, fit)
+
+
+def _is_turn(turn: Turn) -> bool:
+    return turn.share >= turns.MAJORITY and int(turn.is_inlier.sum()) >= turns.MIN_MATCHES
+
+
+def _tracks(evidence: _Evidence, members: Ints, masks: dict[int, NDArray[np.bool_]]) -> Tracks:
+    """Rays that the matches of some pairs tell, of the members alone."""
+    c = evidence.correspondences
+    pairs = evidence.pair_idx[list(masks)]
+    matches = [c.matches_of_pair(int(p))[mask] for p, mask in zip(pairs, masks.values(), strict=True)]
+    rest = {
+        field.name: getattr(c, field.name)[pairs] for field in fields(c) if field.name not in ("pair_ptr", "matches")
+    }
+    rest["pair_image_idx"] = np.searchsorted(members, rest["pair_image_idx"]).astype(np.int32)
+    pair_ptr = np.cumsum([0, *(len(each) for each in matches)])
+    chosen = replace(c, pair_ptr=pair_ptr, matches=np.concatenate(matches), **rest)
+    return build_tracks(chosen, [evidence.features[i] for i in members])[0]
+
+
+def _chosen(evidence: _Evidence, rough: _Round) -> tuple[_Round, list[LensChoice]]:
+    """The final adjustment, with as many coefficients of distortion as predict rays that they were not fitted to."""
+    fine = _adjusted(evidence, rough.fit.state.cameras, 1.0, 1)
+    halves = [_every_other(fine.tracks, k) for k in range(2)]
+    choices, fits = [], []
+    for distortion in range(_MOST_DISTORTION + 1):
+        free = [refinable(camera, distortion=distortion) for camera in evidence.priors]
+        if distortion and all(len(names) <= distortion for names in free):
+            break
+        state = replace(fine.fit.state, cameras=[_without(camera, distortion) for camera in fine.fit.state.cameras])
+        held_out = [_held_out(state, halves, k, fine, free, evidence.priors) for k in range(2)]
+        choices.append(LensChoice(num_distortion=distortion, held_out_px=held_out))
+        fits.append((state, free))
+    best = 0
+    for k in range(1, len(choices)):
+        if all(new < old for new, old in zip(choices[k].held_out_px, choices[best].held_out_px, strict=True)):
+            best = k
+    state, free = fits[best]
+    fit = adjust_turns(state, fine.tracks, fine.camera_idx, free, evidence.priors)
+    return replace(fine, fit=fit), choices
+
+
+def _without(camera: Camera, distortion: int) -> Camera:
+    """The camera without those coefficients that are not refined, where its prior had none."""
+    if camera.model != CameraModel.RADIAL or camera.is_fixed:
+        return camera
+    return camera.with_params([*camera.params[: 3 + distortion], *[0.0] * (_MOST_DISTORTION - distortion)])
+
+
+def _every_other(tracks: Tracks, first: int) -> Tracks:
+    """Half of the tracks."""
+    from sfmapp.scene.tracks import make_tracks
+
+    kept = tracks.obs_track_idx % 2 == first
+    return make_tracks(
+        tracks.num_images, (tracks.num_tracks + 1 - first) // 2, tracks.obs_track_idx[kept] // 2,
+        tracks.obs_image_idx[kept], tracks.obs_feature_idx[kept], tracks.obs_xy[kept],
+    )  # fmt: skip
+
+
+def _held_out(
+    state: Turned, halves: Sequence[Tracks], k: int, fine: _Round, free: Sequence[tuple[str, ...]],
+    priors: Sequence[Camera],
+) -> float:  # fmt: skip
+    """Root of the mean robust square of one half, of cameras that were fitted to the other."""
+    mine, other = halves[k], halves[1 - k]
+    start = replace(state, rays=rays_of_tracks(state.cameras, state.rotations, mine, fine.camera_idx))
+    fit = adjust_turns(start, mine, fine.camera_idx, free, priors)
+    cameras, turned = fit.state.cameras, fit.state.rotations
+    held = Turned(cameras, turned, rays_of_tracks(cameras, turned, other, fine.camera_idx))
+    squares = (residuals_px(held, other, fine.camera_idx) ** 2).sum(1)
+    scale2 = 9.0 * fine.fit.noise_px**2
+    return math.sqrt(scale2 * float(np.log1p(squares / scale2).mean()))
+
+
+def residuals_px(state: Turned, tracks: Tracks, camera_idx: Ints) -> Array:
+    """(O, 2) pixels less those predicted."""
+    from sfmapp.camera.camera import project
+
+    seen = np.einsum("nij,nj->ni", state.rotations[tracks.obs_image_idx], state.rays[tracks.obs_track_idx])
+    out = np.empty((tracks.num_observations, 2))
+    whose = camera_idx[tracks.obs_image_idx]
+    for c, camera in enumerate(state.cameras):
+        at = whose == c
+        out[at] = tracks.obs_xy[at] - project(camera, seen[at])
+    return out

@@ -1,0 +1,192 @@
+"""What is said of rotations: of every pair, photograph and camera, and of the photographs that were left out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.camera.camera import Camera, pixels_to_rays
+from sfmapp.contradictions import Contradiction
+from sfmapp.geometry import rigid3
+from sfmapp.panorama.adjustment import TurnedFit
+from sfmapp.panorama.pairs import MAJORITY, MIN_MATCHES, TURNED_SHARE, MatchedPixels, fit_turn
+from sfmapp.panorama.report import LensChoice, TurnedCamera, TurnedImage, TurnedPair, TurningReport
+from sfmapp.reporting import NamedReason
+from sfmapp.scene.tracks import Tracks
+
+if TYPE_CHECKING:
+    from sfmapp.images.image_set import ImageSet
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# The photographs tell a focal length when they do so to a twentieth, which EXIF, rounded to millimetres, does as well.
+_TOLD = 0.05
+# The median of the distance of two points that have the noise of one coordinate each: 2 sqrt(ln 2) of it.
+_MEDIAN_OF_NOISE = 2.0 * math.sqrt(math.log(2.0))
+# A pair whose median is below twice what noise makes of it says nothing of parallax.
+_TWICE = 2.0
+# A rotation that contradicts the panorama is red if it rests on so many matches, of those of its photographs' best pair
+_STRONG_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a panorama makes of a pair of its photographs: see :class:`~sfmapp.panorama.report.TurnedPair`."""
+
+    images: tuple[int, int]
+    num_matches: int
+    num_turned: int
+    threshold_px: float
+    turn_deg: float
+    median_px: float
+    parallax_px: float
+    verdict: str
+
+
+def judge_pairs(
+    pixels: Sequence[MatchedPixels], thresholds: Sequence[float], members: Ints, fit: TurnedFit, seed: int
+) -> dict[tuple[int, int], Verdict]:
+    """Hold all verified matches of pairs of members, used or not, to the rotations."""
+    position = {int(image): k for k, image in enumerate(members)}
+    cameras, rotations = fit.state.cameras, fit.state.rotations
+    expected = _MEDIAN_OF_NOISE * fit.noise_px
+    out = {}
+    for pair, threshold in zip(pixels, thresholds, strict=True):
+        if not all(image in position for image in pair.images):
+            continue
+        i, j = (position[image] for image in pair.images)
+        turn = rotations[j] @ rotations[i].T
+        both = [cameras[c] for c in pair.cameras]
+        a, b = (pixels_to_rays(camera, xy) for camera, xy in zip(both, pair.xy, strict=True))
+        focal = 0.5 * (both[0].focal + both[1].focal)
+        errors = focal * np.linalg.norm(a @ turn.T - b, axis=1)
+        # where a lens has no inverse, as far as anything can be apart
+        errors = np.where(np.isfinite(errors), errors, 2.0 * focal)
+        share, median = float((errors < threshold).mean()), float(np.median(errors))
+        verdict = "rotation" if share >= TURNED_SHARE else "parallax" if share >= MAJORITY else "no rotation"
+        if verdict == "no rotation" and fit_turn(a, b, focal, threshold, (seed, *pair.images)).share >= TURNED_SHARE:
+            verdict = "contradicted"
+        parallax = math.sqrt(median**2 - expected**2) if median > _TWICE * expected else 0.0
+        out[pair.images] = Verdict(
+            pair.images, len(errors), int((errors < threshold).sum()), threshold,
+            float(rigid3.rotation_angle_deg(turn)), median, parallax, verdict,
+        )  # fmt: skip
+    return out
+
+
+def report_of(
+    image_set: ImageSet, groups: tuple[Ints, Sequence[Ints]], rotations: Array, fit: TurnedFit, tracks: Tracks,
+    verdicts: Mapping[tuple[int, int], Verdict], before: tuple[Sequence[Camera], Sequence[Camera]],
+    choices: Sequence[LensChoice],
+) -> TurningReport:  # fmt: skip
+    """The report of the stage.
+
+    Args:
+        groups: photographs of the panorama, and those of other groups. rotations: (K, 3, 3), levelled.
+        before: cameras as they were known, and as pairs alone had them.
+    """
+    members, names = groups[0], image_set.names
+    total = sum(each.num_matches for each in verdicts.values())
+    turned = sum(each.num_turned for each in verdicts.values())
+    return TurningReport(
+        num_images=len(names),
+        num_turned=len(members),
+        noise_px=fit.noise_px,
+        correlation=fit.correlation,
+        num_rays=tracks.num_tracks,
+        num_observations=tracks.num_observations,
+        turned_share=turned / max(total, 1),
+        cameras=_cameras(image_set, members, fit, before),
+        images=_images(image_set, members, rotations, fit, tracks),
+        pairs=[
+            TurnedPair(
+                images=(names[each.images[0]], names[each.images[1]]), num_matches=each.num_matches,
+                num_turned=each.num_turned, threshold_px=each.threshold_px, turn_deg=each.turn_deg,
+                median_px=each.median_px, parallax_px=each.parallax_px,
+                verdict=each.verdict,
+            )
+            for each in verdicts.values()
+        ],
+        lens_choice=choices,
+        left_out=_left_out(image_set, members, groups[1]),
+        contradictions=_contradictions(verdicts, names),
+        thresholds={"turned_share": TURNED_SHARE, "majority": MAJORITY, "min_matches": MIN_MATCHES},
+    )  # fmt: skip
+
+
+def _cameras(
+    image_set: ImageSet, members: Ints, fit: TurnedFit, before: tuple[Sequence[Camera], Sequence[Camera]]
+) -> list[TurnedCamera]:
+    whose = [image_set.images[i].camera_idx for i in members]
+    out = []
+    for c in sorted(set(whose)):
+        camera, sigma = fit.state.cameras[c], fit.sigmas(c)
+        relative = sigma.get("log_focal")
+        out.append(TurnedCamera(
+            camera_idx=c, num_images=whose.count(c), model=camera.model.name, width=camera.width, height=camera.height,
+            prior_focal_px=before[0][c].focal, prior_source=before[0][c].focal_source,
+            start_focal_px=before[1][c].focal, focal_px=camera.focal,
+            focal_sigma_px=None if relative is None else relative * camera.focal,
+            params=camera.params.tolist(), refined=list(sigma), sigma=sigma,
+            is_told=relative is None or relative < _TOLD,
+        ))  # fmt: skip
+    return out
+
+
+def _images(image_set: ImageSet, members: Ints, rotations: Array, fit: TurnedFit, tracks: Tracks) -> list[TurnedImage]:
+    squares = (fit.residuals**2).sum(1)
+    counts = np.bincount(tracks.obs_image_idx, minlength=len(members))
+    sums = np.bincount(tracks.obs_image_idx, squares, len(members))
+    return [
+        TurnedImage(
+            name=image_set.images[i].name, camera_idx=image_set.images[i].camera_idx,
+            rotation=rigid3.quaternion(rotations[k]).tolist(), sigma_deg=fit.rotation_sigma_deg[k].tolist(),
+            num_rays=int(counts[k]), rms_px=math.sqrt(sums[k] / counts[k]) if counts[k] else None,
+        )
+        for k, i in enumerate(members)
+    ]  # fmt: skip
+
+
+def _left_out(image_set: ImageSet, members: Ints, others: Sequence[Ints]) -> list[NamedReason]:
+    inside = set(members.tolist())
+    of_group = {int(i): group for group in others for i in group}
+    out = []
+    for i, record in enumerate(image_set.images):
+        if i in inside:
+            continue
+        reason = "no photograph of the panorama is a rotation away from it: too few matches, or taken from elsewhere"
+        if i in of_group:
+            group = of_group[i]
+            first = image_set.images[int(group[0])].name
+            reason = (
+                f"belongs to another panorama, of {len(group)} photographs that overlap none of these (the first is "
+                f"{first}): give them alone"
+            )
+        out.append(NamedReason(name=record.name, reason=reason))
+    return out
+
+
+def _contradictions(verdicts: Mapping[tuple[int, int], Verdict], names: Sequence[str]) -> list[Contradiction]:
+    """Pairs that are rotations for themselves, others than the panorama has, on many matches."""
+    strongest: dict[int, int] = {}
+    for each in verdicts.values():
+        for image in each.images:
+            strongest[image] = max(strongest.get(image, 0), each.num_turned)
+    return [
+        Contradiction(
+            "panorama",
+            f"{each.num_matches} matches of {names[each.images[0]]} and {names[each.images[1]]} show a rotation that "
+            f"is not the panorama's: its median error there is {each.median_px:.1f} px",
+            "look at the two: if they show different places that look alike, leave one out",
+            {"num_matches": each.num_matches, "median_px": each.median_px},
+        )
+        for each in verdicts.values()
+        if each.verdict == "contradicted"
+        and each.num_matches > _STRONG_SHARE * min(strongest[image] for image in each.images)
+    ]

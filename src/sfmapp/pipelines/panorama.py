@@ -1,0 +1,284 @@
+"""Photographs that were taken turning on the spot, to one picture and the rotations of the camera."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sfmapp.errors import NoReconstructionError, UsageError
+from sfmapp.events import Events
+from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.colmap import MODEL_FILES
+from sfmapp.formats.gpano import Sphere, with_gpano
+from sfmapp.geometry import rigid3
+from sfmapp.images.load import Images, load_images, name_of
+from sfmapp.images.rewrite import encode
+from sfmapp.panorama.report import PictureReport, TurningReport
+from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
+from sfmapp.pipelines.sparse.matches import find_matches
+from sfmapp.pipelines.sparse.run import Run
+from sfmapp.report.model import Outcome
+from sfmapp.report.panorama_html import PanoramaReport, panorama_page
+from sfmapp.reporting import NamedReason, document_text
+from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.tracks import Tracks
+from sfmapp.workspace.kernels import PAIR_MODULES
+from sfmapp.workspace.keys import stage_key
+from sfmapp.workspace.layout import FORMAT, PAGE, PANORAMA, REPORT
+from sfmapp.workspace.manifest import raise_as_before
+from sfmapp.workspace.options import Options
+from sfmapp.workspace.usage import Stopwatch
+
+if TYPE_CHECKING:
+    from sfmapp.images.image_set import ImageSet
+    from sfmapp.panorama.canvas import Canvas, Projection
+    from sfmapp.panorama.stitch import StitchedPicture
+    from sfmapp.panorama.turning import TurnedPhotographs
+
+STAGE = PANORAMA
+# where the stages behind the matches begin
+STAGES = ("sfmapp.panorama.turning", "sfmapp.panorama.stitch", "sfmapp.formats.gpano")
+ROTATIONS = "rotations.json"
+FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".tif": "tiff", ".tiff": "tiff"}
+# what a side of a JPEG may have
+_MOST_OF_JPEG = 65500
+
+
+@dataclass(frozen=True)
+class PictureLayout:
+    """How the picture is made.
+
+    Attributes:
+        file: its name in the folder, whose ending says the format.
+        projection: None: as the field of view asks for. max_size: limit of its longer side; None: none but JPEG's.
+    """
+
+    file: str = "panorama.jpg"
+    projection: Projection | None = None
+    max_size: int | None = None
+
+    def __post_init__(self) -> None:
+        if Path(self.file).name != self.file or self.format not in FORMATS.values():
+            raise UsageError(
+                f"{self.file}: expected the name of a file that ends in one of {', '.join(FORMATS)}",
+                "it is written into OUT",
+            )
+        if self.max_size is not None and self.max_size < 1:
+            raise UsageError(f"the longer side of the picture is to be {self.max_size} pixels", "give one or more")
+        if self.projection not in (None, "spherical", "cylindrical", "planar"):
+            raise UsageError(f"projection {self.projection!r} is not known", "spherical, cylindrical or planar")
+
+    @property
+    def format(self) -> str:
+        return FORMATS.get(Path(self.file).suffix.lower(), "")
+
+    @property
+    def limit(self) -> int | None:
+        """Of the longer side, pixels."""
+        if self.format != "jpeg":
+            return self.max_size
+        return min(self.max_size or _MOST_OF_JPEG, _MOST_OF_JPEG)
+
+
+@dataclass(frozen=True)
+class PanoramaResult:
+    """What was written.
+
+    Attributes:
+        output: the folder. picture: the file.
+        report: of it.
+    """
+
+    output: Path
+    picture: Path
+    report: PanoramaReport
+
+
+def stitch_panorama(
+    images: Images,
+    output: str | os.PathLike[str],
+    options: Options | None = None,
+    *,
+    layout: PictureLayout | None = None,
+    events: Events | None = None,
+    watch: Stopwatch | None = None,
+) -> PanoramaResult:
+    """Stitch photographs that were taken turning on the spot.
+
+    What an earlier run in the same folder has done is used where it still holds.
+
+    Args:
+        images: as of :func:`sfmapp.reconstruct`.
+        output: a new folder, an empty one, or that of an earlier call.
+        options: of these, images, features, pairs, matching, seed and threads.
+        layout: of the picture.
+        events: progress, warnings and cancellation.
+        watch: started when the run began.
+
+    Raises:
+        UsageError: an output that holds something else, or a picture of a kind that is not known.
+        InputError: no photographs.
+        NoReconstructionError: the camera did not turn on the spot, or nothing overlaps; the report is written.
+        InterruptedRunError: ``events`` was asked to stop; the same call resumes.
+    """
+    layout = layout or PictureLayout()
+    with Run.opened(PANORAMA, name_of(images), output, options, events=events, watch=watch, images=images) as run:
+        report = _run(run, layout)
+        return PanoramaResult(run.workspace.folder, run.workspace.folder / layout.file, report)
+
+
+def _run(run: Run, layout: PictureLayout) -> PanoramaReport:
+    with run.stage("images"):
+        image_set, described = load_images(run.images, run.options.images, run.events, threads=run.threads)
+        run.image_set, run.stages = image_set, replace(run.stages, images=described)
+    keys = stage_keys(run.options, image_set)
+    key = stage_key(
+        STAGES, None, keys.matching, [layout.file, layout.projection, layout.limit],
+        [record.orientation for record in image_set.images],
+    )  # fmt: skip
+    if (known := _earlier(run, layout, key)) is not None:
+        return known
+    run.workspace.note(image_root=os.fspath(image_set.root or ""))
+    run.note_inputs(keys.inputs)
+    try:
+        turning, picture, drawn = _stitched(run, image_set, keys, layout, key)
+    except NoReconstructionError as failure:
+        run.workspace.begin(STAGE, key)
+        _write_report(run, _report(run, None, None, failure), None, failure)
+        raise
+    report = _report(run, turning, picture, None)
+    return _write_report(run, report, drawn, None)
+
+
+def _earlier(run: Run, layout: PictureLayout, key: str) -> PanoramaReport | None:
+    """The report of an earlier run, if all that this one would write is there."""
+    workspace = run.workspace
+    if not workspace.is_current(STAGE, key):
+        return None
+    raise_as_before(workspace.manifest.stage(STAGE))
+    wanted = [workspace.folder / name for name in (layout.file, ROTATIONS, PAGE)]
+    wanted += [workspace.model() / name for name in MODEL_FILES]
+    report = workspace.read_report(PanoramaReport)
+    if report is None or not all(path.is_file() for path in wanted):
+        return None
+    return replace(report, run=replace(report.run, is_up_to_date=True, **run.watch.read()))
+
+
+def _stitched(
+    run: Run, image_set: ImageSet, keys: StageKeys, layout: PictureLayout, key: str
+) -> tuple[TurningReport, PictureReport, StitchedPicture]:
+    """From photographs to the picture, which is written with the rotations."""
+    from sfmapp.panorama.stitch import stitch
+    from sfmapp.panorama.turning import find_rotations
+
+    options, workspace = run.options, run.workspace
+    if len(image_set.images) < 2:
+        found = image_set.images[0].name if image_set.images else "none"
+        raise NoReconstructionError(
+            f"expected two usable photographs or more, found {found}",
+            "give photographs that overlap, taken turning on the spot",
+        )
+    correspondences = find_matches(run, image_set, keys, PAIR_MODULES)
+    with run.stage("rotations"):
+        turned, turning = find_rotations(
+            image_set, run.features, correspondences, options.matching, seed=options.seed, events=run.events
+        )
+    _warn(run, turning)
+    with run.stage("picture"):
+        drawn, picture = stitch(
+            image_set, turned, projection=layout.projection, max_size=layout.limit, events=run.events
+        )
+    with run.stage("output"):
+        workspace.begin(STAGE, key)
+        run.save_first(lambda: _write_picture(workspace.folder / layout.file, drawn, layout))
+        workspace.write_models([_model(image_set, turned)], [np.zeros((0, 2))] * len(turned.image_idx), run.events)
+        workspace.write_json(ROTATIONS, _rotations(turning))
+    return turning, replace(picture, file=layout.file), drawn
+
+
+def _warn(run: Run, turning: TurningReport) -> None:
+    for contradiction in turning.contradictions:
+        run.events.warned("rotations", contradiction.message)
+    for camera in turning.cameras:
+        if not camera.is_told:
+            run.events.warned(
+                "rotations",
+                f"the photographs do not tell the focal length of camera {camera.camera_idx}: {camera.focal_px:.0f} px "
+                f"follow from what was known before ({camera.prior_source}). It does not show where little is turned",
+            )
+
+
+def _write_picture(path: Path, drawn: StitchedPicture, layout: PictureLayout) -> None:
+    data = encode(drawn.pixels, layout.format)
+    if drawn.canvas.projection == "spherical":
+        data = with_gpano(data, _sphere(drawn.canvas))
+    with replaced_file(path) as beside:
+        beside.write_bytes(data)
+
+
+def _sphere(canvas: Canvas) -> Sphere:
+    full_width, full_height = round(2.0 * np.pi * canvas.scale), round(np.pi * canvas.scale)
+    left, top = round(canvas.left + 0.5 * full_width), round(canvas.top + 0.5 * full_height)
+    return Sphere(
+        canvas.width, canvas.height, max(full_width, canvas.width), max(full_height, canvas.height),
+        left % max(full_width, 1), max(top, 0),
+    )  # fmt: skip
+
+
+def _model(image_set: ImageSet, turned: TurnedPhotographs) -> Reconstruction:
+    """Cameras at one centre, without points, which have no distance."""
+    names = [image_set.images[i].name for i in turned.image_idx]
+    empty = np.zeros(0, np.int64)
+    tracks = Tracks.from_observations(empty, empty, np.zeros((0, 2)), num_images=len(names))
+    used = sorted(set(turned.camera_idx.tolist()))
+    model = Reconstruction.empty(
+        [turned.cameras[c] for c in used], names, np.searchsorted(used, turned.camera_idx).astype(np.int32), tracks
+    )
+    model.cam_from_world = rigid3.from_matrix(turned.rotations, np.zeros((len(names), 3)))
+    return model
+
+
+def _rotations(turning: TurningReport) -> dict[str, object]:
+    """What ``rotations.json`` holds."""
+    return {
+        "convention": (
+            "cam_from_world is a quaternion x, y, z, w; cameras and world have x right, y down, z forward; sigma_deg "
+            "is about the x, y and z axes of the camera, in the gauge in which the rotations do not turn as a whole"
+        ),
+        "noise_px": turning.noise_px,
+        "cameras": turning.cameras,
+        "images": [
+            {"name": each.name, "camera": each.camera_idx, "cam_from_world": each.rotation, "sigma_deg": each.sigma_deg}
+            for each in turning.images
+        ],
+    }
+
+
+def _report(
+    run: Run, turning: TurningReport | None, picture: PictureReport | None, failure: NoReconstructionError | None
+) -> PanoramaReport:
+    skipped = run.image_set.skipped if run.image_set is not None else ()
+    return PanoramaReport(
+        format=FORMAT, outcome=Outcome.of(failure), run=run.facts(), turning=turning, picture=picture,
+        skipped=[NamedReason(name=name, reason=reason) for name, reason in skipped], usage=run.usage,
+        warnings=run.log.warnings, decisions=run.log.decisions,
+    )  # fmt: skip
+
+
+def _write_report(
+    run: Run, report: PanoramaReport, drawn: StitchedPicture | None, failure: NoReconstructionError | None
+) -> PanoramaReport:
+    workspace = run.workspace
+    page = panorama_page(report, None if drawn is None else drawn.pixels)
+    run.save_first(lambda: workspace.write_text(PAGE, page))
+    took = run.watch.read()
+    report = replace(report, run=replace(report.run, **took))
+    run.save_first(lambda: workspace.write_text(REPORT, document_text(report)))
+    workspace.finish(STAGE, run.usage.get("picture"), outcome=Outcome.of(failure), run=took)
+    workspace.note(usage=run.usage)
+    run.save_first(workspace.save)
+    return report

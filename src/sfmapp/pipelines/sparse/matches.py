@@ -1,0 +1,51 @@
+"""From photographs to verified matches, with what an earlier run has stored of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from sfmapp.features.extract import extract_features
+from sfmapp.matching.pairs import select_pairs
+from sfmapp.matching.stage import match_images
+from sfmapp.workspace.kernels import MODULES, kernels_compiling
+from sfmapp.workspace.store import Store
+
+if TYPE_CHECKING:
+    from sfmapp.images.image_set import ImageSet
+    from sfmapp.pipelines.sparse.keys import StageKeys
+    from sfmapp.pipelines.sparse.run import Run
+    from sfmapp.scene.correspondences import Correspondences
+
+
+def find_matches(run: Run, image_set: ImageSet, keys: StageKeys, modules: tuple[str, ...] = MODULES) -> Correspondences:
+    """Features, pairs and matches of photographs, which are put into the run and its database.
+
+    Args:
+        modules: whose kernels the run will need, compiled meanwhile.
+    """
+    options, events, threads = run.options, run.events, run.threads
+    feature_keys = [keys.of_features(record.name) for record in image_set.images]
+    with (
+        kernels_compiling(events, run.usage, modules),
+        Store(run.workspace.database, image_set, feature_keys, keys.matching) as store,
+    ):
+        with run.stage("features", keys.features):
+            run.features, extracted = extract_features(
+                image_set, options.features, threads=threads, events=events,
+                known=store.known_features(), on_features=store.put_features,
+            )  # fmt: skip
+            run.stages = replace(run.stages, features=extracted)
+        with run.stage("pairs", keys.pairs):
+            pairs, selected = select_pairs(
+                image_set, run.features, options.pairs, seed=options.seed, threads=threads, events=events
+            )
+            run.stages = replace(run.stages, pairs=selected)
+        with run.stage("matching", keys.matching):
+            run.correspondences, matched = match_images(
+                image_set, run.features, pairs, options.matching, seed=options.seed, threads=threads, events=events,
+                known=store.known_pairs(pairs), on_pair=store.put_pair,
+            )  # fmt: skip
+            store.flush()
+            run.stages = replace(run.stages, matching=matched)
+    return run.correspondences

@@ -1,0 +1,273 @@
+"""Panoramas: rotations and their sigmas on synthetic rays, and pictures that are stitched from views of one sphere."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from schemas import check_schema
+from sfmapp.camera.camera import Camera, CameraModel, project
+from sfmapp.cli.main import main
+from sfmapp.formats.colmap import read_model
+from sfmapp.geometry import rigid3
+from sfmapp.images.headers import read_header
+from sfmapp.panorama import compose, pairs
+from sfmapp.panorama.adjustment import Turned, TurnedFit, adjust_turns, refinable
+from sfmapp.panorama.canvas import View, choose_canvas
+from sfmapp.panorama.level import level
+from sfmapp.panorama.preview import Shown, find_gains
+from sfmapp.scene.tracks import Tracks
+
+Array = NDArray[np.float64]
+
+LENS = Camera(CameraModel.RADIAL, 400, 300, np.array([330.0, 200.0, 150.0, -0.08, 0.01]))
+UNKNOWN = Camera(CameraModel.RADIAL, 400, 300, np.array([480.0, 200.0, 150.0, 0.0, 0.0]))
+
+
+def ring(num: int, pitch: float = 0.0) -> Array:
+    """(num, 3, 3) cam_from_world all round, cameras level but for the pitch, in degrees."""
+    yaw = np.radians(360.0 / num) * np.arange(num)
+    tilt = rigid3.exp_so3([np.radians(pitch), 0.0, 0.0])
+    return np.asarray(tilt @ rigid3.exp_so3(np.outer(-yaw, [0.0, 1.0, 0.0])), np.float64)
+
+
+def scene(rotations: Array, num_rays: int, noise: float, seed: int) -> tuple[Tracks, Array]:
+    """What cameras of LENS see of random directions, and these."""
+    rng = np.random.default_rng(seed)
+    rays = rng.normal(size=(num_rays, 3)) * [1.0, 0.4, 1.0]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    track, image, pixels = [], [], []
+    for k, rotation in enumerate(rotations):
+        seen = rays @ rotation.T
+        xy = project(LENS, seen)
+        shown = (seen[:, 2] > 0.3) & (xy > 0).all(1) & (xy < [400, 300]).all(1)
+        track.append(np.flatnonzero(shown))
+        image.append(np.full(shown.sum(), k))
+        pixels.append(xy[shown])
+    ids, images, xy = np.concatenate(track), np.concatenate(image), np.concatenate(pixels)
+    kept = np.isin(ids, np.flatnonzero(np.bincount(ids, minlength=num_rays) > 1))
+    _, ids = np.unique(ids[kept], return_inverse=True)
+    used = np.unique(np.concatenate(track)[kept])
+    xy = xy[kept] + noise * rng.normal(size=(kept.sum(), 2))
+    return Tracks.from_observations(ids, images[kept], xy, num_images=len(rotations)), rays[used]
+
+
+def adjusted(rotations: Array, noise: float, seed: int) -> TurnedFit:
+    tracks, rays = scene(rotations, 1500, noise, seed)
+    rng = np.random.default_rng(seed + 1000)
+    start = Turned(
+        [LENS.with_params([338.0, 200.0, 150.0, 0.0, 0.0])],
+        rigid3.exp_so3(0.01 * rng.normal(size=(len(rotations), 3))) @ rotations, rays,
+    )  # fmt: skip
+    whose = np.zeros(len(rotations), np.int64)
+    return adjust_turns(start, tracks, whose, [refinable(UNKNOWN, distortion=2)], [UNKNOWN])
+
+
+def errors(fit: TurnedFit, truth: Array) -> Array:
+    """(I, 3) radians about the axes of each camera, in the gauge of the covariance."""
+    away = rigid3.log_so3(fit.state.rotations @ truth.swapaxes(1, 2))
+    common = np.einsum("nji,nj->ni", truth, away).mean(0)
+    return np.asarray(away - truth @ common, np.float64)
+
+
+def test_exact_rays_give_back_the_cameras() -> None:
+    fit = adjusted(ring(10), 0.0, 0)
+    assert np.abs(errors(fit, ring(10))).max() < 1e-6
+    assert np.abs(fit.state.cameras[0].params - LENS.params).max() < 1e-3
+    assert fit.correlation < 1.3
+
+
+def test_sigmas_are_those_of_the_errors() -> None:
+    """Of 20 rings with noise: 600 errors of rotations, 20 of each lens parameter; the bounds are three sigmas wide."""
+    truth, rotation, focal, k1 = ring(10), [], [], []
+    for seed in range(20):
+        fit = adjusted(truth, 0.4, seed)
+        assert fit.noise_px == pytest.approx(0.4, rel=0.08)
+        rotation.append((errors(fit, truth) / np.radians(fit.rotation_sigma_deg)) ** 2)
+        sigma = fit.sigmas(0)
+        focal.append((np.log(fit.state.cameras[0].focal / LENS.focal) / sigma["log_focal"]) ** 2)
+        k1.append(((fit.state.cameras[0].params[3] - LENS.params[3]) / sigma["k1"]) ** 2)
+    # errors of neighbours in a ring go together: some three hundred of the six hundred are free
+    assert 0.75 < np.mean(rotation) < 1.25
+    assert 0.2 < np.mean(focal) < 2.1
+    assert 0.2 < np.mean(k1) < 2.1
+
+
+def test_a_wrong_pair_is_found_out_by_its_triangles_and_a_loop_is_shared() -> None:
+    truth = ring(8)
+    edges = [(i, (i + step) % 8) for i in range(8) for step in (1, 2)]
+    edges = [(min(e), max(e)) for e in edges]
+    rng = np.random.default_rng(0)
+    turns = np.array([rigid3.exp_so3(0.004 * rng.normal(size=3)) @ truth[j] @ truth[i].T for i, j in edges])
+    counts = np.full(len(edges), 80)
+    turns[5] = rigid3.exp_so3([0.0, 0.9, 0.0]) @ turns[5]
+    kept = pairs.consistent(edges, turns, counts)
+    assert kept.tolist() == [k != 5 for k in range(len(edges))]
+    found, agrees = pairs.average_rotations(8, np.array(edges)[kept], turns[kept], counts[kept])
+    assert agrees.all()
+    away = rigid3.log_so3(found @ found[0].T @ truth[0] @ truth.swapaxes(1, 2))
+    assert np.abs(away).max() < 0.02
+
+
+def test_half_of_the_matches_may_be_wrong() -> None:
+    rng = np.random.default_rng(3)
+    a = rng.normal(size=(200, 3)) + np.array([0.0, 0.0, 4.0])
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    turn = rigid3.exp_so3([0.1, -0.4, 0.05])
+    b = a @ turn.T
+    b[::2] = rng.normal(size=(100, 3))
+    b /= np.linalg.norm(b, axis=1, keepdims=True)
+    found = pairs.fit_turn(a, b, 500.0, 2.0, (0, 1))
+    assert rigid3.rotation_angle_deg(found.rotation @ turn.T) < 1e-3
+    assert found.is_inlier[1::2].all()
+    same = np.repeat(a[:1], 20, axis=0)
+    assert np.isfinite(pairs.fit_turn(same, same, 500.0, 2.0, (0, 1)).rotation).all()
+    assert not pairs.fit_turn(np.full((20, 3), np.nan), a[:20], 500.0, 2.0, (0, 1)).is_inlier.any()
+
+
+@pytest.mark.parametrize("pitch", [0.0, 25.0])
+def test_a_ring_is_levelled(pitch: float) -> None:
+    tilted = ring(9, pitch) @ rigid3.exp_so3([0.2, 0.3, -0.4])
+    levelled = level(tilted, [1] * 9)
+    assert np.abs(levelled[:, 0, 1]).max() < 1e-9  # the x axes are horizontal
+    assert (levelled[:, 1, 1] > 0.5).all()  # and down is down
+
+
+def test_gains_undo_exposures() -> None:
+    rng = np.random.default_rng(0)
+    base = rng.uniform(60.0, 110.0, (40, 200, 3)).astype(np.float32)
+    factors = [1.0, 2.0, 0.8]
+    shown = [
+        Shown(60 * k, 0, base[:, 60 * k : 60 * k + 80] * factor, np.ones((40, 80), bool), np.ones((40, 80), np.float32))
+        for k, factor in enumerate(factors)
+    ]
+    gains, apart = find_gains(shown)
+    products = gains * np.array(factors)[:, None]
+    assert np.abs(products / products[0] - 1.0).max() < 0.02
+    assert apart.max() < 0.02
+
+
+def test_strips_and_tiles_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The margin is as wide as a pixel reaches: the same picture, whatever it is cut into."""
+    rng = np.random.default_rng(0)
+    pictures = [rng.integers(0, 256, (300, 400, 3)).astype(np.uint8) for _ in range(2)]
+    views = [View.of(LENS, rotation) for rotation in ring(10)[:2]]
+    canvas = choose_canvas(views, "cylindrical", None)
+    label = np.zeros((canvas.height, canvas.width), np.int16)
+    label[:, canvas.width // 2 :] = 0
+    label[:, : canvas.width // 2] = 1
+    plan = compose.Plan(canvas, views, np.ones((2, 3)), canvas, label)
+
+    class Given:
+        def __getitem__(self, k: int) -> NDArray[np.uint8]:
+            return pictures[k]
+
+    whole = compose._blend(plan, Given(), compose._Tile(0, 0, canvas.width, canvas.height))  # type: ignore[arg-type]
+    part = compose._blend(plan, Given(), compose._Tile(128, 64, 96, 128))  # type: ignore[arg-type]
+    difference = whole[0][64:192, 128:224].astype(int) - part[0].astype(int)
+    assert np.abs(difference).max() <= 1
+    assert (whole[1][64:192, 128:224] == part[1]).all()
+
+
+def sphere() -> NDArray[np.uint8]:
+    """(512, 1024, 3) an equirectangular texture."""
+    rng = np.random.default_rng(7)
+    total = np.zeros((512, 1024, 3))
+    for size, weight in ((8, 1.0), (32, 0.8), (128, 0.7), (512, 0.4)):
+        part = rng.normal(size=(size // 2, size, 3))
+        part = np.concatenate([part, part[:, :1]], 1)
+        total += weight * cv2.resize(part, (1024, 512), interpolation=cv2.INTER_CUBIC)
+    return np.clip(128 + 45 * total, 0, 255).astype(np.uint8)
+
+
+def photograph(texture: NDArray[np.uint8], rotation: Array, focal: float) -> NDArray[np.uint8]:
+    """(240, 320, 3) of a pinhole at the centre of the sphere."""
+    y, x = np.mgrid[0:240, 0:320]
+    rays = np.stack([(x - 159.5) / focal, (y - 119.5) / focal, np.ones_like(x)], -1) @ rotation
+    u = (np.arctan2(rays[..., 0], rays[..., 2]) / np.pi + 1.0) * 512 - 0.5
+    v = (np.arcsin(rays[..., 1] / np.linalg.norm(rays, axis=-1)) / np.pi + 0.5) * 512 - 0.5
+    return cv2.remap(texture, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+
+
+@pytest.fixture(scope="module")
+def stitched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Array]:
+    """Photographs, one of them of something else, their panorama, and the rotations."""
+    folder = tmp_path_factory.mktemp("panorama")
+    photos, texture = folder / "photos", sphere()
+    photos.mkdir()
+    rotations = ring(12)[:4]
+    for k, rotation in enumerate(rotations):
+        pixels = photograph(texture, rotation, 250.0)
+        Image.fromarray(pixels).save(photos / f"{k}.png")
+    noise = np.random.default_rng(1).integers(0, 256, (60, 80, 3)).astype(np.uint8)
+    Image.fromarray(noise).resize((320, 240)).save(photos / "stray.png")
+    assert main(["panorama", str(photos), "-o", str(folder / "out"), "--projection", "spherical", "-q"]) == 0
+    return photos, folder / "out", rotations
+
+
+def test_photographs_become_a_panorama(stitched: tuple[Path, Path, Array]) -> None:
+    photos, out, truth = stitched
+    report = json.loads((out / "report.json").read_text())
+    check_schema("panorama", report)
+    assert [one["name"] for one in report["turning"]["left_out"]] == ["stray.png"]
+    focal = report["turning"]["cameras"][0]
+    assert focal["focal_px"] == pytest.approx(250.0, rel=0.005)
+    model, _ = read_model(out / "sparse" / "0")
+    assert np.abs(model.cam_from_world[:, 4:]).max() == 0.0
+    found = rigid3.rotation_matrix(model.cam_from_world)
+    away = found @ found[0].T @ truth[0] @ truth.swapaxes(1, 2)
+    assert rigid3.rotation_angle_deg(away).max() < 0.1
+    entries = json.loads((out / "rotations.json").read_text())["images"]
+    assert np.allclose(entries[1]["cam_from_world"], model.cam_from_world[1, :4], atol=1e-9)
+    assert "<img" in (out / "report.html").read_text()
+    # the panorama is the texture: the same rays have the same colours
+    data = (out / "panorama.jpg").read_bytes()
+    tags = {name: int(value) for name, value in re.findall(rb'GPano:(\w+)="(\d+)"', data)}
+    header = read_header(data)
+    assert tags[b"CroppedAreaImageWidthPixels"] == header.width
+    assert tags[b"FullPanoWidthPixels"] == pytest.approx(2 * np.pi * focal["focal_px"], abs=1.0)
+    picture = np.asarray(Image.open(out / "panorama.jpg"), np.float64)
+    view = rigid3.rotation_matrix(model.cam_from_world[1, :4])
+    ray = view.T @ np.array([0.05, 0.02, 1.0])
+    x = np.arctan2(ray[0], ray[2]) * focal["focal_px"] + 0.5 * tags[b"FullPanoWidthPixels"]
+    y = np.arcsin(ray[1] / np.linalg.norm(ray)) * focal["focal_px"] + 0.5 * tags[b"FullPanoHeightPixels"]
+    at = int(x - tags[b"CroppedAreaLeftPixels"]), int(y - tags[b"CroppedAreaTopPixels"])
+    source = np.asarray(Image.open(photos / "1.png"), np.float64)
+    there = source[120 + 4 : 120 + 7, 160 + 11 : 160 + 14].mean((0, 1))
+    assert np.abs(picture[at[1] - 1 : at[1] + 2, at[0] - 1 : at[0] + 2].mean((0, 1)) - there).max() < 12.0
+
+
+def test_the_same_command_has_nothing_to_do(
+    stitched: tuple[Path, Path, Array], capsys: pytest.CaptureFixture[str]
+) -> None:
+    photos, out, _ = stitched
+    before = (out / "panorama.jpg").stat().st_mtime_ns
+    assert main(["panorama", str(photos), "-o", str(out), "--projection", "spherical"]) == 0
+    assert "up to date" in capsys.readouterr().out
+    assert (out / "panorama.jpg").stat().st_mtime_ns == before
+
+
+def test_what_is_no_panorama_is_refused(tmp_path: Path, stitched: tuple[Path, Path, Array]) -> None:
+    photos, _, _ = stitched
+    assert main(["panorama", str(tmp_path / "nowhere"), "-o", str(tmp_path / "a"), "-q"]) == 3
+    assert main(["panorama", str(photos), "-o", str(tmp_path / "b"), "--picture", "a.gif", "-q"]) == 2
+    assert main(["panorama", str(photos / "0.png"), "-o", str(tmp_path / "c"), "-q"]) in (3, 4)
+    flat = tmp_path / "flat"
+    flat.mkdir()
+    texture = sphere()
+    for k in range(3):  # a wall seen from three places, before a nearer one that hides half of it
+        far, near = texture[100:340, 100 + 20 * k : 420 + 20 * k], texture[200:440, 500 + 60 * k : 820 + 60 * k]
+        stripes = (np.arange(320) // 40 % 2 == 0)[None, :, None]
+        Image.fromarray(np.where(stripes, far, near)).save(flat / f"{k}.png")
+    out = tmp_path / "d"
+    assert main(["panorama", str(flat), "-o", str(out), "-q"]) == 4
+    report = json.loads((out / "report.json").read_text())
+    check_schema("panorama", report)
+    assert "reconstruct" in report["outcome"]["advice"]
