@@ -9,6 +9,7 @@ from sfmapp.geometry import epipolar, rigid3
 from sfmapp.geometry.essential import essential_of_cameras, find_essential, moved_pose, pose_covariance, refine_pose
 from sfmapp.geometry.five_point import essentials_of_five
 from sfmapp.geometry.two_rays import fundamental_of
+from sfmapp.matching.search import Ransac, find_relative_pose
 
 K = np.array([[900.0, 0, 512], [0, 905.0, 380], [0, 0, 1]])
 POSE = rigid3.from_matrix(rigid3.exp_so3([0.1, -0.3, 0.05]), np.array([1.0, 0.2, -0.3]) / np.sqrt(1.13))
@@ -98,6 +99,24 @@ def test_the_search_is_refined_and_as_sure_as_it_says() -> None:
     # chi-square of five
     assert 4.0 < np.mean(scaled) < 6.2
     assert 3.0 < np.mean(of_e) < 9.0
+
+
+def test_the_quick_search_finds_the_pose_among_as_many_wrong_matches() -> None:
+    rng = np.random.default_rng(2)
+    noise, errors = 7e-4, []
+    for seed in range(8):
+        xn1, xn2 = cloud(300, seed)
+        a, b = xn1 + rng.normal(0, noise, xn1.shape), xn2 + rng.normal(0, noise, xn2.shape)
+        b[:150] = rng.uniform(-0.5, 0.5, (150, 2))
+        pose = find_relative_pose(a, b, 3.0 * noise, Ransac(5000, seed))
+        assert pose is not None
+        # what nobody has who does not know which of them are right
+        best, _, _ = refine_pose(POSE, a[150:], b[150:], noise)
+        errors.append([np.linalg.norm(_step_between(each, POSE)) for each in (pose, best)])
+    found, known = np.median(errors, 0)
+    assert found < 1.6 * known
+    assert known > 0.0
+    assert find_relative_pose(np.zeros((20, 2)), np.zeros((20, 2)), 1e-3, Ransac(50, 0)) is None
 
 
 def _step_between(pose: np.ndarray, other: np.ndarray) -> np.ndarray:

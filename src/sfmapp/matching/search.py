@@ -115,3 +115,42 @@ def find_homography(xy1: Array, xy2: Array, threshold: float, ransac: Ransac) ->
         return first_matrix(cv2.findHomography(xy1, xy2, ransac.params(threshold))[0])
     except cv2.error:
         return None
+
+
+def find_essential(xn1: Array, xn2: Array, threshold: float, ransac: Ransac) -> Array | None:
+    """E (3, 3) of unit norm by RANSAC from normalised image points (N, 2), or None; the threshold in their units."""
+    import cv2
+
+    eye, no_distortion = np.eye(3), np.zeros(4)
+    try:
+        found = cv2.findEssentialMat(xn1, xn2, eye, eye, no_distortion, no_distortion, ransac.params(threshold))[0]
+    except cv2.error:
+        return None
+    e = first_matrix(found)
+    return None if e is None else epipolar.nearest_essential(e)
+
+
+def find_relative_pose(xn1: Array, xn2: Array, threshold: float, ransac: Ransac) -> Array | None:
+    """The relative pose (7,) with unit translation of two calibrated views, of which some matches are wrong, or None.
+
+    Args:
+        xn1, xn2: (N, 2) normalised image points, N >= 8.
+        threshold: largest Sampson distance of an inlier, in their units.
+        ransac: how to draw.
+    """
+    # of the samples whose model comes within the threshold of most matches, half of it tells the better ones
+    essential = find_essential(xn1, xn2, 0.5 * threshold, ransac)
+    if essential is None:
+        return None
+    pose = None
+    # a sample is off by more than the noise: its inliers are looked for more widely than those of what is refined
+    for gate in (2.0 * threshold, threshold):
+        inlier = epipolar.sampson_errors(essential, xn1, xn2) < gate**2
+        if inlier.sum() < 8:
+            break
+        a, b = xn1[inlier], xn2[inlier]
+        if pose is None:
+            pose = epipolar.choose_in_front(epipolar.decompose_essential(essential), a, b)[0]
+        pose = epipolar.refine_relative_pose(pose, a, b, threshold)
+        essential = epipolar.essential_from_pose(pose)
+    return pose

@@ -17,9 +17,9 @@ from sfmapp.geometry import epipolar, five_point, homography, rigid3
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.search import (
     Ransac,
+    find_essential,
     find_fundamental,
     find_homography,
-    first_matrix,
     is_significant,
     is_significant_of_rays,
     polish_fundamental,
@@ -212,18 +212,6 @@ def _classify(result: TwoViewGeometry, inliers: _Inliers, is_calibrated: bool, o
             result.is_inlier = inliers.h
 
 
-def _find_essential(xn1: Array, xn2: Array, threshold: float, ransac: Ransac) -> Array | None:
-    import cv2
-
-    eye, no_distortion = np.eye(3), np.zeros(4)
-    try:
-        found = cv2.findEssentialMat(xn1, xn2, eye, eye, no_distortion, no_distortion, ransac.params(threshold))[0]
-    except cv2.error:
-        return None
-    e = first_matrix(found)
-    return None if e is None else epipolar.nearest_essential(e)
-
-
 def _estimate_homography(xy1: Array, xy2: Array, pool: Mask, threshold: float, ransac: Ransac) -> tuple[Array, Mask]:
     h = find_homography(xy1[pool], xy2[pool], threshold, ransac)
     if h is None:
@@ -292,7 +280,7 @@ def _estimate_pose(
     if inliers.h.sum() > 0.5 * mask.sum():  # a plane leaves F undetermined, and with it the pose that F suggests
         groups.append(homography.motions_from_homography(result.homography, poses.k1, poses.k2).poses)
     for a, b in searched:
-        essential = _find_essential(a, b, 0.5 * poses.scale, ransac)
+        essential = find_essential(a, b, 0.5 * poses.scale, ransac)
         if essential is not None:
             groups.append(epipolar.decompose_essential(essential))
     groups = [group for group in groups if len(group)]
