@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
-from sfmapp.geometry.noise import sigma_of_lengths
+from sfmapp.geometry.noise import exceeded_by_chance, sigma_of_lengths
 
 
 def test_the_sigma_of_normal_residuals_is_found_and_outliers_hardly_count() -> None:
@@ -15,3 +16,9 @@ def test_the_sigma_of_normal_residuals_is_found_and_outliers_hardly_count() -> N
     assert sigma_of_lengths(lengths) == pytest.approx(0.7, rel=5e-3)
     lengths[:10_000] = 1e4
     assert sigma_of_lengths(lengths) == pytest.approx(0.7, rel=0.06)
+
+
+@pytest.mark.parametrize("num", [1, 2, 3, 4, 9, 16, 100])
+@pytest.mark.parametrize("chance", [0.5, 1e-3, 1e-6])
+def test_what_chance_exceeds_is_the_quantile_of_chi_square(num: int, chance: float) -> None:
+    assert exceeded_by_chance(num, chance) == pytest.approx(chi2.isf(chance, num), rel=1e-9)

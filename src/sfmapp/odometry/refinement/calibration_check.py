@@ -16,8 +16,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh
-from scipy.special import chdtri
 
 from sfmapp.adjust.calibration import RAW, CalibrationSystem, reduce_to_calibration
 from sfmapp.adjust.covariance import similarity_basis
@@ -31,6 +29,7 @@ from sfmapp.camera.models import PARAM_NAMES, canonical_from_params, kind_of
 from sfmapp.camera.names import CameraModel
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.geometry.noise import exceeded_by_chance
 from sfmapp.geometry.triangulation import Observed, triangulate_tracks
 from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.map.backend import classify
@@ -233,7 +232,7 @@ def question_calibration(
     if first is None or begin is None:
         is_rig = len(model.cameras) > 1
         return Answer(model, False, CalibrationCheck(is_refined=False), [], _UNKNOWN_SCALE if is_rig else None)
-    limit = _SHARED_ERRORS * float(chdtri(len(first.x), _MAX_CHANCE))
+    limit = _SHARED_ERRORS * exceeded_by_chance(len(first.x), _MAX_CHANCE)
     surprise = float(first.step @ first.data_information @ first.step)
     if begin is first and surprise < limit / _SHARED_ERRORS:
         return _kept(first, first, unknowns, _report(first, surprise, limit, unknowns), [])
@@ -366,7 +365,9 @@ def _held_out(look: _Look) -> tuple[Array, Array]:
     system, num = look.system, len(look.x)
     prior = np.concatenate([look.priors**-2.0, np.full(system.gradient.shape[1] - num, look.field_prior)])
     off = np.concatenate([look.x, np.zeros(len(prior) - num)])
-    _, basis = eigh(look.data_information, np.diag(prior[:num]))
+    # of the information against the priors
+    root = np.sqrt(prior[:num])
+    basis = np.linalg.eigh(look.data_information / np.outer(root, root)).eigenvectors / root[:, None]
     coordinates = np.linalg.inv(basis)
     gains = np.zeros((len(system.gradient), num + 1))
     for fold in range(_FOLDS):
