@@ -44,7 +44,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
             picture.save(folder / "photos" / f"{k:03d}.png")
     np.save(folder / "truth.npy", film.ground_truth[::STEP])
     command = ["calibrate", "board", str(folder / "board"), "-o", str(folder / "cam"), "--board", BOARD.text()]
-    assert main([*command, "--model", "opencv", "-q"]) == 0
+    assert main([*command, "--camera-model", "opencv", "-q"]) == 0
     return folder
 
 
