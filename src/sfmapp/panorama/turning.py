@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import Camera
+from sfmapp.camera.camera import Camera, project
 from sfmapp.camera.names import CameraModel
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
@@ -25,7 +25,7 @@ from sfmapp.panorama.report import LensChoice, TurningReport
 from sfmapp.panorama.turning_report import judge_pairs, report_of
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.features import Features
-from sfmapp.scene.tracks import Tracks
+from sfmapp.scene.tracks import Tracks, make_tracks
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet
@@ -39,6 +39,8 @@ _LOOSE = 4.0
 # Of all verified matches rotations are to explain three quarters: 96 % of a panorama of alike columns that match each
 # other wrongly, and 61 % of two planes, one behind the other, before which the camera moved.
 _LEAST_SHARE = 0.75
+# Lens models are compared on so many rays of each half: enough to see a hundredth of a pixel.
+_TRACKS_OF_HALF = 5000
 # coefficients of distortion that are tried
 _MOST_DISTORTION = 2
 _ADVICE = (
@@ -243,7 +245,8 @@ def _tracks(evidence: _Evidence, members: Ints, masks: dict[int, NDArray[np.bool
 def _chosen(evidence: _Evidence, rough: _Round) -> tuple[_Round, list[LensChoice]]:
     """The final adjustment, with as many coefficients of distortion as predict rays that they were not fitted to."""
     fine = _adjusted(evidence, rough.fit.state.cameras, 1.0, 1)
-    halves = [_every_other(fine.tracks, k) for k in range(2)]
+    step = 2 * max(1, fine.tracks.num_tracks // (2 * _TRACKS_OF_HALF))
+    halves = [_every(step, fine.tracks, k) for k in range(2)]
     choices, fits = [], []
     for distortion in range(_MOST_DISTORTION + 1):
         free = [refinable(camera, distortion=distortion) for camera in evidence.priors]
@@ -269,13 +272,11 @@ def _without(camera: Camera, distortion: int) -> Camera:
     return camera.with_params([*camera.params[: 3 + distortion], *[0.0] * (_MOST_DISTORTION - distortion)])
 
 
-def _every_other(tracks: Tracks, first: int) -> Tracks:
-    """Half of the tracks."""
-    from sfmapp.scene.tracks import make_tracks
-
-    kept = tracks.obs_track_idx % 2 == first
+def _every(step: int, tracks: Tracks, first: int) -> Tracks:
+    """Every so many of the tracks."""
+    kept = tracks.obs_track_idx % step == first
     return make_tracks(
-        tracks.num_images, (tracks.num_tracks + 1 - first) // 2, tracks.obs_track_idx[kept] // 2,
+        tracks.num_images, -(-(tracks.num_tracks - first) // step), tracks.obs_track_idx[kept] // step,
         tracks.obs_image_idx[kept], tracks.obs_feature_idx[kept], tracks.obs_xy[kept],
     )  # fmt: skip
 
@@ -297,8 +298,6 @@ def _held_out(
 
 def residuals_px(state: Turned, tracks: Tracks, camera_idx: Ints) -> Array:
     """(O, 2) pixels less those predicted."""
-    from sfmapp.camera.camera import project
-
     seen = np.einsum("nij,nj->ni", state.rotations[tracks.obs_image_idx], state.rays[tracks.obs_track_idx])
     out = np.empty((tracks.num_observations, 2))
     whose = camera_idx[tracks.obs_image_idx]

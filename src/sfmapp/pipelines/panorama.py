@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from sfmapp.panorama.turning import TurnedPhotographs
 
 STAGE = PANORAMA
+# Three numbers for each photograph are told by some hundred rays; matching costs the square of the keypoints.
+_MOST_FEATURES = 3000
 # where the stages behind the matches begin
 STAGES = ("sfmapp.panorama.turning", "sfmapp.panorama.stitch", "sfmapp.formats.gpano")
 ROTATIONS = "rotations.json"
@@ -114,7 +116,7 @@ def stitch_panorama(
     Args:
         images: as of :func:`sfmapp.reconstruct`.
         output: a new folder, an empty one, or that of an earlier call.
-        options: of these, images, features, pairs, matching, seed and threads.
+        options: of these, images, features (of each photograph 3,000 at most), pairs, matching, seed and threads.
         layout: of the picture.
         events: progress, warnings and cancellation.
         watch: started when the run began.
@@ -125,7 +127,9 @@ def stitch_panorama(
         NoReconstructionError: the camera did not turn on the spot, or nothing overlaps; the report is written.
         InterruptedRunError: ``events`` was asked to stop; the same call resumes.
     """
-    layout = layout or PictureLayout()
+    layout, options = layout or PictureLayout(), options or Options()
+    most = min(options.features.max_num_features, _MOST_FEATURES)
+    options = replace(options, features=replace(options.features, max_num_features=most))
     with Run.opened(PANORAMA, name_of(images), output, options, events=events, watch=watch, images=images) as run:
         report = _run(run, layout)
         return PanoramaResult(run.workspace.folder, run.workspace.folder / layout.file, report)
