@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from sfmapp.calibration.result import CameraCalibration
 from sfmapp.calibration.uncertainty import image_grid
@@ -68,6 +67,8 @@ def compare(a: CameraCalibration, b: CameraCalibration) -> Comparison:
     Raises:
         InputError: they are for pictures of different sizes, or hardly any ray is in both.
     """
+    from scipy.stats import chi2  # heavy to load, and densifying, for one, imports this module
+
     xy, difference, rotation = projection_difference(a.camera, b.camera)
     is_known = np.isfinite(difference).all(1)
     rays = pixels_to_rays(a.camera, xy)
