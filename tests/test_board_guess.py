@@ -45,7 +45,7 @@ def test_kind_and_size(text: str, expected: str) -> None:
 
 
 def test_photographs_that_disagree_are_refused_with_the_reason() -> None:
-    mixed = signs("chessboard:8x5:0.03") + signs("chessboard:6x9:0.02", 4)
+    mixed = signs("chessboard:8x5:0.03", 6) + signs("chessboard:6x9:0.02", 4)
     with pytest.raises(InputError, match=r"one board, found chessboard:9x6:1.*show chessboard 8x5"):
         guess_board(mixed, "photos")
     nothing = np.random.default_rng(0).integers(0, 255, (300, 400)).astype(np.uint8)

@@ -48,6 +48,8 @@ _FITS, _TELLS = 0.1, 2.0
 _GAP, _NEAR_GAP = 0.05, 0.01
 # of a grid's places: more than this filled, and of those around it inside of the picture, is the whole of it
 _WHOLE = 0.95
+# steps beyond a grid at which its next row would have been seen well enough to be found
+_BEYOND = 1.6
 _EVERY_CIRCLE, _LEAST_CROSSINGS = 10_000, 12
 # photographs that show another board, per photograph that shows this one, are a contradiction; and least of them
 _CONTRADICTING, _LEAST_CONTRADICTING = 0.25, 2
@@ -340,11 +342,11 @@ def _has_room(places: Ints, xy: Array, shape: tuple[int, ...]) -> bool:
     for c in range(columns + 1):
         for edge, before in ((0, 1), (rows, rows - 1)):
             if (c, edge) in at and (c, before) in at:
-                inside.append(2.0 * at[c, edge] - at[c, before])
+                inside.append(at[c, edge] + _BEYOND * (at[c, edge] - at[c, before]))
     for r in range(rows + 1):
         for edge, before in ((0, 1), (columns, columns - 1)):
             if (edge, r) in at and (before, r) in at:
-                inside.append(2.0 * at[edge, r] - at[before, r])
+                inside.append(at[edge, r] + _BEYOND * (at[edge, r] - at[before, r]))
     if not inside:
         return False
     beyond = np.array(inside)
@@ -385,26 +387,40 @@ def _staggered(places: Ints, xy: Array, along: Ints, shape: tuple[int, ...]) -> 
 
 def _of_grids(pictures: Sequence[PictureSigns]) -> BoardGuess | None:
     signs = [one.sign for one in pictures if one.sign is not None]
-    votes = Counter((sign.kind, sign.columns, sign.rows) for sign in signs if sign.is_whole)
-    if not votes:
-        # no board is seen with room all around: the largest grid that comes again
-        votes = Counter((sign.kind, sign.columns, sign.rows) for sign in signs)
-        votes = Counter({key: count for key, count in votes.items() if count > 1})
-    if not votes:
+    counts = Counter((sign.kind, sign.columns, sign.rows) for sign in signs if sign.is_whole)
+    if not counts:
+        # no board is seen with room all around: a grid that comes again
+        counts = Counter((sign.kind, sign.columns, sign.rows) for sign in signs)
+        counts = Counter({key: count for key, count in counts.items() if count > 1})
+    if not counts:
         return None
-    (kind, columns, rows), _ = max(votes.items(), key=lambda item: (item[1], item[0][1] * item[0][2]))
+    # whoever shows more speaks against a size, whoever shows less does not
+
+    def score(key: tuple[Kind, int, int]) -> tuple[int, int]:
+        larger = sum(not _may_be_part(sign, *key) for sign in signs)
+        return counts[key] - larger, key[1] * key[2]
+
+    kind, columns, rows = max(counts, key=score)
     agree = part = other = 0
     different: Counter[str] = Counter()
     for sign in signs:
         if (sign.kind, sign.columns, sign.rows) == (kind, columns, rows):
             agree += 1
-        elif sign.kind == kind and not sign.is_whole and sign.columns <= columns and sign.rows <= columns:
+        elif _may_be_part(sign, kind, columns, rows):
             part += 1
-        elif sign.is_whole:
+        else:
             other += 1
             different[f"{sign.kind} {sign.columns}x{sign.rows}"] += 1
-        else:
-            part += 1
     notes = [f"{count} show {text}" for text, count in different.most_common(3)]
     board = Board(kind, columns, rows, 1.0, unit=UNIT)
     return BoardGuess(board, agree, part, other, len(pictures) - len(signs), tuple(notes))
+
+
+def _may_be_part(sign: Sign, kind: Kind, columns: int, rows: int) -> bool:
+    """Whether a photograph may show a board of a size, or a part of it."""
+    if (sign.kind, sign.columns, sign.rows) == (kind, columns, rows):
+        return True
+    if sign.kind != kind or sign.is_whole:
+        return False
+    # the rows of an asymmetric grid that is cut may be taken for others
+    return sign.kind == "acircles" or (sign.columns <= columns and sign.rows <= min(rows, columns))

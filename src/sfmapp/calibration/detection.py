@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from sfmapp.calibration.boards import Board
 from sfmapp.calibration.circles import disk_bias, find_circle_lattice, grid_of, place_on
-from sfmapp.calibration.lattice import Lattice, find_lattice
+from sfmapp.calibration.lattice import Lattice, field_contrast, find_lattice
 from sfmapp.calibration.markers import dictionary_of
 from sfmapp.calibration.symmetry import symmetric_points
-from sfmapp.geometry.dlt import find_homography
+from sfmapp.geometry.dlt import find_homography, homogeneous
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -33,13 +33,27 @@ _STRAY = 0.25
 # beside markers there are other crossings, of their cells, a tenth of a field away and more
 _STRAY_BESIDE_MARKERS = 0.08
 _NEIGHBORS = 9
-_AROUND = 14
+# so many around a point tell where it is, by a quadratic from so many on; the noise of a point is at least so much
+_AROUND, _QUADRATIC, _NOISE_PX = 14, 9, 0.1
+# wrong points are left out one neighbourhood at a time
+_ROUNDS = 12
 # of a marker's side: OpenCV's patterns and Kalibr's
 _TAG_BORDERS = (2, 1)
+# points beside markers that cannot be read go on from those that can, so many times; and by how much of the contrast
+# the light fields at one must be lighter than the dark ones
+_UNREAD_ROUNDS, _FOUR_FIELDS = 2, 0.4
+# of the gap between tags: how far the corner of a tag is from where it was read or expected
+_TAG_MOVES = 0.3
+# what takes back the blur of a picture: sigma in pixels of what is subtracted, and how much of it
+_UNSHARP = (4.0, 3.0)
 # how far around a circle is its own, in steps of the board: not quite half of the way to the next; and grey values that
 # tell a disk from its ground
 _ROOM = {"circles": 0.47, "acircles": 0.66}
 _FAINT = 8.0
+# of that room, what a disk takes at most
+_DISK = 0.75
+# fewer blobs in rows are found in noise
+_LEAST_CIRCLES = 12
 
 
 @dataclass(frozen=True)
@@ -83,11 +97,14 @@ def detect_board(gray: Pixels, board: Board) -> Detection:
     xy = (xy + 0.5) * [gray.shape[1] / small.shape[1], gray.shape[0] / small.shape[0]] - 0.5
     if board.kind in ("circles", "acircles"):
         xy = _disk_centers(gray, board, idx, xy)
+    elif board.tells_part:
+        idx, xy = _crossings_beside_markers(gray, board, idx, xy)
     else:
         xy = _crossings(gray, board, idx, xy)
     is_good = np.isfinite(xy).all(1) & _fits_neighbors(board, idx, xy)
     idx, xy = idx[is_good], xy[is_good]
-    if len(idx) < 6 or np.ptp(board.points[idx, :2], axis=0).min() == 0.0:
+    least = _LEAST_CIRCLES if board.kind in ("circles", "acircles") else 6
+    if len(idx) < min(least, len(board.points)) or np.ptp(board.points[idx, :2], axis=0).min() == 0.0:
         return Detection(np.zeros(0, np.int64), np.zeros((0, 2)), problem=_nothing(board))
     return Detection(idx, xy + 0.5, _edge_width(gray, board, idx, xy))
 
@@ -166,12 +183,34 @@ def _placed(lattice: Lattice, board: Board) -> tuple[Ints, Array] | None:
 # ------------------------------------------------------------------------------------------------------------ markers
 
 
-def _markers(gray: Pixels, dictionary: str, border: int) -> dict[int, Array]:
-    """(4, 2) corners of each marker, clockwise from its own top left."""
+def _markers(gray: Pixels, dictionary: str, border: int, num: int) -> dict[int, Array]:
+    """(4, 2) corners of each of the first ``num`` markers that is seen, clockwise from its own top left. Where some are
+    missing they are looked for once more with the blur taken back."""
+    found = _markers_of_one(gray, dictionary, border, is_sharpened=False)
+    if sum(number < num for number in found) < num:
+        found = _markers_of_one(_sharpened(gray), dictionary, border, is_sharpened=True) | found
+    return {number: quad for number, quad in found.items() if number < num}
+
+
+def _sharpened(gray: Pixels) -> Pixels:
+    import cv2
+
+    values = gray.astype(np.float32)
+    sharp = values + _UNSHARP[1] * (values - cv2.GaussianBlur(values, (0, 0), _UNSHARP[0]))
+    found: Pixels = np.clip(sharp, 0.0, 255.0).astype(np.uint8)
+    return found
+
+
+def _markers_of_one(gray: Pixels, dictionary: str, border: int, *, is_sharpened: bool) -> dict[int, Array]:
     import cv2
 
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border
+    if is_sharpened:
+        # corners are round, and cells run into each other
+        parameters.polygonalApproxAccuracyRate = 0.06
+        parameters.perspectiveRemovePixelPerCell = 8
+        parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
     parameters.minMarkerPerimeterRate = 0.015
     parameters.adaptiveThreshWinSizeMax = 53
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -189,7 +228,8 @@ def _markers(gray: Pixels, dictionary: str, border: int) -> dict[int, Array]:
 
 def _charuco(gray: Pixels, board: Board) -> tuple[Ints, Array]:
     """Corners of squares, where the markers around have them."""
-    found = _markers(gray, board.dictionary, 1)
+    num = (board.columns * board.rows + 1) // 2
+    found = _markers(gray, board.dictionary, 1, num)
     best: tuple[Ints, Array] = (np.zeros(0, np.int64), np.zeros((0, 2)))
     best_error = np.inf
     # OpenCV's boards begin with a dark square; those of before 4.6 with a light one where rows are even
@@ -208,20 +248,24 @@ def _charuco(gray: Pixels, board: Board) -> tuple[Ints, Array]:
     return best
 
 
-def _predicted(source: Array, target: Array, board: Board) -> tuple[Ints, Array, float]:
-    """Where points of a board are by the corners of markers beside them, and how well those fit each other."""
+def _predicted(source: Array, target: Array, board: Board, reach: float = 1.01) -> tuple[Ints, Array, float]:
+    """Where points of a board are by the corners of markers beside them, and how well those fit each other. ``reach``:
+    how far these may be, in sides of a square or tag."""
     idx, xy, errors = [], [], []
     for i, point in enumerate(board.points[:, :2]):
         distance = np.abs(source - point).max(1)
-        near = np.flatnonzero(distance < 1.01 * board.spacing)
+        near = np.flatnonzero(distance < reach * board.spacing)
         if len(near) < 4:
             continue
         if len(near) < 8:  # one marker beside it: more from further away keep the plane from tipping
             near = np.flatnonzero(distance < 2.01 * board.spacing)
         h = find_homography(source[near], target[near])
         mapped = np.concatenate([source[near], np.ones((len(near), 1))], 1) @ h.T
-        errors.append(np.sqrt(((mapped[:, :2] / mapped[:, 2:] - target[near]) ** 2).sum(1).mean()))
         at = h @ [*point, 1.0]
+        # a plane through corners that are none, of a misread marker, may be seen from its edge
+        if not np.isfinite(mapped).all() or (mapped[:, 2] * at[2] <= 0.0).any():
+            continue
+        errors.append(np.sqrt(((mapped[:, :2] / mapped[:, 2:] - target[near]) ** 2).sum(1).mean()))
         idx.append(i)
         xy.append(at[:2] / at[2])
     if not idx:
@@ -235,8 +279,7 @@ def _april_grid(gray: Pixels, board: Board) -> tuple[Ints, Array]:
     num = board.columns * board.rows
     found: dict[int, Array] = {}
     for border in _TAG_BORDERS:
-        tags = _markers(gray, board.dictionary, border)
-        tags = {number: quad for number, quad in tags.items() if number < num}
+        tags = _markers(gray, board.dictionary, border, num)
         if len(tags) > len(found):
             found = tags
     if len(found) < 2:
@@ -328,8 +371,11 @@ def _mass(gray: Pixels, at: Array, axes: Array, room: float) -> tuple[Array, flo
     """
     reach = room * np.sqrt((axes**2).sum(0))
     low, high = np.ceil(at - reach).astype(int), np.floor(at + reach).astype(int)
-    if low.min() < 0 or high[0] >= gray.shape[1] or high[1] >= gray.shape[0] or (high - low).min() < 2:
+    size = np.array(gray.shape[::-1])
+    # the ring around may be cut by the border, the disk may not
+    if (at - _DISK * reach < 0).any() or (at + _DISK * reach > size - 1).any() or (high - low).min() < 2:
         return None
+    low, high = np.maximum(low, 0), np.minimum(high, size - 1)
     values = gray[low[1] : high[1] + 1, low[0] : high[0] + 1].astype(np.float64)
     x, y = np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)
     on_board = np.stack(np.meshgrid(x - at[0], y - at[1]), -1) @ np.linalg.inv(axes)
@@ -390,22 +436,93 @@ def _crossings(gray: Pixels, board: Board, idx: Ints, xy: Array) -> Array:
     return found
 
 
+def _crossings_beside_markers(gray: Pixels, board: Board, idx: Ints, xy: Array) -> tuple[Ints, Array]:
+    """Crossings of boards with markers. Beside them there are corners of markers and cells, where three fields are
+    light: what is no crossing of four is left out, and looked for where those that are have it, together with what
+    markers that could not be read have left open."""
+    found = _crossings(gray, board, idx, xy)
+    is_good = _have_four_fields(gray, board, idx, xy, found)
+    idx, found = idx[is_good], found[is_good]
+    for _ in range(_UNREAD_ROUNDS):
+        if len(idx) < 6:
+            break
+        more, at, _ = _predicted(board.points[idx, :2], found, board, 2.01)
+        is_new = ~np.isin(more, idx)
+        if not is_new.any():
+            break
+        both, begin = np.concatenate([idx, more[is_new]]), np.concatenate([found, at[is_new]])
+        measured = _crossings(gray, board, both, begin)
+        measured[: len(idx)] = found
+        is_good = _have_four_fields(gray, board, both, begin, measured)
+        is_good[: len(idx)] = True
+        if is_good.sum() == len(idx):
+            break
+        idx, found = both[is_good], measured[is_good]
+    order = np.argsort(idx, kind="stable")
+    return idx[order], found[order]
+
+
+def _have_four_fields(gray: Pixels, board: Board, idx: Ints, begin: Array, xy: Array) -> NDArray[np.bool_]:
+    """(N,) bool: near where a point was expected, dark and light meet in turn."""
+    known = np.isfinite(xy).all(1)
+    found = np.zeros(len(xy), np.bool_)
+    if known.sum() < 4:
+        return found
+    axes = _axes(board, idx[known], xy[known])
+    gap = board.marker if board.kind == "aprilgrid" else 0.5 * (1.0 - board.marker / board.spacing)
+    for i, axis in zip(np.flatnonzero(known), axes, strict=True):
+        share = 0.4 * gap
+        reach = share * np.abs(axis).sum(0) + 1.0
+        is_inside = (xy[i] > reach).all() and (xy[i] < np.array(gray.shape[::-1]) - 1.0 - reach).all()
+        is_near = board.kind == "charuco" or (
+            np.hypot(*(xy[i] - begin[i])) < _TAG_MOVES * gap * np.linalg.norm(axis, axis=1).min() + 1.0
+        )
+        found[i] = is_inside and is_near and field_contrast(gray, xy[i], axis[0], axis[1], share) > _FOUR_FIELDS
+    return found
+
+
 def _fits_neighbors(board: Board, idx: Ints, xy: Array) -> NDArray[np.bool_]:
-    """(N,) bool: a point is where the plane through its neighbours has it, a part of a field either way."""
+    """(N,) bool: a point is where those around it have it, a part of a field either way.
+
+    A wrong point puts its neighbours in the wrong as well, but less than itself: so the worst of each neighbourhood
+    goes first, and the rest is looked at again without it.
+    """
     is_good: NDArray[np.bool_] = np.asarray(np.isfinite(xy).all(1))
-    where = np.flatnonzero(is_good)
-    if len(where) < 6:
-        return is_good
-    plane, pixels = board.points[idx[where], :2] / board.spacing, xy[where]
-    near = np.argsort(((plane[:, None] - plane[None]) ** 2).sum(2), axis=1, kind="stable")[:, 1 : _AROUND + 1]
-    steps = np.linalg.norm(_axes(board, idx[where], pixels), axis=2).min(1)
-    stray = _STRAY if board.kind in ("chessboard", "circles", "acircles") else _STRAY_BESIDE_MARKERS
-    for n, point in enumerate(where):
-        h = find_homography(plane[near[n]], pixels[near[n]])
-        at = h @ [*plane[n], 1.0]
-        off = np.hypot(*(at[:2] / at[2] - pixels[n])) if at[2] != 0 else np.inf
-        is_good[point] = off < max(stray * steps[n], 1.5)
+    stray = _STRAY_BESIDE_MARKERS if board.tells_part else _STRAY
+    for _ in range(_ROUNDS):
+        where = np.flatnonzero(is_good)
+        if len(where) < 6:
+            break
+        plane, pixels = board.points[idx[where], :2] / board.spacing, xy[where]
+        off, near = _off_neighbors(plane, pixels)
+        off /= np.maximum(stray * np.linalg.norm(_axes(board, idx[where], pixels), axis=2).min(1), 1.5)
+        is_worst = (off > 1.0) & (off >= off[near].max(1))
+        if not is_worst.any():
+            break
+        is_good[where[is_worst]] = False
     return is_good
+
+
+def _off_neighbors(plane: Array, pixels: Array) -> tuple[Array, Ints]:
+    """(N,) how far points are from where those around have them, pixels; and (N, K) which these are. What a homography
+    through all leaves is smooth, whatever the lens: it is a quadratic through the neighbours, those that fit it worst
+    weighing less."""
+    mapped = homogeneous(plane) @ find_homography(plane, pixels).T
+    left = pixels - mapped[:, :2] / mapped[:, 2:]
+    near = np.argsort(((plane[:, None] - plane[None]) ** 2).sum(2), axis=1, kind="stable")[:, 1 : _AROUND + 1]
+    x, y = np.moveaxis(plane[near] - plane[:, None], 2, 0)
+    terms = [np.ones_like(x), x, y, x * x, x * y, y * y]
+    design = np.stack(terms if near.shape[1] >= _QUADRATIC else terms[:3], -1)
+    weight = np.ones(near.shape)
+    for _ in range(2):
+        square = np.einsum("nk,nka,nkb->nab", weight, design, design)
+        # neighbours on one or two lines leave some of it open
+        square += 1e-6 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(design.shape[2])
+        found = np.linalg.solve(square, np.einsum("nk,nka,nki->nai", weight, design, left[near]))
+        residual = np.linalg.norm(left[near] - design @ found, axis=2)
+        scale = np.median(residual, axis=1, keepdims=True) + _NOISE_PX
+        weight = 1.0 / (1.0 + (residual / scale) ** 2)
+    return np.linalg.norm(left - found[:, 0], axis=1), near
 
 
 def _edge_width(gray: Pixels, board: Board, idx: Ints, xy: Array) -> float:

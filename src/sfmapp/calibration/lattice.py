@@ -196,7 +196,7 @@ def _with_four_fields(
         ]  # fmt: skip
         if steps[0] is None or steps[1] is None:
             continue
-        worst = min(_contrast(gray, at, steps[0], steps[1], share) for share in _FIELD_SHARES)
+        worst = min(field_contrast(gray, at, steps[0], steps[1], share) for share in _FIELD_SHARES)
         if worst > _FOUR_FIELDS:
             kept[c, r] = idx
     return kept
@@ -215,7 +215,7 @@ def _step(
     return found
 
 
-def _contrast(gray: NDArray[np.uint8], at: Array, u: Array, v: Array, share: float) -> float:
+def field_contrast(gray: NDArray[np.uint8], at: Array, u: Array, v: Array, share: float) -> float:
     """By how much two fields across from each other are lighter than the others, of all contrast there is."""
     values = []
     for i, j in ((1, 1), (-1, -1), (1, -1), (-1, 1)):

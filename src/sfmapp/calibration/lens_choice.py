@@ -109,7 +109,9 @@ def try_models(
             return replace(trial, reason=f"its residuals are {trial.rms_px / best_rms:.1f} times the best's")
         if len(fitted) > 1 and not covers_picture(trial.fit):
             return replace(trial, reason="it has no ray for a part of the picture")
-        if not trial.worst_px <= max(open_px, _OPEN_SHARE * np.hypot(camera.width, camera.height)):
+        if not np.isfinite(trial.worst_px) or not trial.worst_px <= max(
+            open_px, _OPEN_SHARE * np.hypot(camera.width, camera.height)
+        ):
             reason = f"the views leave it open: sigmas of up to {trial.worst_px:.3g} px in the picture"
             return replace(trial, reason=reason)
         return replace(trial, held_out=hold_out(trial, views, is_used))
