@@ -254,6 +254,18 @@ def test_the_same_command_has_nothing_to_do(
     assert (out / "panorama.jpg").stat().st_mtime_ns == before
 
 
+def test_copies_of_one_picture_tell_no_focal_length(tmp_path: Path, stitched: tuple[Path, Path, Array]) -> None:
+    photos, _, _ = stitched
+    copies = tmp_path / "copies"
+    copies.mkdir()
+    for k in range(2):
+        (copies / f"{k}.png").write_bytes((photos / "0.png").read_bytes())
+    assert main(["panorama", str(copies), "-o", str(tmp_path / "out"), "-q"]) == 0
+    camera = json.loads((tmp_path / "out" / "report.json").read_text())["turning"]["cameras"][0]
+    assert not camera["is_told"]
+    assert camera["focal_px"] == pytest.approx(camera["prior_focal_px"], rel=0.05)
+
+
 def test_what_is_no_panorama_is_refused(tmp_path: Path, stitched: tuple[Path, Path, Array]) -> None:
     photos, _, _ = stitched
     assert main(["panorama", str(tmp_path / "nowhere"), "-o", str(tmp_path / "a"), "-q"]) == 3

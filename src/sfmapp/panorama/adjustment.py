@@ -28,8 +28,8 @@ Ints = NDArray[np.int64]
 
 # Cauchy's weight is a half at three standard deviations: one measurement in ninety is as far off by chance.
 _CAUCHY = 3.0
-# least noise of a keypoint, pixels, so that exact data leave something to divide by
-_LEAST_NOISE_PX = 1e-4
+# least noise of a keypoint, pixels: copies of one picture have none, and the prior is to weigh more than rounding
+_LEAST_NOISE_PX = 0.01
 _MAX_STEPS, _CONVERGED = 30, 1e-7
 # What is believed of a lens before it is seen: k1 and k2 of photographs are a few tenths at most.
 _DISTORTION_SIGMA = 0.3
@@ -388,8 +388,10 @@ def _fit(problem: _Problem, state: Turned, scale2: float, noise2: float) -> Turn
     weights = 1.0 / (1.0 + squares.sum(1, keepdims=True) / scale2)
     influence = float((weights**2 * squares).mean()) / float(problem.share.mean())
     slope = float((weights - 2.0 * weights**2 * squares / scale2).mean())
-    variance = influence * float(weights.mean()) / slope**2
-    inverse = np.linalg.pinv(hessian, hermitian=True)
+    variance = max(influence * float(weights.mean()) / slope**2, noise2)
+    # in units of its diagonal: what the prior alone holds is small beside what rays hold, and no rounding
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    inverse = unit[:, None] * np.linalg.pinv(unit[:, None] * hessian * unit, hermitian=True) * unit
     # without what the gauge was held by
     gauge = np.zeros((problem.num_unknowns, 3))
     gauge[: 3 * problem.num_images] = state.rotations.reshape(-1, 3)

@@ -34,6 +34,8 @@ _MATCHES_OF_TRIAL = 300
 _FOCALS = np.geomspace(0.3, 12.0, 23)
 _PAIRS_FOR_FOCAL = 30
 _SURE_SIGMA = 0.2
+# mean squared error, in units of the threshold, by which a focal length must be better than that known before
+_TELLING = 1e-3
 # Three rotations close if they do so to within this: far above what errors add up to, far below chance.
 _TRIANGLE_DEG = 5.0
 _LOOP_DEG = 20.0
@@ -156,7 +158,9 @@ def find_focal(
         return float(sum(np.minimum((turn.errors_px / threshold_px) ** 2, 1.0).sum() for turn in turns_at(focal)))
 
     costs = [cost(float(focal)) for focal in trials]
-    found = float(trials[int(np.argmin(costs))])
+    # copies of one picture fit any focal length: what was known before stays where no other is better
+    is_told = min(costs) < costs[0] - _TELLING * sum(len(pair.xy[0]) for pair in few)
+    found = float(trials[int(np.argmin(costs))]) if is_told else camera.focal
     turns = turns_at(found)
     good = [(p.xy[0][t.is_inlier], p.xy[1][t.is_inlier]) for p, t in zip(few, turns, strict=True)
             if t.share > TURNED_SHARE]  # fmt: skip
