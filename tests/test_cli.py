@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 import sfmapp
+from processes import start
 from sfmapp.cli.main import main
 from sfmapp.cli.progress import JsonLines, PlainLines
 from sfmapp.events import Event, Events
@@ -222,7 +223,7 @@ def test_ctrl_c_ends_cleanly_and_the_same_command_resumes(
 ) -> None:
     output = tmp_path / "out"
     line = [sys.executable, "-m", "sfmapp", "reconstruct", str(photos), "-o", str(output), "--no-recording", "--json"]
-    child = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    child = start(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert child.stderr is not None
     for event in child.stderr:
         if json.loads(event)["kind"] == "advanced" and json.loads(event)["stage"] == "features":
@@ -247,7 +248,7 @@ def test_ctrl_c_ends_cleanly_and_the_same_command_resumes(
 def test_a_killed_run_resumes_too(photos: Path, finished: Path, tmp_path: Path) -> None:
     output = tmp_path / "out"
     line = [sys.executable, "-m", "sfmapp", "reconstruct", str(photos), "-o", str(output), "--no-recording", "--json"]
-    child = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    child = start(line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     assert child.stderr is not None
     for event in child.stderr:
         if json.loads(event)["kind"] == "advanced" and json.loads(event)["stage"] == "matching":

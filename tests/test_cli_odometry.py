@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from odometry_fakes import FakeRunner, FakeSequence
+from processes import start
 from sfmapp.cli.main import main
 from sfmapp.pipelines.odometry import track as pipeline
 from sfmapp.reporting import Usage
@@ -158,7 +159,7 @@ def test_ctrl_c_writes_what_was_tracked(tmp_path: Path, sign: signal.Signals) ->
         "sys.exit(main(sys.argv[1:]))\n"
     )
     line = [sys.executable, "-c", script, str(Path(__file__).parent), "odometry", "fake", "-o", str(tmp_path / "out")]
-    child = subprocess.Popen([*line, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    child = start([*line, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert child.stderr is not None
     for event in child.stderr:
         if json.loads(event).get("done") == 8:

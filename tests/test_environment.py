@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 import sfmapp
+from processes import start
 from sfmapp import children, kernel_cache
 from sfmapp.cli import signals
 from sfmapp.cli.main import main
@@ -273,7 +274,7 @@ def test_the_server_of_a_view_ends_with_it(number: signal.Signals, tmp_path: Pat
         port = probe.getsockname()[1]
     line = [sys.executable, "-m", "sfmapp", "view", str(path), "--serve", "--port", str(port)]
     with (tmp_path / "said.txt").open("wb") as said:
-        parent = subprocess.Popen(line, stdout=said, stderr=said)
+        parent = start(line, stdout=said, stderr=said)
 
     def is_serving() -> bool:
         with socket.socket() as client:

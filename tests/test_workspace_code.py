@@ -148,7 +148,7 @@ def test_what_is_loaded_is_in_the_key(stage: str) -> None:
         ("features.sift", {"features"}),
         ("matching.guided", {"matching"}),
         ("mapping.register", {"mapping"}),
-        ("adjust.problem", {"mapping"}),
+        ("adjust.problem", {"mapping", "dense", "mesh", "undistort"}),  # a calibration given to these adjusts poses
         ("dense.growth", {"dense"}),
         ("surface.poisson_child", {"mesh"}),
         ("report.html", set()),
