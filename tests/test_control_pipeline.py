@@ -124,7 +124,7 @@ def test_a_model_comes_to_its_control_points(
     ("change", "expected"),
     [
         (("EPSG:32633", "EPSG:99999"), "line 1: expected a coordinate system"),
-        (("EPSG:32633", "EPSG:2229"), "foot"),
+        (("EPSG:32633", "EPSG:2229"), "in US survey feet"),
         ((" G0", " G0 \nnonsense"), "line 3: expected at least 6 words"),
     ],
 )

@@ -162,7 +162,7 @@ def test_what_cannot_be(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture
         assert main(["export", str(run), *arguments, "-o", str(tmp_path / "x")]) in (2, 3)
         return capsys.readouterr().err
 
-    assert "US survey foot" in refused("--to", "laz", "--crs", "EPSG:2229")
+    assert "US survey feet" in refused("--to", "laz", "--crs", "EPSG:2229")
     assert "degree" in refused("--to", "laz", "--crs", "EPSG:4326")
     assert "--crs" in refused("--to", "laz", "--crs", "EPSG:999999")
     assert "does not go with colmap-bin" in refused("--to", "colmap-bin", "--crs", "EPSG:32633")

@@ -91,7 +91,7 @@ def test_heights_are_named_for_what_they_are() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "unit"), [("EPSG:2263", "US survey foot"), ("EPSG:4326", "degree"), ("EPSG:4258", "degree")]
+    ("text", "unit"), [("EPSG:2263", "US survey feet"), ("EPSG:4326", "degree"), ("EPSG:4258", "degree")]
 )
 def test_feet_and_degrees_are_refused_where_metres_are_needed(text: str, unit: str) -> None:
     with pytest.raises(InputError, match=f"gcp.txt:1: expected a coordinate system in metres.*{unit}") as failure:
@@ -107,7 +107,7 @@ def test_what_is_no_coordinate_system_is_named(text: str) -> None:
 
 
 def test_coordinates_off_the_earth_are_named() -> None:
-    with pytest.raises(InputError, match=r"geo.txt: expected longitude, latitude in degrees.*row 2"):
+    with pytest.raises(InputError, match=r"geo.txt, row 2: expected longitude, latitude in degrees"):
         coordinate_system("EPSG:4326", "x").geodetic([[13.0, 55.0, 0.0], [55.0, 113.0, 0.0]], "geo.txt")
 
 

@@ -393,7 +393,7 @@ def raising(monkeypatch: pytest.MonkeyPatch) -> None:
     def bug(*_: object, **__: object) -> None:
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr("sfmapp.pipelines.sparse.reconstruct.select_pairs", bug)
+    monkeypatch.setattr("sfmapp.pipelines.sparse.matches.select_pairs", bug)
 
 
 @pytest.mark.usefixtures("raising")
