@@ -221,6 +221,7 @@ def write(report: dict[str, Any]) -> None:
         cells = ["" if run.get(key) is None else f"{run[key]:.4g}" for key in keys]
         lines.append(f"| {run['set']} | {run['program']} | {' | '.join(cells)} |")
     (RESULTS / "panorama.md").write_text("\n".join(lines) + "\n")
+    (RESULTS / "panorama.json").write_text(json.dumps(report, indent=1) + "\n")
 
 
 def main() -> None:

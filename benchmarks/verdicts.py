@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -91,6 +92,7 @@ def rows_of(folder: Path) -> list[Row]:
         "two_views": two_view_rows,
         "known_points": known_point_rows,
         "rigs": rig_rows,
+        "panorama": panorama_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
 
@@ -134,6 +136,22 @@ def two_view_rows(folder: Path) -> Iterator[Row]:
             for quantity, unit, key in (("CPU time", "ms", "cpu_ms"), ("median error", row["unit"], "median_error")):
                 case = f"{what}, 1,000 matches, half wrong"
                 yield Row("two_views", case, quantity, unit, "less", mine[key], program, row[key], *about)
+
+
+def panorama_rows(folder: Path) -> Iterator[Row]:
+    """``sfmapp panorama`` against OpenCV's Stitcher."""
+    report = read(folder, "panorama")
+    about = (False, report["date"][:10], report["commit"])
+    runs = {(run["set"], run["program"]): run for run in report["runs"]}
+    for (case, program), peer in runs.items():
+        if program == "sfmapp":
+            continue
+        ours = runs[case, "sfmapp"]
+        for quantity, unit, key in (
+            ("worst rotation", "deg", "rotation_deg"), ("focal length", "%", "focal_percent"),
+            ("where neighbours meet, rms", "px", "seam_rms_px"), ("CPU time", "s", "cpu_s"),
+        ):  # fmt: skip
+            yield Row("panorama", case, quantity, unit, "less", ours[key], program, peer[key], *about)
 
 
 def known_point_rows(folder: Path) -> Iterator[Row]:
@@ -277,6 +295,11 @@ def promises(folder: Path) -> Iterator[Promise]:
     named, num = (sum(row[name] for row in report["rows"]) for name in ("named", "surveys"))
     text = "a control point that is wrong by a metre is named, and no other"
     yield Promise("control_surveys", text, named, num, report["date"][:10])
+    report = read(folder, "inertial")
+    scaled = [run["inertial"] for run in report["runs"] if run["inertial"].get("sigma") is not None]
+    within = sum(abs(math.log(run["scale"])) < 3 * run["sigma"] for run in scaled)
+    text = "a scale told by an IMU is within three stated sigmas"
+    yield Promise("inertial", text, within, len(scaled), report["date"][:10])
     report = read(folder, "odometry")
     same = [row["same_bytes"] for row in report["rows"]]
     yield Promise("odometry", "two runs write the same bytes", sum(same), len(same), report["date"][:10])
