@@ -198,6 +198,7 @@ def _fill_rows(t: int, seen: _Seen, cameras: _Cameras, unknowns: _Unknowns, nois
     frames, pose_part, lens_part, point_part, residual, J = rows
     scratch, pose, lens = pointer(J), pointer(poses), pointer(canonical)
     n, num = 0, directions.shape[2]
+    num_lens = num - 2 * fields.shape[1] * canonical.shape[0]  # the others are amplitudes of fields
     if not np.isfinite(xyz[t, 0] + xyz[t, 1] + xyz[t, 2]):
         return 0
     for o in range(track_ptr[t], track_ptr[t + 1]):
@@ -222,13 +223,16 @@ def _fill_rows(t: int, seen: _Seen, cameras: _Cameras, unknowns: _Unknowns, nois
                     total += J[POSE + 8 * r + m] * adjoints[s, m, k]
                 pose_part[row, k] = weight * total
             for q in range(num):
-                total = 0.0
-                for k in range(used):
-                    total += J[CANON + 2 * k + r] * directions[s, k, q]
-                for k in range(3):
-                    total += J[POSE + 8 * r + k] * directions[s, FAMILY + k, q]
-                lens_part[row, q] = weight * total
-            first = num - 2 * fields.shape[1] * canonical.shape[0] + (2 * s + r) * fields.shape[1]
+                lens_part[row, q] = 0.0
+            for k in range(used):  # along rows of memory, for all unknowns at once
+                value = weight * J[CANON + 2 * k + r]
+                for q in range(num_lens):
+                    lens_part[row, q] += value * directions[s, k, q]
+            for k in range(3):
+                value = weight * J[POSE + 8 * r + k]
+                for q in range(num_lens):
+                    lens_part[row, q] += value * directions[s, FAMILY + k, q]
+            first = num_lens + (2 * s + r) * fields.shape[1]
             for q in range(fields.shape[1]):
                 lens_part[row, first + q] = weight * J[CANON + 4] * fields[o, q]
         n += 1
