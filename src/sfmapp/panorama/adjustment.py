@@ -316,7 +316,8 @@ class _Problem:
         """The state after a step, with what follows from it for the rays."""
         inverses, toward, weights, by_camera, by_ray = of_rays
         by_step = np.where(self.columns >= 0, step[self.columns], 0.0)
-        change = weights[:, None] * np.einsum("nki,nkp,np->ni", by_ray, by_camera, by_step)
+        followed = np.einsum("nkp,np->nk", by_camera, by_step)
+        change = weights[:, None] * np.einsum("nki,nk->ni", by_ray, followed)
         rest = toward - np.add.reduceat(change, self.tracks.track_ptr[:-1], axis=0)
         sideways = np.einsum("tij,tj->ti", inverses, rest)
         rays = state.rays + np.einsum("tij,tj->ti", _tangents(state.rays), sideways)

@@ -50,8 +50,9 @@ class View:
         """Pixels (N, 2) of directions in the world (N, 3), and which of them the photograph shows."""
         seen = rays @ self.rotation.T
         xy = project(self.camera, seen)
-        inside = (seen[:, 2] >= self.least_z) & (xy > 0.5).all(1)
-        inside &= (xy < [self.camera.width - 0.5, self.camera.height - 0.5]).all(1)
+        x, y = xy.T
+        inside = (seen[:, 2] >= self.least_z) & (x > 0.5) & (x < self.camera.width - 0.5)
+        inside &= (y > 0.5) & (y < self.camera.height - 0.5)
         return xy, inside
 
 
@@ -79,15 +80,17 @@ class Canvas:
 
     def rays(self, columns: Array, rows: Array) -> Array:
         """(rows, columns, 3) unit directions in the world, of pixels at these places."""
-        x, y = np.meshgrid((columns + self.left) / self.scale, (rows + self.top) / self.scale)
+        x, y = (columns + self.left) / self.scale, ((rows + self.top) / self.scale)[:, None]
+        out = np.empty((len(rows), len(columns), 3))
         if self.projection == "planar":
-            out = np.stack([x, y, np.ones_like(x)], -1)
+            out[..., 0], out[..., 1], out[..., 2] = x, y, 1.0
         elif self.projection == "cylindrical":
-            out = np.stack([np.sin(x), y, np.cos(x)], -1)
+            out[..., 0], out[..., 1], out[..., 2] = np.sin(x), y, np.cos(x)
         else:
-            return np.stack([np.sin(x) * np.cos(y), np.sin(y), np.cos(x) * np.cos(y)], -1)
-        unit: Array = out / np.linalg.norm(out, axis=-1, keepdims=True)
-        return unit
+            out[..., 0], out[..., 1], out[..., 2] = np.sin(x) * np.cos(y), np.sin(y), np.cos(x) * np.cos(y)
+            return out
+        out /= np.linalg.norm(out, axis=-1, keepdims=True)
+        return out
 
     def scaled(self, factor: float) -> Canvas:
         """The same surface with fewer pixels; a closed one keeps whole columns, so its scale may differ a little."""
