@@ -14,13 +14,13 @@ of the lens both count.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.calibration.boards import Board
+from sfmapp.calibration.growing import Steps, grow
 from sfmapp.geometry.dlt import find_homography, homogeneous
 
 Array = NDArray[np.float64]
@@ -153,32 +153,19 @@ def _largest_lattice(disks: Disks) -> CircleLattice | None:
 def _grown(disks: Disks, tree: object, seed: int) -> dict[tuple[int, int], int]:
     """Blobs by place, from one of them on."""
     first = _first_steps(disks, tree, seed)
-    places = {(0, 0): seed}
     if first is None:
-        return places
-    taken, steps, queue = {seed}, {(0, 0): first}, deque([(0, 0)])
+        return {(0, 0): seed}
     xy = disks.xy
-    while queue:
-        at = queue.popleft()
-        here = places[at]
-        for axis, way in ((0, 1), (0, -1), (1, 1), (1, -1)):
-            to = (at[0] + way, at[1]) if axis == 0 else (at[0], at[1] + way)
-            if to in places:
-                continue
-            back = (at[0] - way, at[1]) if axis == 0 else (at[0], at[1] - way)
-            step = xy[here] - xy[places[back]] if back in places else way * steps[at][axis]
-            distance, other = tree.query(xy[here] + step)  # type: ignore[attr-defined]
-            shortest = min(np.hypot(*steps[at][0]), np.hypot(*steps[at][1]))
-            ratio = disks.area[other] / disks.area[here]
-            if other in taken or distance > _OFF * shortest or not 1.0 / _ALIKE < ratio < _ALIKE:
-                continue
-            places[to] = int(other)
-            taken.add(int(other))
-            own = list(steps[at])
-            own[axis] = way * (xy[other] - xy[here])
-            steps[to] = (own[0], own[1])
-            queue.append(to)
-    return places
+
+    def find(here: int, step: Array, steps: Steps) -> int | None:
+        distance, other = tree.query(xy[here] + step)  # type: ignore[attr-defined]
+        shortest = min(np.hypot(*steps[0]), np.hypot(*steps[1]))
+        ratio = disks.area[other] / disks.area[here]
+        if distance > _OFF * shortest or not 1.0 / _ALIKE < ratio < _ALIKE:
+            return None
+        return int(other)
+
+    return grow(xy, seed, first, find)
 
 
 def _first_steps(disks: Disks, tree: object, seed: int) -> tuple[Array, Array] | None:

@@ -9,12 +9,13 @@ ICRA 2012.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sfmapp.calibration.growing import Steps, grow
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -147,30 +148,14 @@ def _grown(saddles: _Saddles, seed: int) -> dict[tuple[int, int], int]:
     first = _first_steps(saddles, seed)
     if first is None:
         return {}
-    places = {(0, 0): seed}
-    taken = {seed}
-    steps: dict[tuple[int, int], tuple[Array, Array]] = {(0, 0): first}
-    queue = deque([(0, 0)])
     xy = saddles.xy
-    while queue:
-        at = queue.popleft()
-        here = places[at]
-        for axis, way in ((0, 1), (0, -1), (1, 1), (1, -1)):
-            to = (at[0] + way, at[1]) if axis == 0 else (at[0], at[1] + way)
-            if to in places:
-                continue
-            back = (at[0] - way, at[1]) if axis == 0 else (at[0], at[1] - way)
-            step = xy[here] - xy[places[back]] if back in places else way * steps[at][axis]
-            found = _nearest(saddles, xy[here] + step, here, steps[at])
-            length = np.hypot(*step)
-            if found is None or found in taken or np.hypot(*(xy[found] - xy[here] - step)) > _OFF * length:
-                continue
-            places[to] = found
-            taken.add(found)
-            own = list(steps[at])
-            own[axis] = way * (xy[found] - xy[here])
-            steps[to] = (own[0], own[1])
-            queue.append(to)
+
+    def find(here: int, step: Array, steps: Steps) -> int | None:
+        found = _nearest(saddles, xy[here] + step, here, steps)
+        is_near = found is not None and np.hypot(*(xy[found] - xy[here] - step)) <= _OFF * np.hypot(*step)
+        return found if is_near else None
+
+    places = grow(xy, seed, first, find)
     return _without_tails(_without_weak(saddles, places))
 
 

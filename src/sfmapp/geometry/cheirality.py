@@ -72,7 +72,6 @@ def choose_pose(essential: Array, xn1: Array, xn2: Array, noise: float = 0.0) ->
     """
     poses = decompose_essential(essential)
     in_front, certain = _ballots(poses, xn1, xn2, noise)
-    _, angles = ray_depths(poses[0], xn1, xn2)
     votes = (in_front & certain).sum(1)
     best = int(np.argmax(votes))
     if not votes.any():

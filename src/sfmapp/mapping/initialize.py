@@ -99,6 +99,14 @@ def rank_initial_pairs(
     return sorted(ranked, key=lambda pair: -pair.score)
 
 
+def initial_angles(options: MappingOptions) -> list[float]:
+    """The median angle that an initial pair should have, and its halves: narrow ones make few points anyway."""
+    angles = [options.min_initial_angle_deg]
+    while angles[-1] >= options.min_triangulation_angle_deg:
+        angles.append(angles[-1] / 2)
+    return angles
+
+
 def single_places(correspondences: Correspondences, num_images: int) -> NDArray[np.int64]:
     """(I,) int64 groups of images taken from one place, -1 for images that moved.
 

@@ -20,7 +20,7 @@ from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.mapping import structure
-from sfmapp.mapping.initialize import InitialPair, initialize_from_pair, rank_initial_pairs
+from sfmapp.mapping.initialize import InitialPair, initial_angles, initialize_from_pair, rank_initial_pairs
 from sfmapp.mapping.keypoint_noise import KeypointNoise, keypoint_noise
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import Registration, rank_next_images, register_image
@@ -91,7 +91,7 @@ class Mapper:
         inliers = options.min_initial_inliers
         while True:
             # many matches under a small angle before few under a wide one, which may be of things that look alike
-            for angle in self._initial_angles():
+            for angle in initial_angles(self.options):
                 for pair in ranked:
                     reason = pair.reason or pair.shortfall(inliers, angle)
                     tried.append(pair.report(self.reconstruction.image_names, reason))
@@ -101,13 +101,6 @@ class Mapper:
                 return tried
             inliers = max(inliers // 2, options.min_pose_inliers)
             self.events.decided(STAGE, f"no initial pair; relaxing to {inliers} matches")
-
-    def _initial_angles(self) -> list[float]:
-        """The median angle that an initial pair should have, and its halves: narrow ones make few points anyway."""
-        angles = [self.options.min_initial_angle_deg]
-        while angles[-1] >= self.options.min_triangulation_angle_deg:
-            angles.append(angles[-1] / 2)
-        return angles
 
     def _start_from(self, pair: InitialPair) -> bool:
         initialize_from_pair(self.reconstruction, pair)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfmapp.mapping.initialize import rank_initial_pairs
+from sfmapp.mapping.initialize import initial_angles, rank_initial_pairs
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.tracks import build_tracks
 from sfmapp.matching.stage import MatchedPair, join_pairs
@@ -30,7 +30,7 @@ def start_of(views: tuple[View, View], pair: MatchedPair, options: MappingOption
         )  # fmt: skip
     first = ranked[0]
     reason = first.reason or first.shortfall(*wanted)
-    least = options.min_pose_inliers, _least_angle(options)
+    least = options.min_pose_inliers, initial_angles(options)[-1]
     fallback = ""
     if reason and not first.reason:
         short = first.shortfall(*least)
@@ -43,11 +43,3 @@ def start_of(views: tuple[View, View], pair: MatchedPair, options: MappingOption
         median_angle_deg=first.median_angle_deg, min_angle_deg=wanted[1], score=first.score, reason=reason,
         fallback=fallback,
     )  # fmt: skip
-
-
-def _least_angle(options: MappingOptions) -> float:
-    """The last of the angles that the mapper asks for, each half of the one before (``Mapper._initial_angles``)."""
-    angle = options.min_initial_angle_deg
-    while angle >= options.min_triangulation_angle_deg:
-        angle /= 2.0
-    return angle

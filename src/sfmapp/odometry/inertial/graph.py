@@ -362,7 +362,7 @@ class Placement:
         scale, offset = np.exp(alignment[0]), alignment[3]
         by_pose, by_velocity, by_alignment = np.zeros((6, 6)), np.zeros((6, 3)), np.zeros((6, 4))
         by_pose[:3, :3] = back @ turned
-        by_pose[3:, :3] = -back @ turned @ _skew(self.arm + mounting[3:])
+        by_pose[3:, :3] = -back @ turned @ rigid3.skew(self.arm + mounting[3:])
         by_pose[3:, 3:] = scale * back @ turned
         by_velocity[3:] = -offset * back
         of_tilt = gtsam.Rot3.ExpmapDerivative(-np.array([alignment[1], alignment[2], 0.0]))[:, :2]
@@ -370,17 +370,12 @@ class Placement:
         by_alignment[:3, 1:3] = back @ of_tilt
         by_alignment[:3, 3] = -rate
         by_alignment[3:, 0] = back @ (center - turned @ (self.arm + mounting[3:]))
-        by_alignment[3:, 1:3] = -back @ _skew(center) @ of_tilt
+        by_alignment[3:, 1:3] = -back @ rigid3.skew(center) @ of_tilt
         by_alignment[3:, 3] = -back @ velocity
         by_mounting = np.zeros((6, 6))
         by_mounting[:3, :3] = gtsam.Rot3.Expmap(offset * rate).matrix() @ gtsam.Rot3.ExpmapDerivative(mounting[:3])
         by_mounting[3:, 3:] = back @ turned
         return by_pose, by_velocity, by_alignment, by_mounting
-
-
-def _skew(v: Array) -> Array:
-    x, y, z = v
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 _SENSOR = tuple(gtsam.symbol("s", n) for n in range(6))
