@@ -30,6 +30,7 @@ FLOORS = (
     ("surface",),
     ("dense",),
     ("georeference",),
+    ("planes",),
     ("calibration",),
     ("twoview",),
     ("panorama",),

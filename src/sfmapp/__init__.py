@@ -42,6 +42,7 @@ if TYPE_CHECKING:
         undistort,
         validate,
     )
+    from sfmapp.api.planes import rectify, warp_picture
     from sfmapp.api.reconstruction import Reconstruction, load
     from sfmapp.api.stages import Matcher, extract_features, map_images, match_images
     from sfmapp.camera.camera import Camera
@@ -120,12 +121,14 @@ __all__ = [
     "map_images",
     "match_images",
     "reconstruct",
+    "rectify",
     "refine",
     "track_sequence",
     "triangulate",
     "undistort",
     "validate",
     "verify_pair",
+    "warp_picture",
 ]
 
 _HOMES = {
@@ -179,12 +182,14 @@ _HOMES = {
     "map_images": "api.stages",
     "match_images": "api.stages",
     "reconstruct": "api.jobs",
+    "rectify": "api.planes",
     "refine": "api.jobs",
     "track_sequence": "api.jobs",
     "triangulate": "api.geometry",
     "undistort": "api.jobs",
     "validate": "api.jobs",
     "verify_pair": "api.geometry",
+    "warp_picture": "api.planes",
 }
 
 

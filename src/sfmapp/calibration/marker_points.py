@@ -24,17 +24,31 @@ def find_marker_points(
     Raises:
         UsageError: no such dictionary.
     """
+    markers = find_markers(gray, dictionary)
+    seen = [number for number, _ in markers]
+    names, xyz, xy = list[str](), [np.zeros((0, 3))], [np.zeros((0, 2))]
+    for number, corners in markers:
+        if number in places and seen.count(number) == 1:
+            names += [f"{number}/{corner}" for corner in range(4)]
+            xyz.append(places[number])
+            xy.append(corners)
+    return names, np.concatenate(xyz), np.concatenate(xy), sorted(set(seen) - set(places))
+
+
+def find_markers(gray: NDArray[np.uint8], dictionary: str) -> list[tuple[int, Array]]:
+    """Markers in a picture (H, W): id, and pixels (4, 2) of the corners clockwise from the marker's own top left.
+
+    Raises:
+        UsageError: no such dictionary.
+    """
     import cv2
 
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary_of(dictionary), parameters).detectMarkers(gray)
-    seen = [] if ids is None else [int(number) for number in np.ravel(ids)]
-    names, xyz, xy = list[str](), [np.zeros((0, 3))], [np.zeros((0, 2))]
-    for number, found in zip(seen, corners, strict=True):
-        if number in places and seen.count(number) == 1:
-            names += [f"{number}/{corner}" for corner in range(4)]
-            xyz.append(places[number])
-            # OpenCV puts the centre of a pixel at its index
-            xy.append(np.asarray(found, np.float64).reshape(4, 2) + 0.5)
-    return names, np.concatenate(xyz), np.concatenate(xy), sorted(set(seen) - set(places))
+    numbers = [] if ids is None else [int(number) for number in np.ravel(ids)]
+    # OpenCV puts the centre of a pixel at its index
+    return [
+        (number, np.asarray(found, np.float64).reshape(4, 2) + 0.5)
+        for number, found in zip(numbers, corners, strict=False)
+    ]

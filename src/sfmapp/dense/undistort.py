@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.camera.lens import distort, project
 from sfmapp.camera.names import CameraModel
-from sfmapp.scene.cube import radial_part, reach_angle
+from sfmapp.scene.cube import reach_angle, reach_radius
 from sfmapp.scene.undistortion import has_distortion
+from sfmapp.simd.cubic import cubic_weights
 
 Array = NDArray[np.float64]
 
@@ -159,7 +160,7 @@ def resample(
     flat, shown = np.empty((size[1], size[0], layers.shape[2]), layers.dtype), np.empty(size[::-1], np.uint8)
     row = camera.canonical
     if plane_from_cam is None:
-        _resample(layers, row, _reach(camera), k, white, flat, shown)
+        _resample(layers, row, reach_radius(camera), k, white, flat, shown)
     else:
         if camera.model == CameraModel.EQUIRECTANGULAR:
             layers = _with_neighbors(layers)
@@ -167,14 +168,6 @@ def resample(
         cam_from_plane = np.ascontiguousarray(plane_from_cam.T)
         _resample_turned(layers, row, math.cos(reach_angle(camera)), cam_from_plane, k, white, flat, shown)
     return flat.reshape(size[1], size[0], *pixels.shape[2:]), shown
-
-
-def _reach(camera: Camera) -> float:
-    """Radius in the normalised plane up to which the lens is one to one: beyond, its polynomial folds back."""
-    radius, row = np.tan(np.linspace(0.0, 1.53, 4000)), radial_part(camera)
-    image = np.array([distort(row, r, 0.0)[0] for r in radius])
-    folds = np.flatnonzero(~(np.diff(image) > 0.0))
-    return float(radius[folds[0]]) if len(folds) else math.inf
 
 
 def _with_neighbors(panorama: NDArray[Any]) -> NDArray[Any]:
@@ -186,27 +179,12 @@ def _with_neighbors(panorama: NDArray[Any]) -> NDArray[Any]:
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _cubic_weights(t: float) -> tuple[float, float, float, float]:
-    """Of four pixels in a row, for a place that is t beyond the second.
-
-    Keys, IEEE ASSP 1981, with a = -1/2, which is exact for parabolas. OpenCV's, with a = -3/4 and on a grid of 1/32
-    pixel, moves edges by up to a twentieth of a pixel, back and forth.
-    """
-    return (
-        t * (-0.5 + t * (1.0 - 0.5 * t)),
-        1.0 + t * t * (1.5 * t - 2.5),
-        t * (0.5 + t * (2.0 - 1.5 * t)),
-        t * t * (0.5 * t - 0.5),
-    )
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
 def _interpolate(pixels: NDArray[Any], px: float, py: float, white: NDArray[np.float64], out: NDArray[Any]) -> None:
     """Fill out (C,) with the colour of a photograph (H, W, C) at a pixel."""
     height, width, channels = pixels.shape
     px, py = min(max(px, 0.0), float(width)) - 0.5, min(max(py, 0.0), float(height)) - 0.5
     i, j = math.floor(px), math.floor(py)
-    wx, wy = _cubic_weights(px - i), _cubic_weights(py - j)
+    wx, wy = cubic_weights(px - i), cubic_weights(py - j)
     for c in range(channels):
         total = 0.5
         for b in range(4):

@@ -210,19 +210,26 @@ def without_orientation(data: bytes) -> bytes:
 def to_8_bits(raw: NDArray[Any]) -> Pixels:
     """uint16 values scaled to uint8 with rounding; uint8 as it is.
 
-    Cameras write 10, 12 and 14 bits into 16: the smallest of these depths that holds the largest value is taken as
-    white, so that such pictures do not come out black.
+    :func:`white_of` is the largest of them, so that pictures of fewer bits do not come out black.
     """
     if raw.dtype == np.uint8:
         return raw
-    color = raw[..., :3] if raw.ndim == 3 else raw
-    largest = int(color.max(initial=0))
-    white = next(value for bits in (8, 10, 12, 14, 16) if largest <= (value := (1 << bits) - 1))
+    white = white_of(raw)
     table = ((np.arange(65536, dtype=np.int64) * 510 + white) // (2 * white)).clip(0, 255).astype(np.uint8)
     scaled: Pixels = table[raw]
     if raw.ndim == 3 and raw.shape[2] == 4:
         scaled[..., 3] = raw[..., 3] >> 8
     return scaled
+
+
+def white_of(raw: NDArray[Any]) -> int:
+    """The value of white in pixels as stored: cameras write 10, 12 and 14 bits into 16, and the smallest of these
+    depths that holds the largest value is taken."""
+    if raw.dtype == np.uint8:
+        return 255
+    color = raw[..., :3] if raw.ndim == 3 else raw
+    largest = int(color.max(initial=0))
+    return next(value for bits in (8, 10, 12, 14, 16) if largest <= (value := (1 << bits) - 1))
 
 
 def _alpha_mask(alpha: Pixels | None) -> NDArray[np.bool_] | None:

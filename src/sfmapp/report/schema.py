@@ -16,6 +16,7 @@ from typing import Any, Union
 from sfmapp.calibration.file import CalibrationDocument
 from sfmapp.calibration.point_reports import LocationReport, MeasureReport, TargetReport
 from sfmapp.georeference.world_frame import Georeference
+from sfmapp.planes.report import RectifyReport, WarpReport
 from sfmapp.report.evaluation import EvaluationReport
 from sfmapp.report.model import (
     CalibrateReport,
@@ -33,8 +34,8 @@ from sfmapp.report.validation import CloudValidation, Validation
 from sfmapp.reporting import Report, field_types
 
 # by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry, refine,
-# calibrate, locate, pair and panorama; calibration.json; validation/report.json and validation/cloud.json; what
-# evaluate, undistort, export and measure print with --json; and georeference.json
+# calibrate, locate, pair, panorama, warp and rectify; calibration.json; validation/report.json and
+# validation/cloud.json; what evaluate, undistort, export and measure print with --json; and georeference.json
 KINDS: Mapping[str, type[Report]] = {
     "reconstruct": ReconstructionReport,
     "dense": DenseRunReport,
@@ -54,6 +55,8 @@ KINDS: Mapping[str, type[Report]] = {
     "measure": MeasureReport,
     "pair": PairReport,
     "panorama": PanoramaReport,
+    "warp": WarpReport,
+    "rectify": RectifyReport,
 }
 _SIMPLE = {bool: "boolean", int: "integer", float: "number", str: "string", type(None): "null"}
 

@@ -65,6 +65,14 @@ def reach_angle(camera: Camera) -> float:
     return float(angle[ends[0]]) if len(ends) else math.pi
 
 
+def reach_radius(camera: Camera) -> float:
+    """Radius in the normalised plane up to which the lens is one to one: beyond, its polynomial folds back."""
+    radius, row = np.tan(np.linspace(0.0, 1.53, 4000)), radial_part(camera)
+    image = np.array([lens.distort(row, r, 0.0)[0] for r in radius])
+    folds = np.flatnonzero(~(np.diff(image) > 0.0))
+    return float(radius[folds[0]]) if len(folds) else math.inf
+
+
 def radial_part(camera: Camera) -> Array:
     """The row (17,) of a lens in units of its focal length, without tangential terms, skew and prism: these are no
     reason for it to fold back."""

@@ -16,16 +16,19 @@ __all__ = [
     "PAIR",
     "PANORAMA",
     "RECONSTRUCT",
+    "RECTIFY",
     "REFINE",
     "REPORT",
     "UNDISTORT",
     "USUAL_FOLDERS",
+    "WARP",
 ]
 
 FORMAT = f"{FORMAT_NAME} 1"
 # the commands that write workspaces; manifests of before the second one name none
 RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "refine", "dense", "undistort"
 CALIBRATE, LOCATE, PAIR, PANORAMA = "calibrate", "locate", "pair", "panorama"
+WARP, RECTIFY = "warp", "rectify"
 # a report for programs, and the page for people beside it
 LOCK, REPORT, PAGE = ".lock", "report.json", "report.html"
 # where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0

@@ -126,7 +126,7 @@ def calibrate_from_target(
         NoReconstructionError: they leave the focal length open.
     """
     _check_sigma(sigma_px)
-    record = _describe(photograph)
+    record = describe_photograph(photograph)
     with Job.opened(CALIBRATE, photograph, output, None, events=events, watch=watch) as job:
         job.note_inputs({record.name: record.digest})
         points = _read_points(record, source, job.events)
@@ -168,8 +168,8 @@ def locate(
     """
     _check_sigma(sigma_px)
     search = search or PoseSearch()
-    record = _describe(photograph)
-    given, covariance = _read_camera(camera, record)
+    record = describe_photograph(photograph)
+    given, covariance = read_camera(camera, record)
     with Job.opened(LOCATE, photograph, output, None, events=events) as job:
         job.note_inputs({record.name: record.digest})
         if source.model is None:
@@ -297,7 +297,8 @@ def _check_sigma(sigma_px: float | None) -> None:
         raise UsageError(f"sigma_px is {sigma_px:g}, expected more than 0 pixels")
 
 
-def _describe(photograph: str | os.PathLike[str]) -> ImageRecord:
+def describe_photograph(photograph: str | os.PathLike[str]) -> ImageRecord:
+    """One photograph. Raises InputError if it cannot be used."""
     path = Path(photograph)
     records, reasons = describe_images(path.parent, [path.name], ImageOptions())
     record = records[0]
@@ -338,7 +339,7 @@ def _read_points(record: ImageRecord, source: PointSource, events: Events) -> _P
     return _Points(PhotographFacts(record.name, names, places.unit), xyz, xy)
 
 
-def _read_camera(given: str, record: ImageRecord) -> tuple[Camera, Array | None]:
+def read_camera(given: str, record: ImageRecord) -> tuple[Camera, Array | None]:
     """The camera of a photograph, and the covariance of its parameters where its file has one for pictures as large."""
     photograph = Photograph(record.name, (record.width, record.height), record.orientation)
     cameras, calibration = read_given_camera(given)
