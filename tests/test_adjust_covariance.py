@@ -9,7 +9,7 @@ from nadir_block import nadir_block
 from sfmapp.adjust.covariance import errors_in_gauge, estimate_covariances
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying
-from sfmapp.adjust.selected_inverse import estimate_pose_covariances
+from sfmapp.adjust.selected_inverse import selected_covariances
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.georeference.factors import position_graph
@@ -175,18 +175,36 @@ def test_poses_from_the_sparse_factor_are_those_of_the_whole_inverse():
     model, centers = scene.observed, scene.ground_truth.centers
     for sigma in (0.02, 3.0):  # RTK, and a phone, which holds the whole 1e10 times as loosely as points hold its shape
         graph = position_graph(np.arange(len(centers)), centers, np.full((len(centers), 3), sigma), None)
-        images, poses = estimate_pose_covariances(model, AdjustOptions(), extra_factors=graph)
-        whole = estimate_covariances(model, AdjustOptions(), extra_factors=graph)
-        np.testing.assert_array_equal(images, whole.image_idx)
-        scale = np.sqrt(np.einsum("nii->ni", whole.poses))
-        scale = scale[:, :, None] * scale[:, None, :]
-        np.testing.assert_allclose(poses / scale, whole.poses / scale, atol=1e-8)
+        found = selected_covariances(model, AdjustOptions(), extra_factors=graph)
+        assert_same_blocks(found, estimate_covariances(model, AdjustOptions(), extra_factors=graph))
+
+
+def assert_same_blocks(found, whole):
+    assert found.num_gauge == whole.num_gauge
+    assert found.sigma_px == pytest.approx(whole.sigma_px)
+    np.testing.assert_array_equal(found.image_idx, whole.image_idx)
+    np.testing.assert_array_equal(found.camera_idx, whole.camera_idx)
+    for ours, theirs in zip([*found.poses, *found.intrinsics], [*whole.poses, *whole.intrinsics], strict=True):
+        scale = np.sqrt(np.diag(theirs))
+        np.testing.assert_allclose(ours / np.outer(scale, scale), theirs / np.outer(scale, scale), atol=1e-8)
+
+
+@pytest.mark.parametrize("model", [CameraModel.SIMPLE_RADIAL, CameraModel.THIN_PRISM_FISHEYE])
+def test_blocks_of_a_free_network_from_the_sparse_factor_are_those_of_the_whole_inverse(model):
+    """In the gauge of inner constraints, where two images hold the whole at first; twelve parameters take two blocks of
+    a camera."""
+    scene = nadir_block(0, simple_camera(model, 1000, 750, 850.0), relief=2.0, tilt_deg=2.0)
+    options = AdjustOptions(refine_principal_point=True, distortion_sigma=0.01)
+    whole = estimate_covariances(scene.observed, options)
+    assert whole.num_gauge == 7
+    assert len(whole.intrinsics[0]) == (4 if model == CameraModel.SIMPLE_RADIAL else 12)
+    assert_same_blocks(selected_covariances(scene.observed, options), whole)
 
 
 def test_what_is_open_has_no_covariance_by_the_sparse_factor():
     scene = nadir_block(1, simple_camera(CameraModel.SIMPLE_RADIAL, 1000, 750, 850.0), relief=2.0, tilt_deg=2.0)
-    assert estimate_pose_covariances(scene.observed, AdjustOptions()) is None
-    # two places leave a turn about their line
-    centers = scene.ground_truth.centers[:2]
-    graph = position_graph(np.arange(2), centers, np.full((2, 3), 1.0), None)
-    assert estimate_pose_covariances(scene.observed, AdjustOptions(), extra_factors=graph) is None
+    model = scene.observed.copy()
+    # a photograph that sees one point only may turn about it
+    seen = np.flatnonzero(model.tracks.obs_image_idx == 0)
+    model.obs_is_inlier[seen[1:]] = False
+    assert selected_covariances(model, AdjustOptions()) is None

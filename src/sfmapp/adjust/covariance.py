@@ -13,7 +13,7 @@ to one image or frame hold that constant: with a baseline nothing is then left o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numba
@@ -341,13 +341,8 @@ def _collect(
     determined: bool,
 ) -> Covariances:
     p = engine.problem
-    image_idx, poses = pose_covariances(reconstruction, p, diagonal_blocks(covariance))
-    cameras = np.flatnonzero(p.camera_block >= 0)
-    intrinsics = []
-    for c in cameras:
-        columns = np.unique(p.free.column[p.free.ptr[c] : p.free.ptr[c + 1]])
-        place = p.camera_block[c] * 8 + columns
-        intrinsics.append(covariance[np.ix_(place, place)])
+    beside = diagonal_blocks(np.roll(covariance, -8, axis=1))
+    found = block_covariances(reconstruction, p, diagonal_blocks(covariance), beside, float(np.sqrt(variance)))
     points = np.full((len(p.xyz), 3, 3), np.inf)
     if determined:
         _point_covariances(
@@ -357,17 +352,38 @@ def _collect(
     for n in np.flatnonzero(p.point_block >= 0):
         at = p.point_block[n] * 8 + np.arange(3)
         points[n] = covariance[np.ix_(at, at)]
+    return replace(
+        found, track_idx=p.track_idx, points=points, num_gauge=num_gauge, is_determined=determined
+    )
+
+
+def block_covariances(
+    reconstruction: Reconstruction, problem: Problem, blocks: Array, beside: Array, sigma_px: float
+) -> Covariances:
+    """Covariances of poses and intrinsics, and of no points, with nothing open.
+
+    Args:
+        blocks: (B, 8, 8) of the blocks; beside: (B, 8, 8) of each with the one behind it, where a wide camera goes on.
+    """
+    image_idx, poses = pose_covariances(reconstruction, problem, blocks)
+    cameras = np.flatnonzero(problem.camera_block >= 0)
+    intrinsics = []
+    for c, b in zip(cameras, problem.camera_block[cameras], strict=True):
+        columns = np.unique(problem.free.column[problem.free.ptr[c] : problem.free.ptr[c + 1]])
+        behind = blocks[min(b + 1, len(blocks) - 1)]
+        both = np.block([[blocks[b], beside[b]], [beside[b].T, behind]])
+        intrinsics.append(both[np.ix_(columns, columns)])
     return Covariances(
         image_idx=image_idx,
         poses=poses,
-        camera_idx=p.camera_idx[cameras],
-        free_params=[p.free.params[c] for c in cameras],
+        camera_idx=problem.camera_idx[cameras],
+        free_params=[problem.free.params[c] for c in cameras],
         intrinsics=intrinsics,
-        track_idx=p.track_idx,
-        points=points,
-        sigma_px=float(np.sqrt(variance)),
-        num_gauge=num_gauge,
-        is_determined=determined,
+        track_idx=np.zeros(0, np.int64),
+        points=np.zeros((0, 3, 3)),
+        sigma_px=sigma_px,
+        num_gauge=0,
+        is_determined=True,
     )
 
 

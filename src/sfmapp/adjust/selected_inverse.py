@@ -1,25 +1,29 @@
-"""Covariances of the poses of many images: those blocks of the inverse of a sparse system that are wanted, and no more.
+"""Covariances of many images and their cameras: those blocks of the inverse of a sparse system that are wanted.
 
 The reduced system of a survey is sparse, its inverse is full: of a thousand images half a gigabyte, of which the blocks
 on the diagonal are a thousandth. The recursion of Takahashi, Fagan and Chen ("Formation of a sparse bus impedance
 matrix", 1973; Golub and Plemmons, "Large-scale geodetic least-squares adjustment", 1980) makes the entries of the
-inverse where the factor has its own, from the last column to the first, and nothing else.
+inverse where the factor has its own, from the last column to the first, and nothing else. What is open is held by two
+images alone, which keeps the system sparse, and the blocks are then moved to the gauge of inner constraints (an
+S-transformation: Baarda 1973), for which as many columns are solved as there are open directions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.covariance import gauge_of, pose_covariances, residual_variance, upper_tiles
+from sfmapp.adjust.covariance import Covariances, block_covariances, gauge_of, residual_variance, upper_tiles
 from sfmapp.adjust.options import AdjustOptions
-from sfmapp.adjust.problem import EVERYTHING
+from sfmapp.adjust.problem import EVERYTHING, Problem, Varying
 from sfmapp.adjust.solver import Engine, make_engine
 from sfmapp.camera.camera import Camera
+from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -32,55 +36,58 @@ _NUM_CHECKED, _MAX_OFF = 4, 1e-3
 _MAX_ENTRIES = 15_000_000
 
 
-def estimate_pose_covariances(
+def selected_covariances(
     reconstruction: Reconstruction,
     options: AdjustOptions,
     *,
+    sigma_px: float | None = None,
+    varying: Varying = EVERYTHING,
     prior_cameras: Sequence[Camera] | None = None,
     extra_factors: Any = None,
-) -> tuple[Ints, Array] | None:
-    """Covariances of poses at a minimum where factors beside the reprojections leave nothing open.
+) -> Covariances | None:
+    """Covariances of poses and intrinsics at a minimum, of any number of images.
 
-    Arguments as of :func:`~sfmapp.adjust.covariance.estimate_covariances`, which has those of everything else too.
+    Arguments and gauge as of :func:`~sfmapp.adjust.covariance.estimate_covariances`, which has points too, and joint
+    ones; these have none.
 
     Returns:
-        Images (n,) that vary, and (n, 6, 6); None where something is open, or too many images meet too many others.
+        None where more than a similarity is open, or too many images meet too many others.
     """
     engine = make_engine(
-        reconstruction, options, EVERYTHING, prior_cameras=prior_cameras, extra_factors=extra_factors, is_closing=True
+        reconstruction, options, varying, prior_cameras=prior_cameras, extra_factors=extra_factors, is_closing=True
     )
-    variance = residual_variance(engine)
+    variance = sigma_px**2 if sigma_px is not None else residual_variance(engine)
     engine.priors.weight *= variance
     if engine.extras is not None:
         engine.extras.weight = variance
     engine.linearize(0.0, map)
-    blocks = _inverse_blocks(engine)
-    return None if blocks is None else pose_covariances(reconstruction, engine.problem, variance * blocks)
+    found = _inverse_blocks(engine)
+    if found is None:
+        return None
+    (blocks, beside), num_gauge = found
+    covariances = block_covariances(
+        reconstruction, engine.problem, variance * blocks, variance * beside, float(np.sqrt(variance))
+    )
+    return replace(covariances, num_gauge=num_gauge)
 
 
-def _inverse_blocks(engine: Engine) -> Array | None:
-    """(B, 8, 8) blocks on the diagonal of the inverse of the undamped reduced system."""
-    from scipy.sparse.linalg import splu
-
+def _inverse_blocks(engine: Engine) -> tuple[Array, int] | None:
+    """(2, B, 8, 8) blocks of the inverse of the undamped reduced system, on the diagonal and each with the one behind
+    it, and how many directions only the inner constraints hold."""
     used = (np.arange(8) < engine.problem.block_dim[:, None]).ravel()
     matrix = _sparse_system(engine, used)
-    basis, _ = gauge_of(engine.problem, used, matrix, matrix.diagonal(), has_factors=engine.extras is not None)
-    if len(basis):
-        return None
     root = 1.0 / np.sqrt(matrix.diagonal())
-    scaled = matrix.multiply(root[:, None]).multiply(root[None]).tocsc()
-    try:
-        factor = splu(
-            scaled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True, "Equil": False}
-        )
-    except RuntimeError:  # singular
+    basis, constraint = gauge_of(engine.problem, used, matrix, matrix.diagonal(), has_factors=engine.extras is not None)
+    scaled = matrix.multiply(root[:, None]).multiply(root[None])
+    if len(basis):
+        # in the units of the scaled unknowns; two images that are far apart hold what is open
+        basis, constraint = basis / root, constraint * root
+        scaled = scaled + _held_by_two(engine.problem, used, basis)
+    factor = _factored(scaled.tocsc())
+    if factor is None:
         return None
     lower, pivots = factor.L.tocsc(), factor.U.diagonal()
     lower.sort_indices()
-    if lower.nnz > _MAX_ENTRIES:
-        return None
-    if not (pivots > 0).all() or not np.array_equal(factor.perm_r, factor.perm_c):
-        return None
     diagonal, entries = np.empty(len(root)), np.zeros(len(lower.data))
     _select(lower.indptr.astype(np.int64), lower.indices.astype(np.int64), lower.data, pivots, diagonal, entries)
     place = np.argsort(factor.perm_c)  # of the columns of the factor among ours
@@ -88,10 +95,59 @@ def _inverse_blocks(engine: Engine) -> Array | None:
         return None
     column = np.repeat(np.arange(len(root)), np.diff(lower.indptr))
     blocks = _gathered(place[lower.indices], place[column], entries, place, diagonal, used)
+    if len(basis):
+        blocks = _in_inner_gauge(blocks, factor, basis, constraint, used)
     full_root = np.zeros(len(used))
     full_root[used] = root
     per_block = full_root.reshape(-1, 8)
-    return blocks * per_block[:, :, None] * per_block[:, None, :]
+    behind = np.roll(per_block, -1, axis=0)
+    return blocks * per_block[:, :, None] * np.stack([per_block, behind])[:, :, None, :], len(basis)
+
+
+def _factored(scaled: Any) -> Any:
+    """The factor of a symmetric sparse matrix; None where it is singular, or too full."""
+    from scipy.sparse.linalg import splu
+
+    try:
+        factor = splu(
+            scaled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True, "Equil": False}
+        )
+    except RuntimeError:  # singular
+        return None
+    is_sound = (factor.U.diagonal() > 0).all() and np.array_equal(factor.perm_r, factor.perm_c)
+    return factor if is_sound and factor.L.nnz <= _MAX_ENTRIES else None
+
+
+def _held_by_two(problem: Problem, used: NDArray[np.bool_], basis: Array) -> Any:
+    """What is to be added to a system (N, N) for two images to hold the open directions (k, N), as a sparse matrix."""
+    from scipy import sparse
+
+    images = np.flatnonzero(problem.pose_block >= 0)
+    centers = rigid3.center(problem.poses[images])
+    far = int(np.argmax(np.linalg.norm(centers - centers.mean(0), axis=1)))
+    other = int(np.argmax(np.linalg.norm(centers - centers[far], axis=1)))
+    is_holding = np.zeros(len(used), bool)
+    for i in (far, other):
+        is_holding[problem.pose_block[images[i]] * 8 + np.arange(6)] = True
+    holding = np.flatnonzero(is_holding[used])
+    rows, _ = np.linalg.qr(basis[:, holding].T)  # alike in all directions
+    row, column = np.meshgrid(holding, holding, indexing="ij")
+    size = int(used.sum())
+    return sparse.coo_matrix(((rows @ rows.T).ravel(), (row.ravel(), column.ravel())), shape=(size, size))
+
+
+def _in_inner_gauge(blocks: Array, factor: Any, basis: Array, constraint: Array, used: NDArray[np.bool_]) -> Array:
+    """Blocks (2, B, 8, 8) of a covariance S with the open directions (k, N) held somehow, moved to where the
+    constraints (k, N) vanish: of P S P^T, with P = 1 - basis^T (constraint basis^T)^-1 constraint."""
+    crossed = factor.solve(constraint.T)
+    turned = basis.T @ np.linalg.inv(constraint @ basis.T)
+    # P S P^T = S - Y T^T - T Y^T + T W T^T with Y = S C^T, T = B^T (C B^T)^-1, W = C S C^T
+    left, right = np.zeros((2, len(used), len(basis)))
+    left[used], right[used] = crossed, turned
+    y, t = left.reshape(blocks.shape[1], 8, -1), right.reshape(blocks.shape[1], 8, -1)
+    y_behind, t_behind = (np.stack([x, np.roll(x, -1, axis=0)]).transpose(0, 1, 3, 2) for x in (y, t))
+    moved: Array = blocks - y @ t_behind - t @ y_behind + t @ (constraint @ crossed) @ t_behind
+    return moved
 
 
 def _sparse_system(engine: Engine, used: NDArray[np.bool_]) -> Any:
@@ -112,14 +168,18 @@ def _sparse_system(engine: Engine, used: NDArray[np.bool_]) -> Any:
 
 
 def _gathered(row: Ints, column: Ints, entries: Array, place: Ints, diagonal: Array, used: NDArray[np.bool_]) -> Array:
-    """(B, 8, 8) blocks on the diagonal, of entries of the inverse by their unknowns."""
+    """(2, B, 8, 8) blocks on the diagonal, and each with the one behind it, of entries of the inverse by their
+    unknowns; zeros where the factor has none."""
     number = np.flatnonzero(used)
-    blocks = np.zeros((len(used) // 8, 8, 8))
-    row, column, own = number[row], number[column], number[place]
-    within = row // 8 == column // 8
-    i, j, values = row[within], column[within], entries[within]
-    blocks[i // 8, i % 8, j % 8] = blocks[i // 8, j % 8, i % 8] = values
-    blocks[own // 8, own % 8, own % 8] = diagonal
+    num = len(used) // 8
+    blocks = np.zeros((2, num, 8, 8))
+    ends = number[row], number[column]
+    for i, j in (ends, ends[::-1]):
+        for k in range(2):
+            kept = i // 8 + k == j // 8
+            blocks[k, i[kept] // 8, i[kept] % 8, j[kept] % 8] = entries[kept]
+    own = number[place]
+    blocks[0, own // 8, own % 8, own % 8] = diagonal
     return blocks
 
 

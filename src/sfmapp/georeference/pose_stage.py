@@ -17,6 +17,7 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
 
+from sfmapp.adjust.selected_inverse import selected_covariances
 from sfmapp.contradictions import Contradiction
 from sfmapp.errors import InputError
 from sfmapp.events import Events
@@ -33,7 +34,7 @@ from sfmapp.georeference.pose_fit import (
 )
 from sfmapp.georeference.pose_options import PoseOptions
 from sfmapp.georeference.pose_report import KnownPoseRow, PosedModel, PosesReport
-from sfmapp.mapping.mapper import MAX_UNCERTAINTY_IMAGES, Mapper
+from sfmapp.mapping.mapper import Mapper
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -168,18 +169,19 @@ def brought(mapper: Mapper, known: KnownPoses) -> tuple[float, PoseFit | None]:
 
 def _own_covariances(mapper: Mapper, known: KnownPoses) -> Array | None:
     """(m, 6, 6) of poses as photographs alone tell them, in the order of residuals: the centre moves by -R^T v with
-    ``x_cam <- exp(w) x_cam + v``, the rotation residual by R^T w. None where the model is too large, or is not
-    determined."""
+    ``x_cam <- exp(w) x_cam + v``, the rotation residual by R^T w. None where they are not determined, or too many
+    images meet too many others."""
     model = mapper.reconstruction
-    if model.is_registered.sum() > MAX_UNCERTAINTY_IMAGES:
-        return None
-    joint = adjusting_of(mapper).to_judge().marginal_covariance(images=known.image_idx.tolist())
-    if not joint.is_determined:
+    options, varying, noise = mapper.closing_options()
+    found = selected_covariances(
+        model, options, sigma_px=noise.sigma_px, varying=varying, prior_cameras=mapper.prior_cameras
+    )
+    if found is None:
         return None
     back = rigid3.rotation_matrix(model.cam_from_world[known.image_idx]).transpose(0, 2, 1)
     slope = np.zeros((len(back), 6, 6))
     slope[:, :3, 3:], slope[:, 3:, :3] = -back, back
-    own = np.stack([joint.of_image(i) for i in known.image_idx.tolist()])
+    own = np.stack([found.of_image(i) for i in known.image_idx.tolist()])
     turned: Array = slope @ own @ slope.transpose(0, 2, 1)
     return turned
 

@@ -30,7 +30,7 @@ from sfmapp.mapping.focal_priors import (
     focal_sigmas,
     lean_on_priors,
 )
-from sfmapp.mapping.mapper import MAX_UNCERTAINTY_IMAGES, STAGE
+from sfmapp.mapping.mapper import STAGE
 from sfmapp.mapping.report import CameraSigmas, FocalEvidence, ImageSigmas, Uncertainty
 from sfmapp.scene.reconstruction import Reconstruction
 
@@ -47,6 +47,8 @@ CLEAR_RATIO, CLEAR_IMAGES = 0.8, 0.9
 # 0.85 to 1 and offsets of 1 %. The trial holds all photographs to about one lens; more tracks than these tell no more.
 CUT_RATIO, CUT_OFFSET, CUT_TRACKS = 0.7, 0.03, 2000
 CUT_CENTER_SIGMA, CUT_FOCAL_SIGMA, CUT_DISTORTION_SIGMA = 0.15, 0.1, 0.02
+# Intrinsics of their own for every photograph fill the system of so many that the trial takes longer than mapping.
+_MAX_CUT_IMAGES = 200
 # Fewer tracks on either side do not tell.
 MIN_TRACKS = 50
 
@@ -223,7 +225,7 @@ def difference(model: Reconstruction, other: Reconstruction) -> tuple[float, flo
 def _cut_photographs(mapped: Mapped, model: Reconstruction) -> Contradiction | None:
     """What speaks against principal points in the middle, or in one place: photographs that were cut in many ways."""
     registered = model.registered_idx
-    if not 4 <= len(registered) <= MAX_UNCERTAINTY_IMAGES or mapped.mapper_of(model).adjust_options.backend != "schur":
+    if not 4 <= len(registered) <= _MAX_CUT_IMAGES or mapped.mapper_of(model).adjust_options.backend != "schur":
         return None
     noise = max(structure.residual_scale_px(model), 0.1)  # the adjustment counts it as one pixel
     robust = AdjustOptions(loss="cauchy", loss_scale_px=2.0 * noise, max_iterations=30)

@@ -13,7 +13,7 @@ from sfmapp.adjust.covariance import estimate_covariances
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.problem import Varying
-from sfmapp.adjust.selected_inverse import estimate_pose_covariances
+from sfmapp.adjust.selected_inverse import selected_covariances
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.models import PARAM_NAMES
@@ -46,8 +46,9 @@ ELSEWHERE = 2.0
 MAX_CHANGED = 1e-3
 # Synthetic keypoints may be exact; no detector's are better than this.
 MIN_NOISE_PX = 0.02
-# Uncertainties cost an inverse of eight unknowns per image: half a second and 50 MB for this many.
-MAX_UNCERTAINTY_IMAGES = 200
+# The dense inverse of eight unknowns per image takes half a second and 50 MB for this many; beyond it only the blocks
+# that are wanted are made.
+MAX_DENSE_IMAGES = 200
 
 
 @dataclass(kw_only=True)
@@ -388,11 +389,10 @@ class Mapper:
         chosen = self._free_principal_points()
         options = self.with_free_centers(self.adjust_options, chosen) if chosen.any() else self.adjust_options
         given = {"prior_cameras": self.prior_cameras, "extra_factors": extra_factors}
-        selected = estimate_pose_covariances(self.reconstruction, options, **given)
-        if selected is not None or self.reconstruction.is_registered.sum() > MAX_UNCERTAINTY_IMAGES:
-            return selected
-        found = estimate_covariances(self.reconstruction, options, **given)
-        return (found.image_idx, found.poses) if found.is_determined else None
+        found = selected_covariances(self.reconstruction, options, **given)
+        if found is None and self.reconstruction.is_registered.sum() <= MAX_DENSE_IMAGES:
+            found = estimate_covariances(self.reconstruction, options, **given)
+        return (found.image_idx, found.poses) if found is not None and found.is_determined else None
 
     def _polishing(self) -> tuple[AdjustOptions, NDArray[np.bool_]]:
         """Options of the last adjustment, and the cameras (C,) bool whose principal points are free in it."""
@@ -453,17 +453,17 @@ class Mapper:
         """Standard deviations of the finished model for the report: of parameters, and of centres against its size.
 
         They follow from the residuals under the model (independent errors, a right lens model) in the gauge of inner
-        constraints: what the photographs can tell, not how far the lens model is off. Empty for large models, as the
-        dense inverse grows with the cube of the images.
+        constraints: what the photographs can tell, not how far the lens model is off. Empty where that is not
+        determined, and for large models in which most photographs meet most others.
         """
         reconstruction, options = self.reconstruction, self.adjust_options
-        if reconstruction.is_registered.sum() > MAX_UNCERTAINTY_IMAGES:
-            return Uncertainty()
         chosen = self._free_principal_points()
         if chosen.any():
             options = self.with_free_centers(options, chosen)
-        found = estimate_covariances(reconstruction, options, prior_cameras=self.prior_cameras)
-        if not found.is_determined:
+        is_small = reconstruction.is_registered.sum() <= MAX_DENSE_IMAGES
+        estimate = estimate_covariances if is_small else selected_covariances
+        found = estimate(reconstruction, options, prior_cameras=self.prior_cameras)
+        if found is None or not found.is_determined:
             return Uncertainty()
         rotation = rigid3.rotation_matrix(reconstruction.cam_from_world[found.image_idx])
         # c = -R^T t moves by -R^T v; its variance along one axis is a third of the trace
