@@ -13,8 +13,8 @@ import surveys
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.georeference.drift import estimate_drift, similarity_slope
-from sfmapp.georeference.fit import robust_fit
 from sfmapp.georeference.options import GpsOptions
+from sfmapp.georeference.robust_fit import robust_fit
 from sfmapp.georeference.stage import Placed, georeference_models
 from sfmapp.images.image_set import ImageSet
 from sfmapp.images.position import Position

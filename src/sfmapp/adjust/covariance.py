@@ -352,9 +352,7 @@ def _collect(
     for n in np.flatnonzero(p.point_block >= 0):
         at = p.point_block[n] * 8 + np.arange(3)
         points[n] = covariance[np.ix_(at, at)]
-    return replace(
-        found, track_idx=p.track_idx, points=points, num_gauge=num_gauge, is_determined=determined
-    )
+    return replace(found, track_idx=p.track_idx, points=points, num_gauge=num_gauge, is_determined=determined)
 
 
 def block_covariances(

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from sfmapp.geometry import rigid3
 from sfmapp.georeference.drift import Drift
 from sfmapp.georeference.factors import position_graph
-from sfmapp.georeference.fit import MAX_CHI2, MIN_REDUNDANT, LevelOfImage, RobustFit, estimate_factors, fit_similarity
+from sfmapp.georeference.fit import LevelOfImage, fit_similarity
+from sfmapp.georeference.robust_fit import MAX_CHI2, MIN_REDUNDANT, RobustFit, estimate_factors
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.scene.reconstruction import Reconstruction
 
@@ -71,7 +72,9 @@ def adjust_with_positions(
     loose = fit.sigma * _LOOSE
     mapper.adjust_with(position_graph(measured.image_idx, measured.places, loose, level), noise)
     before = model.copy()
-    if measured.is_stated.any():  # what the shape of the model makes of residuals is no reason to doubt them yet
+    if (
+        measured.is_stated.any() and len(measured.image_idx) >= MIN_REDUNDANT
+    ):  # what the shape of the model makes of residuals is no reason to doubt them yet
         fit = _with_factors(fit, measured, np.where(measured.is_stated, 1.0, fit.factor))
     covariance: dict[int, Array] = {}
     for _ in range(_MAX_ROUNDS):

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from sfmapp.events import Events
 from sfmapp.geometry.geodesy import LocalFrame
 from sfmapp.georeference.drift import estimate_drift, similarity_slope
-from sfmapp.georeference.fit import RobustFit, closed_form, fit_similarity, robust_fit
+from sfmapp.georeference.fit import closed_form, fit_similarity
 from sfmapp.georeference.options import GpsOptions
 from sfmapp.georeference.report import ClockReport
+from sfmapp.georeference.robust_fit import RobustFit, robust_fit
 from sfmapp.georeference.sources import places_along, read_positions, with_positions
 from sfmapp.images.image_set import ImageSet
 from sfmapp.mapping.mapper import Mapper

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from sfmapp.formats.control_points import LOCAL, ControlPoints
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.geometry.geodesy import LocalFrame
+from sfmapp.georeference.consensus import likeliest_set
 from sfmapp.georeference.coordinate_systems import HeightReference, coordinate_system
-from sfmapp.georeference.fit import least_median
 
 Array = NDArray[np.float64]
 
@@ -98,8 +98,8 @@ class Alignment:
 def align_to_survey(place: Array, surveyed: Array) -> Alignment:
     """Robust similarity from places in a model (P, 3), NaN where there is none, to those of the survey (P, 3).
 
-    It begins as :func:`~sfmapp.georeference.fit.least_median` has it; then all within 2.5 robust standard deviations
-    count. With three points nothing can be told apart.
+    It begins with the likeliest set of points (:func:`~sfmapp.georeference.consensus.likeliest_set`); then all within
+    2.5 robust standard deviations count. With three points nothing can be told apart.
     """
     known = np.flatnonzero(np.isfinite(place[:, 0]))
     none = np.zeros(len(place), bool)
@@ -110,10 +110,10 @@ def align_to_survey(place: Array, surveyed: Array) -> Alignment:
             f"{len(known)} control points have a place in the model: three that are not on a line are needed",
         )
     model, world = place[known], surveyed[known]
-    start = least_median(model, world, np.ones_like(world))[0]
-    if start is None:
+    found = likeliest_set(model, world, np.ones_like(world), is_stated=False)
+    if found is None:
         return Alignment(None, none, "the control points do not tell where the model lies")
-    lengths = np.linalg.norm(start.apply(model) - world, axis=1)
+    lengths = np.linalg.norm(found.similarity.apply(model) - world, axis=1)
     # a length of three dimensions: the median is 1.538 sigma per axis, and 3.30 sigma of it stand for 2.5 of one axis
     sigma = (1 + 5 / max(len(known) - 3, 1)) * float(np.median(lengths)) / 1.538
     inlier = lengths <= max(3.30 * sigma, 1e-9 * float(np.abs(world).max()))

@@ -18,7 +18,6 @@ from scipy.stats import chi2
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.formats.control_points import ControlPoints
 from sfmapp.georeference.control import CLEARLY, FALSE_ALARM, LeftOut, Survey, leave_out, left_out_already
-from sfmapp.georeference.fit import MEDIAN_CHI2
 from sfmapp.georeference.landmarks import LandmarkFactor, Marks, Surveyed
 from sfmapp.georeference.marks import MarkedPoints
 from sfmapp.scene.reconstruction import Reconstruction
@@ -91,7 +90,7 @@ def adjust_to_control(
             worst, second = np.sort([*outside, 0.0])[::-1][:2]
             if worst - second < CLEARLY or (marked.is_placed & ~is_used).sum() >= most_wrong or spread > 1.0:
                 # who is wrong cannot be told, or too many would be: the survey is poorer than it says
-                wider = spread * float(np.sqrt(np.median(squares[squares > 0]) / MEDIAN_CHI2[3]))
+                wider = spread * float(np.sqrt(np.median(squares[squares > 0]) / chi2.median(3)))
                 is_used, spread = start & marked.is_placed, max(wider, 1.2 * spread)
                 continue
             changed[int(np.argmax(outside))] = False

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.georeference.fit import MAX_CHI2
+from sfmapp.georeference.robust_fit import MAX_CHI2
 from sfmapp.georeference.tags import Tags
 
 Array = NDArray[np.float64]

@@ -11,16 +11,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
+from sfmapp.georeference.disagreement import MIN_AGREEING, find_disagreement
 from sfmapp.georeference.drift import estimate_drift, similarity_slope
-from sfmapp.georeference.fit import robust_fit
+from sfmapp.georeference.faults import name_faults
 from sfmapp.georeference.options import GpsOptions
 from sfmapp.georeference.pose_report import PosedModel, PosesReport, PositionsBeside
 from sfmapp.georeference.pose_stage import STAGE
-from sfmapp.georeference.stage import MAX_SCALE_SIGMA, MIN_AGREEING
+from sfmapp.georeference.robust_fit import RobustFit, robust_fit
+from sfmapp.georeference.stage import MAX_SCALE_SIGMA
 from sfmapp.georeference.tags import Tags, tags_of
 from sfmapp.images.image_set import ImageSet
 from sfmapp.scene.reconstruction import Reconstruction
@@ -29,7 +32,7 @@ from sfmapp.scene.reconstruction import Reconstruction
 _NEARLY_METRES = 1.25
 # Standard deviations by which it may miss: one right one in a thousand is beyond.
 _MAX_SIGMAS = 3.29
-# What sigmas of receivers leave out (the lever arm to the camera, the shutter) makes three or five of them, not ten.
+# Residuals have the errors of known poses too, and what sigmas of receivers leave out: three or five sigmas, not ten.
 _REFUTED_FACTOR = 10.0
 # Positions so many times as sure as the poses had better be used instead.
 _MUCH_SURER = 3.0
@@ -52,9 +55,11 @@ def with_positions(
         if row.reason:
             rows.append(row)
             continue
-        found = _compared(models[row.model], tags)
+        found, fit = _compared(models[row.model], tags)
         events.decided(STAGE, f"model {row.model}: {found.sentence}", **found)
-        contradiction = _contradiction(row, found, _scale_sigma(row, models[row.model]))
+        for name, reason in zip(found.disagreeing, found.faults, strict=True):
+            events.warned(STAGE, f"position of {name}: {reason}")
+        contradiction = None if fit is None else _contradiction(row, found, fit, models[row.model], tags)
         if contradiction is not None:
             events.warned(STAGE, contradiction.message)
             contradictions.append(contradiction)
@@ -67,23 +72,29 @@ def with_positions(
     return replace(report, models=rows, contradictions=contradictions)
 
 
-def _compared(model: Reconstruction, tags: Tags) -> PositionsBeside:
-    n = np.flatnonzero(model.is_registered[tags.image_idx] & (tags.first == np.arange(len(tags.first))))
+def _compared(model: Reconstruction, tags: Tags) -> tuple[PositionsBeside, RobustFit | None]:
+    n = _tags_of_model(model, tags)
     image_idx = tags.image_idx[n]
     centers = model.centers[image_idx]
-    fit = robust_fit(centers, tags.places[n], tags.sigma[n], tags.is_stated) if len(n) >= 3 else None
+    fit = robust_fit(centers, tags.places[n], tags.sigma[n], tags.is_stated)
     if fit is None:
         few = f"{len(n)} of its photographs have one, three are needed"
         reason = few if len(n) < 3 else "they are all within their own errors of each other"
-        return PositionsBeside(num_positions=len(n), reason=reason)
+        return PositionsBeside(num_positions=len(n), reason=reason), None
     used, scale, stated = fit.is_inlier, fit.similarity.scale, float(np.median(tags.sigma[n, 0]))
-    slope = similarity_slope(fit.similarity.apply(centers) - fit.similarity.mean)
-    drift = estimate_drift(fit.residual, fit.sigma, slope, used, image_idx.astype(np.float64))
+    placed = fit.similarity.apply(centers)
+    drift = estimate_drift(
+        fit.residual, fit.sigma, similarity_slope(placed - fit.similarity.mean), used, image_idx.astype(np.float64)
+    )
     heights = fit.residual[used, 2][np.isfinite(fit.residual[used, 2])]
     share = float(np.sqrt(fit.similarity.covariance[3, 3]) * drift.spread[3])
-    return PositionsBeside(
+    names = [model.image_names[i] for i in image_idx]
+    faults = name_faults(tags, n, placed, fit.sigma, used, names)
+    found = PositionsBeside(
         num_positions=len(n),
         num_agreeing=int(used.sum()),
+        disagreeing=[name for name, fault in zip(names, faults, strict=True) if fault],
+        faults=[fault for fault in faults if fault],
         reason=f"they tell the unit within {100 * share:.0f} % only" if share > MAX_SCALE_SIGMA else "",
         stated_sigma_m=stated if tags.is_stated[0] else None,
         unit_m=float(scale),
@@ -94,39 +105,31 @@ def _compared(model: Reconstruction, tags: Tags) -> PositionsBeside:
         ),
         sigma_m=float(np.median(fit.sigma[used, 0])),
     )
+    return found, fit
 
 
-def _contradiction(row: PosedModel, found: PositionsBeside, own_sigma: float) -> Contradiction | None:
-    """Positions and known poses that cannot both be right; None where they can.
+def _tags_of_model(model: Reconstruction, tags: Tags) -> NDArray[np.int64]:
+    """(m,) the tags of registered photographs, without those that are the same as an earlier one."""
+    return np.flatnonzero(model.is_registered[tags.image_idx] & (tags.first == np.arange(len(tags.first))))
 
-    Args:
-        own_sigma: standard deviation of the scale that known poses have given the model, as a share of it.
-    """
-    if found.unit_m is None or found.unit_sigma_m is None:
-        return None
-    subject = "positions and known poses"
-    if found.num_agreeing < MIN_AGREEING * found.num_positions:
-        return Contradiction(
-            subject,
-            f"only {found.num_agreeing} of {found.num_positions} positions of photographs agree with model "
-            f"{row.model} in the frame of known poses",
-            "positions or poses are of other photographs; --set gps.source=none leaves positions out",
-            {"num_positions": found.num_positions, "num_agreeing": found.num_agreeing},
-        )
-    if found.stated_sigma_m and found.sigma_m and found.sigma_m > _REFUTED_FACTOR * found.stated_sigma_m:
-        return Contradiction(
-            subject,
-            f"positions of photographs that are said to be good to {found.stated_sigma_m:.2g} m differ by "
-            f"{found.sigma_m:.3g} m from model {row.model} in the frame of known poses",
-            "positions or poses are of other photographs; --set gps.source=none leaves positions out",
-            {"stated_sigma_m": found.stated_sigma_m, "sigma_m": found.sigma_m},
-        )
+
+def _contradiction(
+    row: PosedModel, found: PositionsBeside, fit: RobustFit, model: Reconstruction, tags: Tags
+) -> Contradiction | None:
+    """Positions and known poses that cannot both be right; None where they can."""
+    names = [model.image_names[i] for i in tags.image_idx[_tags_of_model(model, tags)]]
+    of_model = f"model {row.model} in the frame of known poses"
+    against = find_disagreement(fit, tags.is_stated, names, of_model, _REFUTED_FACTOR)
+    if against is not None:
+        return against
+    assert found.unit_m is not None
+    assert found.unit_sigma_m is not None
     off = abs(float(np.log(found.unit_m)))
-    sigma = float(np.hypot(found.unit_sigma_m / found.unit_m, own_sigma))
+    sigma = float(np.hypot(found.unit_sigma_m / found.unit_m, _scale_sigma(row, model)))
     if off > np.log(_NEARLY_METRES) or off <= _MAX_SIGMAS * sigma or found.reason:
         return None
     return Contradiction(
-        subject,
+        "positions and known poses",
         f"one unit of the known poses is {found.unit_m:.4g} +- {found.unit_sigma_m:.2g} m by {found.num_agreeing} "
         f"positions of photographs: {off / sigma:.1f} sigmas from a metre",
         "if the poses are in metres, their scale or the positions are wrong",

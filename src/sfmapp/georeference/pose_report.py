@@ -37,6 +37,7 @@ class PositionsBeside(Report):
 
     Attributes:
         num_positions, num_agreeing: photographs of the model with one, and those that one similarity explains.
+        disagreeing: names of the others; faults: what is wrong with each.
         reason: why they cannot be compared; empty if they can.
         unit_m: metres by positions of one unit of the frame; unit_sigma_m: its standard deviation.
         rms_residual_m: of those that agree, horizontally and in height; heights may be unknown.
@@ -46,6 +47,8 @@ class PositionsBeside(Report):
 
     num_positions: int
     num_agreeing: int = 0
+    disagreeing: Sequence[str] = ()
+    faults: Sequence[str] = ()
     reason: str = ""
     unit_m: float | None = None
     unit_sigma_m: float | None = None

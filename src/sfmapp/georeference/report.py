@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from sfmapp.contradictions import Contradiction
 from sfmapp.reporting import Report
 
 
@@ -86,6 +87,7 @@ class PlacedModel(Report):
         leveled_by: what told the vertical where positions do not: ``gimbal``, ``photographs``; empty if they do.
         is_adjusted: positions took part in the adjustment; False: the model was moved as a whole.
         moved_m: root mean square by which that moved cameras against a motion of the whole.
+        contradictions: between positions and photographs, or among positions, that could not be resolved.
     """
 
     model: int
@@ -103,6 +105,7 @@ class PlacedModel(Report):
     leveled_by: str | None = None
     is_adjusted: bool | None = None
     moved_m: float | None = None
+    contradictions: Sequence[Contradiction] = ()
 
 
 class ClockReport(Report):
@@ -140,3 +143,8 @@ class GeoreferenceReport(Report):
     models: Sequence[PlacedModel]
     images: Sequence[PositionedImage]
     clock: ClockReport | None = None
+
+    @property
+    def contradictions(self) -> list[Contradiction]:
+        """Those of all models."""
+        return [found for model in self.models for found in model.contradictions]

@@ -13,15 +13,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.contradictions import Contradiction, widened_scale_sigma
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.georeference.adjustment import Adjusted, Measured, adjust_with_positions, finished
 from sfmapp.georeference.clock import settle_clock
+from sfmapp.georeference.disagreement import MIN_AGREEING, find_disagreement
 from sfmapp.georeference.drift import Drift, estimate_drift, similarity_slope
 from sfmapp.georeference.faults import name_faults
-from sfmapp.georeference.fit import Level, LevelOfImage, RobustFit, Similarity, closed_form, robust_fit, turn_between
+from sfmapp.georeference.fit import Level, LevelOfImage, Similarity, closed_form
 from sfmapp.georeference.options import GpsOptions
 from sfmapp.georeference.report import Ellipse, Finding, GeoreferenceReport, PlacedModel, PositionedImage
+from sfmapp.georeference.robust_fit import RobustFit, robust_fit, turn_between
 from sfmapp.georeference.tags import Tags, tags_of
 from sfmapp.georeference.vertical import LEVEL_ENOUGH_RAD, known_level, upside_down
 from sfmapp.georeference.world_frame import Georeference, ModelPlace
@@ -34,8 +37,6 @@ Array = NDArray[np.float64]
 STAGE = "georeference"
 # A scale that is four sigmas from nothing is known; a heading to fifteen degrees is north up on any map.
 MAX_SCALE_SIGMA, MAX_ROTATION_SIGMA_DEG = 0.25, 15.0
-# Where fewer tags agree, they and the model contradict each other, and nothing tells which of them is right.
-MIN_AGREEING = 0.6
 # What the errors of a receiver have in common over some minutes, if nobody says better, as those of phones have.
 _COMMON_M = (3.0, 6.0)
 
@@ -61,6 +62,7 @@ class _Model:
         image_idx: (m,) images of it that have tags; n: (m,) the tags.
         fit: of its cameras to the tags, as they lie at last; drift: of errors of neighbours.
         first: the similarity that brought it there.
+        contradictions: that nothing has resolved.
     """
 
     number: int
@@ -73,6 +75,7 @@ class _Model:
     is_adjusted: bool
     moved_m: float
     center_covariance: dict[int, Array]
+    contradictions: list[Contradiction]
 
 
 def georeference_models(mappers: Sequence[Mapper], image_set: ImageSet, options: GpsOptions, events: Events) -> Placed:
@@ -100,6 +103,9 @@ def georeference_models(mappers: Sequence[Mapper], image_set: ImageSet, options:
             placed.append(outcome)
             reports.append(_report_of(outcome, tags))
             _tell(outcome, reports[-1], events)
+    for row in reports:
+        for contradiction in row.contradictions:
+            events.warned(STAGE, contradiction.message)
     images = _images(tags, placed, mappers, image_set.names) if tags is not None else []
     rejections = _rejections(images)
     findings += rejections
@@ -125,8 +131,12 @@ def _place(number: int, mapper: Mapper, tags: Tags, events: Events) -> _Model | 
     n = np.flatnonzero(model.is_registered[tags.image_idx] & (tags.first == np.arange(len(tags.first))))
     image_idx = tags.image_idx[n]
     fit, leveled, reason = _first_fit(model.cam_from_world, image_idx, tags, n)
-    if fit is None:
-        return PlacedModel(model=number, reason=reason, num_positions=len(n), num_used=0)
+    of_model, names = f"model {number}", [model.image_names[i] for i in image_idx]
+    if fit is None or reason:
+        refuted = fit is not None and fit.is_inlier.mean() < MIN_AGREEING
+        found = find_disagreement(fit, tags.is_stated, names, of_model) if fit is not None and refuted else None
+        against = [] if found is None else [found]
+        return PlacedModel(model=number, reason=reason, num_positions=len(n), num_used=0, contradictions=against)
     level = _level_of(model.cam_from_world, image_idx, leveled)
     first = fit.similarity
     _move(model.cam_from_world, model.point_xyz, first.world_from_model)
@@ -138,22 +148,35 @@ def _place(number: int, mapper: Mapper, tags: Tags, events: Events) -> _Model | 
     is_adjusted = adjusted is not None
     if adjusted is None:
         _restore(mapper, rigid)
-        events.warned(
-            STAGE,
-            f"model {number}: photographs and positions disagree about its shape; it was moved as a whole, "
-            "and its shape left as the photographs have it",
-        )
         adjusted = Adjusted(finished(fit, model, measured, level, drift), {})
     fit, covariance = adjusted.fit, adjusted.covariance
+    contradictions = _contradictions(fit, tags, names, of_model, is_adjusted=is_adjusted)
     moved = _bent(model.centers, rigid.centers)
     by = leveled.source if leveled is not None else ""
-    return _Model(number, image_idx, n, fit, first, by, drift, is_adjusted, moved, covariance)
+    return _Model(number, image_idx, n, fit, first, by, drift, is_adjusted, moved, covariance, contradictions)
+
+
+def _contradictions(
+    fit: RobustFit, tags: Tags, names: Sequence[str], of_model: str, *, is_adjusted: bool
+) -> list[Contradiction]:
+    """Between positions and the photographs of a model that lies in the frame."""
+    found = find_disagreement(fit, tags.is_stated, names, of_model)
+    if found is None and not is_adjusted:
+        flat, up = fit.factor
+        found = Contradiction(
+            "positions",
+            f"photographs and positions disagree about the shape of {of_model}; it was moved as a whole, and its shape "
+            "left as the photographs have it",
+            "wrong positions, or a model that is bent: --set gps.source=none leaves positions out",
+            {"sigma_factor": flat, "sigma_factor_up": up},
+        )
+    return [] if found is None else [found]
 
 
 def _first_fit(
     cam_from_world: Array, image_idx: NDArray[np.int64], tags: Tags, n: NDArray[np.int64]
 ) -> tuple[RobustFit | None, Level | None, str]:
-    """The similarity of a model to its tags, and what levelled it where tags do not; or why there is none."""
+    """The similarity of a model to its tags, and what levelled it where tags do not; and why it is not to be used."""
     if len(n) < 3:
         return None, None, f"{len(n)} of its photographs have a position, three are needed"
     poses = cam_from_world[image_idx]
@@ -167,7 +190,7 @@ def _first_fit(
         if again is not None and (fit is None or turn_between(fit, again) < 3.0 * np.hypot(tilt, level.sigma_rad)):
             fit, leveled = again, level
     reason = "they are all within their own errors of each other" if fit is None else _fault(fit, poses, len(n))
-    return (None, None, f"its positions do not determine it: {reason}") if reason or fit is None else (fit, leveled, "")
+    return fit, leveled, f"its positions do not determine it: {reason}" if reason else ""
 
 
 def _fault(fit: RobustFit, poses: Array, num: int) -> str:
@@ -246,6 +269,7 @@ def _report_of(model: _Model, tags: Tags) -> PlacedModel:
         leveled_by=model.leveled_by,
         is_adjusted=model.is_adjusted,
         moved_m=model.moved_m,
+        contradictions=model.contradictions,
     )
 
 
@@ -263,14 +287,17 @@ def _model_place(model: _Model, row: PlacedModel) -> ModelPlace:
     assert row.position_sigma_m is not None
     assert row.common_offset_m is not None
     flat, up = row.common_offset_m
+    scale_sigma = widened_scale_sigma(row.scale_sigma_share, row.contradictions)
+    assert scale_sigma is not None
+    turned = sum(found.rotation_sigma_deg**2 for found in row.contradictions)
     return ModelPlace(
         model=model.number,
         source="gps",
         scale=float(first[7]),
         rotation=(float(first[0]), float(first[1]), float(first[2]), float(first[3])),
         translation_m=_three(first[4:7]),
-        scale_sigma_share=row.scale_sigma_share,
-        rotation_sigma_deg=row.rotation_sigma_deg,
+        scale_sigma_share=scale_sigma,
+        rotation_sigma_deg=_three(np.hypot(row.rotation_sigma_deg, np.sqrt(turned))),
         position_sigma_m=row.position_sigma_m,
         common_offset_sigma_m=(flat, flat, up),
     )

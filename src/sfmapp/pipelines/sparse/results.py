@@ -124,6 +124,8 @@ def _make_report(
         for model, row in zip(models, mapped, strict=True)
     ]
     images, poses = _image_rows(run, failure), run.stages.poses
+    located = run.stages.georeference
+    also = [*(poses.contradictions if poses else ()), *(located.contradictions if located else ())]
     cameras = camera_rows(
         run.image_set, models[0] if models else None, mapped[0].uncertainty if mapped else Uncertainty()
     )
@@ -133,7 +135,7 @@ def _make_report(
         run=run.facts(),
         models=entries,
         checks=[
-            *make_checks(entries, images, cameras, poses.contradictions if poses is not None else ()),
+            *make_checks(entries, images, cameras, also),
             *check_control(run.stages.control),
             *check_poses(poses),
         ]
