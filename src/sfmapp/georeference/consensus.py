@@ -24,7 +24,7 @@ Mask = NDArray[np.bool_]
 # Beforehand one place in so many is wrong; evidence mostly outweighs this by far.
 _WRONG = 0.02
 # Factors on the sigmas that are averaged over. Stated ones are right within a third, or too small: of what a receiver
-# leaves out (the lever arm, the shutter), and of the model's own bend, which is no error of theirs. Where nothing is
+# leaves out (the lever arm, the shutter), and of the model's own bend, the less likely the larger. Where nothing is
 # stated anything between RTK and a street of tall houses is likely alike beside a guess of some metres.
 _FACTORS = np.geomspace(1e-3, 1e3, 97)
 _STATED_SPREAD, _STATED_UP_TO, _GUESS_RANGE = 0.3, 300.0, (2e-3, 20.0)
@@ -126,7 +126,7 @@ def _prior_of_factors(*, is_stated: bool) -> Array:
         within = (_GUESS_RANGE[0] <= _FACTORS) & (_GUESS_RANGE[1] >= _FACTORS)
         return np.asarray(within / within.sum(), np.float64)
     right = np.exp(-0.5 * (np.log(_FACTORS) / _STATED_SPREAD) ** 2)
-    wider = (_FACTORS >= 1.0) & (_FACTORS <= _STATED_UP_TO)
+    wider = np.where((_FACTORS >= 1.0) & (_FACTORS <= _STATED_UP_TO), 1.0 / _FACTORS, 0.0)
     both: Array = 0.5 * right / right.sum() + 0.5 * wider / wider.sum()
     return both
 

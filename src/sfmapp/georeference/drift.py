@@ -32,8 +32,8 @@ class Drift:
 
     Attributes:
         correlation: of errors from one photograph to the next, mean of what is likely.
-        inflation: by what sigmas of positions are to be multiplied, as if errors were independent, for the mean place
-            to be as uncertain as it is; one at least.
+        inflation: by what sigmas of positions are to be multiplied, as if errors were independent, for places of
+            cameras to be as uncertain as they are, on average; one at least.
         spread: (K,) by what standard deviations of unknowns that were fitted as if they were independent are to be
             multiplied: of rotation, scale and mean place, and of what else was fitted.
     """
@@ -89,15 +89,14 @@ def estimate_drift(residual: Array, sigma: Array, slope: Array, is_used: Mask, o
     independent = np.maximum(variances[0], 1e-300)
     ratio = (weight[:, None] * np.array(variances)).sum(0) / independent
     spread = np.sqrt(np.maximum(ratio, 1.0))
-    of_mean = float(np.sqrt(np.mean(spread[[4 + k for k in axes]] ** 2)))
-    return Drift(float(weight @ [0.0, *_TRIED]), of_mean, spread)
+    return Drift(float(weight @ [0.0, *_TRIED]), float(spread[-1]), spread[:-1])
 
 
 def _with_correlation(
     r: float, jacobian: Array, normal: Array, gaps: Array, held: Array, freedom: int
 ) -> tuple[float, Array]:
-    """Restricted log likelihood of a correlation, and variances (K,) of the fit with independent errors under it, in
-    units in which the sigmas of positions are as stated."""
+    """Restricted log likelihood of a correlation, and variances (K + 1,) under it of what was fitted as if errors were
+    independent, and of a place by it, on average; in units in which the sigmas of positions are as stated."""
     power = r**gaps
     left = np.sqrt(1.0 - power**2)
     white = [
@@ -116,7 +115,9 @@ def _with_correlation(
     together = np.eye(len(number)) if r == 0.0 else r ** np.abs(number[:, None] - number[None])
     between = np.einsum("nai,nm,maj->ij", jacobian, together, jacobian, optimize=True)
     covariance = variance * held @ between @ held
-    return -0.5 * (freedom * np.log(max(variance, 1e-300)) + determinant), np.diag(covariance).copy()
+    of_place = float(np.einsum("nai,ij,naj->", jacobian, covariance, jacobian, optimize=True)) / normal.size
+    likelihood = -0.5 * (freedom * np.log(max(variance, 1e-300)) + determinant)
+    return likelihood, np.append(np.diag(covariance), of_place)
 
 
 def _shaped(values: Array, like: Array) -> Array:

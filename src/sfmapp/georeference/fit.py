@@ -16,8 +16,8 @@ from sfmapp.geometry import rigid3
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Gauss-Newton settles in five.
-_MAX_ROUNDS = 20
+# Gauss-Newton settles in five; it is linear for turns up to about this.
+_MAX_ROUNDS, _LONGEST_TURN_RAD = 20, 0.5
 # A height that is unknown is held to that of the frame's origin within this, in metres.
 UNKNOWN_M = 1000.0
 
@@ -107,6 +107,9 @@ def fit_similarity(
         if solved is None:
             return None
         step, covariance, length = solved
+        # a turn about the line that places lie on is open, and beyond this no small one
+        turn = float(np.linalg.norm(step[:3]))
+        step = step * min(1.0, _LONGEST_TURN_RAD / max(turn, 1e-300))
         rotation = rigid3.exp_so3(step[:3]) @ rotation
         scale *= float(np.exp(np.clip(step[3], -1.0, 1.0)))
         mean = mean + step[4:]
