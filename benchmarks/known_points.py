@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from machine import RESULTS, describe_machine
 from sfmapp.calibration.locate import locate_camera
@@ -154,15 +153,21 @@ def timed(solve: Callable[[Array, Array], Answer], trials: list[Trial]) -> tuple
     return answers, min(rounds)
 
 
-def sigmas_hold(errors: list[Array], covariances: list[Array]) -> dict[str, float]:
+def sigmas_hold(errors: list[Array], covariances: list[Array], degrees: float) -> dict[str, float]:
     """NEES by its degrees of freedom with the interval of 99.8 % that it should lie in, and the share within three
-    sigmas; nothing of a program that has no sigmas."""
+    sigmas; nothing of a program that has no sigmas.
+
+    Args:
+        degrees: of freedom of the residuals that the noise is found from: the squares of n errors over it follow
+            n F(n, degrees), which spreads more than chi-square; of hundreds of pictures the mean is normal.
+    """
     if not covariances[0].size:
         return {}
     size, num = len(errors[0]), len(errors)
     nees = sum(float(e @ np.linalg.solve(c, e)) for e, c in zip(errors, covariances, strict=True)) / (size * num)
-    low, high = (float(chi2.ppf(p, size * num)) / (size * num) for p in (1e-3, 1.0 - 1e-3))
+    spread = np.sqrt(2.0 * (size + degrees - 2.0) / (size * (degrees - 4.0) * num)) if degrees > 4.0 else np.inf
     share = np.mean([np.abs(e) < 3.0 * np.sqrt(np.diag(c)) for e, c in zip(errors, covariances, strict=True)])
+    low, high = 1.0 - 3.09 * float(spread), 1.0 + 3.09 * float(spread)
     return {"nees": nees, "nees_low": low, "nees_high": high, "within_3_sigmas": float(share)}
 
 
@@ -188,7 +193,7 @@ def camera_rows(num_trials: int, num: int, num_wrong: int) -> list[dict[str, Any
         rows.append({
             "case": f"{num} points, {num_wrong} wrong", "program": name, "answers": len(kept),
             "focal_rms_px": float(focal), "focal_worst_px": float(worst), "center_rms_px": float(center),
-            **sigmas_hold(errors, [a[1] for a, _ in kept]), "cpu_ms": cpu_ms,
+            **sigmas_hold(errors, [a[1] for a, _ in kept], 2 * (num - num_wrong) - 14), "cpu_ms": cpu_ms,
         })  # fmt: skip
         print(rows[-1], flush=True)
     return rows
@@ -216,7 +221,8 @@ def pose_rows(num_trials: int, num: int, num_wrong: int, depth: float) -> list[d
         rows.append({
             "case": f"{num} points in {kind}, {num_wrong} wrong", "program": name, "good": len(good),
             "gross": len(kept) - len(good), "no_answer": num_trials - len(kept), "rotation_rms_deg": float(turn),
-            **sigmas_hold([errors[k] for k in good], [kept[k][0][1] for k in good]), "cpu_ms": cpu_ms,
+            **sigmas_hold([errors[k] for k in good], [kept[k][0][1] for k in good], 2 * (num - num_wrong) - 6),
+            "cpu_ms": cpu_ms,
         })  # fmt: skip
         print(rows[-1], flush=True)
     return rows

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from sfmapp.calibration.adjustment import TargetView
-from sfmapp.calibration.one_view import resolution_sigma
+from sfmapp.calibration.one_view import bent_covariance, fit_view, inverse, resolution_sigma
 from sfmapp.calibration.target import TargetFit, calibrate_target
 from sfmapp.calibration.targets import calibrate_targets
 from sfmapp.camera.camera import Camera, project
@@ -91,6 +91,27 @@ def test_the_rank_says_what_the_points_tell(flatten, rank, noise) -> None:
         assert dlt.find_projection(xyz, xy, noise_px=noise).rank == rank
 
 
+def test_kernels_for_small_systems_agree_with_lapack() -> None:
+    rng = np.random.default_rng(15)
+    plane = rng.uniform(-1.0, 1.0, (50, 4, 2))
+    h = np.array([[1.1, 0.2, 3.0], [-0.1, 0.9, 2.0], [0.05, 0.1, 1.0]])
+    mapped = dlt.homogeneous(plane) @ h.T
+    found = dlt.find_homographies(plane, mapped[..., :2] / mapped[..., 2:])
+    np.testing.assert_allclose(found, np.broadcast_to(h / np.linalg.norm(h), found.shape), atol=1e-11)
+    xyz, xy, _ = picture(rng, 12, PINHOLE)
+    noisy = xy + 0.5 * rng.normal(size=xy.shape)
+    ours = dlt.find_projections(xyz[None], noisy[None])[0]
+    np.testing.assert_allclose(ours, dlt.find_projection(xyz, noisy).matrix, rtol=1e-6, atol=1e-6)
+    # symmetric matrices of any scale of their unknowns, and those that are open
+    rows = rng.normal(size=(40, 9)) * np.logspace(-4, 4, 9)
+    expected = np.linalg.inv(rows.T @ rows / np.logspace(-4, 4, 9) / np.logspace(-4, 4, 9)[:, None])
+    expected = expected / np.logspace(-4, 4, 9) / np.logspace(-4, 4, 9)[:, None]
+    np.testing.assert_allclose(inverse(rows.T @ rows), expected, rtol=1e-8, atol=1e-12 * np.abs(expected).max())
+    rows[:, 8] = rows[:, 7]
+    assert inverse(rows.T @ rows) is None
+    assert inverse(np.full((3, 3), np.nan)) is None
+
+
 def test_a_plane_is_told_from_directions_alone() -> None:
     """Tsai's constraint, also where he divides by zero, and under a distortion that he does not know."""
     rng = np.random.default_rng(3)
@@ -162,6 +183,42 @@ def test_the_covariance_holds(camera) -> None:
     assert chi2.ppf(1e-3, degrees) < sum(nees) < chi2.ppf(1.0 - 1e-3, degrees)
     assert (np.abs(sigmas) < 3.0).mean() > 0.99
     assert (num_false, num_missed) == (0, 0)
+
+
+def test_the_curvature_of_the_projection_is_in_the_covariance() -> None:
+    """With x(t) = x0 + A t + 1/2 B t t for data that are moved by J A t, 1/2 sum B_ab B_ab^T is what it adds."""
+    xyz, xy, pose = picture(np.random.default_rng(13), 9, PINHOLE)
+    used, free = np.ones(9, bool), np.ones(4, bool)
+    view = fit_view(PINHOLE, pose, (xyz, xy), used, is_free=free)
+    covariance = np.linalg.inv(view.point_information) * 0.3**2
+    root = np.linalg.cholesky(covariance)
+
+    def bend(t: np.ndarray) -> np.ndarray:
+        """B t t, from the sum of both ways."""
+        total = 0.0
+        for sign in (1.0, -1.0):
+            moved = xy + sign * (view.slope @ root @ t)
+            found = fit_view(view.camera, view.cam_from_world, (xyz, moved), used, is_free=free)
+            turn = rigid3.log_so3(
+                rigid3.rotation_matrix(found.cam_from_world) @ rigid3.rotation_matrix(view.cam_from_world).T
+            )
+            shift = found.cam_from_world[4:] - rigid3.exp_so3(turn) @ view.cam_from_world[4:]
+            total = total + np.concatenate([found.camera.params - view.camera.params, turn, shift])
+        return total
+
+    step, num = 0.1, len(root)
+    axes = np.eye(num) * step
+    squares = np.array([bend(axis) for axis in axes])
+    added = 0.5 * squares.T @ squares
+    for a in range(num):
+        for b in range(a):
+            both = 0.5 * (bend(axes[a] + axes[b]) - squares[a] - squares[b])
+            added += np.outer(both, both)
+    added /= step**4
+    found = bent_covariance(view, covariance, (xyz, xy)) - covariance
+    scale = np.sqrt(np.diag(added))
+    np.testing.assert_allclose(found / scale / scale[:, None], added / scale / scale[:, None], atol=0.01)
+    assert (np.diag(added) > 1e-4 * np.diag(covariance)).any()
 
 
 def test_two_points_that_changed_places_are_named() -> None:

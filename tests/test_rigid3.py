@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from sfmapp.errors import InputError
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.pnp import quaternion_of
 from sfmapp.geometry.rigid3 import Rigid3
 
 vectors = arrays(np.float64, (3,), elements=st.floats(-10, 10))
@@ -23,6 +24,19 @@ def test_composition_is_associative_and_acts_on_points(a, b, c, x):
     right = rigid3.compose(a, rigid3.compose(b, c))
     np.testing.assert_allclose(rigid3.apply(left, x), rigid3.apply(right, x), atol=1e-12)
     np.testing.assert_allclose(rigid3.apply(left, x), rigid3.apply(a, rigid3.apply(b, rigid3.apply(c, x))), atol=1e-12)
+
+
+def test_one_pose_and_many_give_the_same_bits_and_so_does_the_kernel_to_rounding():
+    rng = np.random.default_rng(0)
+    rotations = rigid3.exp_so3(2.0 * rng.normal(size=(500, 3)))
+    rotations[:4] = np.eye(3), np.diag([1.0, -1, -1]), np.diag([-1.0, 1, -1]), np.diag([-1.0, -1, 1])
+    quaternions, in_kernel = rigid3.quaternion(rotations), np.empty(4)
+    for rotation, quaternion in zip(rotations, quaternions, strict=True):
+        assert rigid3.quaternion(rotation).tobytes() == quaternion.tobytes()
+        quaternion_of(rotation, in_kernel)
+        np.testing.assert_allclose(in_kernel, quaternion, atol=1e-15)
+    one_by_one = np.array([rigid3.rotation_matrix(quaternion) for quaternion in quaternions])
+    assert one_by_one.tobytes() == rigid3.rotation_matrix(quaternions).tobytes()
 
 
 @given(poses, vectors)

@@ -6,6 +6,7 @@ wrong, by all points at once where not, and every pose that explains them nearly
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -14,7 +15,6 @@ from numpy.typing import NDArray
 
 from sfmapp.calibration.one_view import (
     MIN_DEGREES,
-    POSE,
     Noise,
     OneView,
     Refit,
@@ -26,9 +26,10 @@ from sfmapp.calibration.one_view import (
     with_noise,
     without_wrong_points,
 )
+from sfmapp.calibration.one_view_kernels import POSE
 from sfmapp.camera.camera import Camera, pixels_to_rays, project_jacobian
 from sfmapp.errors import InputError, NoReconstructionError
-from sfmapp.geometry import pnp, resection, rigid3
+from sfmapp.geometry import p3p, pnp, resection, rigid3
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -45,6 +46,8 @@ _GIVEN_UP = 1e-3
 _RATIO = 22.457744484825323
 # So many of the best poses are tried without the points that contradict them.
 _CLEANED = 3
+# Times the squares that are told: what a pose of the least error in space may have before it is fitted to pixels.
+_HOPELESS = 100.0
 # Poses that differ by less are one: a millionth of a turn.
 _SAME_DEG = 1e-3
 
@@ -152,7 +155,7 @@ def _checked(xyz: Array, xy: Array) -> tuple[Array, Array]:
         raise InputError(f"expected places (N, 3) and pixels (N, 2), found {xyz.shape} and {xy.shape}")
     if not (np.isfinite(xyz).all() and np.isfinite(xy).all()):
         raise InputError("expected finite places and pixels, found others")
-    distinct = np.unique(xyz, axis=0)
+    distinct = np.array(list(dict.fromkeys(map(tuple, xyz.tolist()))))
     if len(distinct) < MIN_POINTS:
         raise InputError(
             f"expected at least {MIN_POINTS} points, found {len(distinct)}", "three points allow up to four poses"
@@ -164,11 +167,19 @@ def _checked(xyz: Array, xy: Array) -> tuple[Array, Array]:
 
 
 def _minima(view: OneView, points: tuple[Array, Array], refit: Refit) -> list[OneView]:
-    """A fit and those from all other poses that its points allow in space, the best first."""
+    """A fit and those from all other poses that its points allow in space, the best first.
+
+    A pose whose squares are a hundred times what :func:`_others` would still tell does not come down to that.
+    """
     rays = pixels_to_rays(view.camera, points[1])
-    seen = view.is_used & np.isfinite(rays).all(1)
+    seen = view.is_used & np.isfinite(rays[:, 0])
+    xyz, rays = points[0][seen], rays[seen]
+    told = view.squares * math.exp(_RATIO / max(view.degrees_of_freedom, MIN_DEGREES)) + _RATIO * view.noise_px**2
+    hopeless = _HOPELESS * told / view.camera.focal**2
     found = [view]
-    for pose in pnp.poses_of_points(points[0][seen], rays[seen]):
+    for pose in pnp.poses_of_points(xyz, rays):
+        if p3p.squared_errors(pose, xyz, rays).sum() > hopeless:
+            continue
         other = refit(replace(view, cam_from_world=pose), view.is_used)
         if np.isfinite(other.cost) and min(_turn_deg(other, one) for one in found) > _SAME_DEG:
             found.append(other)
@@ -176,8 +187,10 @@ def _minima(view: OneView, points: tuple[Array, Array], refit: Refit) -> list[On
 
 
 def _turn_deg(view: OneView, other: OneView) -> float:
-    turn = rigid3.compose(other.cam_from_world, rigid3.inverse(view.cam_from_world))
-    return float(rigid3.rotation_angle_deg(rigid3.rotation_matrix(turn)))
+    """Angle of the turn between two views: of their quaternions, whose signs say nothing, it is twice that."""
+    p, q = view.cam_from_world[:4], other.cam_from_world[:4]
+    apart = min(float(np.linalg.norm(p - q)), float(np.linalg.norm(p + q)))
+    return math.degrees(4.0 * math.asin(0.5 * apart))
 
 
 def _others(views: list[OneView], noise: Noise, sigma_px: float | None) -> tuple[OtherPose, ...]:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from sfmapp.calibration.documents import read_document, write_document
 from sfmapp.calibration.locate import Location
 from sfmapp.calibration.measure import MeasuredFigure
-from sfmapp.calibration.one_view import POSE, Noise, OneView
+from sfmapp.calibration.one_view import Noise, OneView
+from sfmapp.calibration.one_view_kernels import POSE
 from sfmapp.calibration.report import CameraFileReport
 from sfmapp.calibration.target import TargetFit
 from sfmapp.camera.camera import Camera

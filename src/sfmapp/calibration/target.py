@@ -13,16 +13,17 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.calibration.one_view import (
     MIN_DEGREES,
-    POSE,
     Noise,
     OneView,
     Prior,
+    bent_covariance,
     deletion_statistics,
     fit_view,
     misfit_under,
@@ -30,6 +31,7 @@ from sfmapp.calibration.one_view import (
     with_noise,
     without_wrong_points,
 )
+from sfmapp.calibration.one_view_kernels import POSE
 from sfmapp.calibration.result import CameraCalibration, ViewFit
 from sfmapp.camera.camera import Camera, pixels_to_rays, simple_camera
 from sfmapp.camera.models import PARAM_NAMES, kind_of
@@ -269,6 +271,7 @@ class _Start:
     is_used: Bools
 
 
+@lru_cache(maxsize=64)
 def _samples(count: int, size: int) -> NDArray[np.int64]:
     """(S, size) different points each: all there are, or so many of them, the same at every call."""
     if math.comb(count, size) <= _MAX_SAMPLES:
@@ -286,20 +289,29 @@ def _agreeing_points(places: Array, xy: Array, size: int, find: Callable[[Array,
         find: maps of samples (S, size, D) and (S, size, 2).
     """
     chosen = _samples(len(xy), size)
-    of_all = find(places[None], xy[None])
+    squares = [_squared_errors(find(places[None], xy[None]), places, xy)]
+    first = 0
     for num in (*_FIRST_SAMPLES, len(chosen)):
-        part = chosen[:num]
-        maps = np.concatenate([find(places[part], xy[part]), of_all])
-        seen = dlt.homogeneous(places) @ maps.swapaxes(1, 2)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            squares = ((seen[..., :2] / seen[..., 2:] - xy) ** 2).sum(2)
-        # the sign of a homography is that of its first point, and all have to have it; of a projection it is open
-        is_seen = np.isfinite(squares) & ((seen[..., 2] > 0.0) | (places.shape[1] == 3))
-        is_used = _agreeing(np.where(is_seen, squares, np.inf), size)
+        part = chosen[first:num]
+        squares.append(_squared_errors(find(places[part], xy[part]), places, xy))
+        first = num
+        is_used = _agreeing(np.concatenate(squares), size)
         # the chance that each of these samples had a wrong point
-        if (1.0 - is_used.mean() ** size) ** len(part) < _MISSED:
+        if num >= len(chosen) or (1.0 - is_used.mean() ** size) ** num < _MISSED:
             break
     return is_used
+
+
+def _squared_errors(maps: Array, places: Array, xy: Array) -> Array:
+    """(S, N) square pixels between what maps (S, 3, D + 1) make of places (N, D) and pixels (N, 2); infinite where a
+    point is not seen."""
+    u, v, w = np.moveaxis(maps @ dlt.homogeneous(places).T, 1, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        squares = (u / w - xy[:, 0]) ** 2 + (v / w - xy[:, 1]) ** 2
+    # the sign of a homography is that of its first point, and all have to have it; of a projection it is open
+    is_seen = np.isfinite(squares) if places.shape[1] == 3 else np.isfinite(squares) & (w > 0.0)
+    seen: Array = np.where(is_seen, squares, np.inf)
+    return seen
 
 
 def _agreeing(squares: Array, size: int) -> Bools:
@@ -490,9 +502,10 @@ def _told(
     """The result of a fit. Raises NoReconstructionError if the points do not hold it."""
     xyz, xy = points
     noise = noise_of(view, sigma_px, xy)
-    covariance = with_noise(view, noise)
-    if covariance is None:
+    first_order = with_noise(view, noise)
+    if first_order is None:
         raise _open_camera(points, view, None)
+    covariance = bent_covariance(view, first_order, points)
     statistic, distance = deletion_statistics(view, sigma_px)
     linear = None
     if not is_plane:

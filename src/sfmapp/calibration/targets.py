@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sfmapp.calibration.adjustment import Fit, TargetView, normal_at, observations_of, residuals_of
 from sfmapp.calibration.locate import locate_camera
-from sfmapp.calibration.one_view import POSE
+from sfmapp.calibration.one_view_kernels import POSE
 from sfmapp.calibration.result import CameraCalibration, ViewFit
 from sfmapp.calibration.solve import inlier_fit
 from sfmapp.calibration.target import TargetFit, calibrate_target

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ _SLOTS = {"f": (0, 1), "fx": (0,), "fy": (1,), "cx": (2,), "cy": (3,), "w": (0, 
 _NEUTRAL = {"alpha": 0.0, "beta": 1.0}
 
 
+@cache
 def family_of(model: CameraModel) -> int:
     """Number of the family in :mod:`sfmapp.camera.lens`."""
     return int(getattr(lens, model.family))

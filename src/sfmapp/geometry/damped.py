@@ -1,4 +1,4 @@
-"""Steps of Levenberg and Marquardt's method for a few unknowns, in kernels."""
+"""Steps of Levenberg and Marquardt's method for a few unknowns, and what they leave open, in kernels."""
 
 from __future__ import annotations
 
@@ -51,3 +51,44 @@ def turn_columns(w: Array, columns: Array, out: Array) -> None:
         out[0, k] = x + a * cx + b * (wy * cz - wz * cy)
         out[1, k] = y + a * cy + b * (wz * cx - wx * cz)
         out[2, k] = z + a * cz + b * (wx * cy - wy * cx)
+
+
+@numba.njit(cache=True, nogil=True)
+def invert(matrix: Array, limit: float, out: Array) -> bool:
+    """Fill the inverse of a symmetric matrix (U, U), by Cholesky's factors of it scaled to a unit diagonal; False where
+    it is not positive definite, or its condition, by Frobenius' norm, is above a limit."""
+    n = matrix.shape[0]
+    scale, lower = np.empty(n), np.zeros((n, n))
+    for i in range(n):
+        if not (matrix[i, i] > 0.0 and math.isfinite(matrix[i, i])):
+            return False
+        scale[i] = 1.0 / math.sqrt(matrix[i, i])
+    size = 0.0
+    for i in range(n):
+        for j in range(i + 1):
+            value = matrix[i, j] * scale[i] * scale[j]
+            size += value * value if i == j else 2.0 * value * value
+            for k in range(j):
+                value -= lower[i, k] * lower[j, k]
+            if i == j:
+                if not value > 0.0:
+                    return False
+                lower[i, i] = math.sqrt(value)
+            else:
+                lower[i, j] = value / lower[j, j]
+    for j in range(n):  # the inverse of the factor, in its place
+        lower[j, j] = 1.0 / lower[j, j]
+        for i in range(j + 1, n):
+            total = 0.0
+            for k in range(j, i):
+                total -= lower[i, k] * lower[k, j]
+            lower[i, j] = total / lower[i, i]
+    inverse_size = 0.0
+    for i in range(n):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, n):
+                total += lower[k, i] * lower[k, j]
+            inverse_size += total * total if i == j else 2.0 * total * total
+            out[i, j] = out[j, i] = total * scale[i] * scale[j]
+    return size * inverse_size < limit * limit

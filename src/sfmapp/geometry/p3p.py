@@ -8,6 +8,7 @@ by Newton's method. Samples are scored by the distances of rays on the unit sphe
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numba
 import numpy as np
@@ -34,12 +35,18 @@ def find_pose(xyz: Array, rays: Array, max_error: float, confidence: float, max_
     points, directions = (np.ascontiguousarray(a, np.float64) for a in (xyz, rays))
     # to draw ten thousand takes longer than to search a few dozen, which are the first of these
     for num in (min(_FIRST_TRIALS, max_trials), max_trials):
-        samples = np.random.default_rng([0, len(xyz)]).integers(0, len(xyz), (num, 3))
+        samples = _samples(len(xyz), num)
         trials, rotation, translation = _search(points, directions, max_error * max_error, confidence, samples)
         found = trials > 0
         if trials < num:
             break
     return rigid3.from_matrix(rotation, translation) if found else None
+
+
+@lru_cache(maxsize=64)
+def _samples(count: int, num: int) -> Ints:
+    """(num, 3) of so many points; that two are the same is allowed for, as such a sample has no pose."""
+    return np.random.default_rng([0, count]).integers(0, count, (num, 3))
 
 
 def squared_errors(cam_from_world: Array, xyz: Array, rays: Array) -> Array:
