@@ -1,4 +1,5 @@
-"""``sfmapp panorama`` beside OpenCV's Stitcher on the same photographs: rotations, focal length, seams, CPU time.
+"""``sfmapp panorama`` beside OpenCV's Stitcher and Hugin on the same photographs: rotations, focal length, seams, CPU
+time.
 
     python benchmarks/panorama.py
 
@@ -6,7 +7,8 @@ pano-sponza-rot has exact rotations; two rings are rendered from a texture on a 
 with distortion whose exposures differ by a factor of two, and one with things that move and a stray photograph. The
 error at seams is that of where a pixel of one photograph is looked for in its neighbour, by the cameras that were found
 against the true ones, over all of what both show. Both programs run in a process of their own, with what they do to
-write the picture; the second run of ours is counted, when kernels are compiled.
+write the picture; the second run of ours is counted, when kernels are compiled. Hugin is run by the commands of its own
+assistant (pto_gen, cpfind, cpclean, autooptimiser, pano_modify, nona, enblend), and left out where they are not.
 """
 
 from __future__ import annotations
@@ -14,10 +16,13 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -145,7 +150,86 @@ def theirs(photos: Path, out: Path) -> tuple[float, dict[str, tuple[Camera, Arra
     return cpu_s, cameras
 
 
-def errors(found: dict[str, tuple[Camera, Array]], truth: dict[str, tuple[Camera, Array]]) -> dict[str, float]:
+HUGIN = (
+    "pto_gen -o 1.pto {photos}/*",
+    "cpfind --multirow -o 2.pto 1.pto",
+    "cpclean -o 3.pto 2.pto",
+    "autooptimiser -a -m -l -s -o 4.pto 3.pto",
+    "pano_modify --canvas=AUTO --crop=AUTO -o 5.pto 4.pto",
+    "nona -m TIFF_m -o part 5.pto",
+    "enblend -o picture.tif part*.tif",
+)
+
+
+@dataclass(frozen=True)
+class HuginLens:
+    """A lens as Hugin has it: the radius in a photograph is a polynomial of that of a pinhole, in half heights."""
+
+    width: int
+    height: int
+    focal: float
+    powers: tuple[float, float, float]
+    center: tuple[float, float]
+
+    def project(self, rays: Array) -> Array:
+        a, b, c = self.powers
+        plane = self.focal * rays[:, :2] / rays[:, 2:]
+        r = np.linalg.norm(plane, axis=1, keepdims=True) / (0.5 * min(self.width, self.height))
+        scale = a * r**3 + b * r**2 + c * r + 1.0 - a - b - c
+        # what is behind the camera, and beyond the corners, is not in the photograph
+        known = (rays[:, 2:] > 0.0) & (r < 4.0)
+        return np.where(known, plane * scale, np.nan) + self.center
+
+    def rays(self, xy: Array) -> Array:
+        apart = xy - self.center
+        plane = apart
+        for _ in range(50):
+            rays = np.column_stack([plane / self.focal, np.ones(len(plane))])
+            plane = plane - (self.project(rays) - self.center - apart)
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def hugin(photos: Path, out: Path) -> tuple[float, dict[str, tuple[HuginLens, Array]]]:
+    """What Hugin finds of photographs of one lens; nothing if it fails."""
+    out.mkdir()
+    steps = " && ".join(HUGIN).format(photos=photos)
+    cpu_s = timed(["bash", "-c", f"cd {out} && ({steps}) 2>&1 | tail -n 3"])
+    found: dict[str, tuple[HuginLens, Array]] = {}
+    if not (out / "picture.tif").is_file():
+        return cpu_s, found
+    joined = [line for line in (out / "5.pto").read_text().splitlines() if line.startswith("i ")]
+    first = _numbers(joined[0])
+    focal = 0.5 * first["w"] / np.tan(0.5 * np.radians(first["v"]))
+    center = 0.5 * first["w"] + first["d"], 0.5 * first["h"] + first["e"]
+    powers = first["a"], first["b"], first["c"]
+    lens = HuginLens(int(first["w"]), int(first["h"]), focal, powers, center)
+    used = {path.name for path in out.glob("part*.tif")}
+    for k, line in enumerate(joined):
+        numbers, name = _numbers(line), re.search(r'n"([^"]+)"', line)
+        if name is not None and f"part{k:04}.tif" in used:
+            y, p, r = (np.radians(numbers[each]) for each in "ypr")
+            turned = rigid3.exp_so3([0.0, y, 0.0]) @ rigid3.exp_so3([p, 0.0, 0.0]) @ rigid3.exp_so3([0.0, 0.0, r])
+            found[Path(name[1]).name] = lens, np.asarray(turned.T)
+    return cpu_s, found
+
+
+def _numbers(line: str) -> dict[str, float]:
+    """Of a line of a project; what stands for a number of the first photograph is left out."""
+    return {key: float(value) for key, value in re.findall(r" ([a-z])(-?[0-9][0-9.e+-]*)(?= )", line)}
+
+
+def rays_of(camera: Camera | HuginLens, xy: Array) -> Array:
+    return camera.rays(xy) if isinstance(camera, HuginLens) else pixels_to_rays(camera, xy)
+
+
+def pixels_of(camera: Camera | HuginLens, rays: Array) -> Array:
+    return camera.project(rays) if isinstance(camera, HuginLens) else project(camera, rays)
+
+
+Found = dict[str, tuple[Camera | HuginLens, Array]]
+
+
+def errors(found: Found, truth: dict[str, tuple[Camera, Array]]) -> dict[str, float]:
     """Against the truth: of rotations after one common one, of focal lengths, and where neighbours meet."""
     names = [name for name in truth if name in found]
     if len(names) < 2:
@@ -163,18 +247,24 @@ def errors(found: dict[str, tuple[Camera, Array]], truth: dict[str, tuple[Camera
     }  # fmt: skip
 
 
-def _seam(found: tuple[Camera, Array, Camera, Array], truth: tuple[Camera, Array, Camera, Array]) -> Array:
+def _seam(found: tuple[Any, ...], truth: tuple[Any, ...]) -> Array:
     """(N,) distances, pixels, of where pixels of the first photograph are looked for in the second."""
     x, y = np.meshgrid(np.arange(10.0, 640.0, 20.0), np.arange(10.0, 480.0, 20.0))
     xy = np.column_stack([x.ravel(), y.ravel()])
-    places = [project(each[2], pixels_to_rays(each[0], xy) @ each[1] @ each[3].T) for each in (truth, found)]
+    places = [pixels_of(each[2], rays_of(each[0], xy) @ each[1] @ each[3].T) for each in (truth, found)]
     shown = ((places[0] > 0) & (places[0] < [640, 480])).all(1)
     apart = np.linalg.norm(places[0] - places[1], axis=1)[shown]
     return np.where(np.isfinite(apart), apart, 640.0)
 
 
 def measure() -> dict[str, Any]:
-    """All sets, both programs in turns."""
+    """All sets, the programs in turns."""
+    programs: dict[str, Any] = {"sfmapp": ours, "OpenCV": theirs}
+    missing = [name for name in (step.split()[0] for step in HUGIN) if shutil.which(name) is None]
+    if missing:
+        print(f"Hugin is left out: {', '.join(missing)} not found (apt install hugin-tools enblend)", file=sys.stderr)
+    else:
+        programs["Hugin"] = hugin
     rows = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -183,7 +273,7 @@ def measure() -> dict[str, Any]:
             sets.insert(0, sponza(Path(os.environ["SFMAPP_DATA"])))
         ours(sets[-1][1], folder / "warm")
         for n, (title, photos, truth) in enumerate(sets):
-            for program, run in (("sfmapp", ours), ("OpenCV", theirs)):
+            for program, run in programs.items():
                 cpu_s, found = run(photos, folder / f"{n}-{program}")
                 rows.append({"set": title, "program": program, "cpu_s": cpu_s, "num_true": len(truth),
                              **errors(found, truth)})  # fmt: skip

@@ -139,7 +139,7 @@ def two_view_rows(folder: Path) -> Iterator[Row]:
 
 
 def panorama_rows(folder: Path) -> Iterator[Row]:
-    """``sfmapp panorama`` against OpenCV's Stitcher."""
+    """``sfmapp panorama`` against OpenCV's Stitcher and Hugin."""
     report = read(folder, "panorama")
     about = (False, report["date"][:10], report["commit"])
     runs = {(run["set"], run["program"]): run for run in report["runs"]}
@@ -151,7 +151,8 @@ def panorama_rows(folder: Path) -> Iterator[Row]:
             ("worst rotation", "deg", "rotation_deg"), ("focal length", "%", "focal_percent"),
             ("where neighbours meet, rms", "px", "seam_rms_px"), ("CPU time", "s", "cpu_s"),
         ):  # fmt: skip
-            yield Row("panorama", case, quantity, unit, "less", ours[key], program, peer[key], *about)
+            if key in peer:  # a program that joins nothing has no error
+                yield Row("panorama", case, quantity, unit, "less", ours[key], program, peer[key], *about)
 
 
 def known_point_rows(folder: Path) -> Iterator[Row]:

@@ -18,9 +18,9 @@ from sfmapp.cli.main import main
 from sfmapp.formats.colmap import read_model
 from sfmapp.geometry import rigid3
 from sfmapp.images.headers import read_header
-from sfmapp.panorama import compose, pairs
+from sfmapp.panorama import compose, pairs, warp
 from sfmapp.panorama.adjustment import Turned, TurnedFit, adjust_turns, refinable
-from sfmapp.panorama.canvas import View, choose_canvas
+from sfmapp.panorama.canvas import View, choose_canvas, lenses_of
 from sfmapp.panorama.level import level
 from sfmapp.panorama.preview import Shown, find_gains
 from sfmapp.scene.tracks import Tracks
@@ -38,8 +38,10 @@ def ring(num: int, pitch: float = 0.0) -> Array:
     return np.asarray(tilt @ rigid3.exp_so3(np.outer(-yaw, [0.0, 1.0, 0.0])), np.float64)
 
 
-def scene(rotations: Array, num_rays: int, noise: float, seed: int) -> tuple[Tracks, Array]:
-    """What cameras of LENS see of random directions, and these."""
+def scene(
+    rotations: Array, num_rays: int, noise: float, seed: int, spread: bool = False
+) -> tuple[Tracks, Array, Array]:
+    """What cameras of LENS see of random directions, these, and how much noisier each keypoint is than others."""
     rng = np.random.default_rng(seed)
     rays = rng.normal(size=(num_rays, 3)) * [1.0, 0.4, 1.0]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -55,19 +57,25 @@ def scene(rotations: Array, num_rays: int, noise: float, seed: int) -> tuple[Tra
     kept = np.isin(ids, np.flatnonzero(np.bincount(ids, minlength=num_rays) > 1))
     _, ids = np.unique(ids[kept], return_inverse=True)
     used = np.unique(np.concatenate(track)[kept])
-    xy = xy[kept] + noise * rng.normal(size=(kept.sum(), 2))
-    return Tracks.from_observations(ids, images[kept], xy, num_images=len(rotations)), rays[used]
+    times = np.exp(rng.uniform(-1.4, 1.4, kept.sum())) if spread else np.ones(kept.sum())
+    xy = xy[kept] + noise * times[:, None] * rng.normal(size=(kept.sum(), 2))
+    tracks = Tracks.from_observations(ids, images[kept], xy, num_images=len(rotations))
+    order = np.lexsort((images[kept], ids))
+    assert (tracks.obs_xy == xy[order]).all()
+    return tracks, rays[used], times[order]
 
 
-def adjusted(rotations: Array, noise: float, seed: int) -> TurnedFit:
-    tracks, rays = scene(rotations, 1500, noise, seed)
+def adjusted(rotations: Array, noise: float, seed: int, weigh: bool | None = None) -> TurnedFit:
+    """``weigh``: keypoints differ in their noise, and the adjustment is told so or not."""
+    tracks, rays, spread = scene(rotations, 1500, noise, seed, spread=weigh is not None)
     rng = np.random.default_rng(seed + 1000)
     start = Turned(
         [LENS.with_params([338.0, 200.0, 150.0, 0.0, 0.0])],
         rigid3.exp_so3(0.01 * rng.normal(size=(len(rotations), 3))) @ rotations, rays,
     )  # fmt: skip
     whose = np.zeros(len(rotations), np.int64)
-    return adjust_turns(start, tracks, whose, [refinable(UNKNOWN, distortion=2)], [UNKNOWN])
+    free = [refinable(UNKNOWN, distortion=2)]
+    return adjust_turns(start, tracks, whose, free, [UNKNOWN], spread if weigh else None)
 
 
 def errors(fit: TurnedFit, truth: Array) -> Array:
@@ -98,6 +106,72 @@ def test_sigmas_are_those_of_the_errors() -> None:
     assert 0.75 < np.mean(rotation) < 1.25
     assert 0.2 < np.mean(focal) < 2.1
     assert 0.2 < np.mean(k1) < 2.1
+
+
+def test_noisy_keypoints_weigh_less() -> None:
+    """Noise from a quarter to four times the middle: weights take a third of the errors; sigmas are right."""
+    truth = ring(10)
+    rms = []
+    for weigh in (True, False):
+        fits = [adjusted(truth, 0.3, seed, weigh) for seed in range(12)]
+        away = [errors(fit, truth) for fit in fits]
+        ratio = [each / np.radians(fit.rotation_sigma_deg) for each, fit in zip(away, fits, strict=True)]
+        assert 0.7 < np.mean(np.square(ratio)) < 1.3
+        rms.append(np.sqrt(np.mean(np.square(away))))
+    assert rms[0] < 0.65 * rms[1]
+
+
+def test_photographs_are_placed_by_their_lenses() -> None:
+    """Against the projection of each pixel, on windows of canvases, one of them at a pole."""
+    narrow = LENS.with_params([900.0, 200.0, 150.0, 0.0, 0.0])
+    num_shown = 0
+    for lens, projection, pitch in ((LENS, "spherical", 50.0), (LENS, "cylindrical", 5.0), (narrow, "planar", 0.0)):
+        views = [View.of(lens, rotation) for rotation in ring(20, pitch)[:3]]
+        canvas = choose_canvas(views, projection, None)  # type: ignore[arg-type]
+        for at in np.linspace(0.0, 1.0, 4):
+            columns, rows = (int(at * (size - 150)) + np.arange(150) + 0.5 for size in (canvas.width, canvas.height))
+            axes = canvas.axes(columns, rows)
+            rays = np.empty((150, 150, 3))
+            rays[..., 0], rays[..., 1] = np.outer(axes.slant, axes.across), axes.down[:, None]
+            rays[..., 2] = np.outer(axes.slant, axes.ahead)
+            rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+            for k, view in enumerate(views):
+                places, inside = np.empty((150, 150, 2), np.float32), np.empty((150, 150), np.bool_)
+                warp.place_all(lenses_of(views), k, axes, places, inside)
+                xy, shown = view.pixels(rays.reshape(-1, 3))
+                xy, shown = xy.reshape(150, 150, 2), shown.reshape(150, 150)
+                assert np.abs(places + 0.5 - xy)[inside & shown].max(initial=0.0) < 0.02
+                assert (np.abs(np.minimum(xy, [400, 300] - xy).min(2) - 0.5)[inside != shown] < 0.02).all()
+                num_shown += int(shown.sum())
+    assert num_shown > 50_000
+
+
+def test_each_pixel_is_of_the_nearest_label_that_shows_it() -> None:
+    views = [View.of(LENS, rotation) for rotation in ring(6)]
+    canvas = choose_canvas(views, "spherical", 400)
+    small = canvas.scaled(0.25)
+    label = np.random.default_rng(0).integers(-1, 6, (small.height, small.width)).astype(np.int16)
+    label[:, : small.width // 3] = 2
+    columns, rows = np.arange(canvas.width) - 20.5, np.arange(canvas.height) + 0.5
+    x, y = (each * small.scale / canvas.scale - 0.5 for each in (columns, rows))
+    owner = np.empty((len(rows), len(columns)), np.int16)
+    axes = canvas.axes(columns, rows)
+    warp.find_owners(lenses_of(views), axes, label, x, y, True, owner)
+    share = np.zeros((6, *owner.shape), np.float32)
+    around = np.concatenate([label[:, -9:], label, label[:, :9]], 1)
+    place = np.meshgrid((x + 9).astype(np.float32), y.astype(np.float32))
+    for k in range(6):
+        share[k] = cv2.remap(
+            (around == k).astype(np.float32), *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        places, inside = np.empty((*owner.shape, 2), np.float32), np.empty(owner.shape, np.bool_)
+        warp.place_all(lenses_of(views), k, axes, places, inside)
+        share[k][~inside] = 0.0
+    best = np.where(share.max(0) > 0.0, share.argmax(0), -1)
+    chosen = np.where(owner >= 0, np.take_along_axis(share, np.maximum(owner, 0)[None], 0)[0], 0.0)
+    # OpenCV interpolates in steps of 1 / 32 of a pixel
+    assert (chosen > share.max(0) - 0.07).mean() > 0.999
+    assert (owner == best).mean() > 0.9
 
 
 def test_a_wrong_pair_is_found_out_by_its_triangles_and_a_loop_is_shared() -> None:
@@ -163,7 +237,7 @@ def test_strips_and_tiles_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     label = np.zeros((canvas.height, canvas.width), np.int16)
     label[:, canvas.width // 2 :] = 0
     label[:, : canvas.width // 2] = 1
-    plan = compose.Plan(canvas, views, np.ones((2, 3)), canvas, label)
+    plan = compose.Plan(canvas, lenses_of(views), np.ones((2, 3)), canvas, label)
 
     class Given:
         def __getitem__(self, k: int) -> NDArray[np.uint8]:

@@ -4,6 +4,9 @@ they see.
 The rays are landmarks, two numbers each, and not eliminated beforehand as differences of pairs would be: a point that
 four photographs show has four measurements and not six, so that their noise is counted once, and the covariance is that
 of the maximum likelihood. The rays go by the Schur complement, track by track; what is left is dense and small.
+
+The loss is of tracks, and not of each measurement: of two that do not agree none is better than the other, and a loss
+of each would have the least where one of them takes all of the difference.
 """
 
 from __future__ import annotations
@@ -26,11 +29,14 @@ from sfmapp.scene.tracks import Tracks
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Cauchy's weight is a half at three standard deviations: one measurement in ninety is as far off by chance.
+# Cauchy's weight of a track is a half at three standard deviations: one track in ninety is as far off by chance.
 _CAUCHY = 3.0
 # least noise of a keypoint, pixels: copies of one picture have none, and the prior is to weigh more than rounding
 _LEAST_NOISE_PX = 0.01
 _MAX_STEPS, _CONVERGED = 30, 1e-7
+_MOST_LENGTHENING = 2.0
+# of the square of a keypoint's error, what is left of it at least where its ray hangs on it alone
+_LEAST_SHARE = 0.05
 # What is believed of a lens before it is seen: k1 and k2 of photographs are a few tenths at most.
 _DISTORTION_SIGMA = 0.3
 # Nothing known of a focal length: within a factor of two of the guess.
@@ -65,7 +71,7 @@ class TurnedFit:
     Attributes:
         state: the cameras.
         residuals: (O, 2) pixels.
-        noise_px: standard deviation of a coordinate of a keypoint.
+        noise_px: standard deviation of a coordinate of a keypoint, of one whose spread is one.
         free: of each camera the names of what was refined, ``log_focal``, ``k1``, ``k2``.
         covariance: (3 I + K, 3 I + K) of rotations, radians about the axes of each camera, and of the K refined numbers
             of all cameras in the order of ``free``; in the gauge in which the rotations do not turn on the whole.
@@ -223,9 +229,11 @@ class _Problem:
     """What stays the same from step to step."""
 
     def __init__(
-        self, tracks: Tracks, image_camera_idx: Ints, free: Sequence[tuple[str, ...]], priors: Sequence[Camera]
-    ) -> None:
+        self, tracks: Tracks, image_camera_idx: Ints, free: Sequence[tuple[str, ...]], priors: Sequence[Camera],
+        spread: Array | None,
+    ) -> None:  # fmt: skip
         self.tracks, self.free, self.priors = tracks, tuple(free), priors
+        self.inverse2 = np.ones(tracks.num_observations) if spread is None else 1.0 / spread**2
         self.image = tracks.obs_image_idx.astype(np.int64)
         self.track = tracks.obs_track_idx.astype(np.int64)
         self.camera = np.asarray(image_camera_idx, np.int64)[self.image]
@@ -240,9 +248,10 @@ class _Problem:
         for c, names in enumerate(free):
             columns[self.of_camera[c], 3 : 3 + len(names)] = starts[c] + np.arange(len(names))
         self.columns = columns
-        length = np.diff(tracks.track_ptr)
-        # of n measurements of a ray, two numbers of 2 n are its own
-        self.share = (1.0 - 1.0 / np.maximum(length, 2))[tracks.obs_track_idx]
+        # a ray has two numbers of its own: of the squares of n measurements, this is what is left of each
+        total = np.add.reduceat(self.inverse2, tracks.track_ptr[:-1])
+        self.share = np.maximum(1.0 - self.inverse2 / total[tracks.obs_track_idx], _LEAST_SHARE)
+        self.surplus = np.maximum(np.diff(tracks.track_ptr) - 1, 1).astype(np.float64)
 
     def linearize(self, state: Turned, *, with_slopes: bool = True) -> tuple[Array, Array, Array]:
         """Residuals (O, 2), and the derivatives of what is predicted by cameras (O, 2, Q) and by rays (O, 2, 2), which
@@ -266,6 +275,16 @@ class _Problem:
         """(O, 2) pixels."""
         return self.linearize(state, with_slopes=False)[0]
 
+    def squares(self, residuals: Array) -> Array:
+        """(O,) squared lengths of residuals, in units of the spread of each."""
+        out: Array = (residuals[:, 0] ** 2 + residuals[:, 1] ** 2) * self.inverse2
+        return out
+
+    def of_tracks(self, residuals: Array) -> Array:
+        """(T,) sums of these over each track, for every measurement that it has more than one."""
+        out: Array = np.add.reduceat(self.squares(residuals), self.tracks.track_ptr[:-1]) / self.surplus
+        return out
+
     def prior(self, state: Turned) -> tuple[Array, Array]:
         """Errors (K,) of the refined numbers in units of their prior's standard deviation, and its inverse."""
         errors, weights = [], []
@@ -283,18 +302,18 @@ class _Problem:
 
     def cost(self, residuals: Array, state: Turned, scale2: float, noise2: float) -> float:
         """Half of the sum of Cauchy's robust squares, and of the prior in units of the noise."""
-        squares = (residuals**2).sum(1)
+        squares = self.of_tracks(residuals)
         if not np.isfinite(squares).all():
             return math.inf
         errors, _ = self.prior(state)
-        return float(0.5 * scale2 * np.log1p(squares / scale2).sum() + 0.5 * noise2 * (errors**2).sum())
+        return float(0.5 * scale2 * self.surplus @ np.log1p(squares / scale2) + 0.5 * noise2 * (errors**2).sum())
 
     def normal(
         self, state: Turned, scale2: float, noise2: float
     ) -> tuple[Array, Array, tuple[Array, Array, Array, Array, Array]]:
         """Hessian and gradient of all but the rays, and what :meth:`moved` needs of the latter."""
         residuals, by_camera, by_ray = self.linearize(state)
-        weights = 1.0 / (1.0 + (residuals**2).sum(1) / scale2)
+        weights = self.inverse2 / (1.0 + self.of_tracks(residuals) / scale2)[self.tracks.obs_track_idx]
         hessian, gradient = np.zeros((self.num_unknowns, self.num_unknowns)), np.zeros(self.num_unknowns)
         num_tracks = self.tracks.num_tracks
         inverses, toward = np.zeros((num_tracks, 2, 2)), np.zeros((num_tracks, 2))
@@ -332,27 +351,41 @@ class _Problem:
             cameras.append(camera.with_params(params))
         return Turned(cameras, turns, rays)
 
+    def curvature(self, residuals: Array, scale2: float) -> tuple[float, float, float]:
+        """Mean weight, mean second derivative of the loss, and variance of its first, of the tracks."""
+        squares = self.of_tracks(residuals)
+        weights = 1.0 / (1.0 + squares / scale2)
+        total = self.surplus.sum()
+        weight = float(self.surplus @ weights / total)
+        slope = weight - float((weights**2 * squares).sum()) / (scale2 * total)
+        return weight, slope, 0.5 * float(self.surplus @ (weights**2 * squares) / total)
+
     def variance(self, residuals: Array) -> float:
         """Of a coordinate of a keypoint: the median of a squared length of two normal numbers is 2 ln 2."""
-        squares = (residuals**2).sum(1) / self.share
+        squares = self.squares(residuals) / self.share
         return max(float(np.median(squares)) / (2.0 * math.log(2.0)), _LEAST_NOISE_PX**2)
 
 
 def adjust_turns(
-    start: Turned, tracks: Tracks, image_camera_idx: Ints, free: Sequence[tuple[str, ...]], priors: Sequence[Camera]
-) -> TurnedFit:
+    start: Turned, tracks: Tracks, image_camera_idx: Ints, free: Sequence[tuple[str, ...]], priors: Sequence[Camera],
+    spread: Array | None = None,
+) -> TurnedFit:  # fmt: skip
     """Rotations, lenses and rays of least robust squared reprojection error, by Levenberg and Marquardt.
+
+    Where errors have long tails, weights alone make the curvature greater than it is, and steps too short; they are
+    lengthened by what Cauchy's loss curves less on the average.
 
     Args:
         start: near the solution. tracks: of which each image sees three or more.
         image_camera_idx: (I,). free: what is refined of each camera. priors: cameras as they were known beforehand.
+        spread: (O,) how much noisier each keypoint is than others; None: all alike.
 
     Raises:
         ValueError: nothing to adjust, or numbers that are not finite.
     """
     if tracks.num_observations < 6 or not np.isfinite(start.rotations).all() or not np.isfinite(start.rays).all():
         raise ValueError("expected finite rotations and rays and six observations or more")
-    problem = _Problem(tracks, image_camera_idx, free, priors)
+    problem = _Problem(tracks, image_camera_idx, free, priors, spread)
     state, damping = start, 1e-4
     residuals = problem.residuals(state)
     noise2 = problem.variance(residuals)
@@ -360,15 +393,17 @@ def adjust_turns(
     cost = problem.cost(residuals, state, scale2, noise2)
     for _ in range(_MAX_STEPS):
         hessian, gradient, of_rays = problem.normal(state, scale2, noise2)
+        weight, slope, _ = problem.curvature(residuals, scale2)
+        longer = min(weight / max(slope, 1e-9), _MOST_LENGTHENING)
         while damping < 1e8:
             damped = hessian + damping * np.diag(np.diag(hessian) + 1e-12)
-            step = np.asarray(np.linalg.solve(damped, gradient), np.float64)
+            step = longer * np.asarray(np.linalg.solve(damped, gradient), np.float64)
             tried = problem.moved(state, step, of_rays)
             residuals = problem.residuals(tried)
             after = problem.cost(residuals, tried, scale2, noise2)
             if after <= cost:
                 break
-            damping *= 10.0
+            damping, longer = 10.0 * damping, 1.0
         else:
             break
         is_done = cost - after <= _CONVERGED * cost
@@ -389,11 +424,8 @@ def _fit(problem: _Problem, state: Turned, scale2: float, noise2: float) -> Turn
     factor = _correlation(problem, state, residuals, noise2)
     # asymptotic variance of an M-estimator (Huber and Ronchetti, 2009, 7.6), for errors are heavier in the tails than
     # the normal ones that the median stands for
-    squares = residuals**2
-    weights = 1.0 / (1.0 + squares.sum(1, keepdims=True) / scale2)
-    influence = float((weights**2 * squares).mean()) / float(problem.share.mean())
-    slope = float((weights - 2.0 * weights**2 * squares / scale2).mean())
-    variance = max(influence * float(weights.mean()) / slope**2, noise2)
+    weight, slope, influence = problem.curvature(residuals, scale2)
+    variance = max(influence * weight / slope**2, noise2)
     # in units of its diagonal: what the prior alone holds is small beside what rays hold, and no rounding
     unit = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
     inverse = unit[:, None] * np.linalg.pinv(unit[:, None] * hessian * unit, hermitian=True) * unit
@@ -422,6 +454,7 @@ def _correlation(problem: _Problem, state: Turned, residuals: Array, noise2: flo
     size = np.array([[camera.width, camera.height] for camera in state.cameras])[problem.camera]
     place = np.clip((problem.tracks.obs_xy / size * _CELLS).astype(np.int64), 0, _CELLS - 1)
     cell = (problem.image * _CELLS + place[:, 1]) * _CELLS + place[:, 0]
+    residuals = residuals * np.sqrt(problem.inverse2)[:, None]
     variance = noise2 * problem.share
     is_good = (residuals**2).sum(1) < _CAUCHY**2 * 2.0 * variance
     cell, residuals, variance = cell[is_good], residuals[is_good], variance[is_good]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, pixels_to_rays, project
+from sfmapp.panorama.warp import Axes, Lenses
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -56,6 +57,16 @@ class View:
         return xy, inside
 
 
+def lenses_of(views: Sequence[View]) -> Lenses:
+    """The photographs as kernels see them."""
+    return Lenses(
+        np.array([view.rotation for view in views], np.float64),
+        np.array([view.camera.canonical for view in views], np.float64),
+        np.array([(view.camera.width, view.camera.height) for view in views], np.float64),
+        np.array([view.least_z for view in views], np.float64),
+    )
+
+
 @dataclass(frozen=True)
 class Canvas:
     """A surface about the place that the photographs were taken from.
@@ -78,19 +89,14 @@ class Canvas:
     height: int
     is_closed: bool
 
-    def rays(self, columns: Array, rows: Array) -> Array:
-        """(rows, columns, 3) unit directions in the world, of pixels at these places."""
-        x, y = (columns + self.left) / self.scale, ((rows + self.top) / self.scale)[:, None]
-        out = np.empty((len(rows), len(columns), 3))
+    def axes(self, columns: Array, rows: Array) -> Axes:
+        """Directions in the world of pixels at these places."""
+        x, y = (columns + self.left) / self.scale, (rows + self.top) / self.scale
         if self.projection == "planar":
-            out[..., 0], out[..., 1], out[..., 2] = x, y, 1.0
-        elif self.projection == "cylindrical":
-            out[..., 0], out[..., 1], out[..., 2] = np.sin(x), y, np.cos(x)
-        else:
-            out[..., 0], out[..., 1], out[..., 2] = np.sin(x) * np.cos(y), np.sin(y), np.cos(x) * np.cos(y)
-            return out
-        out /= np.linalg.norm(out, axis=-1, keepdims=True)
-        return out
+            return Axes(x, np.ones_like(x), np.ones_like(y), y)
+        if self.projection == "cylindrical":
+            return Axes(np.sin(x), np.cos(x), np.ones_like(y), y)
+        return Axes(np.sin(x), np.cos(x), np.cos(y), np.sin(y))
 
     def scaled(self, factor: float) -> Canvas:
         """The same surface with fewer pixels; a closed one keeps whole columns, so its scale may differ a little."""

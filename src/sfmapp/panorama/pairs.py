@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import heapq
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from sfmapp.camera.camera import Camera, pixels_to_rays
 from sfmapp.camera.lens import BROWN
@@ -32,7 +31,7 @@ _TRIALS = 32
 _MATCHES_OF_TRIAL = 300
 # focal lengths tried, in units of the longer side: from a fisheye's to that of a long telephoto lens
 _FOCALS = np.geomspace(0.3, 12.0, 23)
-_PAIRS_FOR_FOCAL = 30
+_PAIRS_FOR_FOCAL = 12
 _SURE_SIGMA = 0.2
 # mean squared error, in units of the threshold, by which a focal length must be better than that known before
 _TELLING = 1e-3
@@ -98,8 +97,9 @@ def fit_turn(rays1: Array, rays2: Array, focal: float, threshold_px: float, seed
         _frames(b[one], b[two]) @ _frames(a[one], a[two]).swapaxes(1, 2),
         rotation_from_rays(a, b, np.ones(len(a)))[None],
     ])  # fmt: skip
-    squares = ((np.einsum("kij,nj->kni", turns, a[some]) - b[some]) ** 2).sum(2)
-    rotation = turns[np.argmin(np.minimum(squares, scale**2).sum(1))]
+    # |R a - b|^2 = 2 - 2 b' R a, of unit vectors
+    near = 1.0 - turns.reshape(-1, 9) @ (b[some, :, None] * a[some, None, :]).reshape(-1, 9).T
+    rotation = turns[np.argmin(np.minimum(near, 0.5 * scale**2).sum(1))]
     for _ in range(4):
         square = ((a @ rotation.T - b) ** 2).sum(1)
         width = min(scale, 3.0 * math.sqrt(float(np.median(square))) + 0.1 * scale)
@@ -194,13 +194,41 @@ def consistent(pairs: Sequence[tuple[int, int]], turns: Array, counts: Ints) -> 
     return score >= 0.0
 
 
-def largest_component(num_images: int, pairs: Ints) -> tuple[Ints, list[Ints]]:
-    """Images (I',) of the largest group that pairs (P, 2) join, and those of every other of two or more."""
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(num_images, num_images))
-    _, label = connected_components(graph, directed=False)
-    groups = [np.flatnonzero(label == k) for k in range(label.max() + 1)]
-    groups.sort(key=lambda group: (-len(group), group[0]))
-    return groups[0], [group for group in groups[1:] if len(group) > 1]
+def groups_of(num_images: int, pairs: Ints) -> list[Ints]:
+    """Groups of two images or more that pairs (P, 2) join, the largest first."""
+    beside = _neighbors(num_images, pairs, np.ones(len(pairs), np.int64))
+    seen, groups = np.zeros(num_images, bool), []
+    for first in range(num_images):
+        if not seen[first] and beside[first]:
+            group = [first, *(image for image, _ in _tree(beside, first))]
+            seen[group] = True
+            groups.append(np.sort(np.array(group, np.int64)))
+    return sorted(groups, key=lambda group: (-len(group), int(group[0])))
+
+
+def _neighbors(num_images: int, pairs: Ints, counts: Ints) -> list[list[tuple[int, int]]]:
+    """Of each image the images that it is paired with, and the count of each pair."""
+    beside: list[list[tuple[int, int]]] = [[] for _ in range(num_images)]
+    for (i, j), count in zip(pairs.tolist(), counts.tolist(), strict=True):
+        beside[i].append((j, count))
+        beside[j].append((i, count))
+    return beside
+
+
+def _tree(beside: Sequence[Sequence[tuple[int, int]]], root: int) -> list[tuple[int, int]]:
+    """Images behind the root and the one that each hangs on, along the strongest pairs (Prim, 1957)."""
+    seen, order = {root}, []
+    heap = [(-count, image, root) for image, count in beside[root]]
+    heapq.heapify(heap)
+    while heap:
+        _, image, before = heapq.heappop(heap)
+        if image in seen:
+            continue
+        seen.add(image)
+        order.append((image, before))
+        for each, count in beside[image]:
+            heapq.heappush(heap, (-count, each, image))
+    return order
 
 
 def average_rotations(num_images: int, pairs: Ints, turns: Array, counts: Ints) -> tuple[Array, Mask]:
@@ -209,15 +237,11 @@ def average_rotations(num_images: int, pairs: Ints, turns: Array, counts: Ints) 
     Chained along the tree of pairs with most matches, then averaged on the tangent space with Geman and McClure's
     weights (Chatterjee and Govindu, ICCV 2013), so that a loop's error is shared by all of it.
     """
-    weight = coo_array((1.0 / counts, (pairs[:, 0], pairs[:, 1])), shape=(num_images, num_images)).tocsr()
-    tree = minimum_spanning_tree(weight)
     root = int(np.bincount(pairs.ravel(), np.repeat(counts, 2), num_images).argmax())
-    order, parent = breadth_first_order(tree, root, directed=False)
     of = {(int(i), int(j)): turn for (i, j), turn in zip(pairs, turns, strict=True)}
     rotations = np.full((num_images, 3, 3), np.nan)
     rotations[root] = np.eye(3)
-    for node in order[1:].tolist():
-        before = int(parent[node])
+    for node, before in _tree(_neighbors(num_images, pairs, counts), root):
         step = of[before, node] if (before, node) in of else of[node, before].T
         rotations[node] = step @ rotations[before]
     known = np.isfinite(rotations[pairs[:, 0], 0, 0])

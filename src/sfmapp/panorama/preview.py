@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Events
-from sfmapp.panorama.canvas import Canvas, View
+from sfmapp.panorama.canvas import Canvas, View, lenses_of
 from sfmapp.panorama.pictures import Pictures
+from sfmapp.panorama.warp import Axes, Lenses, place_all
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -60,36 +61,44 @@ def small_canvas(canvas: Canvas, num_images: int) -> Canvas:
 def show_all(views: Sequence[View], pictures: Pictures, canvas: Canvas, events: Events) -> list[Shown]:
     """Each photograph on a small canvas."""
     events.started(STAGE, f"{len(views)} photographs in small", total=len(views))
-    out = []
+    out, lenses = [], lenses_of(views)
     for k, view in enumerate(views):
-        out.append(_show(view, pictures[k], canvas))
+        out.append(_show(view, lenses, k, pictures[k], canvas))
         events.advanced(STAGE)
     return out
 
 
-def _show(view: View, picture: NDArray[np.uint8], canvas: Canvas) -> Shown:
+def _show(view: View, lenses: Lenses, k: int, picture: NDArray[np.uint8], canvas: Canvas) -> Shown:
     import cv2
 
     columns, rows = (
         np.arange(0, size + _STRIDE, _STRIDE, dtype=np.float64) + 0.5 * _STRIDE
         for size in (canvas.width, canvas.height)
     )
-    inside = view.pixels(canvas.rays(columns, rows).reshape(-1, 3))[1].reshape(len(rows), len(columns))
+    inside = _places(lenses, k, canvas.axes(columns, rows))[1]
     top, bottom = _reach(inside, 1, canvas.height)
     left, right = _reach(inside, 0, canvas.width)
     x, y = np.arange(left, right, dtype=np.float64) + 0.5, np.arange(top, bottom, dtype=np.float64) + 0.5
-    xy, mask = view.pixels(canvas.rays(x, y).reshape(-1, 3))
-    mask = mask.reshape(len(y), len(x))
+    places, mask = _places(lenses, k, canvas.axes(x, y))
+    xy = places + np.float32(0.5)
     factor = min(1.0, canvas.scale / view.camera.focal)
     size = max(1, round(view.camera.width * factor)), max(1, round(view.camera.height * factor))
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    shape = np.array([view.camera.width, view.camera.height])
-    place = np.nan_to_num(xy, nan=-1e3) * (np.array(size) / shape) - 0.5
-    place = place.astype(np.float32).reshape(len(y), len(x), 2)
+    shape = np.array([view.camera.width, view.camera.height], np.float32)
+    place = xy * (np.array(size) / shape).astype(np.float32) - np.float32(0.5)
     colors = cv2.remap(small, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
-    depth = np.clip((2.0 * np.minimum(xy, shape - xy) / shape).min(1), 0.0, 1.0)
-    depth = np.where(mask.ravel(), depth, 0.0).astype(np.float32).reshape(mask.shape)
+    across = 2.0 * np.minimum(xy, shape - xy) / shape
+    depth = np.clip(np.minimum(across[..., 0], across[..., 1]), 0.0, 1.0)
+    depth[~mask] = 0.0
     return Shown(left, top, colors, mask, depth)
+
+
+def _places(lenses: Lenses, k: int, axes: Axes) -> tuple[Floats, Mask]:
+    """(h, w, 2) where pixels of a canvas are in a photograph, and (h, w) which of them it shows."""
+    inside = np.empty((len(axes.down), len(axes.across)), np.bool_)
+    places = np.empty((*inside.shape, 2), np.float32)
+    place_all(lenses, k, axes, places, inside)
+    return places, inside
 
 
 def _reach(inside: Mask, axis: int, size: int) -> tuple[int, int]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Events
-from sfmapp.panorama.canvas import Canvas, Projection, View, choose_canvas
+from sfmapp.panorama.canvas import Canvas, Projection, View, choose_canvas, lenses_of
 from sfmapp.panorama.compose import Plan, compose
 from sfmapp.panorama.pictures import Pictures
 from sfmapp.panorama.preview import find_gains, find_seams, show_all, small_canvas
@@ -63,7 +63,7 @@ def stitch(
     gains, apart = find_gains(shown)
     label = find_seams(shown, gains, small)
     del shown
-    pixels, inside = compose(Plan(canvas, views, gains, small, label), pictures, events)
+    pixels, inside = compose(Plan(canvas, lenses_of(views), gains, small, label), pictures, events)
     report = PictureReport(
         file="", projection=canvas.projection, width=canvas.width, height=canvas.height, scale=canvas.scale,
         span_deg=_span_deg(canvas), is_closed=canvas.is_closed, shown_share=float(inside.mean()),

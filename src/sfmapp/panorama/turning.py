@@ -41,6 +41,9 @@ _LOOSE = 4.0
 _LEAST_SHARE = 0.75
 # Lens models are compared on so many rays of each half: enough to see a hundredth of a pixel.
 _TRACKS_OF_HALF = 5000
+# Keypoints are of one scale within a quarter of it; so many of them tell how noise grows with scale, and how little of
+# it cannot be told from none.
+_SAME_SCALE, _FEWEST_OF_GROWTH, _LEAST_NOISE_PX = 0.25, 400, 0.01
 # coefficients of distortion that are tried
 _MOST_DISTORTION = 2
 _ADVICE = (
@@ -120,7 +123,7 @@ def find_rotations(
         raise NoReconstructionError("no two photographs have verified matches with each other", _ADVICE)
     start = _start_cameras(evidence)
     events.advanced(STAGE)
-    rough = _adjusted(evidence, start, _LOOSE, 1)
+    rough = _adjusted(evidence, start, _LOOSE)
     events.advanced(STAGE)
     fine, choices = _chosen(evidence, rough)
     events.advanced(STAGE)
@@ -187,7 +190,7 @@ def _start_cameras(evidence: _Evidence) -> list[Camera]:
     return out
 
 
-def _adjusted(evidence: _Evidence, cameras: list[Camera], loose: float, distortion: int) -> _Round:
+def _adjusted(evidence: _Evidence, cameras: list[Camera], loose: float) -> _Round:
     """From cameras to rotations: pairs that are rotations, the largest group that they join, averaged, adjusted.
 
     Raises:
@@ -208,7 +211,7 @@ def _adjusted(evidence: _Evidence, cameras: list[Camera], loose: float, distorti
     kept = turns.consistent([evidence.pixels[k].images for k in used], rotations, counts)
     used, counts, rotations = used[kept], counts[kept], rotations[kept]
     images = np.array([evidence.pixels[k].images for k in used]).reshape(-1, 2)
-    members, groups = turns.largest_component(len(evidence.image_camera_idx), images)
+    members, *groups = turns.groups_of(len(evidence.image_camera_idx), images)
     position = np.full(len(evidence.image_camera_idx), -1)
     position[members] = np.arange(len(members))
     inside = position[images[:, 0]] >= 0
@@ -219,9 +222,36 @@ def _adjusted(evidence: _Evidence, cameras: list[Camera], loose: float, distorti
     tracks = _tracks(evidence, members, masks)
     camera_idx = evidence.image_camera_idx[members]
     state = Turned(cameras, turned, rays_of_tracks(cameras, turned, tracks, camera_idx))
-    free = [refinable(camera, distortion=distortion) for camera in cameras]
+    free = [refinable(camera, distortion=1) for camera in cameras]
     fit = adjust_turns(state, tracks, camera_idx, free, evidence.priors)
     return _Round(members, groups, used, tracks, camera_idx, fit)
+
+
+def _spread(evidence: _Evidence, found: _Round) -> Array:
+    """(O,) noise of keypoints, in units of that of the middle one: it grows with their scale.
+
+    The medians of the errors of each eighth of them, from small scales to large, and a line between each two. The ray
+    of a track takes part of the noise of each of its keypoints: only tracks whose keypoints are of one scale tell.
+    """
+    tracks = found.tracks
+    scales = np.empty(tracks.num_observations)
+    for k, image in enumerate(found.members):
+        at = tracks.obs_image_idx == k
+        scales[at] = evidence.features[image].keypoints[tracks.obs_feature_idx[at], 2]
+    logs = np.log(np.maximum(scales, 1e-6))
+    low, high = (np.asarray(f.reduceat(logs, tracks.track_ptr[:-1])) for f in (np.minimum, np.maximum))
+    is_alike = (high - low < _SAME_SCALE)[tracks.obs_track_idx]
+    order = np.flatnonzero(is_alike)[np.argsort(logs[is_alike], kind="stable")]
+    if len(order) < _FEWEST_OF_GROWTH or np.ptp(logs[order]) < _SAME_SCALE:
+        return np.ones(len(logs))
+    squares = (found.fit.residuals**2).sum(1)
+    parts = np.array_split(order, 8)
+    x = np.array([logs[part].mean() for part in parts])
+    y = np.maximum.accumulate([0.5 * math.log(np.median(squares[part]) + _LEAST_NOISE_PX**2) for part in parts])
+    # of the few that are larger than all of these, noise is a share of their scale
+    noise = np.interp(logs, x, y) + np.maximum(logs - x[-1], 0.0)
+    out: Array = np.exp(noise - np.median(noise))
+    return out
 
 
 def _is_turn(turn: Turn) -> bool:
@@ -244,9 +274,10 @@ def _tracks(evidence: _Evidence, members: Ints, masks: dict[int, NDArray[np.bool
 
 def _chosen(evidence: _Evidence, rough: _Round) -> tuple[_Round, list[LensChoice]]:
     """The final adjustment, with as many coefficients of distortion as predict rays that they were not fitted to."""
-    fine = _adjusted(evidence, rough.fit.state.cameras, 1.0, 1)
+    fine = _adjusted(evidence, rough.fit.state.cameras, 1.0)
+    spread = _spread(evidence, fine)
     step = 2 * max(1, fine.tracks.num_tracks // (2 * _TRACKS_OF_HALF))
-    halves = [_every(step, fine.tracks, k) for k in range(2)]
+    halves = [_every(step, fine.tracks, spread, k) for k in range(2)]
     choices, fits = [], []
     for distortion in range(_MOST_DISTORTION + 1):
         free = [refinable(camera, distortion=distortion) for camera in evidence.priors]
@@ -261,7 +292,7 @@ def _chosen(evidence: _Evidence, rough: _Round) -> tuple[_Round, list[LensChoice
         if all(new < old for new, old in zip(choices[k].held_out_px, choices[best].held_out_px, strict=True)):
             best = k
     state, free = fits[best]
-    fit = adjust_turns(state, fine.tracks, fine.camera_idx, free, evidence.priors)
+    fit = adjust_turns(state, fine.tracks, fine.camera_idx, free, evidence.priors, spread)
     return replace(fine, fit=fit), choices
 
 
@@ -272,26 +303,26 @@ def _without(camera: Camera, distortion: int) -> Camera:
     return camera.with_params([*camera.params[: 3 + distortion], *[0.0] * (_MOST_DISTORTION - distortion)])
 
 
-def _every(step: int, tracks: Tracks, first: int) -> Tracks:
-    """Every so many of the tracks."""
+def _every(step: int, tracks: Tracks, spread: Array, first: int) -> tuple[Tracks, Array]:
+    """Every so many of the tracks, and the spread of their keypoints."""
     kept = tracks.obs_track_idx % step == first
     return make_tracks(
         tracks.num_images, -(-(tracks.num_tracks - first) // step), tracks.obs_track_idx[kept] // step,
         tracks.obs_image_idx[kept], tracks.obs_feature_idx[kept], tracks.obs_xy[kept],
-    )  # fmt: skip
+    ), spread[kept]  # fmt: skip
 
 
 def _held_out(
-    state: Turned, halves: Sequence[Tracks], k: int, fine: _Round, free: Sequence[tuple[str, ...]],
+    state: Turned, halves: Sequence[tuple[Tracks, Array]], k: int, fine: _Round, free: Sequence[tuple[str, ...]],
     priors: Sequence[Camera],
 ) -> float:  # fmt: skip
     """Root of the mean robust square of one half, of cameras that were fitted to the other."""
-    mine, other = halves[k], halves[1 - k]
+    (mine, of_mine), (other, of_other) = halves[k], halves[1 - k]
     start = replace(state, rays=rays_of_tracks(state.cameras, state.rotations, mine, fine.camera_idx))
-    fit = adjust_turns(start, mine, fine.camera_idx, free, priors)
+    fit = adjust_turns(start, mine, fine.camera_idx, free, priors, of_mine)
     cameras, turned = fit.state.cameras, fit.state.rotations
     held = Turned(cameras, turned, rays_of_tracks(cameras, turned, other, fine.camera_idx))
-    squares = (residuals_px(held, other, fine.camera_idx) ** 2).sum(1)
+    squares = (residuals_px(held, other, fine.camera_idx) ** 2).sum(1) / of_other**2
     scale2 = 9.0 * fine.fit.noise_px**2
     return math.sqrt(scale2 * float(np.log1p(squares / scale2).mean()))
 

@@ -40,8 +40,9 @@ if TYPE_CHECKING:
     from sfmapp.panorama.turning import TurnedPhotographs
 
 STAGE = PANORAMA
-# Three numbers for each photograph are told by some hundred rays; matching costs the square of the keypoints.
-_MOST_FEATURES = 3000
+# Three numbers for each photograph are told by some hundred rays, and matching costs the square of the keypoints: 3,000
+# of them bring errors of rotations from 0.002 to 0.001 degrees, for twice the time.
+_MOST_FEATURES = 1200
 # where the stages behind the matches begin
 STAGES = ("sfmapp.panorama.turning", "sfmapp.panorama.stitch", "sfmapp.formats.gpano")
 ROTATIONS = "rotations.json"
@@ -116,7 +117,7 @@ def stitch_panorama(
     Args:
         images: as of :func:`sfmapp.reconstruct`.
         output: a new folder, an empty one, or that of an earlier call.
-        options: of these, images, features (of each photograph 3,000 at most), pairs, matching, seed and threads.
+        options: of these, images, features (of each photograph 1,200 at most), pairs, matching, seed and threads.
         layout: of the picture.
         events: progress, warnings and cancellation.
         watch: started when the run began.
