@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+import sfmapp
 from schemas import check_schema
 from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.cli.main import main
@@ -316,6 +317,30 @@ def test_photographs_become_a_panorama(stitched: tuple[Path, Path, Array]) -> No
     source = np.asarray(Image.open(photos / "1.png"), np.float64)
     there = source[120 + 4 : 120 + 7, 160 + 11 : 160 + 14].mean((0, 1))
     assert np.abs(picture[at[1] - 1 : at[1] + 2, at[0] - 1 : at[0] + 2].mean((0, 1)) - there).max() < 12.0
+
+
+def test_sharp_frames_of_a_video_become_a_panorama(tmp_path: Path) -> None:
+    """Turned by 90 degrees, there and a little back, two of three frames blurred."""
+    texture, path = sphere(), tmp_path / "turn.avi"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (320, 240))
+    for k, yaw in enumerate(np.radians([*np.linspace(0.0, 90.0, 46), *np.linspace(88.0, 80.0, 5)])):
+        pixels = photograph(texture, rigid3.exp_so3([0.0, -yaw, 0.0]), 250.0)
+        video.write(pixels if k % 3 == 1 else cv2.GaussianBlur(pixels, (0, 0), 2.0))
+    video.release()
+    result = sfmapp.stitch_panorama(path, tmp_path / "out", max_size=600)
+    assert result.picture.is_file()
+    turning = result.report.turning
+    assert turning is not None
+    assert turning.num_turned == turning.num_images
+    assert 6 <= turning.num_images <= 12
+    assert all(int(one.name[:6]) % 3 == 1 for one in turning.images)
+    assert turning.cameras[0].focal_px == pytest.approx(250.0, rel=0.005)
+    made = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out" / "frames").iterdir()}
+    assert sfmapp.stitch_panorama(path, tmp_path / "out", max_size=600).report.run.is_up_to_date
+    assert made == {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out" / "frames").iterdir()}
+    (tmp_path / "b.mp4").write_bytes(b"none")
+    with pytest.raises(sfmapp.InputError, match=r"b\.mp4: expected a video"):
+        sfmapp.stitch_panorama(tmp_path / "b.mp4", tmp_path / "b")
 
 
 def test_the_same_command_has_nothing_to_do(

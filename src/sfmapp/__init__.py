@@ -1,9 +1,9 @@
 """Photographs and video into cameras, points and surfaces, on an ordinary CPU, from pip alone.
 
 Three levels. One call: ``reconstruct``, ``track_sequence``, ``densify``, ``make_mesh``, what is done with their
-results, and what is known before: ``calibrate_board`` and its like. The stages, in memory: ``load_images``,
-``extract_features``, ``match_images``, ``map_images``. The parts: ``adjust_bundle``, ``FactorGraph``, ``triangulate``,
-``estimate_pose``, ``verify_pair``.
+results, ``stitch_panorama``, and what is known before: ``calibrate_board`` and its like. The stages, in memory:
+``load_images``, ``extract_features``, ``match_images``, ``map_images``. The parts: ``adjust_bundle``, ``FactorGraph``,
+``triangulate``, ``estimate_pose``, ``verify_pair``.
 
 Conventions: a pose ``cam_from_world`` is a quaternion x, y, z, w and a translation, x_cam = R x_world + t, with camera
 axes x right, y down, z forward. The centre of the top-left pixel is (0.5, 0.5). ``events``, ``threads`` and ``seed``
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         make_mesh,
         reconstruct,
         refine,
+        stitch_panorama,
         track_sequence,
         undistort,
         validate,
@@ -123,6 +124,7 @@ __all__ = [
     "reconstruct",
     "rectify",
     "refine",
+    "stitch_panorama",
     "track_sequence",
     "triangulate",
     "undistort",
@@ -184,6 +186,7 @@ _HOMES = {
     "reconstruct": "api.jobs",
     "rectify": "api.planes",
     "refine": "api.jobs",
+    "stitch_panorama": "api.jobs",
     "track_sequence": "api.jobs",
     "triangulate": "api.geometry",
     "undistort": "api.jobs",

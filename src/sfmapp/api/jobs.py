@@ -23,9 +23,11 @@ if TYPE_CHECKING:
     from sfmapp.images.sequence import Sequence
     from sfmapp.odometry.result import OdometryResult
     from sfmapp.odometry.snapshot import FrameSnapshot
+    from sfmapp.panorama.canvas import Projection
     from sfmapp.pipelines.dense.densify import DenseResult
     from sfmapp.pipelines.dense.mesh import MeshResult
     from sfmapp.pipelines.evaluate import EvaluateOptions, Evaluation
+    from sfmapp.pipelines.panorama import PanoramaResult
     from sfmapp.pipelines.undistort import UndistortResult
     from sfmapp.report.model import ExportReport, OdometryRunReport, ReconstructionReport, RefineReport
     from sfmapp.report.validation import Validation
@@ -366,6 +368,53 @@ def evaluate(
     from sfmapp.pipelines import evaluate as pipeline
 
     return pipeline.evaluate(estimate, ground_truth, options, times=times)
+
+
+def stitch_panorama(
+    images: Images,
+    output: FilePath,
+    options: Options | None = None,
+    *,
+    projection: Projection | None = None,
+    max_size: int | None = None,
+    picture: str = "panorama.jpg",
+    events: Events | None = None,
+    threads: int | None = None,
+    seed: int | None = None,
+) -> PanoramaResult:
+    """Stitch photographs, or a video, that were taken turning on the spot. The same call again resumes one that was cut
+    off.
+
+    Args:
+        images: as of :func:`reconstruct`, or a video, of which sharp frames are picked.
+        output: a new folder, an empty one, or that of an earlier call: the picture, ``rotations.json``, the cameras as
+            a COLMAP model without points, and the report.
+        options: of these, those of images, features (of each photograph 1,200 at most), pairs and matching.
+        projection: ``spherical``, ``cylindrical`` or ``planar``; None: as the field of view asks for.
+        max_size: limit of the longer side of the picture, pixels; None: none but that of JPEG.
+        picture: name of its file, which ends in .jpg, .png or .tif.
+        events: told of progress, and can ask to stop.
+        threads: photographs worked on at a time; None: as ``options.threads`` says, or one for each core.
+        seed: in place of ``options.seed``.
+
+    Returns:
+        The folder, the picture, and the report: ``report.turning.images`` with the rotations (quaternions x, y, z, w of
+        cam_from_world) and their sigmas in degrees, ``report.turning.cameras`` with the lens.
+
+    Raises:
+        UsageError: a projection, size or kind of picture that is none, or an output that holds something else.
+        InputError: no photographs, or none that can be read.
+        NoReconstructionError: the camera did not turn on the spot, or nothing overlaps; the report is written.
+        InterruptedRunError: ``events`` was asked to stop.
+
+    Example:
+        >>> result = sfmapp.stitch_panorama("photos/", "pano/", projection="spherical")
+        >>> result.picture, result.report.turning.cameras[0].focal_px
+    """
+    from sfmapp.pipelines import panorama as pipeline
+
+    layout = pipeline.PictureLayout(picture, projection, max_size)
+    return pipeline.stitch_panorama(images, output, options_with(options, threads, seed), layout=layout, events=events)
 
 
 def undistort(

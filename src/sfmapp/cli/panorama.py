@@ -25,11 +25,13 @@ examples:
   sfmapp panorama photos/ -o pano/
   sfmapp panorama 'photos/IMG_01*.jpg' -o pano/ --projection cylindrical --picture hall.png
   sfmapp panorama photos/ -o pano/ --max-size 8000
+  sfmapp panorama turn.mp4 -o pano/
 
 Writes
   OUT/panorama.jpg      the picture; a spherical one with the XMP tags (GPano) by which viewers know it
   OUT/sparse/0/         the cameras, at one centre, as a COLMAP model without points
   OUT/rotations.json    their rotations and the lens, with sigmas
+  OUT/frames/           of a video the frames that were picked: sharp ones, a fifth of the picture apart
   OUT/report.html       how sure that is, where the camera did not turn on the spot, and what was left out
 Photographs that are not of the panorama are left out and named. The same command again resumes a run that was cut
 off."""
@@ -42,7 +44,9 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="Stitch photographs that were taken turning on the spot; nothing need be known of the camera.",
         epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    parser.add_argument("images", metavar="IMAGES", help="a folder, a quoted glob, or a .txt list of files")
+    parser.add_argument(
+        "images", metavar="IMAGES|VIDEO", help="a folder, a quoted glob, a .txt list of files, or a video"
+    )
     parser.add_argument("-o", "--output", metavar="OUT", type=Path, required=True, help="output folder, new or empty")
     parser.add_argument(
         "--projection", choices=("spherical", "cylindrical", "planar"),

@@ -303,11 +303,19 @@ def _turn_of(frame: VideoFrame) -> tuple[bool, bool, bool]:
 
 def gray_of(decoded: DecodedFrame) -> Pixels:
     """(H, W) uint8, upright: the luma of the full range 0 to 255, or OpenCV's grey of formats without luma."""
-    gray = _luma(decoded.frame)
-    is_transposed, is_mirrored, is_upside_down = decoded.turn
-    gray = gray.T if is_transposed else gray
-    gray = gray[:, ::-1] if is_mirrored else gray
-    return np.ascontiguousarray(gray[::-1] if is_upside_down else gray)
+    return _upright(_luma(decoded.frame), decoded.turn)
+
+
+def rgb_of(decoded: DecodedFrame) -> Pixels:
+    """(H, W, 3) uint8, upright."""
+    return _upright(np.asarray(decoded.frame.to_ndarray(format="rgb24"), np.uint8), decoded.turn)
+
+
+def _upright(pixels: Pixels, turn: tuple[bool, bool, bool]) -> Pixels:
+    is_transposed, is_mirrored, is_upside_down = turn
+    pixels = pixels.swapaxes(0, 1) if is_transposed else pixels
+    pixels = pixels[:, ::-1] if is_mirrored else pixels
+    return np.ascontiguousarray(pixels[::-1] if is_upside_down else pixels)
 
 
 def _luma(frame: VideoFrame) -> Pixels:

@@ -10,6 +10,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import partial
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ from sfmapp.images.frame_reader import (
     skipped_twin,
 )
 from sfmapp.images.sequence import Frame, GroundTruth, Imu, RepeatedFrame, SequenceKind, SequenceOptions
+from sfmapp.images.sources import VIDEOS
 from sfmapp.scene.rig import Rig
 
 Pixels = NDArray[np.uint8]
@@ -48,6 +50,19 @@ _CUT_OFF_SHARE = 0.98
 def is_stream(source: str) -> bool:
     """Whether a source is a URL or a camera (``camera:0``, ``/dev/video0``), rather than a path."""
     return bool(_STREAM.match(source) or _DEVICE.fullmatch(source))
+
+
+def is_video(source: str) -> bool:
+    """Whether a source is a video file, by its ending, or a stream or camera, rather than photographs."""
+    return is_stream(source) or PurePath(source).suffix.lower() in VIDEOS
+
+
+def sharpness(gray: Pixels) -> float:
+    """A number that is greater for the sharper one of two frames that show the same."""
+    import cv2
+
+    step = max(1, max(gray.shape) // 640)
+    return float(cv2.Laplacian(np.ascontiguousarray(gray[::step, ::step]), cv2.CV_32F).var())
 
 
 def _open_device(source: str) -> Any:

@@ -17,6 +17,7 @@ from sfmapp.formats.gpano import Sphere, with_gpano
 from sfmapp.geometry import rigid3
 from sfmapp.images.load import Images, load_images, name_of
 from sfmapp.images.rewrite import encode
+from sfmapp.images.video import is_video
 from sfmapp.panorama.report import PictureReport, TurningReport
 from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
 from sfmapp.pipelines.sparse.matches import find_matches
@@ -46,6 +47,7 @@ _MOST_FEATURES = 1200
 # where the stages behind the matches begin
 STAGES = ("sfmapp.panorama.turning", "sfmapp.panorama.stitch", "sfmapp.formats.gpano")
 ROTATIONS = "rotations.json"
+FRAMES = "frames"
 FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".tif": "tiff", ".tiff": "tiff"}
 # what a side of a JPEG may have
 _MOST_OF_JPEG = 65500
@@ -115,7 +117,7 @@ def stitch_panorama(
     What an earlier run in the same folder has done is used where it still holds.
 
     Args:
-        images: as of :func:`sfmapp.reconstruct`.
+        images: as of :func:`sfmapp.reconstruct`, or a video, of which sharp frames are put into ``frames``.
         output: a new folder, an empty one, or that of an earlier call.
         options: of these, images, features (of each photograph 1,200 at most), pairs, matching, seed and threads.
         layout: of the picture.
@@ -137,6 +139,8 @@ def stitch_panorama(
 
 
 def _run(run: Run, layout: PictureLayout) -> PanoramaReport:
+    if isinstance(run.images, str | os.PathLike) and is_video(os.fspath(run.images)):
+        run.images = _frames_of(run, os.fspath(run.images))
     with run.stage("images"):
         image_set, described = load_images(run.images, run.options.images, run.events, threads=run.threads)
         run.image_set, run.stages = image_set, replace(run.stages, images=described)
@@ -157,6 +161,31 @@ def _run(run: Run, layout: PictureLayout) -> PanoramaReport:
         raise
     report = _report(run, turning, picture, None)
     return _write_report(run, report, drawn, None)
+
+
+def _frames_of(run: Run, video: str) -> Path:
+    """The folder of the frames that were picked of a video, unless an earlier run has done so."""
+    from sfmapp.panorama.frames import STAGE as PICKING
+    from sfmapp.panorama.frames import pick_frames
+
+    workspace, folder = run.workspace, run.workspace.folder / FRAMES
+    facts = Path(video).stat() if Path(video).is_file() else None
+    key = stage_key(
+        ("sfmapp.panorama.frames",), None, os.path.abspath(video), facts and [facts.st_size, facts.st_mtime_ns]
+    )
+    if facts is not None and workspace.is_current(PICKING, key) and folder.is_dir():
+        return folder
+    with run.stage(PICKING):
+        workspace.begin(PICKING, key)
+        folder.mkdir(exist_ok=True)
+        for before in folder.glob("*.png"):
+            before.unlink()
+        for frame in pick_frames(video, run.events):
+            with replaced_file(folder / f"{frame.name}.png") as beside:
+                beside.write_bytes(encode(frame.pixels, "png"))
+    workspace.finish(PICKING, run.usage.get(PICKING))
+    run.save_first(workspace.save)
+    return folder
 
 
 def _earlier(run: Run, layout: PictureLayout, key: str) -> PanoramaReport | None:

@@ -23,7 +23,7 @@ from sfmapp.images.folder import load_images
 from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import read_gray
 from sfmapp.images.sequence import Frame, SequenceOptions
-from sfmapp.images.video import is_stream
+from sfmapp.images.video import is_video, sharpness
 from sfmapp.sequences.open import open_sequence
 from sfmapp.workspace.job import Job
 
@@ -31,7 +31,6 @@ Pixels = NDArray[np.uint8]
 P = TypeVar("P")
 
 STAGE = "detection"
-VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm"})
 # of a video: of so many pieces the sharpest frame is looked into, and so many of these are kept
 _PIECES, _KEPT = 120, 30
 # of photographs, to guess the board: so many, and more up to so many as long as it is not sure
@@ -79,11 +78,6 @@ class BoardPictures:
     @property
     def used(self) -> list[BoardPicture]:
         return [picture for picture in self.pictures if picture.unused is None]
-
-
-def is_video(source: str) -> bool:
-    """Whether a source is a video file or a stream, rather than photographs."""
-    return is_stream(source) or Path(source).suffix.lower() in VIDEOS
 
 
 def look_at_pictures(job: Job, board: Board | None) -> BoardPictures:
@@ -205,7 +199,7 @@ def _look_at_video(job: Job, given: Board | None) -> BoardPictures:
     piece = -1
     for frame in sequence.frames():
         job.events.advanced(STAGE)
-        score = _sharpness(frame.images[0])
+        score = sharpness(frame.images[0])
         if frame.idx // length != piece:
             piece, best = frame.idx // length, -1.0
             sharpest.append(frame)
@@ -224,13 +218,6 @@ def _look_at_video(job: Job, given: Board | None) -> BoardPictures:
     num = sum(picture.unused is None for picture in chosen)
     job.events.finished(STAGE, f"{num} frames were picked of {len(chosen)} that were looked into")
     return BoardPictures(board, guess, (int(size[0]), int(size[1])), tuple(chosen), {})
-
-
-def _sharpness(gray: Pixels) -> float:
-    import cv2
-
-    step = max(1, max(gray.shape) // 640)
-    return float(cv2.Laplacian(np.ascontiguousarray(gray[::step, ::step]), cv2.CV_32F).var())
 
 
 def choose_frames(pictures: Sequence[BoardPicture], size: tuple[int, int], board: Board) -> list[BoardPicture]:
