@@ -380,7 +380,6 @@ def stitch_panorama(
     picture: str = "panorama.jpg",
     events: Events | None = None,
     threads: int | None = None,
-    seed: int | None = None,
 ) -> PanoramaResult:
     """Stitch photographs, or a video, that were taken turning on the spot. The same call again resumes one that was cut
     off.
@@ -389,13 +388,12 @@ def stitch_panorama(
         images: as of :func:`reconstruct`, or a video, of which sharp frames are picked.
         output: a new folder, an empty one, or that of an earlier call: the picture, ``rotations.json``, the cameras as
             a COLMAP model without points, and the report.
-        options: of these, those of images, features (of each photograph 1,200 at most), pairs and matching.
+        options: of these, those of images, features (of each photograph 1,200 at most), pairs, matching and seed.
         projection: ``spherical``, ``cylindrical`` or ``planar``; None: as the field of view asks for.
         max_size: limit of the longer side of the picture, pixels; None: none but that of JPEG.
         picture: name of its file, which ends in .jpg, .png or .tif.
         events: told of progress, and can ask to stop.
         threads: photographs worked on at a time; None: as ``options.threads`` says, or one for each core.
-        seed: in place of ``options.seed``.
 
     Returns:
         The folder, the picture, and the report: ``report.turning.images`` with the rotations (quaternions x, y, z, w of
@@ -414,7 +412,7 @@ def stitch_panorama(
     from sfmapp.pipelines import panorama as pipeline
 
     layout = pipeline.PictureLayout(picture, projection, max_size)
-    return pipeline.stitch_panorama(images, output, options_with(options, threads, seed), layout=layout, events=events)
+    return pipeline.stitch_panorama(images, output, options_with(options, threads), layout=layout, events=events)
 
 
 def undistort(
