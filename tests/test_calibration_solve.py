@@ -17,7 +17,7 @@ from sfmapp.calibration.result import CameraCalibration
 from sfmapp.calibration.solve import inlier_fit, solve_views
 from sfmapp.calibration.start import first_fit, to_model
 from sfmapp.calibration.uncertainty import frame_covariance, image_grid, projection_covariance
-from sfmapp.calibration.zhang import closed_form, plane_pose
+from sfmapp.calibration.zhang import closed_form, plane_poses
 from sfmapp.camera.camera import Camera, pixels_to_rays, project
 from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError
@@ -77,8 +77,16 @@ def test_exact_points_give_the_exact_camera(camera: Camera) -> None:
 def test_a_plane_behind_nothing_is_posed_by_its_rays() -> None:
     camera = Camera(CameraModel.OPENCV_FISHEYE, *SIZE, np.array([300.0, 300.0, 640.0, 480.0, 0.0, 0.0, 0.0, 0.0]))
     pose = rigid3.from_matrix(rigid3.exp_so3(np.array([0.2, 1.2, 0.1])), np.array([0.25, -0.05, 0.03]))
-    found = plane_pose(camera, BOARD.points, project(camera, rigid3.apply(pose, BOARD.points)))
-    assert found is not None
+    xy = project(camera, rigid3.apply(pose, BOARD.points))
+    # a view that has no pose, and one that is turned the other way, do not disturb it
+    turned = project(camera, rigid3.apply(pose, BOARD.points) * [-1.0, -1.0, 1.0])
+    views = [
+        TargetView("a", BOARD.points[:3], xy[:3]), TargetView("b", BOARD.points, xy),
+        TargetView("c", BOARD.points, turned),
+    ]  # fmt: skip
+    none, found, other = plane_poses(camera, views)
+    assert np.isnan(none).all()
+    np.testing.assert_allclose(rigid3.apply(other, BOARD.points)[:, 2], rigid3.apply(pose, BOARD.points)[:, 2])
     np.testing.assert_allclose(rigid3.apply(found, BOARD.points), rigid3.apply(pose, BOARD.points), atol=1e-9)
 
 

@@ -13,7 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.calibration.kernels import Normal, Observations, State, normal_equations, residuals
+from sfmapp.calibration.kernels import (
+    Normal,
+    Observations,
+    State,
+    damped_step,
+    moved_poses,
+    normal_equations,
+    residuals,
+)
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.models import canonical_from_params
 from sfmapp.camera.names import CameraModel
@@ -24,6 +32,9 @@ Bools = NDArray[np.bool_]
 
 _MAX_STEPS = 100
 FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e10
+# least by which a step that does as it promised divides the damping (Madsen, Nielsen and Tingleff, "Methods for
+# non-linear least squares problems", 2004, equation 2.21)
+_LEAST_FACTOR = 0.01
 # relative: a step that lowers the cost by less is the last
 _CONVERGED = 1e-11
 
@@ -91,32 +102,38 @@ def refine(start: Fit, obs: Observations, *, hold_poses: bool = False, hold_came
     Returns:
         The start where no step from it is better.
     """
-    slots = param_of_slot(start.camera.model)
+    slots, spread = param_of_slot(start.camera.model), canonical_from_params(start.camera.model)
     if hold_camera:
         slots = np.full_like(slots, -1)
-    num_params = len(start.camera.params)
-    normal = empty_normal(num_params + len(start.bend), len(obs.ptr) - 1)
-    fit, damping, factor = start, FIRST_DAMPING, 4.0
-    cost = normal_equations(_state(fit), obs, slots, normal)
-    steps = 0
+    num_params, num_views = len(start.camera.params), len(obs.ptr) - 1
+    num_shared = num_params + len(start.bend)
+    normal, next_normal = (empty_normal(num_shared, num_views) for _ in range(2))
+    params, state = start.camera.params, _state(start)
+    damping, factor, steps, is_moved = FIRST_DAMPING, 2.0, 0, False
+    cost = normal_equations(state, obs, slots, normal)
     while steps < _MAX_STEPS and math.isfinite(cost) and damping < LARGEST_DAMPING:
-        step = damped_step(normal, damping, hold_poses=hold_poses)
+        step = step_of(normal, damping, hold_poses=hold_poses)
         if step is None:
             damping *= factor
             continue
-        shared, own = step
-        tried = _moved(fit, shared, own)
-        new_cost = _cost(tried, obs)
+        shared, own, promised = step
+        tried = params + shared[:num_params]
+        next_state = _moved(state, spread @ tried, own, shared[num_params:])
+        new_cost = normal_equations(next_state, obs, slots, next_normal)
         if not new_cost <= cost:
             damping, factor = damping * factor, factor * 2.0
             continue
         steps += 1
-        is_converged = cost - new_cost <= _CONVERGED * cost
-        fit, damping, factor = tried, damping * 0.1, 4.0
-        cost = normal_equations(_state(fit), obs, slots, normal)
+        is_converged, is_moved = cost - new_cost <= _CONVERGED * cost, True
+        damping *= max(_LEAST_FACTOR, 1.0 - (2.0 * (cost - new_cost) / promised - 1.0) ** 3) if promised > 0 else 1.0
+        params, state, cost, factor = tried, next_state, new_cost, 2.0
+        normal, next_normal = next_normal, normal
         if is_converged:
             break
-    return replace(fit, cost=cost, num_steps=steps)
+    if not is_moved:
+        return replace(start, cost=cost, num_steps=steps)
+    poses = rigid3.from_matrix(state.rotation, state.translation)
+    return Fit(start.camera.with_params(params), poses, state.bend, cost, steps)
 
 
 def normal_at(fit: Fit, obs: Observations) -> Normal:
@@ -145,56 +162,19 @@ def _state(fit: Fit) -> State:
     return State(fit.camera.canonical, rigid3.rotation_matrix(poses), np.ascontiguousarray(poses[:, 4:]), fit.bend)
 
 
-def _cost(fit: Fit, obs: Observations) -> float:
-    r = residuals_of(fit, obs)
-    is_used = obs.weight > 0
-    return float(0.5 * (obs.weight[is_used] * (r[is_used] ** 2).sum(1)).sum())
+def _moved(state: State, canonical: Array, own: Array, bend: Array) -> State:
+    """The unknowns after a step: the sixteen numbers of the camera that it leads to, steps of views (V, 6), and of the
+    shape."""
+    row = state.row.copy()
+    row[: len(canonical)] = canonical
+    after = State(row, np.empty_like(state.rotation), np.empty_like(state.translation), state.bend + bend)
+    moved_poses(state, own, after.rotation, after.translation)
+    return after
 
 
-def _moved(fit: Fit, shared: Array, own: Array) -> Fit:
-    """A fit after a step of the shared unknowns (S,) and of each view (V, 6)."""
-    num_params = len(fit.camera.params)
-    rotation = rigid3.rotation_matrix(fit.cam_from_target)
-    turn = rigid3.exp_so3(own[:, :3])
-    translation = np.einsum("vij,vj->vi", turn, fit.cam_from_target[:, 4:]) + own[:, 3:]
-    return replace(
-        fit,
-        camera=fit.camera.with_params(fit.camera.params + shared[:num_params]),
-        cam_from_target=rigid3.from_matrix(turn @ rotation, translation),
-        bend=fit.bend + shared[num_params:],
-    )
-
-
-def damped_step(normal: Normal, damping: float, *, hold_poses: bool) -> tuple[Array, Array] | None:
-    """The damped step of the shared unknowns and of the views; None where there is none."""
-    diagonal = np.diag(normal.shared).copy()
-    is_free = diagonal > 0
-    own_step = np.zeros_like(normal.own_right)
-    shared_step = np.zeros(len(diagonal))
-    try:
-        if hold_poses:
-            reduced, right, coupling = normal.shared.copy(), normal.right, None
-        else:
-            own = normal.own.copy()
-            own[:, range(6), range(6)] *= 1.0 + damping
-            # an empty view has nothing to solve
-            own[~(np.abs(normal.own).max((1, 2)) > 0)] = np.eye(6)
-            solved = np.linalg.solve(
-                own, np.concatenate([normal.cross.swapaxes(1, 2), normal.own_right[:, :, None]], 2)
-            )
-            coupling = solved[:, :, :-1]
-            reduced = normal.shared - np.einsum("vsi,vit->st", normal.cross, coupling)
-            right = normal.right - np.einsum("vsi,vi->s", normal.cross, solved[:, :, -1])
-        if is_free.any():
-            scale = 1.0 / np.sqrt(diagonal[is_free])
-            reduced = reduced[np.ix_(is_free, is_free)]
-            reduced[range(len(reduced)), range(len(reduced))] += damping * diagonal[is_free]
-            scaled = reduced * scale[:, None] * scale[None, :]
-            shared_step[is_free] = scale * np.linalg.solve(scaled, scale * right[is_free])
-        if coupling is not None:
-            own_step = solved[:, :, -1] - np.einsum("vis,s->vi", coupling, shared_step)
-    except np.linalg.LinAlgError:
-        return None
-    if not (np.isfinite(shared_step).all() and np.isfinite(own_step).all()):
-        return None
-    return shared_step, own_step
+def step_of(normal: Normal, damping: float, *, hold_poses: bool) -> tuple[Array, Array, float] | None:
+    """The damped step of the shared unknowns (S,) and of the views (V, 6), and the decrease of the cost that it
+    promises; None where there is none."""
+    shared_step, own_step = np.empty_like(normal.right), np.empty_like(normal.own_right)
+    promised = damped_step(normal, damping, hold_poses, shared_step, own_step)
+    return (shared_step, own_step, promised) if math.isfinite(promised) else None

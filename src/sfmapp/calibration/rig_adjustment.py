@@ -22,10 +22,10 @@ from sfmapp.calibration.adjustment import (
     FIRST_DAMPING,
     LARGEST_DAMPING,
     TargetView,
-    damped_step,
     empty_normal,
     observations_of,
     param_of_slot,
+    step_of,
 )
 from sfmapp.calibration.kernels import Normal, Observations, State, normal_equations, residuals
 from sfmapp.camera.camera import Camera
@@ -220,8 +220,8 @@ def refine_rig(start: RigFit, problem: RigProblem, weights: Sequence[Array] | No
     fit, damping, factor, steps = start, FIRST_DAMPING, 4.0, 0
     cost, normal = rig_normal(fit, problem, obs)
     while steps < _MAX_STEPS and math.isfinite(cost) and damping < LARGEST_DAMPING:
-        step = damped_step(normal, damping, hold_poses=False)
-        tried = None if step is None else _moved(fit, *step)
+        step = step_of(normal, damping, hold_poses=False)
+        tried = None if step is None else _moved(fit, *step[:2])
         new_cost = math.nan if tried is None else float(shot_costs(tried, problem, obs).sum())
         if tried is None or not new_cost <= cost:
             damping, factor = damping * factor, factor * 2.0

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.calibration.adjustment import Fit, TargetView, observations_of, refine, residuals_of
-from sfmapp.calibration.zhang import plane_pose
+from sfmapp.calibration.zhang import plane_poses
 from sfmapp.camera.camera import Camera, simple_camera
 from sfmapp.camera.models import plain_params
 from sfmapp.camera.names import CameraModel
@@ -61,12 +61,10 @@ def first_fit(views: Sequence[TargetView], size: tuple[int, int], k_matrix: Arra
 
 def posed(camera: Camera, views: Sequence[TargetView]) -> Fit:
     """The poses of flat targets in front of a camera that is known; far away where there is none."""
-    poses = []
-    for view in views:
-        pose = plane_pose(camera, view.xyz, view.xy)
-        extent = float(np.ptp(view.xyz, axis=0).max())
-        poses.append(np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 10.0 * extent]) if pose is None else pose)
-    return Fit(camera, np.array(poses).reshape(-1, 7), np.zeros(0), np.inf)
+    poses = plane_poses(camera, views)
+    for v in np.flatnonzero(~np.isfinite(poses).all(1)).tolist():
+        poses[v] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 10.0 * float(np.ptp(views[v].xyz, axis=0).max())]
+    return Fit(camera, poses, np.zeros(0), np.inf)
 
 
 def refine_robustly(start: Fit, views: Sequence[TargetView]) -> Fit:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sfmapp.calibration.adjustment import TargetView
 from sfmapp.camera.camera import Camera, pixels_to_rays
 from sfmapp.geometry import rigid3
-from sfmapp.geometry.dlt import find_homography, homogeneous, normalizing
+from sfmapp.geometry.dlt import find_homography, homogeneous
 
 Array = NDArray[np.float64]
 
@@ -90,29 +90,44 @@ def _k_from_b(b: Array, unscale: Array) -> Array | None:
     return found
 
 
-def plane_pose(camera: Camera, xyz: Array, xy: Array) -> Array | None:
-    """(7,) cam_from_target of a plane z = 0 from its points (N, 3) and their pixels (N, 2), of any lens.
+def plane_poses(camera: Camera, views: Sequence[TargetView]) -> Array:
+    """(V, 7) cam_from_target of planes z = 0, from pixels of any lens; NaN where there is none in front of it.
 
     The DLT of unit rays d: d x H (X, Y, 1) = 0, so that rays may be anywhere around; the two columns that are rotation
-    are brought onto SO(3) by SVD. None where there is none in front of the lens.
+    are brought onto SO(3) by SVD. As |d x v|^2 = v^T (I - d d^T) v, the normal equations of a view are the sum of
+    products of two symmetric matrices, and those of all views come together.
     """
-    rays = pixels_to_rays(camera, xy)
-    is_known = np.isfinite(rays).all(1)
-    if is_known.sum() < 4:
-        return None
-    d, normalize = rays[is_known], normalizing(xyz[is_known, :2])
-    one = homogeneous(xyz[is_known, :2]) @ normalize.T
-    rows = np.einsum("nij,nk->nijk", rigid3.skew(d), one).reshape(-1, 9)
-    h = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, 3)
-    if np.sign((d * (one @ h.T)).sum(1)).sum() < 0:
-        h = -h
-    h = h @ normalize
-    scale = np.sqrt(np.linalg.norm(h[:, 0]) * np.linalg.norm(h[:, 1]))
-    if not scale > 0:
-        return None
-    h = h / scale
-    first = np.stack([h[:, 0], h[:, 1], np.cross(h[:, 0], h[:, 1])], 1)
-    u, _, vt = np.linalg.svd(first)
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    pose: Array = rigid3.from_matrix(rotation, h[:, 2])
-    return pose if np.isfinite(pose).all() else None
+    if not views:
+        return np.zeros((0, 7))
+    counts = np.array([len(view.xy) for view in views])
+    starts = np.cumsum(counts) - counts
+    d = pixels_to_rays(camera, np.concatenate([view.xy for view in views]))
+    is_known: NDArray[np.bool_] = np.isfinite(d).all(axis=1)
+    d = np.where(is_known[:, None], d, 0.0)
+    # places on the plane about their middle, in units of their spread
+    p = np.concatenate([view.xyz[:, :2] for view in views])
+    middle = np.add.reduceat(p, starts) / counts[:, None]
+    p = p - np.repeat(middle, counts, axis=0)
+    spread = np.sqrt(np.add.reduceat((p**2).sum(1), starts) / (2.0 * counts))
+    spread = np.where(spread > 0, spread, 1.0)
+    p = homogeneous(p / np.repeat(spread, counts)[:, None])
+    normalize = np.zeros((len(views), 3, 3))
+    normalize[:, 0, 0] = normalize[:, 1, 1] = 1.0 / spread
+    normalize[:, :2, 2], normalize[:, 2, 2] = -middle / spread[:, None], 1.0
+    i, j = np.triu_indices(3)
+    off = (is_known[:, None, None] * np.eye(3) - d[:, :, None] * d[:, None, :])[:, i, j]
+    both = np.add.reduceat(off[:, :, None] * (p[:, i] * p[:, j])[:, None, :], starts)
+    place = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+    squares = both[:, place[:, None, :, None], place[None, :, None, :]].reshape(-1, 9, 9)
+    h = np.linalg.eigh(squares)[1][:, :, 0].reshape(-1, 3, 3)
+    along = np.add.reduceat(d[:, :, None] * p[:, None, :], starts)
+    h = np.where((h * along).sum(axis=(1, 2), keepdims=True) < 0, -h, h) @ normalize
+    with np.errstate(divide="ignore", invalid="ignore"):
+        h = h / np.sqrt(np.linalg.norm(h[:, :, 0], axis=1) * np.linalg.norm(h[:, :, 1], axis=1))[:, None, None]
+    num_known = np.add.reduceat(is_known.astype(np.int64), starts)
+    is_found = (num_known >= 4) & np.isfinite(h.reshape(-1, 9)).all(axis=1)
+    h[~is_found] = np.eye(3)
+    u, _, vt = np.linalg.svd(np.stack([h[:, :, 0], h[:, :, 1], np.cross(h[:, :, 0], h[:, :, 1])], 2))
+    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
+    poses: Array = np.where(is_found[:, None], rigid3.from_matrix(u @ vt, h[:, :, 2]), np.nan)
+    return poses

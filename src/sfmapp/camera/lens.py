@@ -103,7 +103,7 @@ def _ray_by_others(row: Pointer, given: Pointer, out: Pointer) -> None:
 
 
 def _jacobian_by_others(row: Pointer, given: Pointer, out: Pointer) -> None:
-    """The ``ray_jacobian`` of a ray (x, y, z) that has an image."""
+    """The ``ray_jacobian`` of a ray (x, y, z) that has an image; of the rational family any."""
     c, J, x, y, z = numba.carray(row, (ROW,)), numba.carray(out, (JACOBIAN,)), given[0], given[1], given[2]
     family = c[FAMILY]
     if family == RATIONAL:
@@ -219,13 +219,16 @@ def project_jacobian(c: Array, x: float, y: float, z: float, J: Array) -> None:
         J[2], J[3], J[4] = a * iz, b * iz, -(a * p + b * q) * iz
         J[5], J[6], J[7] = b * iz, d * iz, -(b * p + d * q) * iz
     else:
-        J[0], J[1] = _image_of_ray(c, x, y, z)
+        if family != RATIONAL:  # whose derivatives know where it has an image
+            J[0], J[1] = _image_of_ray(c, x, y, z)
         if math.isnan(J[0]):
             return
         if family == RADIAL_FISHEYE:
             radial_fisheye.ray_jacobian(c, x, y, z, J)
         else:
             _jacobian_elsewhere(c, x, y, z, J)
+            if math.isnan(J[0]):
+                return
     xd, yd, fx, fy = J[0], J[1], c[0], c[1]
     for k in range(15, 3, -1):  # from behind, for the four first make room
         J[8 + 2 * k], J[9 + 2 * k] = fx * J[2 * k], fy * J[2 * k + 1]

@@ -41,6 +41,14 @@ def _bend(c: Array, x: float, y: float) -> tuple[float, float, float, float, flo
     """Image (x', y') of a point of the normalised plane, and dx'/dx, dx'/dy, dy'/dx, dy'/dy."""
     r2 = x * x + y * y
     q, slope, _ = _radial(c, r2)
+    return _bent(c, x, y, r2, q, slope)
+
+
+@numba.njit(cache=True, nogil=True)
+def _bent(
+    c: Array, x: float, y: float, r2: float, q: float, slope: float
+) -> tuple[float, float, float, float, float, float]:
+    """What :func:`_bend` gives, of the radial part q and its slope at r2."""
     prism_x, prism_y = 2.0 * (c[12] + 2.0 * r2 * c[13]), 2.0 * (c[14] + 2.0 * r2 * c[15])
     return (
         x * q + 2.0 * c[6] * x * y + c[7] * (r2 + 2.0 * x * x) + r2 * (c[12] + r2 * c[13]),
@@ -63,19 +71,22 @@ def project(c: Array, x: float, y: float, z: float) -> tuple[float, float]:
 
 @numba.njit(cache=True, nogil=True)
 def ray_jacobian(c: Array, x: float, y: float, z: float, J: Array) -> None:
-    """Fill the row J, see :mod:`sfmapp.camera.lens`."""
+    """Fill the row J, see :mod:`sfmapp.camera.lens`; J[0] is NaN where :func:`project` is."""
+    if not z > 0.0:
+        J[0] = J[1] = math.nan
+        return
     iz = 1.0 / z
     u, v = x * iz, y * iz
-    J[0], J[1], xx, xy, yx, yy = _bend(c, u, v)
+    r2 = u * u + v * v
+    q, slope, below = _radial(c, r2)
+    J[0], J[1], xx, xy, yx, yy = _bent(c, u, v, r2, q, slope)
     J[2], J[3], J[4] = xx * iz, xy * iz, -(xx * u + xy * v) * iz
     J[5], J[6], J[7] = yx * iz, yy * iz, -(yx * u + yy * v) * iz
-    r2 = u * u + v * v
-    q, _, below = _radial(c, r2)
-    power = 1.0
+    by_top, by_below = r2 / below, -q * r2 / below
     for top, under in ((0, 5), (1, 6), (4, 7)):  # k1 k4, k2 k5, k3 k6
-        power *= r2
-        J[8 + 2 * top], J[9 + 2 * top] = u * power / below, v * power / below
-        J[8 + 2 * under], J[9 + 2 * under] = -q * u * power / below, -q * v * power / below
+        J[8 + 2 * top], J[9 + 2 * top] = u * by_top, v * by_top
+        J[8 + 2 * under], J[9 + 2 * under] = u * by_below, v * by_below
+        by_top, by_below = by_top * r2, by_below * r2
     J[12], J[13] = 2.0 * u * v, r2 + 2.0 * v * v
     J[14], J[15] = r2 + 2.0 * u * u, 2.0 * u * v
     J[24], J[25], J[26], J[27] = r2, 0.0, r2 * r2, 0.0

@@ -68,6 +68,12 @@ def add2(typingctx: Any, C: Any, c: Any, A: Any, a: Any, B: Any, b: Any, rows: A
 
 
 @intrinsic
+def add8(typingctx: Any, C: Any, c: Any, A: Any, a: Any, B: Any, b: Any, rows: Any) -> Any:
+    """``C += A^T B``, eight terms."""
+    return _signature(C, A, B), _update(8, "add")
+
+
+@intrinsic
 def subtract3(typingctx: Any, C: Any, c: Any, A: Any, a: Any, B: Any, b: Any, rows: Any) -> Any:
     """``C -= A^T B``, three terms."""
     return _signature(C, A, B), _update(3, "subtract")
