@@ -1,7 +1,7 @@
 """``sfmapp calibrate board`` against OpenCV, and its sigmas against exact ground truth.
 
     python benchmarks/calibration.py                     # all of it
-    python benchmarks/calibration.py --only photographs  # or degraded, trials, next, speed
+    python benchmarks/calibration.py --only photographs  # or degraded, trials, next, refinement, ...
 
 What each part does is in benchmarks/README.md.
 """
@@ -12,7 +12,6 @@ import argparse
 import json
 import os
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from machine import RESULTS, ROOT, describe_machine
 
 sys.path.insert(0, str(ROOT / "tests"))
 
+from board_speed import photographs_12_mp, refinement
 from board_views import board_poses, board_views, render_board
 from sfmapp.calibration.adjustment import Fit, TargetView, normal_at, observations_of, refine, residuals_of
 from sfmapp.calibration.boards import Board, parse_board
@@ -251,51 +251,9 @@ def seen(camera: Camera, pose: Array, seed: int) -> TargetView:
     return TargetView(f"{seed:02d}", CHARUCO.points[found.idx], found.xy)
 
 
-def speed() -> list[Row]:
-    """The refinement against ``cv2.calibrateCamera`` with the rational model; and finding boards in 12 MP."""
-    rng = np.random.default_rng(5)
-    poses = board_poses(rng, CHESS, 30, TRUE)
-    views = board_views(TRUE, CHESS, poses, 0.2, rng)
-    objects = [view.xyz.astype(np.float32) for view in views]
-    pixels = [(view.xy - 0.5).astype(np.float32)[:, None] for view in views]
-    near = Camera(CameraModel.FULL_OPENCV, *SIZE, np.array([960.0, 960.0, 640.0, 480.0, *[0.0] * 8]))
-    matrix = np.array([[960.0, 0, 639.5], [0, 960.0, 479.5], [0, 0, 1.0]])
-    flags = cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_USE_INTRINSIC_GUESS
-    cv2.setNumThreads(1)
-    ours, theirs, rms = [], [], [0.0, 0.0]
-    for _ in range(4):
-        start = time.process_time()
-        rms[1] = cv2.calibrateCamera(objects, pixels, SIZE, matrix.copy(), np.zeros(8), flags=flags)[0]
-        theirs.append(time.process_time() - start)
-        start = time.process_time()
-        obs = observations_of(views)
-        fit = refine(posed(near, views), obs)
-        ours.append(time.process_time() - start)
-        rms[0] = float(np.sqrt((residuals_of(fit, obs) ** 2).sum(1).mean()))
-    big = Camera(CameraModel.OPENCV, 4000, 3000, np.array([3100.0, 3100.0, 2000.0, 1500.0, -0.2, 0.05, 1e-3, -5e-4]))
-    pose = board_poses(rng, CHESS, 1, big)[0]
-    small = render_board(quarter(big), CHESS, pose)
-    gray = cv2.GaussianBlur(cv2.resize(small, (4000, 3000), interpolation=cv2.INTER_CUBIC), (0, 0), 1.0)
-    found = []
-    for _ in range(3):
-        start = time.process_time()
-        num = len(detect_board(gray, CHESS).idx)
-        found.append(time.process_time() - start)
-    return [
-        {"what": "refinement, rational model, 30 views", "cpu_s": min(ours), "opencv_cpu_s": min(theirs),
-         "times": min(theirs) / min(ours), "rms_px": rms[0], "opencv_rms_px": rms[1]},
-        {"what": f"one board in 12 MP, {num} points", "cpu_s": min(found)},
-    ]  # fmt: skip
-
-
-def quarter(camera: Camera) -> Camera:
-    """The camera at a quarter of its size."""
-    params = np.where(np.arange(8) < 4, 0.25 * camera.params, camera.params)
-    return Camera(camera.model, camera.width // 4, camera.height // 4, params)
-
-
 PARTS: dict[str, Callable[[], list[Row]]] = {
-    "photographs": photographs, "degraded": degraded, "trials": trials, "next": suggested, "speed": speed,
+    "photographs": photographs, "degraded": degraded, "trials": trials, "next": suggested,
+    "refinement": refinement, "photographs_12_mp": photographs_12_mp,
 }  # fmt: skip
 
 

@@ -108,10 +108,22 @@ def calibration_rows(folder: Path) -> Iterator[Row]:
     for row in report.get("degraded", []):
         case = f"{row['board']}, {row['case']}"
         yield Row("calibration", case, "points found", "count", "more", row["found"], "OpenCV", row["opencv"], *about)
-    for row in report.get("speed", []):
-        if "opencv_cpu_s" in row:
-            ours, theirs = row["cpu_s"], row["opencv_cpu_s"]
-            yield Row("calibration", row["what"], "CPU time", "s", "less", ours, "OpenCV", theirs, *about)
+    refined = report.get("refinement", [])
+    for lens in dict.fromkeys(row["lens"] for row in refined):
+        mine = [row for row in refined if row["lens"] == lens]
+        for key, start in (("cpu_ms", "the same guess"), ("from_nothing_cpu_ms", "nothing")):
+            ours, theirs = (1e-3 * sum(row[one] for row in mine) for one in (key, f"opencv_{key}"))
+            case = f"rational model, lens of {lens}, from {start}, {len(mine)} sets of 30 views"
+            yield Row("calibration", case, "CPU time", "s", "less", ours, "OpenCV", theirs, *about)
+    whole = {row["program"]: row for row in report.get("photographs_12_mp", [])}
+    for program, row in whole.items():
+        if program.startswith("OpenCV"):
+            for key, what, unit in (
+                ("wall_s", "wall time", "s"), ("cpu_s", "CPU time", "s"), ("peak_mb", "peak memory", "MB"),
+                ("projection_error_px", "projection error", "px"),
+            ):  # fmt: skip
+                ours, theirs = whole["sfmapp"][key], row[key]
+                yield Row("calibration", "30 photographs of 12 MP", what, unit, "less", ours, program, theirs, *about)
 
 
 def two_view_rows(folder: Path) -> Iterator[Row]:

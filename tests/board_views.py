@@ -74,9 +74,10 @@ def rays_of(model: CameraModel, width: int, height: int, params: tuple[float, ..
 
 
 def render_board(
-    camera: Camera, board: Board, pose: np.ndarray, *, blur_px: float = 0.0, noise: float = 0.0, seed: int = 0
-) -> np.ndarray:
-    """(H, W) uint8: the board as the camera sees it, on grey, two samples a pixel each way."""
+    camera: Camera, board: Board, pose: np.ndarray, *, blur_px: float = 0.0, noise: float = 0.0, seed: int = 0,
+    background: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
+    """(H, W) uint8: the board as the camera sees it, on grey or before a picture, two samples a pixel each way."""
     px_per_m = {"aprilgrid": 80.0, "circles": 160.0, "acircles": 160.0}.get(board.kind, 40.0) / board.spacing
     sheet, origin = board_texture(board, px_per_m)
     over = 2
@@ -89,6 +90,9 @@ def render_board(
     xy = np.where(is_seen[:, None], local[:, :2] * px_per_m + origin - 0.5, -1e4)
     maps = xy.reshape(camera.height * over, camera.width * over, 2).astype(np.float32)
     picture = cv2.remap(sheet, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=120)
+    if background is not None:
+        on_sheet = cv2.remap(np.full_like(sheet, 255), maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        picture = np.where(on_sheet == 255, picture, cv2.resize(background, on_sheet.shape[::-1]))
     picture = cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA).astype(np.float64)
     picture = 20.0 + 0.82 * picture
     if blur_px:

@@ -102,7 +102,7 @@ def plane_poses(camera: Camera, views: Sequence[TargetView]) -> Array:
     counts = np.array([len(view.xy) for view in views])
     starts = np.cumsum(counts) - counts
     d = pixels_to_rays(camera, np.concatenate([view.xy for view in views]))
-    is_known: NDArray[np.bool_] = np.isfinite(d).all(axis=1)
+    is_known = np.isfinite(d[:, 0]) & np.isfinite(d[:, 1]) & np.isfinite(d[:, 2])
     d = np.where(is_known[:, None], d, 0.0)
     # places on the plane about their middle, in units of their spread
     p = np.concatenate([view.xyz[:, :2] for view in views])
