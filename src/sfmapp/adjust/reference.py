@@ -166,10 +166,15 @@ class PlainGraph:
 
     def _add_priors(self, priors: IntrinsicPriors) -> None:
         problem = self.problem
-        for c, slot, mean, weight in zip(priors.camera, priors.slot, priors.mean, priors.weight, strict=True):
-            row = (np.array(self._lenses[c].slots) == slot).astype(np.float64)[None]
+        information = np.zeros((len(priors.mean), len(priors.mean)))
+        information[priors.first, priors.second] = priors.weight
+        for c in np.unique(priors.camera):
+            own = np.flatnonzero(priors.camera == c)
+            rows = np.array(self._lenses[c].slots) == priors.slot[own, None]
+            white = np.linalg.cholesky(information[np.ix_(own, own)]).T
+            off = white @ (priors.mean[own] - problem.canonical[c, priors.slot[own]])
             key = C(int(problem.camera_idx[c]))
-            self.graph.add(_linear(self.values, {key: row}, mean - problem.canonical[c, slot], weight**-0.5))
+            self.graph.add(_linear(self.values, {key: white @ rows}, off, 1.0))
 
     def _add_extras(self, extras: ExtraFactors) -> None:
         """The caller's factors; K(c) is tied to the calibration C(c)."""

@@ -365,7 +365,7 @@ class Engine:
             )
         ]  # fmt: skip
         if len(self.priors.weight):
-            num, cost = len(self.priors.weight), self.priors.cost(p.canonical) / variance
+            num, cost = len(self.priors.mean), self.priors.cost(p.canonical) / variance
             residual = float(np.sqrt(2 * cost / num))
             out.append(
                 FactorReport(

@@ -36,6 +36,8 @@ class Camera:
         focal_sigma: standard deviation of the focal prior in pixels; None if the focal is not known a priori at all.
         focal_source: where the focal prior comes from: ``user``, ``exif_35mm``, ``exif_sensor``, ``default``, ``file``.
         is_fixed: the user has said that the parameters may not change.
+        prior_covariance: (P, P) of the prior of all parameters, up to a factor: it is as wide as ``focal_sigma`` has
+            it. None: the prior is of the focal length alone. Rows of parameters that were held are 0.
     """
 
     model: CameraModel
@@ -45,6 +47,7 @@ class Camera:
     focal_sigma: float | None = None
     focal_source: str = "default"
     is_fixed: bool = False
+    prior_covariance: Array | None = None
 
     def __post_init__(self) -> None:
         params = np.array(self.params, np.float64)
@@ -57,6 +60,15 @@ class Camera:
     def focal(self) -> float:
         """Mean focal length in pixels."""
         return float(self.canonical[:2].mean())
+
+    @property
+    def focal_variance(self) -> float:
+        """Of the mean focal length by ``prior_covariance``, in square pixels; 0 without one."""
+        if self.prior_covariance is None:
+            return 0.0
+        share = np.array([kind_of(name) == "focal" for name in PARAM_NAMES[self.model]], np.float64)
+        share /= max(share.sum(), 1.0)
+        return float(share @ self.prior_covariance @ share)
 
     @property
     def canonical(self) -> Array:

@@ -186,7 +186,9 @@ def camera_of_fields(place: str, fields: dict[str, Any], image_size: Size) -> Ca
     """One camera of a section, at the size that the section states, or else at that of the images."""
     size = stated_size(place, fields) or image_size
     if isinstance(fields.get("params"), list) and isinstance(fields.get("model"), str):
-        return camera_from_colmap(place, fields["model"].upper(), size, numbers(place, fields["params"], None))
+        covariance = _covariance(place, fields.get("covariance"))
+        params = numbers(place, fields["params"], None)
+        return camera_from_colmap(place, fields["model"].upper(), size, params, covariance)
     nested = [fields[name] for name in (*_MATRIX_NAMES, *_DISTORTION_NAMES) if isinstance(fields.get(name), dict)]
     sections = [fields, *nested]
     lens = lens_type(place, sections)
@@ -197,6 +199,16 @@ def camera_of_fields(place: str, fields: dict[str, Any], image_size: Size) -> Ca
             "name the distortion model, or remove the coefficients",
         )
     return camera_from_opencv(place, size, intrinsics, coefficients, lens == LensType.FISHEYE)
+
+
+def _covariance(place: str, values: Any) -> Array | None:
+    """Rows of equal length; None for none."""
+    if not isinstance(values, list) or not values:
+        return None
+    rows = [numbers(f"{place}: covariance", row, None) for row in values]
+    if {len(row) for row in rows} != {len(rows)}:
+        raise InputError(f"{place}: covariance: expected a square matrix, found rows of {[len(row) for row in rows]}")
+    return np.array(rows)
 
 
 def _intrinsics(place: str, fields: dict[str, Any]) -> Array:

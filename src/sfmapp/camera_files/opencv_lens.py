@@ -127,13 +127,32 @@ def exact_camera(lens: FullLens) -> Camera | None:
     return replace(camera, focal_sigma=SIGMA_CALIBRATED * camera.focal)
 
 
-def camera_from_colmap(place: str, model: str, size: Size, params: Sequence[float] | Array) -> CalibratedCamera:
+def camera_from_colmap(
+    place: str, model: str, size: Size, params: Sequence[float] | Array, covariance: Array | None = None
+) -> CalibratedCamera:
     """A camera as COLMAP states it: parameters in its order, pixel centres at halves.
+
+    Args:
+        covariance: (P, P) of the parameters, which is the prior then; None: the focal length is good to a hundredth.
 
     Raises:
         InputError: no known model, or not its parameters.
     """
     camera = checked_camera(Path(place), 0, model, *size, params)
+    if covariance is not None:
+        if covariance.shape != (len(camera.params),) * 2 or np.linalg.eigvalsh(covariance)[0] < -1e-9 * np.trace(
+            covariance
+        ):
+            raise InputError(
+                f"{place}: covariance: expected one of {len(camera.params)} parameters, found {covariance.shape[0]} x "
+                f"{covariance.shape[1]} numbers, or one that is none",
+                "take it out of the file, or calibrate again",
+            )
+        camera = replace(camera, prior_covariance=covariance)
+        if camera.focal_variance > 0.0:
+            sigma = float(np.sqrt(camera.focal_variance))
+            note = f"{place}: held as its covariance says, the focal length to {sigma:.2g} px"
+            return CalibratedCamera(replace(camera, focal_sigma=sigma), notes=(note,))
     return CalibratedCamera(replace(camera, focal_sigma=SIGMA_CALIBRATED * camera.focal))
 
 
@@ -222,4 +241,7 @@ def scaled_to(place: str, calibrated: CalibratedCamera, size: Size) -> Calibrate
     params = np.where(is_length, camera.params * scale, camera.params)
     note = f"{place}: calibrated at {camera.width}x{camera.height}, scaled to the images' {size[0]}x{size[1]}"
     scaled = replace(camera, width=size[0], height=size[1], params=params, focal_sigma=sigma)
+    if camera.prior_covariance is not None:
+        by = np.where(is_length, scale, 1.0)
+        scaled = replace(scaled, prior_covariance=camera.prior_covariance * np.outer(by, by))
     return replace(calibrated, camera=scaled, notes=(*calibrated.notes, note))

@@ -25,9 +25,9 @@ Mask = NDArray[np.bool_]
 _WRONG = 0.02
 # Factors on the sigmas that are averaged over. Stated ones are right within a third, or too small: of what a receiver
 # leaves out (the lever arm, the shutter), and of the model's own bend, the less likely the larger. Where nothing is
-# stated anything between RTK and a street of tall houses is likely alike beside a guess of some metres.
+# stated anything from RTK on is likely alike beside a guess of some metres, and poorer the less likely.
 _FACTORS = np.geomspace(1e-3, 1e3, 97)
-_STATED_SPREAD, _STATED_UP_TO, _GUESS_RANGE = 0.3, 300.0, (2e-3, 20.0)
+_STATED_SPREAD, _STATED_UP_TO, _GUESS_RANGE, _GUESS_POOR = 0.3, 300.0, (2e-3, 20.0), 2.0
 # All triples up to this many, else as many drawn: with 40 % wrong places one in five triples is right.
 _MAX_TRIPLES = 2000
 # ... and fewer where there are so many places that memory would matter: then fewer do
@@ -123,8 +123,9 @@ def _median(places: Array) -> Array:
 def _prior_of_factors(*, is_stated: bool) -> Array:
     """Probabilities of :data:`_FACTORS`."""
     if not is_stated:
-        within = (_GUESS_RANGE[0] <= _FACTORS) & (_GUESS_RANGE[1] >= _FACTORS)
-        return np.asarray(within / within.sum(), np.float64)
+        within = np.clip(_FACTORS, *_GUESS_RANGE) == _FACTORS
+        weight = np.where(within, np.minimum(1.0, _GUESS_POOR / _FACTORS), 0.0)
+        return np.asarray(weight / weight.sum(), np.float64)
     right = np.exp(-0.5 * (np.log(_FACTORS) / _STATED_SPREAD) ** 2)
     wider = np.where((_FACTORS >= 1.0) & (_FACTORS <= _STATED_UP_TO), 1.0 / _FACTORS, 0.0)
     both: Array = 0.5 * right / right.sum() + 0.5 * wider / wider.sum()

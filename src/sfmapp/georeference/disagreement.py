@@ -22,7 +22,7 @@ MIN_AGREEING = 0.6
 # leave out (the lever arm to the camera, the shutter) may make as much of a survey by RTK, and is as wrong there.
 REFUTED_FACTOR = 3.0
 # A guess of some metres is refuted by what is worse than any receiver under open sky or between houses.
-_NO_RECEIVER_FACTOR = 10.0
+_NO_RECEIVER_FACTOR = 5.0
 _ADVICE = "see Positions for those that are off; --set gps.source=none leaves all of them out"
 _SUBJECT = "positions"
 

@@ -74,7 +74,9 @@ def as_unknown(camera: Camera) -> Camera:
     """The camera as if nothing were known of its focal length: free, with the prior of photographs without EXIF."""
     focal = DEFAULT_FOCAL * max(camera.width, camera.height)
     sigma = DEFAULT_FOCAL_SIGMA * focal
-    return replace(camera.with_focal(focal), focal_sigma=sigma, focal_source="default", is_fixed=False)
+    return replace(
+        camera.with_focal(focal), focal_sigma=sigma, focal_source="default", is_fixed=False, prior_covariance=None
+    )
 
 
 def settle_focal_lengths(mapped: Mapped, map_from: MapFrom, events: Events) -> Mapped:

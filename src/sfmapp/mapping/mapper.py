@@ -436,7 +436,14 @@ class Mapper:
         reconstruction, mode = self.reconstruction, self.options.refine_principal_point
         registered = reconstruction.image_camera_idx[reconstruction.is_registered]
         shared = np.bincount(registered, minlength=len(reconstruction.cameras)) >= 3
-        unknown = np.array([mode == "always" or c.focal_source == "default" for c in reconstruction.cameras], bool)
+        # a calibration tells them too, and how well
+        unknown = np.array(
+            [
+                mode == "always" or c.focal_source == "default" or prior.focal_variance > 0.0
+                for c, prior in zip(reconstruction.cameras, self.prior_cameras, strict=True)
+            ],
+            bool,
+        )
         free: NDArray[np.bool_] = shared & unknown & (mode != "never")
         return free
 

@@ -44,7 +44,8 @@ def turned_camera(camera: Camera, orientation: int) -> Camera:
             values[x], values[y] = upright_vectors(orientation, [values[x], values[y]]).tolist()
     if "s" in values and orientation in MIRRORED:  # one of the axes goes the other way
         values["s"] = -values["s"]
-    return replace(camera, width=width, height=height, params=np.array(list(values.values())))
+    # what was known of all parameters together is not carried over: the focal length's part is
+    return replace(camera, width=width, height=height, params=np.array(list(values.values())), prior_covariance=None)
 
 
 def turned_back(camera: Camera, orientation: int) -> Camera | None:

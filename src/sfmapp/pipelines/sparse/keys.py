@@ -51,7 +51,13 @@ def stage_keys(
     features = stage_key(FEATURES, options.features)
     images = [features, list(inputs.items()), options.seed]
     lenses = [[camera.model.name, camera.width, camera.height, camera.params.tolist()] for camera in image_set.cameras]
-    priors = [[camera.focal_sigma, camera.focal_source, camera.is_fixed] for camera in image_set.cameras]
+    priors = [
+        [
+            camera.focal_sigma, camera.focal_source, camera.is_fixed,
+            None if camera.prior_covariance is None else camera.prior_covariance.tolist(),
+        ]
+        for camera in image_set.cameras
+    ]  # fmt: skip
     whose = [record.camera_idx for record in image_set.images]
     places = [[record.timestamp, record.gps] for record in image_set.images]
     pairs = stage_key(PAIRS, options.pairs, images, places)
