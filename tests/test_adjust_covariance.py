@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -103,13 +105,26 @@ def test_pose_prior_holds_the_gauge_and_counts_in_its_own_units():
 
 def test_focal_prior_bounds_the_focal():
     scene = make_scene(2, 3, 60, layout="grid")
-    from dataclasses import replace
-
     priors = [replace(scene.ground_truth.cameras[0], focal_sigma=1e-3)]
     found = scene.observed.copy()
     adjust_bundle(found, OPTIONS, prior_cameras=priors)
     covariances = estimate_covariances(found, OPTIONS, prior_cameras=priors)
     assert np.sqrt(covariances.intrinsics[0][0, 0]) == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_the_joint_prior_of_a_calibration_comes_back_where_photographs_tell_less():
+    scene = make_scene(2, 3, 60, synthetic_camera(CameraModel.RADIAL), layout="grid")
+    root = np.array([[1e-3, 0, 0], [4e-7, 3e-7, 0], [-2e-7, 1e-7, 2e-7]])
+    covariance = np.zeros((5, 5))
+    free = np.ix_([0, 3, 4], [0, 3, 4])
+    covariance[free] = root @ root.T
+    # as wide as the sigma has it: twice
+    priors = [replace(scene.ground_truth.cameras[0], focal_sigma=2e-3, prior_covariance=covariance)]
+    found = scene.observed.copy()
+    adjust_bundle(found, OPTIONS, prior_cameras=priors)
+    (told,) = estimate_covariances(found, OPTIONS, prior_cameras=priors).intrinsics
+    scale = np.sqrt(np.diag(covariance[free]))
+    np.testing.assert_allclose(told / np.outer(scale, scale), 4 * covariance[free] / np.outer(scale, scale), atol=0.02)
 
 
 def test_sparse_tiles_give_the_same_covariances(monkeypatch):

@@ -71,6 +71,18 @@ def test_same_with_many_cameras_and_principal_point():
     both(scene, options, extra_factors=hold_gauge(scene), prior_cameras=priors)
 
 
+def test_same_with_the_joint_prior_of_a_calibration():
+    """Of all parameters together, as wide as the sigma of the focal length has it; k1 was held, and is free here."""
+    scene = make_scene(8, 6, 200, synthetic_camera(CameraModel.RADIAL))
+    rng = np.random.default_rng(4)
+    root = np.diag([8.0, 3.0, 3.0, 0.0, 0.004]) @ np.tril(rng.normal(size=(5, 5)) * 0.4 + np.eye(5))
+    prior = replace(scene.ground_truth.cameras[0], focal_sigma=2.0, prior_covariance=root @ root.T)
+    prior = prior.with_params(prior.params + np.array([4.0, 1.0, -1.0, 0.0, 0.001]))
+    options = replace(OPTIONS, refine_principal_point=True)
+    _, ours, theirs = both(scene, options, extra_factors=hold_gauge(scene), prior_cameras=[prior])
+    np.testing.assert_allclose(ours.cameras[0].params, theirs.cameras[0].params, rtol=1e-5, atol=1e-6)
+
+
 def test_same_with_constants_and_factors_on_intrinsics():
     scene = make_scene(4, 6, 200)
     graph = gtsam.NonlinearFactorGraph()

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.camera_files.opencv_lens import FullLens, camera_from_opencv, sampling_map
+from sfmapp.camera_files.photographs import Photograph, read_given_cameras
 from sfmapp.camera_files.reading import read_calibration
 from sfmapp.errors import InputError
 from sfmapp.formats.flat_yaml import parse_flat_yaml
@@ -477,3 +478,24 @@ def test_yaml_too_deep_is_refused(text: str) -> None:
 def test_yaml_beyond_the_part_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="test"):
         parse_flat_yaml(text, "test")
+
+
+def test_the_covariance_in_a_calibration_is_the_prior(tmp_path: Path) -> None:
+    """Scaled with the photographs; without a focal length that varied there is none."""
+    root = np.array([[0.2, 0.0, 0.0, 0.0], [0.05, 0.3, 0.0, 0.0], [0.0, 0.1, 0.3, 0.0], [4e-5, 0.0, 0.0, 1e-4]])
+    fields = {"model": "SIMPLE_RADIAL", "width": 640, "height": 480, "params": [500.0, 320.0, 240.0, -0.1]}
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(fields | {"covariance": (root @ root.T).tolist()}))
+    (found,) = read_given_cameras(str(path)).of_photographs("", [Photograph("a.jpg", (1280, 960))])
+    assert found.camera.focal_sigma == pytest.approx(0.4)
+    assert found.camera.prior_covariance is not None
+    by = np.array([2.0, 2.0, 2.0, 1.0])
+    np.testing.assert_allclose(found.camera.prior_covariance, root @ root.T * np.outer(by, by))
+    assert "held as its covariance says, the focal length to 0.2 px" in found.reason
+    path.write_text(json.dumps(fields | {"covariance": np.zeros((4, 4)).tolist()}))
+    (found,) = read_given_cameras(str(path)).of_photographs("", [Photograph("a.jpg", (640, 480))])
+    assert found.camera.focal_sigma == pytest.approx(5.0)
+    for wrong in (np.eye(3), -np.eye(4)):
+        path.write_text(json.dumps(fields | {"covariance": wrong.tolist()}))
+        with pytest.raises(InputError, match="expected one of 4 parameters"):
+            read_given_cameras(str(path)).of_photographs("", [Photograph("a.jpg", (640, 480))])
