@@ -301,6 +301,21 @@ def promises(folder: Path) -> Iterator[Promise]:
     shares = [row[n] for row in report["rows"] if row["kind"] == "all" for n in SURVEYED]
     text = "95 % intervals of positions hold 93 to 97 % of the truth"
     yield Promise("surveys", text, sum(93 <= share <= 97 for share in shares), len(shares), report["date"][:10])
+    report = read(folder, "wrong_positions")
+    rows = [row for part in ("fits", "stages") for row in report[part] if row["wrong"]]
+    tried = sum(row[name] for row in rows for name in ("named", "red", "missed", "lost"))
+    missed = sum(row["missed"] for row in rows)
+    text = "grossly wrong positions, 4 to 30 with up to 40 % of them wrong: named, or red"
+    yield Promise("wrong_positions", text, tried - missed, tried, report["date"][:10])
+    rows = [row for part in ("fits", "stages") for row in report[part] if not row["wrong"]]
+    tried, red = (sum(row[name] for row in rows for name in names) for names in (("named", "red", "lost"), ("red",)))
+    yield Promise("wrong_positions", "right positions are not red", tried - red, tried, report["date"][:10])
+    report = read(folder, "held_poses")
+    said = [row["verdict"] != "silent" for row in report["rows"] if row["noise"] != "none"]
+    text = "poses that are held and wrong, from 0.05 % and 0.02 degrees on: red, named or refused"
+    yield Promise("held_poses", text, sum(said), len(said), report["date"][:10])
+    silent = [row["verdict"] == "silent" for row in report["rows"] if row["noise"] == "none"]
+    yield Promise("held_poses", "poses that are right: silent", sum(silent), len(silent), report["date"][:10])
     report = read(folder, "control_surveys")
     shares = [row[name] for row in report["rows"] for name in ("horizontal", "vertical")]
     text = "those of control points that were left out do"

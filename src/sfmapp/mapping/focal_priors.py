@@ -246,15 +246,18 @@ def focal_sigmas(
         information = 1.0 / np.mean(np.square(found)) - 1.0 / prior**2
         independent = information**-0.5 if information > 1e-6 / prior**2 else np.inf
         sigmas[c] = FocalSigmas(float(independent), float(FOCAL_INFLATION * independent), float(prior))
-    if all(s.independent_px <= SURE_FOCAL * model.cameras[c].focal for c, s in sigmas.items()):
+    is_sure = all(s.independent_px <= SURE_FOCAL * model.cameras[c].focal for c, s in sigmas.items())
+    known = [c for c, s in sigmas.items() if mapped.cameras[c].focal_source != "default"]
+    # a prior that is surer than the photographs, as a calibration's, hides what these say
+    if is_sure and all(sigmas[c].is_determined for c in known):
         return sigmas, None
-    richer = _with_richer_lens(mapped.mapper_of(model))
-    known = [c for c in sigmas if mapped.cameras[c].focal_source != "default"]
+    richer = None if is_sure else _with_richer_lens(mapped.mapper_of(model))
     alone = _without_priors(mapped.mapper_of(model), known) if known else model
     for c, s in sigmas.items():
-        # what more terms of the lens do, not how far a prior has pulled the focal length meanwhile
-        off = min(abs(richer.cameras[c].focal - plain.cameras[c].focal) for plain in (model, alone))
-        sigmas[c] = replace(s, data_px=float(np.hypot(s.data_px, off)))
+        if richer is not None:
+            # what more terms of the lens do, not how far a prior has pulled the focal length meanwhile
+            off = min(abs(richer.cameras[c].focal - plain.cameras[c].focal) for plain in (model, alone))
+            sigmas[c] = replace(s, data_px=float(np.hypot(s.data_px, off)))
         if c in known:
             sigmas[c] = replace(sigmas[c], alone_px=alone.cameras[c].focal, known_px=mapped.cameras[c].focal)
     return sigmas, richer

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from sfmapp.scene.reconstruction import Reconstruction
 
 FORMAT = "sfmapp report 2"
+# Share of a focal length to which photographs that tell it speak for or against what is surer still.
+_TOLD_SHARE = 0.01
 _NOTHING = Funnel(**dict.fromkeys(Funnel.__dataclass_fields__))
 
 
@@ -227,13 +229,16 @@ def _check_focal(camera: CameraReport, refined: Mapping[str, float], sigma_px: f
     if evidence.is_prior_left_out and found.light != "green":
         return replace(found, light="amber", value=f"{found.value}; the photographs refute it, it was left out")
     if evidence.is_determined is False and camera.focal_source != "default":
-        own = evidence.data_sigma_px
-        told = f"within {own:.0f} px by themselves" if own is not None else "not at all"
+        own, focal = evidence.data_sigma_px, _focal(refined)
+        told = f"only to {100 * own / focal:.2g} % by themselves" if own is not None else "not at all"
         value = (
-            f"{found.value}; not determined by these photographs, which tell it {told}, the prior within "
-            f"{evidence.prior_sigma_px:.0f} px"
+            f"{found.value}; not determined by these photographs, which tell it {told}, the prior to "
+            f"{100 * (evidence.prior_sigma_px or 0.0) / focal:.2g} %"
         )
-        return replace(found, light="amber" if found.light == "green" else found.light, value=value)
+        # photographs that tell it well would have spoken against a prior that is surer still
+        has_spoken = own is not None and evidence.tension is not None and own <= _TOLD_SHARE * focal
+        light = found.light if found.light != "green" or has_spoken else "amber"
+        return replace(found, light=light, value=value)
     return found
 
 

@@ -344,9 +344,17 @@ class LensChange(Report):
     def text(self) -> str:
         """In words."""
         if self.rms_px is None:
-            return f"{self.before} to {self.after}, which see hardly the same"
+            return f"{self.before} to {self.after}, which see hardly the same; {self._told}"
         sigma = "" if self.sigma_px is None else f", sigma of the calibration {self.sigma_px:.2f}"
-        return f"{self.before} to {self.after}: {self.rms_px:.2f} px rms apart, {self.max_px:.2f} at most{sigma}"
+        apart = f"{self.rms_px:.2f} px rms apart, {self.max_px:.2f} at most{sigma}"
+        return f"{self.before} to {self.after}: {apart}; {self._told}"
+
+    @property
+    def _told(self) -> str:
+        if self.told_focal_px is None or self.told_sigma_px is None:
+            return "the photographs cannot tell the focal length, and not contradict it"
+        share = 100 * self.told_sigma_px / self.told_focal_px
+        return f"the photographs can tell the focal length only to {share:.2g} %"
 
 
 class CalibratedModelReport(Report):
