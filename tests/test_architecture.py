@@ -34,6 +34,7 @@ FLOORS = (
     ("calibration",),
     ("twoview",),
     ("panorama",),
+    ("uncalibrated",),
     ("mapping",),
     ("adjust",),
     ("matching",),

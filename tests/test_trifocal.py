@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.fundamental import eight_point, refine_fundamental
 from sfmapp.geometry.projective import project
 from sfmapp.geometry.trifocal import (
     cameras_of,
+    crossing_angles,
     epipoles_of,
     fit_trifocal,
     fundamentals_of,
@@ -17,7 +19,6 @@ from sfmapp.geometry.trifocal import (
     transfer_by_tensor,
     transfer_line,
     trifocal_of,
-    trifocal_plane_gap,
 )
 from sfmapp.geometry.two_rays import fundamental_of
 from uncalibrated_scenes import K, distance, scene
@@ -70,17 +71,32 @@ def test_covariance_of_a_transfer_is_what_noise_does() -> None:
     true, noisy = scene(3, 400, seed=2), scene(3, 400, seed=2, noise=0.4)
     tensor = trifocal_of(true.cameras)
     f31, f32 = (fundamental_of(true.cameras[n], true.cameras[2]) for n in (0, 1))
-    f21 = fundamental_of(true.cameras[0], true.cameras[1])
     for told in (
         transfer_by_tensor(tensor, noisy.xy[:, 0], noisy.xy[:, 1], noise_px=0.4),
         transfer_by_lines(f31, f32, noisy.xy[:, 0], noisy.xy[:, 1], noise_px=0.4),
-        transfer_by_lines(f31, f32, noisy.xy[:, 0], noisy.xy[:, 1], f21=f21, noise_px=0.4),
     ):
         gap = (told.xy - true.xy[:, 2])[told.is_told]
-        # two degrees of freedom each: as lines of sight that were made to meet leave three, some are flat
-        inverse = np.linalg.pinv(told.covariance[told.is_told] + 1e-6 * np.eye(2))
-        nees = np.einsum("ni,nij,nj->n", gap, inverse, gap).mean() / 2.0
-        assert 0.8 < nees < 1.25
+        nees = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(told.covariance[told.is_told]), gap).mean() / 2.0
+        assert 0.85 < nees < 1.2
+
+
+def test_covariance_of_fundamental_matrices_is_in_that_of_the_lines() -> None:
+    ratios = []
+    for seed in range(6):
+        true, noisy = scene(3, 60, seed=seed), scene(3, 60, seed=seed, noise=0.4)
+        fits = [
+            refine_fundamental(eight_point(noisy.xy[:, n], noisy.xy[:, 2])[0], noisy.xy[:, n], noisy.xy[:, 2])
+            for n in (0, 1)
+        ]
+        covariances = tuple(info.covariance for _, info in fits)
+        # exact pixels: what is left is the error of both F alone
+        told = transfer_by_lines(
+            fits[0][0], fits[1][0], true.xy[:, 0], true.xy[:, 1], covariances=covariances, noise_px=1e-3,  # type: ignore[arg-type]
+            limit_sigmas=1e4,
+        )  # fmt: skip
+        gap = (told.xy - true.xy[:, 2])[told.is_told]
+        ratios.append(np.einsum("ni,nij,nj->n", gap, np.linalg.inv(told.covariance[told.is_told]), gap).mean() / 2.0)
+    assert 0.4 < np.mean(ratios) < 1.8
 
 
 def _collinear_centers() -> tuple[np.ndarray, np.ndarray]:
@@ -94,7 +110,7 @@ def test_the_trifocal_plane_is_refused_by_lines_and_not_by_the_tensor() -> None:
     f31, f32 = (fundamental_of(cameras[n], cameras[2]) for n in (0, 1))
     told = transfer_by_lines(f31, f32, xy[:, 0], xy[:, 1])
     assert not told.is_told.any()
-    assert trifocal_plane_gap(cameras, scene(3).points).max() < 1e-6
+    assert crossing_angles(f31, f32, xy[:, 0], xy[:, 1]).max() < 1e-6
     tensor, _ = fit_trifocal(*xy.swapaxes(0, 1))
     told = transfer_by_tensor(tensor, xy[:, 0], xy[:, 1])
     assert told.is_told.all()
@@ -109,11 +125,11 @@ def test_what_lies_in_the_trifocal_plane_of_a_general_triple_is_named() -> None:
     xy = project(cameras, points)
     f31, f32 = (fundamental_of(cameras[n], cameras[2]) for n in (0, 1))
     told = transfer_by_lines(f31, f32, xy[:, 0], xy[:, 1])
-    gap = trifocal_plane_gap(cameras, points)
+    angles = crossing_angles(f31, f32, xy[:, 0], xy[:, 1])
     # the plane y = 0 has all three centres: below it and above points are told, on it they are not
     assert not told.is_told[np.abs(points[:, 1]) < 0.03].any()
     assert told.is_told[np.abs(points[:, 1]) > 0.6].all()
-    assert gap[told.is_told].min() > gap[~told.is_told].min()
+    assert angles[told.is_told].min() > angles[~told.is_told].min()
     assert np.abs(told.xy - xy[:, 2])[told.is_told].max() < 1e-6
 
 

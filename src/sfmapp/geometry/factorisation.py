@@ -23,6 +23,7 @@ MIN_POINTS = 8
 """Of a frame that more than one choice of depths would not fit: F of two views takes as many."""
 
 _CONVERGED, _ROUNDING = 1e-6, 1e-13
+_OFF_PLANE = 90.0
 
 
 def factorise(
@@ -99,7 +100,10 @@ def _homographies_fit(pixels: Array, left_px: float, scale: float) -> bool:
     squared = []
     for view in range(1, pixels.shape[1]):
         h = fit_homography(pixels[:, 0], pixels[:, view])[0]
-        squared.append(float(np.median(transfer_errors(h, pixels[:, 0], pixels[:, view]))))
+        # what stands off a plane may be one in ten of what is seen
+        squared.append(
+            float(np.percentile(transfer_errors(h, pixels[:, 0], pixels[:, view]), _OFF_PLANE, method="nearest"))
+        )
     return math.sqrt(max(squared)) <= 3.0 * left_px + 1e-9 / scale
 
 

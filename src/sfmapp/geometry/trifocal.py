@@ -10,7 +10,6 @@ Part of the literature writes ``F13`` for what takes a point of picture 1 to its
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +20,7 @@ from sfmapp.geometry.dlt import homogeneous, normalizing
 from sfmapp.geometry.fit import FitInfo, count_free, matched_points
 from sfmapp.geometry.projective import dehomogenized, triangulate_views
 from sfmapp.geometry.projective_adjustment import ProjectiveModel, adjust_projective, sightings_of
-from sfmapp.geometry.two_rays import fundamental_of, move_to_meet
+from sfmapp.geometry.two_rays import move_to_meet
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -200,31 +199,14 @@ class Transfer:
         return longest
 
 
-def _with_noise(
-    move: Callable[[Array, Array], Array], xy1: Array, xy2: Array, noise_px: float, limit_sigmas: float
-) -> Transfer:
-    """A transfer and what the noise of its four coordinates makes of it, by differences."""
-    xy = move(xy1, xy2)
-    step = max(0.1 * noise_px, 1e-4)
-    slopes = np.zeros((len(xy), 2, 4))
-    for axis in range(4):
-        d1, d2 = np.zeros(2), np.zeros(2)
-        (d1 if axis < 2 else d2)[axis % 2] = step
-        slopes[:, :, axis] = (move(xy1 + d1, xy2 + d2) - move(xy1 - d1, xy2 - d2)) / (2.0 * step)
-    covariance = noise_px**2 * slopes @ slopes.swapaxes(1, 2)
-    told = Transfer(xy, covariance, np.ones(len(xy), np.bool_))
-    is_told = np.isfinite(xy).all(1) & (told.sigmas <= limit_sigmas * noise_px)
-    return Transfer(xy, covariance, np.asarray(is_told, np.bool_))
-
-
-# An ellipse so many times as long as the noise of a coordinate is no answer: by F31 and F32 it is what lines give that
-# cross at less than six degrees
-_LIMIT_SIGMAS = 10.0
+LIMIT_SIGMAS = 10.0
+"""An ellipse so many times as long as the noise of a coordinate is no answer. Of exact F it is what two lines give that
+cross at some eight degrees."""
 
 
 def transfer_by_lines(
-    f31: Array, f32: Array, xy1: ArrayLike, xy2: ArrayLike, *, f21: Array | None = None, noise_px: float = 1.0,
-    limit_sigmas: float = _LIMIT_SIGMAS,
+    f31: Array, f32: Array, xy1: ArrayLike, xy2: ArrayLike, *, covariances: tuple[Array, Array] | None = None,
+    noise_px: float = 1.0, limit_sigmas: float = LIMIT_SIGMAS,
 ) -> Transfer:  # fmt: skip
     """Points of pictures 1 and 2 in picture 3, where their epipolar lines cross: ``x3 ~ F31 x1 x F32 x2`` (HZ 15.11).
 
@@ -234,7 +216,7 @@ def transfer_by_lines(
 
     Args:
         f31, f32: (3, 3), ``x3^T F31 x1 = 0`` and ``x3^T F32 x2 = 0``. xy1, xy2: (N, 2) matched pixels.
-        f21: pixels are moved first until they meet; None: as they are.
+        covariances: (9, 9) of the entries of both F; None: they are exact.
         noise_px: standard deviation of a coordinate. limit_sigmas: ellipses that are longer, in units of the noise, are
             refused.
 
@@ -242,19 +224,35 @@ def transfer_by_lines(
         ValueError: points that are not finite, or no points.
     """
     a, b = matched_points(xy1, xy2, 1, "a transfer")
+    lines = [homogeneous(xy) @ f.T for xy, f in ((a, f31), (b, f32))]
+    sizes = [np.maximum(np.linalg.norm(line[:, :2], axis=1), 1e-300) for line in lines]
+    normals = np.stack([line[:, :2] / size[:, None] for line, size in zip(lines, sizes, strict=True)], 1)
+    xy = dehomogenized(np.cross(lines[0] / sizes[0][:, None], lines[1] / sizes[1][:, None]))
+    at = homogeneous(np.nan_to_num(xy))
+    # how far each line is off where they cross, at right angles to it
+    offsets = np.stack([
+        noise_px**2 * ((at @ f)[:, :2] ** 2).sum(1) / size**2 for f, size in zip((f31, f32), sizes, strict=True)
+    ], 1)  # fmt: skip
+    if covariances is not None:
+        for n, (pixels, covariance, size) in enumerate(zip((a, b), covariances, sizes, strict=True)):
+            by_f = (at[:, :, None] * homogeneous(pixels)[:, None, :]).reshape(-1, 9)
+            offsets[:, n] += np.einsum("ni,ij,nj->n", by_f, covariance, by_f) / size**2
+    sine = normals[:, 0, 0] * normals[:, 1, 1] - normals[:, 0, 1] * normals[:, 1, 0]
+    crosses = np.isfinite(xy).all(1) & (np.abs(sine) > 1e-12)
+    inverse = np.linalg.inv(np.where(crosses[:, None, None], normals, np.eye(2)))
+    covariance = np.where(
+        crosses[:, None, None], (inverse * offsets[:, None, :]) @ inverse.swapaxes(1, 2), np.full((2, 2), np.inf)
+    )
+    return _judged(xy, covariance, limit_sigmas * noise_px)
 
-    def crossing(at1: Array, at2: Array) -> Array:
-        if f21 is not None:
-            at1, at2 = move_to_meet(f21, at1, at2)
-        lines = [homogeneous(at) @ f.T for at, f in ((at1, f31), (at2, f32))]
-        unit = [line / np.maximum(np.linalg.norm(line[:, :2], axis=1, keepdims=True), 1e-300) for line in lines]
-        return dehomogenized(np.cross(unit[0], unit[1]))
 
-    return _with_noise(crossing, a, b, noise_px, limit_sigmas)
+def _judged(xy: Array, covariance: Array, limit_px: float) -> Transfer:
+    told = Transfer(xy, covariance, np.ones(len(xy), np.bool_))
+    return Transfer(xy, covariance, np.asarray(np.isfinite(xy).all(1) & (told.sigmas <= limit_px), np.bool_))
 
 
 def transfer_by_tensor(
-    tensor: Array, xy1: ArrayLike, xy2: ArrayLike, *, noise_px: float = 1.0, limit_sigmas: float = _LIMIT_SIGMAS
+    tensor: Array, xy1: ArrayLike, xy2: ArrayLike, *, noise_px: float = 1.0, limit_sigmas: float = LIMIT_SIGMAS
 ) -> Transfer:
     """Points of pictures 1 and 2 in picture 3 by ``x3_k = x1_i l2_j T[i, j, k]``, l2 through x2 at right angles to its
     epipolar line, after both pixels were moved until they meet (HZ 15.3).
@@ -281,7 +279,15 @@ def transfer_by_tensor(
         across = np.stack([epipolar[:, 1], -epipolar[:, 0], last], 1)
         return dehomogenized(np.einsum("ni,nj,ijk->nk", x1, across, tensor))
 
-    return _with_noise(contracted, a, b, noise_px, limit_sigmas)
+    # what the noise of the four coordinates makes of it, by differences
+    step = max(0.1 * noise_px, 1e-4)
+    slopes = np.zeros((len(a), 2, 4))
+    for axis in range(4):
+        shift = step * np.eye(4)[axis].reshape(2, 2)
+        after, before = contracted(a + shift[0], b + shift[1]), contracted(a - shift[0], b - shift[1])
+        slopes[:, :, axis] = (after - before) / (2.0 * step)
+    covariance = np.nan_to_num(noise_px**2 * slopes @ slopes.swapaxes(1, 2), nan=np.inf)
+    return _judged(contracted(a, b), covariance, limit_sigmas * noise_px)
 
 
 def transfer_line(tensor: Array, line2: ArrayLike, line3: ArrayLike) -> Array:
@@ -298,11 +304,11 @@ def transfer_line(tensor: Array, line2: ArrayLike, line3: ArrayLike) -> Array:
     return lines
 
 
-def trifocal_plane_gap(cameras: Array, points: Array) -> Array:
-    """(N,) angles in radians between the two epipolar lines that points (N, 4) have in the third of three cameras: zero
-    in the trifocal plane, where a transfer by F31 and F32 tells nothing."""
-    f31, f32 = fundamental_of(cameras[0], cameras[2]), fundamental_of(cameras[1], cameras[2])
-    lines = [points @ cameras[0].T @ f31.T, points @ cameras[1].T @ f32.T]
-    normals = [line[:, :2] / np.maximum(np.linalg.norm(line[:, :2], axis=1, keepdims=True), 1e-300) for line in lines]
-    sine = np.abs(normals[0][:, 0] * normals[1][:, 1] - normals[0][:, 1] * normals[1][:, 0])
-    return np.asarray(np.arcsin(sine.clip(0.0, 1.0)), np.float64)
+def crossing_angles(f31: Array, f32: Array, xy1: Array, xy2: Array) -> Array:
+    """(N,) angles, radians, between the two lines in picture 3 of points (N, 2) matched in pictures 1 and 2: zero in
+    the trifocal plane, where a transfer by lines tells nothing."""
+    one, two = homogeneous(xy1) @ f31.T, homogeneous(xy2) @ f32.T
+    cross = np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
+    size = np.linalg.norm(one[:, :2], axis=1) * np.linalg.norm(two[:, :2], axis=1)
+    angles: Array = np.arcsin((cross / np.maximum(size, 1e-300)).clip(0.0, 1.0))
+    return angles

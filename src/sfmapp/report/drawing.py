@@ -6,6 +6,7 @@ that OpenCV 5 brings. Coordinates are pixels from the top left corner, colours a
 
 from __future__ import annotations
 
+import base64
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
@@ -126,3 +127,12 @@ def colormap(values: Array) -> NDArray[np.uint8]:
     # matplotlib's plasma without its pale yellow end
     index = np.rint(np.clip(np.nan_to_num(values), 0.0, 1.0) * 0.82 * 255).astype(np.uint8)
     return np.ascontiguousarray(cv2.applyColorMap(index[:, None], cv2.COLORMAP_PLASMA)[:, 0, ::-1])
+
+
+def jpeg_url(pixels: NDArray[np.uint8], longest: int, quality: int = 82) -> str:
+    """A picture (H, W, 3) RGB as a JPEG of at most so many pixels, to stand in a page itself."""
+    scale = min(1.0, longest / max(pixels.shape[:2]))
+    size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
+    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)[:, :, ::-1]
+    encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()

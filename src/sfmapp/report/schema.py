@@ -30,6 +30,7 @@ from sfmapp.report.model import (
 )
 from sfmapp.report.pair_html import PairReport
 from sfmapp.report.panorama_html import PanoramaReport
+from sfmapp.report.transfer_html import TransferRunReport
 from sfmapp.report.validation import CloudValidation, Validation
 from sfmapp.reporting import Report, field_types
 
@@ -55,6 +56,7 @@ KINDS: Mapping[str, type[Report]] = {
     "measure": MeasureReport,
     "pair": PairReport,
     "panorama": PanoramaReport,
+    "transfer": TransferRunReport,
     "warp": WarpReport,
     "rectify": RectifyReport,
 }

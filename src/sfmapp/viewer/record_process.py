@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 def main(kind: str, folder: str, output: str, threads: str) -> None:
-    """Draw what lies in folder: the replay of a run, a dense result, a calibration, a rig, or a pair."""
+    """Draw what lies in folder: the replay of a run, a dense result, a calibration, a rig, a pair, or a transfer."""
     if kind == "dense":
         from sfmapp.viewer.dense_replay import DenseReplay
         from sfmapp.viewer.dense_rrd import write_dense_rrd
@@ -35,6 +35,12 @@ def main(kind: str, folder: str, output: str, threads: str) -> None:
         from sfmapp.viewer.pair_rrd import write_pair_rrd
 
         write_pair_rrd(PairReplay.load(Path(folder)), Path(output))
+        return
+    if kind == "transfer":
+        from sfmapp.viewer.transfer_replay import TransferReplay
+        from sfmapp.viewer.transfer_rrd import write_transfer_rrd
+
+        write_transfer_rrd(TransferReplay.load(Path(folder)), Path(output))
         return
     from sfmapp.viewer.replay import Replay
     from sfmapp.viewer.rrd import write_rrd

@@ -19,6 +19,8 @@ __all__ = [
     "RECTIFY",
     "REFINE",
     "REPORT",
+    "TRANSFER",
+    "UNCALIBRATED",
     "UNDISTORT",
     "USUAL_FOLDERS",
     "WARP",
@@ -28,6 +30,7 @@ FORMAT = f"{FORMAT_NAME} 1"
 # the commands that write workspaces; manifests of before the second one name none
 RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "refine", "dense", "undistort"
 CALIBRATE, LOCATE, PAIR, PANORAMA = "calibrate", "locate", "pair", "panorama"
+TRANSFER, UNCALIBRATED = "transfer", "uncalibrated"
 WARP, RECTIFY = "warp", "rectify"
 # a report for programs, and the page for people beside it
 LOCK, REPORT, PAGE = ".lock", "report.json", "report.html"
