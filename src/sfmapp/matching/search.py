@@ -9,10 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.geometry import epipolar, fundamental
+from sfmapp.geometry import epipolar, five_point, fundamental
+from sfmapp.geometry.fit import CAUCHY_SIGMAS, robust_sigma
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+# Of a relative pose: samples of five among inliers of F, of which nine in ten are right; so many of the best are
+# refined, in so many rounds. 30 samples and ten refined leave 2 per cent less error for twice the time.
+_SAMPLES, _REFINED, _ROUNDS = 15, 3, 8
+# what the threshold of normalised image points becomes where OpenCV expects pixels
+_SEARCH_PX = 2.0
 
 
 @dataclass(frozen=True)
@@ -93,18 +101,23 @@ def find_fundamental(xy1: Array, xy2: Array, threshold: float, ransac: Ransac) -
 
 
 def polish_fundamental(f: Array, xy1: Array, xy2: Array, threshold: float, rounds: int = 3) -> tuple[Array, Mask]:
-    """F fitted to all of its inliers, as long as that does not lose any, and the inliers (N,) of the last."""
-    inlier = epipolar.sampson_errors(f, xy1, xy2) < threshold**2
+    """F fitted to all of its inliers, as long as their squared errors, truncated at the threshold, become less in sum;
+    and the inliers (N,) of the last.
+
+    Their number is no judge: at the rim of the threshold one may be lost to an F that is better for all others.
+    """
+    errors, limit = epipolar.sampson_errors(f, xy1, xy2), threshold**2
     for _ in range(rounds):
+        inlier = errors < limit
         if inlier.sum() < 8:
             break
         a, b = xy1[inlier], xy2[inlier]
         refined = fundamental.fundamental_from_points(a, b, fundamental.sampson_weights(f, a, b))
-        refined_inlier = epipolar.sampson_errors(refined, xy1, xy2) < threshold**2
-        if refined_inlier.sum() < inlier.sum():
+        refined_errors = epipolar.sampson_errors(refined, xy1, xy2)
+        if not np.minimum(refined_errors, limit).sum() < np.minimum(errors, limit).sum():
             break
-        f, inlier = refined, refined_inlier
-    return f, inlier
+        f, errors = refined, refined_errors
+    return f, errors < limit
 
 
 def find_homography(xy1: Array, xy2: Array, threshold: float, ransac: Ransac) -> Array | None:
@@ -133,24 +146,79 @@ def find_essential(xn1: Array, xn2: Array, threshold: float, ransac: Ransac) -> 
 def find_relative_pose(xn1: Array, xn2: Array, threshold: float, ransac: Ransac) -> Array | None:
     """The relative pose (7,) with unit translation of two calibrated views, of which some matches are wrong, or None.
 
+    F tells most wrong matches at the least cost; of samples of five among what it leaves, and of F itself, those of
+    least truncated error are refined on all matches that they explain, in front of both cameras, until these settle
+    (Chum, Matas and Kittler, "Locally optimized RANSAC", 2003).
+
     Args:
         xn1, xn2: (N, 2) normalised image points, N >= 8.
         threshold: largest Sampson distance of an inlier, in their units.
         ransac: how to draw.
     """
-    # of the samples whose model comes within the threshold of most matches, half of it tells the better ones
-    essential = find_essential(xn1, xn2, 0.5 * threshold, ransac)
-    if essential is None:
-        return None
-    pose = None
-    # a sample is off by more than the noise: its inliers are looked for more widely than those of what is refined
-    for gate in (2.0 * threshold, threshold):
-        inlier = epipolar.sampson_errors(essential, xn1, xn2) < gate**2
-        if inlier.sum() < 8:
+    candidates, pool = _essentials_by_fundamental(xn1, xn2, threshold, ransac)
+    if len(pool) < 8:  # of the samples whose model comes within the threshold of most, half of it tells the better
+        found = find_essential(xn1, xn2, 0.5 * threshold, ransac)
+        if found is None:
+            return None
+        candidates = found[None]
+        pool = np.flatnonzero(epipolar.sampson_errors(found, xn1, xn2) < (2.0 * threshold) ** 2)
+        if len(pool) < 8:
+            return None
+    a, b = xn1[pool], xn2[pool]
+    costs = [np.minimum(epipolar.sampson_errors(e, a, b), threshold**2).sum() for e in candidates]
+    poses = []
+    for n in np.argsort(costs, kind="stable")[:_REFINED]:
+        of_four = epipolar.decompose_essential(epipolar.nearest_essential(candidates[n]))
+        pose = epipolar.choose_in_front(of_four, a, b)[0]
+        poses.append(_settled(pose, xn1, xn2, threshold))
+    # the first of equals
+    best = min(poses, key=lambda pose: float(np.minimum(_errors_in_front(pose, xn1, xn2), threshold**2).sum()))
+    squared = _errors_in_front(best, xn1, xn2)
+    inlier = squared < threshold**2
+    if inlier.sum() < 8:
+        return best
+    # keypoints of photographs scatter more widely than a normal distribution: the loss bends where these do
+    scale = CAUCHY_SIGMAS * robust_sigma(squared[inlier], 1)
+    return epipolar.refine_relative_pose(best, xn1[inlier], xn2[inlier], max(scale, 1e-3 * threshold))
+
+
+def _essentials_by_fundamental(xn1: Array, xn2: Array, threshold: float, ransac: Ransac) -> tuple[Array, Ints]:
+    """E (K, 3, 3) of F and of samples of five among its inliers, and these; neither where F is chance."""
+    nothing = np.zeros((0, 3, 3)), np.zeros(0, np.int64)
+    scale = _SEARCH_PX / threshold  # to what OpenCV takes for pixels
+    f = find_fundamental(xn1 * scale, xn2 * scale, _SEARCH_PX, ransac)
+    if f is None:
+        return nothing
+    back = np.diag([scale, scale, 1.0])
+    inlier = epipolar.sampson_errors(f, xn1 * scale, xn2 * scale) < _SEARCH_PX**2
+    if not is_significant(inlier, _SEARCH_PX, tuple(np.ptp(xn2 * scale, axis=0))):
+        return nothing
+    pool = np.flatnonzero(inlier)
+    rays = [np.concatenate([xn[pool], np.ones((len(pool), 1))], 1) for xn in (xn1, xn2)]
+    rays = [each / np.linalg.norm(each, axis=1, keepdims=True) for each in rays]
+    drawn = np.random.default_rng([ransac.seed, len(pool)]).integers(0, len(pool), (_SAMPLES, 5))
+    of_samples = [five_point.essentials_of_five(rays[0][sample], rays[1][sample]) for sample in drawn]
+    return np.concatenate([epipolar.nearest_essential(back @ f @ back)[None], *of_samples]), pool
+
+
+def _settled(pose: Array, xn1: Array, xn2: Array, threshold: float) -> Array:
+    """A pose refined on its inliers until these no longer change."""
+    before = None
+    for n in range(_ROUNDS):
+        # a sample is off by more than the noise: its inliers are looked for more widely than those of what is refined
+        gate = threshold if n else 2.0 * threshold
+        inlier = _errors_in_front(pose, xn1, xn2) < gate**2
+        if inlier.sum() < 8 or (before is not None and (inlier == before).all()):
             break
-        a, b = xn1[inlier], xn2[inlier]
-        if pose is None:
-            pose = epipolar.choose_in_front(epipolar.decompose_essential(essential), a, b)[0]
-        pose = epipolar.refine_relative_pose(pose, a, b, threshold)
-        essential = epipolar.essential_from_pose(pose)
+        before = inlier if n else None
+        # nearly squares: which matches are inliers is decided by the threshold alone
+        pose = epipolar.refine_relative_pose(pose, xn1[inlier], xn2[inlier], 2.0 * threshold)
     return pose
+
+
+def _errors_in_front(pose: Array, xn1: Array, xn2: Array) -> Array:
+    """(N,) squared Sampson distances; infinite behind a camera, where half of the wrong matches that lie near their
+    line would be."""
+    depths, _ = epipolar.ray_depths(pose, xn1, xn2)
+    errors = epipolar.sampson_errors(epipolar.essential_from_pose(pose), xn1, xn2)
+    return np.where((depths > 0.0).all(1), errors, np.inf)

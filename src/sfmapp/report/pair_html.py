@@ -25,6 +25,7 @@ from sfmapp.twoview.report import (
     EssentialStep,
     HomographyStep,
     NeighborsStep,
+    PlaneStep,
     RansacStep,
     StoryReport,
     TriangulationStep,
@@ -37,6 +38,11 @@ Pixels = NDArray[np.uint8]
 # longest side of a photograph on the page, and how many of each thing are drawn: more is a carpet
 _SHOWN_PX = 1000
 _KEYPOINTS, _MATCHES, _LINES, _POINTS = 1500, 250, 14, 700
+# of planes, told apart also where red and green are not (Okabe and Ito, "Color universal design", 2008)
+PLANE_COLORS = (
+    (0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (213, 94, 0), (86, 180, 233), (240, 228, 66),
+    (120, 60, 160),
+)  # fmt: skip
 _STYLE = """<style>canvas{width:100%;display:block;background:#8881}
 canvas[data-pose]{touch-action:none}
 canvas[data-show=lines]{cursor:crosshair}
@@ -77,7 +83,7 @@ def _body(report: PairReport, story: Story, pictures: tuple[Pixels, Pixels]) -> 
     if told.ended:
         yield f'<div class="failure"><p><b>The story ends early.</b> {escape(told.ended)}.</p></div>'
     yield "<noscript><p>The pictures of this page are drawn by its own script; your browser runs none.</p></noscript>"
-    yield from _sections(told)
+    yield from _sections(told, _plane_pictures(story, pictures))
     yield f'<p class="dim">{report.run.wall_s:.1f} s, seed {report.run.seed}, {escape(report.run.started)}</p>'
     for n, pixels in enumerate(pictures, 1):
         yield f'<img id="photo{n}" src="{_jpeg(pixels)}" alt="" hidden>'
@@ -87,7 +93,7 @@ def _body(report: PairReport, story: Story, pictures: tuple[Pixels, Pixels]) -> 
     yield f"<script>{script}</script>"
 
 
-def _sections(told: StoryReport) -> Iterator[str]:
+def _sections(told: StoryReport, plane_pictures: str) -> Iterator[str]:
     """The steps in order, numbered."""
     parts: list[tuple[str, str]] = [("Keypoints", _keypoints(told))]
     if told.neighbors is not None:
@@ -107,6 +113,8 @@ def _sections(told: StoryReport) -> Iterator[str]:
         parts.append(("Five ways to a point", _triangulation(told.triangulation)))
     if told.homography is not None:
         parts.append(("H beside F", _homography(told.homography)))
+    if told.planes:
+        parts.append(("Planes", plane_pictures + _planes(told.planes)))
     for n, (title, body) in enumerate(parts, 1):
         yield f"<h2>{n}. {escape(title)}</h2>{body}"
 
@@ -337,6 +345,63 @@ def _homography(step: HomographyStep) -> str:
         else _note("H is a turn on the spot: it has no baseline to be taken apart into.")
     )
     return f"<p>{verdict}{gric}</p>{_matrix('H', step.homography)}{ambiguity}"
+
+
+def _planes(planes: Sequence[PlaneStep]) -> str:
+    rows = []
+    for one in planes:
+        normal = distance = None
+        if one.normal is not None and one.normal_sigma_deg is not None:
+            normal = ", ".join(f"{v:.2f}" for v in one.normal) + f" to {one.normal_sigma_deg:.2g}°"
+        if one.distance is not None and one.distance_sigma is not None:
+            distance = f"{one.distance:.3g} +- {one.distance_sigma:.2g}"
+        alone = "; ".join(
+            f"{', '.join(f'{v:.2f}' for v in each.normal)} ({each.turn_gap_deg:.1f}°, {each.baseline_gap_deg:.1f}°)"
+            for each in one.alternatives
+        )
+        areas = ", ".join(f"{share:.0%}" for share in one.area_shares)
+        rows.append([
+            ("t", one.name), ("t", one.look), ("", one.num_matches), ("", f"{one.share:.1%}"), ("", areas),
+            ("t", normal), ("", distance), ("", f"{one.rms_px:.2f}"), ("w", alone),
+        ])  # fmt: skip
+    head = [
+        ("t", ""), ("t", "looks like"), ("", "matches"), ("", "of the verified"), ("", "area of 1, 2"),
+        ("t", "normal, in camera 1"), ("", "away, baselines"), ("", "rms px"),
+        ("t", "normals that its H alone allows (turn and baseline away from the chosen pose)"),
+    ]  # fmt: skip
+    return table(head, rows) + _note(
+        f"Matches within {planes[0].threshold_px:.2f} px of a homography, one plane after the other, while so many "
+        "cannot lie on one by chance. H of one plane allows two motions; that which several planes allow is the right "
+        "one. Sigmas take the chosen pose for true; what a plane looks like is said for a camera that is held upright."
+    )
+
+
+def _plane_pictures(story: Story, pictures: tuple[Pixels, Pixels]) -> str:
+    """Both photographs, paler, with the matches of each plane in its colour; nothing without planes."""
+    import cv2
+
+    planes = story.report.planes
+    if not planes:
+        return ""
+    figures = []
+    for side, (view, pixels) in enumerate(zip(story.views, pictures, strict=True)):
+        scale = min(1.0, _SHOWN_PX / max(pixels.shape[:2]))
+        size = max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale))
+        canvas = 0.45 * cv2.resize(pixels, size, interpolation=cv2.INTER_AREA) + 0.55 * 255.0
+        canvas = np.ascontiguousarray(canvas.astype(np.uint8))
+        xy = view.xy[story.used[:, side]] * scale
+        for n in range(-1, len(planes)):
+            color = PLANE_COLORS[n % len(PLANE_COLORS)] if n >= 0 else (90, 90, 90)
+            for x, y in np.rint(xy[story.plane_of == n]).astype(int).tolist():
+                cv2.circle(canvas, (x, y), 4 if n >= 0 else 2, color, -1, cv2.LINE_AA)
+        for n, one in enumerate(planes):
+            x, y = np.rint(np.median(xy[story.plane_of == n], axis=0)).astype(int).tolist()
+            for width, color in ((7, (255, 255, 255)), (3, PLANE_COLORS[n % len(PLANE_COLORS)])):
+                cv2.putText(
+                    canvas, one.name, (x - 14, y + 14), cv2.FONT_HERSHEY_SIMPLEX, 1.4, color, width, cv2.LINE_AA
+                )
+        figures.append(f'<figure><img src="{_jpeg(canvas)}" alt=""></figure>')
+    return f'<div class="row large">{"".join(figures)}</div>'
 
 
 def _matrix(name: str, rows: Sequence[Sequence[float]]) -> str:

@@ -9,6 +9,7 @@ from sfmapp.twoview.report import (
     EightPointStep,
     EssentialStep,
     HomographyStep,
+    PlaneStep,
     RansacStep,
     StartStep,
     StoryReport,
@@ -46,10 +47,23 @@ def story_lines(told: StoryReport) -> Iterator[str]:
         counts += f", {told.neighbors.num_mutual} mutual matches"
     yield f"{counts}, {told.num_verified} verified"
     yield f"{told.kind}: {told.kind_reason}"
+    if told.planes:
+        largest = ", ".join(f"{one.name} {one.share:.0%} ({one.look})" for one in told.planes)
+        yield f"planes, by their share of the matches: {largest}"
     if told.start is not None:
         yield start_words(told.start)
     if told.ended:
         yield f"the story ends early: {told.ended}"
+
+
+def plane_lines(planes: Sequence[PlaneStep]) -> Iterator[str]:
+    """A line for each plane."""
+    for one in planes:
+        how = "its normal is open"
+        if one.normal is not None and one.normal_sigma_deg is not None and one.distance is not None:
+            normal = ", ".join(f"{v:.3f}" for v in one.normal)
+            how = f"normal ({normal}) to {one.normal_sigma_deg:.2g} degrees, {one.distance:.3g} baselines away"
+        yield f"{one.name}, {one.look}: {one.num_matches} matches ({one.share:.1%}), {how}, rms {one.rms_px:.2f} px"
 
 
 def step_lines(told: StoryReport) -> Iterator[str]:
@@ -89,7 +103,10 @@ def step_lines(told: StoryReport) -> Iterator[str]:
             )
     if told.homography is not None:
         yield from _homography(told.homography)
-    yield "10. What kind of pair"
+    if told.planes:
+        yield "10. Planes"
+        yield from (f"    {line}" for line in plane_lines(told.planes))
+    yield f"{11 if told.planes else 10}. What kind of pair"
     yield from (f"   {line}" for line in list(story_lines(told))[1:])
 
 

@@ -216,6 +216,46 @@ class HomographyStep(Report):
     gric_h: float
 
 
+class PlaneNormal(Report):
+    """A way in which the camera may have moved, as the homography of a plane alone allows it.
+
+    Attributes:
+        normal: of the plane in the frame of camera 1.
+        turn_gap_deg, baseline_gap_deg: of the motion from that of the chosen pose.
+    """
+
+    normal: Sequence[float]
+    turn_gap_deg: float
+    baseline_gap_deg: float
+
+
+class PlaneStep(Report):
+    """A plane of the scene.
+
+    Attributes:
+        name: a letter. look: how it looks if the camera was held upright.
+        num_matches, share: of the verified ones, within ``threshold_px`` of one homography.
+        normal, normal_sigma_deg: in the frame of camera 1, away from it, under the chosen pose.
+        distance, distance_sigma: of camera 1, in baselines; all four None where the matches leave it open.
+        rms_px: of those matches in photograph 2.
+        alternatives: what its homography alone allows; one of them is near the chosen pose where that is right.
+        area_shares: of photograph 1 and 2, where most matches are on it.
+    """
+
+    name: str
+    look: str
+    num_matches: int
+    share: float
+    threshold_px: float
+    normal: Sequence[float] | None
+    normal_sigma_deg: float | None
+    distance: float | None
+    distance_sigma: float | None
+    rms_px: float
+    alternatives: Sequence[PlaneNormal]
+    area_shares: Sequence[float]
+
+
 class StartStep(Report):
     """Whether the mapper would begin a model with this pair, as its own function says.
 
@@ -256,6 +296,7 @@ class StoryReport(Report):
     choice: ChoiceStep | None
     triangulation: Sequence[TriangulationStep]
     homography: HomographyStep | None
+    planes: Sequence[PlaneStep]
     start: StartStep | None
     kind: str
     kind_reason: str

@@ -22,13 +22,15 @@ from sfmapp.matching import guided
 from sfmapp.matching.coarse_to_fine import is_guidable
 from sfmapp.matching.descriptors import NeighborSteps, neighbor_steps
 from sfmapp.matching.options import MatchingOptions
+from sfmapp.matching.search import Ransac
 from sfmapp.matching.stage import MatchedPair, join_pairs, match_pair
 from sfmapp.matching.two_view import error_threshold_px
 from sfmapp.scene.correspondences import TwoViewConfig
 from sfmapp.scene.features import DescriptorMetric
 from sfmapp.twoview import steps
 from sfmapp.twoview.kinds import kind_of_pair
-from sfmapp.twoview.report import NeighborsStep, StoryReport
+from sfmapp.twoview.planes import planes_of
+from sfmapp.twoview.report import NeighborsStep, PlaneStep, StoryReport
 from sfmapp.twoview.start import start_of
 from sfmapp.twoview.view import View
 
@@ -52,6 +54,7 @@ class Story:
         fundamental: (3, 3) refined, for the lines; NaN without one.
         used: (P, 2) int32 matches that the poses are judged by. poses: (4, 7). points: (4, P, 3) triangulated in the
             frame of camera 1, not finite where rays are parallel. in_front: (4, P) bool.
+        plane_of: (P,) which plane of the report each of ``used`` is on; -1 for none.
     """
 
     report: StoryReport
@@ -67,6 +70,7 @@ class Story:
     poses: Array = field(default_factory=lambda: np.zeros((0, 7)))
     points: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
     in_front: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), np.bool_))
+    plane_of: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
 
 
 def tell_story(
@@ -109,8 +113,9 @@ def tell_story(
             max_ratio=matching.max_ratio, max_distance=matching.max_distance,
         ),
         ransac=ransac, eight_point=None, epipoles=None, essential=None, choice=None, triangulation=[],
-        homography=steps.homography(views, pair, lesson), start=start_of(views, pair, mapping), kind="unknown",
-        kind_reason="", config=TwoViewConfig(pair.geometry.config).name, num_verified=len(pair.matches), ended="",
+        homography=steps.homography(views, pair, lesson), planes=[], start=start_of(views, pair, mapping),
+        kind="unknown", kind_reason="", config=TwoViewConfig(pair.geometry.config).name,
+        num_verified=len(pair.matches), ended="",
     )  # fmt: skip
     story = Story(told, views, found.nearest, found.ratio, found.mutual, own.is_own, own.is_main, pair.matches)
     story = _with_geometry(story, lesson, pair)
@@ -136,8 +141,15 @@ def _with_geometry(story: Story, lesson: steps.Lesson, pair: MatchedPair) -> Sto
     valid = np.isfinite(xn1).all(1) & np.isfinite(xn2).all(1)
     essential, choice = steps.poses(views, fundamental, (xn1[valid], xn2[valid]), noise, pair)
     points, in_front = steps.four_clouds(choice.poses, xn1[valid], xn2[valid])
+    planes: list[PlaneStep] = []
+    plane_of = np.full(int(valid.sum()), -1, np.int32)
+    if pair.geometry.config != TwoViewConfig.PANORAMIC:  # where a turn explains all, every plane does
+        search = Ransac(lesson.options.max_ransac_trials, lesson.seed)
+        px = noise, lesson.threshold_px
+        planes, plane_of = planes_of(views, used[valid], choice, px, search)
     told = replace(
         told,
+        planes=planes,
         eight_point=eight,
         epipoles=steps.epipoles_of(fundamental, views[0].camera, views[1].camera),
         essential=essential,
@@ -146,7 +158,7 @@ def _with_geometry(story: Story, lesson: steps.Lesson, pair: MatchedPair) -> Sto
     )
     return replace(
         story, report=told, fundamental=fundamental, used=used[valid], poses=choice.poses, points=points,
-        in_front=in_front,
+        in_front=in_front, plane_of=plane_of,
     )  # fmt: skip
 
 
