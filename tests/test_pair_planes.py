@@ -146,3 +146,47 @@ def test_polishing_loses_an_inlier_for_a_better_fit() -> None:
         before, after = (np.sqrt(epipolar.sampson_errors(e, *exact).mean()) for e in (start, f))
         gains.append(after / before)
     assert np.median(gains) < 0.6
+
+
+def test_f_tells_a_focal_length_that_nothing_is_known_of() -> None:
+    """Within its sigma, principal points off by five pixels; a focal length that is known stays."""
+    from dataclasses import replace
+
+    from sfmapp.camera.camera import simple_camera
+    from sfmapp.camera.names import CameraModel
+    from sfmapp.geometry.fundamental import fundamental_from_points
+    from sfmapp.scene.features import Features
+    from sfmapp.twoview.focal import with_told_focal
+    from sfmapp.twoview.view import View
+
+    pulls = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        xyz, _ = room(rng)
+        turned = rigid3.from_matrix(rigid3.exp_so3(np.array([0.2, -0.25, 0.1])), POSE[4:] * 2.0)
+        moved = rigid3.apply(turned, xyz)
+        center = np.array([600.0, 450.0]) + rng.uniform(-5.0, 5.0, 2)
+        sides = [FOCAL * each[:, :2] / each[:, 2:] + center + rng.normal(0, 0.2, (900, 2)) for each in (xyz, moved)]
+        guess = simple_camera(CameraModel.SIMPLE_RADIAL, 1200, 900, 1440.0, 720.0, "default")
+        views = tuple(
+            View(
+                name,
+                guess,
+                Features(
+                    np.column_stack([xy, np.ones((900, 2))]),
+                    np.zeros((900, 128), np.uint8),
+                    np.zeros((900, 3), np.uint8),
+                ),
+            )
+            for name, xy in zip("ab", sides, strict=True)
+        )
+        matches = np.column_stack([np.arange(900, dtype=np.int32)] * 2)
+        f = fundamental_from_points(*(np.asarray(view.xy, np.float64) for view in views))
+        told = with_told_focal((views[0], views[1]), matches, f)[0].camera
+        assert told.focal_source == "photographs"
+        assert told.focal_sigma is not None
+        pulls.append((told.focal - FOCAL) / told.focal_sigma)
+        known = tuple(replace(view, camera=replace(guess, focal_source="user")) for view in views)
+        assert with_told_focal((known[0], known[1]), matches, f)[0].camera.focal == 1440.0
+    assert max(map(abs, pulls)) < 3.0
+    assert told.focal_sigma < 0.15 * FOCAL

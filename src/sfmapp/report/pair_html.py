@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sfmapp.geometry.rigid3 import rotation_matrix
 from sfmapp.report.model import RunFacts
 from sfmapp.report.page import render_page, table
-from sfmapp.report.pair_words import sigma_words, start_words
+from sfmapp.report.pair_words import focal_words, sigma_words, start_words
 from sfmapp.report.plots import ticks
 from sfmapp.reporting import Report
 from sfmapp.twoview.drawing import spread, spread_points, with_reach
@@ -237,10 +237,10 @@ def _lines(step: EpipolesStep) -> str:
 
 def _essential(step: EssentialStep) -> str:
     s = step.singular_values
-    sources = " and ".join(dict.fromkeys(step.focal_sources))
+    sources = focal_words(step)
     return (
         f"<p>K² <sup>T</sup> F K¹ has the singular values 1, {s[1]:.4f}, {s[2]:.1e}: two alike and a zero if F and the "
-        f"calibration fit (focal length: {escape(sources)}). E is the nearest with 1, 1, 0. Refined over its five "
+        f"calibration fit (focal length {escape(sources)}). E is the nearest with 1, 1, 0. Refined over its five "
         "unknowns "
         f"on the matches it leaves {step.rms_px:.3f} px.</p>".replace(
             "K² <sup>T</sup>", "K<sub>2</sub><sup>T</sup>"

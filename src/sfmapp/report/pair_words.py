@@ -39,6 +39,16 @@ def sigma_words(step: ChoiceStep) -> str:
     )
 
 
+def focal_words(step: EssentialStep) -> str:
+    """Both focal lengths, their sigmas, and where they are from."""
+    texts = []
+    for k, source, sigma in zip((step.k1, step.k2), step.focal_sources, step.focal_sigmas_px, strict=True):
+        focal = 0.5 * (k[0][0] + k[1][1])
+        where = {"photographs": "told by F", "default": "a guess"}.get(source, source)
+        texts.append(f"{focal:.0f}" + (f" +- {sigma:.0f}" if sigma else "") + f" px, {where}")
+    return texts[0] if texts[0] == texts[1] else "; ".join(texts)
+
+
 def story_lines(told: StoryReport) -> Iterator[str]:
     """The story in short: what kind of pair it is, and why a reconstruction would or would not begin with it."""
     first, second = told.keypoints
@@ -140,7 +150,7 @@ def _eight_point(step: EightPointStep) -> Iterator[str]:
 
 
 def _essential(step: EssentialStep) -> Iterator[str]:
-    yield f"6. E from F and K (focal lengths: {', '.join(step.focal_sources)})"
+    yield f"6. E from F and K (focal lengths: {focal_words(step)})"
     yield from _rows("K1", step.k1)
     yield from _rows("K2", step.k2)
     yield "   singular values of K2^T F K1: " + ", ".join(f"{value:.6f}" for value in step.singular_values)

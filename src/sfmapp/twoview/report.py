@@ -119,7 +119,8 @@ class EssentialStep(Report):
     """E from F and the calibration, and E of the main path.
 
     Attributes:
-        k1, k2: calibration matrices. focal_sources: where their focal lengths come from.
+        k1, k2: calibration matrices. focal_sources: where their focal lengths come from; ``photographs``: from F.
+        focal_sigmas_px: of these, None where nothing is known.
         singular_values: of ``K2^T F K1`` over the first: 1, 1, 0 if F and K fit.
         essential: nearest with (1, 1, 0), unit norm.
         refined: after refinement of five unknowns on the inliers; rms_px: of it, in pixels.
@@ -128,6 +129,7 @@ class EssentialStep(Report):
     k1: Matrix
     k2: Matrix
     focal_sources: Sequence[str]
+    focal_sigmas_px: Sequence[float | None]
     singular_values: Sequence[float]
     essential: Matrix
     refined: Matrix

@@ -193,6 +193,7 @@ def poses(
     refined = epipolar.essential_from_pose(pose)
     step = EssentialStep(
         k1=k1.tolist(), k2=k2.tolist(), focal_sources=[view.camera.focal_source for view in views],
+        focal_sigmas_px=[view.camera.focal_sigma for view in views],
         singular_values=info.singular_values.tolist(), essential=essential.tolist(), refined=refined.tolist(),
         rms_px=focal * math.sqrt(cost / max(len(xn[0]), 1)),
     )  # fmt: skip

@@ -28,6 +28,7 @@ from sfmapp.matching.two_view import error_threshold_px
 from sfmapp.scene.correspondences import TwoViewConfig
 from sfmapp.scene.features import DescriptorMetric
 from sfmapp.twoview import steps
+from sfmapp.twoview.focal import with_told_focal
 from sfmapp.twoview.kinds import kind_of_pair
 from sfmapp.twoview.planes import planes_of
 from sfmapp.twoview.report import NeighborsStep, PlaneStep, StoryReport
@@ -46,7 +47,8 @@ class Story:
 
     Attributes:
         report: all that is said.
-        views: both photographs; their cameras are those that the mapper would begin with.
+        views: both photographs; their cameras are those that the mapper would begin with, or, where nothing is known of
+            a focal length, with the one that F tells.
         nearest: (N, 2) int32 keypoints before the ratio test. ratio: (K, 2) after it. putative: (M, 2) after the mutual
             check as well; the lesson's matches.
         is_own, is_main: (M,) bool, explained by F of plain RANSAC, and of the main path.
@@ -113,10 +115,13 @@ def tell_story(
             max_ratio=matching.max_ratio, max_distance=matching.max_distance,
         ),
         ransac=ransac, eight_point=None, epipoles=None, essential=None, choice=None, triangulation=[],
-        homography=steps.homography(views, pair, lesson), planes=[], start=start_of(views, pair, mapping),
+        homography=None, planes=[], start=start_of(views, pair, mapping),
         kind="unknown", kind_reason="", config=TwoViewConfig(pair.geometry.config).name,
         num_verified=len(pair.matches), ended="",
     )  # fmt: skip
+    # what a mapper does is told of its own cameras, the rest of what the pair itself tells of them
+    views = with_told_focal(views, pair.matches, pair.geometry.fundamental)
+    told = replace(told, homography=steps.homography(views, pair, lesson))
     story = Story(told, views, found.nearest, found.ratio, found.mutual, own.is_own, own.is_main, pair.matches)
     story = _with_geometry(story, lesson, pair)
     kind, reason = kind_of_pair(story.report, views, pair)
