@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING
@@ -29,10 +30,29 @@ FUNNEL = (
     ("observations", "observations"),
 )
 
-_PAIRS = (
-    '<p class="dim">Two of them, step by step, and why a model would or would not begin with them: '
-    "<code>sfmapp pair OUT IMAGE IMAGE</code> writes a page.</p>"
-)
+# of pairs that a model was to start from: more tell nothing new
+_MAX_STARTS = 12
+
+
+def _starts(report: ReconstructionReport) -> str:
+    """The pairs that models were to start from, each with the command that tells its story: a page takes seconds, so
+    that none is made before somebody asks."""
+    text = (
+        '<p class="dim">Two photographs step by step, and why a model would or would not begin with them; OUT is the '
+        "folder of this page: <code>sfmapp pair OUT IMAGE IMAGE</code>.</p>"
+    )
+    mapping = report.stages.mapping
+    tried = [pair for start in mapping.initial_pairs for pair in start.pairs] if mapping is not None else []
+    rows = [
+        [
+            ("t", " and ".join(pair.images)), ("", pair.num_points), ("", f"{pair.median_angle_deg:.1f}"),
+            ("w", pair.reason or "a model begins with it"),
+            ("w", f"sfmapp pair OUT {' '.join(shlex.quote(name) for name in pair.images)}"),
+        ]
+        for pair in tried[:_MAX_STARTS]
+    ]  # fmt: skip
+    head = [("t", "to begin with"), ("", "points"), ("", "angle, degrees"), ("t", ""), ("t", "its story")]
+    return text + (table(head, rows) if rows else "")
 
 
 def render_html(
@@ -62,7 +82,7 @@ def render_html(
     if report.dense is not None:
         body.append(dense_section(report.dense, dense_pictures))
     body.append(_failed(report.images) + _skipped(report.skipped))
-    body.append("<h2>Images</h2>" + _images(report.images) + _PAIRS)
+    body.append("<h2>Images</h2>" + _images(report.images) + _starts(report))
     body.append("<h2>Cameras</h2>" + _cameras(report.cameras))
     if report.stages.mapping is not None:
         entries = enumerate(report.stages.mapping.models)
