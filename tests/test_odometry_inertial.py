@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import gtsam
 import numpy as np
@@ -33,6 +34,7 @@ from sfmapp.odometry.inertial.integration import GRAVITY, integrate
 from sfmapp.odometry.inertial.scale import ScaleRefusal
 from sfmapp.odometry.inertial.seen_map import SeenMap
 from sfmapp.odometry.inertial.visual_inertial import InertialAlignment, align_imu
+from sfmapp.odometry.refinement import inertial_adjustment
 
 
 def aligned(seen: SeenMap, imu: Imu) -> InertialAlignment:
@@ -466,6 +468,37 @@ def test_a_fault_that_nothing_explains_is_no_less_refused() -> None:
     assert found.contradiction is not None
     assert "explained_by" not in found.contradiction.evidence
     assert "check the sensor" in found.contradiction.advice
+
+
+@pytest.mark.parametrize(("solver_name", "baseline_m"), [("gtsam", None), ("lapack", 0.11)])
+def test_a_large_map_has_the_same_sigmas_without_those_of_its_keyframes(
+    monkeypatch: pytest.MonkeyPatch, solver_name: str, baseline_m: float | None
+) -> None:
+    flight, times = Flight(4), np.arange(0, 6, 0.25)
+    seen, imu = seen_map(flight, times, 4, 0.5, num_points=250, baseline_m=baseline_m), flight.imu(4, 6.0)
+    whole = aligned(seen, imu)
+    monkeypatch.setattr("sfmapp.odometry.inertial.graph.MAX_COVARIANCE_KEYFRAMES", 20)
+    monkeypatch.setattr("sfmapp.adjust.solver.choose_solver", lambda *_, **__: solver_name)
+    found = aligned(seen, imu)
+    assert whole.pose_covariance is not None
+    assert found.pose_covariance is None
+    assert found.sigma_relative == pytest.approx(whole.sigma_relative, rel=1e-5)
+    assert found.gravity_sigma_rad == pytest.approx(whole.gravity_sigma_rad, rel=1e-5)
+    assert found.clock_sigma_s == pytest.approx(whole.clock_sigma_s, rel=1e-5)
+    np.testing.assert_allclose(found.gyro_bias_sigma, whole.gyro_bias_sigma, rtol=1e-5)
+    np.testing.assert_allclose(found.accel_bias_sigma, whole.accel_bias_sigma, rtol=1e-5)
+    for name in ("mounting_turn_sigma_deg", "mounting_shift_sigma_m"):
+        np.testing.assert_allclose(found.evidence[name], whole.evidence[name], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("num", "reach", "first"), [(300, 300, 0), (1200, 1200, 201), (3000, 150, 0)])
+def test_a_thousand_keyframes_of_one_room_are_adjusted_together(
+    monkeypatch: pytest.MonkeyPatch, num: int, reach: int, first: int
+) -> None:
+    apart = np.abs(np.subtract.outer(np.arange(num), np.arange(num)))
+    monkeypatch.setattr(inertial_adjustment, "count_shared", lambda _: (apart < reach).astype(np.int64))
+    keyframes = SimpleNamespace(keyframes=range(num))
+    assert inertial_adjustment._first_of_part(keyframes) == first  # type: ignore[arg-type]
 
 
 def test_same_input_same_bytes() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from odometry_sequences import Images, room
 from sfmapp.events import Events
@@ -44,6 +45,27 @@ def test_a_board_that_sways_before_the_camera_is_told() -> None:
     assert entry.covariance is not None
     sigma = float(unit[7]) * np.sqrt(np.trace(entry.covariance[:, 3:, 3:], axis1=1, axis2=2))
     assert np.median(error) < 3 * np.median(sigma)
+
+
+def blurred(images: Images, frame: int) -> Images:
+    """The picture smeared along a row, by a twelfth of its width."""
+    if not FIRST <= frame < LAST:
+        return images
+    sums = np.cumsum(np.pad(images[0].astype(np.float64), ((0, 0), (13, 12)), "edge"), 1)
+    noise = np.random.default_rng(frame).normal(0.0, 2.0, images[0].shape)
+    return (np.clip((sums[:, 25:] - sums[:, :-25]) / 25 + noise, 0, 255).astype(np.uint8),)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_blurred_picture_is_not_taken_for_something_that_covers_the_view(seed: int) -> None:
+    walk = room(80, seed=seed)
+    images = [blurred(seen, k) for k, seen in enumerate(walk.images)]
+    result = run_odometry(replace(walk, images=images), OdometryOptions(covariance=False), events=Events())
+    (found,) = result.maps[0].contradictions
+    assert found.subject == "sharpness"
+    assert FIRST <= found.evidence["first_frame"] < LAST
+    assert found.evidence["share_sharp"] < 0.5
+    assert 0.02 < found.scale_sigma < 0.05
 
 
 def test_a_walk_through_a_still_room_is_not_doubted() -> None:

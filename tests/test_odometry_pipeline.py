@@ -24,8 +24,9 @@ from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu, SequenceOptions
 from sfmapp.odometry.inertial.scale import ScaleEstimate
 from sfmapp.odometry.inertial.visual_inertial import contradicted
+from sfmapp.odometry.options import MAX_COVARIANCE_KEYFRAMES
 from sfmapp.odometry.records import _covariance_gap
-from sfmapp.odometry.refinement.final_adjustment import MAX_COVARIANCE_KEYFRAMES, FinalAdjustment
+from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment
 from sfmapp.odometry.report import InertialEvidence
 from sfmapp.odometry.result import FrameState
 from sfmapp.pipelines.odometry import track as pipeline

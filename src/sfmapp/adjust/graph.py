@@ -7,7 +7,7 @@ or by LAPACK where most blocks meet most others.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sfmapp.adjust.covariance import constrained_columns, gauge_of, reduced_matrix, residual_variance
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.problem import EVERYTHING, Problem, Varying, write_back
+from sfmapp.adjust.selected_inverse import covariance_of_functions
 from sfmapp.adjust.solver import Engine, make_engine, run_engine
 from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
@@ -283,6 +284,29 @@ class FactorGraph:
             0.5 * (matrix + matrix.T), np.array(image_idx, np.int64), np.array(camera_idx, np.int64),
             np.array(track_idx, np.int64), len(basis), columns is not None, places, poses,
         )  # fmt: skip
+
+    def covariance_of_functions(self, of_images: Array, of_variables: Mapping[int, Array]) -> Array | None:
+        """The joint covariance (M, M) of a few linear functions of all poses and of variables that were inserted, at
+        the present state, which should be the minimum: of large graphs as well, by one sparse factor.
+
+        Args:
+            of_images: (M, I, 6) how each moves with the pose of each image, in the tangent of
+                :class:`MarginalCovariance`; what is constant does not count.
+            of_variables: (M, D) likewise of variables, by their keys.
+
+        Returns:
+            None where the factors leave something open.
+        """
+        engine = self._engine(self._extras(), is_closing=True)
+        problem, own = engine.problem, engine.extras.own_places() if engine.extras is not None else {}
+        rows = np.zeros((len(of_images), problem.num_blocks * 8))
+        for n in np.flatnonzero(problem.image_block >= 0):
+            at = problem.image_block[n] * 8 + np.arange(6)
+            rows[:, at] += of_images[:, problem.image_idx[n]] @ _of_rig(problem, int(n))
+        for key, part in of_variables.items():
+            rows[:, own[key]] = part
+        found = covariance_of_functions(engine, rows)
+        return None if found is None else self.noise_px**2 * 0.5 * (found + found.T)
 
     def _image_position(self, image: int | str) -> int:
         names = self.reconstruction.image_names

@@ -18,7 +18,15 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.covariance import Covariances, block_covariances, gauge_of, residual_variance, upper_tiles
+from sfmapp.adjust.covariance import (
+    Covariances,
+    block_covariances,
+    constrained_columns,
+    gauge_of,
+    reduced_matrix,
+    residual_variance,
+    upper_tiles,
+)
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import EVERYTHING, Problem, Varying
 from sfmapp.adjust.solver import Engine, make_engine
@@ -69,6 +77,32 @@ def selected_covariances(
         reconstruction, engine.problem, variance * blocks, variance * beside, float(np.sqrt(variance))
     )
     return replace(covariances, num_gauge=num_gauge)
+
+
+def covariance_of_functions(engine: Engine, rows: Array) -> Array | None:
+    """Covariance (M, M) of a few linear functions of all unknowns, in the variance of the observations' noise, where
+    nothing is open: by one factor, which is sparse where that of the closing adjustment is, and a column for each.
+
+    Args:
+        engine: of the closing adjustment, at its minimum. rows: (M, B * 8) how the functions move with the unknowns.
+
+    Returns:
+        None where something is open.
+    """
+    used = (np.arange(8) < engine.problem.block_dim[:, None]).ravel()
+    wanted, none = rows[:, used], np.zeros((0, int(used.sum())))
+    if engine.solver == "gtsam":
+        engine.linearize(0.0, map)
+        matrix = _sparse_system(engine, used)
+        root = 1.0 / np.sqrt(matrix.diagonal())
+        factor = _factored(matrix.multiply(root[:, None]).multiply(root[None]).tocsc())
+        if factor is not None:
+            found: Array = (wanted * root) @ factor.solve((wanted * root).T)
+            return found
+    engine.linearize(0.0, map)  # anew: the other way has added to it
+    information = reduced_matrix(engine)[np.ix_(used, used)]
+    columns = constrained_columns(information, engine.diagonal[used], none, none, wanted.T)
+    return None if columns is None else wanted @ columns
 
 
 def _inverse_blocks(engine: Engine) -> tuple[Array, int] | None:

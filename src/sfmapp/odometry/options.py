@@ -7,6 +7,8 @@ from typing import Literal
 
 from sfmapp.option_checks import SHARE, Range, check_options, positive
 
+# Keyframes that a map may have for covariances of all of them, which take two dense matrices over all poses.
+MAX_COVARIANCE_KEYFRAMES = 400
 _RANGES = {
     "max_tracks": Range(50, 10_000),
     "keyframe_parallax": positive(1.0),

@@ -11,8 +11,8 @@ from sfmapp.contradictions import widened, widened_scale_sigma
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.keyframe_images import KeyframeImages
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.options import MAX_COVARIANCE_KEYFRAMES
 from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment
-from sfmapp.odometry.refinement.inertial_adjustment import MAX_COVARIANCE_KEYFRAMES
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.odometry.tracker import measure_pose
 

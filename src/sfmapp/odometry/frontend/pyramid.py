@@ -47,6 +47,10 @@ class Pyramid(NamedTuple):
         start, step, height, width = (int(value) for value in self.layout[index])
         return self.data[start : start + height * step].reshape(height, step)[:, :width]
 
+    def reduced(self, index: int) -> Pyramid:
+        """The pyramid of a level, which shares its pixels with this one."""
+        return Pyramid(self.data, self.layout[index:])
+
 
 @numba.njit(cache=True, nogil=True)
 def _copy_row(source: Bytes, target: Bytes, width: int) -> None:

@@ -41,6 +41,7 @@ from sfmapp.odometry.inertial.integration import (
     upright,
 )
 from sfmapp.odometry.inertial.seen_map import SeenMap
+from sfmapp.odometry.options import MAX_COVARIANCE_KEYFRAMES
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -80,8 +81,8 @@ class Solved(NamedTuple):
         alignment: (4,) see :mod:`sfmapp.odometry.inertial.graph`; world_from_map: (3, 3) rotation, tilt included.
         covariance: (4, 4) of the alignment, the scale that of the spread of the keyframes and the tilt against their
             mean rotation; mounting: (6,), mounting_covariance: (6, 6) likewise.
-        poses: (K, 6, 6) of the keyframes in the gauge of centroid, mean rotation and spread. All are
-            infinite where the motion leaves anything open.
+        poses: (K, 6, 6) of the keyframes in the gauge of centroid, mean rotation and spread; None of more than
+            400. All are infinite where the motion leaves anything open.
         linked: (J,) keyframes between which something was integrated.
         velocity: (J, 3), bias: (J, 6) accel and gyro; bias_sigma: (6,) at the middle one.
         residual: what the inertial factors add to the cost, twice, over the degrees of freedom that they bring: 1 where
@@ -95,7 +96,7 @@ class Solved(NamedTuple):
     covariance: Array
     mounting: Array
     mounting_covariance: Array
-    poses: Array
+    poses: Array | None
     linked: Ints
     velocity: Array
     bias: Array
@@ -258,18 +259,8 @@ class _Graph:
 
     def read(self, report: AdjustReport, residual: float) -> Solved:
         """Estimates and marginals."""
-        values, images = self._values, [self._image(k) for k in range(len(self._seen.times_s))]
-        middle = B(self._image(self.linked[len(self.linked) // 2]))
-        num, bias_sigma = len(self._seen.times_s), np.full(6, np.inf)
-        covariance, poses, of_mounting = (np.full(n, np.inf) for n in ((4, 4), (num, 6, 6), (6, 6)))
-        try:
-            marginals = self._graph.marginal_covariance(images=images[1:], variables=[A(0), M(0), middle])
-            if marginals.is_determined:
-                covariance, poses = self._in_gauge(marginals.matrix[:-12, :-12])
-                of_mounting = marginals.of_variable(M(0))
-                bias_sigma = np.sqrt(np.diag(marginals.of_variable(middle)))
-        except np.linalg.LinAlgError:
-            pass  # open: a variable of the sensor itself
+        values = self._values
+        covariance, of_mounting, bias_sigma, poses = self._covariances()
         bias = np.array([values.atConstantBias(B(self._image(k))).vector() for k in self.linked])
         alignment, mounting = values.atVector(A(0)), values.atVector(M(0))
         return Solved(
@@ -278,26 +269,64 @@ class _Graph:
             np.array([values.atVector(V(self._image(k))) for k in self.linked]), bias, bias_sigma, residual,
         )  # fmt: skip
 
-    def _in_gauge(self, joint: Array) -> tuple[Array, Array]:
-        """Covariances of the alignment (4, 4) and the keyframes (K, 6, 6) with the map held by all keyframes, out of
-        the joint one (6 (K - 1) + 4) with the map held by the first."""
+    def _covariances(self) -> tuple[Array, Array, Array, Array | None]:
+        """(4, 4) of the alignment and (6, 6) of the mounting, (6,) sigmas of the middle bias, all infinite where
+        anything is open; (K, 6, 6) of the keyframes, None of too many."""
+        num, middle = len(self._seen.times_s), B(self._image(self.linked[len(self.linked) // 2]))
+        if num > MAX_COVARIANCE_KEYFRAMES:
+            return *self._covariances_of_few(middle), None
+        covariance, poses, mounting = (np.full(n, np.inf) for n in ((4, 4), (num, 6, 6), (6, 6)))
+        bias_sigma, images = np.full(6, np.inf), [self._image(k) for k in range(1, num)]
+        try:
+            marginals = self._graph.marginal_covariance(images=images, variables=[A(0), M(0), middle])
+            if marginals.is_determined:
+                covariance, poses = self._in_gauge(marginals.matrix[:-12, :-12])
+                mounting = marginals.of_variable(M(0))
+                bias_sigma = np.sqrt(np.diag(marginals.of_variable(middle)))
+        except np.linalg.LinAlgError:
+            pass  # open: a variable of the sensor itself
+        return covariance, mounting, bias_sigma, poses
+
+    def _covariances_of_few(self, middle: int) -> tuple[Array, Array, Array]:
+        """Of the alignment, the mounting and the middle bias, without those of all poses."""
+        num, num_sensors = len(self._seen.times_s), self._seen.num_sensors
+        _, _, of_alignment = self._freedoms()
+        of_images, parts = np.zeros((16, num * num_sensors, 6)), np.split(np.eye(16), [4, 10], axis=1)
+        of_images[:4, ::num_sensors] = of_alignment.reshape(4, num, 6)
+        variables = dict(zip((A(0), M(0), middle), parts, strict=True))
+        joint = self._graph.covariance_of_functions(of_images, variables)
+        if joint is None:
+            joint = np.full((16, 16), np.inf)
+        return joint[:4, :4], joint[4:10, 4:10], np.sqrt(np.diag(joint)[10:])
+
+    def _freedoms(self) -> tuple[Array, Array, Array]:
+        """(7, 6 K) what each freedom of the map, six on a rig, does to its keyframes, (7, 6 K) what the errors of these
+        have of it, and (4, 6 K) what the alignment gains where the map is held by all of them."""
         poses = self._seen.poses
-        size = 6 * len(poses)
         basis, constraint = similarity_basis(poses)
         if self._seen.is_metric:
             basis, constraint = basis[:6], constraint[:6]
-        move = np.linalg.solve(constraint @ basis.T, constraint)  # (7, 6 K): what the errors have of each freedom
+        move = np.asarray(np.linalg.solve(constraint @ basis.T, constraint), np.float64)
+        of_alignment = np.zeros((4, 6 * len(poses)))
+        # a map that turns and grows turns and shrinks against the world: rows of turns are about the map's axes
+        of_alignment[1:3] = (self._place.world_from_map @ move[:3])[:2]
+        if not self._seen.is_metric:
+            of_alignment[0] = move[6]
+        return basis, move, of_alignment
+
+    def _in_gauge(self, joint: Array) -> tuple[Array, Array]:
+        """Covariances of the alignment (4, 4) and the keyframes (K, 6, 6) with the map held by all keyframes, out of
+        the joint one (6 (K - 1) + 4) with the map held by the first."""
+        num = len(self._seen.times_s)
+        size = 6 * num
+        basis, move, of_alignment = self._freedoms()
         change = np.zeros((size + 4, size + 4))
         change[:size, :size] = np.eye(size) - basis.T @ move
-        change[size:, size:] = np.eye(4)
-        # a map that turns and grows turns and shrinks against the world: rows of turns are about the map's axes
-        change[size + 1 : size + 3, :size] = (self._place.world_from_map @ move[:3])[:2]
-        if not self._seen.is_metric:
-            change[size, :size] = move[6]
+        change[size:, :size], change[size:, size:] = of_alignment, np.eye(4)
         change = change[:, 6:]  # the first keyframe did not move
         found = change @ joint @ change.T
-        blocks = found[:size, :size].reshape(len(poses), 6, len(poses), 6)
-        return found[size:, size:], blocks[np.arange(len(poses)), :, np.arange(len(poses))]
+        blocks = found[:size, :size].reshape(num, 6, num, 6)
+        return found[size:, size:], blocks[np.arange(num), :, np.arange(num)]
 
 
 def _value(values: Any, key: int) -> Any:

@@ -55,7 +55,7 @@ class InertialAlignment:
     Attributes:
         model: the map, bent to both, in the frame and the unit that it had.
         pose_covariance: (K, 6, 6) of its keyframes in the gauge of centroid, mean rotation and spread (of a metric map
-            without the spread), over ``x_cam <- exp(w) x_cam + v``.
+            without the spread), over ``x_cam <- exp(w) x_cam + v``; None of more than 400.
         adjustment: of all together.
         scale: metres per map unit. sigma_relative: its relative standard deviation, that of the spread of the map.
         world_from_map: (8,) similarity into a world in metres, z up, with the map's origin and the smallest turn.
@@ -69,7 +69,7 @@ class InertialAlignment:
     """
 
     model: Reconstruction
-    pose_covariance: Array
+    pose_covariance: Array | None
     adjustment: AdjustReport
     scale: float
     sigma_relative: float

@@ -18,9 +18,13 @@ from sfmapp.odometry.inertial.scale import ScaleEstimate, ScaleRefusal
 from sfmapp.odometry.inertial.visual_inertial import InertialAlignment
 from sfmapp.odometry.loops.sweep import is_too_large, sweep
 from sfmapp.odometry.map.backend import classify, make_job, take_over
-from sfmapp.odometry.map.covariance import covariance_of_refinement, estimate_map_covariance, scale_sigma_of_refinement
+from sfmapp.odometry.map.covariance import (
+    covariance_of_refinement,
+    estimate_map_covariance,
+    scale_sigma_of_refinement,
+)
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
-from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.options import MAX_COVARIANCE_KEYFRAMES, OdometryOptions
 from sfmapp.odometry.refinement.calibration_check import (
     LOSS_SIGMAS,
     Answer,
@@ -28,7 +32,7 @@ from sfmapp.odometry.refinement.calibration_check import (
     close_poses,
     question_calibration,
 )
-from sfmapp.odometry.refinement.inertial_adjustment import MAX_COVARIANCE_KEYFRAMES, adjust_with_imu
+from sfmapp.odometry.refinement.inertial_adjustment import adjust_with_imu
 from sfmapp.odometry.report import AdjustmentReport
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig

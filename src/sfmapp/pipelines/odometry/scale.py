@@ -250,10 +250,13 @@ def _from_imu(entry: MapResult) -> ScaleEstimate | ScaleRefusal:
 
 def _bend(entry: MapResult) -> float:
     """By how much of its size a map may be bent, beyond the noise of its observations: a length that is told by a part
-    of the map is no better known than that for the rest."""
+    of the map is no better known than that for the rest. What contradictions add to a length they say themselves."""
     if entry.covariance is None or entry.noise_covariance is None:
         return 0.0
     variance = np.trace((entry.covariance - entry.noise_covariance)[:, 3:, 3:], axis1=1, axis2=2)
     spread = rigid3.spread(entry.reconstruction.cam_from_world[entry.keyframe_image_idx])
     known = np.isfinite(variance)
-    return float(np.sqrt(max(variance[known].mean(), 0.0))) / spread if known.any() and spread > 0 else 0.0
+    if not (known.any() and spread > 0):
+        return 0.0
+    said = 3.0 * sum(c.position_sigma_share**2 for c in entry.contradictions)
+    return math.sqrt(max(float(variance[known].mean()) / spread**2 - said, 0.0))
