@@ -100,12 +100,13 @@ class Odometry:
         self.executor = ThreadPoolExecutor(1, "adjust") if threads > 1 else None
         self.state, self.counts = RunState(), _Counts()
         self.records: list[FrameRecord] = []
-        self.atlas = Atlas(options, self.executor)
+        self.imu = sequence.imu if with_imu else None
+        # a rig holds rotations well enough
+        self.atlas = Atlas(options, self.executor, None if self.rig.is_stereo else self.imu)
         self.local: LocalMap | None = None  # the map that the camera is in, or was in when it was lost
         self.recognition, self.keyframe_images = Recognition(seed), KeyframeImages(markers)
         self.tracked, self.motion = _Tracked(), MotionModel(sequence.imu)
         self.clock = StereoClock(self.rig)
-        self.imu = sequence.imu if with_imu else None
         self._begin_to_wait()
 
     def process(self, frame: Frame) -> FrameRecord:
@@ -474,7 +475,8 @@ def run_odometry(
         events: told of every frame (``advanced`` with a FrameSnapshot) and of every change of the map (``decided`` with
             a MapSnapshot). The result does not depend on them.
         markers: looks for markers in the keyframes; what it finds is in the result's maps.
-        with_imu: inertial measurements of the sequence count in the closing adjustment.
+        with_imu: inertial measurements of the sequence count, in the windows of one camera and in the closing
+            adjustment.
 
     Raises:
         InterruptedRunError: on cancellation.

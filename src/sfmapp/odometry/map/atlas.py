@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import Executor
 
+from sfmapp.images.sequence import Imu
 from sfmapp.odometry.map.local_map import LocalMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.scene.rig import Rig
@@ -17,9 +18,9 @@ class Atlas:
         maps: by number, in the order in which they began; those that were taken into others are gone.
     """
 
-    def __init__(self, options: OdometryOptions, executor: Executor | None) -> None:
+    def __init__(self, options: OdometryOptions, executor: Executor | None, imu: Imu | None = None) -> None:
         self.maps: dict[int, LocalMap] = {}
-        self._options, self._executor = options, executor
+        self._options, self._executor, self._imu = options, executor, imu
         self._num_begun = 0
 
     def __iter__(self) -> Iterator[LocalMap]:
@@ -28,7 +29,7 @@ class Atlas:
     def new_map(self, rig: Rig) -> LocalMap:
         """An empty map, which takes the place of one that did not begin."""
         number = self._num_begun
-        self.maps[number] = LocalMap(rig, self._options, self._executor, number)
+        self.maps[number] = LocalMap(rig, self._options, self._executor, number, self._imu)
         return self.maps[number]
 
     def begin(self, local: LocalMap) -> None:

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.adjust.graph import FactorGraph
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.geometry.noise import sigma_of_lengths
 from sfmapp.mapping.structure import residual_scale_px
+from sfmapp.odometry.inertial.window import Turn, turn_factor
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.scene.reconstruction import Reconstruction
@@ -31,6 +33,9 @@ LAG = 2
 _OUTLIER_SIGMAS, _OUTLIER_RANGE_PX = 4.0, (1.0, 4.0)
 # Where the loss begins to bend, in sigmas: Cauchy's 95 % efficiency, and no less than this.
 _LOSS_SIGMAS, _MIN_LOSS_PX = 2.0, 0.1
+# Errors of patches have so much in common that they weigh as if they were larger: up to twice what residuals show
+# (:mod:`sfmapp.odometry.map.covariance`). Counts where a sensor is weighed against them.
+_SHARED = 2.0
 # Local steps: a window starts close to its minimum, and the next keyframe adjusts it again.
 _WINDOW_STEPS = 6
 
@@ -42,6 +47,7 @@ class Job:
     Attributes:
         keyframe_idx: (K,) keyframes that take part. is_variable: (K,) those that may move.
         point_id: (P,) ids of the model's points. num_elsewhere: (P,) their observations by other keyframes.
+        turns: what a gyroscope says of neighbouring keyframes, by their positions in the map.
     """
 
     keyframe_idx: NDArray[np.int64]
@@ -49,6 +55,7 @@ class Job:
     model: Reconstruction
     point_id: NDArray[np.int64]
     num_elsewhere: NDArray[np.int64]
+    turns: list[Turn] = field(default_factory=list)
     cpu_s: float = 0.0
 
 
@@ -90,14 +97,32 @@ def run_job(job: Job) -> Job:
     start = time.thread_time()
     model = job.model
     num_sensors = len(model.image_names) // max(1, len(job.keyframe_idx))
+    sigma = residual_scale_px(model, _MIN_LOSS_PX / _LOSS_SIGMAS)
     options = AdjustOptions(
-        loss="cauchy", loss_scale_px=_LOSS_SIGMAS * residual_scale_px(model, _MIN_LOSS_PX / _LOSS_SIGMAS),
+        loss="cauchy", loss_scale_px=_LOSS_SIGMAS * sigma,
         max_iterations=_WINDOW_STEPS, relative_cost_tolerance=1e-4, refine_focal=False, refine_distortion=False,
     )  # fmt: skip
-    adjust_bundle(model, options, varying=Varying(images=np.repeat(job.is_variable, num_sensors)))
+    varying = Varying(images=np.repeat(job.is_variable, num_sensors))
+    if job.turns:
+        graph = FactorGraph(model, options, varying=varying, noise_px=_SHARED * sigma)
+        _add_turns(graph, job, num_sensors)
+        graph.optimize()
+    else:
+        adjust_bundle(model, options, varying=varying)
     classify(model, job.num_elsewhere)
     job.cpu_s = time.thread_time() - start
     return job
+
+
+def _add_turns(graph: FactorGraph, job: Job, num_sensors: int) -> None:
+    """Add what a gyroscope says of keyframes that take part, unless neither may move."""
+    from gtsam.symbol_shorthand import X
+
+    place = {int(k): n for n, k in enumerate(job.keyframe_idx)}
+    for turn in job.turns:
+        first, second = place.get(turn.first, -1), place.get(turn.second, -1)
+        if min(first, second) >= 0 and job.is_variable[[first, second]].any():
+            graph.add(turn_factor(X(first * num_sensors), X(second * num_sensors), turn), "gyroscope")
 
 
 def classify(model: Reconstruction, num_elsewhere: NDArray[np.int64]) -> float:

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from sfmapp.camera.camera import Camera, pixels_to_normalized, project
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.triangulation import Observed, triangulate_tracks
+from sfmapp.images.sequence import Imu
 from sfmapp.odometry.frontend.active_tracks import ActiveTracks, References, align_to_references, patch_warp
 from sfmapp.odometry.frontend.corners import find_corners
 from sfmapp.odometry.frontend.pyramid import Pyramid
 from sfmapp.odometry.frontend.stereo import match_stereo
+from sfmapp.odometry.inertial.window import NUM_KEYFRAMES, turns_between
 from sfmapp.odometry.map.backend import Backend, Job, choose_window, make_job
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.map.moving import Witnesses
@@ -76,8 +78,10 @@ class _Sought:
 class LocalMap:
     """Keyframes, points and the images that points are looked for with."""
 
-    def __init__(self, rig: Rig, options: OdometryOptions, executor: Executor | None, map_idx: int) -> None:
-        self.rig, self.options, self.map_idx = rig, options, map_idx
+    def __init__(
+        self, rig: Rig, options: OdometryOptions, executor: Executor | None, map_idx: int, imu: Imu | None = None
+    ) -> None:
+        self.rig, self.options, self.map_idx, self._imu = rig, options, map_idx, imu
         self.keyframes = KeyframeMap(rig)
         self.backend = Backend(executor)
         self.images: dict[int, Pyramid] = {}
@@ -191,6 +195,12 @@ class LocalMap:
         """Triangulate what has become triangulable, and begin to adjust the window."""
         job = make_job(self.keyframes, *choose_window(self.keyframes, self.options))
         self._triangulate(job, tracks.point_id)
+        if self._imu is not None:
+            first = max(0, self.newest + 1 - NUM_KEYFRAMES)
+            recent = self.keyframes.keyframes[first:]
+            times = np.array([keyframe.timestamp_s for keyframe in recent])
+            poses = np.array([keyframe.rig_from_world for keyframe in recent])
+            job.turns = turns_between(times, poses, self._imu, first)
         self.backend.begin(job, frame_number)
 
     def _triangulate(self, job: Job, wanted: NDArray[np.int64]) -> None:
