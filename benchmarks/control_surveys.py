@@ -27,9 +27,9 @@ from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.formats.control_points import LOCAL, ControlPoints
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.georeference.control import align_to_survey, survey_in_frame
-from sfmapp.georeference.control_adjustment import Adjusting, ControlSolution, adjust_to_control
-from sfmapp.georeference.marks import check_marks
+from sfmapp.georeference.control.adjustment import Adjusting, ControlSolution, adjust_to_control
+from sfmapp.georeference.control.marks import check_marks
+from sfmapp.georeference.control.points import align_to_survey, survey_in_frame
 from sfmapp.mapping.keypoint_noise import keypoint_noise
 from sfmapp.mapping.mapper import MIN_NOISE_PX
 from sfmapp.scene.reconstruction import Reconstruction

@@ -19,10 +19,10 @@ from sfmapp.adjust.problem import Varying, free_params
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.events import Events
 from sfmapp.geometry import similarity
-from sfmapp.georeference.control import survey_in_frame
-from sfmapp.georeference.control_adjustment import Adjusting, adjust_to_control
+from sfmapp.georeference.control.adjustment import Adjusting, adjust_to_control
+from sfmapp.georeference.control.marks import check_marks
+from sfmapp.georeference.control.points import survey_in_frame
 from sfmapp.georeference.factors import position_graph
-from sfmapp.georeference.marks import check_marks
 from sfmapp.georeference.options import GpsOptions
 from sfmapp.georeference.stage import georeference_models
 from sfmapp.scene.reconstruction import Reconstruction

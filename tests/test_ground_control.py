@@ -21,10 +21,10 @@ from sfmapp.errors import InputError
 from sfmapp.formats.control_points import ControlPoints
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.geometry.geodesy import LocalFrame
-from sfmapp.georeference.control import align_to_survey, leave_out, survey_in_frame
-from sfmapp.georeference.control_adjustment import Adjusting, ControlSolution, adjust_to_control
-from sfmapp.georeference.landmarks import Positions
-from sfmapp.georeference.marks import check_marks
+from sfmapp.georeference.control.adjustment import Adjusting, ControlSolution, adjust_to_control
+from sfmapp.georeference.control.landmarks import Positions
+from sfmapp.georeference.control.marks import check_marks
+from sfmapp.georeference.control.points import align_to_survey, leave_out, survey_in_frame
 from sfmapp.scene.reconstruction import Reconstruction
 
 OPTIONS = AdjustOptions(relative_cost_tolerance=1e-10, initial_damping=1e-6, max_iterations=100)

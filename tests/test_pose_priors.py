@@ -20,13 +20,13 @@ from sfmapp.formats.colmap import read_model
 from sfmapp.formats.ground_truth import read_ground_truth
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.geometry.geodesy import LocalFrame
-from sfmapp.georeference.held_poses import judge_held_poses
 from sfmapp.georeference.options import GpsOptions
-from sfmapp.georeference.pose_fit import known_poses, robust_pose_fit
-from sfmapp.georeference.pose_options import PoseOptions
-from sfmapp.georeference.pose_positions import with_positions
-from sfmapp.georeference.pose_report import PosesReport
-from sfmapp.georeference.pose_stage import PoseFile, pose_models
+from sfmapp.georeference.poses.fit import known_poses, robust_pose_fit
+from sfmapp.georeference.poses.held import judge_held_poses
+from sfmapp.georeference.poses.options import PoseOptions
+from sfmapp.georeference.poses.positions import with_positions
+from sfmapp.georeference.poses.report import PosesReport
+from sfmapp.georeference.poses.stage import PoseFile, pose_models
 from sfmapp.images.image_set import ImageRecord, ImageSet
 from sfmapp.images.position import Position
 from sfmapp.mapping.mapper import Mapper

@@ -18,8 +18,8 @@ from sfmapp.errors import UsageError
 from sfmapp.formats.colmap import read_model
 from sfmapp.formats.ground_truth import read_ground_truth
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.georeference.control.scale_bars import ScaleBar, scale_by_bars
 from sfmapp.georeference.leveling import level_rotation, up_of_ground, up_of_markers, up_of_photographs
-from sfmapp.georeference.scale_bars import ScaleBar, scale_by_bars
 from sfmapp.odometry.inertial.markers import MarkerSightings
 from sfmapp.pipelines.sparse.known_lengths import parse_known_lengths
 from sfmapp.pipelines.sparse.units import marker_corners

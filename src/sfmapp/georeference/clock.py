@@ -3,7 +3,7 @@
 Photographs tell where cameras were but for a similarity; a track tells where the receiver was at every time. The offset
 is that by which the one fits the other best. A way that is straight and steady looks the same at any time and tells
 nothing; turns, stops and loops tell it. A constant error of heights does not show beside a track: the model follows it.
-With control points it does, and is a variable of that adjustment (:mod:`sfmapp.georeference.control_stage`).
+With control points it does, and is a variable of that adjustment (:mod:`sfmapp.georeference.control.stage`).
 """
 
 from __future__ import annotations

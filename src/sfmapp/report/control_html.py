@@ -8,8 +8,8 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.georeference.control_report import ControlledModel, ControlPointRow, ControlReport, UnitsReport
-from sfmapp.georeference.pose_report import PosesReport
+from sfmapp.georeference.control.report import ControlledModel, ControlPointRow, ControlReport, UnitsReport
+from sfmapp.georeference.poses.report import PosesReport
 from sfmapp.report.page import table
 from sfmapp.report.top_view import HEIGHT, WIDTH, fit_page
 from sfmapp.report.world_map import nice_length, scale_bar

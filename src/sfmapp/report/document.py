@@ -12,8 +12,8 @@ from sfmapp.camera.camera import Camera
 from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.contradictions import Contradiction
 from sfmapp.features.report import FEW_FEATURES
-from sfmapp.georeference.control_report import ControlReport
-from sfmapp.georeference.pose_report import PosesReport
+from sfmapp.georeference.control.report import ControlReport
+from sfmapp.georeference.poses.report import PosesReport
 from sfmapp.mapping.report import FocalEvidence, MappedImage, ModelEntry, Uncertainty
 from sfmapp.report.model import CameraReport, Check, Failure, Funnel, ImageReport, Light
 

@@ -25,8 +25,8 @@ from sfmapp.dense.report import (
 from sfmapp.errors import SfmError
 from sfmapp.evaluation.report import Statistics
 from sfmapp.features.report import FeaturesReport
-from sfmapp.georeference.control_report import ControlReport, UnitsReport
-from sfmapp.georeference.pose_report import PosesReport
+from sfmapp.georeference.control.report import ControlReport, UnitsReport
+from sfmapp.georeference.poses.report import PosesReport
 from sfmapp.georeference.report import GeoreferenceReport
 from sfmapp.images.report import ImagesReport
 from sfmapp.mapping.report import FocalEvidence, MappingReport, ModelEntry

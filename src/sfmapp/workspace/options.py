@@ -21,9 +21,9 @@ from sfmapp.adjust.options import AdjustOptions
 from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import SfmError, UsageError
 from sfmapp.features.extract import FeatureOptions
-from sfmapp.georeference.control_options import ControlOptions
+from sfmapp.georeference.control.options import ControlOptions
 from sfmapp.georeference.options import GpsOptions
-from sfmapp.georeference.pose_options import PoseOptions
+from sfmapp.georeference.poses.options import PoseOptions
 from sfmapp.georeference.unit_options import UnitOptions
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.images.sequence import SequenceOptions

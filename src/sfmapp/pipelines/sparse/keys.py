@@ -10,7 +10,7 @@ from sfmapp.workspace.options import Options, options_to_dict
 
 if TYPE_CHECKING:
     from sfmapp.formats.control_points import ControlPoints
-    from sfmapp.georeference.pose_stage import PoseFile
+    from sfmapp.georeference.poses.stage import PoseFile
     from sfmapp.images.image_set import ImageSet
 
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 FEATURES, PAIRS, MATCHING = ("sfmapp.features.extract",), ("sfmapp.matching.pairs",), ("sfmapp.matching.stage",)
 MAPPING = (
     "sfmapp.mapping.incremental", "sfmapp.formats.colmap", "sfmapp.georeference.stage",
-    "sfmapp.georeference.control_stage", "sfmapp.georeference.pose_stage", "sfmapp.mapping.known_poses",
+    "sfmapp.georeference.control.stage", "sfmapp.georeference.poses.stage", "sfmapp.mapping.known_poses",
     "sfmapp.pipelines.sparse.units",
 )  # fmt: skip
 

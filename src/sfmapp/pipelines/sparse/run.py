@@ -12,7 +12,7 @@ from sfmapp.workspace.job import Job
 
 if TYPE_CHECKING:
     from sfmapp.formats.control_points import ControlPoints
-    from sfmapp.georeference.pose_stage import PoseFile
+    from sfmapp.georeference.poses.stage import PoseFile
     from sfmapp.georeference.world_frame import Georeference
     from sfmapp.images.image_set import ImageSet
     from sfmapp.pipelines.sparse.known_lengths import KnownLength

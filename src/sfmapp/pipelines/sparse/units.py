@@ -17,10 +17,10 @@ from sfmapp.adjust.graph import FactorGraph
 from sfmapp.events import Events
 from sfmapp.formats.control_points import LOCAL, ControlPoints
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.georeference.control_report import LeveledModel, ScaledModel, UnitsReport
+from sfmapp.georeference.control.marks import check_marks
+from sfmapp.georeference.control.report import LeveledModel, ScaledModel, UnitsReport
+from sfmapp.georeference.control.scale_bars import ScaleBar, scale_by_bars
 from sfmapp.georeference.leveling import Up, level_rotation, up_of_ground, up_of_markers, up_of_photographs
-from sfmapp.georeference.marks import check_marks
-from sfmapp.georeference.scale_bars import ScaleBar, scale_by_bars
 from sfmapp.images.pixels import read_gray
 from sfmapp.odometry.inertial.markers import MarkerDetector, MarkerSightings, scale_from_markers
 from sfmapp.odometry.inertial.scale import ScaleRefusal

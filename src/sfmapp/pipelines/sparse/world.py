@@ -11,8 +11,8 @@ from sfmapp.formats.control_points import ControlPoints, read_control_points
 from sfmapp.pipelines.sparse.run import Run
 
 if TYPE_CHECKING:
-    from sfmapp.georeference.pose_report import PosesReport
-    from sfmapp.georeference.pose_stage import PoseFile
+    from sfmapp.georeference.poses.report import PosesReport
+    from sfmapp.georeference.poses.stage import PoseFile
     from sfmapp.images.image_set import ImageSet
     from sfmapp.mapping.known_poses import HeldPoses
     from sfmapp.mapping.mapper import Mapper
@@ -28,7 +28,7 @@ def read_control(run: Run, image_set: ImageSet) -> ControlPoints | None:
     options = run.options.control
     if options.file is None:
         return None
-    from sfmapp.georeference.control import survey_in_frame
+    from sfmapp.georeference.control.points import survey_in_frame
 
     sizes = {record.name: (record.width, record.height) for record in image_set.images}
     sigma_m = (options.sigma_m, options.sigma_m, options.sigma_up_m)
@@ -63,14 +63,14 @@ def read_known_poses(run: Run, image_set: ImageSet) -> PoseFile | None:
             f"--pose-priors and {beside[0]} both set the frame of the models",
             "give one of them; known poses bring their frame",
         )
-    from sfmapp.georeference.pose_stage import read_poses
+    from sfmapp.georeference.poses.stage import read_poses
 
     return read_poses(options.poses, image_set.names)
 
 
 def held_poses(run: Run, poses: PoseFile, image_set: ImageSet) -> HeldPoses:
     """Known poses that stay, and what judges them in the end."""
-    from sfmapp.georeference.held_poses import judge_held_poses
+    from sfmapp.georeference.poses.held import judge_held_poses
     from sfmapp.mapping.known_poses import HeldPoses
 
     def judge(mapper: Mapper) -> None:
@@ -82,7 +82,7 @@ def held_poses(run: Run, poses: PoseFile, image_set: ImageSet) -> HeldPoses:
 
 def _beside_positions(run: Run, report: PosesReport, mappers: Sequence[Mapper], image_set: ImageSet) -> PosesReport:
     """The report on known poses, with what positions of the photographs say beside these."""
-    from sfmapp.georeference.pose_positions import with_positions
+    from sfmapp.georeference.poses.positions import with_positions
 
     return with_positions(report, [mapper.reconstruction for mapper in mappers], image_set, run.options.gps, run.events)
 
@@ -91,7 +91,7 @@ def closing(run: Run, image_set: ImageSet) -> Callable[[list[Mapper]], None] | N
     """What is to be done with finished models; None where nothing is known of where they lie."""
     poses = run.poses
     if poses is not None:
-        from sfmapp.georeference.pose_stage import pose_models
+        from sfmapp.georeference.poses.stage import pose_models
 
         def bring_to_poses(mappers: list[Mapper]) -> None:
             report = pose_models(mappers, poses, run.events)
@@ -111,7 +111,7 @@ def closing(run: Run, image_set: ImageSet) -> Callable[[list[Mapper]], None] | N
             run.georeference = placed.georeference
             run.stages = replace(run.stages, georeference=placed.report)
         if run.control is not None:
-            from sfmapp.georeference.control_stage import control_models, positions_after
+            from sfmapp.georeference.control.stage import control_models, positions_after
 
             controlled = control_models(
                 mappers, run.control, run.georeference, run.stages.georeference, run.events

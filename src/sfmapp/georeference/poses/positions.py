@@ -20,8 +20,8 @@ from sfmapp.georeference.disagreement import MIN_AGREEING, find_disagreement
 from sfmapp.georeference.drift import estimate_drift, similarity_slope
 from sfmapp.georeference.faults import name_faults
 from sfmapp.georeference.options import GpsOptions
-from sfmapp.georeference.pose_report import PosedModel, PosesReport, PositionsBeside
-from sfmapp.georeference.pose_stage import STAGE
+from sfmapp.georeference.poses.report import PosedModel, PosesReport, PositionsBeside
+from sfmapp.georeference.poses.stage import STAGE
 from sfmapp.georeference.robust_fit import RobustFit, robust_fit
 from sfmapp.georeference.stage import MAX_SCALE_SIGMA
 from sfmapp.georeference.tags import Tags, tags_of

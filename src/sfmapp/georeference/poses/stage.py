@@ -2,7 +2,7 @@
 
 For each model a robust similarity to the known poses, which are judged by it: their residuals have the errors of the
 known pose, and those of the model as photographs alone made it. A pose that is refuted is named and left aside, the
-others take part in the adjustment. Poses that are held are judged in :mod:`sfmapp.georeference.held_poses`.
+others take part in the adjustment. Poses that are held are judged in :mod:`sfmapp.georeference.poses.held`.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from sfmapp.events import Events
 from sfmapp.formats.ground_truth import read_ground_truth
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.georeference.adjustment import MAX_COST_PER_NUMBER, growth_of_cost
-from sfmapp.georeference.control_stage import adjusting_of
-from sfmapp.georeference.pose_fit import (
+from sfmapp.georeference.control.stage import adjusting_of
+from sfmapp.georeference.poses.fit import (
     GROUPS,
     KnownPoses,
     PoseFit,
     known_poses,
     robust_pose_fit,
 )
-from sfmapp.georeference.pose_options import PoseOptions
-from sfmapp.georeference.pose_report import KnownPoseRow, PosedModel, PosesReport
+from sfmapp.georeference.poses.options import PoseOptions
+from sfmapp.georeference.poses.report import KnownPoseRow, PosedModel, PosesReport
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.scene.reconstruction import Reconstruction
 

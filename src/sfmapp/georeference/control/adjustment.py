@@ -1,9 +1,9 @@
 """A model adjusted with ground control: which points to believe, and what each says of the model that others made.
 
-Every point is left out in turn, in one factorisation (:mod:`sfmapp.georeference.control`). A point that is too far
-from where the others put it is left aside and named, if the others agree without it and it is clear which one it is;
-where it is not, or where more than a third would have to go, the survey is less sure than it says, and its sigmas are
-widened until it agrees.
+Every point is left out in turn, in one factorisation (:mod:`sfmapp.georeference.control.points`). A point that is too
+far from where the others put it is left aside and named, if the others agree without it and it is clear which one it
+is; where it is not, or where more than a third would have to go, the survey is less sure than it says, and its sigmas
+are widened until it agrees.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from scipy.stats import chi2
 
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.formats.control_points import ControlPoints
-from sfmapp.georeference.control import CLEARLY, FALSE_ALARM, LeftOut, Survey, leave_out, left_out_already
-from sfmapp.georeference.landmarks import LandmarkFactor, Marks, Surveyed
-from sfmapp.georeference.marks import MarkedPoints
+from sfmapp.georeference.control.landmarks import LandmarkFactor, Marks, Surveyed
+from sfmapp.georeference.control.marks import MarkedPoints
+from sfmapp.georeference.control.points import CLEARLY, FALSE_ALARM, LeftOut, Survey, leave_out, left_out_already
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]

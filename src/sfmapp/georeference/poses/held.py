@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.georeference.pose_fit import MAX_POSE_CHI2, MIN_REDUNDANT_POSES, KnownPoses, PoseFit
-from sfmapp.georeference.pose_report import KnownPoseRow, PosedModel, PosesReport
-from sfmapp.georeference.pose_stage import (
+from sfmapp.georeference.poses.fit import MAX_POSE_CHI2, MIN_REDUNDANT_POSES, KnownPoses, PoseFit
+from sfmapp.georeference.poses.report import KnownPoseRow, PosedModel, PosesReport
+from sfmapp.georeference.poses.stage import (
     MIN_AGREEING,
     STAGE,
     Judged,

@@ -18,7 +18,10 @@ from sfmapp.adjust.problem import free_params
 from sfmapp.events import Events
 from sfmapp.formats.control_points import ControlPoints
 from sfmapp.geometry import similarity
-from sfmapp.georeference.control import (
+from sfmapp.georeference.control.adjustment import Adjusting, ControlSolution, adjust_to_control
+from sfmapp.georeference.control.landmarks import Positions
+from sfmapp.georeference.control.marks import MarkedPoints, check_marks
+from sfmapp.georeference.control.points import (
     Alignment,
     LeftOut,
     Survey,
@@ -26,10 +29,7 @@ from sfmapp.georeference.control import (
     similarity_covariance,
     survey_in_frame,
 )
-from sfmapp.georeference.control_adjustment import Adjusting, ControlSolution, adjust_to_control
-from sfmapp.georeference.control_report import ControlledModel, ControlPointRow, ControlReport, LeftOutSummary, Role
-from sfmapp.georeference.landmarks import Positions
-from sfmapp.georeference.marks import MarkedPoints, check_marks
+from sfmapp.georeference.control.report import ControlledModel, ControlPointRow, ControlReport, LeftOutSummary, Role
 from sfmapp.georeference.report import GeoreferenceReport
 from sfmapp.georeference.world_frame import Georeference, ModelPlace
 from sfmapp.mapping.mapper import Mapper

@@ -17,8 +17,8 @@ from scipy.stats import beta, chi2
 from sfmapp.camera.camera import pixels_to_rays, project
 from sfmapp.formats.control_points import ControlPoints
 from sfmapp.geometry import rigid3
-from sfmapp.georeference.control_report import MarkSlip
-from sfmapp.georeference.landmarks import Linearized, Marks, fit_landmark
+from sfmapp.georeference.control.landmarks import Linearized, Marks, fit_landmark
+from sfmapp.georeference.control.report import MarkSlip
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from sfmapp.georeference.control import CLEARLY, FALSE_ALARM
-from sfmapp.georeference.control_report import ScaleBarRow, ScaledModel
+from sfmapp.georeference.control.points import CLEARLY, FALSE_ALARM
+from sfmapp.georeference.control.report import ScaleBarRow, ScaledModel
 
 Array = NDArray[np.float64]
 

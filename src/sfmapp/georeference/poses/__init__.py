@@ -1,0 +1,1 @@
+"""Poses that are known beforehand: as priors, or held, and judged by the photographs."""
