@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.calibration.boards import Board
+from sfmapp.calibration.circle_centers import DiskMarks
 from sfmapp.calibration.circles import disk_bias, find_circle_lattice, grid_of, place_on
 from sfmapp.calibration.lattice import Lattice, field_contrast, find_lattice
 from sfmapp.calibration.markers import dictionary_of
@@ -65,12 +66,14 @@ class Detection:
         xy: (N, 2) pixels, centres at halves.
         sharpness_px: width over which edges blur, pixels of the photograph; NaN where it was not measured.
         problem: why there are none; None where there are.
+        disks: what ``xy`` of circles is from.
     """
 
     idx: Ints
     xy: Array
     sharpness_px: float = float("nan")
     problem: str | None = None
+    disks: DiskMarks | None = None
 
 
 def detect_board(gray: Pixels, board: Board) -> Detection:
@@ -95,8 +98,9 @@ def detect_board(gray: Pixels, board: Board) -> Detection:
     if len(idx) < 4:
         return Detection(np.zeros(0, np.int64), np.zeros((0, 2)), problem=_nothing(board))
     xy = (xy + 0.5) * [gray.shape[1] / small.shape[1], gray.shape[0] / small.shape[0]] - 0.5
+    disks = None
     if board.kind in ("circles", "acircles"):
-        xy = _disk_centers(gray, board, idx, xy)
+        xy, disks = _disk_centers(gray, board, idx, xy)
     elif board.tells_part:
         idx, xy = _crossings_beside_markers(gray, board, idx, xy)
     else:
@@ -106,7 +110,8 @@ def detect_board(gray: Pixels, board: Board) -> Detection:
     least = _LEAST_CIRCLES if board.kind in ("circles", "acircles") else 6
     if len(idx) < min(least, len(board.points)) or np.ptp(board.points[idx, :2], axis=0).min() == 0.0:
         return Detection(np.zeros(0, np.int64), np.zeros((0, 2)), problem=_nothing(board))
-    return Detection(idx, xy + 0.5, _edge_width(gray, board, idx, xy))
+    disks = None if disks is None else DiskMarks(disks.mass[is_good], disks.area[is_good])
+    return Detection(idx, xy + 0.5, _edge_width(gray, board, idx, xy), disks=disks)
 
 
 def _nothing(board: Board) -> str:
@@ -340,9 +345,9 @@ def _opencvs_circles(gray: Pixels, board: Board) -> Array | None:
     return None
 
 
-def _disk_centers(gray: Pixels, board: Board, idx: Ints, xy: Array) -> Array:
+def _disk_centers(gray: Pixels, board: Board, idx: Ints, xy: Array) -> tuple[Array, DiskMarks]:
     """Images of the centres of the disks near pixels (N, 2): their centres of mass, less what perspective and lens move
-    these by."""
+    these by as far as the points tell; and what was measured, for when the camera is known."""
     axes = _axes(board, idx, xy)
     found, area = np.full_like(xy, np.nan), np.full(len(xy), np.nan)
     for i in range(len(xy)):
@@ -353,13 +358,14 @@ def _disk_centers(gray: Pixels, board: Board, idx: Ints, xy: Array) -> Array:
                 break
             at, area[i] = mass
             found[i] = at
+    marks = DiskMarks(found + 0.5, area)
     is_found = np.isfinite(found).all(1)
     if is_found.sum() >= 6:
         plane = board.points[idx[is_found], :2] / board.spacing
         determinants = np.abs(np.linalg.det(_axes(board, idx[is_found], found[is_found])))
         radius = np.sqrt(np.median(area[is_found] / determinants) / np.pi)
         found[is_found] -= disk_bias(plane, found[is_found], float(radius))
-    return found
+    return found, marks
 
 
 def _mass(gray: Pixels, at: Array, axes: Array, room: float) -> tuple[Array, float] | None:

@@ -30,6 +30,7 @@ from sfmapp.calibration.uncertainty import image_grid, projection_sigma
 from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
+from sfmapp.pipelines.calibration.disks import with_disk_centers
 from sfmapp.pipelines.calibration.pictures import BoardPictures, look_at_pictures
 from sfmapp.pipelines.calibration.results import outline_of, write_camera, write_recording
 from sfmapp.report.calibration_html import render_board_html
@@ -113,18 +114,12 @@ def calibrate_board(
                 "check --board: of a chessboard inner corners count, one less than fields",
             )
         with job.stage("calibration"):
-            views = [TargetView(one.name, board.points[one.detection.idx], one.detection.xy) for one in used]
-            facts = [_facts(board, len(one.detection.idx), one.detection.sharpness_px) for one in used]
-            solution = solve_views(
-                views,
-                pictures.size,
-                asked.model,
-                facts=facts,
-                bends=asked.bends,
-                threads=job.threads,
-                events=job.events,
-                unit=board.unit,
-            )
+            solution, views = _solved(job, pictures, asked)
+            centered = with_disk_centers(pictures, solution.calibration.camera)
+            if centered is not None:
+                job.events.decided("calibration", "centres of circles by the camera that was found, then once more")
+                pictures = centered
+                solution, views = _solved(job, pictures, asked)
         with job.stage("plan"):
             made = solution.calibration
             solved = {view.name: view for view in views}
@@ -140,6 +135,18 @@ def calibrate_board(
                 _record(job, board, pictures, made)
         job.workspace.save()
         return CalibrationResult(job.workspace.folder, solution.calibration, report)
+
+
+def _solved(job: Job, pictures: BoardPictures, asked: BoardOptions) -> tuple[Solution, list[TargetView]]:
+    """The camera by the points of the pictures, and these as views of the board."""
+    board = pictures.board
+    views = [TargetView(one.name, board.points[one.detection.idx], one.detection.xy) for one in pictures.used]
+    facts = [_facts(board, len(one.detection.idx), one.detection.sharpness_px) for one in pictures.used]
+    solution = solve_views(
+        views, pictures.size, asked.model, facts=facts, bends=asked.bends, threads=job.threads, events=job.events,
+        unit=board.unit,
+    )  # fmt: skip
+    return solution, views
 
 
 def _hull(xy: NDArray[np.float64]) -> list[list[float]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from sfmapp.calibration.adjustment import TargetView
 from sfmapp.calibration.boards import Board
 from sfmapp.calibration.report import BoardPictureReport, CameraFileReport
-from sfmapp.calibration.result import ViewFit
+from sfmapp.calibration.result import CameraCalibration, ViewFit
 from sfmapp.calibration.rig import RigCalibration, calibrate_rig
 from sfmapp.calibration.rig_adjustment import RigView
 from sfmapp.calibration.rig_ends import read_from_one_end
@@ -25,6 +25,7 @@ from sfmapp.camera_files.rig_writing import write_rig_files
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
 from sfmapp.images.video import is_video
+from sfmapp.pipelines.calibration.disks import with_disk_centers
 from sfmapp.pipelines.calibration.pictures import BoardPictures, look_at_pictures
 from sfmapp.pipelines.calibration.results import note_recording, outline_of, write_camera
 from sfmapp.pipelines.calibration.shots import match_shots
@@ -172,19 +173,38 @@ def _with_lens(job: Job, one: _Seen, boards: Sequence[Board], given: str | None,
     if given is not None:
         camera = read_calibration(given, [size]).rig.cameras[0] if is_calibration_path(given) else None
         camera = camera_from_text(given, size) if camera is None else camera
-        return replace(one, camera=camera, is_held=True, intrinsics=f"held as {given} has them")
+        one = replace(one, camera=camera, is_held=True, intrinsics=f"held as {given} has them")
+        return _with_disk_centers(one, camera) or one
+    made = _calibrated(job, one, boards, model)
+    centered = _with_disk_centers(one, made.camera)
+    if centered is not None:
+        one, made = centered, _calibrated(job, centered, boards, model)
+    text = f"begun with those of its {len(made.views)} photographs alone, rms {made.rms_px:.3f} px"
+    return replace(one, camera=made.camera, intrinsics=text)
+
+
+def _calibrated(job: Job, one: _Seen, boards: Sequence[Board], model: CameraModel | None) -> CameraCalibration:
+    """A camera by its own photographs."""
     views = [
         TargetView(picture.name, board.points[picture.detection.idx], picture.detection.xy)
         for board, pictures in zip(boards, one.of_board, strict=True)
         for picture in pictures.used
     ]
     try:
-        solution = solve_views(views, size, model, bends=False, threads=job.threads, events=job.events)
+        size = one.of_board[0].size
+        return solve_views(
+            views, size, model, bends=False, threads=job.threads, events=job.events
+        ).calibration  # fmt: skip
     except InputError as error:
         raise InputError(f"{one.name}: {error}", "give its intrinsics with --camera, or more photographs") from error
-    made = solution.calibration
-    text = f"begun with those of its {len(made.views)} photographs alone, rms {made.rms_px:.3f} px"
-    return replace(one, camera=made.camera, intrinsics=text)
+
+
+def _with_disk_centers(one: _Seen, camera: Camera) -> _Seen | None:
+    """With the centres of circles that a camera gives them; None where no board has any."""
+    centered = [with_disk_centers(pictures, camera) for pictures in one.of_board]
+    if not any(centered):
+        return None
+    return replace(one, of_board=tuple(new or old for new, old in zip(centered, one.of_board, strict=True)))
 
 
 def _views(seen: Sequence[_Seen], boards: Sequence[Board], shots: Sequence[dict[int, int]]) -> list[RigView]:
