@@ -11,6 +11,7 @@ import pycolmap
 import pytest
 from scipy.stats import chi2
 
+from schemas import check_schema
 from sfmapp.calibration.locate import locate_camera
 from sfmapp.calibration.measure import Plane, measure, place_by_homography, place_on_plane
 from sfmapp.calibration.point_reports import read_pose
@@ -386,6 +387,58 @@ def test_calibrate_locate_and_measure_by_command(desk, tmp_path, capsys) -> None
         [f"{x} {y} {u} {v}" for (x, y), (u, v) in zip([(0, 8), (8, 8), (8, 0), (0, 0)], corners, strict=True)],
     )
     assert run(capsys, "measure", marks, "--metric", metric)["figures"][0]["length"]["value"] == pytest.approx(32.0)
+
+
+def test_several_photographs_are_calibrated_together(desk, tmp_path, capsys) -> None:
+    """A table with a column image, one for each photograph, and markers: the same camera, and a pose each."""
+    folder, rng = tmp_path / "photos", np.random.default_rng(16)
+    folder.mkdir()
+    xyz, _, _ = picture(rng, 24, CAMERA)
+    rows, tables = ["image,name,x_m,y_m,z_m,u,v"], []
+    while len(tables) < 3:
+        pose = rigid3.from_matrix(rigid3.exp_so3(0.4 * rng.normal(size=3)), np.array([0.0, 0.0, 3.5]))
+        xy = project(CAMERA, rigid3.apply(pose, xyz)) + 0.3 * rng.normal(size=(24, 2))
+        if not (np.isfinite(xy).all() and (xy > 20).all() and (xy < [CAMERA.width - 20, CAMERA.height - 20]).all()):
+            continue
+        xy[5] += 15.0 * (len(tables) == 1)
+        name = "abc"[len(tables)]
+        assert cv2.imwrite(str(folder / f"{name}.png"), np.full((CAMERA.height, CAMERA.width), 128, np.uint8))
+        lines = [f"p{n},{x:.6f},{y:.6f},{z:.6f},{u:.3f},{v:.3f}" for n, ((x, y, z), (u, v)) in
+                 enumerate(zip(xyz, xy, strict=True))]  # fmt: skip
+        rows += [f"{name}.png,{line}" for line in lines]
+        tables.append(write_lines(tmp_path / f"{name}.csv", ["name,x_m,y_m,z_m,u,v", *lines]))
+    table = write_lines(tmp_path / "all.csv", rows)
+    found = run(capsys, "calibrate", "target", folder, "--points", table, "-o", tmp_path / "one", "--no-recording")
+    check_schema("calibrate-targets", json.loads((tmp_path / "one" / "report.json").read_text(encoding="utf-8")))
+    values = {p["name"]: (p["value"], p["sigma"]) for p in found["parameters"]}
+    for name, truth in zip(("fx", "fy", "cx", "cy"), CAMERA.params, strict=False):
+        assert abs(values[name][0] - truth) < 4.0 * values[name][1]
+    wrong = [(one["photograph"], p["name"]) for one in found["photographs"] for p in one["points"] if not p["is_used"]]
+    assert wrong == [("b.png", "p5")]
+    assert read_pose(tmp_path / "one" / "poses" / "c.json").unit == "m"
+    photos = sorted(folder.iterdir())
+    same = run(capsys, "calibrate", "target", *photos, "--points", *tables, "-o", tmp_path / "two", "--no-recording")
+    assert same["parameters"] == found["parameters"]
+    # one photograph of the table alone, and a name that it does not have
+    alone = run(capsys, "calibrate", "target", photos[1], "--points", table, "-o", tmp_path / "b", "--no-recording")
+    assert [p["name"] for p in alone["fit"]["points"] if not p["is_used"]] == ["p5"]
+    (folder / "d.png").write_bytes(photos[0].read_bytes())
+    assert main(["calibrate", "target", str(folder / "d.png"), "--points", str(table), "-o", str(tmp_path / "d")]) == 3
+    assert "found those of a.png, b.png, c.png" in capsys.readouterr().err
+    words = ["calibrate", "target", *photos[:2], "--points", tables[0], "-o", tmp_path / "e"]
+    assert main(list(map(str, words))) == 2
+    assert "column image" in capsys.readouterr().err
+    # markers with known places, seen twice
+    twice = tmp_path / "twice"
+    twice.mkdir()
+    for name in ("1.png", "2.png"):
+        (twice / name).write_bytes((desk[0] / "desk.png").read_bytes())
+    markers = run(
+        capsys, "calibrate", "target", twice, "--markers", desk[0] / "markers.csv", "--dictionary", "DICT_4X4_50",
+        "-o", tmp_path / "markers", "--no-recording",
+    )  # fmt: skip
+    focal = {p["name"]: (p["value"], p["sigma"]) for p in markers["parameters"]}["fx"]
+    assert abs(focal[0] - 900.0) < 4.0 * focal[1] < 100.0
 
 
 def test_commands_say_what_is_missing(desk, tmp_path, capsys) -> None:

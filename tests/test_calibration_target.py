@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from sfmapp.calibration.adjustment import TargetView
 from sfmapp.calibration.one_view import bent_covariance, fit_view, inverse, resolution_sigma
 from sfmapp.calibration.target import TargetFit, calibrate_target
-from sfmapp.calibration.targets import calibrate_targets
+from sfmapp.calibration.targets import calibrate_targets, located_views
 from sfmapp.camera.camera import Camera, project
 from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.camera.names import CameraModel
@@ -317,16 +317,18 @@ def test_few_points_are_never_surer_than_a_hand() -> None:
 
 def test_several_photographs_tell_one_camera_within_their_sigmas() -> None:
     rng = np.random.default_rng(8)
-    nees, alone = [], []
+    nees, alone, of_poses = [], [], []
     for _ in range(12):
-        views = []
+        views, poses = [], []
         for name in ("a", "b", "c"):
-            xyz, xy, _ = picture(rng, 30, OPENCV)
+            xyz, xy, pose = picture(rng, 30, OPENCV)
             xy = xy + 0.5 * rng.normal(size=xy.shape)
             xy[:2] += rng.uniform(15, 40, (2, 2))
             views.append(TargetView(name, xyz, xy))
+            poses.append(pose)
         # a few points more, which tell no camera by themselves
-        xyz, xy, _ = picture(rng, 5, OPENCV)
+        xyz, xy, pose = picture(rng, 5, OPENCV)
+        poses.append(pose)
         views.append(TargetView("few", xyz, xy + 0.5 * rng.normal(size=xy.shape)))
         made = calibrate_targets(views, SIZE, camera_model=OPENCV.model)
         assert [view.name for view in made.views] == ["a", "b", "c", "few"]
@@ -335,7 +337,13 @@ def test_several_photographs_tell_one_camera_within_their_sigmas() -> None:
         nees.append(float(off @ np.linalg.solve(made.covariance, off)))
         alone.append(calibrate_target(views[0].xyz, views[0].xy, SIZE, camera_model=OPENCV.model).focal_sigma_px)
         assert made.sigmas[0] < alone[-1]
+        for found, pose in zip(located_views(made, views), poses, strict=True):
+            turn = rigid3.log_so3(rigid3.rotation_matrix(found.view.cam_from_world) @ rigid3.rotation_matrix(pose).T)
+            error = np.r_[off, turn, found.view.cam_from_world[4:] - rigid3.exp_so3(turn) @ pose[4:]]
+            of_poses.append(float(error @ np.linalg.solve(found.covariance, error)))
     num = 12 * len(OPENCV.params)
+    # four poses of a trial share its camera: their mean is held, whose spread is below that of independent ones
+    assert chi2.ppf(1e-3, 12 * 14) < sum(of_poses) / 4 < chi2.ppf(1.0 - 1e-3, 12 * 14)
     assert chi2.ppf(1e-4, num) < sum(nees) < chi2.ppf(1.0 - 1e-4, num)
     with pytest.raises(InputError, match="found none"):
         calibrate_targets([], SIZE)

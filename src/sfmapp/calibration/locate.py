@@ -143,7 +143,7 @@ def locate_camera(
             "use points that are not on one line, nor all far away",
         )
     return Location(
-        view=view, covariance=_joint(view, own, camera_covariance, points[0]), noise=noise,
+        view=view, covariance=with_camera(view, own, camera_covariance, points[0]), noise=noise,
         distance=deletion_statistics(view, sigma_px)[1], others=_others(views, noise, sigma_px),
         method="P3P in samples" if method != "all" and len(points[1]) > MIN_POINTS else "all points at once",
     )  # fmt: skip
@@ -216,8 +216,12 @@ def _others(views: list[OneView], noise: Noise, sigma_px: float | None) -> tuple
     return tuple(found)
 
 
-def _joint(view: OneView, own: Array, camera_covariance: Array | None, xyz: Array) -> Array:
-    """(P + 6, P + 6): the pose follows the camera's parameters by -(J^T J)^-1 J^T J_camera."""
+def with_camera(view: OneView, own: Array, camera_covariance: Array | None, xyz: Array) -> Array:
+    """(P + 6, P + 6) covariance of a camera and of the pose of a view that was fitted with it held, ``own`` (6, 6): the
+    pose follows the camera's parameters by -(J^T J)^-1 J^T J_camera.
+
+    Of photographs that tell the camera jointly it is that of the whole adjustment, by Schur's complement.
+    """
     num = len(view.camera.params)
     whole = np.zeros((num + POSE, num + POSE))
     whole[num:, num:] = own

@@ -15,6 +15,7 @@ from sfmapp.calibration.measure import MeasuredFigure
 from sfmapp.calibration.one_view import Noise, OneView
 from sfmapp.calibration.one_view_kernels import POSE
 from sfmapp.calibration.report import CameraFileReport
+from sfmapp.calibration.result import CameraCalibration
 from sfmapp.calibration.target import TargetFit
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.models import PARAM_NAMES
@@ -139,6 +140,35 @@ class TargetReport(Report):
     files: Sequence[CameraFileReport]
 
 
+class LostPhotographReport(Report):
+    """A photograph that tells nothing of its camera, and why."""
+
+    photograph: str
+    reason: str
+
+
+class TargetsReport(Report):
+    """The report of ``sfmapp calibrate target`` with several photographs.
+
+    Attributes:
+        photographs: their poses by the joint camera, whose sigmas are in theirs, and their points.
+        lost: those that were left aside.
+    """
+
+    model: str
+    width: int
+    height: int
+    parameters: Sequence[ParameterReport]
+    photographs: Sequence[FitReport]
+    lost: Sequence[LostPhotographReport]
+    rms_px: float
+    noise_px: float
+    degrees_of_freedom: float
+    method: str
+    files: Sequence[CameraFileReport]
+    warnings: Sequence[str]
+
+
 class LocationReport(Report):
     """The report of ``sfmapp locate``; ``others``: poses that explain the points nearly as well."""
 
@@ -234,6 +264,26 @@ def target_report(fit: TargetFit, facts: PhotographFacts, files: Sequence[Camera
             for t in fit.trials
         ],
         files=list(files),
+    )  # fmt: skip
+
+
+def targets_report(
+    made: CameraCalibration, fits: Sequence[FitReport], files: Sequence[CameraFileReport]
+) -> TargetsReport:
+    """A calibration from several photographs in plain values; ``fits``: of those that count."""
+    return TargetsReport(
+        model=made.camera.model.name, width=made.camera.width, height=made.camera.height,
+        parameters=[
+            ParameterReport(name=name, value=float(value), sigma=float(sigma))
+            for name, value, sigma in zip(made.param_names, made.camera.params, made.sigmas, strict=True)
+        ],
+        photographs=list(fits),
+        lost=[
+            LostPhotographReport(photograph=view.name, reason=view.problem)
+            for view in made.views if view.problem is not None
+        ],
+        rms_px=made.rms_px, noise_px=made.noise_px, degrees_of_freedom=made.degrees_of_freedom, method=made.method,
+        files=list(files), warnings=list(made.warnings),
     )  # fmt: skip
 
 

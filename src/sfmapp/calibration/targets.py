@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.calibration.adjustment import Fit, TargetView, normal_at, observations_of, residuals_of
-from sfmapp.calibration.locate import locate_camera
+from sfmapp.calibration.locate import Location, locate_camera, with_camera
+from sfmapp.calibration.one_view import Noise, deletion_statistics, fit_view, with_noise
 from sfmapp.calibration.one_view_kernels import POSE
 from sfmapp.calibration.result import CameraCalibration, ViewFit
 from sfmapp.calibration.solve import inlier_fit
@@ -34,8 +35,9 @@ _MAX_ERROR_PX = 20.0
 
 
 def calibrate_targets(
-    views: Sequence[TargetView], size: tuple[int, int], *, camera_model: CameraModel | None = None
-) -> CameraCalibration:
+    views: Sequence[TargetView], size: tuple[int, int], *, camera_model: CameraModel | None = None,
+    sigma_px: float | None = None,
+) -> CameraCalibration:  # fmt: skip
     """The camera that took several photographs, each of points with known places.
 
     Args:
@@ -44,6 +46,7 @@ def calibrate_targets(
         size: width and height of all photographs.
         camera_model: None: the one of the photograph that tells most; see
             :func:`sfmapp.calibration.target.calibrate_target`.
+        sigma_px: standard deviation of a marked coordinate, if known; None: from the residuals.
 
     Returns:
         The camera with its covariance, and every photograph with its pose, residuals, and which points are used.
@@ -68,7 +71,8 @@ def calibrate_targets(
             )
         else:
             shown.append((view, found))
-    return _together([view for view, _ in shown], np.array([pose for _, pose in shown]), best.view.camera, lost)
+    poses = np.array([pose for _, pose in shown])
+    return _together([view for view, _ in shown], poses, best.view.camera, lost, sigma_px)
 
 
 def _alone(
@@ -90,7 +94,34 @@ def _placed(view: TargetView, alone: TargetFit | Exception, camera: Camera) -> A
     return found.view.cam_from_world
 
 
-def _together(views: Sequence[TargetView], poses: Array, camera: Camera, lost: Sequence[ViewFit]) -> CameraCalibration:
+def located_views(made: CameraCalibration, views: Sequence[TargetView]) -> list[Location | None]:
+    """Where the camera of a joint fit stood in each of its photographs, with the covariance that this has with the
+    camera; None for a photograph that was left aside. Arguments as of :func:`calibrate_targets`, and what it returned.
+    """
+    fits = {view.name: view for view in made.views}
+    noise = Noise(made.noise_px, made.noise_px**2, f"residuals of all, {made.degrees_of_freedom} degrees of freedom")
+    found: list[Location | None] = []
+    for view in views:
+        fit = fits[view.name]
+        own = None
+        if fit.cam_from_target is not None:
+            one = fit_view(
+                made.camera, fit.cam_from_target, (view.xyz, view.xy), fit.is_used, noise_px=made.noise_px
+            )  # fmt: skip
+            own = with_noise(one, noise)
+        if own is None:
+            found.append(None)
+            continue
+        found.append(Location(
+            view=one, covariance=with_camera(one, own, made.covariance, view.xyz), noise=noise,
+            distance=deletion_statistics(one, made.noise_px)[1], others=(), method=made.method,
+        ))  # fmt: skip
+    return found
+
+
+def _together(
+    views: Sequence[TargetView], poses: Array, camera: Camera, lost: Sequence[ViewFit], sigma_px: float | None
+) -> CameraCalibration:
     """The joint fit, its covariance, and what it leaves."""
     fit, is_used = inlier_fit(Fit(camera, poses, np.zeros(0), np.inf), views)
     obs = observations_of(views)
@@ -99,7 +130,8 @@ def _together(views: Sequence[TargetView], poses: Array, camera: Camera, lost: S
     variance = float((residual[is_used] ** 2).sum()) / max(degrees, 1)
     normal = normal_at(fit, obs._replace(weight=is_used.astype(np.float64)))
     # of a Student distribution, which with few degrees of freedom is wider
-    whole = frame_covariance(normal, num, variance * degrees / (degrees - 2.0)) if degrees > 2 else None
+    spread = variance * degrees / max(degrees - 2.0, 0.5) if sigma_px is None else sigma_px**2
+    whole = frame_covariance(normal, num, spread) if degrees > 2 or sigma_px is not None else None
     if whole is None:
         raise InputError(
             f"expected photographs that hold all {num} parameters of {fit.camera.model.name}, found {len(views)} that "
@@ -118,6 +150,7 @@ def _together(views: Sequence[TargetView], poses: Array, camera: Camera, lost: S
     return CameraCalibration(
         camera=replace(fit.camera, focal_source="user"), covariance=whole[:num, :num],
         method=f"known points of {len(views)} photographs, {int(is_used.sum())} points, jointly",
-        noise_px=float(np.sqrt(variance)), degrees_of_freedom=degrees, views=(*shown, *lost), frame_covariance=whole,
+        noise_px=float(np.sqrt(variance)) if sigma_px is None else sigma_px, degrees_of_freedom=degrees,
+        views=(*shown, *lost), frame_covariance=whole,
         distances=(float(near), float(middle), float(far)), warnings=tuple(warnings),
     )  # fmt: skip

@@ -59,7 +59,7 @@ def _locate(args: argparse.Namespace) -> int:
     from sfmapp.errors import UsageError
     from sfmapp.pipelines.calibration.known_points import PoseSearch, locate
 
-    source = replace(point_source(args), model=args.model)
+    source = replace(point_source(args, args.points), model=args.model)
     if args.model is not None and (args.points is not None or args.markers is not None):
         raise UsageError("expected one of --points, --markers and --model, found two")
     with listening(args) as events:

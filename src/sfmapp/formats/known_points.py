@@ -24,7 +24,7 @@ _LARGEST_BYTES = 2**26
 _NAMES: Mapping[str, str] = {
     "x": "x", "y": "y", "z": "z", "xw": "x", "yw": "y", "zw": "z", "u": "u", "v": "v", "px": "u", "py": "v",
     "col": "u", "row": "v", "name": "name", "id": "name", "point": "name", "label": "name", "figure": "name",
-    "corner": "corner",
+    "corner": "corner", "image": "image", "photograph": "image", "photo": "image", "picture": "image", "file": "image",
 }  # fmt: skip
 _HEAD = re.compile(r"\s*([A-Za-z]+)\s*(?:[_\s]\s*([A-Za-z]+)|[\[(]\s*([A-Za-z]+)\s*[\])])?\s*")
 
@@ -72,16 +72,40 @@ class _Table:
     rows: list[tuple[int, list[str]]]
 
 
-def read_known_points(path: str | Path) -> KnownPoints:
-    """Read ``[name] X Y Z u v``, or ``[name] X Y u v`` of a plane, whose Z is 0.
+def photographs_of(path: str | Path) -> tuple[str, ...]:
+    """The photographs that the column ``image`` of a table of points names, in their order; none without one.
 
     Raises:
-        InputError: no such file, a line that is not what it has to be, or one place twice: the message names the line.
+        InputError: no such file, or one that is no table of points.
     """
-    path = Path(path)
+    table = _read_points(Path(path))
+    if "image" not in table.columns:
+        return ()
+    place = table.columns.index("image")
+    return tuple(dict.fromkeys(fields[place] for _, fields in table.rows))
+
+
+def _read_points(path: Path) -> _Table:
     kinds = {4: ("x", "y", "u", "v"), 5: ("x", "y", "z", "u", "v"), 6: ("name", "x", "y", "z", "u", "v")}
     table = _read(path, kinds, "a line is: [name] X Y Z u v")
     _need(path, table, ("x", "y", "u", "v"))
+    return table
+
+
+def read_known_points(path: str | Path, photograph: str | None = None) -> KnownPoints:
+    """Read ``[image] [name] X Y Z u v``, or ``[image] [name] X Y u v`` of a plane, whose Z is 0.
+
+    Args:
+        photograph: whose lines count where the table has a column ``image``, which names it with or without its ending.
+
+    Raises:
+        InputError: no such file, a line that is not what it has to be, one place twice in a photograph, or no line of
+            the photograph: the message names the line.
+    """
+    path = Path(path)
+    table = _read_points(path)
+    if "image" in table.columns:
+        table = _of_photograph(path, table, photograph)
     values = {name: _column(path, table, name) for name in ("x", "y", "z", "u", "v") if name in table.columns}
     xyz = np.stack([values["x"], values["y"], values.get("z", np.zeros(len(table.rows)))], 1)
     lines = np.array([line for line, _ in table.rows], np.int64)
@@ -97,6 +121,26 @@ def read_known_points(path: str | Path) -> KnownPoints:
         twice = next(name for n, name in enumerate(names) if name in names[:n])
         raise InputError(f"{path}: expected every name once, found {twice!r} twice")
     return KnownPoints(path, names, xyz, np.stack([values["u"], values["v"]], 1), lines, table.unit)
+
+
+def _of_photograph(path: Path, table: _Table, photograph: str | None) -> _Table:
+    """The lines of one photograph of a table that names several."""
+    place = table.columns.index("image")
+    named = list(dict.fromkeys(fields[place] for _, fields in table.rows))
+    if photograph is None and len(named) > 1:
+        raise InputError(f"{path}: expected points of one photograph, found those of {len(named)}: {_shown(named)}")
+    wanted = {photograph, Path(photograph).stem} if photograph is not None else set(named)
+    rows = [(line, fields) for line, fields in table.rows if fields[place] in wanted]
+    if not rows:
+        raise InputError(
+            f"{path}: expected points of {photograph} in its column image, found those of {_shown(named)}",
+            "the column has the name of the file, with or without its ending",
+        )
+    return _Table(table.columns, table.unit, rows)
+
+
+def _shown(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def read_marker_places(path: str | Path) -> MarkerPlaces:

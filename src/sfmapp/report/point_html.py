@@ -10,7 +10,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.calibration.point_reports import FitReport, LocationReport, PointReport, PoseReport, TargetReport
+from sfmapp.calibration.point_reports import (
+    FitReport,
+    LocationReport,
+    ParameterReport,
+    PointReport,
+    PoseReport,
+    TargetReport,
+    TargetsReport,
+)
+from sfmapp.calibration.report import CameraFileReport
 from sfmapp.geometry.orientation import upright_pixels, upright_xy
 from sfmapp.report.page import render_page, table
 
@@ -77,21 +86,54 @@ def _circle(canvas: Pixels, center: Array, radius: int, color: tuple[int, int, i
 
 def render_target_html(report: TargetReport, picture: tuple[bytes, float] | None) -> str:
     """The page of a calibration; ``picture`` from :func:`draw_residuals`, None without a photograph."""
-    rows = [
-        [("t", p.name), ("", f"{p.value:.6g}"), ("", f"{p.sigma:.2g}" if p.sigma else "held")]
-        for p in report.parameters
-    ]
     parts = [
         _head(report.fit),
         f"<h2>Camera</h2><p>{escape(report.fit.model)}, {report.fit.width} x {report.fit.height} pixels</p>",
-        table([("t", "parameter"), ("", "value"), ("", "sigma")], rows),
+        table([("t", "parameter"), ("", "value"), ("", "sigma")], _parameters(report.parameters)),
         _picture(picture),
         "<h2>Pose</h2>" + _pose(report.fit.pose),
         _held(report),
         _points(report.fit.points),
-        _files(report),
+        _files(report.files),
     ]
     return render_page(f"Calibration of {report.fit.photograph}", parts)
+
+
+def render_targets_html(report: TargetsReport, pictures: Sequence[tuple[bytes, float]]) -> str:
+    """The page of a calibration from several photographs; ``pictures`` from :func:`draw_residuals`, of as many of the
+    first of them as there are."""
+    rows = [
+        [("t", fit.photograph), ("", f"{fit.num_used} of {len(fit.points)}"), ("", f"{fit.rms_px:.3f}"),
+         *[("", f"{value:.6g} +- {sigma:.2g}")
+           for value, sigma in zip(fit.pose.center, fit.pose.sigma_center, strict=True)],
+         ("", f"{max(fit.pose.sigma_rotation_deg):.2g}")]
+        for fit in report.photographs
+    ]  # fmt: skip
+    unit = report.photographs[0].pose.unit
+    axes = [("", f"{axis}, {unit}") for axis in "xyz"]
+    head = [("t", "photograph"), ("", "points that agree"), ("", "rms px"), *axes, ("", "rotation, degrees")]
+    lost = [[("t red", one.photograph), ("w", one.reason)] for one in report.lost]
+    warnings = "".join(f"<li>{escape(warning)}</li>" for warning in report.warnings)
+    parts = [
+        f'<p class="{"amber" if report.warnings else "green"}">rms {report.rms_px:.3f} px, noise of a mark '
+        f"{report.noise_px:.3g} px, {report.degrees_of_freedom:.0f} degrees of freedom</p>"
+        f"<p class=dim>{escape(report.method)}</p>{f'<ul>{warnings}</ul>' if warnings else ''}",
+        f"<h2>Camera</h2><p>{escape(report.model)}, {report.width} x {report.height} pixels</p>",
+        table([("t", "parameter"), ("", "value"), ("", "sigma")], _parameters(report.parameters)),
+        "<h2>Photographs</h2><p>Where the camera stood, with what is not known of it in the sigmas.</p>"
+        + table(head, rows) + (table([("t", "left aside"), ("t", "")], lost) if lost else ""),
+    ]  # fmt: skip
+    for n, fit in enumerate(report.photographs):
+        wrong = sum(not point.is_used for point in fit.points)
+        title = escape(fit.photograph) + (f", {wrong} left aside" if wrong else "")
+        inner = (_picture(pictures[n]) if n < len(pictures) else "") + _points(fit.points)
+        parts.append(f"<details{' open' if wrong else ''}><summary>{title}</summary>{inner}</details>")
+    parts.append(_files(report.files))
+    return render_page(f"Calibration of {len(report.photographs)} photographs of known points", parts)
+
+
+def _parameters(parameters: Sequence[ParameterReport]) -> list[list[tuple[str, object]]]:
+    return [[("t", p.name), ("", f"{p.value:.6g}"), ("", f"{p.sigma:.2g}" if p.sigma else "held")] for p in parameters]
 
 
 def render_location_html(report: LocationReport, picture: tuple[bytes, float]) -> str:
@@ -183,10 +225,10 @@ def _points(points: Sequence[PointReport]) -> str:
     return "<h2>Points</h2>" + table(head, rows) + more
 
 
-def _files(report: TargetReport) -> str:
+def _files(files: Sequence[CameraFileReport]) -> str:
     rows = [
         [("t", f.name), ("t", f.program), ("", None if f.max_px is None else f"{f.max_px:.2g}"), ("w", f.reason)]
-        for f in report.files
+        for f in files
     ]
     head = [("t", "file"), ("t", "for"), ("", "read back, px"), ("t", "")]
     return "<h2>Files</h2>" + table(head, rows) if rows else ""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Union
 
 from sfmapp.calibration.file import CalibrationDocument
-from sfmapp.calibration.point_reports import LocationReport, MeasureReport, TargetReport
+from sfmapp.calibration.point_reports import LocationReport, MeasureReport, TargetReport, TargetsReport
 from sfmapp.georeference.world_frame import Georeference
 from sfmapp.planes.report import RectifyReport, WarpReport
 from sfmapp.report.evaluation import EvaluationReport
@@ -52,6 +52,7 @@ KINDS: Mapping[str, type[Report]] = {
     "export": ExportReport,
     "georeference": Georeference,
     "calibrate-target": TargetReport,
+    "calibrate-targets": TargetsReport,
     "locate": LocationReport,
     "measure": MeasureReport,
     "pair": PairReport,

@@ -101,7 +101,9 @@ class LocateResult:
 
 
 @dataclass(frozen=True)
-class _Points:
+class PhotographPoints:
+    """Places (N, 3) and pixels (N, 2) of a photograph."""
+
     facts: PhotographFacts
     xyz: Array
     xy: Array
@@ -125,11 +127,11 @@ def calibrate_from_target(
         InputError: the photograph or the points cannot be read, or tell no camera.
         NoReconstructionError: they leave the focal length open.
     """
-    _check_sigma(sigma_px)
+    check_sigma(sigma_px)
     record = describe_photograph(photograph)
     with Job.opened(CALIBRATE, photograph, output, None, events=events, watch=watch) as job:
         job.note_inputs({record.name: record.digest})
-        points = _read_points(record, source, job.events)
+        points = read_points(record, source, job.events)
         fit = calibrate_target(
             points.xyz, points.xy, (record.width, record.height), camera_model=camera_model, sigma_px=sigma_px
         )  # fmt: skip
@@ -166,17 +168,17 @@ def locate(
         InputError: the photograph, the points or the camera cannot be read.
         NoReconstructionError: no pose agrees with the points, or they leave it open.
     """
-    _check_sigma(sigma_px)
+    check_sigma(sigma_px)
     search = search or PoseSearch()
     record = describe_photograph(photograph)
     given, covariance = read_camera(camera, record)
     with Job.opened(LOCATE, photograph, output, None, events=events) as job:
         job.note_inputs({record.name: record.digest})
         if source.model is None:
-            points = _read_points(record, source, job.events)
+            points = read_points(record, source, job.events)
         else:
             names, xyz, xy = find_model_points(source.model, record, given, job.events)
-            points = _Points(PhotographFacts(record.name, names, "units"), xyz, xy)
+            points = PhotographPoints(PhotographFacts(record.name, names, "units"), xyz, xy)
         found = locate_camera(
             points.xyz, points.xy, given, method=search.method, max_error_px=search.max_error_px, sigma_px=sigma_px,
             camera_covariance=covariance,
@@ -231,7 +233,7 @@ def measure_marks(
         UsageError: neither a pose nor known points are given, or both.
         InputError: a file that cannot be read, or marks that do not see the plane.
     """
-    _check_sigma(sigma_px)
+    check_sigma(sigma_px)
     if (source.pose is None) == (source.metric is None):
         raise UsageError("expected either a pose or known points of the plane: --pose or --metric")
     table = read_marks(Path(marks))
@@ -281,23 +283,30 @@ def _plane(text: str, known: Mapping[str, Array]) -> tuple[Plane, str]:
 
 
 def _record(job: Job, record: ImageRecord, made: CameraCalibration, xyz: Array) -> None:
-    """The photograph, and the points in front of the camera as a rectangle along their two widest directions."""
+    write_recording(job, made, plane_outline(xyz), {record.name: str(record.path)}, record.name)
+
+
+def plane_outline(xyz: Array) -> Array:
+    """(4, 3) corners of the rectangle of points (N, 3) along their two widest directions, which is what a recording
+    shows in front of a camera."""
     middle = xyz.mean(0)
     axes = np.linalg.svd(xyz - middle)[2][:2]
     low, high = ((xyz - middle) @ axes.T).min(0), ((xyz - middle) @ axes.T).max(0)
-    outline = middle + np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) @ axes
-    write_recording(job, made, outline, {record.name: str(record.path)}, record.name)
+    corners: Array = middle + np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) @ axes
+    return corners
 
 
 # ------------------------------------------------------------------------------------------------------------- reading
 
 
-def _check_sigma(sigma_px: float | None) -> None:
+def check_sigma(sigma_px: float | None) -> None:
+    """Raises UsageError for a sigma that is none."""
     if sigma_px is not None and not (np.isfinite(sigma_px) and sigma_px > 0.0):
         raise UsageError(f"sigma_px is {sigma_px:g}, expected more than 0 pixels")
 
 
 def describe_photograph(photograph: str | os.PathLike[str]) -> ImageRecord:
+    """What a file is. Raises InputError if it is no photograph."""
     """One photograph. Raises InputError if it cannot be used."""
     path = Path(photograph)
     records, reasons = describe_images(path.parent, [path.name], ImageOptions())
@@ -307,11 +316,17 @@ def describe_photograph(photograph: str | os.PathLike[str]) -> ImageRecord:
     return record
 
 
-def _read_points(record: ImageRecord, source: PointSource, events: Events) -> _Points:
+def read_points(record: ImageRecord, source: PointSource, events: Events) -> PhotographPoints:
+    """The points of a photograph.
+
+    Raises:
+        UsageError: a source that is none, or two.
+        InputError: a table that cannot be read, pixels outside the photograph, or markers that it does not show.
+    """
     if (source.points is None) == (source.markers is None):
         raise UsageError("expected either a table of points or one of markers: --points or --markers")
     if source.points is not None:
-        known = read_known_points(source.points)
+        known = read_known_points(source.points, record.name)
         xy = known.xy + 0.5 * source.is_opencv
         outside = ~((xy >= 0.0) & (xy <= [record.width, record.height])).all(1)
         if outside.any():
@@ -321,7 +336,7 @@ def _read_points(record: ImageRecord, source: PointSource, events: Events) -> _P
                 f"{record.height}, found ({xy[n, 0]:g}, {xy[n, 1]:g})",
                 "pixels are those of the file as it is stored, before EXIF turns it",
             )
-        return _Points(PhotographFacts(record.name, known.names, known.unit), known.xyz, xy)
+        return PhotographPoints(PhotographFacts(record.name, known.names, known.unit), known.xyz, xy)
     assert source.markers is not None
     if source.dictionary is None:
         raise UsageError("expected the dictionary of the markers: --dictionary, such as DICT_4X4_50")
@@ -336,7 +351,7 @@ def _read_points(record: ImageRecord, source: PointSource, events: Events) -> _P
         )
     if unknown:
         events.warned(CALIBRATE, f"markers {', '.join(map(str, unknown))} have no place in {source.markers}")
-    return _Points(PhotographFacts(record.name, names, places.unit), xyz, xy)
+    return PhotographPoints(PhotographFacts(record.name, names, places.unit), xyz, xy)
 
 
 def read_camera(given: str, record: ImageRecord) -> tuple[Camera, Array | None]:
