@@ -91,7 +91,6 @@ def rows_of(folder: Path) -> list[Row]:
         "calibration": calibration_rows,
         "two_views": two_view_rows,
         "known_points": known_point_rows,
-        "circle_centers": circle_rows,
         "rigs": rig_rows,
         "panorama": panorama_rows,
     }
@@ -125,19 +124,6 @@ def calibration_rows(folder: Path) -> Iterator[Row]:
             ):  # fmt: skip
                 ours, theirs = whole["sfmapp"][key], row[key]
                 yield Row("calibration", "30 photographs of 12 MP", what, unit, "less", ours, program, theirs, *about)
-
-
-def circle_rows(folder: Path) -> Iterator[Row]:
-    """Cameras from grids of circles seen from the side, against OpenCV with centres of mass."""
-    report = read(folder, "circle_centers")
-    about = (False, report["date"][:10], report["commit"])
-    for tilt in sorted({row["tilt_deg"] for row in report["rows"]}):
-        rows = [row for row in report["rows"] if row["tilt_deg"] == tilt]
-        ours = [row["focal_error_px"] ** 2 for row in rows if row["centers"] == "by the camera"]
-        theirs = [row["opencv_focal_error_px"] ** 2 for row in rows if "opencv_focal_error_px" in row]
-        off = math.sqrt(sum(ours) / len(ours)), math.sqrt(sum(theirs) / len(theirs))
-        case = f"circles at {tilt:.0f} degrees"
-        yield Row("circle_centers", case, "focal length, rms", "px", "less", off[0], "OpenCV", off[1], *about)
 
 
 def two_view_rows(folder: Path) -> Iterator[Row]:

@@ -12,11 +12,14 @@ import pytest
 from scipy.stats import chi2
 
 from schemas import check_schema
+from sfmapp.calibration.file import covariance_at
 from sfmapp.calibration.locate import locate_camera
 from sfmapp.calibration.measure import Plane, measure, place_by_homography, place_on_plane
 from sfmapp.calibration.point_reports import read_pose
+from sfmapp.calibration.result import CameraCalibration
 from sfmapp.camera.camera import Camera, project
 from sfmapp.camera.names import CameraModel
+from sfmapp.camera_files.photographs import Photograph
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.formats.colmap import read_model
@@ -165,6 +168,22 @@ def test_the_covariance_of_the_camera_moves_the_pose_along() -> None:
         joint = np.concatenate([off.params - CAMERA.params, pose_error(found.view.cam_from_world, pose)])
         nees += joint @ np.linalg.solve(found.covariance, joint)
     assert chi2.ppf(1e-3, 14 * num_trials) < nees < chi2.ppf(1.0 - 1e-3, 14 * num_trials)
+
+
+def test_the_covariance_follows_a_camera_to_other_sizes_and_turns(tmp_path) -> None:
+    """Of a photograph of half the size lengths have half the sigma; of one on its side, x and y have changed places."""
+    rng = np.random.default_rng(17)
+    root = rng.normal(size=(8, 8)) * np.array([3.0, 3, 2, 2, 0.01, 0.01, 1e-3, 1e-3])[:, None]
+    made = CameraCalibration(CAMERA, root @ root.T, "", 1.0, 1)
+    small = covariance_at(made, str(tmp_path), Photograph("a.jpg", (CAMERA.width // 2, CAMERA.height // 2)))
+    scale = np.array([0.5, 0.5, 0.5, 0.5, 1, 1, 1, 1])
+    np.testing.assert_allclose(small, made.covariance * scale * scale[:, None], rtol=1e-6)
+    same = covariance_at(made, str(tmp_path), Photograph("a.jpg", (CAMERA.width, CAMERA.height)))
+    np.testing.assert_allclose(same, made.covariance, rtol=1e-6)
+    # sensor readings turned by EXIF: what was x of the upright pictures is y of the file, with or without its sign
+    side = covariance_at(made, str(tmp_path), Photograph("a.jpg", (CAMERA.height, CAMERA.width), orientation=6))
+    np.testing.assert_allclose(np.diag(side), np.diag(made.covariance)[[1, 0, 3, 2, 4, 5, 7, 6]], rtol=1e-6)
+    assert np.linalg.slogdet(side)[1] == pytest.approx(np.linalg.slogdet(made.covariance)[1], rel=1e-6)
 
 
 def test_a_second_pose_that_fits_as_well_is_told() -> None:
@@ -416,6 +435,8 @@ def test_several_photographs_are_calibrated_together(desk, tmp_path, capsys) -> 
     wrong = [(one["photograph"], p["name"]) for one in found["photographs"] for p in one["points"] if not p["is_used"]]
     assert wrong == [("b.png", "p5")]
     assert read_pose(tmp_path / "one" / "poses" / "c.json").unit == "m"
+    with pytest.raises(InputError, match="those of 3"):
+        read_pose(tmp_path / "one")
     photos = sorted(folder.iterdir())
     same = run(capsys, "calibrate", "target", *photos, "--points", *tables, "-o", tmp_path / "two", "--no-recording")
     assert same["parameters"] == found["parameters"]

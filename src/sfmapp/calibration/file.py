@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sfmapp.calibration.documents import read_document, write_document
 from sfmapp.calibration.result import CameraCalibration, ViewFit
 from sfmapp.camera_files.opencv_lens import CalibratedCamera
-from sfmapp.camera_files.photographs import GivenCameras, read_given_cameras
+from sfmapp.camera_files.photographs import GivenCameras, Photograph, read_given_cameras
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap_model import checked_camera
 from sfmapp.formats.text_input import read_json_object
@@ -148,6 +148,32 @@ def read_given_camera(given: str) -> tuple[GivenCameras, CameraCalibration | Non
         return read_given_cameras(given), None
     camera = CalibratedCamera(calibration.camera)
     return GivenCameras(given, {"": lambda _: camera}), calibration
+
+
+def covariance_at(calibration: CameraCalibration, root: str, photograph: Photograph) -> NDArray[np.float64]:
+    """(P, P) covariance of the camera's parameters in the pixels of a photograph that it took, which may be smaller or
+    turned against those that it was calibrated with.
+
+    Args:
+        root: folder of the photograph.
+
+    Raises:
+        InputError: a photograph of another shape.
+    """
+    camera = calibration.camera
+
+    def params_of(params: NDArray[np.float64]) -> NDArray[np.float64]:
+        one = CalibratedCamera(camera.with_params(params))
+        return GivenCameras("camera", {"": lambda _: one}).of_photographs(root, [photograph])[0].camera.params
+
+    # scaling and turning are affine, so that differences of any size are their slopes
+    steps = np.where(calibration.sigmas > 0.0, calibration.sigmas, 1e-3)
+    middle = params_of(camera.params)
+    slopes = np.stack(
+        [(params_of(camera.params + step) - middle) / step.sum() for step in np.diag(steps)], axis=1
+    )  # fmt: skip
+    found: NDArray[np.float64] = slopes @ calibration.covariance @ slopes.T
+    return found
 
 
 def _read(path: Path, fields: Mapping[str, Any] | None) -> CameraCalibration:

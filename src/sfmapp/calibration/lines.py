@@ -78,8 +78,9 @@ _BENT_PX, _WORST_STRENGTH = 0.3, 0.05
 # A bend that the means of edge points, good to a twentieth of a pixel, show.
 _TELLING_PX = 0.1
 # A focal length that is no better known than this share is not called known, nor one whose halves differ by more than
-# so many sigmas (and one per cent), nor one with a rival of nearly its likelihood (a ratio of e to this).
-_WORST_FOCAL, _MOST_APART_SIGMAS, _RIVAL_GAIN = 0.05, 3.0, 12.0
+# so many sigmas (and one per cent). Others of nearly its likelihood (a ratio of e to this) are in its sigma, up to so
+# far away: a third of what nothing but a default leaves open.
+_WORST_FOCAL, _MOST_APART_SIGMAS, _RIVAL_GAIN, _WORST_RIVAL = 0.05, 3.0, 12.0, 0.2
 # Fewer lines than this along a direction do not count it.
 _LEAST_OF_DIRECTION = 6
 # What is assumed where lines do not tell: the project's default for photographs that say nothing, and how far off it
@@ -207,14 +208,14 @@ class _Search:
     Attributes:
         best: refined on all lines.
         problem: with the errors that the lines of directions show to have.
-        num_agreeing: searches whose best has the same focal length.
-        rival: another focal length that lines like nearly as well, in units of R; None for none.
+        num_agreeing: searches whose best has the same focal length, or one of the rivals.
+        rivals: logarithms of other focal lengths that lines like nearly as well, over that of the best.
     """
 
     best: Found
     problem: Problem
     num_agreeing: int
-    rival: float | None
+    rivals: tuple[float, ...]
 
 
 def _search(problem: Problem, arcs: Sequence[Arcs], strengths: Array, seed: int) -> _Search | None:
@@ -227,15 +228,14 @@ def _search(problem: Problem, arcs: Sequence[Arcs], strengths: Array, seed: int)
         tops.append(found[0])
         others += found
     top = max(tops, key=lambda one: one.gain)
-    rivals = [
-        one.focal for one in others
-        if one.gain > top.gain - _RIVAL_GAIN and abs(math.log(one.focal / top.focal)) > _WORST_FOCAL
-    ]  # fmt: skip
-    agreeing = sum(abs(math.log(one.focal / top.focal)) < _SAME_FOCAL for one in tops)
     best = settle(problem, arcs, top.solution.camera, worlds_of(top.solution))
     sharp = sharpened(problem, best.solution)
     best = settle(sharp, arcs, best.solution.camera, worlds_of(best.solution))
-    return _Search(best, sharp, agreeing, rivals[0] if rivals else None)
+    liked = [math.log(one.focal / best.focal) for one in others if one.gain > top.gain - _RIVAL_GAIN]
+    rivals = tuple(sorted((log for log in liked if abs(log) > _WORST_FOCAL), key=abs))
+    farthest = max((abs(log) for log in rivals), default=0.0) + _SAME_FOCAL
+    agreeing = sum(abs(math.log(one.focal / best.focal)) < max(farthest, 2.0 * _SAME_FOCAL) for one in tops)
+    return _Search(best, sharp, agreeing, rivals)
 
 
 # --------------------------------------------------------------------------------------------------- held-out lines
@@ -410,8 +410,9 @@ def _judge_focal(search: _Search | None, trials: Sequence[_Trial], held_out: Hel
     apart = abs(logs[0] - logs[1])
     if apart > _MOST_APART_SIGMAS * math.hypot(*(trial.log_focal_sigma for trial in trials)) and apart > _SAME_FOCAL:
         return _Judged(False, f"two halves of the lines have focal lengths that differ by {100 * apart:.1f} %")
-    if search.rival is not None:
-        rival = 100 * (search.rival / search.best.focal - 1.0)
+    farthest = abs(search.rivals[-1]) if search.rivals else 0.0
+    if farthest > _WORST_RIVAL:
+        rival = 100 * (math.exp(search.rivals[-1]) - 1.0)
         return _Judged(False, f"another focal length, {rival:+.0f} %, explains the lines nearly as well")
     if search.num_agreeing < NUM_SEEDS:
         return _Judged(False, f"{search.num_agreeing} of {NUM_SEEDS} searches found this focal length")
@@ -419,9 +420,12 @@ def _judge_focal(search: _Search | None, trials: Sequence[_Trial], held_out: Hel
         f"{held_out.num_met} of {held_out.num_lines} held-out lines meet the vanishing points of the others "
         f"({held_out.num_expected:.0f} would by chance)"
     )
+    if search.rivals:
+        rival = 100 * (math.exp(search.rivals[-1]) - 1.0)
+        reason += f"; another focal length, {rival:+.0f} %, explains the lines nearly as well and is in the sigma"
     # halves that lie on one side of the whole show that it hangs on few lines
     whole = math.log(search.best.focal)
-    return _Judged(True, reason, widened=max(apart / 2.0, *(abs(log - whole) for log in logs)))
+    return _Judged(True, reason, widened=max(apart / 2.0, farthest, *(abs(log - whole) for log in logs)))
 
 
 def _judge_strength(problem: Problem, solution: Solution, trials: Sequence[_Trial]) -> _Judged:

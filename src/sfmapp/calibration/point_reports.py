@@ -29,6 +29,8 @@ from sfmapp.reporting import Report
 Array = NDArray[np.float64]
 
 POSE_FILE = "pose.json"
+POSES = "poses"
+"""Folder of ``NAME.json``, a pose for each of several photographs."""
 FORMAT = "sfmapp pose 1"
 
 
@@ -416,6 +418,12 @@ def read_pose(path: Path) -> KnownPose:
     Raises:
         InputError: it cannot be read, or is no such file.
     """
+    if path.is_dir() and not (path / POSE_FILE).is_file() and (path / POSES).is_dir():
+        names = sorted(one.name for one in (path / POSES).glob("*.json"))
+        raise InputError(
+            f"{path}: expected the pose of one photograph, found those of {len(names)}",
+            f"give one of {path / POSES}: {', '.join(names[:5])}",
+        )
     path = path / POSE_FILE if path.is_dir() else path
     document = read_document(
         path, PoseDocument, FORMAT, "the pose of a photograph",

@@ -32,6 +32,7 @@ view the focal length stays a default with a sigma of 60 per cent. The lens is S
 Writes
   OUT/calibration.json   for --camera; with the covariance
   OUT/report.html        what is told and why; report.json has the same
+  OUT/recording.rrd      lines, their planes through the camera and where they vanish, for rerun
   OUT/lines/NAME.jpg     edges in the colours of their directions
   OUT/undistorted/NAME.jpg
 and the camera for other programs, where they know the lens."""
@@ -48,6 +49,7 @@ def add_way(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument("-o", "--output", metavar="DIR", required=True, help="output folder, new or empty")
     parser.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; black pixels are ignored")
     parser.add_argument("--seed", metavar="N", help="of the search; default: 0")
+    parser.add_argument("--no-recording", action="store_true", help="do not write recording.rrd")
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_calibrate)
 
@@ -61,7 +63,9 @@ def _calibrate(args: argparse.Namespace) -> int:
 
     watch = Stopwatch(whole_process=True)
     with listening(args) as events:
-        result = calibrate_lines(args.photos, args.output, options, events=events, watch=watch)
+        result = calibrate_lines(
+            args.photos, args.output, options, recording=not args.no_recording, events=events, watch=watch
+        )
     tell_result(args, result, lambda: _print(result))
     return 0
 

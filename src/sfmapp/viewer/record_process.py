@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 def main(kind: str, folder: str, output: str, threads: str) -> None:
-    """Draw what lies in folder: the replay of a run, a dense result, a calibration, a rig, a pair, or a transfer."""
+    """Draw what lies in folder: the replay of a run, a dense result, a calibration, a rig, a pair, and so on."""
     if kind == "dense":
         from sfmapp.viewer.dense_replay import DenseReplay
         from sfmapp.viewer.dense_rrd import write_dense_rrd
@@ -41,6 +41,12 @@ def main(kind: str, folder: str, output: str, threads: str) -> None:
         from sfmapp.viewer.transfer_rrd import write_transfer_rrd
 
         write_transfer_rrd(TransferReplay.load(Path(folder)), Path(output))
+        return
+    if kind == "lines":
+        from sfmapp.viewer.lines_replay import LinesReplay
+        from sfmapp.viewer.lines_rrd import write_lines_rrd
+
+        write_lines_rrd(LinesReplay.load(Path(folder)), Path(output))
         return
     from sfmapp.viewer.replay import Replay
     from sfmapp.viewer.rrd import write_rrd

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.calibration.file import read_given_camera
+from sfmapp.calibration.file import covariance_at, read_given_camera
 from sfmapp.calibration.locate import MAX_ERROR_PX, Location, Method, locate_camera
 from sfmapp.calibration.marker_points import find_marker_points
 from sfmapp.calibration.measure import PlacedMarks, Plane, measure, place_by_homography, place_on_plane
@@ -277,9 +277,9 @@ def _plane(text: str, known: Mapping[str, Array]) -> tuple[Plane, str]:
             f"plane is {text!r}, expected a,b,c,d of a X + b Y + c Z = d, or three names of points",
             f"0,0,1,0 is Z = 0; points of the pose: {shown}",
         )
-    return Plane.of_equation(
-        np.array(values[:3]), values[3]
-    ), f"{values[0]:g} X + {values[1]:g} Y + {values[2]:g} Z = {values[3]:g}"
+    terms = [(value, axis) for value, axis in zip(values[:3], "XYZ", strict=True) if value != 0.0]
+    shown = " + ".join(axis if value == 1.0 else f"{value:g} {axis}" for value, axis in terms)
+    return Plane.of_equation(np.array(values[:3]), values[3]), f"{shown} = {values[3]:g}"
 
 
 def _record(job: Job, record: ImageRecord, made: CameraCalibration, xyz: Array) -> None:
@@ -355,14 +355,11 @@ def read_points(record: ImageRecord, source: PointSource, events: Events) -> Pho
 
 
 def read_camera(given: str, record: ImageRecord) -> tuple[Camera, Array | None]:
-    """The camera of a photograph, and the covariance of its parameters where its file has one for pictures as large."""
-    photograph = Photograph(record.name, (record.width, record.height), record.orientation)
+    """The camera of a photograph, and the covariance of its parameters where its file has one."""
+    photograph, root = Photograph(record.name, (record.width, record.height), record.orientation), record.path.parent
     cameras, calibration = read_given_camera(given)
-    camera = cameras.of_photographs(str(record.path.parent), [photograph])[0].camera
-    if calibration is None:
-        return camera, None
-    is_same = calibration.camera.model == camera.model and np.allclose(calibration.camera.params, camera.params)
-    return camera, calibration.covariance if is_same else None
+    camera = cameras.of_photographs(str(root), [photograph])[0].camera
+    return camera, None if calibration is None else covariance_at(calibration, str(root), photograph)
 
 
 def _only_camera(given: str) -> Camera:

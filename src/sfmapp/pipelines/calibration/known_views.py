@@ -11,7 +11,14 @@ import numpy as np
 
 from sfmapp.calibration.adjustment import TargetView
 from sfmapp.calibration.locate import Location
-from sfmapp.calibration.point_reports import FitReport, TargetsReport, location_report, targets_report, write_pose
+from sfmapp.calibration.point_reports import (
+    POSES,
+    FitReport,
+    TargetsReport,
+    location_report,
+    targets_report,
+    write_pose,
+)
 from sfmapp.calibration.result import CameraCalibration
 from sfmapp.calibration.targets import calibrate_targets, located_views
 from sfmapp.camera.names import CameraModel
@@ -34,9 +41,6 @@ from sfmapp.report.point_html import draw_residuals, render_targets_html
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.layout import CALIBRATE, PAGE, REPORT
 from sfmapp.workspace.usage import Stopwatch
-
-POSES = "poses"
-"""Folder of ``NAME.json``, a pose for each photograph, for ``measure``."""
 
 # Photographs that the page shows: each takes a fifth of a megabyte.
 _MAX_PICTURES = 12

@@ -20,10 +20,11 @@ from sfmapp.formats.atomic import replaced_file
 from sfmapp.images.folder import describe_images, load_images
 from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import read_gray, read_mask, read_rgb
-from sfmapp.pipelines.calibration.results import write_camera
+from sfmapp.pipelines.calibration.results import note_recording, write_camera
 from sfmapp.report.lines_html import CalibrateLinesReport, line_picture, lines_page
 from sfmapp.reporting import NamedReason
 from sfmapp.scene.undistortion import Layout, plan_undistortion
+from sfmapp.viewer.lines_recording import record_lines
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.layout import CALIBRATE, PAGE, REPORT
 from sfmapp.workspace.options import Options
@@ -57,6 +58,7 @@ def calibrate_lines(
     output: str | os.PathLike[str],
     options: Options | None = None,
     *,
+    recording: bool = True,
     events: Events | None = None,
     watch: Stopwatch | None = None,
 ) -> LinesResult:
@@ -66,6 +68,7 @@ def calibrate_lines(
         sources: photographs, or one folder, glob pattern or list of them.
         output: a new folder, an empty one, or that of an earlier call.
         options: of these, those of images, the seed and ``threads``.
+        recording: write ``recording.rrd``.
         events: progress, decisions, warnings and cancellation.
         watch: started when the run began.
 
@@ -91,6 +94,13 @@ def calibrate_lines(
         report = CalibrateLinesReport(lines=lines, skipped=skipped, run=job.facts())
         job.workspace.write_json(REPORT, report)
         job.workspace.write_text(PAGE, lines_page(report, found.calibration, shown))
+        if recording:
+            with job.stage("recording"):
+                paths = {record.name: str(record.path) for record in records}
+                shown_files = [(name, paths[name]) for name in found.names]
+                camera = found.calibration.camera
+                title = found.names[0] if len(found.names) == 1 else f"{len(found.names)} photographs"
+                note_recording(job, record_lines(job.workspace.recording, camera, found.photos, shown_files, title))
         job.workspace.save()
         return LinesResult(job.workspace.folder, found.calibration, report)
 
