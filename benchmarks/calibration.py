@@ -25,6 +25,7 @@ from machine import RESULTS, ROOT, describe_machine
 
 sys.path.insert(0, str(ROOT / "tests"))
 
+from board_choices import lenses, suggested_points
 from board_speed import photographs_12_mp, refinement
 from board_views import board_poses, board_views, render_board
 from sfmapp.calibration.adjustment import Fit, TargetView, normal_at, observations_of, refine, residuals_of
@@ -177,23 +178,30 @@ def trials(num: int = 500) -> list[Row]:
         rng = np.random.default_rng(seed)
         poses = board_poses(rng, CHESS, 10, TRUE)
         grid = image_grid(TRUE, (9, 7))
-        nees, inside, covered = [], [], []
+        nees, inside, covered, correlations = [], [], [], np.zeros((8, 8))
         for _ in range(num):
-            error, sigmas, squared, places = one_trial(poses, depth, rng, grid)
+            made, squared, places = one_trial(poses, depth, rng, grid)
             nees.append(squared)
-            inside.append(np.abs(error) < 3.0 * sigmas)
+            inside.append(np.abs(made.camera.params - TRUE.params) < 3.0 * made.sigmas)
             covered.append(places)
+            correlations += made.correlations / num
+        # what numbers with these correlations do by themselves, by a million draws
+        drawn = rng.multivariate_normal(np.zeros(8), correlations, 1_000_000)
+        expected = float((np.abs(drawn) < 3.0).all(1).mean())
         rows.append({
             "case": name, "trials": num, "nees": float(np.mean(nees)),
             "parameters_within_3_sigma": float(np.mean(inside)),
             "trials_with_all_within_3_sigma": float(np.mean(np.all(inside, axis=1))),
+            "expected_of_right_sigmas": expected, "sigma_of_that": float(np.sqrt(expected * (1.0 - expected) / num)),
             "projections_covered": float(np.mean(covered)),
         })  # fmt: skip
     return rows
 
 
-def one_trial(poses: Array, depth: float, rng: np.random.Generator, grid: Array) -> tuple[Array, Array, float, float]:
-    """Errors and sigmas of the parameters, their NEES, and the share of places whose 95 % ellipse holds the error."""
+def one_trial(
+    poses: Array, depth: float, rng: np.random.Generator, grid: Array
+) -> tuple[CameraCalibration, float, float]:
+    """The calibration, the NEES of its parameters, and the share of places whose 95 % ellipse holds the error."""
     views = board_views(TRUE, CHESS, poses, 0.25, rng, bend=depth)
     bends = [bend_basis(view, views) for view in views] if depth else None
     obs, num = observations_of(views, bends), len(TRUE.params)
@@ -217,7 +225,7 @@ def one_trial(poses: Array, depth: float, rng: np.random.Generator, grid: Array)
     off = project(fit.camera, points + np.cross(motion[:3], points) + motion[3:]) - grid
     squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(projection_covariance(made, grid, distance)), off)
     nees = float(error @ np.linalg.solve(made.covariance, error)) / num
-    return error, made.sigmas, nees, float((squared < chi2.ppf(0.95, 2)).mean())
+    return made, nees, float((squared < chi2.ppf(0.95, 2)).mean())
 
 
 def suggested() -> list[Row]:
@@ -253,6 +261,7 @@ def seen(camera: Camera, pose: Array, seed: int) -> TargetView:
 
 PARTS: dict[str, Callable[[], list[Row]]] = {
     "photographs": photographs, "degraded": degraded, "trials": trials, "next": suggested,
+    "next_points": suggested_points, "lenses": lenses,
     "refinement": refinement, "photographs_12_mp": photographs_12_mp,
 }  # fmt: skip
 

@@ -362,7 +362,15 @@ def promises(folder: Path) -> Iterator[Promise]:
     yield Promise(
         "calibration", "sigmas of a calibration are those of its errors (NEES, coverage)", good, len(rows), date
     )
-    if taken := report.get("next"):
+    good = sum(abs(row["trials_with_all_within_3_sigma"] - row["expected_of_right_sigmas"])
+               <= 2.0 * row["sigma_of_that"] for row in rows)  # fmt: skip
+    text = "all eight parameters are inside three sigmas as often as right sigmas have it (98.2 %)"
+    yield Promise("calibration", text, good, len(rows), date)
+    lenses = report.get("lenses", [])
+    good, total = (sum(row[key] for row in lenses) for key in ("within_its_sigma", "sets"))
+    text = "the lens model that is chosen is the true one, or nearer to it than its sigma"
+    yield Promise("calibration", text, good, total, date)
+    if taken := [*report.get("next", []), *report.get("next_points", [])]:
         good = sum(row["times_as_fast"] >= 2.0 for row in taken)
         text = "suggested views make projections sure twice as fast as others"
         yield Promise("calibration", text, good, len(taken), date)

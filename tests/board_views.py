@@ -100,3 +100,30 @@ def render_board(
     if noise:
         picture += noise * np.random.default_rng(seed).standard_normal(picture.shape)
     return np.clip(np.round(picture), 0, 255).astype(np.uint8)
+
+
+def filmed_board(
+    camera: Camera, board: Board, num: int, blurred: set[int], *, seed: int = 0, noise: float = 2.0
+) -> list[np.ndarray]:
+    """(H, W) uint8 frames of a board that is moved before a camera, smoothly; fast while ``blurred`` frames are
+    exposed, so that each is the mean of what it shows in that time."""
+    rng = np.random.default_rng(seed)
+    phase, turns = rng.uniform(0.0, 2.0 * np.pi, 5), np.array([1.0, 2.0, 1.0, 2.0, 3.0])
+    middle = board.points.mean(0)
+    extent = float(np.ptp(board.points, axis=0).max())
+
+    def at(time: float) -> np.ndarray:
+        wave = np.sin(2.0 * np.pi * turns * time / num + phase)
+        depth = extent * camera.focal / camera.width * (1.7 + 0.5 * wave[2])
+        pixel = np.array([camera.width, camera.height]) * (0.5 + 0.33 * wave[:2])
+        turn = rigid3.exp_so3(np.radians([40.0 * wave[3], 40.0 * wave[4], 10.0 * wave[0]]))
+        ray = pixels_to_rays(camera, pixel[None])[0]
+        return rigid3.from_matrix(turn, ray / ray[2] * depth - turn @ middle)
+
+    frames = []
+    for n in range(num):
+        times = (n + np.linspace(-0.4, 0.4, 9)).tolist() if n in blurred else [float(n)]
+        seen = [render_board(camera, board, at(time), blur_px=0.6).astype(np.float64) for time in times]
+        picture = np.mean(seen, axis=0) + noise * rng.standard_normal(seen[0].shape)
+        frames.append(np.clip(np.round(picture), 0, 255).astype(np.uint8))
+    return frames

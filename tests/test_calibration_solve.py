@@ -188,18 +188,40 @@ def test_the_lens_is_chosen_by_views_held_out() -> None:
 
     def fit_model(model: CameraModel) -> Candidate:
         fit, is_used = inlier_fit(to_model(base, model, views), views)
+        if model == CameraModel.SIMPLE_RADIAL:
+            # one that looks at the middle of the picture alone, where it fits, gains nothing by it
+            is_used = np.linalg.norm(observations_of(views).xy - np.array(SIZE) / 2.0, axis=1) < 250.0
+            fit = refine(fit, observations_of(views)._replace(weight=is_used.astype(float)))
         worst_px = 9000.0 if model == CameraModel.FULL_OPENCV else 0.1
         return Candidate(fit, is_used, worst_px)
 
-    models = (CameraModel.PINHOLE, CameraModel.RADIAL, CameraModel.OPENCV, CameraModel.FULL_OPENCV)
+    models = (CameraModel.PINHOLE, CameraModel.SIMPLE_RADIAL, CameraModel.OPENCV, CameraModel.FULL_OPENCV)
     one, two = (try_models(models, views, fit_model, threads) for threads in (1, 2))
     assert [trial.model for trial in one] == [trial.model for trial in two]
     # without decentering there is more left than chance leaves, without distortion it is hopeless
     assert one[0].model == CameraModel.OPENCV
     reasons = {trial.model: trial.reason for trial in one}
     assert "times the best's" in reasons[CameraModel.PINHOLE]
+    assert "times the best's" in reasons[CameraModel.SIMPLE_RADIAL]
     assert "leave it open: sigmas of up to 9e+03 px" in reasons[CameraModel.FULL_OPENCV]
     held_out = {trial.model: trial.held_out_px for trial in one}
     # the noise of two coordinates, and what poses and parameters take of it
     assert held_out[CameraModel.OPENCV] == pytest.approx(0.1 * np.sqrt(2.0), rel=0.1)
-    assert held_out[CameraModel.RADIAL] > 1.05 * held_out[CameraModel.OPENCV]
+
+
+def test_a_small_bias_is_seen_by_all_views_where_one_held_out_does_not_show_it() -> None:
+    """A fisheye lens that another family nearly has: 0.4 px off over the picture, 2 per cent of the residuals."""
+    camera = Camera(CameraModel.OPENCV_FISHEYE, *SIZE, np.array([420.0, 425.0, 630.0, 490.0, -0.02, 4e-3, -1e-3, 2e-4]))
+    views = seen(camera, 15, 0.2, 200)
+    base = first_fit(views, SIZE, closed_form(views, SIZE).k_matrix)
+
+    def fit_model(model: CameraModel) -> Candidate:
+        return Candidate(*inlier_fit(to_model(base, model, views), views), 0.1)
+
+    trials = try_models(
+        (CameraModel.FOV, CameraModel.OPENCV_FISHEYE, CameraModel.THIN_PRISM_FISHEYE), views, fit_model, 1
+    )
+    assert trials[0].model == CameraModel.OPENCV_FISHEYE
+    reasons = {trial.model: trial.reason for trial in trials[1:]}
+    assert "leaves residuals" in reasons[CameraModel.FOV] or "worse on views" in reasons[CameraModel.FOV]
+    assert "do not need" in reasons[CameraModel.THIN_PRISM_FISHEYE]

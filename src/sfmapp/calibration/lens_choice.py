@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from sfmapp.calibration.adjustment import Fit, TargetView, observations_of, refine, residuals_of
 from sfmapp.calibration.kernels import Observations
@@ -19,11 +20,19 @@ Bools = NDArray[np.bool_]
 
 # views are held out in so many groups, fewer where there are fewer views
 _FOLDS = 5
-# a model whose residuals are this many times the best's is not looked at further
-_HOPELESS = 3.0
-# nor one whose worst sigma in the picture is this many times the least of any, and this share of its diagonal: it fits
-# where there were boards, and is anything elsewhere
-_OPEN, _OPEN_SHARE = 3.0, 1.0 / 400.0
+# one good point in a hundred thousand is further off than this, squared, in sigmas of a coordinate
+REJECTED = float(chi2.isf(1e-5, 2))
+_ARITHMETIC_PX = 1e-6
+# a model whose residuals are this many times the best's is not looked at further; cut off, they are 3.4 times at most
+_HOPELESS = 2.0
+# nor one whose worst sigma in the picture is this share of its diagonal: it fits where there were boards, and is
+# anything elsewhere. A lens that few parameters do not describe is uncertain in the corners, and says so
+_OPEN_SHARE = 1.0 / 40.0
+# held-out views speak against a model that is worse by so many standard errors: the best of seventeen is so by luck too
+_STANDARD_ERRORS = 2.0
+# evidence below which a simpler model stays that is as good on views held out: ten is "very strong" (Kass and Raftery,
+# "Bayes factors", 1995), and corners share errors that no criterion knows of
+_STRONG_BIC = 10.0
 
 # those that are tried: a panorama is no lens, and pixels of no camera of today are skewed
 TRIED = tuple(
@@ -43,8 +52,9 @@ class Trial:
         fit: to all views.
         rms_px: of what it was fitted to.
         worst_px: largest sigma of a projection in the picture.
-        held_out: (V,) mean squared residual of each view while it was held out, pixels squared; None where it was not
-            worth it.
+        bic: Schwarz's criterion, by all points.
+        held_out: (V,) mean squared residual of each view while it was held out, far ones cut off, pixels squared; None
+            where it was not worth it.
         reason: why it was not chosen, or that it was.
     """
 
@@ -52,6 +62,7 @@ class Trial:
     fit: Fit
     rms_px: float
     worst_px: float
+    bic: float
     held_out: Array | None = None
     reason: str = ""
 
@@ -84,41 +95,52 @@ def try_models(
 ) -> list[Trial]:
     """Fit every model, hold out views of those that fit, and choose: the first of the result.
 
-    The model with the fewest parameters is taken that is no worse than the best by more than one standard error of
-    the differences, view by view (Breiman et al., "Classification and regression trees", 1984, the rule of one
-    standard error).
+    Views held out say which models may be right: those that are no worse than the best by more than two standard errors
+    of the differences, view by view. They cannot tell a small bias from the noise of a view, though, so among these
+    Schwarz's criterion decides, chi2 + P ln N ("Estimating the dimension of a model", 1978), which sees all points at
+    once and asks a price for every parameter; where it is not sure, a simpler model that does as well on views held out
+    stays. All are judged by all points: what a model leaves aside, or has no ray
+    for, counts as the largest residual that a good point may have, as does what is wrong for every model.
 
     Args:
         threads: how many are fitted at a time; the result does not depend on it.
     """
-    fitted: list[tuple[Trial, Bools]] = []
     with ThreadPoolExecutor(threads) as pool:
-        candidates = list(pool.map(fit_model, models))
-    for model, found in zip(models, candidates, strict=True):
-        r = residuals_of(found.fit, observations_of(views))[found.is_used]
-        rms = float(np.sqrt((r**2).sum(1).mean())) if len(r) and np.isfinite(r).all() else float("inf")
-        fitted.append((Trial(model, found.fit, rms, found.worst_px), found.is_used))
-    best_rms = min(trial.rms_px for trial, _ in fitted)
-    fits = [trial for trial, _ in fitted if trial.rms_px <= _HOPELESS * best_rms]
-    open_px = _OPEN * min((trial.worst_px for trial in fits), default=np.inf)
+        fitted = list(zip(models, pool.map(fit_model, models), strict=True))
+    obs = observations_of(views)
+    squared = [_squared(residuals_of(found.fit, obs)) for _, found in fitted]
+    # the noise of a coordinate by the model that fits most points best; half of the squared lengths are below 2 ln 2
+    limit = REJECTED * min(float(np.median(one)) for one in squared) / (2.0 * np.log(2.0))
+    # exact points have no noise but that of arithmetic
+    limit = max(limit, _ARITHMETIC_PX**2)
+    scores = [float(np.sqrt(np.minimum(one, limit).mean())) for one in squared]
+    is_hopeless = [len(fitted) > 1 and score > _HOPELESS * min(scores) for score in scores]
 
-    def tested(entry: tuple[Trial, Bools]) -> Trial:
-        trial, is_used = entry
-        camera = trial.fit.camera
-        if len(fitted) > 1 and not trial.rms_px <= _HOPELESS * best_rms:
-            return replace(trial, reason=f"its residuals are {trial.rms_px / best_rms:.1f} times the best's")
+    def tested(n: int) -> Trial:
+        model, found = fitted[n]
+        camera, own = found.fit.camera, squared[n][found.is_used]
+        rms = float(np.sqrt(own.mean())) if len(own) else float("inf")
+        chi2_sum = float(np.minimum(squared[n], limit).sum()) * REJECTED / limit
+        bic = chi2_sum + len(model.params) * float(np.log(2 * len(squared[n])))
+        trial = Trial(model, found.fit, rms, found.worst_px, bic)
+        if is_hopeless[n]:
+            return replace(trial, reason=f"its residuals are {scores[n] / min(scores):.1f} times the best's")
         if len(fitted) > 1 and not covers_picture(trial.fit):
             return replace(trial, reason="it has no ray for a part of the picture")
-        if not np.isfinite(trial.worst_px) or not trial.worst_px <= max(
-            open_px, _OPEN_SHARE * np.hypot(camera.width, camera.height)
-        ):
+        if not trial.worst_px <= _OPEN_SHARE * np.hypot(camera.width, camera.height):
             reason = f"the views leave it open: sigmas of up to {trial.worst_px:.3g} px in the picture"
             return replace(trial, reason=reason)
-        return replace(trial, held_out=hold_out(trial, views, is_used))
+        return replace(trial, held_out=hold_out(trial, views, found.is_used, limit))
 
     with ThreadPoolExecutor(threads) as pool:
-        trials = list(pool.map(tested, fitted))
+        trials = list(pool.map(tested, range(len(fitted))))
     return _chosen_first(trials)
+
+
+def _squared(residuals: Array) -> Array:
+    """(N,) squared lengths; infinite where the lens does not look."""
+    squared = (residuals**2).sum(1)
+    return np.where(np.isfinite(squared), squared, np.inf)
 
 
 def covers_picture(fit: Fit) -> bool:
@@ -132,20 +154,20 @@ def covers_picture(fit: Fit) -> bool:
     return bool(is_known.all()) or (camera.is_wide and bool(is_known.mean() > 0.5))
 
 
-def hold_out(trial: Trial, views: Sequence[TargetView], is_used: Bools) -> Array:
-    """(V,) mean squared residual of each view under the parameters that fit the others best."""
+def hold_out(trial: Trial, views: Sequence[TargetView], is_used: Bools, limit: float) -> Array:
+    """(V,) mean squared residual of all points of each view, each at most ``limit``, under the parameters that fit the
+    others best; parameters and the pose of a view follow from the points that the model takes for good."""
     num, ptr = len(views), observations_of(views).ptr
     num_folds = min(_FOLDS, num)
-    errors = np.full(num, np.inf)
+    errors = np.full(num, limit)
     for fold in range(num_folds):
         is_out = np.arange(num) % num_folds == fold
         trained = _refined(trial.fit, views, is_used, ptr, ~is_out)
         held = replace(trial.fit, camera=trained.camera, bend=trained.bend)
         for v in np.flatnonzero(is_out):
-            own = np.arange(num) == v
-            obs, start = _of(held, views, is_used, ptr, own)
-            found = residuals_of(refine(start, obs, hold_camera=True), obs)[obs.weight > 0]
-            errors[v] = float((found**2).sum(1).mean()) if np.isfinite(found).all() and len(found) else np.inf
+            obs, start = _of(held, views, is_used, ptr, np.arange(num) == v)
+            found = residuals_of(refine(start, obs, hold_camera=True), obs)
+            errors[v] = float(np.minimum(_squared(found), limit).mean())
     return errors
 
 
@@ -165,22 +187,39 @@ def _of(
 
 
 def _chosen_first(trials: list[Trial]) -> list[Trial]:
-    known = [trial for trial in trials if trial.held_out is not None and np.isfinite(trial.held_out).all()]
+    known = [trial for trial in trials if trial.held_out is not None]
     if not known:
         return sorted(trials, key=lambda trial: trial.rms_px)
     best = min(known, key=lambda trial: trial.held_out_px)
-    assert best.held_out is not None
-    chosen = best
-    for trial in sorted(known, key=lambda trial: (len(trial.model.params), trial.held_out_px)):
-        assert trial.held_out is not None
-        worse = trial.held_out - best.held_out
-        error = float(worse.std(ddof=1) / np.sqrt(len(worse))) if len(worse) > 1 else 0.0
-        if float(worse.mean()) <= error:
-            chosen = trial
-            break
+    worse = [_standard_errors(trial, best) for trial in known]
+    likely = [trial for trial, errors in zip(known, worse, strict=True) if errors <= _STANDARD_ERRORS]
+    chosen = min(likely, key=lambda trial: (trial.bic, len(trial.model.params)))
+    simpler = [
+        trial for trial in likely
+        if len(trial.model.params) < len(chosen.model.params) and trial.held_out_px <= chosen.held_out_px
+        and trial.bic <= chosen.bic + _STRONG_BIC
+    ]  # fmt: skip
+    chosen = min(simpler, key=lambda trial: trial.bic, default=chosen)
     why = "the best on views held out"
     if chosen is not best:
-        why = f"as good as {best.model.name} on views held out, within one standard error, with fewer parameters"
-    others = [trial for trial in trials if trial is not chosen]
-    others.sort(key=lambda trial: (trial.held_out is None, trial.held_out_px, trial.rms_px))
-    return [replace(chosen, reason=why), *others]
+        why = f"no worse than {best.model.name} on views held out, and the best by all views and number of parameters"
+    told = [replace(chosen, reason=why)]
+    for trial, errors in zip(known, worse, strict=True):
+        if trial is not chosen:
+            reason = f"worse on views held out, by {errors:.1f} standard errors"
+            if errors <= _STANDARD_ERRORS:
+                more = len(trial.model.params) > len(chosen.model.params)
+                does = "has parameters that its residuals do not need" if more else "leaves residuals"
+                reason = f"{does} (BIC {trial.bic - chosen.bic:+.0f})"
+            told.append(replace(trial, reason=reason))
+    told[1:] = sorted(told[1:], key=lambda trial: (trial.held_out_px, trial.rms_px))
+    return told + sorted((trial for trial in trials if trial.held_out is None), key=lambda trial: trial.rms_px)
+
+
+def _standard_errors(trial: Trial, best: Trial) -> float:
+    """By how many standard errors of the differences a model is worse than the best on views held out."""
+    assert trial.held_out is not None
+    assert best.held_out is not None
+    worse = trial.held_out - best.held_out
+    error = float(worse.std(ddof=1)) / np.sqrt(len(worse)) if len(worse) > 1 else 0.0
+    return float(worse.mean()) / error if error > 0 else (np.inf if worse.mean() > 0 else 0.0)

@@ -19,7 +19,7 @@ from sfmapp.calibration.boards import Board
 from sfmapp.calibration.kernels import Normal
 from sfmapp.calibration.result import CameraCalibration
 from sfmapp.calibration.uncertainty import image_grid, projection_sigma
-from sfmapp.camera.camera import Camera, pixels_to_rays, project
+from sfmapp.camera.camera import pixels_to_rays, project
 from sfmapp.geometry import rigid3
 
 Array = NDArray[np.float64]
@@ -27,7 +27,17 @@ Array = NDArray[np.float64]
 # where the middle of the board may be, as shares of the picture; how much of its width it fills; and how it is tilted
 _PLACES = (0.1, 0.3, 0.5, 0.7, 0.9)
 _FILLS = (0.45, 0.8)
-_TILTS_DEG = ((0.0, 0.0), (40.0, 0.0), (-40.0, 0.0), (0.0, 40.0), (0.0, -40.0), (30.0, 30.0), (-30.0, 30.0))
+_TILTS_DEG = (
+    (0.0, 0.0), (50.0, 0.0), (-50.0, 0.0), (0.0, 50.0), (0.0, -50.0),
+    (35.0, 35.0), (-35.0, 35.0), (35.0, -35.0), (-35.0, -35.0),
+)  # fmt: skip
+# the best of these is moved by such steps, then by half of them, as long as that is better, within bounds: place, share
+# of the width, tilts in degrees
+_STEPS = (0.1, 0.1, 0.15, 10.0, 10.0)
+_BOUNDS = ((0.05, 0.95), (0.05, 0.95), (0.3, 1.0), (-55.0, 55.0), (-55.0, 55.0))
+# of both together: every finder of boards here sees them at 60 degrees
+_LARGEST_TILT_DEG = 55.0
+_HALVINGS, _MOVES = 1, 4
 # of the points; a board that is further out of the picture is not found
 _INSIDE = 0.5
 _MARGIN_PX = 4.0
@@ -77,20 +87,14 @@ def next_views(
     # a board that fills half of the picture, where the calibration does not say how far its boards were
     half_full = 2.0 * float(np.ptp(board.points[:, 0])) * fit.camera.focal / fit.camera.width
     distance = made.distances[1] if made.distances else half_full
-    candidates = _candidates(fit.camera, board)
-    blocks = [
-        _sums(normal_at(Fit(fit.camera, pose[None], np.zeros(0), 0.0), observations_of([view])))
-        for pose, view, _ in candidates
-    ]
+    planner = _Planner(made, board, distance)
     found: list[NextView] = []
-    for _ in range(min(num, len(candidates))):
-        scores = [_mean_sigma(made, sums.plus(block), distance) for block in blocks]
-        best = int(np.argmin(scores))
-        if not np.isfinite(scores[best]):
+    for _ in range(num):
+        best = planner.best(sums)
+        if best is None:
             break
-        sums = sums.plus(blocks[best])
-        pose, view, hint = candidates[best]
-        found.append(NextView(pose, view.xy, hint, scores[best]))
+        sums = sums.plus(best.block)
+        found.append(NextView(best.pose, best.view.xy, _hint(best.place), planner.sigma_px(sums)))
     return found
 
 
@@ -124,29 +128,76 @@ def _mean_sigma(made: CameraCalibration, sums: _Sums, distance: float) -> float:
     return mean_sigma(expected, distance)
 
 
-def _candidates(camera: Camera, board: Board) -> list[tuple[Array, TargetView, str]]:
-    """Poses of a board of which enough is in the picture, what would be seen, and how to say it."""
-    middle, extent = board.points.mean(0), float(np.ptp(board.points, axis=0).max())
-    found = []
-    for u, v, fill, tilt in product(_PLACES, _PLACES, _FILLS, _TILTS_DEG):
+@dataclass(frozen=True)
+class _Candidate:
+    """A view that might be taken: (u, v, fill, tilt, tilt), where it is, what is seen, and what that tells."""
+
+    place: tuple[float, ...]
+    pose: Array
+    view: TargetView
+    block: _Sums
+
+
+class _Planner:
+    """Views of a board before a camera, and what they would bring."""
+
+    def __init__(self, made: CameraCalibration, board: Board, distance: float) -> None:
+        self._made, self._board, self._distance = made, board, distance
+        self._middle, self._extent = board.points.mean(0), float(np.ptp(board.points, axis=0).max())
+        grid = product(_PLACES, _PLACES, _FILLS, _TILTS_DEG)
+        tried = [self._at((u, v, fill, *tilt)) for u, v, fill, tilt in grid]
+        self._candidates = [one for one in tried if one is not None]
+
+    def sigma_px(self, sums: _Sums) -> float:
+        """Root of the mean variance of a projection once these sums are those of the views."""
+        return _mean_sigma(self._made, sums, self._distance)
+
+    def best(self, sums: _Sums) -> _Candidate | None:
+        """The view that helps most beside those that make the sums; None where none does."""
+        scores = [self.sigma_px(sums.plus(one.block)) for one in self._candidates]
+        if not scores or not np.isfinite(min(scores)):
+            return None
+        best, score = self._candidates[int(np.argmin(scores))], min(scores)
+        for halving in range(_HALVINGS + 1):
+            for _ in range(_MOVES):
+                before = score
+                for k, step in enumerate(_STEPS):
+                    for sign in (-1.0, 1.0):
+                        place = list(best.place)
+                        place[k] = float(np.clip(place[k] + sign * step / 2.0**halving, *_BOUNDS[k]))
+                        tried = self._at(tuple(place))
+                        now = np.inf if tried is None else self.sigma_px(sums.plus(tried.block))
+                        if tried is not None and now < score:
+                            best, score = tried, now
+                if not score < before:
+                    break
+        return best
+
+    def _at(self, place: tuple[float, ...]) -> _Candidate | None:
+        """The view at a place; None where too little of the board is in the picture."""
+        u, v, fill, *tilt = place
+        if np.hypot(tilt[0], tilt[1]) > _LARGEST_TILT_DEG:
+            return None
+        camera, board = self._made.camera, self._board
         ray = pixels_to_rays(camera, np.array([[u * camera.width, v * camera.height]]))[0]
         if not np.isfinite(ray).all():
-            continue
+            return None
         # as far as makes the board fill so much of the width where the lens is straight, along the ray
-        depth = extent * camera.focal / (fill * camera.width)
+        depth = self._extent * camera.focal / (fill * camera.width)
         rotation = rigid3.exp_so3(np.radians([tilt[0], tilt[1], 0.0]))
-        pose = rigid3.from_matrix(rotation, ray * depth - rotation @ middle)
+        pose = rigid3.from_matrix(rotation, ray * depth - rotation @ self._middle)
         xy = project(camera, rigid3.apply(pose, board.points))
         with np.errstate(invalid="ignore"):
             inside = ((xy > _MARGIN_PX) & (xy < np.array([camera.width, camera.height]) - _MARGIN_PX)).all(1)
         if inside.mean() < _INSIDE:
-            continue
+            return None
         view = TargetView("", board.points[inside], xy[inside])
-        found.append((pose, view, _hint(u, v, fill, tilt)))
-    return found
+        block = _sums(normal_at(Fit(camera, pose[None], np.zeros(0), 0.0), observations_of([view])))
+        return _Candidate(place, pose, view, block)
 
 
-def _hint(u: float, v: float, fill: float, tilt: tuple[float, float]) -> str:
+def _hint(place: tuple[float, ...]) -> str:
+    u, v, fill, *tilt = place
     rows = "top" if v < 0.4 else "bottom" if v > 0.6 else ""
     columns = "left" if u < 0.4 else "right" if u > 0.6 else ""
     where = f"at the {' '.join(part for part in (rows, columns) if part)}" if rows or columns else "in the middle"

@@ -29,6 +29,7 @@ class BoardPictureReport(Report):
         rms_px: of these.
         unused: why it has no part in the calibration.
         problem: why it stands out though it has a part.
+        picked: why a frame of a video was taken.
     """
 
     name: str
@@ -37,6 +38,7 @@ class BoardPictureReport(Report):
     rms_px: float | None = None
     unused: str | None = None
     problem: str | None = None
+    picked: str | None = None
 
 
 class LensTrialReport(Report):

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 from scipy.stats import f as fisher
 
 from sfmapp.calibration.adjustment import Fit, TargetView, normal_at, observations_of, refine, residuals_of
 from sfmapp.calibration.kernels import Observations
-from sfmapp.calibration.lens_choice import TRIED, Candidate, Trial, try_models
+from sfmapp.calibration.lens_choice import REJECTED, TRIED, Candidate, Trial, try_models
 from sfmapp.calibration.result import CameraCalibration, ViewFit
 from sfmapp.calibration.start import first_fit, refine_robustly, to_model
 from sfmapp.calibration.uncertainty import frame_covariance, image_grid, projection_sigma
@@ -30,8 +29,6 @@ Bools = NDArray[np.bool_]
 
 STAGE = "calibration"
 LEAST_VIEWS, ADVISED_VIEWS = 3, 10
-# one good point in a hundred thousand is further off than this, squared, in sigmas
-_REJECTED = float(chi2.isf(1e-5, 2))
 _ROUNDS = 4
 # a view whose typical residual is so many times that of all, and so many pixels, was not seen rightly
 _WRONG_VIEW, _WRONG_VIEW_PX = 20.0, 3.0
@@ -170,12 +167,12 @@ def inlier_fit(start: Fit, views: Sequence[TargetView], bends: Sequence[Array] |
     fit = start
     squared = (residuals_of(fit, obs) ** 2).sum(1)
     variance = float(np.nanmedian(squared)) / (2.0 * np.log(2.0))
-    is_used = np.isfinite(squared) & (squared <= _REJECTED * variance)
+    is_used = np.isfinite(squared) & (squared <= REJECTED * variance)
     for _ in range(_ROUNDS):
         fit = refine(fit, obs._replace(weight=is_used.astype(np.float64)))
         squared = (residuals_of(fit, obs) ** 2).sum(1)
         variance = float(squared[is_used].sum()) / max(_degrees_of_freedom(fit, is_used, obs.ptr), 1)
-        now = np.isfinite(squared) & (squared <= _REJECTED * variance)
+        now = np.isfinite(squared) & (squared <= REJECTED * variance)
         if (now == is_used).all():
             break
         is_used = now

@@ -21,6 +21,9 @@ from sfmapp.cli.common import (
 if TYPE_CHECKING:
     from sfmapp.pipelines.calibration.board import CalibrationResult
 
+# so many pictures that stand out are named on the terminal; a video has more
+_LINES = 15
+
 EPILOG = f"""\
 {BOARD_FORMS}
 
@@ -94,10 +97,10 @@ def _print(result: CalibrationResult) -> None:
         f"sigma of a projection over the picture: {report.mean_sigma_px:.4f} px in the mean, "
         f"{report.worst_sigma_px:.4f} px at worst"
     )
-    for picture in report.pictures:
-        why = picture.unused or picture.problem
-        if why:
-            print(f"  {picture.name}: {why}")
+    odd = [f"  {one.name}: {one.unused or one.problem}" for one in report.pictures if one.unused or one.problem]
+    print("".join(f"{line}\n" for line in odd[:_LINES]), end="")
+    if len(odd) > _LINES:
+        print(f"  and {len(odd) - _LINES} more, in report.html")
     for warning in made.warnings:
         print(f"  note: {warning}")
     for n, view in enumerate(report.next_views, 1):

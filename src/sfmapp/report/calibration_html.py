@@ -105,7 +105,7 @@ def _pictures(board: BoardReport) -> str:
     for one in board.pictures:
         light = "red" if one.unused else "amber" if one.problem else "green"
         rms = None if one.rms_px is None else f"{one.rms_px:.3f}"
-        why = one.unused or one.problem
+        why = one.unused or one.problem or one.picked
         rows.append([(f"t {light}", one.name), ("", one.num_points), ("", one.num_used), ("", rms), ("w", why)])
     head = [("t", "photograph"), ("", "points"), ("", "used"), ("", "rms px"), ("t", "why")]
     return "<h2>Photographs</h2>" + table(head, rows)

@@ -65,7 +65,7 @@ _LAYOUTS = (
 )
 HOW_TO_CALIBRATE = (
     "give --camera PINHOLE,fx,fy,cx,cy or --camera FILE (calib.json, cameras.txt, sensor.yaml, camera_info.yaml, "
-    "OpenCV's yml or xml), to be had by photographing a chessboard (OpenCV's calibrate_camera, Kalibr); or let "
+    "OpenCV's yml or xml), to be had from photographs or a video of a chessboard by sfmapp calibrate board; or let "
     "--self-calibrate find the focal length from the first minute"
 )
 

@@ -203,6 +203,7 @@ def _report(
                 rms_px=fit.rms_px if fit is not None and num_used else None,
                 unused=one.unused if fit is None or num_used else problem,
                 problem=problem if num_used else None,
+                picked=one.picked,
             )
         )
     sigma = projection_sigma(made, image_grid(made.camera), made.distances[1] if made.distances else None)

@@ -6,7 +6,7 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -49,12 +49,14 @@ class BoardPicture:
         name: of the file, or number of the frame.
         detection: what was found.
         unused: why it is left aside; None for one that counts.
+        picked: why a frame of a video was taken.
         path: of a photograph; None of a frame.
     """
 
     name: str
     detection: Detection
     unused: str | None = None
+    picked: str | None = None
     path: Path | None = None
 
 
@@ -107,12 +109,12 @@ def _look_at_photographs(job: Job, given: Board | None) -> BoardPictures:
         if (record.width, record.height) != size:
             turned = ", it was turned by a program" if (record.height, record.width) == size else ""
             other = f"it has {record.width}x{record.height} pixels, most have {size[0]}x{size[1]}{turned}"
-            return BoardPicture(record.name, _nothing(other), other, record.path)
+            return BoardPicture(record.name, _nothing(other), other, path=record.path)
         try:
             found = detect_board(read_gray(record), board)
         except InputError as error:
-            return BoardPicture(record.name, _nothing(str(error)), str(error), record.path)
-        return BoardPicture(record.name, found, found.problem, record.path)
+            return BoardPicture(record.name, _nothing(str(error)), str(error), path=record.path)
+        return BoardPicture(record.name, found, found.problem, path=record.path)
 
     pictures = _in_threads(look, images.images, job.threads, job.events)
     return BoardPictures(board, guess, size, tuple(pictures), {record.name: record.digest for record in images.images})
@@ -221,7 +223,8 @@ def _look_at_video(job: Job, given: Board | None) -> BoardPictures:
 
 
 def choose_frames(pictures: Sequence[BoardPicture], size: tuple[int, int], board: Board) -> list[BoardPicture]:
-    """The same pictures; those that are blurred, or show what another shows, with the reason why they do not count.
+    """The same pictures, each with the reason why it was picked or does not count: it is blurred, or shows what another
+    shows.
 
     Frames are taken one after another, each as far as can be from all that were taken: by where the corners of the
     whole board are, so that place, distance and tilt all count.
@@ -238,6 +241,7 @@ def choose_frames(pictures: Sequence[BoardPicture], size: tuple[int, int], board
     diagonal = float(np.hypot(*size))
     # the one with most points begins
     taken: list[int] = []
+    picked: dict[int, str] = {}
     left = sorted(where, key=lambda i: (-len(pictures[i].detection.idx), i))
     while left and len(taken) < _KEPT:
         if taken:
@@ -245,16 +249,16 @@ def choose_frames(pictures: Sequence[BoardPicture], size: tuple[int, int], board
             n = int(np.argmax(away))
             if away[n] < _ALIKE:
                 break
+            why = f"the board is {away[n]:.0%} of the picture from where those before it have it"
         else:
-            n = 0
+            n, why = 0, "it shows most points"
+        picked[left[n]] = why
         taken.append(left.pop(n))
     for i in left:
         nearest = min(taken, key=lambda k: _apart(where[i], where[k]))
         apart = _apart(where[i], where[nearest]) / diagonal
         reasons[i] = f"like frame {pictures[nearest].name}: the board is {apart:.1%} of the picture away"
-    return [
-        BoardPicture(one.name, one.detection, reasons.get(i, one.unused), one.path) for i, one in enumerate(pictures)
-    ]
+    return [replace(one, unused=reasons.get(i, one.unused), picked=picked.get(i)) for i, one in enumerate(pictures)]
 
 
 def _outline(detection: Detection, board: Board) -> NDArray[np.float64]:
