@@ -328,6 +328,10 @@ def promises(folder: Path) -> Iterator[Promise]:
     within = sum(abs(math.log(run["scale"])) < 3 * run["sigma"] for run in scaled)
     text = "a scale told by an IMU is within three stated sigmas"
     yield Promise("inertial", text, within, len(scaled), report["date"][:10])
+    both = [(run["alone"], run["inertial"]) for run in report["runs"]]
+    live = [[row["ate_live_mm"] for row in pair] for pair in both if all("ate_live_mm" in row for row in pair)]
+    text = "poses given out live drift less with an IMU than without"
+    yield Promise("inertial", text, sum(b < a for a, b in live), len(live), report["date"][:10])
     report = read(folder, "odometry")
     same = [row["same_bytes"] for row in report["rows"]]
     yield Promise("odometry", "two runs write the same bytes", sum(same), len(same), report["date"][:10])
