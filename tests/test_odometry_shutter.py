@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 
 from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.images.sequence import Imu
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.records import FrameRecord
 from sfmapp.odometry.result import FrameState
@@ -103,3 +106,35 @@ def test_frames_without_neighbours_say_nothing() -> None:
     for record in records[1:]:
         record.frame_from_keyframe = np.full(7, np.nan)
     assert straighten(records, keyframes, 0)["readout"] == 0.0
+
+
+_steady = pose_at
+
+
+def trembling(frame: float) -> np.ndarray:
+    """The same with a hand that trembles by half a degree, faster than frames can tell."""
+    pose, t = _steady(frame), frame / 30.0
+    turn = rigid3.exp_so3(0.008 * np.sin(2 * np.pi * np.array([6.1, 7.3, 5.2]) * t + np.arange(3)))
+    rotation = turn @ rigid3.rotation_matrix(pose)
+    return rigid3.from_matrix(rotation, -rotation @ rigid3.center(pose))
+
+
+def gyroscope(late_s: float = 0.0) -> Imu:
+    """On the camera, with a bias and the noise of a small sensor."""
+    times, h, rng = np.arange(-0.1, 3.1, 0.005), 1e-3, np.random.default_rng(6)
+    rotation = [[rigid3.rotation_matrix(trembling(30 * (t + d))) for t in times] for d in (-h, h)]
+    rates = rigid3.log_so3(np.array(rotation[0]) @ np.array(rotation[1]).swapaxes(1, 2)) / (2 * h)
+    gyro = rates + [0.01, -0.02, 0.03] + 1.7e-4 * np.sqrt(200) * rng.normal(size=rates.shape)
+    return Imu(times + late_s, gyro, np.zeros_like(gyro), rigid3.IDENTITY, 1.7e-4, 2e-3, 1.9e-5, 3e-3)
+
+
+def test_a_gyroscope_tells_what_a_hand_does_between_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "pose_at", trembling)
+    errors, found = [], []
+    for imu in (None, gyroscope(), gyroscope(late_s=0.4)):
+        keyframes, records = make_map(0.6)
+        found.append(straighten(records, keyframes, 0, imu)["readout"])
+        errors.append(error(keyframes))
+    assert found[1] == pytest.approx(0.6, abs=0.04)
+    assert errors[1] < 0.5 * errors[0]
+    assert errors[2] < 1.05 * errors[0]  # on another clock: not believed

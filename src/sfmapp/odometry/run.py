@@ -439,7 +439,7 @@ class Odometry:
         looked for."""
         if self.rig.is_stereo or not self.options.refine_camera or is_too_large(local.keyframes):
             return None
-        numbers = straighten(self.records, local.keyframes, local.map_idx)
+        numbers = straighten(self.records, local.keyframes, local.map_idx, self.imu)
         self.events.raise_if_cancelled()
         if numbers.readout:
             self.events.decided("adjustment", "the images show a rolling shutter, which is undone", **numbers)

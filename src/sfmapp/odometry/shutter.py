@@ -2,7 +2,9 @@
 
 A point of row y is seen at the time ``readout (y / height - 1/2)`` from the middle of the image. How fast it moves in
 the image there follows from the map itself: it is projected with the poses of the frames before and after. So the
-readout, as a share of the time between frames, is the only unknown. Adjustments with three values of it tell where the
+readout, as a share of the time between frames, is the only unknown. A hand trembles faster than frames follow each
+other: where there is a gyroscope, it tells how the camera turned while a frame was read, unless the motion by frames
+explains more. Adjustments with three values of it tell where the
 cost is least, and whether the images care at all: a global shutter, or a camera that hardly moves, leaves it at zero.
 """
 
@@ -18,7 +20,9 @@ from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import project
 from sfmapp.geometry import rigid3
+from sfmapp.images.sequence import Imu
 from sfmapp.mapping.structure import residual_scale_px
+from sfmapp.odometry.inertial.window import rates_at
 from sfmapp.odometry.map.backend import Job, make_job, take_over
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.records import FrameRecord, measure_again
@@ -36,22 +40,31 @@ _STRIDES, _MAX_READOUT = (0.25, 0.1), 1.0
 _MIN_READOUT = 0.05
 # Frames that are farther apart than that many steady steps say nothing about the motion in between.
 _MAX_GAP = 2.5
+# A time over which a motion is straight, as a share of that between frames.
+_SHORT = 0.01
 # Of each adjustment, the last one having brought the map close to its minimum; and of a first glance, which spares all
 # else where there is no sign of a rolling shutter.
 _STEPS, _GLANCE_STEPS = 12, 3
 
 
-def straighten(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int) -> ShutterReport:
+def straighten(
+    records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, imu: Imu | None = None
+) -> ShutterReport:
     """Find the readout of the camera of a map, and move what its frames saw to where a global shutter had seen it.
 
     Where that is worth it, the map is adjusted, and observations and poses are changed in place. Else nothing is.
+
+    Args:
+        imu: measured beside the frames; None where there is none, or where it is not to count.
 
     Returns:
         The numbers behind the decision.
     """
     total, first = 0.0, (0.0, 0.0)
+    sources = [None] if imu is None else [None, imu]
     for stride in _STRIDES:
-        readout, evidence, job = _search(records, keyframes, map_idx, stride)
+        tried = [(_search(_RowShift(records, keyframes, map_idx, one), keyframes, stride), one) for one in sources]
+        (readout, evidence, job), best = max(tried, key=lambda pair: pair[0][1])
         if stride == _STRIDES[0]:
             first = evidence, readout
         # what is next gained is little, but never a loss
@@ -59,22 +72,20 @@ def straighten(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int)
         if job is None or not evidence >= least or not _MIN_READOUT <= abs(total + readout) <= _MAX_READOUT:
             break
         total += readout
-        _move(records, keyframes, map_idx, readout)
+        sources = [best]
+        _move(records, keyframes, map_idx, _RowShift(records, keyframes, map_idx, best), readout)
         take_over(job, keyframes)
         measure_again(records, keyframes, map_idx)
     return ShutterReport(evidence=first[0], min_evidence=MIN_EVIDENCE, first_readout=first[1], readout=total)
 
 
-def _search(
-    records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, stride: float
-) -> tuple[float, float, Job | None]:
+def _search(shift_of: _RowShift, keyframes: KeyframeMap, stride: float) -> tuple[float, float, Job | None]:
     """The readout of least cost in steps of a stride, what it gains, and the map adjusted with it; None for the map
     where there is no least cost within reach, or costs that are no numbers."""
     everything = np.arange(len(keyframes.keyframes))
     job = make_job(keyframes, everything, everything > 0)
     model, tracks = job.model, job.model.tracks
     shifts = np.zeros_like(tracks.obs_xy)
-    shift_of = _RowShift(records, keyframes, map_idx)
     for k, keyframe in enumerate(keyframes.keyframes):
         obs = tracks.observations_of_image(k)
         shifts[obs] = shift_of(keyframe.frame_idx, model.point_xyz[tracks.obs_track_idx[obs]], tracks.obs_xy[obs])
@@ -107,9 +118,10 @@ def _vertex(before: float, here: float, after: float) -> float:
     return 0.5 * (before - after) / bend
 
 
-def _move(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, readout: float) -> None:
+def _move(
+    records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, shift_of: _RowShift, readout: float
+) -> None:
     """Take what a readout adds from all observations."""
-    shift_of = _RowShift(records, keyframes, map_idx)
     for keyframe in keyframes.keyframes:
         xy = keyframe.xy[:, 0]
         keyframe.xy[:, 0] = xy - readout * shift_of(keyframe.frame_idx, keyframes.point_xyz[keyframe.point_id], xy)
@@ -123,7 +135,9 @@ def _move(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, read
 class _RowShift:
     """How far points move in the image between the middle of a readout of a whole frame and their rows."""
 
-    def __init__(self, records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int) -> None:
+    def __init__(
+        self, records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, imu: Imu | None = None
+    ) -> None:
         rows = [r for r in records if r.map_idx == map_idx and r.has_pose]
         self._camera = keyframes.rig.cameras[0]
         self._poses = [
@@ -132,6 +146,11 @@ class _RowShift:
         self._position = {r.frame_idx: n for n, r in enumerate(rows)}
         self._times = np.array([r.timestamp_s for r in rows])
         self._unit = float(np.median(np.diff(self._times))) if len(rows) > 1 else 0.0
+        self._rates: Array | None = None  # (F, 3) rad/s of the camera
+        if imu is not None:
+            times = np.array([k.timestamp_s for k in keyframes.keyframes])
+            poses = np.array([k.rig_from_world for k in keyframes.keyframes])
+            self._rates = rates_at(self._times, times, poses, imu)
 
     def __call__(self, frame_idx: int, xyz: Array, xy: Array) -> Array:
         """(N, 2) pixels for points seen at pixels in a frame; zero where the motion is not known."""
@@ -142,9 +161,24 @@ class _RowShift:
         gap = float(self._times[after] - self._times[before]) / self._unit
         if gap > _MAX_GAP:
             return np.zeros_like(xy)
-        first, last = (project(self._camera, rigid3.apply(self._poses[k], xyz)) for k in (before, after))
-        shift = (last - first) / gap * (xy[:, 1] / self._camera.height - 0.5)[:, None]
+        if self._rates is None or not np.isfinite(self._rates[n]).all():
+            first, last = self._poses[before], self._poses[after]
+        else:
+            first, last, gap = *self._turned(n, before, after, gap), 2 * _SHORT
+        here, there = (project(self._camera, rigid3.apply(pose, xyz)) for pose in (first, last))
+        shift = (there - here) / gap * (xy[:, 1] / self._camera.height - 0.5)[:, None]
         return np.where(np.isfinite(shift), shift, 0.0)
+
+    def _turned(self, n: int, before: int, after: int, gap: float) -> tuple[Array, Array]:
+        """Poses (7,) a short time before and after a frame, which turns as measured and moves as those around it."""
+        assert self._rates is not None
+        center, rotation = rigid3.center(self._poses[n]), rigid3.rotation_matrix(self._poses[n])
+        way = (rigid3.center(self._poses[after]) - rigid3.center(self._poses[before])) / gap
+        out = []
+        for time in (-_SHORT, _SHORT):
+            turned = rigid3.exp_so3(-time * self._unit * self._rates[n]) @ rotation
+            out.append(rigid3.from_matrix(turned, -turned @ (center + time * way)))
+        return out[0], out[1]
 
 
 def _adjusted(

@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu
-from sfmapp.odometry.inertial.integration import gyro_bias_of, intervals_between, map_from_imu_rotation, reintegrate
+from sfmapp.odometry.inertial.integration import (
+    Interval,
+    gyro_bias_of,
+    intervals_between,
+    map_from_imu_rotation,
+    reintegrate,
+)
 
 Array = NDArray[np.float64]
 
@@ -56,18 +62,42 @@ def turns_between(times_s: Array, cam_from_world: Array, imu: Imu, first: int = 
     Returns:
         None of them where the measurements are too few, or contradict the keyframes.
     """
-    intervals = intervals_between(times_s, np.arange(len(times_s)), imu, _MAX_INTERVAL_S)
-    if len(intervals) < _MIN_INTERVALS:
+    found = _bias(times_s, cam_from_world, imu)
+    if found is None:
         return []
-    bias, left, turned = gyro_bias_of(intervals, map_from_imu_rotation(cam_from_world, imu))
-    if not left < _MAX_LEFT * max(turned, _MIN_TURN_RAD):
-        return []
+    intervals, bias, left = found
     imu_from_cam, out = rigid3.rotation_matrix(imu.imu_from_cam), []
     for interval in intervals:
         rotation = imu_from_cam.T @ reintegrate(interval, bias).rotation @ imu_from_cam
         sigma = np.hypot(_EXCESS * imu.gyro_noise * np.sqrt(interval.duration), left / _ROOT_3)
         out.append(Turn(first + interval.first, first + interval.second, rotation, float(sigma)))
     return out
+
+
+def rates_at(times_s: Array, keyframe_times_s: Array, cam_from_world: Array, imu: Imu) -> Array | None:
+    """Angular velocities (N, 3) of the camera, in its own frame in rad/s, at some times, by the gyroscope.
+
+    Args:
+        times_s: (N,). keyframe_times_s: (K,), cam_from_world: (K, 7) keyframes that tell its bias.
+
+    Returns:
+        None where the measurements are too few, or contradict the keyframes; NaN at times that they do not cover.
+    """
+    found = _bias(keyframe_times_s, cam_from_world, imu)
+    if found is None:
+        return None
+    rates = [np.interp(times_s, imu.timestamps_s, column, np.nan, np.nan) for column in (imu.gyro - found[1]).T]
+    return np.stack(rates, 1) @ rigid3.rotation_matrix(imu.imu_from_cam)
+
+
+def _bias(times_s: Array, cam_from_world: Array, imu: Imu) -> tuple[list[Interval], Array, float] | None:
+    """What was measured between keyframes, the bias (3,) with which it agrees best with them, and what that leaves of a
+    rotation in radians; None where that is too little, or too much is left."""
+    intervals = intervals_between(times_s, np.arange(len(times_s)), imu, _MAX_INTERVAL_S)
+    if len(intervals) < _MIN_INTERVALS:
+        return None
+    bias, left, turned = gyro_bias_of(intervals, map_from_imu_rotation(cam_from_world, imu))
+    return (intervals, bias, left) if left < _MAX_LEFT * max(turned, _MIN_TURN_RAD) else None
 
 
 def turn_factor(first_key: int, second_key: int, turn: Turn) -> Any:
