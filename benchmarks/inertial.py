@@ -5,9 +5,9 @@
 
 Each flight is tracked twice, with its IMU and without. The scale of the run with it is held against the true one in its
 own standard deviations. The absolute error of both is after the best similarity (the run without has no metres), and of
-the run with it also after the best rigid motion, in the metres that it states. Live errors are those of the poses as they
-were given out while the map grew, after the best similarity. Every third flight is blurred (exposed for 25 ms, not 6),
-every third one comes with a mounting that is wrong by a degree and centimetres. A row names the commit that it is of.
+the run with it also after the best rigid motion, in the metres that it states. Live errors, after the best similarity,
+are those of the poses as they were given out while the map grew. Every third flight is blurred (exposed for 25 ms, not
+6), every third one has a mounting that is wrong by a degree and centimetres. A row names the commit that it is of.
 """
 
 from __future__ import annotations
