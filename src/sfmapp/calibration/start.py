@@ -1,9 +1,8 @@
 """Where the refinement of a calibration begins: a camera and poses that are near enough for it.
 
-Zhang's closed form knows no distortion, and a strong one ruins it. So beside it, lenses of known focal length are
-tried, perspective and equidistant; of the few that fit best the distortion is refined, and the best of these is the
-start of
-every other model.
+Zhang's closed form knows no distortion, and a strong one ruins it. So lenses of known focal length, perspective and
+equidistant, are tried beside it. Of the few that fit best the distortion is refined; the best of these is where every
+other model starts.
 """
 
 from __future__ import annotations

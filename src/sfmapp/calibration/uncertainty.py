@@ -1,10 +1,9 @@
 """How sure a calibration is: the covariance of its parameters, and of where it puts a point in the picture.
 
-The parameters alone do not say that: what turns all boards together in front of the camera is taken for a shift of the
-principal point, and does no harm. So the frame of the camera belongs to the unknowns: the motion that fits the boards'
-of all views best, weighted as they were measured, is the error of the frame, and a point that stays where it is moves
-by both. This is what mrcal's documentation calls the uncertainty of projection; here it is linear algebra, for the best
-common motion is the mean of the views' own motions under their normal equations.
+The covariance of the parameters alone says too much: a principal point that is off is made up for by boards that are
+all turned, and does no harm. So the frame of the camera is an unknown too. Its error is the one motion that fits those
+of all boards best, each weighted by its normal equations, and a projection moves by the errors of parameters and frame
+together. mrcal's documentation calls this the uncertainty of projection.
 """
 
 from __future__ import annotations
