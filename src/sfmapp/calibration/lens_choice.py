@@ -95,12 +95,13 @@ def try_models(
 ) -> list[Trial]:
     """Fit every model, hold out views of those that fit, and choose: the first of the result.
 
-    Views held out say which models may be right: those that are no worse than the best by more than two standard errors
-    of the differences, view by view. They cannot tell a small bias from the noise of a view, though, so among these
-    Schwarz's criterion decides, chi2 + P ln N ("Estimating the dimension of a model", 1978), which sees all points at
-    once and asks a price for every parameter; where it is not sure, a simpler model that does as well on views held out
-    stays. All are judged by all points: what a model leaves aside, or has no ray
-    for, counts as the largest residual that a good point may have, as does what is wrong for every model.
+    Held-out views say which models may be right: those at most two standard errors worse than the best, by differences
+    view by view. A bias below the noise of a view escapes them. So among these models Schwarz's criterion decides,
+    chi2 + P ln N over all points ("Estimating the dimension of a model", 1978); where it is not sure, a simpler model
+    that does as well on held-out views stays.
+
+    All are judged by all points: one that a model leaves aside, or has no ray for, counts as the largest residual that
+    a good point may have.
 
     Args:
         threads: how many are fitted at a time; the result does not depend on it.

@@ -93,9 +93,9 @@ def _k_from_b(b: Array, unscale: Array) -> Array | None:
 def plane_poses(camera: Camera, views: Sequence[TargetView]) -> Array:
     """(V, 7) cam_from_target of planes z = 0, from pixels of any lens; NaN where there is none in front of it.
 
-    The DLT of unit rays d: d x H (X, Y, 1) = 0, so that rays may be anywhere around; the two columns that are rotation
-    are brought onto SO(3) by SVD. As |d x v|^2 = v^T (I - d d^T) v, the normal equations of a view are the sum of
-    products of two symmetric matrices, and those of all views come together.
+    The DLT of unit rays d, which may point anywhere: d x H (X, Y, 1) = 0; the two columns that are rotation are brought
+    onto SO(3) by SVD. As |d x v|^2 = v^T (I - d d^T) v, the normal equations of a view are sums of products of two
+    symmetric matrices, which are made for all views at once.
     """
     if not views:
         return np.zeros((0, 7))
