@@ -282,8 +282,7 @@ def write_results(rows: list[dict[str, Any]]) -> None:
         "about three axes, mean place. Phone: sigmas of 3 and 6 m that nobody states; RTK: 2 and 3 cm, stated; "
         "drifting: as the phone, errors of neighbours correlated by 0.8. Half a pixel of noise, a wrong lens to begin "
         "with, errors drawn anew in every row. Cameras of a survey share errors: a row of 30 surveys wavers by some "
-        "3 %, in its scale by 4 %; the last rows, of all, by 1 and 2 %. Intervals of drifting receivers, whose "
-        "correlation 30 photographs hardly tell, are on the wide side.",
+        "3 %, in its scale by 4 %; the last rows, of all, by 1 and 2 %.",
         "",
         "| survey | receiver | wrong | placed | horizontal | height | scale | rotation | mean place | wrong ones found "
         "| right ones lost |",

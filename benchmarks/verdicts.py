@@ -93,6 +93,7 @@ def rows_of(folder: Path) -> list[Row]:
         "known_points": known_point_rows,
         "rigs": rig_rows,
         "panorama": panorama_rows,
+        "tagged_sets": tagged_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
 
@@ -165,6 +166,22 @@ def panorama_rows(folder: Path) -> Iterator[Row]:
         ):  # fmt: skip
             if key in peer:  # a program that joins nothing has no error
                 yield Row("panorama", case, quantity, unit, "less", ours[key], program, peer[key], *about)
+
+
+def tagged_rows(folder: Path) -> Iterator[Row]:
+    """Photographs with positions in their tags against pycolmap's mapper with position priors."""
+    report = read(folder, "tagged_sets")
+    about = (False, report["date"][:10], report["commit"])
+    runs = {(run["kind"], run["seed"], run["program"]): run for run in report["rows"]}
+    for (kind, seed, program), peer in runs.items():
+        if program == "sfmapp":
+            continue
+        ours, case = runs[kind, seed, "sfmapp"], f"{kind}, seed {seed}"
+        for quantity, unit, key in (
+            ("error of the scale", "share", "scale_error_share"), ("places of cameras, rms", "m", "rms_m"),
+            ("CPU time", "s", "cpu_s"),
+        ):  # fmt: skip
+            yield Row("tagged_sets", case, quantity, unit, "less", abs(ours[key]), program, abs(peer[key]), *about)
 
 
 def known_point_rows(folder: Path) -> Iterator[Row]:
