@@ -94,6 +94,7 @@ def rows_of(folder: Path) -> list[Row]:
         "rigs": rig_rows,
         "panorama": panorama_rows,
         "tagged_sets": tagged_rows,
+        "circle_centers": circle_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
 
@@ -166,6 +167,19 @@ def panorama_rows(folder: Path) -> Iterator[Row]:
         ):  # fmt: skip
             if key in peer:  # a program that joins nothing has no error
                 yield Row("panorama", case, quantity, unit, "less", ours[key], program, peer[key], *about)
+
+
+def circle_rows(folder: Path) -> Iterator[Row]:
+    """Focal lengths from tilted circles whose centres are corrected, against OpenCV's centres of mass."""
+    report = read(folder, "circle_centers")
+    about = (False, report["date"][:10], report["commit"])
+    for tilt in sorted({row["tilt_deg"] for row in report["rows"]}):
+        of_tilt = [row for row in report["rows"] if row["tilt_deg"] == tilt]
+        ours = [row["focal_error_px"] for row in of_tilt if row["centers"] == "by the camera"]
+        theirs = [row["opencv_focal_error_px"] for row in of_tilt if row.get("opencv_focal_error_px") is not None]
+        own, peer = (math.sqrt(sum(error**2 for error in part) / len(part)) for part in (ours, theirs))
+        case = f"circles tilted by {tilt:g} degrees"
+        yield Row("circle_centers", case, "focal length, rms error", "px", "less", own, "OpenCV", peer, *about)
 
 
 def tagged_rows(folder: Path) -> Iterator[Row]:
