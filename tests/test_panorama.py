@@ -95,7 +95,7 @@ def test_exact_rays_give_back_the_cameras() -> None:
 
 def test_sigmas_are_those_of_the_errors() -> None:
     """Of 20 rings with noise: 600 errors of rotations, 20 of each lens parameter; the bounds are three sigmas wide."""
-    truth, rotation, focal, k1 = ring(10), [], [], []
+    truth, rotation, focal, k1, whole = ring(10), [], [], [], []
     for seed in range(20):
         fit = adjusted(truth, 0.4, seed)
         assert fit.noise_px == pytest.approx(0.4, rel=0.08)
@@ -103,6 +103,11 @@ def test_sigmas_are_those_of_the_errors() -> None:
         sigma = fit.sigmas(0)
         focal.append((np.log(fit.state.cameras[0].focal / LENS.focal) / sigma["log_focal"]) ** 2)
         k1.append(((fit.state.cameras[0].params[3] - LENS.params[3]) / sigma["k1"]) ** 2)
+        covariance = fit.covariance[:30, :30]
+        values, axes = np.linalg.eigh(covariance)
+        told = values > 1e-9 * values.max()  # the rotations do not turn as a whole
+        whole.append((axes.T @ errors(fit, truth).ravel())[told] ** 2 / values[told])
+    assert 0.82 < np.mean(whole) < 1.18  # 540 of them, three sigmas
     # errors of neighbours in a ring go together: some three hundred of the six hundred are free
     assert 0.75 < np.mean(rotation) < 1.25
     assert 0.2 < np.mean(focal) < 2.1

@@ -127,9 +127,9 @@ def find_rotations(
     events.advanced(STAGE)
     fine, choices = _chosen(evidence, rough)
     events.advanced(STAGE)
-    verdicts = judge_pairs(evidence.pixels, evidence.thresholds, fine.members, fine.fit, seed)
-    total = sum(each.num_matches for each in verdicts.values())
-    share = sum(each.num_turned for each in verdicts.values()) / max(total, 1)
+    verdicts = judge_pairs(evidence.pixels, evidence.thresholds, fine.members, image_set.names, fine.fit, seed)
+    total = sum(each.num_matches for each in verdicts)
+    share = sum(each.num_turned for each in verdicts) / max(total, 1)
     if share < _LEAST_SHARE:
         raise NoReconstructionError(
             f"the camera did not turn on the spot: rotations explain {share:.0%} of {total} verified matches between "

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,28 +34,15 @@ _TWICE = 2.0
 _STRONG_SHARE = 0.5
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """What a panorama makes of a pair of its photographs: see :class:`~sfmapp.panorama.report.TurnedPair`."""
-
-    images: tuple[int, int]
-    num_matches: int
-    num_turned: int
-    threshold_px: float
-    turn_deg: float
-    median_px: float
-    parallax_px: float
-    verdict: str
-
-
 def judge_pairs(
-    pixels: Sequence[MatchedPixels], thresholds: Sequence[float], members: Ints, fit: TurnedFit, seed: int
-) -> dict[tuple[int, int], Verdict]:
-    """Hold all verified matches of pairs of members, used or not, to the rotations."""
+    pixels: Sequence[MatchedPixels], thresholds: Sequence[float], members: Ints, names: Sequence[str], fit: TurnedFit,
+    seed: int,
+) -> list[TurnedPair]:  # fmt: skip
+    """Hold all verified matches of pairs of members, used or not, to the rotations. ``names``: of all photographs."""
     position = {int(image): k for k, image in enumerate(members)}
     cameras, rotations = fit.state.cameras, fit.state.rotations
     expected = _MEDIAN_OF_NOISE * fit.noise_px
-    out = {}
+    out = []
     for pair, threshold in zip(pixels, thresholds, strict=True):
         if not all(image in position for image in pair.images):
             continue
@@ -73,16 +59,17 @@ def judge_pairs(
         if verdict == "no rotation" and fit_turn(a, b, focal, threshold, (seed, *pair.images)).share >= TURNED_SHARE:
             verdict = "contradicted"
         parallax = math.sqrt(median**2 - expected**2) if median > _TWICE * expected else 0.0
-        out[pair.images] = Verdict(
-            pair.images, len(errors), int((errors < threshold).sum()), threshold,
-            float(rigid3.rotation_angle_deg(turn)), median, parallax, verdict,
-        )  # fmt: skip
+        out.append(TurnedPair(
+            images=(names[pair.images[0]], names[pair.images[1]]), num_matches=len(errors),
+            num_turned=int((errors < threshold).sum()), threshold_px=threshold,
+            turn_deg=float(rigid3.rotation_angle_deg(turn)), median_px=median, parallax_px=parallax, verdict=verdict,
+        ))  # fmt: skip
     return out
 
 
 def report_of(
     image_set: ImageSet, groups: tuple[Ints, Sequence[Ints]], rotations: Array, fit: TurnedFit, tracks: Tracks,
-    verdicts: Mapping[tuple[int, int], Verdict], before: tuple[Sequence[Camera], Sequence[Camera]],
+    verdicts: Sequence[TurnedPair], before: tuple[Sequence[Camera], Sequence[Camera]],
     choices: Sequence[LensChoice],
 ) -> TurningReport:  # fmt: skip
     """The report of the stage.
@@ -92,8 +79,8 @@ def report_of(
         before: cameras as they were known, and as pairs alone had them.
     """
     members, names = groups[0], image_set.names
-    total = sum(each.num_matches for each in verdicts.values())
-    turned = sum(each.num_turned for each in verdicts.values())
+    total = sum(each.num_matches for each in verdicts)
+    turned = sum(each.num_turned for each in verdicts)
     return TurningReport(
         num_images=len(names),
         num_turned=len(members),
@@ -104,18 +91,10 @@ def report_of(
         turned_share=turned / max(total, 1),
         cameras=_cameras(image_set, members, fit, before),
         images=_images(image_set, members, rotations, fit, tracks),
-        pairs=[
-            TurnedPair(
-                images=(names[each.images[0]], names[each.images[1]]), num_matches=each.num_matches,
-                num_turned=each.num_turned, threshold_px=each.threshold_px, turn_deg=each.turn_deg,
-                median_px=each.median_px, parallax_px=each.parallax_px,
-                verdict=each.verdict,
-            )
-            for each in verdicts.values()
-        ],
+        pairs=verdicts,
         lens_choice=choices,
         left_out=_left_out(image_set, members, groups[1]),
-        contradictions=_contradictions(verdicts, names),
+        contradictions=_contradictions(verdicts),
         thresholds={"turned_share": TURNED_SHARE, "majority": MAJORITY, "min_matches": MIN_MATCHES},
     )  # fmt: skip
 
@@ -172,21 +151,21 @@ def _left_out(image_set: ImageSet, members: Ints, others: Sequence[Ints]) -> lis
     return out
 
 
-def _contradictions(verdicts: Mapping[tuple[int, int], Verdict], names: Sequence[str]) -> list[Contradiction]:
+def _contradictions(verdicts: Sequence[TurnedPair]) -> list[Contradiction]:
     """Pairs that are rotations for themselves, others than the panorama has, on many matches."""
-    strongest: dict[int, int] = {}
-    for each in verdicts.values():
+    strongest: dict[str, int] = {}
+    for each in verdicts:
         for image in each.images:
             strongest[image] = max(strongest.get(image, 0), each.num_turned)
     return [
         Contradiction(
             "panorama",
-            f"{each.num_matches} matches of {names[each.images[0]]} and {names[each.images[1]]} show a rotation that "
+            f"{each.num_matches} matches of {each.images[0]} and {each.images[1]} show a rotation that "
             f"is not the panorama's: its median error there is {each.median_px:.1f} px",
             "look at the two: if they show different places that look alike, leave one out",
             {"num_matches": each.num_matches, "median_px": each.median_px},
         )
-        for each in verdicts.values()
+        for each in verdicts
         if each.verdict == "contradicted"
         and each.num_matches > _STRONG_SHARE * min(strongest[image] for image in each.images)
     ]
