@@ -164,10 +164,8 @@ def boards(data: Path) -> Iterator[str]:
                 before.append(straightness(corners))
                 after.append(straightness(straightened(found, corners)))
         bend = found.report.parameters[0]
-        yield (
-            f"| {label} | {np.mean(before):.2f} | {np.mean(after):.3f} | {bend.value:.3f} +- {bend.sigma:.3f} "
-            f"| {bend.verdict} | {cpu:.0f} |"
-        )
+        shown = f"{np.mean(before):.2f} | {np.mean(after):.3f}" if before else "not found by OpenCV |"
+        yield (f"| {label} | {shown} | {bend.value:.3f} +- {bend.sigma:.3f} | {bend.verdict} | {cpu:.0f} |")
 
 
 def straightened(found: LineCalibration, corners: Array) -> Array:

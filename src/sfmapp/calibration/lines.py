@@ -177,7 +177,9 @@ def calibrate_from_arcs(
         trials = [_try(problem, *parts, has_worlds=False, seed=seed) for parts in _folds(problem, shown, _PLUMB_FOLDS)]
         held_out = _held_out(trials, None)
     strength = _judge_strength(problem, solution, trials)
+    free = solution
     solution, center = _final(problem, solution, strength)
+    focal = _held_to(focal, abs(float(solution.camera[LOG_FOCAL] - free.camera[LOG_FOCAL])))
     if not (focal.is_told or strength.is_told or strength.is_none):
         raise InputError(
             f"the lines of {len(used)} photograph{'s' * (len(used) > 1)} tell nothing of the camera: distortion: "
@@ -243,18 +245,17 @@ def _search(problem: Problem, arcs: Sequence[Arcs], strengths: Array, seed: int)
 
 @dataclass(frozen=True)
 class _Trial:
-    """What one half of the lines came to, and what the other half says to it.
+    """A calibration from some of the lines, and how it fares with the others, N of them.
 
     Attributes:
-        strength, log_focal: of the half; the focal length None where it found no world.
+        strength, log_focal: of the calibration; the focal length is None where no world was found.
         log_focal_sigma: of it.
-        predicted_px: (N,) how far the distortion bends each of the other lines, rms.
-        before_px, after_px: (N,) rms distances of the points of the other lines from straight ones, without and with
-            the distortion undone.
-        gained: (N,) by how much less the other lines have against the distortion than against none.
-        witness: (N,) of the lines: those in one part of a picture count as one.
-        num_met, num_expected, num_lines: straight lines of the other half that meet a vanishing point, those that would
-            by chance, and all.
+        predicted_px: (N,) rms bend of each line by the distortion.
+        before_px, after_px: (N,) rms distances of the points of a line from a straight one, without and with the
+            distortion undone.
+        gained: (N,) log-likelihood of each line with the distortion, less that without.
+        witness: (N,) part of a picture that the line is in: all lines of a part count as one witness.
+        num_met, num_expected, num_lines: straight lines that meet a vanishing point, how many would by chance, and all.
         variance: of num_met by chance.
     """
 
@@ -445,11 +446,24 @@ def _judge_strength(problem: Problem, solution: Solution, trials: Sequence[_Tria
     # few lines long enough to show a bend cannot make many sigmas of it, but agree whichever of them are left out
     is_steady = len(each) == _PLUMB_FOLDS and abs(strength) > _STEADY_SIGMAS * sigma and t > _STEADY_T
     if t < _SEEN_SIGMAS and not is_steady:
-        return _Judged(False, f"held-out lines do not prefer it to none ({t:.1f} sigmas)")
+        # it is left zero, which may be wrong by all that was found
+        text = f"held-out lines do not prefer it to none ({t:.1f} sigmas)"
+        return _Judged(False, text, widened=max(spread, abs(strength)))
     reason = f"held-out lines prefer it to none ({t:.1f} sigmas)"
     if is_steady:
         reason += f", and it is the same to {sigma:.3f} whichever {_PLUMB_FOLDS}th of the lines is left out"
     return _Judged(True, reason, widened=spread)
+
+
+def _held_to(focal: _Judged, moved: float) -> _Judged:
+    """The verdict on a focal length that moved by a share when what lines do not tell was held at what is assumed: a
+    distortion that is there, and held at zero, takes it along."""
+    if not focal.is_told:
+        return focal
+    if moved > _WORST_FOCAL:
+        text = f"a distortion or a principal point that the lines do not tell changes it by {100 * moved:.0f} %"
+        return _Judged(False, text)
+    return replace(focal, widened=max(focal.widened, moved))
 
 
 def _t_of_gains(problem: Problem, trials: Sequence[_Trial]) -> float:

@@ -1,7 +1,8 @@
 """Where a camera stood, from points with known places in its photograph, and how sure that is.
 
-Three points allow up to four poses and a plane often two: the pose is searched by P3P in samples where points may be
-wrong, by all points at once where not, and every pose that explains them nearly as well is told beside the best.
+Three points allow up to four poses, a plane often two. Where some of the points may be wrong, poses of samples of three
+(P3P) are tried, otherwise all points are taken at once; every pose that explains them nearly as well as the best is
+returned beside it.
 """
 
 from __future__ import annotations

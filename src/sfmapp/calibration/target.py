@@ -80,12 +80,12 @@ class LensTrial:
     """A lens that was tried.
 
     Attributes:
-        model: of the camera. num_unknown: with the pose.
+        model: of the camera. num_unknown: its free parameters and the pose.
         num_used: points that agree with it.
         rms_px: of these.
-        left_out_px: root mean square distance of all points from where the others put them, each no more than what is
-            far off; None where the points are too few.
-        is_chosen: the first, unless another is surely better by these.
+        left_out_px: root mean square distance of each point from where the others put it, clipped at three sigmas; None
+            where the points are too few.
+        is_chosen: the first lens is, unless another predicts points that were left out surely better.
     """
 
     model: CameraModel
