@@ -95,6 +95,7 @@ def rows_of(folder: Path) -> list[Row]:
         "panorama": panorama_rows,
         "tagged_sets": tagged_rows,
         "circle_centers": circle_rows,
+        "uncalibrated": uncalibrated_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
 
@@ -196,6 +197,24 @@ def tagged_rows(folder: Path) -> Iterator[Row]:
             ("CPU time", "s", "cpu_s"),
         ):  # fmt: skip
             yield Row("tagged_sets", case, quantity, unit, "less", abs(ours[key]), program, abs(peer[key]), *about)
+
+
+def uncalibrated_rows(folder: Path) -> Iterator[Row]:
+    """``sfmapp uncalibrated`` and ``transfer``, against the truth alone."""
+    report = read(folder, "uncalibrated")
+    about = ("", None, False, report["date"][:10], report["commit"])
+    dino = report["dinosaur"]
+    for what, value in (
+        ("five known points, rms of the rest, median", dino["five_points_percent"][0]),
+        ("five known points, rms of the rest, 90 %", dino["five_points_percent"][1]),
+        ("self-calibration, similarity to the reference", dino["similarity_percent"]),
+        ("self-calibration, two open numbers freed", dino["two_numbers_freed_percent"]),
+    ):
+        yield Row("uncalibrated", "dinosaur", what, "%", "less", value, *about)
+    for row in report["transfers"]:
+        if "refused" not in row:
+            case = "courtyard, to " + row["triple"][2]
+            yield Row("uncalibrated", case, "transfer, median", "px", "less", row["tensor"]["median_px"], *about)
 
 
 def known_point_rows(folder: Path) -> Iterator[Row]:

@@ -142,3 +142,33 @@ def test_the_command_transfers_photographs(photos: Path, tmp_path: Path, capsys:
     assert main(["transfer", given[0], given[0], given[1], "-o", str(tmp_path / "b")]) == 2
     assert main(["transfer", given[0], str(tmp_path / "no.jpg"), given[1], "-o", str(tmp_path / "c")]) == 3
     assert "no such file" in capsys.readouterr().err
+
+
+def test_the_command_reconstructs_without_a_calibration(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["uncalibrated", str(photos), "-o", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "projective: 7 of 7 photographs" in printed
+    report = json.loads((out / "report.json").read_text())
+    check_schema("uncalibrated", report)
+    told = report["projective"]
+    assert told["rms_px"] < 1.0
+    assert told["ambiguity_rms_px"] == pytest.approx(told["rms_px"], rel=1e-3)
+    assert told["ambiguity_ratio"] > 1.05
+    assert len(json.loads((out / "cameras_projective.json").read_text())["images"]) == 7
+    camera = report["self_calibration"]
+    if camera is None:
+        assert report["refused"]
+    else:
+        assert (out / "sparse" / "0" / "cameras.bin").is_file()
+        assert camera["focal_sigma_px"] < 0.1 * camera["focal_px"]
+    page = (out / "report.html").read_text()
+    assert len(page) < 5e6
+    assert not re.search(r"(src|href)=\"(?!data:)", page)
+    assert not re.search(r"https?://", page)
+    assert (out / "recording.rrd").is_file()
+    points = tmp_path / "known.csv"
+    points.write_text("# crs: local\nname,x,y,z,image,px,py\na,0,0,0,nobody.jpg,1,1\n")
+    assert main(["uncalibrated", str(photos), "-o", str(tmp_path / "b"), "--points", str(points)]) == 3

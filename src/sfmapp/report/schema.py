@@ -31,6 +31,7 @@ from sfmapp.report.model import (
 from sfmapp.report.pair_html import PairReport
 from sfmapp.report.panorama_html import PanoramaReport
 from sfmapp.report.transfer_html import TransferRunReport
+from sfmapp.report.uncalibrated_html import UncalibratedReport
 from sfmapp.report.validation import CloudValidation, Validation
 from sfmapp.reporting import Report, field_types
 
@@ -58,6 +59,7 @@ KINDS: Mapping[str, type[Report]] = {
     "pair": PairReport,
     "panorama": PanoramaReport,
     "transfer": TransferRunReport,
+    "uncalibrated": UncalibratedReport,
     "warp": WarpReport,
     "rectify": RectifyReport,
 }

@@ -34,7 +34,7 @@ _CORE_VIEWS = 5
 _LIMIT = 3.6
 # pixels: keypoints are no better than that in any photograph, and a matched pair no worse
 _LEAST_LIMIT, _MOST_LIMIT = 0.5, 4.0
-_STEPS_BETWEEN, _STEPS_AT_END = 3, 40
+_STEPS_BETWEEN, _STEPS_AT_END = 3, 12
 # depth is seen in what stands off a plane, which may be one in ten of all points
 _OFF_PLANE = 90.0
 # of right matches a few per cent are dropped; where most are, what is left is no geometry of the scene
@@ -229,6 +229,10 @@ class _State:
             if not at_end:
                 chosen = self.holding(chosen, counts)
             seen, _ = self.sightings(chosen)
+            if not len(seen.xy):
+                raise NoReconstructionError(
+                    "no matches agree on cameras", "the photographs may show look-alikes, or something that moved"
+                )
             model = ProjectiveModel(self.cameras[self.has_camera], self.points[chosen])
             model, self.info = adjust_projective(model, seen, is_robust=True, max_iterations=steps)
             self.cameras[self.has_camera], self.points[chosen] = model.cameras, model.points

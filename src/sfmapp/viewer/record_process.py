@@ -36,6 +36,12 @@ def main(kind: str, folder: str, output: str, threads: str) -> None:
 
         write_pair_rrd(PairReplay.load(Path(folder)), Path(output))
         return
+    if kind == "clouds":
+        from sfmapp.viewer.uncalibrated_replay import CloudsReplay
+        from sfmapp.viewer.uncalibrated_rrd import write_clouds_rrd
+
+        write_clouds_rrd(CloudsReplay.load(Path(folder)), Path(output))
+        return
     if kind == "transfer":
         from sfmapp.viewer.transfer_replay import TransferReplay
         from sfmapp.viewer.transfer_rrd import write_transfer_rrd
