@@ -1,6 +1,6 @@
 """How far each estimator of two views is from what is possible: errors against noise, baseline and number of points.
 
-    python benchmarks/two_view_study.py      # writes results/two_view_study.md
+    python benchmarks/two_view_study.py      # writes results/two_view_study.md and docs/pictures/two-view-study.svg
 
 Exact scenes with normal noise and no wrong matches. F and E are judged by the Sampson distance of the exact points, H
 by their transfer error, points by the median distance from the truth in units of the baseline; root of the mean
@@ -11,6 +11,7 @@ covariance at the truth.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -162,7 +163,70 @@ def main() -> None:
                     cells = " | ".join(f"{error:.3g}" for error in row.values())
                     lines.append(f"| {value:g} | {cells} |")
                 lines.append("")
-    RESULTS.joinpath("two_view_study.md").write_text("\n".join(lines), encoding="utf-8")
+    text = "\n".join(lines)
+    RESULTS.joinpath("two_view_study.md").write_text(text, encoding="utf-8")
+    PICTURE.write_text(chart(text), encoding="utf-8")
+
+
+# ---------------------------------------------------------------------------------------------------- the chart
+
+PICTURE = Path(__file__).resolve().parent.parent / "docs" / "pictures" / "two-view-study.svg"
+# of Okabe and Ito, told apart by everybody
+CURVES = {
+    "F raw": "#999999", "F normalised": "#e69f00", "F refined": "#d55e00",
+    "E from F": "#56b4e9", "E refined": "#0072b2",
+}  # fmt: skip
+_PANEL, _HEIGHT, _LEFT, _TOP, _BOTTOM = 300.0, 300.0, 56.0, 40.0, 46.0
+
+
+def tables(text: str) -> list[tuple[str, list[float], dict[str, list[float]]]]:
+    """Of F and E: what is changed, its values, and the columns."""
+    found = []
+    part = text.split("## F and E")[1].split("\n## ")[0]
+    for block in part.split("\n\n"):
+        lines = [[cell.strip() for cell in line.strip("| ").split("|")] for line in block.splitlines() if "|" in line]
+        if len(lines) > 2:
+            values = np.array([[float(cell) for cell in line] for line in lines[2:]])
+            columns = dict(zip(lines[0][1:], values[:, 1:].T.tolist(), strict=True))
+            found.append((lines[0][0], values[:, 0].tolist(), columns))
+    return found
+
+
+def chart(text: str) -> str:
+    """An SVG of the tables of F and E: errors in units of the Cramer-Rao bound, which is the dashed line at one."""
+    panels = [
+        (name, values, {c: np.divide(columns[c], columns[f"{c[0]} bound"]) for c in CURVES})
+        for name, values, columns in tables(text)
+    ]
+    high = np.log10(max(curve.max() for _, _, curves in panels for curve in curves.values())) + 0.1
+    width, plot = _LEFT + len(panels) * _PANEL + 110.0, _HEIGHT - _TOP - _BOTTOM
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {_HEIGHT:.0f}" font-family="sans-serif" '
+        f'font-size="12" fill="#777"><text x="{_LEFT:.0f}" y="18">error over the Cramer-Rao bound</text>'
+    ]
+
+    def down(value: float) -> float:
+        return float(_TOP + (high - np.log10(value)) / (high + 0.05) * plot)
+
+    for n, (name, values, curves) in enumerate(panels):
+        left, across = _LEFT + n * _PANEL, _PANEL - 40.0
+        at = left + np.log(np.divide(values, values[0])) / np.log(values[-1] / values[0]) * across
+        for tick in (1, 2, 5, 10, 20):
+            dash = '#777" stroke-dasharray="6 5' if tick == 1 else "#8886"
+            parts.append(f'<path d="M{left:.1f} {down(tick):.1f}h{across:.1f}" stroke="{dash}"/>')
+            if n == 0:
+                parts.append(f'<text x="{left - 8:.1f}" y="{down(tick) + 4:.1f}" text-anchor="end">{tick}</text>')
+        for x, value in zip(at, values, strict=True):
+            parts.append(f'<text x="{x:.1f}" y="{_HEIGHT - _BOTTOM + 18:.1f}" text-anchor="middle">{value:g}</text>')
+        parts.append(f'<text x="{left + across / 2:.1f}" y="{_HEIGHT - 8:.1f}" text-anchor="middle">{name}</text>')
+        for label, color in CURVES.items():
+            points = " ".join(f"{x:.1f},{down(y):.1f}" for x, y in zip(at, curves[label], strict=True))
+            parts.append(f'<polyline points="{points}" fill="none" stroke="{color}" stroke-width="2"/>')
+    for k, (label, color) in enumerate(CURVES.items()):
+        x, y = width - 140.0, _TOP + 8.0 + 22.0 * k
+        parts.append(f'<path d="M{x:.0f} {y:.0f}h28" stroke="{color}" stroke-width="2"/>')
+        parts.append(f'<text x="{x + 36:.0f}" y="{y + 4:.0f}">{label}</text>')
+    return "\n".join([*parts, "</svg>"]) + "\n"
 
 
 if __name__ == "__main__":
