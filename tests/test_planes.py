@@ -204,6 +204,12 @@ def test_depth_alpha_mask_and_blend() -> None:
     kept, _ = put_picture(picture, with_alpha, view)
     assert tuple(kept[150, 150]) == (255, 0, 0, 255)
     assert tuple(kept[150, 250]) == (0, 0, 0, 0)
+    twelve = np.full((360, 480), 4095, np.uint16)  # a camera's twelve bits: white stays what it is
+    stripes = np.repeat(np.array([[0], [255]], np.uint8), 100, 1).repeat(50, 0)
+    white, _ = put_picture(stripes, twelve, view)
+    assert white.max() == 4095
+    assert white.min() == 0
+    assert take_plane(white, view, Area(-20.0, -20.0, 120.0, 120.0, 300, 300))[0].max() == 4095
     grey, _ = put_picture(picture[..., :3], np.full((360, 480), 9, np.uint8), view)
     assert grey.shape == (360, 480, 3)
     assert tuple(grey[10, 10]) == (9, 9, 9)

@@ -340,7 +340,7 @@ def _laid_out(plane: _Plane, wanted: Wanted) -> _LaidOut:
 def _compare(plane: _Plane, aspect: float, what: str) -> None:
     """Warn where the corners contradict a ratio of width and height that is given."""
     gap = math.log(aspect / plane.shape.aspect)
-    if abs(gap) > 3.0 * plane.shape.aspect_share:
+    if plane.shape.is_rectangle and abs(gap) > 3.0 * plane.shape.aspect_share:
         plane.warnings.append(
             f"{what} has width to height as {aspect:.4g}, the corners tell {plane.shape.aspect:.4g} +- "
             f"{plane.shape.aspect_sigma:.2g}: corners, camera or size are wrong, and the picture is stretched"

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import UsageError
+from sfmapp.images.pixels import white_of
 from sfmapp.planes.sampling import resampled
 from sfmapp.planes.view import PlaneView
 
@@ -45,7 +46,7 @@ def take_plane(photograph: NDArray[Any], view: PlaneView, area: Area) -> tuple[N
     layers = photograph if photograph.ndim == 3 else photograph[..., None]
     out = np.zeros((area.height, area.width, layers.shape[2]), layers.dtype)
     shown = np.zeros((area.height, area.width), np.bool_)
-    limit = float(np.iinfo(layers.dtype).max)
+    full, white = float(np.iinfo(layers.dtype).max), float(white_of(photograph))
     step = np.array([(area.right - area.left) / area.width, (area.bottom - area.top) / area.height])
 
     def find(xy: Array) -> Array:
@@ -54,9 +55,10 @@ def take_plane(photograph: NDArray[Any], view: PlaneView, area: Area) -> tuple[N
     for tile in resampled(layers, find, (0, 0, area.width, area.height)):
         at, values = (tile.rows, tile.columns), tile.values
         if values.shape[2] == 4:
-            values[..., :3] *= limit / np.maximum(values[..., 3:], 1e-3)
+            values[..., :3] *= full / np.maximum(values[..., 3:], 1e-3)
+        values[..., :3] = np.clip(values[..., :3], 0.0, white)  # cubics overshoot, and twelve bits end before sixteen
         shown[at] = tile.cover > 0.5
-        out[at] = np.where(shown[at][..., None], np.clip(np.rint(values), 0, limit), 0).astype(layers.dtype)
+        out[at] = np.where(shown[at][..., None], np.clip(np.rint(values), 0, full), 0).astype(layers.dtype)
     return (out[..., 0] if photograph.ndim == 2 else out), shown
 
 

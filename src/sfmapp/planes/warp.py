@@ -99,6 +99,7 @@ def _composed(
         out[..., 3:] = total * full
     else:
         out[...] = weight * top + (1.0 - opaque) * color
+    out[..., :3] = np.clip(out[..., :3], 0, white)  # cubics overshoot, and twelve bits end before sixteen do
     limit = np.iinfo(below.dtype).max
     kept: NDArray[Any] = np.where(opaque > 0.0, np.clip(np.rint(out), 0, limit), below).astype(below.dtype)
     return kept
