@@ -148,6 +148,8 @@ def test_the_page_is_whole_small_and_fetches_nothing(finished: Path) -> None:
     assert len(text) < 300_000
     assert "7 of 7 images registered" in page.text
     assert text.count("<polygon") == 7
+    begun = json.loads((finished / "report.json").read_text())["stages"]["mapping"]["initial_pairs"][0]["pairs"][-1]
+    assert f"sfmapp pair OUT {' '.join(begun['images'])}" in page.text
 
 
 def test_the_same_command_again_does_nothing(photos: Path, copy: Path) -> None:
