@@ -177,15 +177,15 @@ def find_seams(shown: Sequence[Shown], gains: Array, canvas: Canvas) -> NDArray[
     label = np.full((canvas.height, canvas.width), -1, np.int16)
     best = np.zeros(label.shape, np.float32)
     colors = np.zeros((*label.shape, 3), np.float32)
-    own = [each.colors * gain.astype(np.float32) for each, gain in zip(shown, gains, strict=True)]
+    factors = gains.astype(np.float32)
     for k, each in enumerate(shown):
         at = _place(each)
         is_better = each.inside & (each.depth + 1e-6 > best[at])
         label[at][is_better], best[at][is_better] = k, each.depth[is_better] + 1e-6
-        colors[at][is_better] = own[k][is_better]
+        colors[at][is_better] = each.colors[is_better] * factors[k]
     difference = np.zeros(label.shape, np.float32)
-    for each, mine in zip(shown, own, strict=True):
-        at = _place(each)
+    for each, factor in zip(shown, factors, strict=True):
+        at, mine = _place(each), each.colors * factor
         apart = np.abs(cv2.blur(mine, _BLUR) - cv2.blur(colors[at], _BLUR)).max(2)
         # the blur reaches beyond the borders of a photograph
         inner = cv2.erode(each.inside.astype(np.uint8), np.ones(_BLUR, np.uint8), borderValue=0) > 0
