@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+import sfmapp
 from schemas import check_schema
 from sfmapp.cli.main import main
 from sfmapp.errors import NoReconstructionError
@@ -139,7 +140,8 @@ def test_the_command_transfers_photographs(photos: Path, tmp_path: Path, capsys:
     assert len(page) < 5e6
     assert not re.search(r"(src|href)=\"(?!data:)", page)
     assert not re.search(r"https?://", page)
-    assert main(["transfer", given[0], given[0], given[1], "-o", str(tmp_path / "b")]) == 2
+    with pytest.raises(sfmapp.UsageError, match="three different photographs"):
+        sfmapp.transfer_views([given[0], given[0], given[1]], tmp_path / "b")
     assert main(["transfer", given[0], str(tmp_path / "no.jpg"), given[1], "-o", str(tmp_path / "c")]) == 3
     assert "no such file" in capsys.readouterr().err
 
@@ -172,3 +174,29 @@ def test_the_command_reconstructs_without_a_calibration(
     points = tmp_path / "known.csv"
     points.write_text("# crs: local\nname,x,y,z,image,px,py\na,0,0,0,nobody.jpg,1,1\n")
     assert main(["uncalibrated", str(photos), "-o", str(tmp_path / "b"), "--points", str(points)]) == 3
+
+
+def test_known_points_make_it_metric(reconstructed: Path, tmp_path: Path) -> None:
+    straight = tmp_path / "straight"  # no projective camera has the distortion of these photographs
+    sfmapp.undistort(reconstructed, straight)
+    model = sfmapp.load(straight)
+    many = np.flatnonzero(np.bincount(model.tracks.obs_track_idx[model.obs_is_inlier]) >= 5)
+    chosen = many[:: len(many) // 12][:12]
+    rows = ["# crs: local", "name,x,y,z,image,px,py"]
+    for track in chosen:
+        seen = model.observations_of_track(int(track))
+        place = ",".join(f"{value:.9f}" for value in model.point_xyz[track])
+        rows += [
+            f"p{track},{place},{name},{x:.4f},{y:.4f}" for name, (x, y) in zip(seen.image_names, seen.xy, strict=True)
+        ]
+    points = tmp_path / "known.csv"
+    points.write_text("\n".join(rows) + "\n")
+    found = sfmapp.reconstruct_uncalibrated(straight / "images", tmp_path / "out", points=points)
+    assert found.known is not None
+    assert found.metric is None
+    cameras = found.projective.model.cameras @ np.linalg.inv(found.known.frame)
+    centers = dehomogenized(np.linalg.svd(cameras)[2][:, 3])
+    true = np.array([model.image(name).cam_from_world.center for name in sorted(model.image_names)])
+    true = true[found.projective.view_idx]
+    away = np.linalg.norm(true - np.median(model.point_xyz[chosen], axis=0), axis=1)
+    assert (np.linalg.norm(centers - true, axis=1) < 0.001 * away).all()

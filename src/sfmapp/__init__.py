@@ -1,9 +1,9 @@
 """Photographs and video into cameras, points and surfaces, on an ordinary CPU, from pip alone.
 
 Three levels. One call: ``reconstruct``, ``track_sequence``, ``densify``, ``make_mesh``, what is done with their
-results, ``stitch_panorama``, and what is known before: ``calibrate_board`` and its like. The stages, in memory:
-``load_images``, ``extract_features``, ``match_images``, ``map_images``. The parts: ``adjust_bundle``, ``FactorGraph``,
-``triangulate``, ``estimate_pose``, ``verify_pair``.
+results, ``stitch_panorama``, ``explain_pair``, and what is known before: ``calibrate_board`` and its like. The
+stages, in memory: ``load_images``, ``extract_features``, ``match_images``, ``map_images``. The parts:
+``adjust_bundle``, ``FactorGraph``, ``triangulate``, ``estimate_pose``, ``verify_pair``.
 
 Conventions: a pose ``cam_from_world`` is a quaternion x, y, z, w and a translation, x_cam = R x_world + t, with camera
 axes x right, y down, z forward. The centre of the top-left pixel is (0.5, 0.5). ``events``, ``threads`` and ``seed``
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from sfmapp.api.planes import rectify, warp_picture
     from sfmapp.api.reconstruction import Reconstruction, load
     from sfmapp.api.stages import Matcher, extract_features, map_images, match_images
+    from sfmapp.api.views import explain_pair, reconstruct_uncalibrated, transfer_views
     from sfmapp.camera.camera import Camera
     from sfmapp.camera.names import CameraModel
     from sfmapp.errors import (
@@ -112,6 +113,7 @@ __all__ = [
     "densify",
     "estimate_pose",
     "evaluate",
+    "explain_pair",
     "export",
     "extract_features",
     "load",
@@ -122,10 +124,12 @@ __all__ = [
     "map_images",
     "match_images",
     "reconstruct",
+    "reconstruct_uncalibrated",
     "rectify",
     "refine",
     "stitch_panorama",
     "track_sequence",
+    "transfer_views",
     "triangulate",
     "undistort",
     "validate",
@@ -174,6 +178,7 @@ _HOMES = {
     "densify": "api.jobs",
     "estimate_pose": "api.geometry",
     "evaluate": "api.jobs",
+    "explain_pair": "api.views",
     "export": "api.jobs",
     "extract_features": "api.stages",
     "load": "api.reconstruction",
@@ -184,10 +189,12 @@ _HOMES = {
     "map_images": "api.stages",
     "match_images": "api.stages",
     "reconstruct": "api.jobs",
+    "reconstruct_uncalibrated": "api.views",
     "rectify": "api.planes",
     "refine": "api.jobs",
     "stitch_panorama": "api.jobs",
     "track_sequence": "api.jobs",
+    "transfer_views": "api.views",
     "triangulate": "api.geometry",
     "undistort": "api.jobs",
     "validate": "api.jobs",
