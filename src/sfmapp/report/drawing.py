@@ -129,10 +129,15 @@ def colormap(values: Array) -> NDArray[np.uint8]:
     return np.ascontiguousarray(cv2.applyColorMap(index[:, None], cv2.COLORMAP_PLASMA)[:, 0, ::-1])
 
 
-def jpeg_url(pixels: NDArray[np.uint8], longest: int, quality: int = 82) -> str:
-    """A picture (H, W, 3) RGB as a JPEG of at most so many pixels, to stand in a page itself."""
+def shrunk(pixels: NDArray[np.uint8], longest: int) -> tuple[NDArray[np.uint8], float]:
+    """A picture whose longer side has at most so many pixels, and its size as a share of what it was."""
     scale = min(1.0, longest / max(pixels.shape[:2]))
     size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
-    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)[:, :, ::-1]
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8), scale
+
+
+def jpeg_url(pixels: NDArray[np.uint8], longest: int, quality: int = 82) -> str:
+    """A picture (H, W, 3) RGB as a JPEG of at most so many pixels, to stand in a page itself."""
+    small = shrunk(pixels, longest)[0][:, :, ::-1]
     encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()

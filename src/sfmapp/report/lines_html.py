@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 
@@ -13,6 +11,7 @@ from numpy.typing import NDArray
 from sfmapp.calibration.line_refinement import Lines
 from sfmapp.calibration.line_report import HeldOutLines, LinePhotograph, LinesReport
 from sfmapp.calibration.result import CameraCalibration
+from sfmapp.report.drawing import jpeg_url
 from sfmapp.report.model import RunFacts
 from sfmapp.report.page import render_page, table
 from sfmapp.report.plots import Curve, plot_svg
@@ -94,7 +93,8 @@ def _body(
     )
     yield '<div class="row large">'
     for name, pixels in list(pictures.items())[:_MOST_SHOWN]:
-        yield f'<figure><img src="{_jpeg(pixels)}" alt=""><figcaption>{escape(name)}</figcaption></figure>'
+        source = jpeg_url(pixels, _SHOWN_PX, quality=85)
+        yield f'<figure><img src="{source}" alt=""><figcaption>{escape(name)}</figcaption></figure>'
     yield "</div>"
 
 
@@ -117,13 +117,3 @@ def _held_out(held: HeldOutLines) -> str:
 def _row(one: LinePhotograph) -> list[tuple[str, object]]:
     counts = ", ".join(str(direction.num_lines) for direction in one.directions) or "none stands out"
     return [("t", one.name), ("", one.num_arcs), ("", one.num_straight), ("t", counts), ("w", one.problem)]
-
-
-def _jpeg(pixels: Pixels) -> str:
-    from PIL import Image
-
-    picture = Image.fromarray(pixels)
-    picture.thumbnail((_SHOWN_PX, _SHOWN_PX))
-    data = io.BytesIO()
-    picture.save(data, "JPEG", quality=85)
-    return "data:image/jpeg;base64," + base64.b64encode(data.getvalue()).decode()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Iterator, Sequence
 from html import escape
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry.rigid3 import rotation_matrix
+from sfmapp.report.drawing import jpeg_url, shrunk
 from sfmapp.report.model import RunFacts
 from sfmapp.report.page import render_page, table
 from sfmapp.report.pair_words import focal_words, sigma_words, start_words
@@ -86,7 +86,7 @@ def _body(report: PairReport, story: Story, pictures: tuple[Pixels, Pixels]) -> 
     yield from _sections(told, _plane_pictures(story, pictures))
     yield f'<p class="dim">{report.run.wall_s:.1f} s, seed {report.run.seed}, {escape(report.run.started)}</p>'
     for n, pixels in enumerate(pictures, 1):
-        yield f'<img id="photo{n}" src="{_jpeg(pixels)}" alt="" hidden>'
+        yield f'<img id="photo{n}" src="{jpeg_url(pixels, _SHOWN_PX)}" alt="" hidden>'
     text = json.dumps(_data(story), separators=(",", ":")).replace("<", "\\u003c")
     yield f'<script type="application/json" id="pair-data">{text}</script>'
     script = Path(__file__).with_name("pair_script.js").read_text(encoding="utf-8")
@@ -385,10 +385,8 @@ def _plane_pictures(story: Story, pictures: tuple[Pixels, Pixels]) -> str:
         return ""
     figures = []
     for side, (view, pixels) in enumerate(zip(story.views, pictures, strict=True)):
-        scale = min(1.0, _SHOWN_PX / max(pixels.shape[:2]))
-        size = max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale))
-        canvas = 0.45 * cv2.resize(pixels, size, interpolation=cv2.INTER_AREA) + 0.55 * 255.0
-        canvas = np.ascontiguousarray(canvas.astype(np.uint8))
+        small, scale = shrunk(pixels, _SHOWN_PX)
+        canvas = np.ascontiguousarray((0.45 * small + 0.55 * 255.0).astype(np.uint8))
         xy = view.xy[story.used[:, side]] * scale
         for n in range(-1, len(planes)):
             color = PLANE_COLORS[n % len(PLANE_COLORS)] if n >= 0 else (90, 90, 90)
@@ -400,7 +398,7 @@ def _plane_pictures(story: Story, pictures: tuple[Pixels, Pixels]) -> str:
                 cv2.putText(
                     canvas, one.name, (x - 14, y + 14), cv2.FONT_HERSHEY_SIMPLEX, 1.4, color, width, cv2.LINE_AA
                 )
-        figures.append(f'<figure><img src="{_jpeg(canvas)}" alt=""></figure>')
+        figures.append(f'<figure><img src="{jpeg_url(canvas, _SHOWN_PX)}" alt=""></figure>')
     return f'<div class="row large">{"".join(figures)}</div>'
 
 
@@ -411,16 +409,6 @@ def _matrix(name: str, rows: Sequence[Sequence[float]]) -> str:
 
 def _note(text: str) -> str:
     return f'<p class="dim">{escape(text)}</p>'
-
-
-def _jpeg(pixels: Pixels) -> str:
-    import cv2
-
-    scale = min(1.0, _SHOWN_PX / max(pixels.shape[:2]))
-    size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
-    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)[:, :, ::-1]
-    encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 82])[1]
-    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 
 # ------------------------------------------------------------------------------------------- what the script draws

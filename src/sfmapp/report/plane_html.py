@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from html import escape
 from typing import Any
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from sfmapp.geometry.orientation import upright_pixels, upright_xy
 from sfmapp.images.pixels import to_8_bits
 from sfmapp.planes.report import PlaneReport, RectifyReport, WarpReport
+from sfmapp.report.drawing import jpeg_url, shrunk
 from sfmapp.report.page import render_page, table
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ def warp_page(report: WarpReport, pixels: NDArray[Any], orientation: int) -> str
 def rectify_page(report: RectifyReport, photograph: NDArray[Any], pixels: NDArray[Any], orientation: int) -> str:
     """The page of ``rectify``: the photograph with the corners, as stored, and the plane."""
     plane = report.plane
-    shown, scale = _small(upright_pixels(_rgb(photograph), orientation))
+    shown, scale = shrunk(upright_pixels(_rgb(photograph), orientation), _SHOWN_PX)
     size = photograph.shape[1], photograph.shape[0]
     outline = upright_xy(orientation, np.array(plane.corners), *size)
     text = f"{plane.photograph}: corners {plane.source}, 1 at the top left of the plane"
@@ -120,12 +120,6 @@ def _rgb(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     return cv2.cvtColor(shown, cv2.COLOR_GRAY2RGB) if shown.ndim == 2 else np.ascontiguousarray(shown[..., :3])
 
 
-def _small(rgb: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
-    scale = min(1.0, _SHOWN_PX / max(rgb.shape[:2]))
-    size = max(1, round(rgb.shape[1] * scale)), max(1, round(rgb.shape[0] * scale))
-    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8), scale
-
-
 def _outlined(rgb: NDArray[np.uint8], corners: Array) -> NDArray[np.uint8]:
     canvas = np.ascontiguousarray(rgb)
     fixed = np.clip(np.rint(16.0 * (corners - 0.5)), -(2**30), 2**30).astype(np.int32)  # of OpenCV, 1/16 pixel
@@ -139,7 +133,5 @@ def _outlined(rgb: NDArray[np.uint8], corners: Array) -> NDArray[np.uint8]:
 
 
 def _figure(rgb: NDArray[np.uint8], text: str) -> str:
-    small = cv2.cvtColor(_small(rgb)[0], cv2.COLOR_RGB2BGR)
-    data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
-    source = "data:image/jpeg;base64," + base64.b64encode(data).decode()
+    source = jpeg_url(rgb, _SHOWN_PX, _QUALITY)
     return f'<figure><img src="{source}" alt=""><figcaption>{escape(text)}</figcaption></figure>'
