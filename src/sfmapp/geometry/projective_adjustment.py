@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.geometry.dlt import normalizing
 from sfmapp.geometry.fit import CAUCHY_SIGMAS, cauchy, robust_sigma
 
 Array = NDArray[np.float64]
@@ -97,7 +98,8 @@ def adjust_projective(
     if not np.isfinite(seen.xy).all():
         raise ValueError("an adjustment takes pixels that are finite")
     num_views = len(model.cameras)
-    scaled, about = _normalized(seen)
+    about = normalizing(seen.xy)
+    scaled = replace(seen, xy=seen.xy * about[0, 0] + about[:2, 2])
     moves = np.ones(num_views, np.bool_) if fixed_views is None else ~fixed_views
     state = _unit(ProjectiveModel(about @ model.cameras, model.points))
     squared = (state.left(scaled) ** 2).sum(1)
@@ -128,14 +130,6 @@ def adjust_projective(
     rms = math.sqrt(float(squared.mean()) / 2.0)
     within = squared <= 2.0 * (3.0 * max(sigma, 1e-9)) ** 2 if math.isfinite(sigma) else np.ones(len(left), np.bool_)
     return found, AdjustmentInfo(taken, rms, sigma, np.asarray(within, np.bool_))
-
-
-def _normalized(seen: Sightings) -> tuple[Sightings, Array]:
-    """Pixels about their middle, with a mean square of two, and the map (3, 3) that brings them there."""
-    middle = seen.xy.mean(0)
-    scale = math.sqrt(2.0) / max(float(np.sqrt(((seen.xy - middle) ** 2).sum(1).mean())), 1e-300)
-    about = np.array([[scale, 0, -scale * middle[0]], [0, scale, -scale * middle[1]], [0, 0, 1.0]])
-    return replace(seen, xy=(seen.xy - middle) * scale), about
 
 
 def _unit(model: ProjectiveModel) -> ProjectiveModel:
