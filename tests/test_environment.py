@@ -197,6 +197,7 @@ def test_a_stream_that_fails_is_given_up_and_any_name_can_be_printed(tmp_path: P
 @pytest.mark.parametrize("number", signals.STOPPING)
 def test_signals_ask_once_and_one_that_is_ignored_stays_so(number: signal.Signals) -> None:
     asked: list[int] = []
+    inherited = signal.signal(number, signal.SIG_DFL)  # a shell's background jobs ignore SIGINT
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:
         with signals.signals_stop(lambda: asked.append(1), is_talking=False):
@@ -204,10 +205,12 @@ def test_signals_ask_once_and_one_that_is_ignored_stays_so(number: signal.Signal
             os.kill(os.getpid(), number)  # timeout(1) signals the process and then its group
         assert len(asked) == (0 if number == signal.SIGHUP else 1)
         assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+        signal.signal(signal.SIGHUP, before)
+        with pytest.raises(KeyboardInterrupt), signals.signals_interrupt():
+            os.kill(os.getpid(), number)
     finally:
         signal.signal(signal.SIGHUP, before)
-    with pytest.raises(KeyboardInterrupt), signals.signals_interrupt():
-        os.kill(os.getpid(), number)
+        signal.signal(number, inherited)
 
 
 # ------------------------------------------------------------------------------------------------------------- children

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 
 import cv2
@@ -340,12 +339,12 @@ def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
 
 @pytest.mark.real
-def test_a_real_chessboard(tmp_path: Path) -> None:
+def test_a_real_chessboard(data_root: Path, tmp_path: Path) -> None:
     """OpenCV's sample boards, through their calibrated lens: the shape is told from each photograph, and the corners
     between stand where they are printed."""
     from sfmapp.pipelines.planes import PlaneSource, Wanted, rectify
 
-    folder = Path(os.environ["SFMAPP_DATA"]) / "opencv-doc-samples" / "calib"
+    folder = data_root / "opencv-doc-samples" / "calib"
     pulls: list[float] = []
     residuals: dict[str | None, list[float]] = {str(folder / "left_intrinsics.yml"): [], None: []}
     for number in (1, 2, 5, 12):
