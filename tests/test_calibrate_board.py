@@ -81,6 +81,7 @@ def test_frames_are_picked_that_differ_and_are_sharp() -> None:
     )
     assert [one.unused is None for one in chosen] == [True, False, True, False]
     assert "like frame 000000" in str(chosen[1].unused)
+    assert [one.like for one in chosen] == [None, "000000", None, None]
     assert "blurred" in str(chosen[3].unused)
 
 

@@ -30,6 +30,8 @@ def test_a_filmed_board_calibrates_the_camera_that_filmed_it(tmp_path: Path, cap
     for frame in filmed_board(CAMERA, BOARD, NUM_FRAMES, set(BLURRED), seed=3):
         writer.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
     writer.release()
+    # of another program, another camera or an earlier try: it is not asked for
+    (tmp_path / "calibration.json").write_text("{}")
     output = tmp_path / "out"
     assert main(["calibrate", "board", str(film), "-o", str(output), "--no-recording"]) == 0
     board = json.loads((output / "report.json").read_text())["board"]
@@ -42,6 +44,14 @@ def test_a_filmed_board_calibrates_the_camera_that_filmed_it(tmp_path: Path, cap
     assert 8 <= len(picked) <= 30
     assert not {f"{n:06d}" for n in BLURRED[1:-1]} & set(picked)
     assert any("blurred" in str(row.get("unused")) or "no markers" in str(row.get("unused")) for row in rows.values())
+    # a frame that shows what another shows is no fault
+    page = (output / "report.html").read_text()
+    for row in rows.values():
+        light = (
+            "grey" if row.get("like") else "red" if row.get("unused") else "amber" if row.get("problem") else "green"
+        )
+        assert f'<td class="t {light}">{row["name"]}</td>' in page
+    assert any(row.get("like") for row in rows.values())
     made = read_calibration_file(output)
     xy, off, _ = projection_difference(CAMERA, made.camera)
     sigma = projection_sigma(made, xy)

@@ -30,6 +30,7 @@ class BoardPictureReport(Report):
         unused: why it has no part in the calibration.
         problem: why it stands out though it has a part.
         picked: why a frame of a video was taken.
+        like: the frame that was taken for it, as it shows the same: nothing is wrong with it.
     """
 
     name: str
@@ -39,6 +40,7 @@ class BoardPictureReport(Report):
     unused: str | None = None
     problem: str | None = None
     picked: str | None = None
+    like: str | None = None
 
 
 class LensTrialReport(Report):

@@ -15,7 +15,7 @@ from sfmapp.calibration.kernels import Observations
 from sfmapp.calibration.lens_choice import REJECTED, TRIED, Candidate, Trial, try_models
 from sfmapp.calibration.result import CameraCalibration, ViewFit
 from sfmapp.calibration.start import first_fit, refine_robustly, to_model
-from sfmapp.calibration.uncertainty import frame_covariance, image_grid, projection_sigma
+from sfmapp.calibration.uncertainty import frame_covariance, image_grid, projection_covariance
 from sfmapp.calibration.zhang import ClosedForm, closed_form
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.models import PARAM_NAMES, kind_of
@@ -251,8 +251,11 @@ def _worst_px(fit: Fit, is_used: Bools, views: Sequence[TargetView]) -> float:
     num = len(fit.camera.params)
     middle = float(np.median(np.linalg.norm(_points(fit, views), axis=1)))
     made = CameraCalibration(fit.camera, found[0][:num, :num], "", found[1], found[2], frame_covariance=found[0])
-    worst = np.nanmax(projection_sigma(made, image_grid(fit.camera), middle))
-    return float(worst) if np.isfinite(worst) else float("inf")
+    variance = 0.5 * np.trace(projection_covariance(made, image_grid(fit.camera), middle), axis1=1, axis2=2)
+    known = variance[~np.isnan(variance)]
+    # a variance below 0 is one that rounding has eaten: the parameters are open along it
+    is_told = len(known) > 0 and bool((known >= 0.0).all() and np.isfinite(known).all())
+    return float(np.sqrt(known.max())) if is_told else float("inf")
 
 
 def _points(fit: Fit, views: Sequence[TargetView]) -> Array:

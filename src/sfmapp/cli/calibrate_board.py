@@ -97,10 +97,16 @@ def _print(result: CalibrationResult) -> None:
         f"sigma of a projection over the picture: {report.mean_sigma_px:.4f} px in the mean, "
         f"{report.worst_sigma_px:.4f} px at worst"
     )
-    odd = [f"  {one.name}: {one.unused or one.problem}" for one in report.pictures if one.unused or one.problem]
+    odd = [
+        f"  {one.name}: {one.unused or one.problem}"
+        for one in report.pictures if (one.unused or one.problem) and not one.like
+    ]  # fmt: skip
+    num_alike = sum(one.like is not None for one in report.pictures)
     print("".join(f"{line}\n" for line in odd[:_LINES]), end="")
     if len(odd) > _LINES:
         print(f"  and {len(odd) - _LINES} more, in report.html")
+    if num_alike:
+        print(f"  {num_alike} frames show what others show, and were not needed")
     for warning in made.warnings:
         print(f"  note: {warning}")
     for n, view in enumerate(report.next_views, 1):

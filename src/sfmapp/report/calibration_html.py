@@ -103,7 +103,7 @@ def _maps(made: CameraCalibration, unit: str) -> str:
 def _pictures(board: BoardReport) -> str:
     rows = []
     for one in board.pictures:
-        light = "red" if one.unused else "amber" if one.problem else "green"
+        light = "grey" if one.like else "red" if one.unused else "amber" if one.problem else "green"
         rms = None if one.rms_px is None else f"{one.rms_px:.3f}"
         why = one.unused or one.problem or one.picked
         rows.append([(f"t {light}", one.name), ("", one.num_points), ("", one.num_used), ("", rms), ("w", why)])

@@ -24,9 +24,9 @@ table{border-collapse:collapse;font-size:.88rem;font-variant-numeric:tabular-num
 .wide{overflow-x:auto}
 th,td{padding:.25rem .6rem;border-bottom:1px solid #8884;text-align:right;white-space:nowrap}
 th{font-weight:600;vertical-align:bottom;white-space:normal}td.t,th.t{text-align:left}td.w{text-align:left;white-space:normal;min-width:18rem}
-.green::before,.amber::before,.red::before{content:"";display:inline-block;width:.75rem;height:.75rem;
+.green::before,.amber::before,.red::before,.grey::before{content:"";display:inline-block;width:.75rem;height:.75rem;
 border-radius:50%;margin-right:.5rem}
-.green::before{background:#2a9d4a}.amber::before{background:#e0a100}.red::before{background:#d1372c}
+.green::before{background:#2a9d4a}.amber::before{background:#e0a100}.red::before{background:#d1372c}.grey::before{background:#8888}
 .failure{border-left:.3rem solid #d1372c;padding:.3rem 1rem;background:#d1372c18}
 .dim{color:#888}svg{width:100%;max-height:32rem;border:1px solid #8884}details{margin:.5rem 0}
 .plot{max-height:none}.plot text,.view text{fill:currentColor;font-size:13px}.grid{stroke:#8884}

@@ -75,8 +75,9 @@ class MissingCameraError(InputError):
 
 
 def open_sequence(
-    source: str | Path, options: SequenceOptions, events: Events, *, require_camera: bool = True
-) -> Sequence:
+    source: str | Path, options: SequenceOptions, events: Events, *, require_camera: bool = True,
+    look_beside: bool = True,
+) -> Sequence:  # fmt: skip
     """Open a sequence; nothing is decoded yet but the first frame of a video.
 
     Args:
@@ -86,6 +87,7 @@ def open_sequence(
         events: told what was recognised and assumed, and, while frames are read, what is left out.
         require_camera: False: where nothing tells the intrinsics, the rig has one SIMPLE_RADIAL camera with a focal
             length from EXIF or a guess (``focal_source`` is ``default`` or begins with ``exif``).
+        look_beside: False: a calibration file that merely lies beside the frames is not read.
 
     Raises:
         MissingCameraError: nothing tells the intrinsics, and they are required.
@@ -96,27 +98,27 @@ def open_sequence(
     if "\0" in text:
         raise InputError(f"{printable(text)}: expected a sequence, found a name that no file can have")
     try:
-        return _open(text, options, events, require_camera)
+        return _open(text, options, events, require_camera, look_beside)
     except OSError as error:
         raise InputError(f"{printable(text)}: cannot be read: {error}") from error
 
 
-def _open(text: str, options: SequenceOptions, events: Events, require_camera: bool) -> Sequence:
+def _open(text: str, options: SequenceOptions, events: Events, require_camera: bool, look_beside: bool) -> Sequence:
     path = Path(text)
     if is_stream(text):
-        return _open_video(text, options, events, require_camera)
+        return _open_video(text, options, events, require_camera, look_beside)
     if not path.exists():
         if not glob.has_magic(text):
             raise InputError(f"{printable(text)}: expected a sequence, found nothing", f"a sequence is {_LAYOUTS}")
-        return _sequence(text, read_listed_sequence(text), options, events, require_camera)
+        return _sequence(text, read_listed_sequence(text), options, events, require_camera, look_beside)
     if path.is_file() and path.name not in _LISTS:
         if path.suffix.lower() in EXTENSIONS:
             raise InputError(f"{path}: expected a sequence, found a single image", f"a sequence is {_LAYOUTS}")
         if path.suffix.lower() == ".txt":
-            return _sequence(text, read_listed_sequence(text), options, events, require_camera)
-        return _open_video(text, options, events, require_camera)
+            return _sequence(text, read_listed_sequence(text), options, events, require_camera, look_beside)
+        return _open_video(text, options, events, require_camera, look_beside)
     folder = (path.parent if path.is_file() else path).absolute()
-    return _sequence(text, _read_layout(folder, events), options, events, require_camera)
+    return _sequence(text, _read_layout(folder, events), options, events, require_camera, look_beside)
 
 
 def _read_layout(folder: Path, events: Events) -> Recording:
@@ -265,11 +267,13 @@ def _sampling(rig: Rig, calibration: Calibration | None) -> tuple[NDArray[np.flo
 
 
 def _sequence(
-    source: str, recording: Recording, options: SequenceOptions, events: Events, require_camera: bool
-) -> FileSequence:
+    source: str, recording: Recording, options: SequenceOptions, events: Events, require_camera: bool,
+    look_beside: bool,
+) -> FileSequence:  # fmt: skip
     """The wishes of the user applied to what a layout holds."""
     first = [frame[0] for frame in recording.paths]
     folders = [recording.root, first[0].parent, *([recording.root.parent] if recording.kind == "euroc" else [])]
+    folders = folders if look_beside else []
     sizes = recording.sizes[:1] if options.mono else recording.sizes
     orientation = _exif_of(first[0]).orientation
     calibration = _calibration(
@@ -487,10 +491,12 @@ def _mirrored(
     return played[::-1], total - times, None if elapsed is None else total_elapsed - elapsed, ground_truth, imu
 
 
-def _open_video(source: str, options: SequenceOptions, events: Events, require_camera: bool) -> VideoSequence:
+def _open_video(
+    source: str, options: SequenceOptions, events: Events, require_camera: bool, look_beside: bool
+) -> VideoSequence:
     facts = read_video_facts(source)
     size = (facts.width, facts.height)
-    folders = [] if is_stream(source) else [Path(source).absolute().parent]
+    folders = [Path(source).absolute().parent] if look_beside and not is_stream(source) else []
     calibration = _calibration(options.camera, folders, None, False, (size,))
     rig = _rig(source, calibration, (size,), None, events, require_camera)
     body_from_cam = calibration.body_from_cam if calibration else None

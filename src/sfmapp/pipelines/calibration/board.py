@@ -204,6 +204,7 @@ def _report(
                 unused=one.unused if fit is None or num_used else problem,
                 problem=problem if num_used else None,
                 picked=one.picked,
+                like=one.like,
             )
         )
     sigma = projection_sigma(made, image_grid(made.camera), made.distances[1] if made.distances else None)

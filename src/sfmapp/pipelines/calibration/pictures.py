@@ -50,6 +50,7 @@ class BoardPicture:
         detection: what was found.
         unused: why it is left aside; None for one that counts.
         picked: why a frame of a video was taken.
+        like: name of a frame that was taken and shows the same, where that is why it is left aside.
         path: of a photograph; None of a frame.
     """
 
@@ -57,6 +58,7 @@ class BoardPicture:
     detection: Detection
     unused: str | None = None
     picked: str | None = None
+    like: str | None = None
     path: Path | None = None
 
 
@@ -192,7 +194,10 @@ def _in_threads(
 
 def _look_at_video(job: Job, given: Board | None) -> BoardPictures:
     """The sharpest frame of each piece of a video, and of those with a board some that differ."""
-    sequence = open_sequence(job.source, SequenceOptions(mono=True), job.events, require_camera=False)
+    # a calibration that lies beside it is what the film is to replace, or belongs to another camera
+    sequence = open_sequence(
+        job.source, SequenceOptions(mono=True), job.events, require_camera=False, look_beside=False
+    )
     total = sequence.num_frames
     length = max(1, -(-total // _PIECES)) if total else 15
     job.events.started(STAGE, "frames of the video", total=total)
@@ -232,6 +237,7 @@ def choose_frames(pictures: Sequence[BoardPicture], size: tuple[int, int], board
     where = {i: _outline(picture.detection, board) for i, picture in enumerate(pictures) if picture.unused is None}
     widths = np.array([picture.detection.sharpness_px for picture in pictures])
     reasons: dict[int, str] = {}
+    like: dict[int, str] = {}
     if where:
         limit = _BLURRED * float(np.nanquantile(widths[list(where)], 0.1))
         for i in list(where):
@@ -257,8 +263,12 @@ def choose_frames(pictures: Sequence[BoardPicture], size: tuple[int, int], board
     for i in left:
         nearest = min(taken, key=lambda k: _apart(where[i], where[k]))
         apart = _apart(where[i], where[nearest]) / diagonal
-        reasons[i] = f"like frame {pictures[nearest].name}: the board is {apart:.1%} of the picture away"
-    return [replace(one, unused=reasons.get(i, one.unused), picked=picked.get(i)) for i, one in enumerate(pictures)]
+        like[i] = pictures[nearest].name
+        reasons[i] = f"like frame {like[i]}: the board is {apart:.1%} of the picture away"
+    return [
+        replace(one, unused=reasons.get(i, one.unused), picked=picked.get(i), like=like.get(i))
+        for i, one in enumerate(pictures)
+    ]
 
 
 def _outline(detection: Detection, board: Board) -> NDArray[np.float64]:
