@@ -3,9 +3,12 @@
 A point of row y is seen at the time ``readout (y / height - 1/2)`` from the middle of the image. How fast it moves in
 the image there follows from the map itself: it is projected with the poses of the frames before and after. So the
 readout, as a share of the time between frames, is the only unknown. A hand trembles faster than frames follow each
-other: where there is a gyroscope, it tells how the camera turned while a frame was read, unless the motion by frames
-explains more. Adjustments with three values of it tell where the
-cost is least, and whether the images care at all: a global shutter, or a camera that hardly moves, leaves it at zero.
+other: where there is a gyroscope, it tells how the camera turned while a frame was read, if that clearly explains more.
+Adjustments with three values of the readout tell where the cost is least, and whether the images care at all: a global
+shutter, or a camera that hardly moves, leaves it at zero.
+
+A map that was made as if there were none has given up observations for what the shutter did to them, most of all where
+it did much. Those left speak for a readout that is too short, so which agree is asked again after each step towards it.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu
 from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.inertial.window import rates_at
-from sfmapp.odometry.map.backend import Job, make_job, take_over
+from sfmapp.odometry.map.backend import Job, classify, make_job, take_over
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.records import FrameRecord, measure_again
 from sfmapp.odometry.refinement.final_adjustment import MIN_EVIDENCE, MIN_SIGMA_PX
@@ -32,10 +35,10 @@ from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
 
-# Steps, as shares of the time between frames, in which the least cost is looked for, first far and then near: the
-# motion is known the better the straighter its images are. No camera reads longer than one frame; one that reads from
-# the bottom up is mounted upside down.
-_STRIDES, _MAX_READOUT = (0.25, 0.1), 1.0
+# Steps, as shares of the time between frames, in which the least cost is looked for, first far and then near, until it
+# has settled: the motion is known the better the straighter its images are. No camera reads longer than one frame; one
+# that reads from the bottom up is mounted upside down.
+_STRIDES, _SETTLED, _MAX_READOUT = (0.25, 0.1, 0.1, 0.1, 0.1), 0.005, 1.0
 # A sensor that reads within so small a share is as good as a global shutter: what is found is some other error.
 _MIN_READOUT = 0.05
 # Frames that are farther apart than that many steady steps say nothing about the motion in between.
@@ -61,27 +64,37 @@ def straighten(
         The numbers behind the decision.
     """
     total, first = 0.0, (0.0, 0.0)
-    sources = [None] if imu is None else [None, imu]
-    for stride in _STRIDES:
-        tried = [(_search(_RowShift(records, keyframes, map_idx, one), keyframes, stride), one) for one in sources]
-        (readout, evidence, job), best = max(tried, key=lambda pair: pair[0][1])
-        if stride == _STRIDES[0]:
+    source: Imu | None = None
+    for n, stride in enumerate(_STRIDES):
+        is_first = n == 0
+        found = _search(_RowShift(records, keyframes, map_idx, source), keyframes, stride, is_first)
+        if is_first and imu is not None:
+            turned = _search(_RowShift(records, keyframes, map_idx, imu), keyframes, stride, is_first)
+            # what it adds has to be as clear as a rolling shutter itself
+            if turned[1] > found[1] + MIN_EVIDENCE:
+                found, source = turned, imu
+        readout, evidence, job = found
+        if is_first:
             first = evidence, readout
         # what is next gained is little, but never a loss
-        least = MIN_EVIDENCE if stride == _STRIDES[0] else 0.0
+        least = MIN_EVIDENCE if is_first else 0.0
         if job is None or not evidence >= least or not _MIN_READOUT <= abs(total + readout) <= _MAX_READOUT:
             break
         total += readout
-        sources = [best]
-        _move(records, keyframes, map_idx, _RowShift(records, keyframes, map_idx, best), readout)
+        _move(records, keyframes, map_idx, _RowShift(records, keyframes, map_idx, source), readout)
+        classify(job.model, job.num_elsewhere)
         take_over(job, keyframes)
         measure_again(records, keyframes, map_idx)
+        if abs(readout) < _SETTLED:
+            break
     return ShutterReport(evidence=first[0], min_evidence=MIN_EVIDENCE, first_readout=first[1], readout=total)
 
 
-def _search(shift_of: _RowShift, keyframes: KeyframeMap, stride: float) -> tuple[float, float, Job | None]:
+def _search(
+    shift_of: _RowShift, keyframes: KeyframeMap, stride: float, is_first: bool
+) -> tuple[float, float, Job | None]:
     """The readout of least cost in steps of a stride, what it gains, and the map adjusted with it; None for the map
-    where there is no least cost within reach, or costs that are no numbers."""
+    where there is no least cost within reach, or costs that are no numbers; or, the first time, no sign of one."""
     everything = np.arange(len(keyframes.keyframes))
     job = make_job(keyframes, everything, everything > 0)
     model, tracks = job.model, job.model.tracks
@@ -92,9 +105,10 @@ def _search(shift_of: _RowShift, keyframes: KeyframeMap, stride: float) -> tuple
     if not shifts.any():
         return 0.0, 0.0, None
     sigma = residual_scale_px(model, MIN_SIGMA_PX)
-    glance = [_adjusted(job, shifts, n * stride, sigma, _GLANCE_STEPS)[0] for n in (-1, 0, 1)]
-    if not np.isfinite(glance).all() or abs(_vertex(*glance)) * stride < 0.5 * _MIN_READOUT:
-        return 0.0, 0.0, None
+    if is_first:
+        glance = [_adjusted(job, shifts, n * stride, sigma, _GLANCE_STEPS)[0] for n in (-1, 0, 1)]
+        if not np.isfinite(glance).all() or abs(_vertex(*glance)) * stride < 0.5 * _MIN_READOUT:
+            return 0.0, 0.0, None
     costs = {n: _adjusted(job, shifts, n * stride, sigma)[0] for n in (-1, 0, 1)}
     best = min(costs, key=lambda n: (costs[n], abs(n)))
     while {best - 1, best + 1} - set(costs) and abs(best) * stride <= _MAX_READOUT:
