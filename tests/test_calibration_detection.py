@@ -9,10 +9,11 @@ import pytest
 
 from board_views import render_board
 from sfmapp.calibration.adjustment import TargetView
+from sfmapp.calibration.bent_edges import bend_shift, unbent
 from sfmapp.calibration.boards import Board, parse_board
 from sfmapp.calibration.circle_centers import DiskMarks, disk_images, recentered
 from sfmapp.calibration.circles import disk_bias
-from sfmapp.calibration.detection import detect_board
+from sfmapp.calibration.detection import detect_board, window_of
 from sfmapp.calibration.solve import solve_views
 from sfmapp.camera.camera import Camera, project
 from sfmapp.camera.names import CameraModel
@@ -146,3 +147,32 @@ def test_a_picture_without_a_board_says_so() -> None:
         found = detect_board(noise, parse_board(text))
         assert found.problem is not None
         assert len(found.idx) == 0
+
+
+def test_bent_edges_move_crossings_and_a_camera_tells_by_how_much() -> None:
+    """A barrel lens near the corners of the picture: crossings are found to the inside of the bend of their edges, and
+    less than half as far off once the camera is known."""
+    board = parse_board("charuco:6x5:0.03:0.022")
+    camera = Camera(CameraModel.OPENCV, 400, 300, np.array([230.0, 231.0, 203.0, 148.0, -0.24, 0.045, 5e-4, -4e-4]))
+    window = window_of(board)
+    assert window is not None
+    before, after, shifts = [], [], []
+    for x, y, z in ((-0.2, -0.15, 0.15), (0.02, -0.15, 0.15), (-0.18, -0.13, 0.13), (0.01, 0.0, 0.13)):
+        pose = rigid3.from_matrix(rigid3.exp_so3(np.array([0.1, -0.15, 0.02])), np.array([x, y, z]))
+        found = detect_board(render_board(camera, board, pose, blur_px=0.6), board)
+        view = TargetView("", board.points[found.idx], found.xy)
+        truth = project(camera, rigid3.apply(pose, view.xyz))
+        freed = unbent([view], camera, board.spacing, *window)[0]
+        before.append(view.xy - truth)
+        after.append(freed - truth)
+        shifts.append(bend_shift(camera, pose, view.xyz, board.spacing, window))
+        # the pose that fits crossings that are off is near enough to tell by how much they are
+        np.testing.assert_allclose(view.xy - freed, shifts[-1], atol=2e-3)
+    error, left, shift = (np.concatenate(values) for values in (before, after, shifts))
+    assert len(error) > 60
+    assert (error * shift).sum() > 0.9 * np.sqrt((error**2).sum() * (shift**2).sum())
+    assert 0.05 < np.sqrt((error**2).sum(1).mean()) < 0.08
+    assert np.sqrt((left**2).sum(1).mean()) < 0.035
+    # straight edges, however oblique, move nothing
+    pinhole = Camera(CameraModel.PINHOLE, 400, 300, camera.params[:4])
+    np.testing.assert_allclose(bend_shift(pinhole, pose, view.xyz, board.spacing, window), 0.0, atol=1e-9)

@@ -423,6 +423,12 @@ def _reach(board: Board) -> Array:
     return np.array([0.45, 0.45])
 
 
+def window_of(board: Board) -> tuple[float, float] | None:
+    """Half of the window in which a crossing is measured, along its edges: in fields, and in pixels at most. None for
+    boards without crossings of four fields whose edges go through."""
+    return (float(_reach(board)[0]), _WINDOW_PX) if board.kind in ("chessboard", "charuco") else None
+
+
 def _crossings(gray: Pixels, board: Board, idx: Ints, xy: Array) -> Array:
     """Crossings near pixels (N, 2): first in a window as wide as the picture was reduced by, then once more from
     there."""

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 # A step shorter than this, in pixels, ends the search.
 _SHORT_PX = 1e-3
 _MAX_STEPS = 12
+# a pair at a share s of half of the window weighs exp(-s^2 times this)
+WINDOW_DECAY = 1.5
 
 
 @numba.njit(cache=True, nogil=True)
@@ -76,7 +78,7 @@ def _symmetric_point(
                     continue
                 p, px, py = _sampled(gray, x + dx, y + dy)
                 q, qx, qy = _sampled(gray, x - dx, y - dy)
-                weight = math.exp(-1.5 * ((s / half[0]) ** 2 + (t / half[1]) ** 2))
+                weight = math.exp(-WINDOW_DECAY * ((s / half[0]) ** 2 + (t / half[1]) ** 2))
                 row[0], row[1], row[2], row[3] = px - qx, py - qy, dx, dy
                 for a in range(4):
                     g[a] += weight * row[a] * (p - q)

@@ -30,7 +30,7 @@ from sfmapp.calibration.uncertainty import image_grid, projection_sigma
 from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
-from sfmapp.pipelines.calibration.disks import with_disk_centers
+from sfmapp.pipelines.calibration.centers import with_disk_centers, with_unbent_crossings
 from sfmapp.pipelines.calibration.pictures import BoardPictures, look_at_pictures
 from sfmapp.pipelines.calibration.results import outline_of, write_camera, write_recording
 from sfmapp.report.calibration_html import render_board_html
@@ -119,6 +119,11 @@ def calibrate_board(
             if centered is not None:
                 job.events.decided("calibration", "centres of circles by the camera that was found, then once more")
                 pictures = centered
+                solution, views = _solved(job, pictures, asked)
+            freed = with_unbent_crossings(pictures, solution.calibration.camera)
+            if freed is not None:
+                job.events.decided("calibration", "crossings freed of the bend of their edges, then once more")
+                pictures = freed
                 solution, views = _solved(job, pictures, asked)
         with job.stage("plan"):
             made = solution.calibration

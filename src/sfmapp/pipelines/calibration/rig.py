@@ -25,7 +25,7 @@ from sfmapp.camera_files.rig_writing import write_rig_files
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
 from sfmapp.images.video import is_video
-from sfmapp.pipelines.calibration.disks import with_disk_centers
+from sfmapp.pipelines.calibration.centers import with_disk_centers
 from sfmapp.pipelines.calibration.pictures import BoardPictures, look_at_pictures
 from sfmapp.pipelines.calibration.results import note_recording, outline_of, write_camera
 from sfmapp.pipelines.calibration.shots import match_shots
