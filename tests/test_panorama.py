@@ -14,7 +14,7 @@ from PIL import Image
 
 import sfmapp
 from schemas import check_schema
-from sfmapp.camera.camera import Camera, CameraModel, project
+from sfmapp.camera.camera import Camera, CameraModel, pixels_to_rays, project
 from sfmapp.cli.main import main
 from sfmapp.formats.colmap import read_model
 from sfmapp.geometry import rigid3
@@ -24,6 +24,8 @@ from sfmapp.panorama.adjustment import Turned, TurnedFit, adjust_turns, refinabl
 from sfmapp.panorama.canvas import View, choose_canvas, lenses_of
 from sfmapp.panorama.level import level
 from sfmapp.panorama.preview import Shown, find_gains
+from sfmapp.panorama.report import TurnedPair
+from sfmapp.panorama.turning_report import judge_pairs
 from sfmapp.scene.tracks import Tracks
 
 Array = NDArray[np.float64]
@@ -278,25 +280,27 @@ def photograph(texture: NDArray[np.uint8], rotation: Array, focal: float) -> NDA
 
 @pytest.fixture(scope="module")
 def stitched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Array]:
-    """Photographs, one of them of something else, their panorama, and the rotations."""
+    """Photographs, two of them behind the camera, one of something else, their panoramas, and the rotations."""
     folder = tmp_path_factory.mktemp("panorama")
     photos, texture = folder / "photos", sphere()
     photos.mkdir()
-    rotations = ring(12)[:4]
+    rotations = ring(12)[[0, 1, 2, 3, 7, 8]]
     for k, rotation in enumerate(rotations):
         pixels = photograph(texture, rotation, 250.0)
         Image.fromarray(pixels).save(photos / f"{k}.png")
     noise = np.random.default_rng(1).integers(0, 256, (60, 80, 3)).astype(np.uint8)
     Image.fromarray(noise).resize((320, 240)).save(photos / "stray.png")
     assert main(["panorama", str(photos), "-o", str(folder / "out"), "--projection", "spherical", "-q"]) == 0
-    return photos, folder / "out", rotations
+    return photos, folder / "out", rotations[:4]
 
 
 def test_photographs_become_a_panorama(stitched: tuple[Path, Path, Array]) -> None:
     photos, out, truth = stitched
     report = json.loads((out / "report.json").read_text())
     check_schema("panorama", report)
-    assert [one["name"] for one in report["turning"]["left_out"]] == ["stray.png"]
+    left_out = {one["name"]: one["reason"] for one in report["turning"]["left_out"]}
+    assert list(left_out) == ["4.png", "5.png", "stray.png"]
+    assert "belongs to another panorama, of 2 photographs" in left_out["4.png"]
     focal = report["turning"]["cameras"][0]
     assert focal["focal_px"] == pytest.approx(250.0, rel=0.005)
     model, _ = read_model(out / "sparse" / "0")
@@ -322,6 +326,56 @@ def test_photographs_become_a_panorama(stitched: tuple[Path, Path, Array]) -> No
     source = np.asarray(Image.open(photos / "1.png"), np.float64)
     there = source[120 + 4 : 120 + 7, 160 + 11 : 160 + 14].mean((0, 1))
     assert np.abs(picture[at[1] - 1 : at[1] + 2, at[0] - 1 : at[0] + 2].mean((0, 1)) - there).max() < 12.0
+
+
+def test_photographs_that_overlap_none_of_them_become_another_panorama(stitched: tuple[Path, Path, Array]) -> None:
+    _, out, _ = stitched
+    (other,) = json.loads((out / "report.json").read_text())["others"]
+    assert [one["name"] for one in other["turning"]["images"]] == ["4.png", "5.png"]
+    assert other["turning"]["left_out"] == []
+    picture = Image.open(out / "panorama-2.jpg")
+    assert other["picture"]["file"] == "panorama-2.jpg"
+    assert picture.size == (other["picture"]["width"], other["picture"]["height"])
+    model, _ = read_model(out / "sparse" / "1")
+    entries = json.loads((out / "rotations.json").read_text())["others"][0]["images"]
+    assert np.allclose([one["cam_from_world"] for one in entries], model.cam_from_world[:, :4], atol=1e-9)
+    turn = rigid3.rotation_matrix(model.cam_from_world)
+    assert rigid3.rotation_angle_deg(turn[1] @ turn[0].T) == pytest.approx(30.0, abs=0.5)
+    assert (out / "report.html").read_text().count("<img") == 2
+
+
+def moved_pair(noise: float, by: float, spread: float, seed: int) -> tuple[TurnedPair, float]:
+    """What is said of a pair with that noise, pixels, in a panorama with noise of 0.1, and the parallax that it has.
+
+    The second camera has moved sideways, so that a wall, inclined by depths from one to two, moves by ``by`` pixels;
+    points stand before it by a share of their depth that goes up to ``spread``.
+    """
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform([20.0, 20.0], [380.0, 280.0], (200, 2))
+    rays = pixels_to_rays(LENS, xy)
+    inverse = (0.5 + 0.5 * xy[:, 0] / 400.0) * rng.uniform(1.0, 1.0 + spread, 200)
+    turn = rigid3.exp_so3([0.02, 0.05, 0.0])
+    # what they have in common is a turn to the panorama
+    moved = rays - np.outer(inverse - inverse.mean(), [by / LENS.focal, 0.0, 0.0])
+    moved /= np.linalg.norm(moved, axis=1, keepdims=True)
+    parallax = LENS.focal * float(np.median(np.linalg.norm(moved - rays, axis=1)))
+    seen = project(LENS, moved @ turn.T) + noise * rng.normal(size=(200, 2))
+    state = Turned([LENS], np.stack([np.eye(3), turn]), rays)
+    fit = TurnedFit(state, np.zeros((400, 2)), 0.1, ((),), np.zeros((6, 6)), 1.0, 0.0)
+    pair = pairs.MatchedPixels((0, 1), (0, 0), (xy, seen))
+    return judge_pairs([pair], [50.0], np.arange(2), ["a", "b"], fit, 0)[0], parallax
+
+
+def test_parallax_is_held_to_the_noise_of_its_pair() -> None:
+    """A blurred photograph has five times the noise of the others and no parallax; what has moved is told, where
+    neighbours are equally far and where they are not."""
+    for seed in range(20):
+        blurred, _ = moved_pair(0.5, 0.0, 0.0, seed)
+        assert blurred.median_px > 2.0 * 0.1 * 2.0 * np.sqrt(np.log(2.0))  # twice what noise of 0.1 makes of it
+        assert blurred.parallax_px == 0.0
+        for noise, spread in ((0.1, 0.0), (0.5, 0.0), (0.1, 3.0), (0.5, 3.0)):
+            moved, parallax = moved_pair(noise, 40.0, spread, seed)
+            assert moved.parallax_px == pytest.approx(parallax, rel=0.15)
 
 
 def test_sharp_frames_of_a_video_become_a_panorama(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from sfmapp.cli.common import (
 )
 
 if TYPE_CHECKING:
+    from sfmapp.panorama.report import PictureReport, TurningReport
     from sfmapp.pipelines.panorama import PanoramaResult
 
 EXAMPLES = """\
@@ -32,6 +33,7 @@ Writes
   OUT/sparse/0/         the cameras, at one centre, as a COLMAP model without points
   OUT/rotations.json    their rotations and the lens, with sigmas
   OUT/frames/           of a video the frames that were picked: sharp ones, a fifth of the picture apart
+  OUT/panorama-2.jpg    and so on: of photographs that overlap none of the first panorama, but each other; OUT/sparse/1/
   OUT/report.html       how sure that is, where the camera did not turn on the spot, and what was left out
 Photographs that are not of the panorama are left out and named. The same command again resumes a run that was cut
 off."""
@@ -86,9 +88,17 @@ def _panorama(args: argparse.Namespace) -> int:
 def _print(result: PanoramaResult) -> None:
     """A result in a few lines."""
     report = result.report
-    turning, picture = report.turning, report.picture
-    if turning is None or picture is None:
+    if report.turning is None or report.picture is None:
         return
+    _print_panorama(report.turning, report.picture)
+    for other in report.others:
+        print(f"another panorama, {other.picture.file}:")
+        _print_panorama(other.turning, other.picture)
+    print(took(result.output, report.run))
+    print(f"picture {result.picture}, report {result.output / 'report.html'}")
+
+
+def _print_panorama(turning: TurningReport, picture: PictureReport) -> None:
     print(
         f"{turning.num_turned} of {turning.num_images} photographs, {picture.width} x {picture.height} pixels, "
         f"{picture.projection}, {picture.span_deg:.0f} degrees"
@@ -104,5 +114,3 @@ def _print(result: PanoramaResult) -> None:
     if moved:
         print(f"  parallax in {len(moved)} pairs, up to {max(moved):.1f} px: see the report")
     print_contradictions(turning.contradictions)
-    print(took(result.output, report.run))
-    print(f"picture {result.picture}, report {result.output / 'report.html'}")

@@ -61,7 +61,8 @@ class TurnedPair(Report):
         num_matches: verified. num_turned: those that the panorama explains, within ``threshold_px``.
         turn_deg: between the two.
         median_px: of the angles between matched rays, in pixels, over all verified matches.
-        parallax_px: what of that neither noise nor the widened sigmas explain: 0 where the camera turned on the spot.
+        parallax_px: what of that noise does not explain, neither that of the panorama nor the pair's own: 0 where the
+            camera turned on the spot.
         verdict: ``rotation``, ``parallax``, ``contradicted`` or ``no rotation``.
     """
 

@@ -62,6 +62,8 @@ class TurnedPhotographs:
         camera_idx: (K,) positions in ``cameras``.
         rotations: (K, 3, 3) cam_from_world; in the world y is down, and z looks at the middle of the panorama.
         sigma_deg: (K, 3) about the axes of each camera.
+        other_groups: positions of photographs that were turned as well, each group from a place of its own, or without
+            overlap with these; the largest first.
     """
 
     image_idx: Ints
@@ -69,6 +71,7 @@ class TurnedPhotographs:
     camera_idx: Ints
     rotations: Array
     sigma_deg: Array
+    other_groups: Sequence[Ints]
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,7 @@ class _Round:
 
 def find_rotations(
     image_set: ImageSet, features: Sequence[Features], correspondences: Correspondences, options: MatchingOptions, *,
-    seed: int, events: Events,
+    seed: int, events: Events, among: Ints | None = None,
 ) -> tuple[TurnedPhotographs, TurningReport]:  # fmt: skip
     """Find the largest group of photographs that were taken from one place, their rotations and lenses.
 
@@ -113,12 +116,14 @@ def find_rotations(
         image_set: the photographs. features: of each. correspondences: verified matches.
         options: of the matching, for its threshold.
         seed: of the draws.
+        among: positions of the photographs to look at; None: all.
 
     Raises:
         NoReconstructionError: no two photographs are a rotation apart, or most matches contradict that.
     """
-    events.started(STAGE, f"rotations of {len(image_set.images)} photographs", total=4)
-    evidence = _evidence(image_set, features, correspondences, options, seed)
+    among = np.arange(len(image_set.images)) if among is None else among
+    events.started(STAGE, f"rotations of {len(among)} photographs", total=4)
+    evidence = _evidence(image_set, features, correspondences, options, seed, among)
     if not evidence.pixels:
         raise NoReconstructionError("no two photographs have verified matches with each other", _ADVICE)
     start = _start_cameras(evidence)
@@ -139,24 +144,22 @@ def find_rotations(
     orientation = [image_set.images[i].orientation for i in fine.members]
     found = TurnedPhotographs(
         fine.members, fine.fit.state.cameras, fine.camera_idx,
-        level(fine.fit.state.rotations, orientation), fine.fit.rotation_sigma_deg,
+        level(fine.fit.state.rotations, orientation), fine.fit.rotation_sigma_deg, fine.groups,
     )  # fmt: skip
     report = report_of(
-        image_set, (fine.members, fine.groups), found.rotations, fine.fit, fine.tracks, verdicts,
+        image_set, (among, fine.members, *fine.groups), found.rotations, fine.fit, fine.tracks, verdicts,
         (evidence.priors, start), choices,
     )  # fmt: skip
     events.advanced(STAGE)
-    events.finished(
-        STAGE, f"{len(found.image_idx)} of {len(image_set.images)} photographs turned on the spot", **report
-    )
+    events.finished(STAGE, f"{len(found.image_idx)} of {len(among)} photographs turned on the spot", **report)
     return found, report
 
 
 def _evidence(
     image_set: ImageSet, features: Sequence[Features], correspondences: Correspondences, options: MatchingOptions,
-    seed: int,
+    seed: int, among: Ints,
 ) -> _Evidence:  # fmt: skip
-    useful = ~np.isin(correspondences.config, USELESS_CONFIGS)
+    useful = ~np.isin(correspondences.config, USELESS_CONFIGS) & np.isin(correspondences.pair_image_idx, among).all(1)
     pair_idx = np.flatnonzero(useful & (correspondences.num_inliers >= turns.MIN_MATCHES))
     cameras = [_with_distortion(camera) for camera in image_set.cameras]
     whose = np.array([record.camera_idx for record in image_set.images], np.int64)

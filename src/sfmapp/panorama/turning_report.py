@@ -30,6 +30,13 @@ _TOLD = 0.05
 _MEDIAN_OF_NOISE = 2.0 * math.sqrt(math.log(2.0))
 # A pair whose median is below twice what noise makes of it says nothing of parallax.
 _TWICE = 2.0
+# Matches nearer to each other than this angle are no neighbours: they share pixels, and with these their noise.
+_APART = 0.02
+# directions, of a half sphere, in which a pair may have moved: a tenth of a right angle from one to the next
+_NUM_DIRECTIONS = 200
+# The median of the length of two coordinates of noise, in units of that of one: sqrt(2 ln 2) / 0.6745; and a half more,
+# for blur by motion makes noise up to twice as great along it (of rendered frames that eleven pixels passed).
+_MEDIAN_OF_ONE = 1.5 * math.sqrt(2.0 * math.log(2.0)) / 0.6745
 # A rotation that contradicts the panorama is red if it rests on so many matches, of those of its photographs' best pair
 _STRONG_SHARE = 0.5
 
@@ -51,14 +58,18 @@ def judge_pairs(
         both = [cameras[c] for c in pair.cameras]
         a, b = (pixels_to_rays(camera, xy) for camera, xy in zip(both, pair.xy, strict=True))
         focal = 0.5 * (both[0].focal + both[1].focal)
-        errors = focal * np.linalg.norm(a @ turn.T - b, axis=1)
+        there = a @ turn.T
+        errors = focal * np.linalg.norm(there - b, axis=1)
         # where a lens has no inverse, as far as anything can be apart
         errors = np.where(np.isfinite(errors), errors, 2.0 * focal)
         share, median = float((errors < threshold).mean()), float(np.median(errors))
         verdict = "rotation" if share >= TURNED_SHARE else "parallax" if share >= MAJORITY else "no rotation"
         if verdict == "no rotation" and fit_turn(a, b, focal, threshold, (seed, *pair.images)).share >= TURNED_SHARE:
             verdict = "contradicted"
-        parallax = math.sqrt(median**2 - expected**2) if median > _TWICE * expected else 0.0
+        noise = expected
+        if median > _TWICE * expected:
+            noise = max(noise, focal * _noise_of_pair(there, b))
+        parallax = math.sqrt(median**2 - noise**2) if median > _TWICE * noise else 0.0
         out.append(TurnedPair(
             images=(names[pair.images[0]], names[pair.images[1]]), num_matches=len(errors),
             num_turned=int((errors < threshold).sum()), threshold_px=threshold,
@@ -67,22 +78,52 @@ def judge_pairs(
     return out
 
 
+def _noise_of_pair(there: Array, seen: Array) -> float:
+    """What noise makes of the median distance of matched unit rays (N, 3), radians, the pair's own: a blurred
+    photograph has several times that of the others.
+
+    Parallax is common to neighbours that are equally far, or lies along the lines to where the camera moved, whatever
+    is how far; noise is neither. The lesser of what neighbours differ by and of what lies across such lines counts, so
+    that leaves before a sky do not pass for noise; where the camera moved to is found on one half of the matches, and
+    what lies across taken from the other.
+    """
+    known = np.isfinite(there[:, 0]) & np.isfinite(seen[:, 0])
+    there, errors = there[known], (seen - there)[known]
+    if len(errors) < MIN_MATCHES:
+        return math.inf
+    near = there @ there.T
+    near[near > math.cos(_APART)] = -2.0
+    beside = near.argmax(1)
+    of_neighbors = float(np.median(np.linalg.norm(errors - errors[beside], axis=1))) / math.sqrt(2.0)
+    # of directions by Fibonacci's spiral
+    k = np.arange(_NUM_DIRECTIONS)
+    z, angle = (k + 0.5) / _NUM_DIRECTIONS, k * math.pi * (3.0 - math.sqrt(5.0))
+    toward = np.stack([np.sqrt(1.0 - z**2) * np.cos(angle), np.sqrt(1.0 - z**2) * np.sin(angle), z], 1)
+    normals = np.cross(toward[:, None], there[None])
+    length = np.maximum(np.linalg.norm(normals, axis=2), 1e-9)
+    lengths = np.abs(np.einsum("kni,ni->kn", normals, errors)) / length
+    across = [np.median(lengths[:, half::2], axis=1) for half in range(2)]
+    held_out = max(float(across[1 - half][across[half].argmin()]) for half in range(2))
+    return min(of_neighbors, _MEDIAN_OF_ONE * held_out)
+
+
 def report_of(
-    image_set: ImageSet, groups: tuple[Ints, Sequence[Ints]], rotations: Array, fit: TurnedFit, tracks: Tracks,
+    image_set: ImageSet, groups: Sequence[Ints], rotations: Array, fit: TurnedFit, tracks: Tracks,
     verdicts: Sequence[TurnedPair], before: tuple[Sequence[Camera], Sequence[Camera]],
     choices: Sequence[LensChoice],
 ) -> TurningReport:  # fmt: skip
     """The report of the stage.
 
     Args:
-        groups: photographs of the panorama, and those of other groups. rotations: (K, 3, 3), levelled.
+        groups: photographs that were looked at, those of the panorama, and those of each other group.
+        rotations: (K, 3, 3), levelled.
         before: cameras as they were known, and as pairs alone had them.
     """
-    members, names = groups[0], image_set.names
+    among, members, *others = groups
     total = sum(each.num_matches for each in verdicts)
     turned = sum(each.num_turned for each in verdicts)
     return TurningReport(
-        num_images=len(names),
+        num_images=len(among),
         num_turned=len(members),
         noise_px=fit.noise_px,
         correlation=fit.correlation,
@@ -93,7 +134,7 @@ def report_of(
         images=_images(image_set, members, rotations, fit, tracks),
         pairs=verdicts,
         lens_choice=choices,
-        left_out=_left_out(image_set, members, groups[1]),
+        left_out=_left_out(image_set, among, members, others),
         contradictions=_contradictions(verdicts),
         thresholds={"turned_share": TURNED_SHARE, "majority": MAJORITY, "min_matches": MIN_MATCHES},
     )  # fmt: skip
@@ -132,11 +173,11 @@ def _images(image_set: ImageSet, members: Ints, rotations: Array, fit: TurnedFit
     ]  # fmt: skip
 
 
-def _left_out(image_set: ImageSet, members: Ints, others: Sequence[Ints]) -> list[NamedReason]:
+def _left_out(image_set: ImageSet, among: Ints, members: Ints, others: Sequence[Ints]) -> list[NamedReason]:
     inside = set(members.tolist())
     of_group = {int(i): group for group in others for i in group}
     out = []
-    for i, record in enumerate(image_set.images):
+    for i in among.tolist():
         if i in inside:
             continue
         reason = "no photograph of the panorama is a rotation away from it: too few matches, or taken from elsewhere"
@@ -145,9 +186,9 @@ def _left_out(image_set: ImageSet, members: Ints, others: Sequence[Ints]) -> lis
             first = image_set.images[int(group[0])].name
             reason = (
                 f"belongs to another panorama, of {len(group)} photographs that overlap none of these (the first is "
-                f"{first}): give them alone"
+                f"{first})"
             )
-        out.append(NamedReason(name=record.name, reason=reason))
+        out.append(NamedReason(name=image_set.images[i].name, reason=reason))
     return out
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfmapp.errors import NoReconstructionError, UsageError
 from sfmapp.events import Events
@@ -18,12 +21,12 @@ from sfmapp.geometry import rigid3
 from sfmapp.images.load import Images, load_images, name_of
 from sfmapp.images.rewrite import encode
 from sfmapp.images.video import is_video
-from sfmapp.panorama.report import PictureReport, TurningReport
+from sfmapp.panorama.report import TurningReport
 from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
 from sfmapp.pipelines.sparse.matches import find_matches
 from sfmapp.pipelines.sparse.run import Run
 from sfmapp.report.model import Outcome
-from sfmapp.report.panorama_html import PanoramaReport, panorama_page
+from sfmapp.report.panorama_html import OtherPanorama, PanoramaReport, in_small, panorama_page
 from sfmapp.reporting import NamedReason, document_text
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import Tracks
@@ -39,6 +42,7 @@ if TYPE_CHECKING:
     from sfmapp.panorama.canvas import Canvas, Projection
     from sfmapp.panorama.stitch import StitchedPicture
     from sfmapp.panorama.turning import TurnedPhotographs
+    from sfmapp.scene.correspondences import Correspondences
 
 STAGE = PANORAMA
 # Three numbers for each photograph are told by some hundred rays, and matching costs the square of the keypoints: 3,000
@@ -88,14 +92,19 @@ class PictureLayout:
             return self.max_size
         return min(self.max_size or _MOST_OF_JPEG, _MOST_OF_JPEG)
 
+    def file_of(self, k: int) -> str:
+        """Of the panorama with that number, from 0: a further one has its number in its name."""
+        path = Path(self.file)
+        return self.file if k == 0 else f"{path.stem}-{k + 1}{path.suffix}"
+
 
 @dataclass(frozen=True)
 class PanoramaResult:
     """What was written.
 
     Attributes:
-        output: the folder. picture: the file.
-        report: of it.
+        output: the folder. picture: the file of the first panorama, of most photographs.
+        report: of it, and in ``report.others`` of those whose photographs overlap none of the first, beside it.
     """
 
     output: Path
@@ -154,13 +163,12 @@ def _run(run: Run, layout: PictureLayout) -> PanoramaReport:
     run.workspace.note(image_root=os.fspath(image_set.root or ""))
     run.note_inputs(keys.inputs)
     try:
-        turning, picture, drawn = _stitched(run, image_set, keys, layout, key)
+        made, shown = _stitched(run, image_set, keys, layout, key)
     except NoReconstructionError as failure:
         run.workspace.begin(STAGE, key)
-        _write_report(run, _report(run, None, None, failure), None, failure)
+        _write_report(run, _report(run, [], failure), [], failure)
         raise
-    report = _report(run, turning, picture, None)
-    return _write_report(run, report, drawn, None)
+    return _write_report(run, _report(run, made, None), shown, None)
 
 
 def _frames_of(run: Run, video: str) -> Path:
@@ -194,22 +202,25 @@ def _earlier(run: Run, layout: PictureLayout, key: str) -> PanoramaReport | None
     if not workspace.is_current(STAGE, key):
         return None
     raise_as_before(workspace.manifest.stage(STAGE))
-    wanted = [workspace.folder / name for name in (layout.file, ROTATIONS, PAGE)]
-    wanted += [workspace.model() / name for name in MODEL_FILES]
     report = workspace.read_report(PanoramaReport)
-    if report is None or not all(path.is_file() for path in wanted):
+    if report is None:
+        return None
+    num = 1 + len(report.others)
+    wanted = [workspace.folder / name for name in (ROTATIONS, PAGE, *(layout.file_of(k) for k in range(num)))]
+    wanted += [workspace.model(k) / name for name in MODEL_FILES for k in range(num)]
+    if not all(path.is_file() for path in wanted):
         return None
     return replace(report, run=replace(report.run, is_up_to_date=True, **run.watch.read()))
 
 
 def _stitched(
     run: Run, image_set: ImageSet, keys: StageKeys, layout: PictureLayout, key: str
-) -> tuple[TurningReport, PictureReport, StitchedPicture]:
-    """From photographs to the picture, which is written with the rotations."""
+) -> tuple[list[OtherPanorama], list[NDArray[np.uint8]]]:
+    """From photographs to the pictures, which are written with the rotations: what is said of each, the largest first,
+    and each in small."""
     from sfmapp.panorama.stitch import stitch
-    from sfmapp.panorama.turning import find_rotations
 
-    options, workspace = run.options, run.workspace
+    workspace = run.workspace
     if len(image_set.images) < 2:
         found = image_set.images[0].name if image_set.images else "none"
         raise NoReconstructionError(
@@ -218,20 +229,58 @@ def _stitched(
         )
     correspondences = find_matches(run, image_set, keys, PAIR_MODULES)
     with run.stage("rotations"):
-        turned, turning = find_rotations(
-            image_set, run.features, correspondences, options.matching, seed=options.seed, events=run.events
-        )
-    _warn(run, turning)
+        groups = _turned_groups(run, image_set, correspondences)
+    made: list[OtherPanorama] = []
+    shown: list[NDArray[np.uint8]] = []
     with run.stage("picture"):
-        drawn, picture = stitch(
-            image_set, turned, projection=layout.projection, max_size=layout.limit, events=run.events
-        )
-    with run.stage("output"):
         workspace.begin(STAGE, key)
-        run.save_first(lambda: _write_picture(workspace.folder / layout.file, drawn, layout))
-        workspace.write_models([_model(image_set, turned)], [np.zeros((0, 2))] * len(turned.image_idx), run.events)
-        workspace.write_json(ROTATIONS, _rotations(turning))
-    return turning, replace(picture, file=layout.file), drawn
+        for k, (turned, turning) in enumerate(groups):
+            drawn, picture = stitch(
+                image_set, turned, projection=layout.projection, max_size=layout.limit, events=run.events
+            )
+            path = workspace.folder / layout.file_of(k)
+            run.save_first(partial(_write_picture, path, drawn, layout))
+            made.append(OtherPanorama(turning=turning, picture=replace(picture, file=path.name)))
+            shown.append(in_small(drawn.pixels))
+        before = workspace.read_report(PanoramaReport)
+        for k in range(len(groups), 1 + len(before.others) if before is not None else 0):
+            (workspace.folder / layout.file_of(k)).unlink(missing_ok=True)
+    with run.stage("output"):
+        most = max(len(turned.image_idx) for turned, _ in groups)
+        models = [_model(image_set, turned) for turned, _ in groups]
+        workspace.write_models(models, [np.zeros((0, 2))] * most, run.events)
+        workspace.write_json(ROTATIONS, _rotations([turning for _, turning in groups]))
+    return made, shown
+
+
+def _turned_groups(
+    run: Run, image_set: ImageSet, correspondences: Correspondences
+) -> list[tuple[TurnedPhotographs, TurningReport]]:
+    """Photographs from one place, the largest group first, and each group that overlaps none of these and was turned on
+    the spot as well."""
+    from sfmapp.panorama.turning import find_rotations
+
+    options = run.options
+    out: list[tuple[TurnedPhotographs, TurningReport]] = []
+    waiting = [np.arange(len(image_set.images))]
+    while waiting:
+        among = waiting.pop(0)
+        try:
+            turned, turning = find_rotations(
+                image_set, run.features, correspondences, options.matching, seed=options.seed, events=run.events,
+                among=among,
+            )  # fmt: skip
+        except NoReconstructionError as failure:
+            if not out:
+                raise
+            first = image_set.images[int(among[0])].name
+            run.events.warned("rotations", f"no panorama of {len(among)} photographs from {first} on: {failure}")
+            continue
+        _warn(run, turning)
+        out.append((turned, turning))
+        if len(out) == 1:
+            waiting = list(turned.other_groups)
+    return out
 
 
 def _warn(run: Run, turning: TurningReport) -> None:
@@ -276,13 +325,21 @@ def _model(image_set: ImageSet, turned: TurnedPhotographs) -> Reconstruction:
     return model
 
 
-def _rotations(turning: TurningReport) -> dict[str, object]:
-    """What ``rotations.json`` holds."""
+def _rotations(found: Sequence[TurningReport]) -> dict[str, object]:
+    """What ``rotations.json`` holds: the first panorama, and the others in a list of their own."""
+    others = [_rotations_of(turning) for turning in found[1:]]
     return {
         "convention": (
             "cam_from_world is a quaternion x, y, z, w; cameras and world have x right, y down, z forward; sigma_deg "
             "is about the x, y and z axes of the camera, in the gauge in which the rotations do not turn as a whole"
         ),
+        **_rotations_of(found[0]),
+        **({"others": others} if others else {}),
+    }
+
+
+def _rotations_of(turning: TurningReport) -> dict[str, object]:
+    return {
         "noise_px": turning.noise_px,
         "cameras": turning.cameras,
         "images": [
@@ -292,22 +349,21 @@ def _rotations(turning: TurningReport) -> dict[str, object]:
     }
 
 
-def _report(
-    run: Run, turning: TurningReport | None, picture: PictureReport | None, failure: NoReconstructionError | None
-) -> PanoramaReport:
+def _report(run: Run, made: Sequence[OtherPanorama], failure: NoReconstructionError | None) -> PanoramaReport:
     skipped = run.image_set.skipped if run.image_set is not None else ()
     return PanoramaReport(
-        format=FORMAT, outcome=Outcome.of(failure), run=run.facts(), turning=turning, picture=picture,
+        format=FORMAT, outcome=Outcome.of(failure), run=run.facts(), turning=made[0].turning if made else None,
+        picture=made[0].picture if made else None, others=made[1:],
         skipped=[NamedReason(name=name, reason=reason) for name, reason in skipped], usage=run.usage,
         warnings=run.log.warnings, decisions=run.log.decisions,
     )  # fmt: skip
 
 
 def _write_report(
-    run: Run, report: PanoramaReport, drawn: StitchedPicture | None, failure: NoReconstructionError | None
+    run: Run, report: PanoramaReport, shown: Sequence[NDArray[np.uint8]], failure: NoReconstructionError | None
 ) -> PanoramaReport:
     workspace = run.workspace
-    page = panorama_page(report, None if drawn is None else drawn.pixels)
+    page = panorama_page(report, shown)
     run.save_first(lambda: workspace.write_text(PAGE, page))
     took = run.watch.read()
     report = replace(report, run=replace(report.run, **took))

@@ -20,11 +20,19 @@ _SHOWN_PX, _QUALITY = 1600, 85
 _LIGHTS = {"rotation": "green", "parallax": "amber", "contradicted": "red", "no rotation": "dim"}
 
 
+class OtherPanorama(Report):
+    """A further panorama of photographs that overlap none of the first: what the stages said."""
+
+    turning: TurningReport
+    picture: PictureReport
+
+
 class PanoramaReport(Report):
     """The report of ``sfmapp panorama``.
 
     Attributes:
         outcome: how it ended. turning, picture: what the stages said; absent where they were not reached.
+        others: further panoramas, of photographs that overlap none of the first.
         skipped: files that could not be used.
         usage: of each step.
     """
@@ -34,26 +42,39 @@ class PanoramaReport(Report):
     run: RunFacts
     turning: TurningReport | None = None
     picture: PictureReport | None = None
+    others: Sequence[OtherPanorama] = ()
     skipped: Sequence[NamedReason]
     usage: Mapping[str, Usage]
     warnings: Sequence[LogLine]
     decisions: Sequence[LogLine]
 
 
-def panorama_page(report: PanoramaReport, pixels: NDArray[np.uint8] | None) -> str:
-    """The page, self-contained. ``pixels``: (H, W, 3) of the panorama."""
-    return render_page(f"Panorama: {report.run.source}", _body(report, pixels))
+def panorama_page(report: PanoramaReport, shown: Sequence[NDArray[np.uint8]]) -> str:
+    """The page, self-contained. ``shown``: the panoramas in small, as :func:`in_small` makes them."""
+    return render_page(f"Panorama: {report.run.source}", _body(report, shown))
 
 
-def _body(report: PanoramaReport, pixels: NDArray[np.uint8] | None) -> Iterator[str]:
+def in_small(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A picture (H, W, 3) as it fits on the page."""
+    import cv2
+
+    factor = min(1.0, _SHOWN_PX / max(pixels.shape[:2]))
+    size = max(1, round(pixels.shape[1] * factor)), max(1, round(pixels.shape[0] * factor))
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _body(report: PanoramaReport, shown: Sequence[NDArray[np.uint8]]) -> Iterator[str]:
     yield failure_box(report.outcome)
-    turning, picture = report.turning, report.picture
-    if turning is not None:
+    panoramas = [] if report.turning is None else [(report.turning, report.picture)]
+    panoramas += [(other.turning, other.picture) for other in report.others]
+    for turning, _ in panoramas:
         for each in turning.contradictions:
             yield f'<div class="failure"><p>{escape(each.message)}</p><p>{escape(each.advice)}</p></div>'
-    if picture is not None and pixels is not None:
-        yield _picture(picture, pixels)
-    if turning is not None:
+    for k, (turning, picture) in enumerate(panoramas):
+        if k:
+            yield f"<h1>Panorama {k + 1}</h1>"
+        if picture is not None and k < len(shown):
+            yield _picture(picture, shown[k])
         yield _cameras(turning) + _parallax(turning) + _left_out(turning) + _images(turning, picture) + _pairs(turning)
     if report.skipped:
         rows = [[("t red", one.name), ("w", one.reason)] for one in report.skipped]
@@ -62,13 +83,11 @@ def _body(report: PanoramaReport, pixels: NDArray[np.uint8] | None) -> Iterator[
     yield log_table("Warnings", report.warnings) + log_table("Decisions", report.decisions)
 
 
-def _picture(picture: PictureReport, pixels: NDArray[np.uint8]) -> str:
+def _picture(picture: PictureReport, small: NDArray[np.uint8]) -> str:
     import cv2
 
-    factor = min(1.0, _SHOWN_PX / max(pixels.shape[:2]))
-    size = max(1, round(pixels.shape[1] * factor)), max(1, round(pixels.shape[0] * factor))
-    small = cv2.cvtColor(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
-    data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+    bgr = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
+    data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
     text = (
         f"{picture.file}: {picture.width} x {picture.height} pixels, {picture.projection}, "
         f"{picture.span_deg:.0f} degrees{', closed' if picture.is_closed else ''}; overlaps differ in brightness by "
