@@ -12,7 +12,7 @@ from odometry_sequences import keyframe_map
 from sfmapp.camera.camera import CameraModel
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu
-from sfmapp.odometry.inertial.window import Turn, turns_between
+from sfmapp.odometry.inertial.window import Turn, swings_at, turns_between
 from sfmapp.odometry.map.backend import make_job, run_job
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.synthetic import make_scene, synthetic_camera
@@ -55,6 +55,18 @@ def test_what_speaks_against_a_gyroscope_makes_it_less_sure() -> None:
         errors, sigmas = scores(other, flight, 2e-4, 3)
         assert sigmas.min() > 2 * right.max()
         assert np.sqrt((errors**2).mean()) < 2.0
+
+
+def test_swings_are_what_frames_cannot_tell() -> None:
+    times, frames, rate = np.arange(-0.1, 1.1, 0.002), np.arange(0, 1, 0.05), 2 * np.pi * 6
+    gyro = np.stack([0.3 + 0.5 * np.sin(rate * times), 0.2 - times, 0 * times], 1)  # a tremble, a bias; a steady change
+    turn = rigid3.exp_so3([0, 0, np.pi / 2])  # the camera's x axis is the sensor's y axis
+    imu = Imu(times, gyro, 0 * gyro, rigid3.from_matrix(turn, np.zeros(3)), 1e-4, 1e-3, 1e-5, 1e-3)
+    found = swings_at(frames, imu)
+    expected = 0.5 * np.sin(rate * frames) * (1 - np.sin(rate * 0.05) / (rate * 0.05))
+    np.testing.assert_allclose(found[1:-1, 1], -expected[1:-1], atol=1e-3)
+    np.testing.assert_allclose(found[1:-1, [0, 2]], 0, atol=1e-6)
+    assert np.isnan(swings_at(frames + 0.5, imu)[-1]).all()  # not measured any more
 
 
 def test_one_that_is_read_wrongly_or_on_another_clock_says_nothing() -> None:

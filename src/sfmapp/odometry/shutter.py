@@ -3,7 +3,8 @@
 A point of row y is seen at the time ``readout (y / height - 1/2)`` from the middle of the image. How fast it moves in
 the image there follows from the map itself: it is projected with the poses of the frames before and after. So the
 readout, as a share of the time between frames, is the only unknown. A hand trembles faster than frames follow each
-other: where there is a gyroscope, it tells how the camera turned while a frame was read, if that clearly explains more.
+other: where there is a gyroscope, it tells how much faster the camera turned while a frame was read than on the way
+from the frame before to the one after, if that clearly explains more.
 Adjustments with three values of the readout tell where the cost is least, and whether the images care at all: a global
 shutter, or a camera that hardly moves, leaves it at zero.
 
@@ -25,7 +26,7 @@ from sfmapp.camera.camera import project
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu
 from sfmapp.mapping.structure import residual_scale_px
-from sfmapp.odometry.inertial.window import rates_at
+from sfmapp.odometry.inertial.window import swings_at
 from sfmapp.odometry.map.backend import Job, classify, make_job, take_over
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.records import FrameRecord, measure_again
@@ -41,6 +42,9 @@ Array = NDArray[np.float64]
 _STRIDES, _SETTLED, _MAX_READOUT = (0.25, 0.1, 0.1, 0.1, 0.1), 0.005, 1.0
 # A sensor that reads within so small a share is as good as a global shutter: what is found is some other error.
 _MIN_READOUT = 0.05
+# What a gyroscope has to explain beyond the frames: as much as errors of patches, which are not independent, make of
+# nothing (``MIN_EVIDENCE``).
+_CLEAR = 30.0
 # Frames that are farther apart than that many steady steps say nothing about the motion in between.
 _MAX_GAP = 2.5
 # A time over which a motion is straight, as a share of that between frames.
@@ -70,8 +74,7 @@ def straighten(
         found = _search(_RowShift(records, keyframes, map_idx, source), keyframes, stride, is_first)
         if is_first and imu is not None:
             turned = _search(_RowShift(records, keyframes, map_idx, imu), keyframes, stride, is_first)
-            # what it adds has to be as clear as a rolling shutter itself
-            if turned[1] > found[1] + MIN_EVIDENCE:
+            if turned[1] > found[1] + _CLEAR:
                 found, source = turned, imu
         readout, evidence, job = found
         if is_first:
@@ -160,11 +163,8 @@ class _RowShift:
         self._position = {r.frame_idx: n for n, r in enumerate(rows)}
         self._times = np.array([r.timestamp_s for r in rows])
         self._unit = float(np.median(np.diff(self._times))) if len(rows) > 1 else 0.0
-        self._rates: Array | None = None  # (F, 3) rad/s of the camera
-        if imu is not None:
-            times = np.array([k.timestamp_s for k in keyframes.keyframes])
-            poses = np.array([k.rig_from_world for k in keyframes.keyframes])
-            self._rates = rates_at(self._times, times, poses, imu)
+        # (F, 3) rad/s of the camera beyond what the frames say
+        self._swings = None if imu is None or len(rows) < 2 else swings_at(self._times, imu)
 
     def __call__(self, frame_idx: int, xyz: Array, xy: Array) -> Array:
         """(N, 2) pixels for points seen at pixels in a frame; zero where the motion is not known."""
@@ -175,7 +175,7 @@ class _RowShift:
         gap = float(self._times[after] - self._times[before]) / self._unit
         if gap > _MAX_GAP:
             return np.zeros_like(xy)
-        if self._rates is None or not np.isfinite(self._rates[n]).all():
+        if self._swings is None or not np.isfinite(self._swings[n]).all():
             first, last = self._poses[before], self._poses[after]
         else:
             first, last, gap = *self._turned(n, before, after, gap), 2 * _SHORT
@@ -184,13 +184,17 @@ class _RowShift:
         return np.where(np.isfinite(shift), shift, 0.0)
 
     def _turned(self, n: int, before: int, after: int, gap: float) -> tuple[Array, Array]:
-        """Poses (7,) a short time before and after a frame, which turns as measured and moves as those around it."""
-        assert self._rates is not None
+        """Poses (7,) a short time before and after a frame, which moves as those around it and turns faster by its
+        swing."""
+        assert self._swings is not None
         center, rotation = rigid3.center(self._poses[n]), rigid3.rotation_matrix(self._poses[n])
-        way = (rigid3.center(self._poses[after]) - rigid3.center(self._poses[before])) / gap
+        around = [self._poses[k] for k in (before, after)]
+        way = (rigid3.center(around[1]) - rigid3.center(around[0])) / gap
+        first, last = (rigid3.rotation_matrix(pose) for pose in around)
+        turn = rigid3.log_so3(last @ first.T) / gap - self._unit * self._swings[n]
         out = []
         for time in (-_SHORT, _SHORT):
-            turned = rigid3.exp_so3(-time * self._unit * self._rates[n]) @ rotation
+            turned = rigid3.exp_so3(time * turn) @ rotation
             out.append(rigid3.from_matrix(turned, -turned @ (center + time * way)))
         return out[0], out[1]
 

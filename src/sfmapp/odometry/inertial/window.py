@@ -14,13 +14,7 @@ from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu
-from sfmapp.odometry.inertial.integration import (
-    Interval,
-    gyro_bias_of,
-    intervals_between,
-    map_from_imu_rotation,
-    reintegrate,
-)
+from sfmapp.odometry.inertial.integration import gyro_bias_of, intervals_between, map_from_imu_rotation, reintegrate
 
 Array = NDArray[np.float64]
 
@@ -62,10 +56,12 @@ def turns_between(times_s: Array, cam_from_world: Array, imu: Imu, first: int = 
     Returns:
         None of them where the measurements are too few, or contradict the keyframes.
     """
-    found = _bias(times_s, cam_from_world, imu)
-    if found is None:
+    intervals = intervals_between(times_s, np.arange(len(times_s)), imu, _MAX_INTERVAL_S)
+    if len(intervals) < _MIN_INTERVALS:
         return []
-    intervals, bias, left = found
+    bias, left, turned = gyro_bias_of(intervals, map_from_imu_rotation(cam_from_world, imu))
+    if not left < _MAX_LEFT * max(turned, _MIN_TURN_RAD):
+        return []
     imu_from_cam, out = rigid3.rotation_matrix(imu.imu_from_cam), []
     for interval in intervals:
         rotation = imu_from_cam.T @ reintegrate(interval, bias).rotation @ imu_from_cam
@@ -74,30 +70,26 @@ def turns_between(times_s: Array, cam_from_world: Array, imu: Imu, first: int = 
     return out
 
 
-def rates_at(times_s: Array, keyframe_times_s: Array, cam_from_world: Array, imu: Imu) -> Array | None:
-    """Angular velocities (N, 3) of the camera, in its own frame in rad/s, at some times, by the gyroscope.
+def swings_at(times_s: Array, imu: Imu) -> Array:
+    """Angular velocities (N, 3) of the camera, in its own frame in rad/s, at some times, beyond their means from the
+    time before each to the time after: what poses at these times do not tell. A bias falls out.
 
     Args:
-        times_s: (N,). keyframe_times_s: (K,), cam_from_world: (K, 7) keyframes that tell its bias.
+        times_s: (N,) ascending, N >= 2; the first and the last have one neighbour.
 
     Returns:
-        None where the measurements are too few, or contradict the keyframes; NaN at times that they do not cover.
+        NaN at times that the measurements do not cover.
     """
-    found = _bias(keyframe_times_s, cam_from_world, imu)
-    if found is None:
-        return None
-    rates = [np.interp(times_s, imu.timestamps_s, column, np.nan, np.nan) for column in (imu.gyro - found[1]).T]
-    return np.stack(rates, 1) @ rigid3.rotation_matrix(imu.imu_from_cam)
 
+    def at(when: Array, values: Array) -> Array:
+        return np.stack([np.interp(when, imu.timestamps_s, column, np.nan, np.nan) for column in values.T], 1)
 
-def _bias(times_s: Array, cam_from_world: Array, imu: Imu) -> tuple[list[Interval], Array, float] | None:
-    """What was measured between keyframes, the bias (3,) with which it agrees best with them, and what that leaves of a
-    rotation in radians; None where that is too little, or too much is left."""
-    intervals = intervals_between(times_s, np.arange(len(times_s)), imu, _MAX_INTERVAL_S)
-    if len(intervals) < _MIN_INTERVALS:
-        return None
-    bias, left, turned = gyro_bias_of(intervals, map_from_imu_rotation(cam_from_world, imu))
-    return (intervals, bias, left) if left < _MAX_LEFT * max(turned, _MIN_TURN_RAD) else None
+    steps = 0.5 * np.diff(imu.timestamps_s)[:, None] * (imu.gyro[1:] + imu.gyro[:-1])
+    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, 0)])
+    before, after = np.append(times_s[:1], times_s[:-1]), np.append(times_s[1:], times_s[-1:])
+    mean = (at(after, turned) - at(before, turned)) / (after - before)[:, None]
+    swings: Array = (at(times_s, imu.gyro) - mean) @ rigid3.rotation_matrix(imu.imu_from_cam)
+    return swings
 
 
 def turn_factor(first_key: int, second_key: int, turn: Turn) -> Any:
