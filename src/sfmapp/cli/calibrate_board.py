@@ -106,7 +106,7 @@ def _print(result: CalibrationResult) -> None:
     if len(odd) > _LINES:
         print(f"  and {len(odd) - _LINES} more, in report.html")
     if num_alike:
-        print(f"  {num_alike} frames show what others show, and were not needed")
+        print(f"  frames that show what others show, and were not needed: {num_alike}")
     for warning in made.warnings:
         print(f"  note: {warning}")
     for n, view in enumerate(report.next_views, 1):

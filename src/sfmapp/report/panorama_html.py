@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.panorama.report import PictureReport, TurningReport
+from sfmapp.report.drawing import jpeg_url, shrunk
 from sfmapp.report.model import LogLine, Outcome, RunFacts
 from sfmapp.report.page import failure_box, log_table, render_page, table, usage_table
 from sfmapp.reporting import NamedReason, Report, Usage
@@ -56,11 +56,7 @@ def panorama_page(report: PanoramaReport, shown: Sequence[NDArray[np.uint8]]) ->
 
 def in_small(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """A picture (H, W, 3) as it fits on the page."""
-    import cv2
-
-    factor = min(1.0, _SHOWN_PX / max(pixels.shape[:2]))
-    size = max(1, round(pixels.shape[1] * factor)), max(1, round(pixels.shape[0] * factor))
-    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return shrunk(pixels, _SHOWN_PX)[0]
 
 
 def _body(report: PanoramaReport, shown: Sequence[NDArray[np.uint8]]) -> Iterator[str]:
@@ -84,18 +80,14 @@ def _body(report: PanoramaReport, shown: Sequence[NDArray[np.uint8]]) -> Iterato
 
 
 def _picture(picture: PictureReport, small: NDArray[np.uint8]) -> str:
-    import cv2
-
-    bgr = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
-    data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
     text = (
         f"{picture.file}: {picture.width} x {picture.height} pixels, {picture.projection}, "
         f"{picture.span_deg:.0f} degrees{', closed' if picture.is_closed else ''}; overlaps differ in brightness by "
         f"{picture.worst_overlap:.1%} at most"
     )
-    source = base64.b64encode(data).decode("ascii")
+    source = jpeg_url(small, _SHOWN_PX, _QUALITY)
     return (
-        f'<figure><img style="max-width:100%" src="data:image/jpeg;base64,{source}" alt="the panorama">'
+        f'<figure><img style="max-width:100%" src="{source}" alt="the panorama">'
         f"<figcaption>{escape(text)}</figcaption></figure>"
     )
 
