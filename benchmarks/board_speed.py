@@ -50,6 +50,7 @@ LENSES = {
 SEEDS = range(5, 11)
 PHONE = Camera(CameraModel.OPENCV, 4000, 3000, np.array([3100.0, 3100.0, 2010.0, 1490.0, 0.12, -0.25, 1e-3, -5e-4]))
 PHOTOGRAPHS, THREADS = 30, 2
+_RENDER = "render"
 
 
 def refinement() -> list[Row]:
@@ -119,7 +120,8 @@ def photographs_12_mp() -> list[Row]:
     with tempfile.TemporaryDirectory(prefix="boards-") as name:
         folder = Path(name) / "photographs"
         folder.mkdir()
-        render_photographs(folder)
+        # in a process of its own: what this one has used counts as what its children begin with
+        run([sys.executable, __file__, _RENDER, str(folder)])
         for program in ("sfmapp", "sfmapp", "OpenCV findChessboardCorners", "OpenCV findChessboardCornersSB"):
             out = Path(name) / f"out-{len(rows)}"
             if program == "sfmapp":
@@ -195,4 +197,7 @@ def opencv_child(program: str, folder: Path, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    opencv_child(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]))
+    if sys.argv[1] == _RENDER:
+        render_photographs(Path(sys.argv[2]))
+    else:
+        opencv_child(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]))
