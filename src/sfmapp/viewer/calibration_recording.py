@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 from sfmapp.calibration.result import CameraCalibration
 from sfmapp.geometry import rigid3
 from sfmapp.viewer.calibration_replay import CalibrationReplay
-from sfmapp.viewer.recording import RecordingReport, draw_in_child
+from sfmapp.viewer.recording import RecordingReport, record_in_child
 
 Array = NDArray[np.float64]
 
@@ -26,7 +24,6 @@ def record_calibration(
         outline: (4, 3) corners of the board in its frame.
         photographs: files by name of the view.
     """
-    start = time.monotonic()
     views = [view for view in made.views if view.cam_from_target is not None]
     ptr = np.concatenate([[0], np.cumsum([len(view.xy) for view in views])]).astype(np.int64)
     canonical = made.camera.canonical
@@ -44,11 +41,4 @@ def record_calibration(
         corners=np.array([rigid3.apply(pose, outline) for pose in poses]).reshape(-1, 4, 3),
         paths=[photographs.get(view.name, "") for view in views],
     )
-    try:
-        with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
-            replay.save(Path(name))
-            problem = draw_in_child("calibration", Path(name), path, 1, 300.0)
-    except OSError as error:
-        problem = error.strerror or str(error)
-    size = path.stat().st_size if not problem else 0
-    return RecordingReport(None if problem else path, size, time.monotonic() - start, problem)
+    return record_in_child(path, "calibration", lambda _: replay)

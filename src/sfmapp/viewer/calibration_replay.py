@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.viewer.handover import load_fields, save_fields
+from sfmapp.viewer.handover import HandedOver
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class CalibrationReplay:
+class CalibrationReplay(HandedOver):
     """What is drawn.
 
     Attributes:
@@ -38,12 +37,3 @@ class CalibrationReplay:
     is_used: NDArray[np.bool_]
     corners: Array
     paths: list[str]
-
-    def save(self, folder: Path) -> None:
-        """Write it to a folder, for the process that draws."""
-        save_fields(folder, "calibration", self)
-
-    @classmethod
-    def load(cls, folder: Path) -> CalibrationReplay:
-        """What :meth:`save` wrote."""
-        return cls(**load_fields(folder, "calibration"))

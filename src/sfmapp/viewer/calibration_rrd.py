@@ -10,6 +10,7 @@ import rerun as rr
 from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import read_gray
 from sfmapp.viewer.calibration_replay import CalibrationReplay
+from sfmapp.viewer.lines_replay import LinesReplay
 from sfmapp.viewer.rrd_file import recording_file
 
 SHOWN_PX = 1024
@@ -23,16 +24,7 @@ def write_calibration_rrd(replay: CalibrationReplay, output: Path) -> None:
 
     with recording_file(output, "sfmapp_calibrate", replay.title) as recording:
         width, height = (int(side) for side in replay.size)
-        scale = min(1.0, SHOWN_PX / max(width, height))
-        recording.log("/", rr.ViewCoordinates.RDF, static=True)
-        recording.log(
-            "camera",
-            rr.Pinhole(
-                focal_length=(replay.focal * scale).tolist(), principal_point=(replay.center * scale).tolist(),
-                width=round(width * scale), height=round(height * scale),
-            ),
-            static=True,
-        )  # fmt: skip
+        scale = log_camera(recording, replay)
         for v, name in enumerate(replay.names):
             recording.set_time("view", sequence=v)
             own = slice(int(replay.ptr[v]), int(replay.ptr[v + 1]))
@@ -51,3 +43,21 @@ def write_calibration_rrd(replay: CalibrationReplay, output: Path) -> None:
             recording.log("camera/residuals", rr.Arrows2D(origins=xy, vectors=ENLARGED * known, colors=colors))
             rms = float(np.sqrt((known[used] ** 2).sum(1).mean())) / scale if used.any() else 0.0
             recording.log("plots/rms_px", rr.Scalars(rms))
+
+
+def log_camera(
+    recording: rr.RecordingStream, replay: CalibrationReplay | LinesReplay, image_plane_distance: float | None = None
+) -> float:
+    """The camera that was calibrated, at the origin; returns the factor of its pixels."""
+    width, height = replay.size
+    scale = min(1.0, SHOWN_PX / float(max(width, height)))
+    recording.log("/", rr.ViewCoordinates.RDF, static=True)
+    recording.log(
+        "camera",
+        rr.Pinhole(
+            focal_length=(replay.focal * scale).tolist(), principal_point=(replay.center * scale).tolist(),
+            width=round(width * scale), height=round(height * scale), image_plane_distance=image_plane_distance,
+        ),
+        static=True,
+    )  # fmt: skip
+    return scale

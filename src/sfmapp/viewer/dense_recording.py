@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 from sfmapp.dense.scene import DenseScene, Patches
 from sfmapp.scene.mesh import Mesh
 from sfmapp.viewer.dense_replay import make_dense_replay
-from sfmapp.viewer.recording import RecordingReport, draw_in_child
+from sfmapp.viewer.recording import RecordingReport, record_in_child
 
 
 def record_dense(
@@ -31,12 +29,8 @@ def record_dense(
         max_points: to show. Half a million are 40 MB.
         timeout_s: the child is stopped after this long.
     """
-    start = time.monotonic()
-    try:
-        with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
-            make_dense_replay(scene, patches, mesh=mesh, title=title, up=up, max_points=max_points).save(Path(name))
-            problem = draw_in_child("dense", Path(name), path, 1, timeout_s)
-    except OSError as error:
-        problem = error.strerror or str(error)
-    size = path.stat().st_size if not problem else 0
-    return RecordingReport(None if problem else path, size, time.monotonic() - start, problem)
+    return record_in_child(
+        path, "dense",
+        lambda _: make_dense_replay(scene, patches, mesh=mesh, title=title, up=up, max_points=max_points),
+        timeout_s=timeout_s,
+    )  # fmt: skip

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from sfmapp.geometry import rigid3
 from sfmapp.geometry.orientation import ROTATION_OF, upright_pinhole, upright_pixels, upright_poses
 from sfmapp.geometry.upright import up_direction
 from sfmapp.scene.mesh import Mesh
-from sfmapp.viewer.handover import load_fields, save_fields
+from sfmapp.viewer.handover import HandedOver
 from sfmapp.viewer.photos import shrunk_jpeg
 
 Ints = NDArray[np.int64]
@@ -30,7 +29,7 @@ _SPACING_SAMPLE = 2000
 
 
 @dataclass(frozen=True)
-class DenseReplay:
+class DenseReplay(HandedOver):
     """Views (V), the shown ones (N) of the patches, waves in steps (S), and a mesh if there is one.
 
     Attributes:
@@ -77,15 +76,6 @@ class DenseReplay:
     mesh_rgb: NDArray[np.uint8]
     mesh_uv: Float32
     mesh_texture: NDArray[np.uint8]
-
-    def save(self, folder: Path) -> None:
-        """Write ``dense.npz`` and ``dense.json``."""
-        save_fields(folder, "dense", self)
-
-    @staticmethod
-    def load(folder: Path) -> DenseReplay:
-        """Read what :meth:`save` wrote."""
-        return DenseReplay(**load_fields(folder, "dense"))
 
 
 def make_dense_replay(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +10,7 @@ import numpy as np
 from sfmapp.calibration.line_refinement import Lines
 from sfmapp.camera.camera import Camera, pixels_to_rays
 from sfmapp.viewer.lines_replay import LinesReplay
-from sfmapp.viewer.recording import RecordingReport, draw_in_child
+from sfmapp.viewer.recording import RecordingReport, record_in_child
 
 
 def record_lines(
@@ -24,7 +22,6 @@ def record_lines(
         photos: V photographs with their lines.
         files: name and path of each.
     """
-    start = time.monotonic()
     points = np.concatenate([photo.arcs.points for photo in photos])
     ends = pixels_to_rays(camera, points[:, [0, -1]].reshape(-1, 2)).reshape(-1, 2, 3)
     directions = [np.zeros((0, 3)) if photo.world is None else photo.world.directions for photo in photos]
@@ -43,14 +40,7 @@ def record_lines(
         direction_ptr=_ends_of([len(one) for one in directions]),
         directions=np.concatenate(directions),
     )
-    try:
-        with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
-            replay.save(Path(name))
-            problem = draw_in_child("lines", Path(name), path, 1, 300.0)
-    except OSError as error:
-        problem = error.strerror or str(error)
-    size = path.stat().st_size if not problem else 0
-    return RecordingReport(None if problem else path, size, time.monotonic() - start, problem)
+    return record_in_child(path, "lines", lambda _: replay)
 
 
 def _ends_of(counts: Sequence[int]) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.viewer.handover import load_fields, save_fields
+from sfmapp.viewer.handover import HandedOver
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class LinesReplay:
+class LinesReplay(HandedOver):
     """What is drawn.
 
     Attributes:
@@ -41,12 +40,3 @@ class LinesReplay:
     rays: Array
     direction_ptr: Ints
     directions: Array
-
-    def save(self, folder: Path) -> None:
-        """Write it to a folder, for the process that draws."""
-        save_fields(folder, "lines", self)
-
-    @classmethod
-    def load(cls, folder: Path) -> LinesReplay:
-        """What :meth:`save` wrote."""
-        return cls(**load_fields(folder, "lines"))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import read_gray
-from sfmapp.viewer.calibration_rrd import SHOWN_PX
+from sfmapp.viewer.calibration_rrd import log_camera
 from sfmapp.viewer.lines_replay import LinesReplay
 from sfmapp.viewer.rrd_file import recording_file
 
@@ -27,17 +27,7 @@ def write_lines_rrd(replay: LinesReplay, output: Path) -> None:
     """Write, photograph by photograph, its lines in the colours of their directions, the planes of the longest through
     the camera's centre, and the directions that these planes share."""
     with recording_file(output, "sfmapp_calibrate", replay.title) as recording:
-        width, height = (int(side) for side in replay.size)
-        scale = min(1.0, SHOWN_PX / max(width, height))
-        recording.log("/", rr.ViewCoordinates.RDF, static=True)
-        recording.log(
-            "camera",
-            rr.Pinhole(
-                focal_length=(replay.focal * scale).tolist(), principal_point=(replay.center * scale).tolist(),
-                width=round(width * scale), height=round(height * scale), image_plane_distance=1.0,
-            ),
-            static=True,
-        )  # fmt: skip
+        scale = log_camera(recording, replay, image_plane_distance=1.0)
         for v in range(len(replay.names)):
             recording.set_time("photograph", sequence=v)
             _log_photograph(recording, replay, v, scale)

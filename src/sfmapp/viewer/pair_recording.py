@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,8 @@ from sfmapp.geometry.dlt import homogeneous
 from sfmapp.twoview.drawing import clip_lines, spread, spread_points, with_reach
 from sfmapp.twoview.story import Story
 from sfmapp.viewer.pair_replay import PairReplay
-from sfmapp.viewer.recording import RecordingReport, draw_in_child
+from sfmapp.viewer.photos import shrunk
+from sfmapp.viewer.recording import RecordingReport, record_in_child
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
@@ -28,20 +27,12 @@ def record_pair(path: Path, story: Story, pictures: tuple[Pixels, Pixels]) -> Re
     Args:
         pictures: (H, W, 3) RGB of both photographs as stored.
     """
-    start = time.monotonic()
-    try:
-        with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
-            _replay(story, pictures).save(Path(name))
-            problem = draw_in_child("pair", Path(name), path, 1, 120.0)
-    except OSError as error:
-        problem = error.strerror or str(error)
-    size = path.stat().st_size if not problem else 0
-    return RecordingReport(None if problem else path, size, time.monotonic() - start, problem)
+    return record_in_child(path, "pair", lambda _: _replay(story, pictures), timeout_s=120.0)
 
 
 def _replay(story: Story, pictures: tuple[Pixels, Pixels]) -> PairReplay:
     views, told = story.views, story.report
-    small, scale = zip(*(_shrunk(picture) for picture in pictures), strict=True)
+    small, scale = zip(*(shrunk(picture, _SHOWN_PX) for picture in pictures), strict=True)
     first, second = (view.xy * s for view, s in zip(views, scale, strict=True))
 
     def pairs(matches: NDArray[np.int32], kept: NDArray[np.int64]) -> Array:
@@ -96,14 +87,3 @@ def _words(story: Story) -> str:
         "(red)."
     )
     return "\n\n".join(lines)
-
-
-def _shrunk(picture: Pixels) -> tuple[Pixels, Array]:
-    """The picture for a screen, and the factors (2,) of its pixels."""
-    import cv2
-
-    height, width = picture.shape[:2]
-    scale = min(1.0, _SHOWN_PX / max(width, height))
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    small: Pixels = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return small, np.array([size[0] / width, size[1] / height])

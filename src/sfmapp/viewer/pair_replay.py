@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.viewer.handover import load_fields, save_fields
+from sfmapp.viewer.handover import HandedOver
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class PairReplay:
+class PairReplay(HandedOver):
     """What is drawn. Pixels are those of the shown, smaller photographs.
 
     Attributes:
@@ -48,12 +47,3 @@ class PairReplay:
     in_front: NDArray[np.bool_]
     reach: float
     labels: list[str]
-
-    def save(self, folder: Path) -> None:
-        """Write it to a folder, for the process that draws."""
-        save_fields(folder, "pair", self)
-
-    @classmethod
-    def load(cls, folder: Path) -> PairReplay:
-        """What :meth:`save` wrote."""
-        return cls(**load_fields(folder, "pair"))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfmapp.geometry.orientation import MIRRORED, upright_pixels
 from sfmapp.images.headers import UnusableImage, read_header
@@ -98,6 +99,12 @@ def _as_bgr(pixels: Any) -> Any:
     if pixels.ndim == 2:
         return cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR)
     return cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGR if pixels.shape[2] == 4 else cv2.COLOR_RGB2BGR)
+
+
+def shrunk(pixels: NDArray[np.uint8], max_side_px: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """A picture (H, W, 3) for a screen, and the factors (2,) of its pixels."""
+    small: NDArray[np.uint8] = _shrink(pixels, max_side_px)
+    return small, np.divide(small.shape[1::-1], pixels.shape[1::-1])
 
 
 def _shrink(pixels: Any, max_side_px: int) -> Any:

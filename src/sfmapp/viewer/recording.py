@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal
 from sfmapp.children import with_parent
 from sfmapp.errors import InputError
 from sfmapp.packages import MissingPackageError, require
+from sfmapp.viewer.handover import HandedOver
 from sfmapp.viewer.listener import Message, RecordingListener, Step
 from sfmapp.viewer.photos import SCREEN_QUALITY, screen_side_px, shrunk_jpeg
 from sfmapp.viewer.replay import Replay
@@ -24,7 +25,9 @@ if TYPE_CHECKING:
 
 Kind = Literal["run", "dense", "calibration", "rig", "pair", "transfer", "lines", "clouds"]
 
-__all__ = ["Message", "RecordingListener", "RecordingReport", "Step", "draw_in_child", "write_recording"]
+__all__ = [
+    "Message", "RecordingListener", "RecordingReport", "Step", "draw_in_child", "record_in_child", "write_recording",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -56,11 +59,26 @@ def write_recording(
         threads: photographs read at a time.
         timeout_s: the child is stopped after this long.
     """
+    return record_in_child(
+        path, "run", lambda folder: _with_files(replay, photographs, folder), threads=threads, timeout_s=timeout_s
+    )
+
+
+def record_in_child(
+    path: Path, kind: Kind, make: Callable[[Path], HandedOver], *, threads: int = 1, timeout_s: float = 300.0
+) -> RecordingReport:
+    """Write a recording in a child process; never raises for what happens there, or for a disk that is full.
+
+    Args:
+        path: the file, replaced when the new one is whole.
+        make: what it shows; given the folder that the child reads, and which is then removed.
+        timeout_s: the child is stopped after this long.
+    """
     start = time.monotonic()
     try:
         with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
-            _with_files(replay, photographs, Path(name)).save(Path(name))
-            problem = draw_in_child("run", Path(name), path, threads, timeout_s)
+            make(Path(name)).save(Path(name))
+            problem = draw_in_child(kind, Path(name), path, threads, timeout_s)
     except OSError as error:
         problem = error.strerror or str(error)
     size = path.stat().st_size if not problem else 0

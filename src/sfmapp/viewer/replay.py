@@ -7,9 +7,9 @@ over by a similarity fitted to the cameras, so that nothing jumps when it is pla
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sfmapp.geometry import similarity
 from sfmapp.geometry.orientation import upright_pinhole, upright_poses, upright_size, upright_vectors, upright_xy
 from sfmapp.geometry.upright import up_direction
-from sfmapp.viewer.handover import load_fields, save_fields
+from sfmapp.viewer.handover import HandedOver
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageRecord, ImageSet
@@ -35,7 +35,7 @@ MAX_LOOSE_KEYPOINTS = 2000
 
 
 @dataclass(frozen=True)
-class Replay:
+class Replay(HandedOver):
     """A run, ready to be drawn. S steps, I images, M models (largest first), P pose and C cloud snapshots.
 
     Photographs are shown upright: their cameras are rolled until they are (:mod:`sfmapp.geometry.orientation`), and all
@@ -95,16 +95,11 @@ class Replay:
     messages: list[tuple[int, str, str]]
     up: NDArray[np.float64]
 
-    def save(self, folder: Path) -> None:
-        """Write ``replay.npz`` and ``replay.json``."""
-        save_fields(folder, "replay", self)
-
-    @staticmethod
-    def load(folder: Path) -> Replay:
-        """Read what :meth:`save` wrote."""
-        values = load_fields(folder, "replay")
-        values["messages"] = [(int(step), level, text) for step, level, text in values["messages"]]
-        return Replay(**values)
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        """What :meth:`save` wrote, the messages as they were."""
+        loaded = super().load(folder)
+        return replace(loaded, messages=[(int(step), level, text) for step, level, text in loaded.messages])
 
 
 def make_replay(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +12,7 @@ from numpy.typing import NDArray
 from sfmapp.calibration.result import CameraCalibration, ViewFit
 from sfmapp.geometry import rigid3
 from sfmapp.scene.rig import Rig
-from sfmapp.viewer.recording import RecordingReport, draw_in_child
+from sfmapp.viewer.recording import RecordingReport, record_in_child
 from sfmapp.viewer.rig_replay import RigReplay
 
 Array = NDArray[np.float64]
@@ -40,7 +38,6 @@ def record_rig(
         cameras: names and calibrations.
         photographs: files by camera and name.
     """
-    start = time.monotonic()
     shown = sorted((view for view in views if view.fit.cam_from_target is not None), key=lambda view: view.shot)
     rows = [made.camera.canonical for _, made in cameras]
     corners = []
@@ -62,11 +59,4 @@ def record_rig(
         paths=[photographs.get((view.camera, view.fit.name), "") for view in shown],
         problems=[view.fit.problem or "" for view in shown],
     )  # fmt: skip
-    try:
-        with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
-            replay.save(Path(name))
-            problem = draw_in_child("rig", Path(name), path, 1, 300.0)
-    except OSError as error:
-        problem = error.strerror or str(error)
-    size = path.stat().st_size if not problem else 0
-    return RecordingReport(None if problem else path, size, time.monotonic() - start, problem)
+    return record_in_child(path, "rig", lambda _: replay)

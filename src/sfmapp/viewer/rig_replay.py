@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.viewer.handover import load_fields, save_fields
+from sfmapp.viewer.handover import HandedOver
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class RigReplay:
+class RigReplay(HandedOver):
     """What is drawn.
 
     Attributes:
@@ -44,12 +43,3 @@ class RigReplay:
     is_used: NDArray[np.bool_]
     paths: list[str]
     problems: list[str]
-
-    def save(self, folder: Path) -> None:
-        """Write it to a folder, for the process that draws."""
-        save_fields(folder, "rig", self)
-
-    @classmethod
-    def load(cls, folder: Path) -> RigReplay:
-        """What :meth:`save` wrote."""
-        return cls(**load_fields(folder, "rig"))

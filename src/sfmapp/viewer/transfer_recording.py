@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import tempfile
-import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry.dlt import homogeneous
 from sfmapp.twoview.drawing import clip_lines, spread_points
 from sfmapp.uncalibrated.three_views import ThreeViews, TransferReport
-from sfmapp.viewer.recording import RecordingReport, draw_in_child
+from sfmapp.viewer.photos import shrunk
+from sfmapp.viewer.recording import RecordingReport, record_in_child
 from sfmapp.viewer.transfer_replay import TransferReplay
 
 Array = NDArray[np.float64]
@@ -30,19 +28,11 @@ def record_transfer(
     Args:
         pictures: (H, W, 3) RGB of the photographs as stored, and the synthesised one.
     """
-    start = time.monotonic()
-    try:
-        with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
-            _replay(told, views, pictures).save(Path(name))
-            problem = draw_in_child("transfer", Path(name), path, 1, 120.0)
-    except OSError as error:
-        problem = error.strerror or str(error)
-    size = path.stat().st_size if not problem else 0
-    return RecordingReport(None if problem else path, size, time.monotonic() - start, problem)
+    return record_in_child(path, "transfer", lambda _: _replay(told, views, pictures), timeout_s=120.0)
 
 
 def _replay(told: TransferReport, views: ThreeViews, pictures: tuple[Pixels, Pixels, Pixels, Pixels]) -> TransferReplay:
-    small, scales = zip(*(_shrunk(picture) for picture in pictures), strict=True)
+    small, scales = zip(*(shrunk(picture, _SHOWN_PX) for picture in pictures), strict=True)
     shown = views.xy[spread_points(views.xy[:, 2], _POINTS)]
     f21, f31, f32 = (np.array(f) for f in (told.fundamental_21, told.fundamental_31, told.fundamental_32))
     one, two = homogeneous(shown[:, 0]), homogeneous(shown[:, 1])
@@ -53,7 +43,7 @@ def _replay(told: TransferReport, views: ThreeViews, pictures: tuple[Pixels, Pix
     )
     return TransferReplay(
         f"{told.names[0]} and {told.names[1]} in {told.names[2]}", list(told.names), _words(told),
-        small[0], small[1], small[2], small[3], shown * np.array(scales[:3])[:, None], lines2, lines31, lines32, plane,
+        small[0], small[1], small[2], small[3], shown * np.array(scales[:3]), lines2, lines31, lines32, plane,
     )  # fmt: skip
 
 
@@ -67,10 +57,3 @@ def _words(told: TransferReport) -> str:
         lines.append(f"**{told.degenerate}**")
     lines.append("In photograph 3 two lines of one colour cross in each point; grey: the trifocal plane.")
     return "\n\n".join(lines)
-
-
-def _shrunk(picture: Pixels) -> tuple[Pixels, float]:
-    """The picture for a screen, and the factor of its pixels."""
-    scale = min(1.0, _SHOWN_PX / max(picture.shape[:2]))
-    size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8), scale

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.viewer.handover import load_fields, save_fields
+from sfmapp.viewer.handover import HandedOver
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class CloudsReplay:
+class CloudsReplay(HandedOver):
     """What is drawn.
 
     Attributes:
@@ -29,12 +28,3 @@ class CloudsReplay:
     metric: Array
     rgb: NDArray[np.uint8]
     centers: Array
-
-    def save(self, folder: Path) -> None:
-        """Write it to a folder, for the process that draws."""
-        save_fields(folder, "clouds", self)
-
-    @classmethod
-    def load(cls, folder: Path) -> CloudsReplay:
-        """What :meth:`save` wrote."""
-        return cls(**load_fields(folder, "clouds"))
