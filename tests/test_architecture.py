@@ -28,6 +28,7 @@ FLOORS = (
     ("report", "viewer"),
     ("odometry",),
     ("surface",),
+    ("stereo",),
     ("dense",),
     ("georeference",),
     ("planes",),

@@ -1,0 +1,1 @@
+"""Two photographs of one moment: rectified, matched in every pixel, measured."""
