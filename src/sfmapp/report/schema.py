@@ -34,10 +34,12 @@ from sfmapp.report.transfer_html import TransferRunReport
 from sfmapp.report.uncalibrated_html import UncalibratedReport
 from sfmapp.report.validation import CloudValidation, Validation
 from sfmapp.reporting import Report, field_types
+from sfmapp.stereo.design import DesignReport
 
 # by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry, refine,
 # calibrate, locate, pair, panorama, warp and rectify; calibration.json; validation/report.json and
-# validation/cloud.json; what evaluate, undistort, export and measure print with --json; and georeference.json
+# validation/cloud.json; what evaluate, undistort, export, measure and stereo-design print with --json; and
+# georeference.json
 KINDS: Mapping[str, type[Report]] = {
     "reconstruct": ReconstructionReport,
     "dense": DenseRunReport,
@@ -60,6 +62,7 @@ KINDS: Mapping[str, type[Report]] = {
     "panorama": PanoramaReport,
     "transfer": TransferRunReport,
     "uncalibrated": UncalibratedReport,
+    "stereo-design": DesignReport,
     "warp": WarpReport,
     "rectify": RectifyReport,
 }
