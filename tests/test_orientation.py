@@ -52,6 +52,8 @@ from sfmapp.viewer.dense_replay import make_dense_replay
 from sfmapp.viewer.replay import make_replay
 from sfmapp.workspace.options import Options
 
+Array = NDArray[np.float64]
+
 ALL = range(1, 9)
 W, H = 48, 32
 
@@ -103,9 +105,8 @@ def test_pixels_places_and_cameras_turn_as_pillow_turns_pictures(orientation: in
     np.testing.assert_array_equal(upright_pixels(upright, INVERSE[orientation]), stored)
 
 
-@pytest.mark.parametrize("model", list(CameraModel))
-@pytest.mark.parametrize("orientation", ALL)
-def test_a_turned_camera_sees_the_turned_picture(orientation: int, model: CameraModel) -> None:
+def bent_camera(model: CameraModel) -> Camera:
+    """A camera of that model, none of whose terms is zero."""
     values = {
         "f": 40.0,
         "fx": 40.0,
@@ -120,7 +121,13 @@ def test_a_turned_camera_sees_the_turned_picture(orientation: int, model: Camera
     values |= {"k3": 0.01, "k4": -0.004, "k0": -0.02, "k5": 0.002, "k6": 0.001, "k": -0.1, "omega": 0.8, "w": W, "h": H}
     values |= {"alpha": 0.6, "beta": 1.1, "p0": 0.01, "s0": 0.02, "s1": -0.01, "s2": 0.03, "s3": 0.015, "s4": -0.02}
     values |= {"sx1": 0.02, "sy1": -0.01, "s": 2.0}
-    camera = Camera(model, W, H, np.array([values[name] for name in PARAM_NAMES[model]]))
+    return Camera(model, W, H, np.array([values[name] for name in PARAM_NAMES[model]]))
+
+
+@pytest.mark.parametrize("model", list(CameraModel))
+@pytest.mark.parametrize("orientation", ALL)
+def test_a_turned_camera_sees_the_turned_picture(orientation: int, model: CameraModel) -> None:
+    camera = bent_camera(model)
     if is_sideways(orientation) and model in (CameraModel.EQUIRECTANGULAR, CameraModel.PINHOLE_SKEW):
         with pytest.raises(UsageError, match="on their side"):
             turned_camera(camera, orientation)
@@ -129,6 +136,29 @@ def test_a_turned_camera_sees_the_turned_picture(orientation: int, model: Camera
     turned_rays = np.column_stack([upright_vectors(orientation, rays[:, :2]), rays[:, 2]])
     expected = upright_xy(orientation, project(camera, rays), W, H)
     np.testing.assert_allclose(project(turned_camera(camera, orientation), turned_rays), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", [CameraModel.OPENCV, CameraModel.THIN_PRISM_FISHEYE, CameraModel.SIMPLE_RADIAL])
+@pytest.mark.parametrize("orientation", ALL)
+def test_the_prior_of_a_turned_camera_says_the_same_of_pixels(orientation: int, model: CameraModel) -> None:
+    camera = bent_camera(model)
+    rays = np.random.default_rng(1).uniform([-0.6, -0.4, 1.0], [0.6, 0.4, 1.0], (7, 3))
+    turned_rays = np.column_stack([upright_vectors(orientation, rays[:, :2]), rays[:, 2]])
+    root = np.random.default_rng(2).normal(size=(len(camera.params),) * 2) * 1e-3
+    turned = turned_camera(replace(camera, prior_covariance=root @ root.T), orientation)
+    assert turned.prior_covariance is not None
+
+    def deviations(of: Camera, at: Array, covariance: Array) -> Array:
+        """(14, 14) covariance of pixels by that of the parameters, through central differences."""
+        steps = 1e-5 * np.eye(len(of.params))
+        slope = [project(of.with_params(of.params + h), at) - project(of.with_params(of.params - h), at) for h in steps]
+        jacobian = np.stack(slope, -1).reshape(14, -1) / 2e-5
+        return np.asarray(jacobian @ covariance @ jacobian.T)
+
+    expected = deviations(camera, rays, root @ root.T)
+    turn = np.kron(np.eye(7), np.stack([upright_vectors(orientation, axis) for axis in np.eye(2)], 1))
+    found = deviations(turned, turned_rays, turned.prior_covariance)
+    np.testing.assert_allclose(found, turn @ expected @ turn.T, atol=1e-6 * float(np.abs(expected).max()))
 
 
 @pytest.mark.parametrize("orientation", ALL)

@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.errors import UsageError
 from sfmapp.geometry.orientation import INVERSE, MIRRORED, is_sideways, upright_size, upright_vectors, upright_xy
+
+Array = NDArray[np.float64]
 
 # shares of the picture's sides within which a principal point is in the middle, and beyond which it is nowhere near;
 # 4:3 taken for 3:4 puts it off by an eighth
@@ -17,21 +20,35 @@ _NEAR_CENTER, _FAR_OFF_CENTER = 0.04, 0.08
 
 
 def turned_camera(camera: Camera, orientation: int) -> Camera:
-    """The camera of the same pictures turned, and mirrored, as an EXIF orientation says; exact for every model.
+    """The camera of the same pictures turned, and mirrored, as an EXIF orientation says; exact for every model,
+    with the covariance of its prior.
 
     Raises:
         UsageError: a panorama or a skewed pinhole on its side.
     """
-    values = dict(zip(PARAM_NAMES[camera.model], camera.params.tolist(), strict=True))
+    names = PARAM_NAMES[camera.model]
     width, height = upright_size(orientation, camera.width, camera.height)
-    if is_sideways(orientation) and ("w" in values or "s" in values):
+    if is_sideways(orientation) and ("w" in names or "s" in names):
         raise UsageError(
             f"pictures of a {camera.model.name} camera cannot be turned on their side as EXIF's orientation "
             f"{orientation} says",
             "turn the photographs themselves, or take the tag out",
         )
-    if "w" in values:
+    if "w" in names:
         return replace(camera, width=width, height=height)
+    params = _turned(camera, orientation, camera.params)
+    covariance = camera.prior_covariance
+    if covariance is not None:
+        # affine with whole numbers, so that differences are the exact slope
+        zero = _turned(camera, orientation, np.zeros(len(names)))
+        slope = np.stack([_turned(camera, orientation, unit) - zero for unit in np.eye(len(names))], 1)
+        covariance = slope @ covariance @ slope.T
+    return replace(camera, width=width, height=height, params=params, prior_covariance=covariance)
+
+
+def _turned(camera: Camera, orientation: int, params: Array) -> Array:
+    """Parameters (P,) of a camera of that model and size in the turned pictures: exchanged, moved, with other signs."""
+    values = dict(zip(PARAM_NAMES[camera.model], params.tolist(), strict=True))
     center = upright_xy(orientation, [values["cx"], values["cy"]], camera.width, camera.height)
     values["cx"], values["cy"] = center.tolist()
     if is_sideways(orientation) and "fx" in values:
@@ -44,8 +61,7 @@ def turned_camera(camera: Camera, orientation: int) -> Camera:
             values[x], values[y] = upright_vectors(orientation, [values[x], values[y]]).tolist()
     if "s" in values and orientation in MIRRORED:  # one of the axes goes the other way
         values["s"] = -values["s"]
-    # what was known of all parameters together is not carried over: the focal length's part is
-    return replace(camera, width=width, height=height, params=np.array(list(values.values())), prior_covariance=None)
+    return np.array(list(values.values()))
 
 
 def turned_back(camera: Camera, orientation: int) -> Camera | None:
