@@ -207,6 +207,31 @@ def test_poses_that_are_all_a_little_off_are_contradicted_where_they_are_held(po
     assert names
 
 
+def test_held_poses_tell_what_exif_says_wrongly_of_a_camera(pool: Executor) -> None:
+    """A focal length that is off by four of its sigmas, and a principal point that EXIF knows nothing of, speak neither
+    for nor against poses that are held."""
+    true_camera = synthetic_camera(CameraModel.SIMPLE_RADIAL)
+    focal, *center = true_camera.params[:3].tolist()
+    true_camera = true_camera.with_params([focal, center[0] - 0.04 * true_camera.width, *true_camera.params[2:]])
+    scene = make_scene(3, NUM, 300, true_camera, sigma_px=0.3)
+    mapper = finished_map(scene, pool)
+    model = mapper.reconstruction
+    exif = replace(
+        true_camera.with_params([1.2 * focal, *center, 0.0]), focal_sigma=0.05 * focal, focal_source="exif_35mm"
+    )
+    model.cameras[:], mapper.prior_cameras[:] = [exif], [exif]
+    model.cam_from_world[:], model.point_xyz[:] = scene.ground_truth.cam_from_world, np.nan
+    mapper.held, mapper.poses_tell_centers = np.ones(NUM, bool), True
+    mapper.max_error_px = mapper.options.max_pose_error_px
+    mapper.triangulate_images(list(range(NUM)))
+    mapper.adjust_globally()
+    mapper.finish()
+    np.testing.assert_allclose(model.cameras[0].params[:3], true_camera.params[:3], atol=2.0)
+    report = judge_held_poses(mapper, pose_file(scene.ground_truth.cam_from_world, fixed=True), Events())
+    assert not report.contradictions
+    assert all(row.is_used for row in report.images)
+
+
 def positioned(scene: SyntheticScene, metres: float, seed: int, wrong: int = 0) -> ImageSet:
     """Photographs with positions to two centimetres of a scene whose unit has so many metres; some far away."""
     rng, place = np.random.default_rng([seed, 7]), LocalFrame(48.2, 16.4, 170.0)

@@ -60,6 +60,7 @@ class Mapper:
     ``loss_scale_px``: the noise that robust losses are set for, once it has been measured.
     ``waits``: weak images whose strongest pairs are with images outside of the model are left to another one, which
     may grow from there. ``held`` (I,) bool: images whose poses are known and stay as they are; None for none.
+    ``poses_tell_centers``: poses are or were known, which tells principal points that EXIF does not.
     """
 
     reconstruction: Reconstruction
@@ -77,6 +78,7 @@ class Mapper:
     loss_scale_px: float | None = None
     waits: bool = True
     held: NDArray[np.bool_] | None = None
+    poses_tell_centers: bool = False
     max_error_px: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -298,6 +300,8 @@ class Mapper:
         if reconstruction.is_registered.sum() < 3:  # two views cannot tell the lens from the scene
             options = replace(options, refine_focal=False, refine_distortion=False)
         adjust_bundle(reconstruction, options, varying=self._everything(), prior_cameras=self.prior_cameras)
+        if self.held is not None:  # what does not fit known poses is taken back next
+            self._refine_principal_points(options)
         self._settle_points()
         self.size_at_global = self._size()
 
@@ -439,7 +443,10 @@ class Mapper:
         # a calibration tells them too, and how well
         unknown = np.array(
             [
-                mode == "always" or c.focal_source == "default" or prior.focal_variance > 0.0
+                mode == "always"
+                or c.focal_source == "default"
+                or prior.focal_variance > 0.0
+                or (self.poses_tell_centers and c.focal_source.startswith("exif"))
                 for c, prior in zip(reconstruction.cameras, self.prior_cameras, strict=True)
             ],
             bool,

@@ -48,7 +48,9 @@ def judge_held_poses(mapper: Mapper, known: PoseFile, events: Events) -> PosesRe
     assert held is not None
     rows = {int(i): _taken_back(int(i), mapper) for i in np.flatnonzero(known.is_known & ~held)}
     image_idx = np.flatnonzero(held)
-    free = replace(mapper, reconstruction=mapper.reconstruction.copy(), held=None)
+    # what was known of the cameras beforehand speaks neither for nor against poses: it holds them where these put them
+    cameras = list(mapper.reconstruction.cameras)
+    free = replace(mapper, reconstruction=mapper.reconstruction.copy(), held=None, prior_cameras=cameras)
     free.polish()
     judged_idx = image_idx[free.reconstruction.is_registered[image_idx]]
     of_images = known.of_images(judged_idx)
@@ -104,8 +106,12 @@ def _contradiction(
     assert row.sigma_deg is not None
     if mapper.held is None or not mapper.held.any():
         return []
-    base = free.reconstruction.copy()
+    base, own = free.reconstruction.copy(), mapper.reconstruction
     base.cam_from_world[mapper.held] = known.cam_from_world[mapper.held]
+    # a loss that lets go of what is far off needs the lens that these poses have
+    base.cameras[:] = own.cameras
+    both = base.is_triangulated & own.is_triangulated
+    base.point_xyz[both] = own.point_xyz[both]
     options = free.robust(free.adjust_options)
     found = hold_out(base, options, free.reconstruction.copy(), options, held_images=mapper.held)
     if not found.ratio <= CLEAR_RATIO:
