@@ -14,6 +14,7 @@ from sfmapp.errors import InputError
 from sfmapp.formats.colmap_binary import read_binary_cameras, read_binary_images
 from sfmapp.formats.colmap_text import read_text_images
 from sfmapp.formats.flat_yaml import parse_flat_yaml
+from sfmapp.formats.middlebury_calibration import is_middlebury, middlebury_fields
 from sfmapp.formats.nerfstudio import read_nerfstudio_cameras
 from sfmapp.formats.text_input import read_json_object, read_limited_text
 
@@ -46,6 +47,8 @@ def read_fields(path: Path) -> Fields:
     text = read_limited_text(path, _LARGEST_BYTES)
     if text.lstrip().startswith("<"):
         return _fields_of_xml(str(path), text)
+    if is_middlebury(text):
+        return middlebury_fields(str(path), text)
     rows = [
         line.split() for line in text.replace(",", " ").splitlines() if line.strip() and line.lstrip()[0] not in "#%"
     ]

@@ -62,8 +62,9 @@ def read_calibration(path: str | Path, image_sizes: Sequence[Size]) -> Calibrati
     baseline; fps; or two such objects ``cam0`` and ``cam1``), COLMAP's ``cameras.txt``, ``cameras.bin`` or
     the folder of a model, ``cameras.json`` and ``transforms.json`` with one camera for all views, EuRoC's
     ``sensor.yaml``, Kalibr's ``camchain.yaml``, ROS's ``camera_info.yaml``, OpenCV's yml and xml (``camera_matrix`` or
-    ``M1``, ``D1``, ``M2``, ``D2``, ``R``, ``T``), settings of ORB-SLAM and VINS-Fusion, KITTI's ``calib.txt``, and
-    plain text of ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` or of the 3 x 3 matrix. What they call the lens counts: see
+    ``M1``, ``D1``, ``M2``, ``D2``, ``R``, ``T``), settings of ORB-SLAM and VINS-Fusion, KITTI's and
+    Middlebury's ``calib.txt``, and plain text of
+    ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` or of the 3 x 3 matrix. What they call the lens counts: see
     :mod:`sfmapp.camera_files.lens_types`.
 
     Args:

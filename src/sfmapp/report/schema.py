@@ -30,6 +30,7 @@ from sfmapp.report.model import (
 )
 from sfmapp.report.pair_html import PairReport
 from sfmapp.report.panorama_html import PanoramaReport
+from sfmapp.report.stereo_document import StereoReport
 from sfmapp.report.transfer_html import TransferRunReport
 from sfmapp.report.uncalibrated_html import UncalibratedReport
 from sfmapp.report.validation import CloudValidation, Validation
@@ -37,7 +38,7 @@ from sfmapp.reporting import Report, field_types
 from sfmapp.stereo.design import DesignReport
 
 # by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry, refine,
-# calibrate, locate, pair, panorama, warp and rectify; calibration.json; validation/report.json and
+# calibrate, locate, pair, panorama, warp, rectify and stereo; calibration.json; validation/report.json and
 # validation/cloud.json; what evaluate, undistort, export, measure and stereo-design print with --json; and
 # georeference.json
 KINDS: Mapping[str, type[Report]] = {
@@ -65,6 +66,7 @@ KINDS: Mapping[str, type[Report]] = {
     "stereo-design": DesignReport,
     "warp": WarpReport,
     "rectify": RectifyReport,
+    "stereo": StereoReport,
 }
 _SIMPLE = {bool: "boolean", int: "integer", float: "number", str: "string", type(None): "null"}
 

@@ -19,6 +19,7 @@ __all__ = [
     "RECTIFY",
     "REFINE",
     "REPORT",
+    "STEREO",
     "TRANSFER",
     "UNCALIBRATED",
     "UNDISTORT",
@@ -31,7 +32,7 @@ FORMAT = f"{FORMAT_NAME} 1"
 RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "refine", "dense", "undistort"
 CALIBRATE, LOCATE, PAIR, PANORAMA = "calibrate", "locate", "pair", "panorama"
 TRANSFER, UNCALIBRATED = "transfer", "uncalibrated"
-WARP, RECTIFY = "warp", "rectify"
+WARP, RECTIFY, STEREO = "warp", "rectify", "stereo"
 # a report for programs, and the page for people beside it
 LOCK, REPORT, PAGE = ".lock", "report.json", "report.html"
 # where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0

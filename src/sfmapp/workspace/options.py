@@ -32,6 +32,7 @@ from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.pairs import PairOptions
 from sfmapp.odometry.options import OdometryOptions, ScaleOptions
 from sfmapp.option_checks import Range, check_options
+from sfmapp.stereo.options import StereoOptions
 from sfmapp.surface.options import SurfaceOptions
 from sfmapp.workspace import resources
 
@@ -47,6 +48,7 @@ class Options:
         control, units, poses: ground control points of a reconstruction, known lengths and the vertical, known poses.
         dense, surface: those of patches and of the mesh that is made of them.
         sequence, odometry, scale: those of odometry.
+        stereo: those of matching rectified pairs.
         seed: where every random choice starts; the same seed gives the same bytes.
         threads: worker threads; None: as many as the process has cores. Results do not depend on it.
         min_registered: fail (exit code 5) when fewer images are registered; None: any model will do.
@@ -67,6 +69,7 @@ class Options:
     sequence: SequenceOptions = field(default_factory=SequenceOptions)
     odometry: OdometryOptions = field(default_factory=OdometryOptions)
     scale: ScaleOptions = field(default_factory=ScaleOptions)
+    stereo: StereoOptions = field(default_factory=StereoOptions)
     seed: int = 0
     threads: int | None = None
     min_registered: int | None = None

@@ -1,0 +1,106 @@
+"""``sfmapp stereo``: two photographs of one moment to disparities and depths."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from sfmapp.cli.common import (
+    add_output_flags,
+    limit_library_threads,
+    listening,
+    load_numba_without_blas,
+    options_of,
+    tell_result,
+    took,
+)
+
+if TYPE_CHECKING:
+    from sfmapp.pipelines.stereo.run import StereoResult
+    from sfmapp.stereo.report import StereoPairReport
+
+EXAMPLES = """\
+examples:
+  sfmapp stereo left.jpg right.jpg --camera rig/ -o depth/     any two calibrated cameras: rectified, then matched
+  sfmapp stereo im0.png im1.png --camera calib.txt -o depth/   Middlebury's, rectified already
+  sfmapp stereo left/ right/ --camera rig/rig.json -o depth/   pairs by name, a folder for each
+  sfmapp stereo kitti/00/ -o depth/                            image_2 and image_3, or image_0 and image_1
+  sfmapp stereo l.png r.png --focal 995 --baseline 0.193 --doffs 31.1 -o depth/   rectified, with three numbers
+
+The calibration of two cameras has any form: that of sfmapp calibrate rig, OpenCV's stereo files, Kalibr's, ROS's,
+EuRoC's, KITTI's or Middlebury's calib.txt. Where its cameras are rectified already, pictures stay as they are. Without
+one, photographs are taken to be rectified, and disparities are all that there is.
+
+Writes
+  OUT/left.png, OUT/right.png   the pair, its rows epipolar lines
+  OUT/disparity.npy             x_left - x_right of each pixel of the left picture, float32 pixels, NaN for unknown
+  OUT/depth.npy                 the same in the unit of the baseline, metres, where one is known
+  OUT/report.json               how it was rectified and matched, and what is wrong with the pair"""
+
+
+def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the commands of this family to the parser."""
+    parser = commands.add_parser(
+        "stereo", help="two photographs of one moment to disparities and depths",
+        description="Rectify two photographs, match every pixel, and measure depths.", epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("sources", metavar="SOURCE", nargs="+", help="two photographs, two folders, or a KITTI folder")
+    parser.add_argument("-o", "--output", metavar="DIR", required=True, help="output folder, new or empty")
+    cameras = parser.add_argument_group("cameras")
+    cameras.add_argument("--camera", metavar="FILE", help="calibration of both cameras, of any form")
+    cameras.add_argument("--focal", metavar="PX", type=float, help="focal length of a rectified pair, pixels")
+    cameras.add_argument("--baseline", metavar="M", type=float, help="distance of its cameras, metres")
+    cameras.add_argument(
+        "--doffs", metavar="PX", type=float, help="its principal points along x, right minus left; default: 0"
+    )
+    matching = parser.add_argument_group("matching")
+    matching.add_argument("--matcher", metavar="NAME", help="opencv-sgbm or opencv-bm; default: opencv-sgbm")
+    matching.add_argument(
+        "--min-disparity", metavar="PX", help="least disparity looked for; default: as sparse matches tell"
+    )
+    matching.add_argument("--num-disparities", metavar="N", help="how many from there on")
+    matching.add_argument("--window", metavar="PX", help="side of the window, odd; default: the matcher's own")
+    add_output_flags(parser, has_log=True)
+    parser.set_defaults(run=_stereo)
+
+
+def _stereo(args: argparse.Namespace) -> int:
+    limit_library_threads()
+    options = options_of({
+        "stereo.matcher": args.matcher, "stereo.min_disparity": args.min_disparity,
+        "stereo.num_disparities": args.num_disparities, "stereo.window": args.window,
+    })  # fmt: skip
+    load_numba_without_blas()
+    from sfmapp.pipelines.stereo.run import stereo
+    from sfmapp.pipelines.stereo.sources import KnownCameras
+    from sfmapp.workspace.usage import Stopwatch
+
+    watch = Stopwatch(whole_process=True)
+    known = KnownCameras(args.camera, args.focal, args.baseline, args.doffs)
+    with listening(args) as events:
+        result = stereo(args.sources, args.output, options, known=known, events=events, watch=watch)
+    tell_result(args, result, lambda: _print(result))
+    return 0
+
+
+def _print(result: StereoResult) -> None:
+    for pair in result.report.pairs:
+        _print_pair(pair)
+    for each in result.report.failed:
+        print(f"{each.name}: FAILED: {each.reason}")
+    print(f"{took(result.output, result.report.run)}; report {result.output / 'report.json'}")
+
+
+def _print_pair(pair: StereoPairReport) -> None:
+    how, found = pair.rectification, pair.disparity
+    start = f"{pair.name}: " if pair.name else ""
+    rows = "" if how.rows is None else f", rows agree to {how.rows.rms_px:.2f} px"
+    made = "as they are" if how.is_as_given else f"turned by {how.turn_deg[0]:.2f} and {how.turn_deg[1]:.2f} degrees"
+    print(f"{start}{how.width} x {how.height} pixels, rectified {made}{rows}")
+    text = f"{found.matcher}: {found.density:.1%} of the pixels matched"
+    if found.quantiles_px:
+        text += f", disparities {found.quantiles_px[0]:.1f} to {found.quantiles_px[-1]:.1f} px"
+    if found.depths:
+        text += f", depths {found.depths[0]:.3g} to {found.depths[-1]:.3g} {how.unit} (median {found.depths[1]:.3g})"
+    print(text)

@@ -1,0 +1,1 @@
+"""Pairs of photographs to disparities and depths."""

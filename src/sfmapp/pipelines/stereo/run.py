@@ -1,0 +1,164 @@
+"""Pairs of photographs to rectified pictures, disparities and depths, one pair after another."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.errors import InputError
+from sfmapp.events import Events
+from sfmapp.formats.atomic import replaced_file
+from sfmapp.images.rewrite import encode
+from sfmapp.pipelines.stereo.sources import KnownCameras, PairSource, find_pairs
+from sfmapp.report.stereo_document import StereoReport
+from sfmapp.reporting import NamedReason
+from sfmapp.stereo.depth import depth_of_disparity
+from sfmapp.stereo.match import match_pair
+from sfmapp.stereo.prepare import PreparedPair, prepare_pair
+from sfmapp.stereo.report import DisparityReport, StereoPairReport
+from sfmapp.stereo.result import DisparityMap, PixelState
+from sfmapp.workspace.job import Job
+from sfmapp.workspace.layout import REPORT, STEREO
+from sfmapp.workspace.options import Options
+from sfmapp.workspace.usage import Stopwatch
+
+STAGE = STEREO
+_QUANTILES = (0.01, 0.5, 0.99)
+
+
+@dataclass(frozen=True)
+class MatchedStereo:
+    """One pair when it is done: rectified, matched, with its depths (H, W) float32, NaN where there are none."""
+
+    source: PairSource
+    prepared: PreparedPair
+    disparity: DisparityMap
+    depth: NDArray[np.float32] | None
+
+
+@dataclass(frozen=True)
+class StereoResult:
+    """What was found and written.
+
+    Attributes:
+        output: the folder. report: what is in ``report.json``.
+        last: the pair that was done last.
+    """
+
+    output: Path
+    report: StereoReport
+    last: MatchedStereo
+
+
+def stereo(
+    sources: Sequence[str | os.PathLike[str]], output: str | os.PathLike[str], options: Options | None = None, *,
+    known: KnownCameras | None = None, events: Events | None = None, watch: Stopwatch | None = None,
+) -> StereoResult:  # fmt: skip
+    """Rectify and match pairs of photographs.
+
+    Args:
+        sources: two photographs; two folders, whose files belong together by name; or a folder of KITTI.
+        output: a new folder, an empty one, or that of an earlier call; of several pairs, each gets a folder in it.
+        options: of these, ``stereo``.
+        known: what is known of the cameras; None: the photographs are rectified, and nothing else is known.
+        events: progress, warnings and cancellation. watch: started when the run began.
+
+    Raises:
+        UsageError: sources that are none, or an output that holds something else.
+        InputError: photographs or a calibration that cannot be used; of several pairs, all of them.
+    """
+    with Job.opened(
+        STEREO, ", ".join(os.fspath(one) for one in sources), output, options, events=events, watch=watch
+    ) as job:
+        pairs = list(find_pairs(sources, known or KnownCameras()))
+        job.note_inputs({name: digest for pair in pairs for name, digest in pair.digests.items()})
+        job.events.started(STAGE, f"{len(pairs)} pairs" if len(pairs) > 1 else "matching", total=len(pairs))
+        told: list[StereoPairReport] = []
+        failed: list[NamedReason] = []
+        last: MatchedStereo | None = None
+        for pair in pairs:
+            try:
+                last, report = _do_pair(job, pair)
+                told.append(report)
+            except InputError as error:
+                if len(pairs) == 1:
+                    raise
+                failed.append(NamedReason(name=pair.name, reason=str(error)))
+                job.events.warned(STAGE, f"{pair.name}: {error}")
+            job.events.advanced(STAGE)
+        if last is None:
+            raise InputError(f"{len(pairs)} pairs, none of which can be used: {failed[0].name}: {failed[0].reason}")
+        job.events.finished(STAGE, f"{len(told)} pairs matched")
+        document = StereoReport(
+            run=job.facts(), pairs=told, failed=failed, usage=job.usage, warnings=job.log.warnings
+        )  # fmt: skip
+        job.workspace.write_json(REPORT, document)
+        job.workspace.save()
+        return StereoResult(job.workspace.folder, document, last)
+
+
+def _do_pair(job: Job, source: PairSource) -> tuple[MatchedStereo, StereoPairReport]:
+    with job.stage("rectification"):
+        left, right = source.read()
+        least = job.options.stereo.min_disparity
+        prepared = prepare_pair(
+            left, right, source.cameras(), (source.left, source.right), is_cropped=least is not None and least < 0
+        )
+        for warning in prepared.report.warnings:
+            job.events.warned(STAGE, warning)
+    with job.stage("matching"):
+        disparity = match_pair(prepared.pair, job.options.stereo, matches=prepared.matches)
+    with job.stage("files"):
+        geometry = prepared.pair.geometry
+        is_metric = geometry is not None and geometry.baseline is not None
+        depth = depth_of_disparity(disparity.disparity, geometry) if geometry is not None and is_metric else None
+        done = MatchedStereo(source, prepared, disparity, depth)
+        files = [
+            str(path.relative_to(job.workspace.folder)) for path in _write(job.workspace.folder / source.name, done)
+        ]
+    return done, StereoPairReport(
+        name=source.name, left=source.left, right=source.right, rectification=prepared.report,
+        disparity=_disparity_report(done), files=files,
+    )  # fmt: skip
+
+
+def _disparity_report(done: MatchedStereo) -> DisparityReport:
+    found = done.disparity
+    known = found.disparity[found.state == PixelState.MATCHED]
+    quantiles = np.quantile(known, _QUANTILES).tolist() if known.size else []
+    depths: list[float] = []
+    if done.depth is not None and known.size:
+        of = done.depth[np.isfinite(done.depth)]
+        depths = np.quantile(of, _QUANTILES).tolist() if of.size else []
+    return DisparityReport(
+        matcher=str(found.info.get("matcher", "")), searched=found.searched,
+        told_by=str(found.info.get("range_told_by", "")), density=found.density,
+        filled=float((found.state == PixelState.FILLED).mean()), quantiles_px=quantiles, depths=depths,
+    )  # fmt: skip
+
+
+def _write(folder: Path, done: MatchedStereo) -> Iterator[Path]:
+    """Write the files of a pair; gives the path of each."""
+    pair = done.prepared.pair
+    for name, picture in (("left.png", pair.left), ("right.png", pair.right)):
+        yield _write_bytes(folder / name, encode(picture, "png"))
+    arrays = {"disparity.npy": done.disparity.disparity, "depth.npy": done.depth}
+    for name, array in arrays.items():
+        path = folder / name
+        if array is None:
+            path.unlink(missing_ok=True)  # of an earlier run with a baseline
+            continue
+        with replaced_file(path) as beside, beside.open("wb") as stream:
+            np.save(stream, array, allow_pickle=False)
+        yield path
+
+
+def _write_bytes(path: Path, data: bytes) -> Path:
+    with replaced_file(path) as beside:
+        beside.write_bytes(data)
+    return path

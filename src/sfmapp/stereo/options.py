@@ -1,0 +1,38 @@
+"""What is asked of the matching of a rectified pair."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from sfmapp.errors import UsageError
+from sfmapp.option_checks import Range, check_options
+
+MatcherName = Literal["opencv-sgbm", "opencv-bm"]
+
+
+@dataclass(frozen=True)
+class StereoOptions:
+    """Options of the stage ``stereo``.
+
+    Attributes:
+        matcher: opencv-sgbm and opencv-bm are OpenCV's StereoSGBM and StereoBM.
+        min_disparity: Least disparity x_left - x_right that is looked for, pixels; may be negative. None: as sparse
+            matches tell.
+        num_disparities: How many from there on, pixels. None: as sparse matches tell.
+        window: Side of the matching window, pixels, odd; None: what is best for the matcher.
+        left_right_px: Disparities that differ by more when they are looked for from the other side are dropped, pixels.
+        fill: Fill what only one camera sees from its neighbours, and mark it so.
+    """
+
+    matcher: MatcherName = "opencv-sgbm"
+    min_disparity: int | None = None
+    num_disparities: int | None = None
+    window: int | None = None
+    left_right_px: float = 1.0
+    fill: bool = False
+
+    def __post_init__(self) -> None:
+        check_options("stereo", self, {"num_disparities": Range(1), "window": Range(1), "left_right_px": Range(0.0)})
+        if self.window is not None and self.window % 2 == 0:
+            raise UsageError(f"stereo.window is {self.window}, expected an odd number of pixels")

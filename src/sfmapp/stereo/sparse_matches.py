@@ -1,0 +1,103 @@
+"""Sparse matches of two pictures: they tell the range of disparities, misalignment, and wrong pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.features.extract import FeatureOptions, features_from_picture
+from sfmapp.images.pixels import Picture
+from sfmapp.matching.descriptors import match_sift
+from sfmapp.matching.options import MatchingOptions
+
+Array = NDArray[np.float64]
+
+# enough for a range and an alignment; SIFT takes half a CPU second a picture at this size
+_NUM_FEATURES, _SIZE_PX = 3000, 1600
+# a Lucas-Kanade window of this side, as much of two octaves of pyramid as the keypoint's own error needs
+_WINDOW_PX, _LEVELS, _ROUNDS, _STEP_PX = 21, 1, 30, 0.005
+# a window whose pixels differ so much in the mean, grey levels, is another place; a step farther than this too
+_WORST_DIFFERENCE, _FARTHEST_PX = 20.0, 4.0
+
+
+@dataclass(frozen=True)
+class PairMatches:
+    """Of two pictures.
+
+    Attributes:
+        left, right: (N, 2) pixels, the centre of the first pixel at (0.5, 0.5).
+    """
+
+    left: Array
+    right: Array
+
+    def __len__(self) -> int:
+        return len(self.left)
+
+    @property
+    def disparities(self) -> Array:
+        """(N,) x_left - x_right."""
+        return self.left[:, 0] - self.right[:, 0]
+
+    @property
+    def row_differences(self) -> Array:
+        """(N,) y_left - y_right: 0 of a rectified pair."""
+        return self.left[:, 1] - self.right[:, 1]
+
+    def of(self, kept: NDArray[np.bool_]) -> PairMatches:
+        """Those that are kept, (N,) bool."""
+        return PairMatches(self.left[kept], self.right[kept])
+
+
+def match_pictures(
+    left: NDArray[np.uint8], right: NDArray[np.uint8],
+    left_shown: NDArray[np.bool_] | None = None, right_shown: NDArray[np.bool_] | None = None,
+) -> PairMatches:  # fmt: skip
+    """SIFT in two pictures (H, W) or (H, W, 3), mutual nearest neighbours that pass the ratio test, not verified.
+
+    Args:
+        left_shown, right_shown: (H, W), False where nothing may be detected; None for everywhere.
+    """
+    options = FeatureOptions(max_num_features=_NUM_FEATURES, max_size_px=_SIZE_PX, max_num_orientations=1)
+    found = [
+        features_from_picture(_picture(pixels, shown), options)[0]
+        for pixels, shown in ((left, left_shown), (right, right_shown))
+    ]
+    limits = MatchingOptions()
+    if not all(map(len, found)):
+        return PairMatches(np.zeros((0, 2)), np.zeros((0, 2)))
+    rows = match_sift(found[0].descriptors, found[1].descriptors, limits.max_ratio, limits.max_distance)
+    xy = [one.keypoints[rows[:, n], :2].astype(np.float64) for n, one in enumerate(found)]
+    return PairMatches(xy[0], xy[1])
+
+
+def _picture(pixels: NDArray[np.uint8], shown: NDArray[np.bool_] | None) -> Picture:
+    from sfmapp.stereo.opencv_matchers import gray_of
+
+    rgb = np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels
+    return Picture(rgb, gray_of(pixels), None if shown is None or shown.all() else shown)
+
+
+def refined_matches(left: NDArray[np.uint8], right: NDArray[np.uint8], matches: PairMatches) -> PairMatches:
+    """Matches whose right ends are moved to where a window about the left one fits best (Lucas and Kanade 1981, in
+    OpenCV's pyramid), a tenth of a keypoint's error; those that go astray are dropped.
+
+    Args:
+        left, right: (H, W) uint8 grey pictures that differ by little more than disparities.
+    """
+    import cv2
+
+    if not len(matches):
+        return matches
+    start = (matches.right - 0.5).astype(np.float32).reshape(-1, 1, 2)
+    moved, is_found, difference = cv2.calcOpticalFlowPyrLK(
+        left, right, (matches.left - 0.5).astype(np.float32).reshape(-1, 1, 2), start.copy(),
+        winSize=(_WINDOW_PX, _WINDOW_PX), maxLevel=_LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ROUNDS, _STEP_PX),
+    )  # fmt: skip
+    right_ends = moved.reshape(-1, 2).astype(np.float64) + 0.5
+    kept = (is_found.ravel() == 1) & (difference.ravel() < _WORST_DIFFERENCE)
+    kept &= np.hypot(*(right_ends - matches.right).T) < _FARTHEST_PX
+    return PairMatches(matches.left[kept], right_ends[kept])
