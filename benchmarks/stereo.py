@@ -1,0 +1,173 @@
+"""Matchers of rectified pairs beside each other: errors against true disparities, density, CPU time on one thread.
+
+    python benchmarks/stereo.py
+    python benchmarks/stereo.py --sets cones "room, converging" --matchers StereoBM sfmapp -o /tmp/stereo.json
+    python benchmarks/stereo.py --peer-python /tmp/peers/bin/python    # pip install pyelas pandora[sgm] there
+
+Motorcycle, cones and aloe (Middlebury) and six rendered pairs, whose two cameras differ in noise and exposure; the last
+two have disparities below zero. All matchers search the same disparities. Three errors are told, each over the pixels
+that the other camera sees and over all whose disparity is known:
+
+- *answered*: over pixels that the matcher gives a disparity; who answers less errs less, so the density stands beside.
+- *wrong or none*: bad-1, where a pixel without an answer is wrong.
+- *complete*: bad-1, bad-2 and the mean over every pixel, when holes are filled as KITTI's development kit fills those
+  of everybody: by the lesser of the disparities beside them on the row.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from machine import RESULTS, describe_machine
+from stereo_pairs import StereoSet, rendered_set, shared_sets, shots
+from stereo_peers import ELSEWHERE, OPENCV, run_elsewhere
+
+Disparity = NDArray[np.float32]
+
+ROUNDS = 3  # the least of their times counts
+
+
+def completed(disparity: Disparity) -> Disparity:
+    """Holes filled by the lesser disparity of the two beside them on their row, or else in their column."""
+    out = _row_fill(disparity)
+    empty = np.isnan(out)
+    return np.where(empty, _row_fill(out.T).T, out) if empty.any() else out
+
+
+def _row_fill(disparity: Disparity) -> Disparity:
+    height, width = disparity.shape
+    known, column = np.isfinite(disparity), np.arange(width)
+    before = np.maximum.accumulate(np.where(known, column, -1), axis=1)
+    behind = np.minimum.accumulate(np.where(known, column, width)[:, ::-1], axis=1)[:, ::-1]
+    padded = np.pad(disparity, ((0, 0), (1, 1)), constant_values=np.nan)
+    row = np.arange(height)[:, None]
+    return np.fmin(padded[row, before + 1], padded[row, behind + 1])
+
+
+def scores(disparity: Disparity, case: StereoSet) -> dict[str, float]:
+    """Densities and errors of the module's docstring, shares in percent."""
+    out: dict[str, float] = {}
+    full = completed(disparity)
+    for where, counted in (("visible", case.visible), ("all", np.isfinite(case.truth))):
+        answered = counted & np.isfinite(disparity)
+        error = np.abs(disparity - case.truth)[answered]
+        out[f"density_{where}"] = 100.0 * float(answered.sum() / counted.sum())
+        out |= _errors(error, f"answered_{where}")
+        out[f"wrong_or_none_{where}"] = 100.0 * float(1.0 - (error <= 1.0).sum() / counted.sum())
+        out |= _errors(np.abs(full - case.truth)[counted], f"complete_{where}")
+    return out
+
+
+def _errors(error: Disparity, name: str) -> dict[str, float]:
+    if not len(error):
+        error = np.full(1, np.nan, np.float32)
+    bad = {f"bad{t}_{name}": 100.0 * float((error > t).mean()) for t in (1, 2)}
+    return {**bad, f"mean_{name}": float(error.mean())}
+
+
+def matchers(peer_python: Path | None) -> dict[str, Callable[[StereoSet], tuple[Disparity, float]]]:
+    """By name, what gives the disparities of a set and the CPU seconds that they took."""
+    out: dict[str, Callable[[StereoSet], tuple[Disparity, float]]] = {}
+    for name, peer in OPENCV.items():
+        out[name] = timed(lambda case, peer=peer: peer(case.pair.left, case.pair.right, case.search))
+    if peer_python is not None:
+        for name in ELSEWHERE:
+            out[name] = lambda case, name=name: run_elsewhere(
+                peer_python, name, case.pair.left, case.pair.right, case.search
+            )
+    return out
+
+
+def timed(run: Callable[[StereoSet], Disparity]) -> Callable[[StereoSet], tuple[Disparity, float]]:
+    """The same, with its least CPU time in a few rounds, the first of which only warms up."""
+
+    def measured(case: StereoSet) -> tuple[Disparity, float]:
+        found, least = run(case), np.inf
+        for _ in range(ROUNDS):
+            start = time.process_time()
+            found = run(case)
+            least = min(least, time.process_time() - start)
+        return found, least
+
+    return measured
+
+
+def markdown(report: dict[str, Any]) -> str:
+    """The tables."""
+    about = f"{report['date']}, {report['commit']}, {report['cpu']}, one thread"
+    lines = [
+        "# Matchers of rectified pairs", "", about, "",
+        "Bad-1 and bad-2: percent of pixels whose disparity is off by more than 1 or 2 px. The first three errors are",
+        "of pixels that the matcher answers, among those that both cameras see. Complete: holes filled on their rows.",
+        "",
+    ]  # fmt: skip
+    head = ("matcher", "density %", "bad-1", "bad-2", "mean px", "none or bad-1", "complete: bad-1", "bad-2", "mean px",
+            "all: bad-1", "bad-2", "mean px", "CPU ms")  # fmt: skip
+    keys = ("density_visible", "bad1_answered_visible", "bad2_answered_visible", "mean_answered_visible",
+            "wrong_or_none_visible", "bad1_complete_visible", "bad2_complete_visible", "mean_complete_visible",
+            "bad1_complete_all", "bad2_complete_all", "mean_complete_all", "cpu_ms")  # fmt: skip
+    for name in dict.fromkeys(run["set"] for run in report["runs"]):
+        runs = [run for run in report["runs"] if run["set"] == name]
+        low, count = runs[0]["search"]
+        lines += [f"## {name}, {runs[0]['width']} x {runs[0]['height']}, disparities {low} to {low + count - 1}", ""]
+        lines += ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+        for run in runs:
+            digits = (0 if key == "cpu_ms" else 3 if key.startswith("mean") else 2 for key in keys)
+            cells = [f"{run[key]:.{n}f}" for key, n in zip(keys, digits, strict=True)]
+            lines.append("| " + " | ".join([run["matcher"], *cells]) + " |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def measure(
+    names: Sequence[str] | None, wanted: Sequence[str] | None, peer_python: Path | None, root: Path
+) -> list[dict[str, Any]]:
+    """A row for each set and matcher; ``names``: of sets, ``wanted``: how names of matchers begin."""
+    cases = list(shared_sets(root)) + [rendered_set(shot) for shot in shots() if not names or shot.name in names]
+    runs = []
+    for case in cases:
+        if names and case.name not in names:
+            continue
+        height, width = case.truth.shape
+        for matcher, run in matchers(peer_python).items():
+            if wanted and not any(matcher.startswith(word) for word in wanted):
+                continue
+            found, cpu_s = run(case)
+            row: dict[str, Any] = {"set": case.name, "matcher": matcher, "search": case.search}
+            row |= {"width": width, "height": height, **scores(found, case), "cpu_ms": 1e3 * cpu_s}
+            runs.append(row)
+            print(f"{case.name:16} {matcher:26} density {row['density_visible']:5.1f}"
+                  f" answered {row['bad1_answered_visible']:5.2f} {row['bad2_answered_visible']:5.2f}"
+                  f" {row['mean_answered_visible']:5.3f} none or bad {row['wrong_or_none_visible']:5.2f}"
+                  f" complete {row['bad1_complete_visible']:5.2f} all {row['bad1_complete_all']:5.2f}"
+                  f" {row['cpu_ms']:7.0f} ms", flush=True)  # fmt: skip
+    return runs
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sets", nargs="+", help="names of sets; all without it")
+    parser.add_argument("--matchers", nargs="+", help="how the names of matchers begin; all without it")
+    parser.add_argument("--peer-python", type=Path, help="an interpreter that has elas and pandora")
+    parser.add_argument("-o", "--out", type=Path, default=RESULTS / "stereo.json")
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    root = Path(os.environ.get("SFMAPP_DATA", "../shared/data"))
+    runs = measure(args.sets, args.matchers, args.peer_python, root)
+    report = {**describe_machine(), "runs": runs}
+    args.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    args.out.with_suffix(".md").write_text(markdown(report), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""How the benchmark of stereo scores: exact cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sfmapp.stereo.result import RectifiedPair
+
+stereo = pytest.importorskip("stereo", reason="benchmarks/ is not part of an installed package")
+stereo_pairs = pytest.importorskip("stereo_pairs")
+NAN = np.nan
+
+
+def test_holes_are_filled_by_the_farther_neighbour() -> None:
+    found = np.array([[NAN, 5, NAN, NAN, 3, NAN], [NAN] * 6], np.float32)
+    expected = [[5, 5, 3, 3, 3, 3]] * 2
+    np.testing.assert_array_equal(stereo.completed(found), expected)
+
+
+def test_what_is_nearer_covers_what_is_behind_it() -> None:
+    # a strip at columns 6 and 7 moves by four and covers the wall, which moves by one, at columns 3 and 4
+    truth = np.array([[1, 1, 1, 1, 1, 1, 4, 4, 1, NAN]], np.float32)
+    assert stereo_pairs.visible_from_right(truth).tolist() == [
+        [False, True, True, False, False, True, True, True, True, False]
+    ]
+
+
+def test_a_slanted_surface_of_whole_disparities_covers_nothing_of_itself() -> None:
+    truth = np.repeat(np.arange(4, 14), 2)[None].astype(np.float32)
+    assert stereo_pairs.visible_from_right(truth)[0, 8:].all()
+
+
+def test_scores_of_a_known_map() -> None:
+    truth = np.array([[2.0] * 8 + [4.0] * 4], np.float32)
+    found = np.array([[2, 2, 2, 3.5, NAN, 2, 2, 7, 4, 4, NAN, 4]], np.float32)
+    picture, shown = np.zeros((1, 12), np.uint8), np.ones((1, 12), np.bool_)
+    visible = np.arange(12)[None] >= 2
+    case = stereo_pairs.StereoSet("", RectifiedPair(picture, picture, shown, shown), truth, visible, (0, 16))
+    scores = stereo.scores(found, case)
+    assert scores["density_visible"] == pytest.approx(80.0)
+    assert scores["bad1_answered_visible"] == pytest.approx(25.0)
+    assert scores["bad2_answered_visible"] == pytest.approx(12.5)
+    assert scores["mean_answered_visible"] == pytest.approx(6.5 / 8)
+    assert scores["wrong_or_none_visible"] == pytest.approx(40.0)
+    assert scores["bad1_complete_all"] == pytest.approx(100.0 * 2 / 12)
