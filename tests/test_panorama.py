@@ -26,6 +26,7 @@ from sfmapp.panorama.level import level
 from sfmapp.panorama.preview import Shown, find_gains
 from sfmapp.panorama.report import TurnedPair
 from sfmapp.panorama.turning_report import judge_pairs
+from sfmapp.panorama.zooms import find_zooms, unzoomed
 from sfmapp.scene.tracks import Tracks
 
 Array = NDArray[np.float64]
@@ -214,6 +215,54 @@ def test_half_of_the_matches_may_be_wrong() -> None:
     assert not pairs.fit_turn(np.full((20, 3), np.nan), a[:20], 500.0, 2.0, (0, 1)).is_inlier.any()
 
 
+def zoomed_pairs(zooms: Array, noise: float, seed: int) -> tuple[list[pairs.MatchedPixels], list[Array]]:
+    """Neighbours in half a ring of cameras with these focal lengths over LENS's, and next but one: matches and maps."""
+    rng = np.random.default_rng(seed)
+    turns, found, maps = ring(2 * len(zooms)), [], []
+    for i, j in [(i, i + step) for step in (1, 2) for i in range(len(zooms) - step)]:
+        first, second = (np.diag([LENS.focal * zooms[k]] * 2 + [1.0]) for k in (i, j))
+        exact = second @ turns[j] @ turns[i].T @ np.linalg.inv(first)
+        xy = rng.uniform([-250.0, -150.0], [250.0, 150.0], (800, 2))
+        there = np.column_stack([xy, np.ones(800)]) @ exact.T
+        seen = there[:, :2] / there[:, 2:] + noise * rng.normal(size=(800, 2))
+        shown = (there[:, 2] > 0.0) & (np.abs(seen) < [250.0, 150.0]).all(1)
+        xy, seen = xy[shown], seen[shown]
+        center = LENS.params[1:3]
+        found.append(pairs.MatchedPixels((i, j), (0, 0), (xy + center, seen + center)))
+        maps.append(cv2.findHomography(*found[-1].xy)[0])
+    return found, maps
+
+
+def test_zooms_are_told_by_the_maps_between_photographs() -> None:
+    """Two and three focal lengths in any order, a wrong map among them, from a focal length that is a quarter off."""
+    rng = np.random.default_rng(1)
+    for steps in ([1.0, 1.2], [1.0, 2.0], [1.0, 1.03], [0.8, 1.0, 1.5]):
+        which = np.concatenate([np.arange(len(steps)), rng.integers(0, len(steps), 13 - len(steps))])
+        truth = np.array(steps)[which]
+        matched, maps = zoomed_pairs(truth, 0.3, 2)
+        maps[5] = maps[5] @ np.diag([1.7, 1.7, 1.0])
+        found = find_zooms(LENS.with_focal(420.0), matched, maps, 2.0)
+        assert found is not None
+        assert found.images.tolist() == list(range(13))
+        away = found.log_zoom - np.log(truth)
+        assert np.abs(away - np.median(away)).max() < 0.01
+        assert len(set(zip(found.group.tolist(), which.tolist(), strict=True))) == len(steps)
+        pair, homography = unzoomed(matched[0], maps[0], found, LENS.params[1:3])
+        ends = np.column_stack([pair.xy[0], np.ones(len(pair.xy[0]))]) @ homography.T
+        assert np.abs(ends[:, :2] / ends[:, 2:] - pair.xy[1]).max() < 3.0
+
+
+def test_one_zoom_stays_one() -> None:
+    num_split = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        assert find_zooms(LENS, *zoomed_pairs(np.ones(10), 0.5, seed), 2.0) is None
+        # a camera that moved makes zooms of any size, and hardly ever groups of them
+        moved = zoomed_pairs(np.exp(0.05 * rng.normal(size=10)), 0.3, seed)
+        num_split += find_zooms(LENS, *moved, 2.0) is not None
+    assert num_split <= 2  # 2 % each are expected
+
+
 @pytest.mark.parametrize("pitch", [0.0, 25.0])
 def test_a_ring_is_levelled(pitch: float) -> None:
     tilted = ring(9, pitch) @ rigid3.exp_so3([0.2, 0.3, -0.4])
@@ -342,6 +391,28 @@ def test_photographs_that_overlap_none_of_them_become_another_panorama(stitched:
     turn = rigid3.rotation_matrix(model.cam_from_world)
     assert rigid3.rotation_angle_deg(turn[1] @ turn[0].T) == pytest.approx(30.0, abs=0.5)
     assert (out / "report.html").read_text().count("<img") == 2
+
+
+def test_photographs_of_two_zooms_have_a_camera_each(tmp_path: Path) -> None:
+    """Of one size, without EXIF; the last is the only one of its zoom."""
+    photos, texture, truth = tmp_path / "photos", sphere(), ring(14)[:6]
+    photos.mkdir()
+    focals = [250.0, 250.0, 350.0, 250.0, 350.0, 250.0]
+    for k, (rotation, focal) in enumerate(zip(truth, focals, strict=True)):
+        Image.fromarray(photograph(texture, rotation, focal)).save(photos / f"{k}.png")
+    result = sfmapp.stitch_panorama(photos, tmp_path / "out", max_size=600)
+    turning = result.report.turning
+    assert turning is not None
+    assert turning.num_turned == 6
+    assert [camera.num_images for camera in turning.cameras] == [4, 2]
+    for image, focal in zip(turning.images, focals, strict=True):
+        assert turning.cameras[image.camera_idx].focal_px == pytest.approx(focal, rel=0.003)
+    found = rigid3.rotation_matrix(np.array([image.rotation for image in turning.images]))
+    away = found @ found[0].T @ truth[0] @ truth.swapaxes(1, 2)
+    assert rigid3.rotation_angle_deg(away).max() < 0.1
+    assert any("2 photographs" in each["message"] for each in result.report.decisions)
+    model, _ = read_model(tmp_path / "out" / "sparse" / "0")
+    assert len(model.cameras) == 2
 
 
 def moved_pair(noise: float, by: float, spread: float, seed: int) -> tuple[TurnedPair, float]:

@@ -119,8 +119,8 @@ def robust_sigma(squared: Array, degrees: int) -> float:
 
 def cauchy(squared: Array, scale: float) -> tuple[float, Array]:
     """Cost and weights (N,) of residuals with these squared lengths: ``s^2 log(1 + r^2 / s^2)`` each; plain squares
-    where the scale is infinite."""
-    if math.isinf(scale):
+    where the scale is infinite, or zero, as that of copies of one picture is."""
+    if math.isinf(scale) or scale == 0.0:
         return float(squared.sum()), np.ones(len(squared))
     ratio = squared / scale**2
     return float(scale**2 * np.log1p(ratio).sum()), 1.0 / (1.0 + ratio)

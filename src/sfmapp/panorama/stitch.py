@@ -16,7 +16,7 @@ from sfmapp.panorama.compose import Plan, compose
 from sfmapp.panorama.pictures import Pictures
 from sfmapp.panorama.preview import find_gains, find_seams, show_all, small_canvas
 from sfmapp.panorama.report import PictureReport
-from sfmapp.panorama.turning import TurnedPhotographs
+from sfmapp.panorama.turned_photographs import TurnedPhotographs
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, project
+from sfmapp.camera.lens import BROWN
 from sfmapp.camera.names import CameraModel
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
@@ -22,7 +23,9 @@ from sfmapp.panorama.adjustment import Turned, TurnedFit, adjust_turns, rays_of_
 from sfmapp.panorama.level import level
 from sfmapp.panorama.pairs import MatchedPixels, Turn
 from sfmapp.panorama.report import LensChoice, TurningReport
+from sfmapp.panorama.turned_photographs import TurnedPhotographs
 from sfmapp.panorama.turning_report import judge_pairs, report_of
+from sfmapp.panorama.zooms import Zooms, find_zooms, unzoomed
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.features import Features
 from sfmapp.scene.tracks import Tracks, make_tracks
@@ -50,28 +53,6 @@ _ADVICE = (
     "photographs taken from different places belong into sfmapp reconstruct; for a panorama turn the camera on the "
     "spot, about its lens, and let each photograph overlap the next by a third"
 )
-
-
-@dataclass(frozen=True)
-class TurnedPhotographs:
-    """Photographs from one place.
-
-    Attributes:
-        image_idx: (K,) positions in the image set, ascending.
-        cameras: those of the set, refined.
-        camera_idx: (K,) positions in ``cameras``.
-        rotations: (K, 3, 3) cam_from_world; in the world y is down, and z looks at the middle of the panorama.
-        sigma_deg: (K, 3) about the axes of each camera.
-        other_groups: positions of photographs that were turned as well, each group from a place of its own, or without
-            overlap with these; the largest first.
-    """
-
-    image_idx: Ints
-    cameras: list[Camera]
-    camera_idx: Ints
-    rotations: Array
-    sigma_deg: Array
-    other_groups: Sequence[Ints]
 
 
 @dataclass(frozen=True)
@@ -126,9 +107,11 @@ def find_rotations(
     evidence = _evidence(image_set, features, correspondences, options, seed, among)
     if not evidence.pixels:
         raise NoReconstructionError("no two photographs have verified matches with each other", _ADVICE)
-    start = _start_cameras(evidence)
+    found = _with_zooms(evidence)
     events.advanced(STAGE)
-    rough = _adjusted(evidence, start, _LOOSE)
+    if found is not None:
+        _tell_zooms(evidence.priors, found, events)
+    evidence, start, rough = found or _from_pairs(evidence, {})
     events.advanced(STAGE)
     fine, choices = _chosen(evidence, rough)
     events.advanced(STAGE)
@@ -142,17 +125,17 @@ def find_rotations(
             _ADVICE,
         )
     orientation = [image_set.images[i].orientation for i in fine.members]
-    found = TurnedPhotographs(
+    turned = TurnedPhotographs(
         fine.members, fine.fit.state.cameras, fine.camera_idx,
         level(fine.fit.state.rotations, orientation), fine.fit.rotation_sigma_deg, fine.groups,
     )  # fmt: skip
     report = report_of(
-        image_set, (among, fine.members, *fine.groups), found.rotations, fine.fit, fine.tracks, verdicts,
+        image_set, (among, fine.members, *fine.groups), turned, fine.fit, fine.tracks, verdicts,
         (evidence.priors, start), choices,
     )  # fmt: skip
     events.advanced(STAGE)
-    events.finished(STAGE, f"{len(found.image_idx)} of {len(among)} photographs turned on the spot", **report)
-    return found, report
+    events.finished(STAGE, f"{len(turned.image_idx)} of {len(among)} photographs turned on the spot", **report)
+    return turned, report
 
 
 def _evidence(
@@ -182,15 +165,108 @@ def _with_distortion(camera: Camera) -> Camera:
     return replace(camera, model=CameraModel.RADIAL, params=params)
 
 
-def _start_cameras(evidence: _Evidence) -> list[Camera]:
-    """Cameras with focal lengths from their own pairs."""
-    out = []
+def _from_pairs(evidence: _Evidence, zooms: Mapping[int, Zooms]) -> tuple[_Evidence, list[Camera], _Round]:
+    """The evidence with a camera for each zoom, their focal lengths from pairs, and what these come to.
+
+    Args:
+        zooms: of those cameras that are split.
+
+    Raises:
+        NoReconstructionError: no pair is a rotation.
+    """
+    whose, priors, start = evidence.image_camera_idx.copy(), list(evidence.priors), []
+    split: list[Camera] = []
     for c, camera in enumerate(evidence.priors):
-        own = [k for k, pair in enumerate(evidence.pixels) if pair.cameras == (c, c)]
-        homographies = [evidence.correspondences.homography[evidence.pair_idx[k]] for k in own]
-        threshold = evidence.thresholds[own[0]] if own else 1.0
-        out.append(turns.find_focal(camera, [evidence.pixels[k] for k in own], homographies, threshold, evidence.seed))
+        own, homographies, threshold = _own_pairs(evidence, c)
+        if c not in zooms:
+            start.append(turns.find_focal(camera, own, homographies, threshold, evidence.seed))
+            continue
+        # what was known of the focal length is right for one of them at most
+        unknown = replace(camera, focal_source="default", focal_sigma=None)
+        several = _focals(camera, zooms[c], own, homographies, threshold, evidence.seed)
+        numbers = np.array([c, *(len(evidence.priors) + len(split) + k for k in range(len(several) - 1))])
+        whose[zooms[c].images] = numbers[zooms[c].group]
+        priors[c] = unknown
+        start.append(several[0])
+        split += several[1:]
+        priors += [unknown] * (len(several) - 1)
+    pixels = [replace(p, cameras=(int(whose[p.images[0]]), int(whose[p.images[1]]))) for p in evidence.pixels]
+    evidence = replace(evidence, pixels=pixels, image_camera_idx=whose, priors=priors)
+    start += split
+    return evidence, start, _adjusted(evidence, start, _LOOSE)
+
+
+def _focals(
+    camera: Camera, zooms: Zooms, own: Sequence[MatchedPixels], homographies: Sequence[Array], threshold: float,
+    seed: int,
+) -> list[Camera]:  # fmt: skip
+    """A camera for each group of zooms: of the photographs that hang together pixels are drawn to one zoom, and its
+    focal length found as that of one camera."""
+    out = []
+    for part in range(int(zooms.part.max()) + 1):
+        mine = zooms.part == part
+        inside = [np.isin(pair.images, zooms.images[mine]).all() and np.isfinite(h).all()
+                  for pair, h in zip(own, homographies, strict=True)]  # fmt: skip
+        alike = [
+            unzoomed(own[k], homographies[k], zooms, camera.canonical[2:4]) for k in np.flatnonzero(inside).tolist()
+        ]
+        base = turns.find_focal(camera, [p for p, _ in alike], [h for _, h in alike], threshold, seed)
+        for group in sorted(set(zooms.group[mine].tolist())):
+            zoom = math.exp(float(zooms.log_zoom[zooms.group == group].mean()))
+            out.append(base.with_focal(base.focal * zoom))
     return out
+
+
+def _with_zooms(evidence: _Evidence) -> tuple[_Evidence, list[Camera], _Round] | None:
+    """Photographs of one size from one folder share a camera, but may be of several zooms: a camera for each of them,
+    if that predicts rays that it was not fitted to better than one camera does; None if it does not."""
+    zooms = {}
+    for c, camera in enumerate(evidence.priors):
+        own, homographies, threshold = _own_pairs(evidence, c)
+        if not camera.is_fixed and camera.family == BROWN and own:
+            found = find_zooms(camera, own, homographies, threshold)
+            if found is not None:
+                zooms[c] = found
+    if not zooms:
+        return None
+    try:
+        several = _from_pairs(evidence, zooms)
+    except NoReconstructionError:
+        return None
+    split, _, rough = several
+    halves = _halves(rough.tracks, np.ones(rough.tracks.num_observations))
+    state = rough.fit.state
+    one = replace(rough, camera_idx=evidence.image_camera_idx[rough.members])
+    num = len(evidence.priors)
+    for k in range(2):
+        free = [refinable(camera, distortion=1) for camera in split.priors]
+        apart = _held_out(state, halves, k, rough, free, split.priors)
+        shared = _held_out(replace(state, cameras=state.cameras[:num]), halves, k, one, free[:num], evidence.priors)
+        # a lens that fits one camera to two zooms may have no inverse, and predicts nothing
+        if not math.isfinite(apart) or apart >= shared:
+            return None
+    return several
+
+
+def _tell_zooms(before: Sequence[Camera], found: tuple[_Evidence, list[Camera], _Round], events: Events) -> None:
+    split, start, rough = found
+    whose = rough.camera_idx.tolist()
+    zooms = [
+        f"{start[c].focal:.0f} px ({whose.count(c)} photographs)"
+        for c in sorted(set(whose), key=lambda c: start[c].focal)
+    ]
+    events.decided(
+        STAGE,
+        f"{len(split.priors) - len(before)} more cameras than sizes and EXIF tell: focal lengths {', '.join(zooms)}",
+        focals_px=[start[c].focal for c in sorted(set(whose))],
+    )
+
+
+def _own_pairs(evidence: _Evidence, c: int) -> tuple[list[MatchedPixels], list[Array], float]:
+    """Pairs of photographs of one camera, their homographies, and the threshold of their matches, pixels."""
+    own = [k for k, pair in enumerate(evidence.pixels) if pair.cameras == (c, c)]
+    homographies = [evidence.correspondences.homography[evidence.pair_idx[k]] for k in own]
+    return [evidence.pixels[k] for k in own], homographies, evidence.thresholds[own[0]] if own else 1.0
 
 
 def _adjusted(evidence: _Evidence, cameras: list[Camera], loose: float) -> _Round:
@@ -279,8 +355,7 @@ def _chosen(evidence: _Evidence, rough: _Round) -> tuple[_Round, list[LensChoice
     """The final adjustment, with as many coefficients of distortion as predict rays that they were not fitted to."""
     fine = _adjusted(evidence, rough.fit.state.cameras, 1.0)
     spread = _spread(evidence, fine)
-    step = 2 * max(1, fine.tracks.num_tracks // (2 * _TRACKS_OF_HALF))
-    halves = [_every(step, fine.tracks, spread, k) for k in range(2)]
+    halves = _halves(fine.tracks, spread)
     choices, fits = [], []
     for distortion in range(_MOST_DISTORTION + 1):
         free = [refinable(camera, distortion=distortion) for camera in evidence.priors]
@@ -304,6 +379,12 @@ def _without(camera: Camera, distortion: int) -> Camera:
     if camera.model != CameraModel.RADIAL or camera.is_fixed:
         return camera
     return camera.with_params([*camera.params[: 3 + distortion], *[0.0] * (_MOST_DISTORTION - distortion)])
+
+
+def _halves(tracks: Tracks, spread: Array) -> list[tuple[Tracks, Array]]:
+    """Two that have no track in common, and the spread of their keypoints."""
+    step = 2 * max(1, tracks.num_tracks // (2 * _TRACKS_OF_HALF))
+    return [_every(step, tracks, spread, k) for k in range(2)]
 
 
 def _every(step: int, tracks: Tracks, spread: Array, first: int) -> tuple[Tracks, Array]:

@@ -20,6 +20,7 @@ from sfmapp.scene.tracks import Tracks
 
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet
+    from sfmapp.panorama.turned_photographs import TurnedPhotographs
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -108,7 +109,7 @@ def _noise_of_pair(there: Array, seen: Array) -> float:
 
 
 def report_of(
-    image_set: ImageSet, groups: Sequence[Ints], rotations: Array, fit: TurnedFit, tracks: Tracks,
+    image_set: ImageSet, groups: Sequence[Ints], turned: TurnedPhotographs, fit: TurnedFit, tracks: Tracks,
     verdicts: Sequence[TurnedPair], before: tuple[Sequence[Camera], Sequence[Camera]],
     choices: Sequence[LensChoice],
 ) -> TurningReport:  # fmt: skip
@@ -116,12 +117,12 @@ def report_of(
 
     Args:
         groups: photographs that were looked at, those of the panorama, and those of each other group.
-        rotations: (K, 3, 3), levelled.
+        turned: those of the panorama.
         before: cameras as they were known, and as pairs alone had them.
     """
     among, members, *others = groups
     total = sum(each.num_matches for each in verdicts)
-    turned = sum(each.num_turned for each in verdicts)
+    num_explained = sum(each.num_turned for each in verdicts)
     return TurningReport(
         num_images=len(among),
         num_turned=len(members),
@@ -129,9 +130,9 @@ def report_of(
         correlation=fit.correlation,
         num_rays=tracks.num_tracks,
         num_observations=tracks.num_observations,
-        turned_share=turned / max(total, 1),
-        cameras=_cameras(image_set, members, fit, before),
-        images=_images(image_set, members, rotations, fit, tracks),
+        turned_share=num_explained / max(total, 1),
+        cameras=_cameras(turned.camera_idx, fit, before),
+        images=_images(image_set, turned, fit, tracks),
         pairs=verdicts,
         lens_choice=choices,
         left_out=_left_out(image_set, among, members, others),
@@ -140,10 +141,8 @@ def report_of(
     )  # fmt: skip
 
 
-def _cameras(
-    image_set: ImageSet, members: Ints, fit: TurnedFit, before: tuple[Sequence[Camera], Sequence[Camera]]
-) -> list[TurnedCamera]:
-    whose = [image_set.images[i].camera_idx for i in members]
+def _cameras(camera_idx: Ints, fit: TurnedFit, before: tuple[Sequence[Camera], Sequence[Camera]]) -> list[TurnedCamera]:
+    whose = camera_idx.tolist()
     out = []
     for c in sorted(set(whose)):
         camera, sigma = fit.state.cameras[c], fit.sigmas(c)
@@ -159,13 +158,14 @@ def _cameras(
     return out
 
 
-def _images(image_set: ImageSet, members: Ints, rotations: Array, fit: TurnedFit, tracks: Tracks) -> list[TurnedImage]:
+def _images(image_set: ImageSet, turned: TurnedPhotographs, fit: TurnedFit, tracks: Tracks) -> list[TurnedImage]:
+    members, rotations = turned.image_idx, turned.rotations
     squares = (fit.residuals**2).sum(1)
     counts = np.bincount(tracks.obs_image_idx, minlength=len(members))
     sums = np.bincount(tracks.obs_image_idx, squares, len(members))
     return [
         TurnedImage(
-            name=image_set.images[i].name, camera_idx=image_set.images[i].camera_idx,
+            name=image_set.images[i].name, camera_idx=int(turned.camera_idx[k]),
             rotation=rigid3.quaternion(rotations[k]).tolist(), sigma_deg=fit.rotation_sigma_deg[k].tolist(),
             num_rays=int(counts[k]), rms_px=math.sqrt(sums[k] / counts[k]) if counts[k] else None,
         )

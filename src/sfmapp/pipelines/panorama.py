@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet
     from sfmapp.panorama.canvas import Canvas, Projection
     from sfmapp.panorama.stitch import StitchedPicture
-    from sfmapp.panorama.turning import TurnedPhotographs
+    from sfmapp.panorama.turned_photographs import TurnedPhotographs
     from sfmapp.scene.correspondences import Correspondences
 
 STAGE = PANORAMA
