@@ -23,6 +23,7 @@ from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.images.folder import ImageSet
 from sfmapp.mapping import join, near_views, repair, structure, verified_pairs
+from sfmapp.mapping.closing_move import closing_move, widened_by_move
 from sfmapp.mapping.focal import estimate_focal_ratio
 from sfmapp.mapping.focal_priors import MapFrom, Mapped, settle_focal_lengths
 from sfmapp.mapping.intrinsics_check import check_intrinsics, widened_uncertainty
@@ -106,7 +107,9 @@ def map_images(
         mapped, look_alikes = tell_apart(mapped, correspondences, map_again, events)
         models = mapped.models
         finished = [mapped.mapper_of(model) for model in models]
+        first = [model.copy() for model in models]
         adjustments = [mapper.polish() for mapper in finished]
+        moves = [closing_move(before, after) for before, after in zip(first, models, strict=True)]
         for model in models:
             model.point_rgb = track_colors(model.tracks, features)
         contradictions = contradictions_of(models, correspondences)
@@ -114,6 +117,10 @@ def map_images(
             replace(_model_report(mapped, model, found, apart, map_all, events), adjustment=adjustment)
             for model, found, apart, adjustment in zip(models, contradictions, mapped.apart, adjustments, strict=True)
         ]
+        for n, (mapper, move) in enumerate(zip(finished, moves, strict=True)):
+            mapper.widening = move.widening(model_reports[n].uncertainty)
+            uncertainty = widened_by_move(model_reports[n].uncertainty, move, events)
+            model_reports[n] = replace(model_reports[n], uncertainty=uncertainty)
         if closing is not None:
             closing(finished)  # which know where the closing loss bends
     report = MappingReport(

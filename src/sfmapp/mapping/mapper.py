@@ -60,7 +60,8 @@ class Mapper:
     ``loss_scale_px``: the noise that robust losses are set for, once it has been measured.
     ``waits``: weak images whose strongest pairs are with images outside of the model are left to another one, which
     may grow from there. ``held`` (I,) bool: images whose poses are known and stay as they are; None for none.
-    ``poses_tell_centers``: poses are or were known, which tells principal points that EXIF does not.
+    ``poses_tell_centers``: poses are or were known, which tells principal points that EXIF does not. ``widening``: of
+    standard deviations that the residuals give, by what closing adjustments have moved.
     """
 
     reconstruction: Reconstruction
@@ -79,6 +80,7 @@ class Mapper:
     waits: bool = True
     held: NDArray[np.bool_] | None = None
     poses_tell_centers: bool = False
+    widening: float = 1.0
     max_error_px: float = field(init=False)
 
     def __post_init__(self) -> None:

@@ -174,7 +174,7 @@ def _own_covariances(mapper: Mapper, known: KnownPoses) -> Array | None:
     model = mapper.reconstruction
     options, varying, noise = mapper.closing_options()
     found = selected_covariances(
-        model, options, sigma_px=noise.sigma_px, varying=varying, prior_cameras=mapper.prior_cameras
+        model, options, sigma_px=mapper.widening * noise.sigma_px, varying=varying, prior_cameras=mapper.prior_cameras
     )
     if found is None:
         return None
