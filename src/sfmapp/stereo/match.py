@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfmapp.stereo.matcher import match_by_sgm
 from sfmapp.stereo.opencv_matchers import match_by_bm, match_by_sgbm
 from sfmapp.stereo.options import MatcherName, StereoOptions
 from sfmapp.stereo.result import DisparityMap, RectifiedPair
 from sfmapp.stereo.sparse_matches import PairMatches, match_pictures
 
 MATCHERS: dict[MatcherName, Callable[[RectifiedPair, StereoOptions, tuple[int, int]], DisparityMap]] = {
+    "sgm": match_by_sgm,
     "opencv-sgbm": match_by_sgbm,
     "opencv-bm": match_by_bm,
 }

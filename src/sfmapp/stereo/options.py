@@ -8,7 +8,7 @@ from typing import Literal
 from sfmapp.errors import UsageError
 from sfmapp.option_checks import Range, check_options
 
-MatcherName = Literal["opencv-sgbm", "opencv-bm"]
+MatcherName = Literal["sgm", "opencv-sgbm", "opencv-bm"]
 
 
 @dataclass(frozen=True)
@@ -16,16 +16,17 @@ class StereoOptions:
     """Options of the stage ``stereo``.
 
     Attributes:
-        matcher: opencv-sgbm and opencv-bm are OpenCV's StereoSGBM and StereoBM.
+        matcher: sgm is our semi-global matching; opencv-sgbm and opencv-bm are OpenCV's StereoSGBM and StereoBM.
         min_disparity: Least disparity x_left - x_right that is looked for, pixels; may be negative. None: as sparse
             matches tell.
         num_disparities: How many from there on, pixels. None: as sparse matches tell.
-        window: Side of the matching window, pixels, odd; None: what is best for the matcher.
+        window: Side of the matching window, pixels, odd; None: what is best for the matcher; sgm has
+            none.
         left_right_px: Disparities that differ by more when they are looked for from the other side are dropped, pixels.
         fill: Fill what only one camera sees from its neighbours, and mark it so.
     """
 
-    matcher: MatcherName = "opencv-sgbm"
+    matcher: MatcherName = "sgm"
     min_disparity: int | None = None
     num_disparities: int | None = None
     window: int | None = None

@@ -1,0 +1,403 @@
+"""Kernels of semi-global matching: 64 disparities of a pixel are one vector of bytes.
+
+Hirschmueller, "Stereo processing by semiglobal matching and mutual information", PAMI 2008. Each pixel looks at the
+disparities ``base + k``, k from 0 to 63, of a base of its own, which coarser levels tell. Where neighbours have other
+bases their vectors are read shifted: in memory 32 bytes of 255 lie between pixels, so what falls outside is dear. Costs
+along a path are held with their minimum at zero, which keeps them in a byte; four paths come from above, four from
+below, and half their sums are kept.
+
+``Rows`` is a ring: pictures with more rows than it has are worked on in strips, in which paths from below begin some
+rows further down. Nothing here allocates.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.simd import u8x64 as u8
+from sfmapp.simd.pointers import Index, Pointer, pointer
+
+LANES = u8.WIDTH
+GAP = 32
+STRIDE = LANES + GAP
+# bases that differ by more share too few disparities to hand costs over
+MOST_SHIFT = GAP - 2
+# what leads out of the right picture costs at most so many times what the best in it does: where there is nothing to
+# tell disparities apart by, that they lead into the picture speaks for none of them
+UNSEEN_OVER_SEEN = 3
+# disparities that are looked at beyond those of half the resolution
+ROOM = 4
+# at the beginning of a path
+_START = 1 << 20
+
+Bytes = NDArray[np.uint8]
+Words = NDArray[np.uint64]
+Ints = NDArray[np.int16]
+Floats = NDArray[np.float32]
+
+
+class Views(NamedTuple):
+    """What is matched.
+
+    Attributes:
+        left: (H, W) uint64 words whose bits describe a pixel's surroundings.
+        right: (H, W + 2 M) the same of the right picture, columns reversed, with M more on both sides.
+        grey: (H, W) uint8 of the left picture.
+        base: (H, W) int16 least disparity that a pixel looks at.
+        expected: (H, W) uint8 lane that the coarser level found, 64 where it found none.
+        doubt: (65, 64) uint8 by expected lane: what is added to costs; 255 for lanes that are not looked at.
+    """
+
+    left: Words
+    right: Words
+    grey: Bytes
+    base: Ints
+    expected: Bytes
+    doubt: Bytes
+
+
+class Penalties(NamedTuple):
+    """Of a path: small (uint8) for a step of one disparity, large (256,) uint8 for a larger one by the difference in
+    grey of the two pixels."""
+
+    small: np.uint8
+    large: Bytes
+
+
+class Rows(NamedTuple):
+    """(R, W, 64) uint8 each, row y at y % R: costs, and half the sums of the paths from above and from below."""
+
+    costs: Bytes
+    above: Bytes
+    below: Bytes
+
+
+class Found(NamedTuple):
+    """(H, W) each.
+
+    Attributes:
+        disparity: float32 pixels.
+        agrees: uint8, 1 where the right picture finds it too.
+        best, elsewhere: uint8 half the sum of all paths there, and the least but for its neighbours.
+        bend: int16 second difference of these sums there; 0 at the end of the search.
+    """
+
+    disparity: Floats
+    agrees: Bytes
+    best: Bytes
+    elsewhere: Bytes
+    bend: Ints
+
+
+@numba.njit(cache=True, nogil=True)
+def _beside(row: Pointer, at: Index, shift: Index, own: Any) -> Any:
+    """Costs of a neighbour for one's own disparities; one's own where it does not look at them."""
+    if shift > MOST_SHIFT or shift < -MOST_SHIFT:
+        return own
+    value = u8.load(row, at + shift)
+    return u8.select_equal(value, u8.splat(np.uint8(255)), own, value)
+
+
+@numba.njit(cache=True, nogil=True)
+def _raw_costs(views: Views, y: Index, out: Pointer) -> None:
+    """Differing bits of row y for all disparities."""
+    width = views.left.shape[1]
+    margin = (views.right.shape[1] - width) // 2
+    right = pointer(views.right[y])
+    for x in range(width):
+        start = margin + width - 1 - x + views.base[y, x]
+        u8.store(out, GAP + STRIDE * x, u8.count_differences(views.left[y, x], right, start))
+
+
+@numba.njit(cache=True, nogil=True)
+def _smooth_costs(views: Views, unseen: np.uint8, y: Index, raw: Bytes, costs: Pointer) -> None:
+    """Costs of row y: weighted means, 1 2 1 both ways, of raw costs of three rows; the cost of the unseen put in."""
+    base, (height, width) = views.base, views.left.shape
+    above, below = max(y - 1, 0), min(y + 1, height - 1)
+    row_a, row_b, row_c = pointer(raw[above % 3]), pointer(raw[y % 3]), pointer(raw[below % 3])
+    middle, doubt = pointer(raw[3]), pointer(views.doubt)
+    for x in range(width):
+        at, b = GAP + STRIDE * x, np.int64(base[y, x])
+        own = u8.load(row_b, at)
+        both = u8.mean(_beside(row_a, at, b - base[above, x], own), _beside(row_c, at, b - base[below, x], own))
+        u8.store(middle, at, u8.mean(both, own))
+    for x in range(width):
+        at, b = GAP + STRIDE * x, np.int64(base[y, x])
+        own = u8.load(middle, at)
+        left, right = max(x - 1, 0), min(x + 1, width - 1)
+        both = u8.mean(
+            _beside(middle, GAP + STRIDE * left, b - base[y, left], own),
+            _beside(middle, GAP + STRIDE * right, b - base[y, right], own),
+        )
+        cost = u8.mean(both, own)
+        first, last = x - b - width + 1, x - b + 1
+        if first > 0 or last < LANES:
+            seen = u8.lowest(u8.within(cost, first, last, u8.splat(np.uint8(255))))
+            most = min(np.int64(unseen), UNSEEN_OVER_SEEN * np.int64(seen))
+            cost = u8.within(cost, first, last, u8.splat(np.uint8(most)))
+        u8.store(costs, LANES * x, u8.add(cost, u8.load(doubt, LANES * np.int64(views.expected[y, x]))))
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_costs(views: Views, unseen: np.uint8, first: Index, last: Index, raw: Bytes, rows: Rows) -> None:
+    """Costs of the rows first to last - 1; ``raw``: scratch (4, GAP + STRIDE W)."""
+    height, ring = views.left.shape[0], rows.costs.shape[0]
+    _clear(raw)
+    for y in range(max(first - 1, 0), min(first + 1, height)):
+        _raw_costs(views, y, pointer(raw[y % 3]))
+    for y in range(first, last):
+        if y + 1 < height:
+            _raw_costs(views, y + 1, pointer(raw[(y + 1) % 3]))
+        _smooth_costs(views, unseen, y, raw, pointer(rows.costs[y % ring]))
+
+
+@numba.njit(cache=True, nogil=True)
+def _step(path: Pointer, at: Index, shift: Index, small: Any, large: np.uint8, cost: Any) -> Any:
+    """One pixel further on a path: its costs, before their minimum is taken off."""
+    if shift == _START:
+        return cost
+    m = u8.splat(large)
+    if shift >= -MOST_SHIFT and shift <= MOST_SHIFT:
+        before = at + shift
+        m = u8.minimum(m, u8.load(path, before))
+        beside = u8.minimum(u8.load(path, before - 1), u8.load(path, before + 1))
+        m = u8.minimum(m, u8.add(beside, small))
+    return u8.add(m, cost)
+
+
+@numba.njit(cache=True, nogil=True)
+def _follow_row(
+    views: Views, penalties: Penalties, y: Index, step: Index, begins: bool, paths: Bytes, costs: Pointer, sums: Pointer
+) -> None:
+    """Four paths through row y: along it, on both diagonals, down the column; half their sum goes to ``sums``.
+
+    step: 1 for paths from the left and from above, -1 for those from the right and from below. begins: no row came
+    before.
+    """
+    base, grey, width = views.base, views.grey, views.left.shape[1]
+    yb = y if begins else y - step
+    first, second, column, along = pointer(paths[0]), pointer(paths[1]), pointer(paths[2]), pointer(paths[3])
+    small = u8.splat(penalties.small)
+    x = 0 if step > 0 else width - 1
+    diagonal_a, diagonal_b = (x - y) % width, (x + y) % width
+    value_d = u8.splat(np.uint8(0))
+    for n in range(width):
+        b, g = np.int64(base[y, x]), np.int64(grey[y, x])
+        cost = u8.load(costs, LANES * x)
+        shift_a = shift_b = shift_c = shift_d = np.int64(_START)
+        large_a = large_b = large_c = large_d = penalties.small
+        xa, xb = x - step, x + step
+        if not begins:
+            shift_c = b - base[yb, x]
+            large_c = penalties.large[abs(g - grey[yb, x])]
+            if n > 0:
+                shift_a = b - base[yb, xa]
+                large_a = penalties.large[abs(g - grey[yb, xa])]
+            if n < width - 1:
+                shift_b = b - base[yb, xb]
+                large_b = penalties.large[abs(g - grey[yb, xb])]
+        if n > 0:
+            shift_d = b - base[y, xa]
+            large_d = penalties.large[abs(g - grey[y, xa])]
+        slot_a, slot_b, slot_c = GAP + STRIDE * diagonal_a, GAP + STRIDE * diagonal_b, GAP + STRIDE * x
+        value_a = _step(first, slot_a, shift_a, small, large_a, cost)
+        value_b = _step(second, slot_b, shift_b, small, large_b, cost)
+        value_c = _step(column, slot_c, shift_c, small, large_c, cost)
+        if shift_d == 0:  # what was stored just now is slow to read shifted
+            beside = u8.minimum(u8.shift_up(value_d), u8.shift_down(value_d))
+            m = u8.minimum(u8.minimum(value_d, u8.splat(large_d)), u8.add(beside, small))
+            value_d = u8.add(m, cost)
+        else:
+            value_d = _step(along, GAP, shift_d, small, large_d, cost)
+        value_a = u8.subtract(value_a, u8.splat(u8.lowest(value_a)))
+        value_b = u8.subtract(value_b, u8.splat(u8.lowest(value_b)))
+        value_c = u8.subtract(value_c, u8.splat(u8.lowest(value_c)))
+        value_d = u8.subtract(value_d, u8.splat(u8.lowest(value_d)))
+        u8.store(first, slot_a, value_a)
+        u8.store(second, slot_b, value_b)
+        u8.store(column, slot_c, value_c)
+        u8.store(along, GAP, value_d)
+        u8.store(sums, LANES * x, u8.add(u8.mean(value_a, value_b), u8.mean(value_c, value_d)))
+        x += step
+        diagonal_a, diagonal_b = (diagonal_a + step) % width, (diagonal_b + step) % width
+
+
+@numba.njit(cache=True, nogil=True)
+def follow_down(views: Views, penalties: Penalties, first: Index, last: Index, paths: Bytes, rows: Rows) -> None:
+    """Paths from above through the rows first to last - 1, which go on from where ``paths`` (4, GAP + STRIDE W) is."""
+    ring = rows.costs.shape[0]
+    if first == 0:
+        _clear(paths)
+    for y in range(first, last):
+        costs, sums = pointer(rows.costs[y % ring]), pointer(rows.above[y % ring])
+        _follow_row(views, penalties, y, 1, y == 0, paths, costs, sums)
+
+
+@numba.njit(cache=True, nogil=True)
+def follow_up(views: Views, penalties: Penalties, first: Index, last: Index, paths: Bytes, rows: Rows) -> None:
+    """Paths from below that begin in row last - 1 and end in row first; ``paths`` is scratch."""
+    ring = rows.costs.shape[0]
+    _clear(paths)
+    for y in range(last - 1, first - 1, -1):
+        costs, sums = pointer(rows.costs[y % ring]), pointer(rows.below[y % ring])
+        _follow_row(views, penalties, y, -1, y == last - 1, paths, costs, sums)
+
+
+@numba.njit(cache=True, nogil=True)
+def decide(
+    views: Views, tolerance: Index, first: Index, last: Index, rows: Rows, cost: Bytes, label: Ints, found: Found
+) -> None:
+    """Disparities of the rows first to last - 1, and whether the right picture finds the same but for a tolerance.
+
+    Between whole pixels by two lines of opposite slope (equiangular fit). ``cost``, ``label``: scratch (W + 2 M,) of a
+    row of the right picture, uint8 and int16.
+    """
+    base, width = views.base, views.left.shape[1]
+    corner = (views.right.shape[1] - width) // 2 + width - 1
+    ring = rows.costs.shape[0]
+    right_cost, right_label = pointer(cost), pointer(label)
+    for y in range(first, last):
+        above, below = pointer(rows.above[y % ring]), pointer(rows.below[y % ring])
+        for n in range(cost.shape[0]):
+            right_cost[n], right_label[n] = np.uint8(255), np.int16(-32768)
+        for x in range(width):
+            value = u8.add(u8.load(above, LANES * x), u8.load(below, LANES * x))
+            u8.store(above, LANES * x, value)
+            best = u8.lowest(value)
+            k = u8.first_bit(u8.lanes_equal(value, u8.splat(best)))
+            found.best[y, x] = best
+            found.elsewhere[y, x] = u8.lowest(u8.hide(value, k))
+            found.bend[y, x] = np.int16(k)
+            u8.keep_lower(value, base[y, x], right_cost, right_label, corner - x + base[y, x])
+        for x in range(width):
+            k = np.int64(found.bend[y, x])
+            best, disparity = np.int64(found.best[y, x]), base[y, x] + k
+            shift, bend = np.float32(0.0), np.int64(0)
+            if k > 0 and k < LANES - 1:
+                before, after = np.int64(above[LANES * x + k - 1]), np.int64(above[LANES * x + k + 1])
+                bend, rise = before + after - 2 * best, max(before, after) - best
+                if rise > 0 and max(before, after) < 255:
+                    shift = np.float32(0.5) * np.float32(before - after) / np.float32(rise)
+            found.disparity[y, x] = np.float32(disparity) + shift
+            found.bend[y, x] = np.int16(bend)
+            seen = x - disparity
+            agrees = seen >= 0 and seen < width
+            if agrees:
+                agrees = abs(np.int64(right_label[corner - seen]) - disparity) <= tolerance
+            found.agrees[y, x] = np.uint8(agrees)
+
+
+@numba.njit(cache=True, nogil=True)
+def _clear(rows: Bytes) -> None:
+    flat = rows.reshape(-1)
+    for n in range(flat.shape[0]):
+        flat[n] = np.uint8(255)
+
+
+@numba.njit(cache=True, nogil=True)
+def noise_of(grey: Bytes, counts: NDArray[np.int64]) -> float:
+    """Standard deviation of the noise of a picture, from the median of what is not linear in it (after Immerkaer,
+    "Fast noise variance estimation", CVIU 1996), in every fourth row; ``counts``: scratch (2048,)."""
+    height, width = grey.shape
+    for n in range(counts.shape[0]):
+        counts[n] = 0
+    total = 0
+    for y in range(1, height - 1, 4):
+        a, b, c = grey[y - 1], grey[y], grey[y + 1]
+        for x in range(1, width - 1):
+            sides = np.int64(a[x - 1]) + a[x + 1] + c[x - 1] + c[x + 1] + 4 * np.int64(b[x])
+            counts[abs(sides - 2 * (np.int64(a[x]) + b[x - 1] + b[x + 1] + c[x]))] += 1
+            total += 1
+    passed, value = 0, 0
+    while value < counts.shape[0] - 1 and 2 * (passed + counts[value]) < total:
+        passed += counts[value]
+        value += 1
+    # where in the bin the median is
+    inside = (0.5 * total - passed) / max(counts[value], 1) - 0.5
+    return float(max(value + inside, 0.0) / (6.0 * 0.6745))
+
+
+@numba.njit(cache=True, nogil=True)
+def _uniqueness(found: Found, y: Index, x: Index) -> float:
+    """1 - best / elsewhere; 0 where all costs are zero."""
+    best, elsewhere = np.float32(found.best[y, x]), np.float32(found.elsewhere[y, x])
+    return float((elsewhere - best) / max(elsewhere, np.float32(1.0)))
+
+
+@numba.njit(cache=True, nogil=True)
+def look_again(
+    coarse: Found, least: float, texture: NDArray[np.uint16], plain: float, search: tuple[int, int], base: Ints,
+    expected: Bytes,
+) -> None:  # fmt: skip
+    """Where a level looks, by what half the resolution found: ``base`` and ``expected`` (H, W) of :class:`Views`.
+
+    A pixel looks about the disparities of its neighbourhood; where these are too far apart to be looked at all, at its
+    own and at as many as can be of those on the nearer side. It expects its own where ``texture`` (H, W) uint16 is
+    below ``plain``, both views agreed, and the uniqueness was not below ``least``.
+    """
+    height, width = base.shape
+    rows, columns = coarse.disparity.shape
+    first, count = search
+    for y in range(height):
+        v = min(y // 2, rows - 1)
+        for x in range(width):
+            u = min(x // 2, columns - 1)
+            if x % 2 == 1 and u == x // 2:
+                start = int(base[y, x - 1])
+            elif count <= LANES:
+                start = first
+            else:
+                start = _start_of_search(coarse.disparity, v, u)
+                start = min(max(start, first), first + count - LANES)
+            base[y, x] = np.int16(start)
+            lane = np.int64(np.rint(2 * coarse.disparity[v, u])) - start
+            wanted = texture[y, x] < plain and lane >= 0 and lane < LANES
+            wanted = wanted and coarse.agrees[v, u] > 0 and _uniqueness(coarse, v, u) >= least
+            expected[y, x] = np.uint8(lane if wanted else LANES)
+
+
+@numba.njit(cache=True, nogil=True)
+def _start_of_search(disparity: Floats, v: Index, u: Index) -> int:
+    """Least disparity to look at from those of half the resolution about (u, v)."""
+    rows, columns = disparity.shape
+    own = 2 * disparity[v, u]
+    low = high = own
+    for j in range(max(v - 1, 0), min(v + 2, rows)):
+        for i in range(max(u - 1, 0), min(u + 2, columns)):
+            low, high = min(low, 2 * disparity[j, i]), max(high, 2 * disparity[j, i])
+    if high - low <= LANES - 2 * ROOM:
+        return int(np.rint((low + high) / 2)) - LANES // 2
+    if own - low < high - own:
+        return int(np.rint(max(low - ROOM, own + ROOM + 1 - LANES)))
+    return int(np.rint(min(high + ROOM - LANES, own - ROOM)))
+
+
+@numba.njit(cache=True, nogil=True)
+def collect(found: Found, least: float, out: Ints) -> None:
+    """Sixteenths of disparities (H, W) int16 that both views tell and whose uniqueness is not below ``least``."""
+    height, width = out.shape
+    for y in range(height):
+        for x in range(width):
+            sure = found.agrees[y, x] > 0 and _uniqueness(found, y, x) >= least
+            out[y, x] = np.int16(np.rint(16 * found.disparity[y, x])) if sure else np.int16(-32768)
+
+
+@numba.njit(cache=True, nogil=True)
+def report(found: Found, kept: Ints, disparity: Floats, state: Bytes, measures: Floats) -> None:
+    """What a disparity map holds: ``kept`` (H, W) is -32768 where nothing is known; measures (3, H, W) cost, curvature
+    and uniqueness."""
+    height, width = kept.shape
+    nan = np.float32(np.nan)
+    for y in range(height):
+        for x in range(width):
+            known = kept[y, x] != -32768
+            best = np.float32(found.best[y, x])
+            disparity[y, x] = found.disparity[y, x] if known else nan
+            state[y, x] = np.uint8(known)
+            measures[0, y, x] = best if known else nan
+            measures[1, y, x] = np.float32(found.bend[y, x]) if known else nan
+            measures[2, y, x] = _uniqueness(found, y, x)
