@@ -26,6 +26,7 @@ from machine import RESULTS, ROOT, describe_machine
 sys.path.insert(0, str(ROOT / "tests"))
 
 from board_choices import lenses, suggested_points
+from board_films import films
 from board_speed import photographs_12_mp, refinement
 from board_views import board_poses, board_views, render_board
 from sfmapp.calibration.adjustment import Fit, TargetView, normal_at, observations_of, refine, residuals_of
@@ -261,7 +262,7 @@ def seen(camera: Camera, pose: Array, seed: int) -> TargetView:
 
 PARTS: dict[str, Callable[[], list[Row]]] = {
     "photographs": photographs, "degraded": degraded, "trials": trials, "next": suggested,
-    "next_points": suggested_points, "lenses": lenses,
+    "next_points": suggested_points, "lenses": lenses, "films": films,
     "refinement": refinement, "photographs_12_mp": photographs_12_mp,
 }  # fmt: skip
 

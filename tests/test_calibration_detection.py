@@ -9,7 +9,7 @@ import pytest
 
 from board_views import render_board
 from sfmapp.calibration.adjustment import TargetView
-from sfmapp.calibration.bent_edges import bend_shift, unbent
+from sfmapp.calibration.bent_edges import edge_course, edge_courses, measured_along_edges
 from sfmapp.calibration.boards import Board, parse_board
 from sfmapp.calibration.circle_centers import DiskMarks, disk_images, recentered
 from sfmapp.calibration.circles import disk_bias
@@ -149,30 +149,33 @@ def test_a_picture_without_a_board_says_so() -> None:
         assert len(found.idx) == 0
 
 
-def test_bent_edges_move_crossings_and_a_camera_tells_by_how_much() -> None:
+def test_crossings_are_measured_along_edges_that_a_camera_bends() -> None:
     """A barrel lens near the corners of the picture: crossings are found to the inside of the bend of their edges, and
-    less than half as far off once the camera is known."""
+    at a third of that distance in windows that follow the edges."""
     board = parse_board("charuco:6x5:0.03:0.022")
     camera = Camera(CameraModel.OPENCV, 400, 300, np.array([230.0, 231.0, 203.0, 148.0, -0.24, 0.045, 5e-4, -4e-4]))
     window = window_of(board)
     assert window is not None
-    before, after, shifts = [], [], []
+    before, after = [], []
     for x, y, z in ((-0.2, -0.15, 0.15), (0.02, -0.15, 0.15), (-0.18, -0.13, 0.13), (0.01, 0.0, 0.13)):
         pose = rigid3.from_matrix(rigid3.exp_so3(np.array([0.1, -0.15, 0.02])), np.array([x, y, z]))
-        found = detect_board(render_board(camera, board, pose, blur_px=0.6), board)
+        picture = render_board(camera, board, pose, blur_px=0.6)
+        found = detect_board(picture, board)
         view = TargetView("", board.points[found.idx], found.xy)
         truth = project(camera, rigid3.apply(pose, view.xyz))
-        freed = unbent([view], camera, board.spacing, *window)[0]
+        # by the pose that fits crossings that are off: it is near enough
+        course = edge_courses([view], camera, window)[0]
+        assert course.largest_bend_px(window) > 0.2
         before.append(view.xy - truth)
-        after.append(freed - truth)
-        shifts.append(bend_shift(camera, pose, view.xyz, board.spacing, window))
-        # the pose that fits crossings that are off is near enough to tell by how much they are
-        np.testing.assert_allclose(view.xy - freed, shifts[-1], atol=2e-3)
-    error, left, shift = (np.concatenate(values) for values in (before, after, shifts))
+        after.append(measured_along_edges(picture, view.xy, course, window) - truth)
+    error, left = np.concatenate(before), np.concatenate(after)
     assert len(error) > 60
-    assert (error * shift).sum() > 0.9 * np.sqrt((error**2).sum() * (shift**2).sum())
     assert 0.05 < np.sqrt((error**2).sum(1).mean()) < 0.08
-    assert np.sqrt((left**2).sum(1).mean()) < 0.035
-    # straight edges, however oblique, move nothing
+    assert np.sqrt((left**2).sum(1).mean()) < 0.02
+    # straight edges, however oblique, do not bend, and a crossing that the lens does not see stays where it was
     pinhole = Camera(CameraModel.PINHOLE, 400, 300, camera.params[:4])
-    np.testing.assert_allclose(bend_shift(pinhole, pose, view.xyz, board.spacing, window), 0.0, atol=1e-9)
+    oblique = edge_course(pinhole, pose, view.xyz, window)
+    across = np.stack([-oblique.axes[..., 1], oblique.axes[..., 0]], -1)
+    np.testing.assert_allclose((oblique.curves[:, ::2] * across).sum(2), 0.0, atol=1e-9)
+    behind = edge_course(pinhole, rigid3.from_matrix(np.eye(3), np.array([0.0, 0.0, -0.1])), view.xyz, window)
+    np.testing.assert_array_equal(measured_along_edges(picture, view.xy, behind, window), view.xy)

@@ -225,3 +225,19 @@ def test_a_small_bias_is_seen_by_all_views_where_one_held_out_does_not_show_it()
     reasons = {trial.model: trial.reason for trial in trials[1:]}
     assert "leaves residuals" in reasons[CameraModel.FOV] or "worse on views" in reasons[CameraModel.FOV]
     assert "do not need" in reasons[CameraModel.THIN_PRISM_FISHEYE]
+
+
+def test_a_view_of_which_two_points_are_good_goes_whole() -> None:
+    """Two points agree with many a pose: kept, they left the covariance singular, and no camera was told."""
+    rng = np.random.default_rng(4)
+    poses = board_poses(rng, BOARD, 8, CAMERA)
+    views = board_views(CAMERA, BOARD, poses, 0.05, rng)
+    off = rng.uniform(1.0, 2.0, views[3].xy.shape) * rng.choice([-1.0, 1.0], views[3].xy.shape)
+    off[[10, 30]] = 0.0
+    views[3] = replace(views[3], xy=views[3].xy + off)
+    _, is_used = inlier_fit(Fit(CAMERA, poses, np.zeros(0), np.inf), views)
+    counts = is_used.reshape(8, -1).sum(1)
+    assert counts[3] == 0
+    assert np.delete(counts, 3).min() >= 52
+    made = solve_views(views, SIZE, CAMERA.model, bends=False).calibration
+    assert np.abs((made.camera.params - CAMERA.params) / made.sigmas).max() < 4.0

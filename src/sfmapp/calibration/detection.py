@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.calibration.bent_edges import CrossingWindow
 from sfmapp.calibration.boards import Board
 from sfmapp.calibration.circle_centers import DiskMarks
 from sfmapp.calibration.circles import disk_bias, find_circle_lattice, grid_of, place_on
@@ -423,10 +424,11 @@ def _reach(board: Board) -> Array:
     return np.array([0.45, 0.45])
 
 
-def window_of(board: Board) -> tuple[float, float] | None:
-    """Half of the window in which a crossing is measured, along its edges: in fields, and in pixels at most. None for
-    boards without crossings of four fields whose edges go through."""
-    return (float(_reach(board)[0]), _WINDOW_PX) if board.kind in ("chessboard", "charuco") else None
+def window_of(board: Board) -> CrossingWindow | None:
+    """The window in which crossings are measured; None for boards of circles."""
+    if board.kind in ("circles", "acircles"):
+        return None
+    return CrossingWindow(board.spacing, _reach(board), _WINDOW_PX)
 
 
 def _crossings(gray: Pixels, board: Board, idx: Ints, xy: Array) -> Array:
@@ -434,7 +436,6 @@ def _crossings(gray: Pixels, board: Board, idx: Ints, xy: Array) -> Array:
     there."""
     found = np.ascontiguousarray(xy)
     for _ in range(2):
-        out = np.empty_like(found)
         is_known = np.isfinite(found).all(1)
         axes = np.full((len(found), 2, 2), np.nan)
         if is_known.sum() < 4:
@@ -442,7 +443,8 @@ def _crossings(gray: Pixels, board: Board, idx: Ints, xy: Array) -> Array:
         axes[is_known] = _axes(board, idx[is_known], found[is_known])
         out = np.full_like(found, np.nan)
         kept = np.empty((int(is_known.sum()), 2))
-        symmetric_points(gray, found[is_known], axes[is_known], _reach(board), _WINDOW_PX, kept)
+        straight = np.zeros((len(kept), 3, 2))
+        symmetric_points(gray, found[is_known], axes[is_known], straight, _reach(board), _WINDOW_PX, kept)
         out[is_known] = kept
         found = out
     return found

@@ -30,6 +30,8 @@ Bools = NDArray[np.bool_]
 STAGE = "calibration"
 LEAST_VIEWS, ADVISED_VIEWS = 3, 10
 _ROUNDS = 4
+# a view with fewer points does not hold its pose: six numbers, and two to judge them by
+_LEAST_POINTS = 4
 # a view whose typical residual is so many times that of all, and so many pixels, was not seen rightly
 _WRONG_VIEW, _WRONG_VIEW_PX = 20.0, 3.0
 # of the focal length: a sigma beyond is no calibration
@@ -161,22 +163,29 @@ def inlier_fit(start: Fit, views: Sequence[TargetView], bends: Sequence[Array] |
     """The least-squares fit to the points that agree with it, and which these are, (N,) bool.
 
     A point is left aside whose residual one good point in a hundred thousand would have; the sigma is that of the
-    points that are left, at first by their median.
+    points that are left, at first by their median. A view goes whole where fewer than four of its points are left.
     """
     obs = observations_of(views, bends)
     fit = start
     squared = (residuals_of(fit, obs) ** 2).sum(1)
     variance = float(np.nanmedian(squared)) / (2.0 * np.log(2.0))
-    is_used = np.isfinite(squared) & (squared <= REJECTED * variance)
+    is_used = _of_placed_views(np.isfinite(squared) & (squared <= REJECTED * variance), obs.ptr)
     for _ in range(_ROUNDS):
         fit = refine(fit, obs._replace(weight=is_used.astype(np.float64)))
         squared = (residuals_of(fit, obs) ** 2).sum(1)
         variance = float(squared[is_used].sum()) / max(_degrees_of_freedom(fit, is_used, obs.ptr), 1)
-        now = np.isfinite(squared) & (squared <= REJECTED * variance)
+        now = _of_placed_views(np.isfinite(squared) & (squared <= REJECTED * variance), obs.ptr)
         if (now == is_used).all():
             break
         is_used = now
     return fit, is_used
+
+
+def _of_placed_views(is_used: Bools, ptr: NDArray[np.int64]) -> Bools:
+    """Those of the points (N,) that belong to views with enough of them."""
+    counts = np.array([is_used[a:b].sum() for a, b in itertools.pairwise(ptr)])
+    placed: Bools = is_used & np.repeat(counts >= _LEAST_POINTS, np.diff(ptr))
+    return placed
 
 
 def _degrees_of_freedom(fit: Fit, is_used: Bools, ptr: NDArray[np.int64]) -> int:

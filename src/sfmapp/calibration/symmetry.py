@@ -4,7 +4,9 @@ Where two straight edges cross between four fields, light and dark in turn, a ha
 picture onto itself: whatever the angle between the edges (a board seen obliquely), however wide the blur, if only it is
 symmetric itself. So the crossing is where I(p + d) - I(p - d) is least over a window of offsets d, up to a gradient of
 the light across it. The window follows the board: a parallelogram along its rows and columns, so that it is as large as
-the fields allow, in the direction in which they are foreshortened as well.
+the fields allow, in the direction in which they are foreshortened as well. Where lens and perspective bend the edges
+it bends with them, d going along the parabola that neighbouring crossings tell: a straight window would lay the middle
+of a chord beside its edge, and catch what else is drawn in the fields.
 """
 
 from __future__ import annotations
@@ -26,23 +28,24 @@ WINDOW_DECAY = 1.5
 
 @numba.njit(cache=True, nogil=True)
 def symmetric_points(
-    gray: NDArray[np.uint8], xy: Array, axes: Array, reach: Array, largest_px: float, out: Array
+    gray: NDArray[np.uint8], xy: Array, axes: Array, curves: Array, reach: Array, largest_px: float, out: Array
 ) -> None:
     """Fill out (N, 2) with the crossings near pixels (N, 2), centres at whole numbers; NaN where there is none.
 
     Args:
         gray: (H, W).
         axes: (N, 2, 2) pixels along a field's two sides, rows.
+        curves: (N, 3, 2) pixels that s^2, s t and t^2 add, s and t in fields along the two sides.
         reach: (2,) how far the window goes along the edges, and how far from the nearer of them, in fields.
         largest_px: half of the window at most.
     """
     for i in range(len(xy)):
-        out[i, 0], out[i, 1] = _symmetric_point(gray, xy[i], axes[i], reach, largest_px)
+        out[i, 0], out[i, 1] = _symmetric_point(gray, xy[i], axes[i], curves[i], reach, largest_px)
 
 
 @numba.njit(cache=True, nogil=True)
 def _symmetric_point(
-    gray: NDArray[np.uint8], start: Array, axes: Array, reach: Array, largest_px: float
+    gray: NDArray[np.uint8], start: Array, axes: Array, curve: Array, reach: Array, largest_px: float
 ) -> tuple[float, float]:
     height, width = gray.shape
     lengths = np.sqrt((axes * axes).sum(axis=1))
@@ -72,12 +75,17 @@ def _symmetric_point(
                 if abs(s) > near[0] and abs(t) > near[1]:
                     continue
                 dx, dy = s * axes[0, 0] + t * axes[1, 0], s * axes[0, 1] + t * axes[1, 1]
+                ex = x + s * s * curve[0, 0] + s * t * curve[1, 0] + t * t * curve[2, 0]
+                ey = y + s * s * curve[0, 1] + s * t * curve[1, 1] + t * t * curve[2, 1]
                 if not (
-                    x - abs(dx) > 1.0 and x + abs(dx) < width - 2.0 and y - abs(dy) > 1.0 and y + abs(dy) < height - 2.0
+                    ex - abs(dx) > 1.0
+                    and ex + abs(dx) < width - 2.0
+                    and ey - abs(dy) > 1.0
+                    and ey + abs(dy) < height - 2.0
                 ):
                     continue
-                p, px, py = _sampled(gray, x + dx, y + dy)
-                q, qx, qy = _sampled(gray, x - dx, y - dy)
+                p, px, py = _sampled(gray, ex + dx, ey + dy)
+                q, qx, qy = _sampled(gray, ex - dx, ey - dy)
                 weight = math.exp(-WINDOW_DECAY * ((s / half[0]) ** 2 + (t / half[1]) ** 2))
                 row[0], row[1], row[2], row[3] = px - qx, py - qy, dx, dy
                 for a in range(4):

@@ -30,7 +30,7 @@ from sfmapp.calibration.uncertainty import image_grid, projection_sigma
 from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
-from sfmapp.pipelines.calibration.centers import with_disk_centers, with_unbent_crossings
+from sfmapp.pipelines.calibration.centers import with_points_by
 from sfmapp.pipelines.calibration.pictures import BoardPictures, look_at_pictures
 from sfmapp.pipelines.calibration.results import outline_of, write_camera, write_recording
 from sfmapp.report.calibration_html import render_board_html
@@ -115,15 +115,10 @@ def calibrate_board(
             )
         with job.stage("calibration"):
             solution, views = _solved(job, pictures, asked)
-            centered = with_disk_centers(pictures, solution.calibration.camera)
-            if centered is not None:
-                job.events.decided("calibration", "centres of circles by the camera that was found, then once more")
-                pictures = centered
-                solution, views = _solved(job, pictures, asked)
-            freed = with_unbent_crossings(pictures, solution.calibration.camera)
-            if freed is not None:
-                job.events.decided("calibration", "crossings freed of the bend of their edges, then once more")
-                pictures = freed
+            again = with_points_by(solution.calibration.camera, pictures, job.threads)
+            if again is not None:
+                job.events.decided("calibration", "points measured by the camera that was found, then once more")
+                pictures = again
                 solution, views = _solved(job, pictures, asked)
         with job.stage("plan"):
             made = solution.calibration
@@ -208,7 +203,7 @@ def _report(
                 rms_px=fit.rms_px if fit is not None and num_used else None,
                 unused=one.unused if fit is None or num_used else problem,
                 problem=problem if num_used else None,
-                picked=one.picked,
+                picked=one.picked if num_used else None,
                 like=one.like,
             )
         )

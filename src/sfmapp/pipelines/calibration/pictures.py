@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -52,6 +53,7 @@ class BoardPicture:
         picked: why a frame of a video was taken.
         like: name of a frame that was taken and shows the same, where that is why it is left aside.
         path: of a photograph; None of a frame.
+        read: its grey values (H, W) once more; None of what does not count.
     """
 
     name: str
@@ -60,6 +62,7 @@ class BoardPicture:
     picked: str | None = None
     like: str | None = None
     path: Path | None = None
+    read: Callable[[], Pixels] | None = None
 
 
 @dataclass(frozen=True)
@@ -116,7 +119,7 @@ def _look_at_photographs(job: Job, given: Board | None) -> BoardPictures:
             found = detect_board(read_gray(record), board)
         except InputError as error:
             return BoardPicture(record.name, _nothing(str(error)), str(error), path=record.path)
-        return BoardPicture(record.name, found, found.problem, path=record.path)
+        return BoardPicture(record.name, found, found.problem, path=record.path, read=partial(read_gray, record))
 
     pictures = _in_threads(look, images.images, job.threads, job.events)
     return BoardPictures(board, guess, size, tuple(pictures), {record.name: record.digest for record in images.images})
@@ -221,10 +224,17 @@ def _look_at_video(job: Job, given: Board | None) -> BoardPictures:
     with ThreadPoolExecutor(job.threads) as pool:
         found = list(pool.map(lambda frame: detect_board(frame.images[0], board), sharpest))
     pictures = [BoardPicture(frame.name, one, one.problem) for frame, one in zip(sharpest, found, strict=True)]
-    chosen = choose_frames(pictures, (int(size[0]), int(size[1])), board)
+    chosen = [
+        replace(one, read=partial(_gray_of, frame)) if one.unused is None else one
+        for one, frame in zip(choose_frames(pictures, (int(size[0]), int(size[1])), board), sharpest, strict=True)
+    ]
     num = sum(picture.unused is None for picture in chosen)
     job.events.finished(STAGE, f"{num} frames were picked of {len(chosen)} that were looked into")
     return BoardPictures(board, guess, (int(size[0]), int(size[1])), tuple(chosen), {})
+
+
+def _gray_of(frame: Frame) -> Pixels:
+    return frame.images[0]
 
 
 def choose_frames(pictures: Sequence[BoardPicture], size: tuple[int, int], board: Board) -> list[BoardPicture]:

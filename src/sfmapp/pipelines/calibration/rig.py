@@ -25,7 +25,7 @@ from sfmapp.camera_files.rig_writing import write_rig_files
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
 from sfmapp.images.video import is_video
-from sfmapp.pipelines.calibration.centers import with_disk_centers
+from sfmapp.pipelines.calibration.centers import with_points_by
 from sfmapp.pipelines.calibration.pictures import BoardPictures, look_at_pictures
 from sfmapp.pipelines.calibration.results import note_recording, outline_of, write_camera
 from sfmapp.pipelines.calibration.shots import match_shots
@@ -174,11 +174,11 @@ def _with_lens(job: Job, one: _Seen, boards: Sequence[Board], given: str | None,
         camera = read_calibration(given, [size]).rig.cameras[0] if is_calibration_path(given) else None
         camera = camera_from_text(given, size) if camera is None else camera
         one = replace(one, camera=camera, is_held=True, intrinsics=f"held as {given} has them")
-        return _with_disk_centers(one, camera) or one
+        return _with_points_by(job, one, camera) or one
     made = _calibrated(job, one, boards, model)
-    centered = _with_disk_centers(one, made.camera)
-    if centered is not None:
-        one, made = centered, _calibrated(job, centered, boards, model)
+    again = _with_points_by(job, one, made.camera)
+    if again is not None:
+        one, made = again, _calibrated(job, again, boards, model)
     text = f"begun with those of its {len(made.views)} photographs alone, rms {made.rms_px:.3f} px"
     return replace(one, camera=made.camera, intrinsics=text)
 
@@ -199,12 +199,12 @@ def _calibrated(job: Job, one: _Seen, boards: Sequence[Board], model: CameraMode
         raise InputError(f"{one.name}: {error}", "give its intrinsics with --camera, or more photographs") from error
 
 
-def _with_disk_centers(one: _Seen, camera: Camera) -> _Seen | None:
-    """With the centres of circles that a camera gives them; None where no board has any."""
-    centered = [with_disk_centers(pictures, camera) for pictures in one.of_board]
-    if not any(centered):
+def _with_points_by(job: Job, one: _Seen, camera: Camera) -> _Seen | None:
+    """With the points that its camera gives its photographs; None where that changes nothing."""
+    found = [with_points_by(camera, pictures, job.threads) for pictures in one.of_board]
+    if not any(found):
         return None
-    return replace(one, of_board=tuple(new or old for new, old in zip(centered, one.of_board, strict=True)))
+    return replace(one, of_board=tuple(new or old for new, old in zip(found, one.of_board, strict=True)))
 
 
 def _views(seen: Sequence[_Seen], boards: Sequence[Board], shots: Sequence[dict[int, int]]) -> list[RigView]:
