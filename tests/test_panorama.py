@@ -21,10 +21,11 @@ from sfmapp.geometry import rigid3
 from sfmapp.images.headers import read_header
 from sfmapp.panorama import compose, pairs, warp
 from sfmapp.panorama.adjustment import Turned, TurnedFit, adjust_turns, refinable
-from sfmapp.panorama.canvas import View, choose_canvas, lenses_of
+from sfmapp.panorama.canvas import Canvas, View, choose_canvas, lenses_of
 from sfmapp.panorama.level import level
 from sfmapp.panorama.preview import Shown, find_gains
 from sfmapp.panorama.report import TurnedPair
+from sfmapp.panorama.seams import find_seams
 from sfmapp.panorama.turning_report import judge_pairs
 from sfmapp.panorama.zooms import find_zooms, unzoomed
 from sfmapp.scene.tracks import Tracks
@@ -283,6 +284,43 @@ def test_gains_undo_exposures() -> None:
     products = gains * np.array(factors)[:, None]
     assert np.abs(products / products[0] - 1.0).max() < 0.02
     assert apart.max() < 0.02
+
+
+@pytest.mark.parametrize("start", [96, 236, 380])
+def test_no_seam_cuts_what_moved(start: int) -> None:
+    """Someone walks round a closed panorama: whole or not at all in it, also across its end, and where one photograph
+    has but a half of them, and where nobody is are the middles of overlaps."""
+    rng = np.random.default_rng(start)
+    wide, num, reach = 400, 8, 75
+    wall = cv2.blur(rng.uniform(40.0, 215.0, (100, wide, 3)).astype(np.float32), (5, 5))
+    shown, where = [], np.zeros((num, 100, wide), bool)
+    for k in range(num):
+        left = (50 * k - 12) % wide
+        columns = np.arange(left, left + reach) % wide
+        at = start + 13 * k
+        where[k, 30:80, np.arange(at, at + 20) % wide] = True
+        picture = np.where(where[k][..., None], np.float32([250.0, 250.0, 0.0]), wall)
+        inside, depth = np.zeros((100, wide), bool), np.zeros((100, wide), np.float32)
+        inside[:, columns] = True
+        depth[:, columns] = 1.0 - np.abs(np.linspace(-1.0, 1.0, reach))
+        where[k] &= inside
+        shown.append(Shown(0, 0, picture, inside, depth))
+    canvas = Canvas("spherical", wide / (2.0 * np.pi), -wide / 2, -50.0, wide, 100, True)
+    label = find_seams(shown, np.ones((num, 3)), canvas)
+    assert (label >= 0).all()
+    assert np.take_along_axis(np.stack([each.inside for each in shown]), label[None].astype(int), 0).all()
+    beside = np.roll(label, -1, 1)
+    rows, columns = np.nonzero(label != beside)
+    # on both sides of a seam both photographs show the wall, as far as they show the place
+    for k, other in ((label, beside), (beside, label)):
+        for x in (columns, (columns + 1) % wide):
+            a, b = k[rows, columns], other[rows, columns]
+            both = np.array(
+                [shown[p].inside[y, c] and shown[q].inside[y, c] for p, q, y, c in zip(a, b, rows, x, strict=True)]
+            )
+            assert not (where[a, rows, x] & ~where[b, rows, x] & both).any()
+    # above them the seams stay in the middle of overlaps
+    assert sorted(set(columns[rows < 5].tolist())) == [*range(50, wide, 50), wide - 1]
 
 
 def test_strips_and_tiles_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:

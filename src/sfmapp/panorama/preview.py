@@ -1,4 +1,4 @@
-"""The panorama in small: what each photograph shows of it, how bright it is beside the others, and where seams run."""
+"""The panorama in small: what each photograph shows of it, and how bright it is beside the others."""
 
 from __future__ import annotations
 
@@ -30,10 +30,6 @@ _FEWEST = 30
 # What is believed of exposures beforehand: within a factor of two, and the disagreement of an overlap within 5 %.
 _GAIN_SIGMA, _OVERLAP_SIGMA = math.log(2.0), 0.05
 _MOST_GAIN = 8.0
-# Colours are compared in means over so many pixels, so that a hair's breadth of parallax is no motion.
-_BLUR, _CLOSING = (5, 5), (9, 9)
-# What differs by so many grey levels, and by so many times the usual difference, has moved.
-_LEAST_DIFFERENCE, _UNUSUAL = 12.0, 4.0
 
 
 @dataclass(frozen=True)
@@ -163,64 +159,3 @@ def _overlap(a: Shown, b: Shown) -> tuple[Array, Array] | None:
     if not both.any():
         return None
     return a.colors[parts[0]][both].astype(np.float64), b.colors[parts[1]][both].astype(np.float64)
-
-
-def find_seams(shown: Sequence[Shown], gains: Array, canvas: Canvas) -> NDArray[np.int16]:
-    """(H, W) which photograph is shown where, -1 for none, with no seam through what moved.
-
-    Each pixel is of the photograph whose borders are farthest away. Where photographs differ in a connected region, it
-    is shown by one of them that has all of it, so that what moved is there whole or not at all (Uyttendaele, Eden and
-    Szeliski, "Eliminating ghosting and exposure artifacts in image mosaics", CVPR 2001).
-    """
-    import cv2
-
-    label = np.full((canvas.height, canvas.width), -1, np.int16)
-    best = np.zeros(label.shape, np.float32)
-    colors = np.zeros((*label.shape, 3), np.float32)
-    factors = gains.astype(np.float32)
-    for k, each in enumerate(shown):
-        at = _place(each)
-        is_better = each.inside & (each.depth + 1e-6 > best[at])
-        label[at][is_better], best[at][is_better] = k, each.depth[is_better] + 1e-6
-        colors[at][is_better] = each.colors[is_better] * factors[k]
-    difference = np.zeros(label.shape, np.float32)
-    for each, factor in zip(shown, factors, strict=True):
-        at, mine = _place(each), each.colors * factor
-        apart = np.abs(cv2.blur(mine, _BLUR) - cv2.blur(colors[at], _BLUR)).max(2)
-        # the blur reaches beyond the borders of a photograph
-        inner = cv2.erode(each.inside.astype(np.uint8), np.ones(_BLUR, np.uint8), borderValue=0) > 0
-        np.maximum(difference[at], np.where(inner, apart, 0.0), out=difference[at])
-    seen = difference[label >= 0]
-    usual = float(np.median(seen)) if len(seen) else 0.0
-    moved = (difference > _LEAST_DIFFERENCE + _UNUSUAL * usual).astype(np.uint8)
-    moved = cv2.morphologyEx(moved, cv2.MORPH_CLOSE, np.ones(_CLOSING, np.uint8))
-    moved = cv2.dilate(moved, np.ones(_BLUR, np.uint8))
-    _, region, stats, _ = cv2.connectedComponentsWithStats(moved, connectivity=8)
-    for n, (left, top, width, height, _) in enumerate(stats.tolist()[1:], 1):
-        part = slice(top, top + height), slice(left, left + width)
-        mask = region[part] == n
-        if len(np.unique(label[part][mask])) > 1:
-            whole = _best_of_all(shown, (left, top), mask)
-            if whole >= 0:
-                label[part][mask] = whole
-    return label
-
-
-def _place(each: Shown) -> tuple[slice, slice]:
-    height, width = each.inside.shape
-    return slice(each.top, each.top + height), slice(each.left, each.left + width)
-
-
-def _best_of_all(shown: Sequence[Shown], corner: tuple[int, int], mask: Mask) -> int:
-    """The photograph that shows all of a region, farthest from its borders on the average; -1 for none."""
-    left, top = corner
-    height, width = mask.shape
-    best, found = 0.0, -1
-    for k, each in enumerate(shown):
-        y, x = top - each.top, left - each.left
-        if y < 0 or x < 0 or y + height > each.inside.shape[0] or x + width > each.inside.shape[1]:
-            continue
-        at = slice(y, y + height), slice(x, x + width)
-        if each.inside[at][mask].all() and (mean := float(each.depth[at][mask].mean())) > best:
-            best, found = mean, k
-    return found

@@ -14,8 +14,9 @@ from sfmapp.events import Events
 from sfmapp.panorama.canvas import Canvas, Projection, View, choose_canvas, lenses_of
 from sfmapp.panorama.compose import Plan, compose
 from sfmapp.panorama.pictures import Pictures
-from sfmapp.panorama.preview import find_gains, find_seams, show_all, small_canvas
+from sfmapp.panorama.preview import find_gains, show_all, small_canvas
 from sfmapp.panorama.report import PictureReport
+from sfmapp.panorama.seams import find_seams
 from sfmapp.panorama.turned_photographs import TurnedPhotographs
 
 if TYPE_CHECKING:
