@@ -410,6 +410,11 @@ def promises(folder: Path) -> Iterator[Promise]:
     yield Promise("rigs", "sigmas of a rig are those of its errors (NEES 0.9 to 1.1)", good, len(rows), date)
     odd = report["odd"]
     yield Promise("rigs", "a board that moved between exposures is named", odd["moved"], odd["trials"], date)
+    report = read(folder, "stereo_sigma")
+    rows = report["runs"]["Fitted on rendered pairs, judged on photographs"]
+    good = sum(60 <= row["inside_68"] <= 76 and 92 <= row["inside_95"] <= 97 for row in rows)
+    text = "intervals of 68 and 95 % of disparities hold 60 to 76 and 92 to 97 % of the errors on photographs"
+    yield Promise("stereo_sigma", text, good, len(rows), report["date"][:10])
     report = read(folder, "calibration")
     rows, date = report["trials"], report["date"][:10]
     good = sum(0.9 <= row["nees"] <= 1.1 and row["projections_covered"] >= 0.93 for row in rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sfmapp.reporting import Report
+from sfmapp.stereo.measured import MeasuredReport
 
 
 class RowsReport(Report):
@@ -81,6 +82,7 @@ class StereoPairReport(Report):
 
     Attributes:
         name: of the pair, its folder where there are several. left, right: the photographs.
+        measured: how far off disparities and depths may be.
         files: what was written of it, relative to the output.
     """
 
@@ -89,4 +91,5 @@ class StereoPairReport(Report):
     right: str
     rectification: RectificationReport
     disparity: DisparityReport
+    measured: MeasuredReport
     files: Sequence[str]

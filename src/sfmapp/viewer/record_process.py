@@ -54,6 +54,12 @@ def main(kind: str, folder: str, output: str, threads: str) -> None:
 
         write_lines_rrd(LinesReplay.load(Path(folder)), Path(output))
         return
+    if kind == "stereo":
+        from sfmapp.viewer.stereo_replay import StereoReplay
+        from sfmapp.viewer.stereo_rrd import write_stereo_rrd
+
+        write_stereo_rrd(StereoReplay.load(Path(folder)), Path(output))
+        return
     from sfmapp.viewer.replay import Replay
     from sfmapp.viewer.rrd import write_rrd
 

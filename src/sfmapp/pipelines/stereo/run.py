@@ -8,22 +8,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.images.rewrite import encode
+from sfmapp.pipelines.stereo.outputs import write_maps, write_models
 from sfmapp.pipelines.stereo.sources import KnownCameras, PairSource, find_pairs
 from sfmapp.report.stereo_document import StereoReport
+from sfmapp.report.stereo_html import stereo_page
 from sfmapp.reporting import NamedReason
-from sfmapp.stereo.depth import depth_of_disparity
 from sfmapp.stereo.match import match_pair
+from sfmapp.stereo.measured import MeasuredPair, measure_pair, report_of
 from sfmapp.stereo.prepare import PreparedPair, prepare_pair
 from sfmapp.stereo.report import DisparityReport, StereoPairReport
 from sfmapp.stereo.result import DisparityMap, PixelState
-from sfmapp.workspace.job import Job
-from sfmapp.workspace.layout import REPORT, STEREO
+from sfmapp.viewer.stereo_recording import record_stereo
+from sfmapp.workspace.job import FAILED, WRITTEN, Job
+from sfmapp.workspace.layout import PAGE, REPORT, STEREO
 from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
 
@@ -33,12 +35,12 @@ _QUANTILES = (0.01, 0.5, 0.99)
 
 @dataclass(frozen=True)
 class MatchedStereo:
-    """One pair when it is done: rectified, matched, with its depths (H, W) float32, NaN where there are none."""
+    """One pair when it is done: rectified, matched, measured."""
 
     source: PairSource
     prepared: PreparedPair
     disparity: DisparityMap
-    depth: NDArray[np.float32] | None
+    measured: MeasuredPair
 
 
 @dataclass(frozen=True)
@@ -113,18 +115,31 @@ def _do_pair(job: Job, source: PairSource) -> tuple[MatchedStereo, StereoPairRep
             job.events.warned(STAGE, warning)
     with job.stage("matching"):
         disparity = match_pair(prepared.pair, job.options.stereo, matches=prepared.matches)
+    with job.stage("errors"):
+        done = MatchedStereo(source, prepared, disparity, measure_pair(prepared.pair, disparity, threads=job.threads))
     with job.stage("files"):
-        geometry = prepared.pair.geometry
-        is_metric = geometry is not None and geometry.baseline is not None
-        depth = depth_of_disparity(disparity.disparity, geometry) if geometry is not None and is_metric else None
-        done = MatchedStereo(source, prepared, disparity, depth)
         files = [
             str(path.relative_to(job.workspace.folder)) for path in _write(job.workspace.folder / source.name, done)
         ]
-    return done, StereoPairReport(
+    report = StereoPairReport(
         name=source.name, left=source.left, right=source.right, rectification=prepared.report,
-        disparity=_disparity_report(done), files=files,
+        disparity=_disparity_report(done), measured=report_of(prepared.pair, disparity, done.measured), files=files,
     )  # fmt: skip
+    with job.stage("page"):
+        _write_page(job.workspace.folder / source.name / PAGE, report, done)
+    if not source.name:  # of a pair alone; thousands of them would take longer to draw than to match
+        _record(job, report, done)
+    return done, report
+
+
+def _record(job: Job, report: StereoPairReport, done: MatchedStereo) -> None:
+    title = f"{Path(report.left).name} and {Path(report.right).name}"
+    recorded = record_stereo(
+        job.workspace.recording, title, done.prepared.pair, done.disparity, done.measured, report.measured
+    )
+    job.workspace.note(recording=FAILED if recorded.problem else WRITTEN)
+    if recorded.problem:
+        job.events.warned("recording", f"no recording: {recorded.problem}")
 
 
 def _disparity_report(done: MatchedStereo) -> DisparityReport:
@@ -132,8 +147,9 @@ def _disparity_report(done: MatchedStereo) -> DisparityReport:
     known = found.disparity[found.state == PixelState.MATCHED]
     quantiles = np.quantile(known, _QUANTILES).tolist() if known.size else []
     depths: list[float] = []
-    if done.depth is not None and known.size:
-        of = done.depth[np.isfinite(done.depth)]
+    depth = done.measured.depth
+    if depth is not None and known.size:
+        of = depth[np.isfinite(depth)]
         depths = np.quantile(of, _QUANTILES).tolist() if of.size else []
     return DisparityReport(
         matcher=str(found.info.get("matcher", "")), searched=found.searched,
@@ -147,15 +163,13 @@ def _write(folder: Path, done: MatchedStereo) -> Iterator[Path]:
     pair = done.prepared.pair
     for name, picture in (("left.png", pair.left), ("right.png", pair.right)):
         yield _write_bytes(folder / name, encode(picture, "png"))
-    arrays = {"disparity.npy": done.disparity.disparity, "depth.npy": done.depth}
-    for name, array in arrays.items():
-        path = folder / name
-        if array is None:
-            path.unlink(missing_ok=True)  # of an earlier run with a baseline
-            continue
-        with replaced_file(path) as beside, beside.open("wb") as stream:
-            np.save(stream, array, allow_pickle=False)
-        yield path
+    yield from write_maps(folder, done.disparity, done.measured)
+    yield from write_models(folder, pair, done.disparity, done.measured)
+
+
+def _write_page(path: Path, report: StereoPairReport, done: MatchedStereo) -> None:
+    """The page of a pair, whole or not at all."""
+    _write_bytes(path, stereo_page(report, done.prepared.pair, done.disparity, done.measured).encode())
 
 
 def _write_bytes(path: Path, data: bytes) -> Path:

@@ -1,0 +1,52 @@
+"""What is written of a measured pair: maps with their errors, cloud and mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.disparity_files import fits_kitti, write_disparity
+from sfmapp.formats.glb import write_glb
+from sfmapp.formats.ply import write_ply
+from sfmapp.stereo.measured import MeasuredPair, cloud_of, mesh_of
+from sfmapp.stereo.result import DisparityMap, RectifiedPair
+
+
+def write_maps(folder: Path, found: DisparityMap, measured: MeasuredPair) -> Iterator[Path]:
+    """Disparities in the forms of other programs, depths, and the errors of both; gives the path of each file."""
+    for suffix in ("npy", "pfm", "png"):
+        path = folder / f"disparity.{suffix}"
+        if suffix == "png" and not fits_kitti(found.disparity):
+            path.unlink(missing_ok=True)  # KITTI's has no place for them
+            continue
+        write_disparity(path, found.disparity)
+        yield path
+    arrays = {
+        "disparity_sigma.npy": measured.error.sigma, "disparity_95.npy": measured.error.half_width_95,
+        "confidence.npy": measured.error.confidence, "depth.npy": measured.depth,
+        "depth_sigma.npy": measured.depth_sigma,
+    }  # fmt: skip
+    for name, array in arrays.items():
+        path = folder / name
+        if array is None:
+            path.unlink(missing_ok=True)  # of an earlier run with a baseline
+            continue
+        with replaced_file(path) as beside, beside.open("wb") as stream:
+            np.save(stream, array, allow_pickle=False)
+        yield path
+
+
+def write_models(folder: Path, pair: RectifiedPair, found: DisparityMap, measured: MeasuredPair) -> Iterator[Path]:
+    """The coloured cloud and the textured mesh of the view, where depths are known; gives the path of each."""
+    cloud, mesh = folder / "cloud.ply", folder / "view.glb"
+    if measured.depth is None or not measured.is_solid.any():
+        for path in (cloud, mesh):
+            path.unlink(missing_ok=True)
+        return
+    write_ply(cloud, *cloud_of(pair, measured))
+    yield cloud
+    write_glb(mesh, mesh_of(pair, found, measured))
+    yield mesh

@@ -1,0 +1,166 @@
+"""The page of a matched pair: what was seen, how far away it is, and how far off that may be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from html import escape
+
+import cv2
+import numpy as np
+
+from sfmapp.report.drawing import jpeg_url
+from sfmapp.report.page import render_page, table
+from sfmapp.report.stereo_pictures import (
+    QUALITY,
+    SHOWN_PX,
+    ColorScale,
+    anaglyph,
+    map_figure,
+    rows_across,
+    scale_of,
+)
+from sfmapp.stereo.measured import MeasuredPair, MeasuredReport, rgb_of
+from sfmapp.stereo.report import StereoPairReport
+from sfmapp.stereo.result import DisparityMap, RectifiedPair
+
+_STYLE = """<style>.bar-of img{width:100%;height:.8rem;object-fit:fill;image-rendering:auto}
+.bar-of div{display:flex;justify-content:space-between;font-size:.8rem}
+.slider{position:relative}.slider img{width:100%;display:block}.slider img+img{position:absolute;inset:0;
+clip-path:inset(0 0 0 var(--cut,50%))}.slider+input{width:100%}</style>"""
+
+
+def stereo_page(report: StereoPairReport, pair: RectifiedPair, found: DisparityMap, measured: MeasuredPair) -> str:
+    """The page, self-contained, its pictures in it."""
+    title = f"{report.left.rsplit('/', 1)[-1]} and {report.right.rsplit('/', 1)[-1]}"
+    return render_page(title, _body(report, pair, found, measured))
+
+
+def _body(report: StereoPairReport, pair: RectifiedPair, found: DisparityMap, measured: MeasuredPair) -> Iterator[str]:
+    yield _STYLE
+    for warning in report.rectification.warnings:
+        yield f'<div class="failure"><p>{escape(warning)}</p></div>'
+    yield _summary(report)
+    yield from _maps(report, found, measured)
+    yield "<h2>How well depth is told</h2>" + _depths(report.measured)
+    yield from _both_views(pair, found)
+    yield "<h2>Rectification</h2>" + _rectification(report)
+
+
+def _summary(report: StereoPairReport) -> str:
+    disparity, told = report.disparity, report.measured
+    text = (
+        f"<p>{disparity.density:.1%} of the pixels are matched by {escape(disparity.matcher)}, which looked for "
+        f"disparities from {disparity.searched[0]:g} to {disparity.searched[1]:g} px ({escape(disparity.told_by)})"
+    )
+    if disparity.filled:
+        text += f"; {disparity.filled:.1%} are filled from their neighbours, and have no sigma"
+    text += "."
+    if told.median_sigma_px is not None:
+        text += (
+            f" A disparity is good to {told.median_sigma_px:.2f} px in the median (68 %; 95 % within "
+            f"{told.median_half_width_95_px:.2f} px). By their confidences, {told.expected_right:.1%} of the matches "
+            f"are right within a pixel, and {told.sure_share:.1%} are sure of it by nine chances in ten."
+        )
+    if told.least_depth is not None:
+        text += (
+            f"</p><p>The rig tells depths from {told.least_depth:.3g} to {told.greatest_depth:.3g} {told.unit}: nearer "
+            "points were not looked for, farther ones may as well be at infinity. At "
+            f"{told.ten_percent_depth:.3g} {told.unit} sigma is a tenth of the depth."
+        )
+    elif told.median_sigma_px is not None:
+        text += "</p><p>No baseline is known: there are disparities, and no depths."
+    return text + "</p>"
+
+
+def _maps(report: StereoPairReport, found: DisparityMap, measured: MeasuredPair) -> Iterator[str]:
+    yield '<h2>Maps of the left picture</h2><div class="row large">'
+    unit = report.measured.unit
+    if measured.depth is not None and measured.depth_sigma is not None:
+        depth = np.where(measured.is_solid, measured.depth, np.nan)
+        scale = scale_of(depth, is_log=True, colormap=cv2.COLORMAP_TURBO)
+        yield map_figure(depth, scale, f"depth, {unit}: what is rather right than wrong, and told from infinity")
+        with np.errstate(invalid="ignore"):
+            percent = 100.0 * measured.depth_sigma / measured.depth
+        yield map_figure(percent, _errors(percent), "sigma of depth, % of it, calibration included")
+    yield map_figure(found.disparity, scale_of(found.disparity), "disparity, px, all that was matched or filled")
+    sigma = measured.error.sigma
+    yield map_figure(sigma, _errors(sigma), "sigma of disparity, px: 68 % of the errors are below it")
+    confidence = np.where(np.isfinite(sigma), measured.error.confidence, np.nan)
+    scale = ColorScale(0.0, 1.0, colormap=cv2.COLORMAP_VIRIDIS)
+    yield map_figure(confidence, scale, "confidence: chance to be right within a pixel")
+    yield "</div><p class=dim>Dark grey: nothing is known there.</p>"
+
+
+def _errors(values: np.ndarray) -> ColorScale:
+    return scale_of(values, is_log=True, colormap=cv2.COLORMAP_INFERNO)
+
+
+def _depths(told: MeasuredReport) -> str:
+    if not told.depths:
+        return "<p class=dim>No depth: no baseline is known, or nothing was matched.</p>"
+    rows, has_calibration = [], any(at.of_calibration for at in told.depths)
+    for at in told.depths:
+        texts = [
+            f"{at.share:.0%}", f"{at.depth:.4g}", f"{at.disparity_px:.2f}", f"{at.disparity_sigma_px:.3f}",
+            f"{at.sigma:.3g}", f"{100.0 * at.sigma / at.depth:.2g}", f"{at.of_calibration:.3g}",
+        ]  # fmt: skip
+        rows.append([("", text) for text in texts[: len(texts) - (not has_calibration)]])
+    head = [
+        "nearer are", f"depth {told.unit}", "disparity px", "its sigma px", f"sigma of depth {told.unit}", "%",
+        *([f"of calibration {told.unit}"] if has_calibration else []),
+    ]  # fmt: skip
+    note = (
+        "To first order, sigma grows with the square of the depth. The part of the calibration is the same for all "
+        "pixels, and does not average out."
+        if has_calibration
+        else "To first order, sigma grows with the square of the depth. Nothing is known of the calibration's own "
+        "sigma: two ten-thousandths of the width are in the sigma of disparities in its place."
+    )
+    return table([("", name) for name in head], rows) + f"<p class=dim>{note}</p>"
+
+
+def _both_views(pair: RectifiedPair, found: DisparityMap) -> Iterator[str]:
+    known = found.disparity[np.isfinite(found.disparity)]
+    shift = round(float(np.median(known))) if known.size else 0
+    yield '<h2>Both views</h2><figure><div class="slider">'
+    for picture in (pair.left, pair.right):
+        yield f'<img src="{jpeg_url(rgb_of(picture), SHOWN_PX, QUALITY)}" alt="">'
+    yield (
+        '</div><input type="range" min="0" max="100" value="50" aria-label="left or right" '
+        "oninput=\"this.previousElementSibling.style.setProperty('--cut',this.value+'%')\">"
+        "<figcaption>left of the handle the left picture, right of it the right one: whatever crosses it "
+        "has to stay on its row</figcaption></figure>"
+    )
+    yield (
+        f'<figure><img src="{jpeg_url(rows_across(pair, found), 2 * SHOWN_PX, QUALITY)}" alt=""><figcaption>some rows '
+        "across both pictures, and on each some pixels with their matches</figcaption></figure>"
+    )
+    yield (
+        f'<figure><img src="{jpeg_url(anaglyph(pair, shift), 1400, QUALITY)}" alt=""><figcaption>for glasses of red '
+        f"(left) and cyan (right); what has a disparity of {shift} px lies in the plane of the screen</figcaption>"
+        "</figure>"
+    )
+
+
+def _rectification(report: StereoPairReport) -> str:
+    how = report.rectification
+    rows = [
+        ("cameras", how.cameras),
+        ("pictures", f"{how.width} x {how.height} pixels" + (", as they were given" if how.is_as_given else "")),
+    ]
+    if how.focal_px is not None:
+        rows.append(("focal length", f"{how.focal_px:.2f} px"))
+        rows.append(("disparity at infinity", f"{-(how.doffs_px or 0.0):.2f} px"))
+    if how.baseline is not None:
+        rows.append(("baseline", f"{how.baseline:.6g} {how.unit}"))
+    if not how.is_as_given:
+        rows.append(("axes turned by", f"{how.turn_deg[0]:.2f} and {how.turn_deg[1]:.2f} degrees"))
+        rows.append(("kept of each photograph", f"{how.kept[0]:.0%} and {how.kept[1]:.0%}"))
+    if how.rows is not None:
+        rows.append(
+            (
+                "rows of sparse matches",
+                f"{how.rows.median_px:+.2f} px in the median, {how.rows.rms_px:.2f} px rms, of {how.rows.num_matches}",
+            )
+        )
+    return table([("t", ""), ("t", "")], [[("t", name), ("w", value)] for name, value in rows])

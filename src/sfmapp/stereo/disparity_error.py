@@ -1,0 +1,169 @@
+"""How far off each disparity may be, told from the pictures and the disparities round it.
+
+No matcher knows its own error: costs are truncated, aggregated and smoothed, and a wrong match may be as sharp as a
+right one. So nine cues, which are the same for all matchers, are taken at the disparity that was found: what the
+zero-mean NCC of a window says of noise over curvature (Foerstner's error of least-squares matching, the log of
+sqrt((1 - ncc) / -ncc'')), of its peak and of the place of its maximum, and how disparities scatter about (for cues of
+this kind see Hu and Mordohai, "A quantitative evaluation of confidence measures for stereo vision", PAMI 2012). They
+come to one score, a quadratic whose weights were fitted to the logarithm of true errors, and the score to three numbers
+by curves of quantiles, so that the statements hold as frequencies: 68 and 95 per cent of the errors are inside, and so
+many are below one pixel. What a calibration leaves is the same for neighbours and shows in no cue: it is added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.stereo.error_table import ERROR_TABLE, ErrorTable
+from sfmapp.stereo.opencv_matchers import gray_of
+from sfmapp.stereo.result import DisparityMap, PixelState, RectifiedPair
+
+Map = NDArray[np.float32]
+
+CUES = ("theory", "mismatch", "off peak", "scatter", "wide scatter", "outlying", "known", "background", "texture")
+
+# window of the NCC, of the near and of the wide scatter, and of the search for a background, pixels
+_WINDOW, _NEAR, _WIDE, _AROUND = 7, 5, 11, 13
+# variance of a picture that is nothing but rounding and read-out noise, squared grey levels
+_DARK_VARIANCE = 0.5
+# of NCC: floors below which neither mismatch nor curvature are measured by 49 pixels of 8 bits
+_LEAST = 1e-3
+# beyond so many pixels a neighbour is another surface, however far
+_FAR_PX = 32.0
+# What calibration and rectification leave of disparities, a share of the width, where no covariance says it: 0.15 px of
+# 752. Each of the three photographs of the benchmark alone would choose between 1.5e-4 and 2.5e-4.
+RESIDUAL_SHARE = 2e-4
+# rows of a band: what is held at a time is its width times this times some twenty maps, whatever the height
+_BAND = 256
+
+
+@dataclass(frozen=True)
+class DisparityError:
+    """Of each pixel (H, W) float32; NaN where it was not matched.
+
+    Attributes:
+        sigma: the error is below it in 68 per cent of the pixels that are given this one, pixels.
+        half_width_95: the same in 95 per cent. More than twice as much where the match itself is in doubt.
+        confidence: share of such pixels whose error is below one pixel, 0 to 1; 0 where there is no match.
+    """
+
+    sigma: Map
+    half_width_95: Map
+    confidence: Map
+
+
+def disparity_error(
+    pair: RectifiedPair, found: DisparityMap, *, table: ErrorTable = ERROR_TABLE, threads: int = 1
+) -> DisparityError:
+    """The error of each matched disparity; filled ones are guesses and have none.
+
+    With a covariance of the calibration in the pair's geometry, its part is left to
+    :func:`~sfmapp.stereo.uncertainty.depth_sigma`; without, ``RESIDUAL_SHARE`` of the width is in sigma.
+
+    Args:
+        table: what scores mean, fitted by ``benchmarks/stereo_sigma.py``. threads: bands of rows at a time.
+    """
+    is_calibrated = pair.geometry is not None and pair.geometry.covariance is not None
+    residual = 0.0 if is_calibrated else RESIDUAL_SHARE * found.disparity.shape[1]
+    shape = found.disparity.shape
+    result = DisparityError(*(np.full(shape, value, np.float32) for value in (np.nan, np.nan, 0.0)))
+
+    def fill(band: tuple[slice, slice, slice]) -> None:
+        wide, inner, rows = band
+        cues, known = match_cues(pair, found, wide)
+        told = with_residual(table.read(cues[inner][known[inner]]), residual)
+        for field, values in zip((result.sigma, result.half_width_95, result.confidence), told, strict=True):
+            field[rows][known[inner]] = values
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(fill, _bands(shape[0])))
+    return result
+
+
+def with_residual(told: tuple[Map, Map, Map], residual_px: float) -> tuple[Map, Map, Map]:
+    """Sigma, half width and confidence with the standard deviation of something that they do not know of."""
+    sigma, half_width, confidence = told
+    return np.hypot(sigma, np.float32(residual_px)), np.hypot(half_width, np.float32(1.96 * residual_px)), confidence
+
+
+def match_cues(pair: RectifiedPair, found: DisparityMap, rows: slice = slice(None)) -> tuple[Map, NDArray[np.bool_]]:
+    """The cues (R, W, 9) of the rows asked for, in the order of ``CUES``, and which pixels (R, W) were matched. Within
+    ``_AROUND`` // 2 of the first and the last row windows reach beyond them, and are mirrored."""
+    left, right = (gray_of(picture[rows]).astype(np.float32) for picture in (pair.left, pair.right))
+    known = (found.state[rows] == PixelState.MATCHED) & np.isfinite(found.disparity[rows])
+    disparity = np.where(known, found.disparity[rows], np.float32(0.0))
+    cues = np.empty((*disparity.shape, len(CUES)), np.float32)
+    cues[..., :3], cues[..., 8] = _correlation_cues(left, right, disparity, known)
+    cues[..., 3:8] = _scatter_cues(disparity, known)
+    return cues, known
+
+
+def _correlation_cues(left: Map, right: Map, disparity: Map, known: NDArray[np.bool_]) -> tuple[Map, Map]:
+    """What the zero-mean NCC of a window says, of the disparity and of one pixel more and less: each pixel of the
+    window goes by its own disparity, so that slanted surfaces match as well as others."""
+    import cv2
+
+    mask = known.astype(np.float32)
+    share = np.maximum(_mean(mask, _WINDOW), np.float32(1e-6))
+    of_left = left * mask
+    left_mean = _mean(of_left, _WINDOW) / share
+    left_variance = np.maximum(_mean(of_left * left, _WINDOW) / share - left_mean**2, 0.0) + np.float32(_DARK_VARIANCE)
+    height, width = disparity.shape
+    y = np.repeat(np.arange(height, dtype=np.float32)[:, None], width, axis=1)
+    ncc = []
+    for shift in (-1.0, 0.0, 1.0):
+        x = np.arange(width, dtype=np.float32) - disparity - np.float32(shift)
+        seen = cv2.remap(right, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) * mask
+        mean = _mean(seen, _WINDOW) / share
+        variance = np.maximum(_mean(seen * seen, _WINDOW) / share - mean**2, 0.0) + np.float32(_DARK_VARIANCE)
+        both = _mean(of_left * seen, _WINDOW) / share - left_mean * mean
+        ncc.append(both / np.sqrt(left_variance * variance))
+    curvature = np.maximum(2.0 * ncc[1] - ncc[0] - ncc[2], np.float32(_LEAST))
+    mismatch = np.maximum(1.0 - ncc[1], np.float32(_LEAST))
+    off_peak = np.abs(np.clip(0.5 * (ncc[2] - ncc[0]) / curvature, -1.0, 1.0))
+    cues = np.stack(
+        [0.5 * np.log((mismatch + _LEAST) / curvature), np.log(mismatch), np.log(off_peak + np.float32(0.05))], axis=-1
+    )
+    return np.asarray(cues, np.float32), np.asarray(0.5 * np.log(left_variance), np.float32)
+
+
+def _scatter_cues(disparity: Map, known: NDArray[np.bool_]) -> Map:
+    """How disparities scatter in a small and in a wide window, how far this one is from their mean, how many are
+    known, and how far behind something stands."""
+    import cv2
+
+    # squares of disparities of some hundred pixels leave no digits for their scatter in single precision
+    mask, exact, scatter = known.astype(np.float32), disparity.astype(np.float64), []
+    for side in (_NEAR, _WIDE):
+        share = np.maximum(_mean(mask, side), np.float32(1e-6))
+        mean = _mean(exact, side) / share  # disparities are zero where they are not known
+        scatter.append(np.sqrt(np.maximum(_mean(exact * exact, side) / share - mean**2, 0.0)))
+    nearest_to_background = np.where(known, disparity, np.float32(np.inf))
+    behind = disparity - cv2.erode(nearest_to_background, np.ones((_AROUND, _AROUND), np.uint8))
+    cues = [
+        np.log(scatter[0] + 0.05), np.log(scatter[1] + 0.05), np.log(np.abs(exact - mean) + 0.05), share,
+        np.log(np.clip(behind, 0.0, _FAR_PX) + 0.1),
+    ]  # fmt: skip
+    return np.asarray(np.stack(cues, axis=-1), np.float32)
+
+
+def _bands(height: int) -> Iterator[tuple[slice, slice, slice]]:
+    """Bands with the rows that their windows reach: those, the band in them, and the band in the picture."""
+    margin = _AROUND // 2
+    for start in range(0, height, _BAND):
+        end = min(start + _BAND, height)
+        first = max(start - margin, 0)
+        yield slice(first, min(end + margin, height)), slice(start - first, end - first), slice(start, end)
+
+
+def _mean(values: NDArray[Any], side: int) -> NDArray[Any]:
+    import cv2
+
+    mean: NDArray[Any] = cv2.boxFilter(values, -1, (side, side), normalize=True, borderType=cv2.BORDER_REFLECT)
+    return mean
