@@ -23,6 +23,7 @@ class StereoOptions:
         window: Side of the matching window, pixels, odd; None: what is best for the matcher; sgm has
             none.
         left_right_px: Disparities that differ by more when they are looked for from the other side are dropped, pixels.
+        correct_rig: Where matches say that the cameras have turned since their calibration, rectify as they say.
         fill: Fill what only one camera sees from its neighbours, and mark it so.
     """
 
@@ -31,6 +32,7 @@ class StereoOptions:
     num_disparities: int | None = None
     window: int | None = None
     left_right_px: float = 1.0
+    correct_rig: bool = True
     fill: bool = False
 
     def __post_init__(self) -> None:

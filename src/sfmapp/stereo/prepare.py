@@ -9,11 +9,16 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
 from sfmapp.geometry import rigid3
+from sfmapp.planes.sampling import resampled
 from sfmapp.scene.rig import Rig
+from sfmapp.stereo.alignment import aligned_matches
+from sfmapp.stereo.misalignment import Misalignment, measure_misalignment
+from sfmapp.stereo.opencv_matchers import gray_of
 from sfmapp.stereo.rectification import Rectification, plan_rectification, rectify
-from sfmapp.stereo.report import RectificationReport, RowsReport
-from sfmapp.stereo.result import RectifiedGeometry, RectifiedPair
+from sfmapp.stereo.report import MisalignmentReport, RectificationReport, RowsReport
+from sfmapp.stereo.result import RectifiedPair
 from sfmapp.stereo.sparse_matches import PairMatches, match_pictures
+from sfmapp.stereo.uncalibrated import rig_from_matches
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
@@ -25,6 +30,8 @@ _FEW_MATCHES, _SOME_BEYOND = 20, 0.1
 # matches whose rows differ by more are not counted as such, a share of the height; rows that differ by more than a
 # pixel cost a matcher of windows more than its own error
 _GROSS_SHARE, _ROWS_OFF_PX = 0.02, 1.0
+# share of a pixel that the photograph has to show
+_COVERED = 0.99
 
 
 @dataclass(frozen=True)
@@ -32,13 +39,13 @@ class PairCameras:
     """What is known of the cameras of a pair.
 
     Attributes:
-        rig: both, with the pose of the second in the frame of the first; or
-        geometry: of photographs that are rectified already; None as well: they are, and nothing else is known.
-        text: where that is from, for people.
+        rig: both, with the pose of the second in the frame of the first; None: nothing is known.
+        has_baseline: the length of that pose is known.
+        text: where it is from, for people.
     """
 
     rig: Rig | None = None
-    geometry: RectifiedGeometry | None = None
+    has_baseline: bool = True
     text: str = "nothing is known of the cameras"
 
 
@@ -47,56 +54,222 @@ class PreparedPair:
     """A pair that can be matched.
 
     Attributes:
-        plan: how it was rectified; None where the photographs came so and no rig is known.
+        plan: how it was rectified; None where the photographs came so and nothing is known of their cameras.
         matches: sparse, of the rectified pictures.
+        misalignment: of the rig against its calibration; None where that is unknown or too little matches.
     """
 
     pair: RectifiedPair
     plan: Rectification | None
     matches: PairMatches
+    misalignment: Misalignment | None
     report: RectificationReport
 
 
+@dataclass(frozen=True)
+class _Draft:
+    """A pair as one plan makes it."""
+
+    pair: RectifiedPair
+    plan: Rectification | None
+    matches: PairMatches
+    rows: RowsReport | None
+
+
+@dataclass(frozen=True)
+class PrepareOptions:
+    """How much is done to a pair.
+
+    Attributes:
+        is_cropped: negative disparities are meant: nothing is said of them.
+        corrects: a rig that has turned since its calibration is corrected.
+    """
+
+    is_cropped: bool = False
+    corrects: bool = True
+
+
 def prepare_pair(
-    left: Pixels, right: Pixels, cameras: PairCameras, names: tuple[str, str], *, is_cropped: bool = False
+    left: Pixels, right: Pixels, cameras: PairCameras, names: tuple[str, str], options: PrepareOptions | None = None
 ) -> PreparedPair:
     """Rectify two photographs, and look for what is wrong with them.
 
     Args:
         left, right: (H, W) or (H, W, 3).
         names: of the photographs, for messages.
-        is_cropped: negative disparities are meant: nothing is said of them.
 
     Raises:
-        InputError: one photograph twice, one without any contrast, sizes that do not fit, cameras that cannot be
-            rectified, or left and right in the wrong order.
+        InputError: one photograph twice, one without any contrast, cameras that cannot be rectified or are not those of
+            the photographs, photographs that share too little, or left and right in the wrong order.
     """
+    options = options or PrepareOptions()
     _check_pictures(left, right, names)
-    is_swapped = False
-    if cameras.rig is not None and _second_is_left(cameras.rig):
-        # the calibration says so: it is obeyed, and said
-        left, right, is_swapped = right, left, True
-        cameras = replace(cameras, rig=_other_way_round(cameras.rig))
-    plan = None
-    if cameras.rig is not None:
-        plan = plan_rectification(cameras.rig)
-        pair = rectify(plan, left, right)
-    else:
-        if left.shape[:2] != right.shape[:2]:
-            raise InputError(
-                f"{names[1]}: expected {left.shape[1]} x {left.shape[0]} pixels, as {names[0]} has, found "
-                f"{right.shape[1]} x {right.shape[0]}",
-                "pictures of a rectified pair have one size; for others give --camera with the calibration of both",
-            )
-        everywhere = np.ones(left.shape[:2], np.bool_)
-        pair = RectifiedPair(left, right, everywhere, everywhere, cameras.geometry)
-    matches = match_pictures(pair.left, pair.right, pair.left_shown, pair.right_shown)
     warnings: list[str] = []
-    rows = rows_of(matches, pair.left.shape[0])
-    _check_rows(rows, cameras, warnings)
-    if not is_cropped:
-        _check_order(matches, pair, rows, names, warnings)
-    return PreparedPair(pair, plan, matches, _report(pair, plan, cameras, rows, is_swapped, warnings))
+    is_swapped, is_projective = False, False
+    if cameras.rig is None:
+        draft, cameras = _without_calibration(left, right, cameras, names, warnings)
+        is_projective = draft.plan is not None
+    else:
+        if _second_is_left(cameras.rig):
+            # the calibration says so: it is obeyed, and said
+            left, right, is_swapped = right, left, True
+            cameras = replace(cameras, rig=_other_way_round(cameras.rig))
+        draft = _drafted(left, right, _needed(cameras.rig))
+    misalignment = None
+    is_corrected = False
+    if draft.plan is not None and not is_projective:
+        _check_rows(draft, (left, right), cameras, warnings)
+        misalignment = _misalignment(draft)
+        if misalignment is not None and options.corrects:
+            draft, is_corrected = _corrected(draft, misalignment, (left, right), warnings)
+    if not options.is_cropped:
+        _check_order(draft, names, warnings)
+    pair = draft.pair
+    if pair.geometry is not None and not cameras.has_baseline:
+        pair = replace(pair, geometry=None if is_projective else replace(pair.geometry, baseline=None, unit=""))
+    report = _report(pair, draft, cameras, is_swapped, warnings)
+    if misalignment is not None:
+        report = replace(report, misalignment=misalignment_report(misalignment, is_corrected))
+    return PreparedPair(pair, draft.plan, draft.matches, misalignment, report)
+
+
+def _needed(rig: Rig | None) -> Rig:
+    assert rig is not None
+    return rig
+
+
+def _drafted(left: Pixels, right: Pixels, rig: Rig | None) -> _Draft:
+    """The pair as a rig makes it; None: as it is."""
+    if rig is None:
+        everywhere = np.ones(left.shape[:2], np.bool_)
+        plan, pair = None, RectifiedPair(left, right, everywhere, everywhere)
+    else:
+        plan = plan_rectification(rig)
+        pair = rectify(plan, left, right)
+    matches = match_pictures(pair.left, pair.right, pair.left_shown, pair.right_shown)
+    return _Draft(pair, plan, matches, rows_of(matches, pair.left.shape[0]))
+
+
+def _without_calibration(
+    left: Pixels, right: Pixels, cameras: PairCameras, names: tuple[str, str], warnings: list[str]
+) -> tuple[_Draft, PairCameras]:
+    """Photographs of which nothing is known: taken as they are where their rows agree, rectified by their matches where
+    they do not."""
+    told = ""
+    if left.shape[:2] == right.shape[:2]:
+        draft = _drafted(left, right, None)
+        if draft.rows is None:
+            warnings.append("too little of one photograph is found again in the other to tell whether rows agree")
+            return draft, cameras
+        if not _are_off(draft.rows):
+            return draft, replace(cameras, has_baseline=False, text=f"{cameras.text}: their rows agree as they are")
+        matches, told = draft.matches, f"their rows differ by {draft.rows.rms_px:.1f} px"
+    else:
+        matches = match_pictures(left, right)
+        told = f"{names[0]} and {names[1]} have different sizes"
+    sizes = (left.shape[1], left.shape[0]), (right.shape[1], right.shape[0])
+    found = rig_from_matches(matches, sizes)
+    if _second_is_left(found.rig):
+        raise InputError(
+            f"{names[0]}, {names[1]}: the second photograph was taken to the left of the first: left and right are "
+            "swapped",
+            "give them the other way round",
+        )
+    focals = [camera.focal for camera in found.rig.cameras]
+    warnings.append(
+        f"the photographs are not rectified ({told}): rectified by {int(found.is_inlier.sum())} matches alone, as if "
+        f"their focal lengths were {focals[0]:.0f} and {focals[1]:.0f} px. Depths are up to a projective "
+        "transformation; --camera with the calibration of both makes them metric"
+    )
+    draft = _drafted(left, right, found.rig)
+    if draft.rows is None or _are_off(draft.rows):
+        rows = "too few" if draft.rows is None else f"rows differ by {draft.rows.rms_px:.1f} px"
+        warnings.append(f"rows of the pair do not agree after that either ({rows}): a lens bends them, or things moved")
+    return draft, replace(cameras, has_baseline=False, text="matches of the photographs alone")
+
+
+def _misalignment(draft: _Draft) -> Misalignment | None:
+    assert draft.pair.geometry is not None
+    gray = gray_of(draft.pair.left), gray_of(draft.pair.right)
+    return measure_misalignment(aligned_matches(*gray, draft.matches), draft.pair.geometry)
+
+
+def _corrected(
+    draft: _Draft, found: Misalignment, photographs: tuple[Pixels, Pixels], warnings: list[str]
+) -> tuple[_Draft, bool]:
+    """The pair with its rig as matches say it is, where they say so and rows agree better for it."""
+    if not found.is_significant or draft.plan is None:
+        return draft, False
+    turn, sigma = float(np.linalg.norm(found.turn_deg)), float(np.linalg.norm(found.sigma_deg[:3]))
+    text = f"matches say that the right camera is turned by {turn:.3f} +- {sigma:.3f} degrees against the calibration"
+    if found.is_foreign:
+        warnings.append(f"{text}: that is not corrected, for it is more than any rig drifts")
+        return draft, False
+    after = _drafted(*photographs, corrected_rig(draft.plan, found)) if found.is_turn else _with_rows(draft, found)
+    if after.rows is None or draft.rows is None or after.rows.rms_px > draft.rows.rms_px:
+        warnings.append(f"{text}, but rows do not agree better for it: not corrected")
+        return draft, False
+    geometry = after.pair.geometry
+    assert geometry is not None
+    if not found.is_turn:
+        warnings.append(
+            f"rows differ as if the right camera were turned by {found.turn_deg[1]:+.2f} degrees about the vertical, "
+            "more than a rig drifts: the lens or the rectification is not that of the calibration. Rows are brought "
+            f"together ({found.rms_px[0]:.2f} px, now {after.rows.rms_px:.2f}), disparities are left as they are"
+        )
+        return after, True
+    # what is left of a turn about the vertical moves all disparities alike
+    covariance = np.zeros((3, 3)) if geometry.covariance is None else geometry.covariance.copy()
+    covariance[2, 2] += (geometry.focal * np.radians(found.sigma_deg[1])) ** 2
+    shift = geometry.focal * np.radians(abs(float(found.turn_deg[1])))
+    warnings.append(
+        f"{text}: corrected. Rows differed by {found.rms_px[0]:.3f} px, now by {found.rms_px[1]:.3f}; disparities were "
+        f"off by {shift:.2f} px"
+        + ("" if found.is_told[1] else f" at most {geometry.focal * np.radians(3 * found.sigma_deg[1]):.2f}")
+    )
+    return replace(after, pair=replace(after.pair, geometry=replace(geometry, covariance=covariance))), True
+
+
+def _with_rows(draft: _Draft, found: Misalignment) -> _Draft:
+    """The pair with rows of the right picture moved to where those of the left one are, along columns alone."""
+    pair, geometry = draft.pair, draft.pair.geometry
+    assert geometry is not None
+    rows = found.source_rows(geometry)
+
+    def find(xy: Array) -> Array:
+        column, row = (np.clip(np.floor(xy).astype(np.int64), 0, (geometry.width - 1, geometry.height - 1))).T
+        return np.stack([xy[:, 0], rows[row, column] + xy[:, 1] - row - 0.5], 1)
+
+    layers = pair.right if pair.right.ndim == 3 else pair.right[..., None]
+    right, shown = np.zeros_like(layers), np.zeros(pair.right_shown.shape, np.bool_)
+    for tile in resampled(layers, find, (0, 0, geometry.width, geometry.height)):
+        place = tile.rows, tile.columns
+        right[place] = np.clip(np.rint(tile.values), 0, 255).astype(np.uint8)
+        shown[place] = tile.cover > _COVERED
+    shown &= pair.right_shown
+    after = replace(pair, right=right.reshape(pair.right.shape), right_shown=shown)
+    matches = match_pictures(after.left, after.right, after.left_shown, after.right_shown)
+    return _Draft(after, draft.plan, matches, rows_of(matches, geometry.height))
+
+
+def corrected_rig(plan: Rectification, found: Misalignment) -> Rig:
+    """The rig of a plan, its second camera where the misalignment of the rectified pair puts it."""
+    baseline = float(np.linalg.norm(plan.rig.cam_from_rig[1, 4:]))
+    pose = found.right_from_left(baseline)
+    right_from_rectified = plan.right_from_camera.T
+    rotation = right_from_rectified @ rigid3.rotation_matrix(pose) @ plan.left_from_camera
+    second = rigid3.from_matrix(rotation, right_from_rectified @ pose[4:])
+    return Rig(plan.rig.cameras, np.array([rigid3.IDENTITY, second]))
+
+
+def misalignment_report(found: Misalignment, is_corrected: bool) -> MisalignmentReport:
+    """It in plain numbers."""
+    return MisalignmentReport(
+        turn_deg=found.turn_deg.tolist(), direction_deg=found.direction_deg.tolist(),
+        sigma_deg=found.sigma_deg.tolist(),
+        is_told=found.is_told.tolist(), is_significant=found.is_significant, is_corrected=is_corrected,
+        num_matches=found.num_matches, rms_before_px=found.rms_px[0], rms_after_px=found.rms_px[1],
+    )  # fmt: skip
 
 
 def rows_of(matches: PairMatches, height: int) -> RowsReport | None:
@@ -132,24 +305,47 @@ def _other_way_round(rig: Rig) -> Rig:
     return Rig(rig.cameras[::-1], np.array([rigid3.IDENTITY, rigid3.inverse(rig.cam_from_rig[1])]))
 
 
-def _check_rows(rows: RowsReport | None, cameras: PairCameras, warnings: list[str]) -> None:
+def _are_off(rows: RowsReport) -> bool:
+    return abs(rows.median_px) > _ROWS_OFF_PX or rows.rms_px > _ROWS_OFF_PX
+
+
+def _check_rows(draft: _Draft, photographs: tuple[Pixels, Pixels], cameras: PairCameras, warnings: list[str]) -> None:
+    """Name rows that do not agree; refuse a calibration that takes rows apart which agreed before."""
+    rows = draft.rows
+    if rows is not None and not _are_off(rows):
+        return
+    text = "too little is found in both" if rows is None else f"rows differ by {rows.rms_px:.2f} px"
+    left, right = photographs
+    if draft.plan is not None and not draft.plan.is_identity and left.shape == right.shape:
+        as_they_are = _drafted(left, right, None).rows
+        if as_they_are is not None and not _are_off(as_they_are):
+            raise InputError(
+                f"{cameras.text}: of the photographs as they are rows agree to {as_they_are.rms_px:.2f} px, but "
+                f"rectified by this calibration {text}: they are rectified already",
+                "give the calibration of the rectified pair (P1 and P2, or Middlebury's calib.txt), or --focal and "
+                "--baseline",
+            )
     if rows is None:
         warnings.append("too little of one photograph is found again in the other to tell whether rows agree")
-    elif abs(rows.median_px) > _ROWS_OFF_PX or rows.rms_px > _ROWS_OFF_PX:
-        remedy = "the calibration is not of these photographs, or they are rectified already"
-        if cameras.rig is None:
-            remedy = "the photographs are not rectified: give --camera with the calibration of both"
-        warnings.append(f"rows of the pair differ by {rows.rms_px:.2f} px (median {rows.median_px:+.2f} px): {remedy}")
+    elif draft.plan is not None and draft.plan.is_identity:
+        warnings.append(
+            f"{text} (median {rows.median_px:+.2f} px): the photographs are not rectified, as the calibration says. "
+            "Give that of the cameras before rectification"
+        )
+    else:
+        warnings.append(
+            f"{text} (median {rows.median_px:+.2f} px): the calibration is not of these photographs, or they moved"
+        )
 
 
-def _check_order(
-    matches: PairMatches, pair: RectifiedPair, rows: RowsReport | None, names: tuple[str, str], warnings: list[str]
-) -> None:
+def _check_order(draft: _Draft, names: tuple[str, str], warnings: list[str]) -> None:
     """Refuse pictures in the wrong order, whose matches lie beyond infinity, and would not the other way round."""
+    rows, geometry = draft.rows, draft.pair.geometry
     if rows is None:
         return
+    matches = draft.matches
     found = matches.disparities[np.abs(matches.row_differences - rows.median_px) < max(3.0 * rows.rms_px, 2.0)]
-    doffs = 0.0 if pair.geometry is None else pair.geometry.doffs
+    doffs = 0.0 if geometry is None else geometry.doffs
     beyond, beyond_swapped = float((found < -doffs - 1.0).mean()), float((found > doffs + 1.0).mean())
     if beyond < _SOME_BEYOND:
         return
@@ -161,16 +357,15 @@ def _check_order(
             "give them the other way round; of pictures that were cropped so, give --min-disparity",
         )
     remedy = "they were cropped, or their cameras converge: --focal and --doffs say where infinity is"
-    if pair.geometry is not None:
+    if geometry is not None:
         remedy = "the calibration is of other photographs, or doffs is wrong"
     warnings.append(f"{text} than a point at infinity does: {remedy}")
 
 
 def _report(
-    pair: RectifiedPair, plan: Rectification | None, cameras: PairCameras, rows: RowsReport | None, is_swapped: bool,
-    warnings: list[str],
-) -> RectificationReport:  # fmt: skip
-    g = pair.geometry
+    pair: RectifiedPair, draft: _Draft, cameras: PairCameras, is_swapped: bool, warnings: list[str]
+) -> RectificationReport:
+    g, plan = pair.geometry, draft.plan
     both = (1.0, 1.0)
     return RectificationReport(
         cameras=cameras.text, width=pair.left.shape[1], height=pair.left.shape[0],
@@ -178,6 +373,6 @@ def _report(
         doffs_px=None if g is None else g.doffs, baseline=None if g is None else g.baseline,
         unit="" if g is None else g.unit, is_as_given=plan is None or plan.is_identity, is_swapped=is_swapped,
         is_turned=plan is not None and plan.is_turned, kept=both if plan is None else plan.kept,
-        scale=both if plan is None else plan.scale, turn_deg=(0.0, 0.0) if plan is None else plan.turn_deg, rows=rows,
-        warnings=warnings,
+        scale=both if plan is None else plan.scale, turn_deg=(0.0, 0.0) if plan is None else plan.turn_deg,
+        rows=draft.rows, warnings=warnings,
     )  # fmt: skip

@@ -21,6 +21,28 @@ class RowsReport(Report):
     rms_px: float
 
 
+class MisalignmentReport(Report):
+    """How far the right camera has turned since the calibration, in the rectified frame: x along the baseline, y down,
+    z forward.
+
+    Attributes:
+        turn_deg: (3) rotation vector. direction_deg: (2) of the baseline along y and z. sigma_deg: (5) of these.
+        is_told: (5) by the pair; the others are held at the calibration's.
+        is_significant: the calibration does not hold. is_corrected: that was used.
+        num_matches: that it rests on. rms_before_px, rms_after_px: of y_left - y_right of them.
+    """
+
+    turn_deg: Sequence[float]
+    direction_deg: Sequence[float]
+    sigma_deg: Sequence[float]
+    is_told: Sequence[bool]
+    is_significant: bool
+    is_corrected: bool
+    num_matches: int
+    rms_before_px: float
+    rms_after_px: float
+
+
 class RectificationReport(Report):
     """How two photographs became a pair whose rows are epipolar lines.
 
@@ -36,6 +58,7 @@ class RectificationReport(Report):
         kept: share of each photograph that is kept. scale: pixels of the result to one of the photograph, along a side.
         turn_deg: how far the axis of each camera turns.
         rows: how well rows agree; absent where too little matches.
+        misalignment: of the rig against its calibration; absent without one.
         warnings: what is wrong, or may be.
     """
 
@@ -55,6 +78,7 @@ class RectificationReport(Report):
     scale: tuple[float, float]
     turn_deg: tuple[float, float]
     rows: RowsReport | None = None
+    misalignment: MisalignmentReport | None = None
     warnings: Sequence[str]
 
 

@@ -16,10 +16,6 @@ Array = NDArray[np.float64]
 
 # enough for a range and an alignment; SIFT takes half a CPU second a picture at this size
 _NUM_FEATURES, _SIZE_PX = 3000, 1600
-# a Lucas-Kanade window of this side, as much of two octaves of pyramid as the keypoint's own error needs
-_WINDOW_PX, _LEVELS, _ROUNDS, _STEP_PX = 21, 1, 30, 0.005
-# a window whose pixels differ so much in the mean, grey levels, is another place; a step farther than this too
-_WORST_DIFFERENCE, _FARTHEST_PX = 20.0, 4.0
 
 
 @dataclass(frozen=True)
@@ -78,26 +74,3 @@ def _picture(pixels: NDArray[np.uint8], shown: NDArray[np.bool_] | None) -> Pict
 
     rgb = np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels
     return Picture(rgb, gray_of(pixels), None if shown is None or shown.all() else shown)
-
-
-def refined_matches(left: NDArray[np.uint8], right: NDArray[np.uint8], matches: PairMatches) -> PairMatches:
-    """Matches whose right ends are moved to where a window about the left one fits best (Lucas and Kanade 1981, in
-    OpenCV's pyramid), a tenth of a keypoint's error; those that go astray are dropped.
-
-    Args:
-        left, right: (H, W) uint8 grey pictures that differ by little more than disparities.
-    """
-    import cv2
-
-    if not len(matches):
-        return matches
-    start = (matches.right - 0.5).astype(np.float32).reshape(-1, 1, 2)
-    moved, is_found, difference = cv2.calcOpticalFlowPyrLK(
-        left, right, (matches.left - 0.5).astype(np.float32).reshape(-1, 1, 2), start.copy(),
-        winSize=(_WINDOW_PX, _WINDOW_PX), maxLevel=_LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ROUNDS, _STEP_PX),
-    )  # fmt: skip
-    right_ends = moved.reshape(-1, 2).astype(np.float64) + 0.5
-    kept = (is_found.ravel() == 1) & (difference.ravel() < _WORST_DIFFERENCE)
-    kept &= np.hypot(*(right_ends - matches.right).T) < _FARTHEST_PX
-    return PairMatches(matches.left[kept], right_ends[kept])

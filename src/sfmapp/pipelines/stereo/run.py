@@ -20,7 +20,7 @@ from sfmapp.report.stereo_html import stereo_page
 from sfmapp.reporting import NamedReason
 from sfmapp.stereo.match import match_pair
 from sfmapp.stereo.measured import MeasuredPair, measure_pair, report_of
-from sfmapp.stereo.prepare import PreparedPair, prepare_pair
+from sfmapp.stereo.prepare import PreparedPair, PrepareOptions, prepare_pair
 from sfmapp.stereo.report import DisparityReport, StereoPairReport
 from sfmapp.stereo.result import DisparityMap, PixelState
 from sfmapp.viewer.stereo_recording import record_stereo
@@ -108,9 +108,8 @@ def _do_pair(job: Job, source: PairSource) -> tuple[MatchedStereo, StereoPairRep
     with job.stage("rectification"):
         left, right = source.read()
         least = job.options.stereo.min_disparity
-        prepared = prepare_pair(
-            left, right, source.cameras(), (source.left, source.right), is_cropped=least is not None and least < 0
-        )
+        how = PrepareOptions(is_cropped=least is not None and least < 0, corrects=job.options.stereo.correct_rig)
+        prepared = prepare_pair(left, right, source.cameras(), (source.left, source.right), how)
         for warning in prepared.report.warnings:
             job.events.warned(STAGE, warning)
     with job.stage("matching"):

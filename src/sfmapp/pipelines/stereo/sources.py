@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera
+from sfmapp.camera.names import CameraModel
 from sfmapp.camera_files.opencv_lens import exact_camera
 from sfmapp.camera_files.reading import Calibration, kitti_calibration, read_calibration
 from sfmapp.errors import InputError, UsageError
+from sfmapp.geometry import rigid3
 from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import read_rgb
 from sfmapp.pipelines.calibration.known_points import describe_photograph
@@ -21,7 +23,6 @@ from sfmapp.scene.rig import Rig
 from sfmapp.sequences.files import list_images
 from sfmapp.sequences.kitti import is_kitti
 from sfmapp.stereo.prepare import PairCameras
-from sfmapp.stereo.result import RectifiedGeometry
 
 Pixels = NDArray[np.uint8]
 Size = tuple[int, int]
@@ -170,10 +171,15 @@ def cameras_of(known: KnownCameras, sizes: tuple[Size, Size]) -> PairCameras:
     if known.focal_px is None:
         return PairCameras()
     width, height = sizes[0]
-    geometry = RectifiedGeometry(
-        width, height, known.focal_px, 0.5 * width, 0.5 * height, known.doffs_px or 0.0, known.baseline_m, "m"
+    centers = 0.5 * width, 0.5 * width + (known.doffs_px or 0.0)
+    cameras = tuple(
+        Camera(CameraModel.PINHOLE, width, height, np.array([known.focal_px, known.focal_px, cx, 0.5 * height]))
+        for cx in centers
     )
-    return PairCameras(geometry=geometry, text=f"focal length {known.focal_px:g} px, rectified, as given")
+    pose = np.array([0.0, 0.0, 0.0, 1.0, -(known.baseline_m or 1.0), 0.0, 0.0])
+    rig = Rig(cameras, np.array([rigid3.IDENTITY, pose]))
+    text = f"focal length {known.focal_px:g} px, rectified, as given"
+    return PairCameras(rig, known.baseline_m is not None, text)
 
 
 def _of_calibration(found: Calibration, place: str) -> PairCameras:
