@@ -191,6 +191,34 @@ def test_noise_is_measured() -> None:
     assert kernels.noise_of(np.full((50, 50), 7, np.uint8), counts) < 0.1
 
 
+def test_scatter_is_evened_out_and_planes_and_edges_stay() -> None:
+    rng = np.random.default_rng(8)
+    x, y = np.meshgrid(np.arange(60), np.arange(40))
+    plane = (20 + 0.6 * x - 0.3 * y).astype(np.float32)
+    plane[:, 30:] += 9
+    plane[10, 10] = np.nan
+    exact = plane.copy()
+    kernels.even_out(exact, np.empty_like(exact))
+    # across the edge a pair is taken for the two surfaces that it is on
+    assert np.allclose(exact, plane, atol=1e-4, equal_nan=True)
+    noisy = plane + rng.normal(0, 0.2, plane.shape).astype(np.float32)
+    evened = noisy.copy()
+    kernels.even_out(evened, np.empty_like(evened))
+    left = np.nanstd((evened - plane)[4:-4, 4:-4]) / 0.2
+    # 5 x 5 equal weights would leave a fifth
+    assert 0.2 < left < 0.35
+
+
+def test_where_nothing_is_to_be_seen_nothing_is_told() -> None:
+    x = np.arange(220)[None] + np.zeros((110, 1))
+    left, right = _pair_of(10 + 0.02 * x)
+    left[20:80, 60:160] = right[20:80, 50:150] = 255
+    found = _match(left, right, (0, 40))
+    blank = found.state == PixelState.UNKNOWN
+    assert blank[33:67, 73:147].mean() > 0.99
+    assert blank[:, 20:45].mean() < 0.05
+
+
 def test_bad_input_is_named() -> None:
     with pytest.raises(UsageError, match="0 disparities"):
         Matcher(100, 100, (0, 0))

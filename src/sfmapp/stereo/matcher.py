@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 from sfmapp.errors import UsageError
 from sfmapp.stereo.options import StereoOptions
 from sfmapp.stereo.result import DisparityMap, PixelState, RectifiedPair
-from sfmapp.stereo.semiglobal import LEAST_UNIQUENESS, Level
-from sfmapp.stereo.semiglobal_kernels import collect, report
+from sfmapp.stereo.semiglobal import BLANK_WINDOW, LEAST_UNIQUENESS, Level
+from sfmapp.stereo.semiglobal_kernels import collect, even_out, report
 
+# mean difference in grey from the blurred picture, about a pixel, below which there is nothing to match: a saturated
+# sky. Noise of a quarter of a grey value, the least there is after rounding, shows more
+BLANK = 0.1
 # islands of fewer pixels, whose disparities differ by more than one from all around them, are dropped
 LEAST_ISLAND, ISLAND_STEP_PX = 100, 1
 
@@ -50,6 +53,7 @@ class Matcher:
         self._grey = np.empty((2, height, width), np.uint8)
         self._kept = np.empty((height, width), np.int16)
         self._disparity, self._state = np.empty((height, width), np.float32), np.empty((height, width), np.uint8)
+        self._scratch = np.empty((height, width), np.float32)
         self._measures = np.empty((3, height, width), np.float32)
 
     def __enter__(self) -> Matcher:
@@ -78,9 +82,10 @@ class Matcher:
         """
         left, right = self._gray(left, 0), self._gray(right, 1)
         found = self._level.match(left, right, self._tolerance, self._pool)
-        collect(found, LEAST_UNIQUENESS, self._kept)
+        collect(found, LEAST_UNIQUENESS, self._level.wide_texture, BLANK * BLANK_WINDOW**2, self._kept)
         cv2.filterSpeckles(self._kept, -32768, LEAST_ISLAND, 16 * ISLAND_STEP_PX)
         report(found, self._kept, self._disparity, self._state, self._measures)
+        even_out(self._disparity, self._scratch)
         first, count = self.search
         cost, curvature, uniqueness = self._measures
         return DisparityMap(

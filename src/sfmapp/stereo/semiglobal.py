@@ -50,6 +50,8 @@ PLAIN, LEAST_NOISE, PLAIN_WINDOW = 0.75, 0.67, 7
 # 1 - best / second below which a disparity is not believed: at 0.2 no set of the benchmark is left with fewer than
 # StereoSGBM answers, and bad-1 is 10 % lower than without
 LEAST_UNIQUENESS = 0.2
+# side of the window in which a picture that shows nothing is not matched; what is narrower its surroundings tell
+BLANK_WINDOW = 21
 # the sides of what is left after so many halvings
 LEAST_SIDE = 48
 # rows of a strip, and those below it in which paths from below begin
@@ -101,7 +103,9 @@ class Level:
         self.margin = LANES + max(0, -first, first + count)
         padded = (2, height + 2 * _PAD, width + 2 * _PAD)
         self.padded, self.blurred = np.empty(padded, np.uint8), np.empty(padded, np.uint8)
-        self.texture = np.empty(padded[1:], np.uint8), np.empty(padded[1:], np.uint16)
+        self.fine, self.summed = np.empty(padded[1:], np.uint8), np.empty(padded, np.uint16)
+        # sums of differences from the blurred picture, over a small and over a large window
+        self.texture, self.wide_texture = self.summed[:, _PAD:-_PAD, _PAD:-_PAD]
         self.counts = np.empty(2048, np.int64)
         self.words = np.empty(shape, np.uint64)
         right = np.zeros((height, width + 2 * self.margin), np.uint64)
@@ -138,6 +142,9 @@ class Level:
         views, rows, height = self.views, self.rows, self.views.grey.shape[0]
         both(pool, partial(self._transform, 0, left, views.left), partial(self._transform_right, right))
         np.copyto(views.grey, left)
+        cv2.absdiff(self.padded[0], self.blurred[0], dst=self.fine)
+        for side, sums in zip((PLAIN_WINDOW, BLANK_WINDOW), self.summed, strict=True):
+            cv2.boxFilter(self.fine, cv2.CV_16U, (side, side), dst=sums, normalize=False)
         if self.coarse is not None:
             self._look_again(self.coarse, left, right, tolerance, pool)
         done, unseen = 0, np.uint8(UNSEEN)
@@ -177,12 +184,8 @@ class Level:
         for image, small in zip((left, right), self.smaller, strict=True):
             cv2.resize(image, (width, height), dst=small, interpolation=cv2.INTER_AREA)
         found = coarse.match(self.smaller[0], self.smaller[1], tolerance, pool)
-        side = PLAIN_WINDOW
-        cv2.absdiff(self.padded[0], self.blurred[0], dst=self.texture[0])
-        cv2.boxFilter(self.texture[0], cv2.CV_16U, (side, side), dst=self.texture[1], normalize=False)
-        plain = side * side * PLAIN * max(noise_of(left, self.counts), LEAST_NOISE)
-        inner = self.texture[1][_PAD:-_PAD, _PAD:-_PAD]
-        look_again(found, LEAST_UNIQUENESS, inner, plain, self.search, self.views.base, self.views.expected)
+        plain = PLAIN * max(noise_of(left, self.counts), LEAST_NOISE) * PLAIN_WINDOW**2
+        look_again(found, LEAST_UNIQUENESS, self.texture, plain, self.search, self.views.base, self.views.expected)
 
 
 def both(pool: Executor | None, one: Callable[[], None], other: Callable[[], None]) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.simd import u8x64 as u8
-from sfmapp.simd.pointers import Index, Pointer, pointer
+from sfmapp.simd.pointers import Index, Pointer, offset, pointer
 
 LANES = u8.WIDTH
 GAP = 32
@@ -29,6 +29,8 @@ MOST_SHIFT = GAP - 2
 # what leads out of the right picture costs at most so many times what the best in it does: where there is nothing to
 # tell disparities apart by, that they lead into the picture speaks for none of them
 UNSEEN_OVER_SEEN = 3
+# the mean of two pixels on opposite sides of one is of its surface where it is off by less
+SAME_SURFACE_PX = 1.0
 # disparities that are looked at beyond those of half the resolution
 ROOM = 4
 # at the beginning of a path
@@ -342,22 +344,18 @@ def look_again(
     height, width = base.shape
     rows, columns = coarse.disparity.shape
     first, count = search
-    for y in range(height):
-        v = min(y // 2, rows - 1)
-        for x in range(width):
-            u = min(x // 2, columns - 1)
-            if x % 2 == 1 and u == x // 2:
-                start = int(base[y, x - 1])
-            elif count <= LANES:
-                start = first
-            else:
-                start = _start_of_search(coarse.disparity, v, u)
-                start = min(max(start, first), first + count - LANES)
-            base[y, x] = np.int16(start)
+    for v in range(rows):
+        for u in range(columns):
+            start = first
+            if count > LANES:
+                start = min(max(_start_of_search(coarse.disparity, v, u), first), first + count - LANES)
             lane = np.int64(np.rint(2 * coarse.disparity[v, u])) - start
-            wanted = texture[y, x] < plain and lane >= 0 and lane < LANES
-            wanted = wanted and coarse.agrees[v, u] > 0 and _uniqueness(coarse, v, u) >= least
-            expected[y, x] = np.uint8(lane if wanted else LANES)
+            sure = coarse.agrees[v, u] > 0 and _uniqueness(coarse, v, u) >= least
+            sure = sure and lane >= 0 and lane < LANES
+            for y in range(2 * v, min(2 * v + 2, height)):
+                for x in range(2 * u, min(2 * u + 2, width)):
+                    base[y, x] = np.int16(start)
+                    expected[y, x] = np.uint8(lane if sure and texture[y, x] < plain else LANES)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -377,13 +375,55 @@ def _start_of_search(disparity: Floats, v: Index, u: Index) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def collect(found: Found, least: float, out: Ints) -> None:
-    """Sixteenths of disparities (H, W) int16 that both views tell and whose uniqueness is not below ``least``."""
+def collect(found: Found, least: float, texture: NDArray[np.uint16], blank: float, out: Ints) -> None:
+    """Sixteenths of disparities (H, W) int16 that both views tell, whose uniqueness is not below ``least``, and whose
+    ``texture`` (H, W) is not below ``blank``; -32768 for others."""
     height, width = out.shape
     for y in range(height):
         for x in range(width):
-            sure = found.agrees[y, x] > 0 and _uniqueness(found, y, x) >= least
+            sure = found.agrees[y, x] > 0 and texture[y, x] >= blank and _uniqueness(found, y, x) >= least
             out[y, x] = np.int16(np.rint(16 * found.disparity[y, x])) if sure else np.int16(-32768)
+
+
+@numba.njit(cache=True, nogil=True)
+def _even_out(values: Pointer, width: Index, step: Index, first: Index, last: Index, out: Pointer) -> None:
+    """A row of means of values and of pairs on opposite sides, one or two ``step`` away, in columns first to last - 1.
+
+    A slanted plane stays as it is, as the mean of a pair is its value in the middle; a pair whose mean is more than
+    SAME_SURFACE_PX off is of more than one surface, and does not count.
+    """
+    for x in range(first, last):
+        own = values[x]
+        total, weights = own, np.float32(1.0)
+        for n in range(1, 3):
+            before, behind = values[x - n * step], values[x + n * step]
+            mean = np.float32(0.5) * (before + behind)
+            off = (mean - own) / np.float32(SAME_SURFACE_PX)
+            weight = np.float32(1.0) - off * off
+            one = abs(behind - before) < np.float32(2.0 * n) and weight > np.float32(0.0)
+            total += weight * mean if one else np.float32(0.0)
+            weights += weight if one else np.float32(0.0)
+        out[x] = total / weights
+
+
+@numba.njit(cache=True, nogil=True)
+def even_out(disparity: Floats, scratch: Floats) -> None:
+    """Take the scatter out of (H, W) disparities, along rows and then down columns; NaN stays NaN.
+
+    Pairs that are on opposite sides of a pixel and lie on its surface are averaged with it.
+    """
+    height, width = disparity.shape
+    rows, between = pointer(disparity), pointer(scratch)
+    for y in range(height):
+        for x in range(width):
+            scratch[y, x] = disparity[y, x]
+        _even_out(offset(rows, y * width), width, 1, 2, width - 2, offset(between, y * width))
+    for y in range(height):
+        if y < 2 or y >= height - 2:
+            for x in range(width):
+                disparity[y, x] = scratch[y, x]
+        else:
+            _even_out(offset(between, y * width), width, width, 0, width, offset(rows, y * width))
 
 
 @numba.njit(cache=True, nogil=True)
