@@ -21,6 +21,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,35 +30,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from machine import RESULTS, describe_machine
+from sfmapp.stereo.checks import fill_holes
+from sfmapp.stereo.match import match_pair
+from sfmapp.stereo.options import StereoOptions
 from stereo_pairs import StereoSet, rendered_set, shared_sets, shots
 from stereo_peers import ELSEWHERE, OPENCV, run_elsewhere
 
 Disparity = NDArray[np.float32]
 
 ROUNDS = 3  # the least of their times counts
-
-
-def completed(disparity: Disparity) -> Disparity:
-    """Holes filled by the lesser disparity of the two beside them on their row, or else in their column."""
-    out = _row_fill(disparity)
-    empty = np.isnan(out)
-    return np.where(empty, _row_fill(out.T).T, out) if empty.any() else out
-
-
-def _row_fill(disparity: Disparity) -> Disparity:
-    height, width = disparity.shape
-    known, column = np.isfinite(disparity), np.arange(width)
-    before = np.maximum.accumulate(np.where(known, column, -1), axis=1)
-    behind = np.minimum.accumulate(np.where(known, column, width)[:, ::-1], axis=1)[:, ::-1]
-    padded = np.pad(disparity, ((0, 0), (1, 1)), constant_values=np.nan)
-    row = np.arange(height)[:, None]
-    return np.fmin(padded[row, before + 1], padded[row, behind + 1])
+OURS: dict[str, StereoOptions] = {
+    "sfmapp": StereoOptions(),
+    "sfmapp, filled": StereoOptions(fill=True),
+    "sfmapp window": StereoOptions(matcher="window"),
+    "sfmapp window, filled": StereoOptions(matcher="window", fill=True),
+    "sfmapp window, fixed": StereoOptions(matcher="window", windows="fixed"),
+    "sfmapp window, adaptive": StereoOptions(matcher="window", windows="adaptive"),
+    "sfmapp window, shiftable": StereoOptions(matcher="window", windows="shiftable"),
+    "sfmapp window, fixed, ZNCC": StereoOptions(matcher="window", windows="fixed", cost="zncc"),
+    "sfmapp window, fixed, SAD": StereoOptions(matcher="window", windows="fixed", cost="sad"),
+}
 
 
 def scores(disparity: Disparity, case: StereoSet) -> dict[str, float]:
     """Densities and errors of the module's docstring, shares in percent."""
     out: dict[str, float] = {}
-    full = completed(disparity)
+    full = fill_holes(disparity)
     for where, counted in (("visible", case.visible), ("all", np.isfinite(case.truth))):
         answered = counted & np.isfinite(disparity)
         error = np.abs(disparity - case.truth)[answered]
@@ -78,6 +76,8 @@ def _errors(error: Disparity, name: str) -> dict[str, float]:
 def matchers(peer_python: Path | None) -> dict[str, Callable[[StereoSet], tuple[Disparity, float]]]:
     """By name, what gives the disparities of a set and the CPU seconds that they took."""
     out: dict[str, Callable[[StereoSet], tuple[Disparity, float]]] = {}
+    for name, options in OURS.items():
+        out[name] = timed(lambda case, options=options: ours(case, options))
     for name, peer in OPENCV.items():
         out[name] = timed(lambda case, peer=peer: peer(case.pair.left, case.pair.right, case.search))
     if peer_python is not None:
@@ -86,6 +86,12 @@ def matchers(peer_python: Path | None) -> dict[str, Callable[[StereoSet], tuple[
                 peer_python, name, case.pair.left, case.pair.right, case.search
             )
     return out
+
+
+def ours(case: StereoSet, options: StereoOptions) -> Disparity:
+    """By one of our matchers, over the disparities that all search."""
+    least, num = case.search
+    return match_pair(case.pair, replace(options, min_disparity=least, num_disparities=num)).disparity
 
 
 def timed(run: Callable[[StereoSet], Disparity]) -> Callable[[StereoSet], tuple[Disparity, float]]:

@@ -12,12 +12,6 @@ stereo_pairs = pytest.importorskip("stereo_pairs")
 NAN = np.nan
 
 
-def test_holes_are_filled_by_the_farther_neighbour() -> None:
-    found = np.array([[NAN, 5, NAN, NAN, 3, NAN], [NAN] * 6], np.float32)
-    expected = [[5, 5, 3, 3, 3, 3]] * 2
-    np.testing.assert_array_equal(stereo.completed(found), expected)
-
-
 def test_what_is_nearer_covers_what_is_behind_it() -> None:
     # a strip at columns 6 and 7 moves by four and covers the wall, which moves by one, at columns 3 and 4
     truth = np.array([[1, 1, 1, 1, 1, 1, 4, 4, 1, NAN]], np.float32)

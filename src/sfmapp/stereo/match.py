@@ -12,9 +12,11 @@ from sfmapp.stereo.opencv_matchers import match_by_bm, match_by_sgbm
 from sfmapp.stereo.options import MatcherName, StereoOptions
 from sfmapp.stereo.result import DisparityMap, RectifiedPair
 from sfmapp.stereo.sparse_matches import PairMatches, match_pictures
+from sfmapp.stereo.windows import match_by_windows
 
 MATCHERS: dict[MatcherName, Callable[[RectifiedPair, StereoOptions, tuple[int, int]], DisparityMap]] = {
     "sgm": match_by_sgm,
+    "window": match_by_windows,
     "opencv-sgbm": match_by_sgbm,
     "opencv-bm": match_by_bm,
 }

@@ -8,7 +8,9 @@ from typing import Literal
 from sfmapp.errors import UsageError
 from sfmapp.option_checks import Range, check_options
 
-MatcherName = Literal["sgm", "opencv-sgbm", "opencv-bm"]
+MatcherName = Literal["sgm", "window", "opencv-sgbm", "opencv-bm"]
+CostName = Literal["census", "zncc", "sad", "ssd"]
+WindowsName = Literal["nested", "fixed", "adaptive", "shiftable"]
 
 
 @dataclass(frozen=True)
@@ -16,12 +18,15 @@ class StereoOptions:
     """Options of the stage ``stereo``.
 
     Attributes:
-        matcher: sgm is our semi-global matching; opencv-sgbm and opencv-bm are OpenCV's StereoSGBM and StereoBM.
+        matcher: sgm is our semi-global matching; window takes the best disparity of each pixel alone by windows about it;
+            opencv-sgbm and opencv-bm are OpenCV's StereoSGBM and StereoBM.
         min_disparity: Least disparity x_left - x_right that is looked for, pixels; may be negative. None: as sparse
             matches tell.
         num_disparities: How many from there on, pixels. None: as sparse matches tell.
-        window: Side of the matching window, pixels, odd; None: what is best for the matcher; sgm has
-            none.
+        cost: What two pixels of windows cost: bits of their census, 1 - ZNCC, absolute or squared differences.
+        windows: nested adds three windows of rising size, fixed has one, adaptive the best of several sizes for each
+            pixel, shiftable the best of nine places about it.
+        window: Side of the matching window, pixels, odd; None: what is best for the matcher; sgm has none.
         left_right_px: Disparities that differ by more when they are looked for from the other side are dropped, pixels.
         correct_rig: Where matches say that the cameras have turned since their calibration, rectify as they say.
         fill: Fill what only one camera sees from its neighbours, and mark it so.
@@ -30,6 +35,8 @@ class StereoOptions:
     matcher: MatcherName = "sgm"
     min_disparity: int | None = None
     num_disparities: int | None = None
+    cost: CostName = "census"
+    windows: WindowsName = "nested"
     window: int | None = None
     left_right_px: float = 1.0
     correct_rig: bool = True
