@@ -55,7 +55,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--doffs", metavar="PX", type=float, help="its principal points along x, right minus left; default: 0"
     )
     matching = parser.add_argument_group("matching")
-    matching.add_argument("--matcher", metavar="NAME", help="sgm, opencv-sgbm or opencv-bm; default: sgm")
+    matching.add_argument("--matcher", metavar="NAME", help="sgm, window, opencv-sgbm or opencv-bm; default: sgm")
     matching.add_argument(
         "--min-disparity", metavar="PX", help="least disparity looked for; default: as sparse matches tell"
     )

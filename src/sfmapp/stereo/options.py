@@ -18,8 +18,8 @@ class StereoOptions:
     """Options of the stage ``stereo``.
 
     Attributes:
-        matcher: sgm is our semi-global matching; window takes the best disparity of each pixel alone by windows about it;
-            opencv-sgbm and opencv-bm are OpenCV's StereoSGBM and StereoBM.
+        matcher: sgm is our semi-global matching; window takes the best disparity of each pixel alone by windows about
+            it; opencv-sgbm and opencv-bm are OpenCV's StereoSGBM and StereoBM.
         min_disparity: Least disparity x_left - x_right that is looked for, pixels; may be negative. None: as sparse
             matches tell.
         num_disparities: How many from there on, pixels. None: as sparse matches tell.
