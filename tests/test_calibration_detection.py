@@ -179,3 +179,16 @@ def test_crossings_are_measured_along_edges_that_a_camera_bends() -> None:
     np.testing.assert_allclose((oblique.curves[:, ::2] * across).sum(2), 0.0, atol=1e-9)
     behind = edge_course(pinhole, rigid3.from_matrix(np.eye(3), np.array([0.0, 0.0, -0.1])), view.xyz, window)
     np.testing.assert_array_equal(measured_along_edges(picture, view.xy, behind, window), view.xy)
+
+
+def test_a_board_of_odd_columns_and_even_rows_is_read_from_its_own_first_square() -> None:
+    """Read as a board of OpenCV before 4.6, or the other way round, all its markers but one in every other row are a
+    column aside: as flat a board, and in a rig another one in each photograph."""
+    board = parse_board("charuco:7x6:0.03:0.022")
+    for seed, (tilt_deg, shift) in enumerate(((10.0, 0.0), (30.0, 0.0), (-40.0, 0.0), (20.0, 0.17), (20.0, -0.17))):
+        pose = pose_of(board, tilt_deg, 0.32, shift)
+        picture = render_board(CAMERA, board, pose, blur_px=0.6, noise=2.0, seed=seed)
+        truth = project(CAMERA, rigid3.apply(pose, board.points))
+        found = detect_board(picture, board)
+        assert len(found.idx) == len(board.points) if shift == 0.0 else 6 <= len(found.idx) < len(board.points)
+        assert np.abs(found.xy - truth[found.idx]).max() < 0.3

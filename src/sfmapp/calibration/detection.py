@@ -236,10 +236,9 @@ def _charuco(gray: Pixels, board: Board) -> tuple[Ints, Array]:
     """Corners of squares, where the markers around have them."""
     num = (board.columns * board.rows + 1) // 2
     found = _markers(gray, board.dictionary, 1, num)
-    best: tuple[Ints, Array] = (np.zeros(0, np.int64), np.zeros((0, 2)))
-    best_error = np.inf
+    layouts = []
     # OpenCV's boards begin with a dark square; those of before 4.6 with a light one where rows are even
-    for first in {0, board.rows % 2 ^ 1}:
+    for first in range(2 - board.rows % 2):
         places = [(c, r) for r in range(board.rows) for c in range(board.columns) if (r + c + first) % 2 == 1]
         known = [number for number in found if number < len(places)]
         if not known:
@@ -248,15 +247,24 @@ def _charuco(gray: Pixels, board: Board) -> tuple[Ints, Array]:
         corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * board.marker + gap
         source = np.concatenate([np.array(places[n]) * board.spacing + corners for n in known])
         target = np.concatenate([found[n] for n in known])
-        idx, xy, error = _predicted(source, target, board)
-        if error < best_error:
-            best, best_error = (idx, xy), error
-    return best
+        layouts.append(_predicted(source, target, board))
+    if not layouts:
+        return np.zeros(0, np.int64), np.zeros((0, 2))
+    # where columns are odd, the other layout is the same one column aside but for a marker in every other row, and the
+    # typical error tells nothing: points disagree beside those markers, and beyond the border no four fields meet
+    limit = 3.0 * min(float(np.median(errors)) if len(errors) else np.inf for _, _, errors in layouts) + 0.5
+
+    def score(layout: tuple[Ints, Array, Array]) -> tuple[int, int]:
+        idx, xy, errors = layout
+        return -int((errors > limit).sum()), int(_have_four_fields(gray, board, idx, xy, xy).sum())
+
+    idx, xy, _ = max(layouts, key=score)
+    return idx, xy
 
 
-def _predicted(source: Array, target: Array, board: Board, reach: float = 1.01) -> tuple[Ints, Array, float]:
-    """Where points of a board are by the corners of markers beside them, and how well those fit each other. ``reach``:
-    how far these may be, in sides of a square or tag."""
+def _predicted(source: Array, target: Array, board: Board, reach: float = 1.01) -> tuple[Ints, Array, Array]:
+    """Where points of a board are by the corners of markers beside them, and how well those fit each other, pixels.
+    ``reach``: how far these may be, in sides of a square or tag."""
     idx, xy, errors = [], [], []
     for i, point in enumerate(board.points[:, :2]):
         distance = np.abs(source - point).max(1)
@@ -274,9 +282,7 @@ def _predicted(source: Array, target: Array, board: Board, reach: float = 1.01) 
         errors.append(np.sqrt(((mapped[:, :2] / mapped[:, 2:] - target[near]) ** 2).sum(1).mean()))
         idx.append(i)
         xy.append(at[:2] / at[2])
-    if not idx:
-        return np.zeros(0, np.int64), np.zeros((0, 2)), np.inf
-    return np.array(idx, np.int64), np.array(xy), float(np.median(errors))
+    return np.array(idx, np.int64), np.array(xy).reshape(-1, 2), np.array(errors)
 
 
 def _april_grid(gray: Pixels, board: Board) -> tuple[Ints, Array]:
