@@ -28,7 +28,6 @@ from sfmapp.calibration.one_view import (
     fit_view,
     misfit_under,
     noise_of,
-    with_noise,
     without_wrong_points,
 )
 from sfmapp.calibration.one_view_kernels import POSE
@@ -502,10 +501,9 @@ def _told(
     """The result of a fit. Raises NoReconstructionError if the points do not hold it."""
     xyz, xy = points
     noise = noise_of(view, sigma_px, xy)
-    first_order = with_noise(view, noise)
-    if first_order is None:
+    covariance = bent_covariance(view, noise, points)
+    if covariance is None:
         raise _open_camera(points, view, None)
-    covariance = bent_covariance(view, first_order, points)
     statistic, distance = deletion_statistics(view, sigma_px)
     linear = None
     if not is_plane:
