@@ -167,7 +167,8 @@ TRUTHS = {
     "DIVISION": [600.0, 605.0, 630.0, 490.0, -0.25],
     "EUCM": [450.0, 455.0, 630.0, 490.0, 0.6, 1.1],
 }
-CHOICE_SEEDS = range(200, 203)
+# the rules were made with 200 to 202 before the eyes; the others are fresh
+CHOICE_SEEDS = (*range(200, 203), *range(400, 404))
 
 
 def lenses() -> list[Row]:
@@ -177,7 +178,7 @@ def lenses() -> list[Row]:
     rows = []
     for name, params in TRUTHS.items():
         truth = Camera(CameraModel[name], *SIZE, np.array(params))
-        chosen, off = [], []
+        chosen, off, told = [], [], []
         for seed in CHOICE_SEEDS:
             rng = np.random.default_rng(seed)
             poses = board_poses(rng, CHESS, 15, truth)
@@ -188,9 +189,13 @@ def lenses() -> list[Row]:
             sigma = projection_sigma(made.calibration, xy, made.calibration.distances[1])
             off.append(float(np.sqrt(np.nanmean((difference**2).sum(1) / (2.0 * sigma**2)))))
             chosen.append(made.calibration.camera.model.name)
+            told.append(any("do not tell" in warning for warning in made.calibration.warnings))
+        is_good = [a == name or b <= 1.0 for a, b in zip(chosen, off, strict=True)]
         rows.append({
             "truth": name, "sets": len(chosen), "chosen": ", ".join(sorted(set(chosen))),
             "true_model": sum(one == name for one in chosen), "largest_bias_sigmas": max(off),
-            "within_its_sigma": sum(a == name or b <= 1.0 for a, b in zip(chosen, off, strict=True)),
+            "within_its_sigma": sum(is_good), "of_fresh": sum(is_good[3:]),
+            "biased_and_told": sum(b and not a for a, b in zip(is_good, told, strict=True)),
+            "good_and_told": sum(a and b for a, b in zip(is_good, told, strict=True)),
         })  # fmt: skip
     return rows

@@ -429,6 +429,9 @@ def promises(folder: Path) -> Iterator[Promise]:
     good, total = (sum(row[key] for row in lenses) for key in ("within_its_sigma", "sets"))
     text = "the lens model that is chosen is the true one, or nearer to it than its sigma"
     yield Promise("calibration", text, good, total, date)
+    if films := [row for row in report.get("films", []) if row.get("nees") is not None and "model" in row]:
+        text = "the camera of a filmed board is within two of its sigmas, in the mean over the picture"
+        yield Promise("calibration", text, sum(row["error_sigmas"] < 2.0 for row in films), len(films), date)
     if taken := [*report.get("next", []), *report.get("next_points", [])]:
         good = sum(row["times_as_fast"] >= 2.0 for row in taken)
         text = "suggested views make projections sure twice as fast as others"

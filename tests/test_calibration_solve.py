@@ -241,3 +241,20 @@ def test_a_view_of_which_two_points_are_good_goes_whole() -> None:
     assert np.delete(counts, 3).min() >= 52
     made = solve_views(views, SIZE, CAMERA.model, bends=False).calibration
     assert np.abs((made.camera.params - CAMERA.params) / made.sigmas).max() < 4.0
+
+
+def test_a_pinhole_is_no_lens_that_is_better_by_luck() -> None:
+    """Of seventeen models one is better on views held out by more than two standard errors of itself."""
+    camera = Camera(CameraModel.PINHOLE, *SIZE, np.array([1000.0, 1015.0, 630.0, 490.0]))
+    made = solve_views(seen(camera, 15, 0.2, 304), SIZE, bends=False).calibration
+    assert made.camera.model == CameraModel.PINHOLE
+
+
+def test_a_lens_that_fits_as_well_and_differs_where_no_board_was_is_told() -> None:
+    """The simpler lens explains all points, and is 3 px off in the corners, at six sigmas: it has to say so."""
+    camera = Camera(CameraModel.OPENCV_FISHEYE, *SIZE, np.array([420.0, 425.0, 630.0, 490.0, -0.02, 4e-3, -1e-3, 2e-4]))
+    made = solve_views(seen(camera, 15, 0.2, 302), SIZE, bends=False).calibration
+    told = [warning for warning in made.warnings if "do not tell" in warning]
+    assert made.camera.model == CameraModel.EUCM
+    assert len(told) == 1
+    assert "EUCM from OPENCV_FISHEYE, which differ by up to" in told[0]

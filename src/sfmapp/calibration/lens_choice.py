@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
+from scipy.stats import t as student
 
 from sfmapp.calibration.adjustment import Fit, TargetView, observations_of, refine, residuals_of
 from sfmapp.calibration.kernels import Observations
@@ -28,8 +29,9 @@ _HOPELESS = 2.0
 # nor one whose worst sigma in the picture is this share of its diagonal: it fits where there were boards, and is
 # anything elsewhere. A lens that few parameters do not describe is uncertain in the corners, and says so
 _OPEN_SHARE = 1.0 / 40.0
-# held-out views speak against a model that is worse by so many standard errors: the best of seventeen is so by luck too
-_STANDARD_ERRORS = 2.0
+# chance that held-out views speak against the right model, over all that are compared: the best of seventeen is better
+# by luck too
+_EXCLUDED = 0.05
 # evidence below which a simpler model stays that is as good on views held out: ten is "very strong" (Kass and Raftery,
 # "Bayes factors", 1995), and corners share errors that no criterion knows of
 _STRONG_BIC = 10.0
@@ -56,6 +58,7 @@ class Trial:
         held_out: (V,) mean squared residual of each view while it was held out, far ones cut off, pixels squared; None
             where it was not worth it.
         reason: why it was not chosen, or that it was.
+        is_rival: the views do not tell it from the chosen one.
     """
 
     model: CameraModel
@@ -65,6 +68,7 @@ class Trial:
     bic: float
     held_out: Array | None = None
     reason: str = ""
+    is_rival: bool = False
 
     @property
     def held_out_px(self) -> float:
@@ -95,10 +99,10 @@ def try_models(
 ) -> list[Trial]:
     """Fit every model, hold out views of those that fit, and choose: the first of the result.
 
-    Held-out views say which models may be right: those at most two standard errors worse than the best, by differences
-    view by view. A bias below the noise of a view escapes them. So among these models Schwarz's criterion decides,
-    chi2 + P ln N over all points ("Estimating the dimension of a model", 1978); where it is not sure, a simpler model
-    that does as well on held-out views stays.
+    Held-out views say which models may be right: all but those that are worse than the best by Student's test of the
+    differences view by view, at one in twenty over all models (Bonferroni). A bias below the noise of a view escapes
+    them. So among these models Schwarz's criterion decides, chi2 + P ln N over all points ("Estimating the dimension of
+    a model", 1978); where it is not sure, a simpler model that does as well on held-out views stays.
 
     All are judged by all points: one that a model leaves aside, or has no ray for, counts as the largest residual that
     a good point may have.
@@ -193,7 +197,8 @@ def _chosen_first(trials: list[Trial]) -> list[Trial]:
         return sorted(trials, key=lambda trial: trial.rms_px)
     best = min(known, key=lambda trial: trial.held_out_px)
     worse = [_standard_errors(trial, best) for trial in known]
-    likely = [trial for trial, errors in zip(known, worse, strict=True) if errors <= _STANDARD_ERRORS]
+    limit = _limit(len(known), len(best.held_out) if best.held_out is not None else 0)
+    likely = [trial for trial, errors in zip(known, worse, strict=True) if errors <= limit]
     chosen = min(likely, key=lambda trial: (trial.bic, len(trial.model.params)))
     simpler = [
         trial for trial in likely
@@ -208,13 +213,19 @@ def _chosen_first(trials: list[Trial]) -> list[Trial]:
     for trial, errors in zip(known, worse, strict=True):
         if trial is not chosen:
             reason = f"worse on views held out, by {errors:.1f} standard errors"
-            if errors <= _STANDARD_ERRORS:
+            if errors <= limit:
                 more = len(trial.model.params) > len(chosen.model.params)
                 does = "has parameters that its residuals do not need" if more else "leaves residuals"
                 reason = f"{does} (BIC {trial.bic - chosen.bic:+.0f})"
-            told.append(replace(trial, reason=reason))
+            is_rival = errors <= limit and trial.bic <= chosen.bic + _STRONG_BIC
+            told.append(replace(trial, reason=reason, is_rival=is_rival))
     told[1:] = sorted(told[1:], key=lambda trial: (trial.held_out_px, trial.rms_px))
     return told + sorted((trial for trial in trials if trial.held_out is None), key=lambda trial: trial.rms_px)
+
+
+def _limit(num_models: int, num_views: int) -> float:
+    """Standard errors by which a model has to be worse than the best on views held out to be none that may be right."""
+    return float(student.isf(_EXCLUDED / max(num_models - 1, 1), max(num_views - 1, 1)))
 
 
 def _standard_errors(trial: Trial, best: Trial) -> float:

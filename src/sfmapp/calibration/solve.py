@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
 from sfmapp.calibration.adjustment import Fit, TargetView, normal_at, observations_of, refine, residuals_of
+from sfmapp.calibration.comparison import projection_difference
 from sfmapp.calibration.kernels import Observations
 from sfmapp.calibration.lens_choice import REJECTED, TRIED, Candidate, Trial, try_models
 from sfmapp.calibration.result import CameraCalibration, ViewFit
 from sfmapp.calibration.start import first_fit, refine_robustly, to_model
-from sfmapp.calibration.uncertainty import frame_covariance, image_grid, projection_covariance
+from sfmapp.calibration.uncertainty import frame_covariance, image_grid, projection_covariance, projection_sigma
 from sfmapp.calibration.zhang import ClosedForm, closed_form
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.models import PARAM_NAMES, kind_of
@@ -155,7 +156,7 @@ def solve_views(
     bend, note = None, "not looked for"
     if bends:
         fit, is_used, bend, note = _bent(work, fit, is_used)
-    calibration = _result(work, fit, is_used)
+    calibration = _with_rivals(_result(work, fit, is_used), trials)
     return Solution(calibration, fit, tuple(trials), linear, bend, note)
 
 
@@ -375,6 +376,32 @@ def _result(work: _Work, fit: Fit, is_used: Bools) -> CameraCalibration:
         distances=(float(near), float(middle), float(far)),
         warnings=tuple(work.warnings),
     )
+
+
+def _with_rivals(made: CameraCalibration, trials: Sequence[Trial]) -> CameraCalibration:
+    """With a warning where a lens model that fits as well puts a part of the picture elsewhere than sigmas allow.
+
+    Sigmas are those of a model that is right. Where no board was seen, models go on from what was in their own ways.
+    """
+    far = None
+    for trial in trials:
+        if not trial.is_rival:
+            continue
+        xy, difference, _ = projection_difference(made.camera, trial.fit.camera)
+        length = np.linalg.norm(difference, axis=1)
+        limit = np.maximum(RESOLVED_SIGMAS * projection_sigma(made, xy), made.noise_px)
+        if not np.nanmax(length / limit) > 1.0:
+            continue
+        n = int(np.nanargmax(length))
+        if far is None or length[n] > far[0]:
+            far = float(length[n]), trial.model.name, xy[n]
+    if far is None:
+        return made
+    warning = (
+        f"the views do not tell {made.camera.model.name} from {far[1]}, which differ by up to {far[0]:.2g} px, most"
+        f" near pixel ({far[2][0]:.0f}, {far[2][1]:.0f}); sigmas do not know of that: photograph the board there"
+    )
+    return replace(made, warnings=(*made.warnings, warning))
 
 
 def _problems(work: _Work, fit: Fit, r: Array, is_used: Bools, ptr: NDArray[np.int64]) -> list[str | None]:
