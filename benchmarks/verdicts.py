@@ -96,6 +96,7 @@ def rows_of(folder: Path) -> list[Row]:
         "tagged_sets": tagged_rows,
         "circle_centers": circle_rows,
         "uncalibrated": uncalibrated_rows,
+        "planes": plane_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
 
@@ -215,6 +216,20 @@ def uncalibrated_rows(folder: Path) -> Iterator[Row]:
         if "refused" not in row:
             case = "courtyard, to " + row["triple"][2]
             yield Row("uncalibrated", case, "transfer, median", "px", "less", row["tensor"]["median_px"], *about)
+
+
+def plane_rows(folder: Path) -> Iterator[Row]:
+    """``sfmapp warp`` and ``rectify`` against OpenCV's warpPerspective, in each of its ways."""
+    report = read(folder, "planes")
+    about = (False, report["date"][:10], report["commit"])
+    ours = {row["case"]: row for row in report["sampling"] if row["program"] == "sfmapp"}
+    for row in report["sampling"]:
+        mine, peer = ours[row["case"]], row["program"]
+        if peer != "sfmapp":
+            yield Row(
+                "planes", row["case"], "sampling, rms", "grey levels", "less", mine["rms"], peer, row["rms"], *about
+            )
+            yield Row("planes", row["case"], "CPU time", "ms", "less", mine["cpu_ms"], peer, row["cpu_ms"], *about)
 
 
 def known_point_rows(folder: Path) -> Iterator[Row]:

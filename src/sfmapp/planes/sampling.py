@@ -65,42 +65,64 @@ def _tile(source: NDArray[Any], find: Callable[[Array], Array], rows: slice, col
     height, width = source.shape[:2]
     # with a rim of one pixel, for the slopes
     y, x = np.mgrid[rows.start - 1 : rows.stop + 1, columns.start - 1 : columns.stop + 1] + 0.5
-    at = find(np.stack([x.ravel(), y.ravel()], 1)).reshape(*x.shape, 2)
-    along_x, along_y = _slopes(at, 1)[1:-1], _slopes(at, 0)[:, 1:-1]
-    at = np.ascontiguousarray(at[1:-1, 1:-1])
-    cover = _cover(at, along_x, along_y, (width, height))
+    found = find(np.stack([x.ravel(), y.ravel()], 1)).reshape(*x.shape, 2)
+    at, along_x, along_y = (np.empty((x.shape[0] - 2, x.shape[1] - 2, 2)) for _ in range(3))
+    cover = np.zeros(at.shape[:2], np.float32)
+    reach = _look(found, width, height, at, along_x, along_y, cover)
     is_seen = cover > 0.0
-    if not is_seen.any():
+    if not reach[0] < math.inf:
         return None
-    reach = 0.5 * (np.abs(along_x) + np.abs(along_y))[is_seen] + 2.0
-    low = np.clip(np.floor((at[is_seen] - reach).min(0)), 0, (width - 1, height - 1)).astype(int)
-    high = np.clip(np.ceil((at[is_seen] + reach).max(0)), low + 1, (width, height)).astype(int)
+    low = np.clip(np.floor(reach[:2]) - 2.0, 0, (width - 1, height - 1)).astype(int)
+    high = np.clip(np.ceil(reach[2:]) + 2.0, low + 1, (width, height)).astype(int)
     part = source[low[1] : high[1], low[0] : high[0]].astype(np.float32)
     if part.shape[2] == 4:
         part[..., :3] *= part[..., 3:] / np.float32(np.iinfo(source.dtype).max)
     values = np.zeros((*cover.shape, part.shape[2]), np.float32)
-    _average(np.ascontiguousarray(part), at - low, np.ascontiguousarray(along_x), np.ascontiguousarray(along_y),
-             is_seen, values)  # fmt: skip
+    _average(np.ascontiguousarray(part), at - low, along_x, along_y, is_seen, values)
     return Tile(rows, columns, values, cover)
 
 
-def _slopes(at: Array, axis: int) -> Array:
-    """Derivatives along an axis, central, one-sided at the edge of what is seen; shorter by the rim along that axis."""
-    at = np.moveaxis(at, axis, 0)
-    ahead, behind = at[2:] - at[1:-1], at[1:-1] - at[:-2]
-    slope = np.where(np.isnan(ahead), behind, np.where(np.isnan(behind), ahead, 0.5 * (ahead + behind)))
-    return np.moveaxis(slope, 0, axis)
+@numba.njit(cache=True, nogil=True)
+def _look(
+    found: Array, width: int, height: int, at: Array, along_x: Array, along_y: Array, cover: Floats
+) -> Array:  # fmt: skip
+    """Where pixels look in a source, how that changes from pixel to pixel, and what share of each the source covers.
 
+    Args:
+        found: (h + 2, w + 2, 2) with a rim of one pixel, NaN for nowhere.
+        at, along_x, along_y: (h, w, 2) to fill: slopes are central, one-sided at the edge of what is seen.
+        cover: (h, w) zeros; filled, along each axis, by how far the source's sides are from the middle of a pixel, in
+            pixels of the result.
 
-def _cover(at: Array, along_x: Array, along_y: Array, size: tuple[int, int]) -> Floats:
-    """(h, w) share of each pixel inside the source: along each axis, by how far its sides are from the middle of the
-    pixel, in pixels of the result."""
-    cover = np.ones(at.shape[:2])
-    for axis in (0, 1):
-        width = np.maximum(np.hypot(along_x[..., axis], along_y[..., axis]), 1e-12)
-        low, high = at[..., axis] / width, (size[axis] - at[..., axis]) / width
-        cover *= np.clip(np.clip(low + 0.5, 0.0, 1.0) + np.clip(high + 0.5, 0.0, 1.0) - 1.0, 0.0, 1.0)
-    return np.nan_to_num(cover).astype(np.float32)
+    Returns:
+        Least x and y and greatest x and y of all footprints that the source covers; the first infinite without any.
+    """
+    reach = np.array([np.inf, np.inf, -np.inf, -np.inf])
+    slope = np.empty((2, 2))
+    for r in range(at.shape[0]):
+        for c in range(at.shape[1]):
+            share = 1.0
+            for n in range(2):
+                middle = found[r + 1, c + 1, n]
+                ahead, behind = found[r + 1, c + 2, n] - middle, middle - found[r + 1, c, n]
+                below, above = found[r + 2, c + 1, n] - middle, middle - found[r, c + 1, n]
+                slope[0, n] = behind if math.isnan(ahead) else ahead if math.isnan(behind) else 0.5 * (ahead + behind)
+                slope[1, n] = above if math.isnan(below) else below if math.isnan(above) else 0.5 * (below + above)
+                at[r, c, n], along_x[r, c, n], along_y[r, c, n] = middle, slope[0, n], slope[1, n]
+                if math.isnan(middle + slope[0, n] + slope[1, n]):
+                    share = 0.0
+                    continue
+                pixel = max(math.hypot(slope[0, n], slope[1, n]), 1e-12)
+                low, high = middle / pixel + 0.5, ((width if n == 0 else height) - middle) / pixel + 0.5
+                share *= max(min(low, 1.0) + min(high, 1.0) - 1.0, 0.0)
+            if share == 0.0:
+                continue
+            cover[r, c] = share
+            for n in range(2):
+                half = 0.5 * (abs(slope[0, n]) + abs(slope[1, n]))
+                reach[n] = min(reach[n], at[r, c, n] - half)
+                reach[2 + n] = max(reach[2 + n], at[r, c, n] + half)
+    return reach
 
 
 @numba.njit(cache=True, nogil=True)

@@ -42,9 +42,7 @@ class PlaneView:
     def seen(self, ab: Array) -> Array:
         """Pixels (N, 2) of points of the plane (N, 2); NaN at and beyond its horizon, and where the lens does not
         look."""
-        mapped = homogeneous(ab) @ self.homography.T
-        mapped[~(mapped[:, 2] > 0.0)] = np.nan
-        flat = mapped[:, :2] / mapped[:, 2:]
+        flat = _mapped(self.homography, ab)
         if self.camera is None:
             return flat
         flat[~((flat**2).sum(1) < self._reach**2)] = np.nan
@@ -56,9 +54,19 @@ class PlaneView:
         if self.camera is not None:
             flat = pixels_to_normalized(self.camera, pixels)
             flat[~((flat**2).sum(1) < self._reach**2)] = np.nan
-        mapped = homogeneous(flat) @ np.linalg.inv(self.homography).T
-        mapped[~(mapped[:, 2] > 0.0)] = np.nan  # one over the weight of the point, which is positive in front
-        return mapped[:, :2] / mapped[:, 2:]
+        # the last coordinate is one over the weight of the point, which is positive in front
+        return _mapped(np.asarray(np.linalg.inv(self.homography), np.float64), flat)
+
+
+def _mapped(homography: Array, xy: Array) -> Array:
+    """(N, 2) points through a homography; NaN where the last coordinate is not positive. A row of numbers for each
+    coordinate: of short vectors side by side numpy makes four times the work."""
+    x, y, weight = homography[:, :2] @ xy.T + homography[:, 2:]
+    out = np.empty_like(xy)
+    unit = 1.0 / np.where(weight > 0.0, weight, np.nan)
+    np.multiply(x, unit, out=out[:, 0])
+    np.multiply(y, unit, out=out[:, 1])
+    return out
 
 
 def view_of_corners(corners: ArrayLike, size: tuple[float, float], camera: Camera | None = None) -> PlaneView:
