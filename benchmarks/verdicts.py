@@ -212,10 +212,20 @@ def uncalibrated_rows(folder: Path) -> Iterator[Row]:
         ("self-calibration, two open numbers freed", dino["two_numbers_freed_percent"]),
     ):
         yield Row("uncalibrated", "dinosaur", what, "%", "less", value, *about)
+    peer, about = "reference P", about[2:]
+    for key, what, unit in (
+        ("step_rms_deg", "turntable's steps against ten degrees, rms", "deg"),
+        ("radius_percent", "radius of the turntable's circle, rms", "%"),
+        ("height_percent", "height of the turntable's circle, rms", "%"),
+    ):
+        ours, given = (dino[name][key] for name in ("turntable", "reference_turntable"))
+        yield Row("uncalibrated", "dinosaur", what, unit, "less", ours, peer, given, *about)
     for row in report["transfers"]:
         if "refused" not in row:
             case = "courtyard, to " + row["triple"][2]
-            yield Row("uncalibrated", case, "transfer, median", "px", "less", row["tensor"]["median_px"], *about)
+            yield Row(
+                "uncalibrated", case, "transfer, median", "px", "less", row["tensor"]["median_px"], "", None, *about
+            )
 
 
 def plane_rows(folder: Path) -> Iterator[Row]:
