@@ -42,6 +42,7 @@ ROUNDS = 3  # the least of their times counts
 OURS: dict[str, StereoOptions] = {
     "sfmapp": StereoOptions(),
     "sfmapp, filled": StereoOptions(fill=True),
+    "sfmapp, refined": StereoOptions(refine=True),
     "sfmapp window": StereoOptions(matcher="window"),
     "sfmapp window, filled": StereoOptions(matcher="window", fill=True),
     "sfmapp window, fixed": StereoOptions(matcher="window", windows="fixed"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from sfmapp.stereo import semiglobal_kernels as kernels
 from sfmapp.stereo.match import match_pair
 from sfmapp.stereo.options import StereoOptions
 from sfmapp.stereo.result import DisparityMap, PixelState, RectifiedPair
+from sfmapp.stereo.slanted import refine_slanted
 
 Grey = NDArray[np.uint8]
 
@@ -172,8 +174,8 @@ def test_threads_strips_and_earlier_pairs_change_nothing(monkeypatch: pytest.Mon
         assert matcher.match(left, right).disparity is together.disparity
     for name in ("disparity", "state", "cost", "curvature", "uniqueness"):
         assert np.array_equal(getattr(alone, name), getattr(together, name), equal_nan=True)
-    monkeypatch.setattr(semiglobal, "STRIP", 40)
-    monkeypatch.setattr(semiglobal, "OVERLAP", 30)
+    monkeypatch.setattr(semiglobal, "RING_BYTES", 0)
+    monkeypatch.setattr(semiglobal, "OVERLAP", 24)
     strips = _match(left, right, (0, 90))
     both = (strips.state == PixelState.MATCHED) & (alone.state == PixelState.MATCHED)
     assert both.sum() > 0.98 * (alone.state == PixelState.MATCHED).sum()
@@ -183,7 +185,7 @@ def test_threads_strips_and_earlier_pairs_change_nothing(monkeypatch: pytest.Mon
 def test_noise_is_measured() -> None:
     rng = np.random.default_rng(1)
     ramp = np.tile(np.linspace(40, 200, 300), (200, 1))
-    counts = np.empty(2048, np.int64)
+    counts = np.empty(kernels.NOISE_BINS, np.int64)
     for sigma in (1.0, 3.0, 8.0):
         picture = np.clip(np.rint(ramp + rng.normal(0, sigma, ramp.shape)), 0, 255).astype(np.uint8)
         told = kernels.noise_of(picture, counts)
@@ -217,6 +219,42 @@ def test_where_nothing_is_to_be_seen_nothing_is_told() -> None:
     blank = found.state == PixelState.UNKNOWN
     assert blank[33:67, 73:147].mean() > 0.99
     assert blank[:, 20:45].mean() < 0.05
+
+
+def test_slanted_planes_refine_what_is_textured_and_leave_the_rest() -> None:
+    x, y = np.meshgrid(np.arange(200), np.arange(90))
+    truth = 12.3 + 0.12 * x + 0.07 * y
+    left, right = _pair_of(truth, noise=2.0)
+    rng = np.random.default_rng(4)
+    start = (truth + rng.normal(0, 0.15, truth.shape)).astype(np.float32)
+    start[40, 100] = np.nan
+    refined = refine_slanted(left, right, start, 30.0)
+    assert np.array_equal(refined, refine_slanted(left, right, start, 30.0, threads=2), equal_nan=True)
+    assert np.array_equal(np.isnan(refined), np.isnan(start))
+    inside = (x - truth > 10) & (x < 190) & (y > 8) & (y < 80) & ~np.isnan(start)
+    errors = [np.sqrt(np.mean((d - truth)[inside] ** 2)) for d in (start, refined)]
+    assert errors[0] == pytest.approx(0.15, rel=0.05)
+    assert 0.02 < errors[1] < 0.08
+    flat = np.full(truth.shape, 80, np.uint8)
+    assert np.array_equal(refine_slanted(flat, flat, start, 30.0), start, equal_nan=True)
+
+
+def test_holes_are_filled_by_what_lies_behind_and_marked() -> None:
+    truth = np.full((100, 200), 5.0)
+    left, right = _pair_of(truth)
+    near, _ = _pair_of(np.zeros((100, 200)), seed=9)
+    left[30:70, 80:140] = near[30:70, 80:140]
+    right[30:70, 55:115] = near[30:70, 80:140]
+    pair = RectifiedPair(left, right, *np.ones((2, 100, 200), bool))
+    options = StereoOptions(min_disparity=0, num_disparities=40, refine=True)
+    holes = match_pair(pair, options)
+    full = match_pair(pair, replace(options, fill=True))
+    empty = holes.state == PixelState.UNKNOWN
+    assert (full.state[empty] == PixelState.FILLED).all()
+    assert np.array_equal(full.disparity[~empty], holes.disparity[~empty])
+    hidden = empty & (np.arange(200) > 60) & (np.arange(200) < 80)
+    assert hidden.sum() > 500
+    assert np.median(np.abs(full.disparity[hidden] - 5)) < 0.2
 
 
 def test_bad_input_is_named() -> None:

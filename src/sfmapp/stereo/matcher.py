@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from types import TracebackType
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.dense.expand import CONTRAST, LEAST_CONTRAST
 from sfmapp.errors import UsageError
+from sfmapp.stereo.checks import fill_holes
+from sfmapp.stereo.opencv_matchers import gray_of
 from sfmapp.stereo.options import StereoOptions
 from sfmapp.stereo.result import DisparityMap, PixelState, RectifiedPair
 from sfmapp.stereo.semiglobal import BLANK_WINDOW, LEAST_UNIQUENESS, Level
-from sfmapp.stereo.semiglobal_kernels import collect, even_out, report
+from sfmapp.stereo.semiglobal_kernels import NOISE_BINS, collect, even_out, noise_of, report
+from sfmapp.stereo.slanted import refine_slanted
 
 # mean difference in grey from the blurred picture, about a pixel, below which there is nothing to match: a saturated
 # sky. Noise of a quarter of a grey value, the least there is after rounding, shows more
 BLANK = 0.1
+# rows are filled one by one: the median of so many pixels and rows takes the streaks out
+FILL_WINDOW = 5
 # islands of fewer pixels, whose disparities differ by more than one from all around them, are dropped
 LEAST_ISLAND, ISLAND_STEP_PX = 100, 1
 
@@ -118,7 +125,26 @@ def match_by_sgm(pair: RectifiedPair, options: StereoOptions, search: tuple[int,
     with Matcher(height, width, search, left_right_px=options.left_right_px) as matcher:
         found = matcher.match(pair.left, pair.right)
     hide_unseen(found, pair)
+    if options.refine:
+        left = gray_of(pair.left)
+        contrast = CONTRAST * noise_of(left, np.empty(NOISE_BINS, np.int64)) + LEAST_CONTRAST
+        disparity = refine_slanted(left, gray_of(pair.right), found.disparity, contrast, threads=2)
+        even_out(disparity, np.empty_like(disparity))
+        found = replace(found, disparity=disparity)
+    if options.fill:
+        fill(found, pair)
     return found
+
+
+def fill(found: DisparityMap, pair: RectifiedPair) -> None:
+    """Put the lesser disparity of both sides of its row into what was not matched, and the median about it there."""
+    empty = np.isnan(found.disparity)
+    if empty.all():
+        return
+    full = fill_holes(found.disparity)
+    filled = empty & pair.left_shown
+    found.disparity[filled] = cv2.medianBlur(full, FILL_WINDOW)[filled]
+    found.state[filled] = PixelState.FILLED
 
 
 def hide_unseen(found: DisparityMap, pair: RectifiedPair) -> None:

@@ -29,6 +29,8 @@ class StereoOptions:
         window: Side of the matching window, pixels, odd; None: what is best for the matcher; sgm has none.
         left_right_px: Disparities that differ by more when they are looked for from the other side are dropped, pixels.
         correct_rig: Where matches say that the cameras have turned since their calibration, rectify as they say.
+        refine: Lay slanted planes through the pixels that sgm has found: errors below a pixel become smaller by a tenth
+            to a quarter, and matching takes three times as long.
         fill: Fill what only one camera sees from its neighbours, and mark it so.
     """
 
@@ -40,6 +42,7 @@ class StereoOptions:
     window: int | None = None
     left_right_px: float = 1.0
     correct_rig: bool = True
+    refine: bool = False
     fill: bool = False
 
     def __post_init__(self) -> None:

@@ -16,10 +16,12 @@ from functools import partial
 import cv2
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from sfmapp.stereo.semiglobal_kernels import (
     GAP,
     LANES,
+    NOISE_BINS,
     STRIDE,
     Bytes,
     Found,
@@ -54,51 +56,63 @@ LEAST_UNIQUENESS = 0.2
 BLANK_WINDOW = 21
 # the sides of what is left after so many halvings
 LEAST_SIDE = 48
-# rows of a strip, and those below it in which paths from below begin
-STRIP, OVERLAP = 512, 64
+# what is held of costs and sums, or more where it holds fewer rows than four times the overlap: pictures with more rows
+# are worked on in strips, whose paths from below begin OVERLAP rows below them
+RING_BYTES, OVERLAP = 1 << 27, 64
 _PAD = 4
 
 
 @numba.njit(cache=True, nogil=True)
-def census(grey: Bytes, blurred: Bytes, out: Words) -> None:
-    """48 bits for each pixel; both pictures have four pixels more than ``out`` on every side."""
-    width = grey.shape[1] - 2 * _PAD
+def census(grey: Bytes, blurred: Bytes, rows: NDArray[np.uint32], margin: int, out: Words) -> None:
+    """48 bits for each pixel of two pictures that have four pixels more on every side than they are told of.
+
+    rows: scratch (2, W) uint32. margin: columns of ``out`` on both sides that stay as they are; where there are any,
+    columns are written in opposite order.
+    """
+    width = rows.shape[1]
     for y in range(out.shape[0]):
-        row = out[y]
+        _compare(grey, y + _PAD, 1, rows[0])
+        _compare(blurred, y + _PAD, 2, rows[1])
         for x in range(width):
-            row[x] = np.uint64(0)
-        for image, stride in ((grey, 1), (blurred, 2)):
-            middle = image[y + _PAD]
-            for dy in range(-2, 3):
-                other = image[y + _PAD + stride * dy]
-                for dx in range(-2, 3):
-                    if dx == 0 and dy == 0:
-                        continue
-                    shift = _PAD + stride * dx
-                    for x in range(width):
-                        row[x] = (row[x] << np.uint64(1)) | np.uint64(other[x + shift] < middle[x + _PAD])
+            word = (np.uint64(rows[0, x]) << np.uint64(24)) | np.uint64(rows[1, x])
+            out[y, margin + width - 1 - x if margin > 0 else x] = word
 
 
 @numba.njit(cache=True, nogil=True)
-def reverse(words: Words, margin: int, out: Words) -> None:
-    """Columns in opposite order, from column ``margin`` on."""
-    height, width = words.shape
-    for y in range(height):
-        for x in range(width):
-            out[y, margin + width - 1 - x] = words[y, x]
+def _compare(picture: Bytes, y: int, stride: int, row: NDArray[np.uint32]) -> None:
+    """24 bits for each pixel of row y: which of its neighbours, ``stride`` apart, are darker."""
+    for x in range(row.shape[0]):
+        row[x] = np.uint32(0)
+    middle = picture[y]
+    for dy in range(-2, 3):
+        other = picture[y + stride * dy]
+        for dx in range(-2, 3):
+            if dx == 0 and dy == 0:
+                continue
+            shift = _PAD + stride * dx
+            for x in range(row.shape[0]):
+                row[x] = np.uint32((row[x] << np.uint32(1)) | np.uint32(other[x + shift] < middle[x + _PAD]))
 
 
 class Level:
     """One resolution: its arrays, which serve picture after picture, and its matching."""
 
-    def __init__(self, height: int, width: int, search: tuple[int, int], *, halve: bool = True) -> None:
+    def __init__(
+        self, height: int, width: int, search: tuple[int, int], *, halve: bool = True, memory: Bytes | None = None
+    ) -> None:
         self.search = first, count = search
         shape = (height, width)
+        # a strip is worked on at a time, and the coarser levels are done before this one begins: they share its memory
+        ring = min(height, max(4 * OVERLAP, RING_BYTES // (3 * width * LANES)))
+        self.strip = height if ring == height else ring - OVERLAP
+        size = 3 * ring * width * LANES
+        memory = np.empty(max(size, RING_BYTES), np.uint8) if memory is None else memory
+        self.rows = Rows(*memory[:size].reshape(3, ring, width, LANES))
         self.coarse: Level | None = None
         if count > LANES or (halve and min(shape) >= 2 * LEAST_SIDE):
             low = first // 2
             half = (low, (first + count + 1) // 2 - low + 1)
-            self.coarse = Level((height + 1) // 2, (width + 1) // 2, half, halve=False)
+            self.coarse = Level((height + 1) // 2, (width + 1) // 2, half, halve=False, memory=memory)
             self.smaller = np.empty((2, (height + 1) // 2, (width + 1) // 2), np.uint8)
         self.margin = LANES + max(0, -first, first + count)
         padded = (2, height + 2 * _PAD, width + 2 * _PAD)
@@ -106,8 +120,8 @@ class Level:
         self.fine, self.summed = np.empty(padded[1:], np.uint8), np.empty(padded, np.uint16)
         # sums of differences from the blurred picture, over a small and over a large window
         self.texture, self.wide_texture = self.summed[:, _PAD:-_PAD, _PAD:-_PAD]
-        self.counts = np.empty(2048, np.int64)
-        self.words = np.empty(shape, np.uint64)
+        self.counts = np.empty(NOISE_BINS, np.int64)
+        self.bits = np.empty((2, 2, width), np.uint32)
         right = np.zeros((height, width + 2 * self.margin), np.uint64)
         doubt = np.zeros((LANES + 1, LANES), np.uint8)
         lanes = np.arange(LANES)
@@ -119,9 +133,6 @@ class Level:
         )  # fmt: skip
         large = [max(SMALL + 1, round(LARGE / (1.0 + difference / FALL_GREY))) for difference in range(256)]
         self.penalties = Penalties(np.uint8(SMALL), np.array(large, np.uint8))
-        self.strip = height if height <= STRIP + OVERLAP else STRIP
-        ring = (min(height, STRIP + OVERLAP), width, LANES)
-        self.rows = Rows(*(np.empty(ring, np.uint8) for _ in range(3)))
         length = GAP + STRIDE * width
         self.raw = np.empty((2, 4, length), np.uint8)
         self.down, self.up = np.empty((4, length), np.uint8), np.empty((4, length), np.uint8)
@@ -140,7 +151,11 @@ class Level:
             pool: does two things at a time; what is found does not depend on it.
         """
         views, rows, height = self.views, self.rows, self.views.grey.shape[0]
-        both(pool, partial(self._transform, 0, left, views.left), partial(self._transform_right, right))
+        both(
+            pool,
+            partial(self._transform, 0, left, 0, views.left),
+            partial(self._transform, 1, right, self.margin, views.right),
+        )
         np.copyto(views.grey, left)
         cv2.absdiff(self.padded[0], self.blurred[0], dst=self.fine)
         for side, sums in zip((PLAIN_WINDOW, BLANK_WINDOW), self.summed, strict=True):
@@ -169,15 +184,11 @@ class Level:
             done = last
         return self.found
 
-    def _transform(self, side: int, grey: Bytes, out: Words) -> None:
+    def _transform(self, side: int, grey: Bytes, margin: int, out: Words) -> None:
         padded, blurred = self.padded[side], self.blurred[side]
         cv2.copyMakeBorder(grey, _PAD, _PAD, _PAD, _PAD, cv2.BORDER_REPLICATE, dst=padded)
         cv2.GaussianBlur(padded, (5, 5), BLUR_PX, dst=blurred)
-        census(padded, blurred, out)
-
-    def _transform_right(self, grey: Bytes) -> None:
-        self._transform(1, grey, self.words)
-        reverse(self.words, self.margin, self.views.right)
+        census(padded, blurred, self.bits[side], margin, out)
 
     def _look_again(self, coarse: Level, left: Bytes, right: Bytes, tolerance: int, pool: Executor | None) -> None:
         height, width = coarse.views.grey.shape

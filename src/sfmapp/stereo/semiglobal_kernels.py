@@ -31,6 +31,8 @@ MOST_SHIFT = GAP - 2
 UNSEEN_OVER_SEEN = 3
 # the mean of two pixels on opposite sides of one is of its surface where it is off by less
 SAME_SURFACE_PX = 1.0
+# greatest departure from linear of 8 x 8 weighted bytes, rounded up
+NOISE_BINS = 2048
 # disparities that are looked at beyond those of half the resolution
 ROOM = 4
 # at the beginning of a path
@@ -303,7 +305,8 @@ def _clear(rows: Bytes) -> None:
 @numba.njit(cache=True, nogil=True)
 def noise_of(grey: Bytes, counts: NDArray[np.int64]) -> float:
     """Standard deviation of the noise of a picture, from the median of what is not linear in it (after Immerkaer,
-    "Fast noise variance estimation", CVIU 1996), in every fourth row; ``counts``: scratch (2048,)."""
+    "Fast noise variance estimation", CVIU 1996), in every fourth row; ``counts``: scratch
+    (NOISE_BINS,)."""
     height, width = grey.shape
     for n in range(counts.shape[0]):
         counts[n] = 0
