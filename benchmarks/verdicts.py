@@ -373,9 +373,10 @@ def promises(folder: Path) -> Iterator[Promise]:
     report = read(folder, "surveys")
     found, wrong = (sum(row[name] for row in report["rows"]) for name in ("found", "wrong"))
     yield Promise("surveys", "a grossly wrong position is found", found, wrong, report["date"][:10])
-    shares = [row[n] for row in report["rows"] if row["kind"] == "all" for n in SURVEYED]
-    text = "95 % intervals of positions hold 93 to 97 % of the truth"
-    yield Promise("surveys", text, sum(93 <= share <= 97 for share in shares), len(shares), report["date"][:10])
+    for kind, what in (("all", "positions"), ("monument", "positions round a monument")):
+        shares = [row[n] for row in report["rows"] if row["kind"] == kind for n in SURVEYED]
+        text = f"95 % intervals of {what} hold 93 to 97 % of the truth"
+        yield Promise("surveys", text, sum(93 <= share <= 97 for share in shares), len(shares), report["date"][:10])
     report = read(folder, "wrong_positions")
     rows = [row for part in ("fits", "stages") for row in report[part] if row["wrong"]]
     tried = sum(row[name] for row in rows for name in ("named", "red", "missed", "lost"))
