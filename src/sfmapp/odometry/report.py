@@ -116,10 +116,15 @@ class ShutterReport(Report):
 
 
 class SharedErrors(Report):
-    """By how much errors that observations share make the variance of the poses larger: along tracks, and between."""
+    """By how much errors that observations share make the variance of the poses larger: along tracks, and between.
+
+    ``wider_loss_sigmas``: how far a loss that believes more observations moves the keyframes, rms, in standard
+    deviations that these give; where it is above one, covariances have grown by what is more.
+    """
 
     within_tracks: float
     between_tracks: float
+    wider_loss_sigmas: float | None = None
 
 
 class AdjustmentReport(Report):

@@ -22,6 +22,7 @@ from sfmapp.odometry.map.covariance import (
     covariance_of_refinement,
     estimate_map_covariance,
     scale_sigma_of_refinement,
+    widened_by_loss,
 )
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.options import MAX_COVARIANCE_KEYFRAMES, OdometryOptions
@@ -129,6 +130,7 @@ def adjust_finally(
         final = _with_imu(final, keyframes, imu, (sigma, None if found is None else found.noise_px), events)
     if found is None or not options.covariance:
         return final
+    found = widened_by_loss(found, model, num_sensors, LOSS_SIGMAS * sigma)
     noise = found.poses if final.noise_covariance is None else final.noise_covariance
     covariance = noise + of_refinement + (0.0 if answer.pose_covariance is None else answer.pose_covariance)
     if answer.is_refined:
