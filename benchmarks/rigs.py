@@ -16,7 +16,7 @@ import argparse
 import json
 import os
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from sfmapp.calibration.adjustment import TargetView
 from sfmapp.calibration.boards import Board
 from sfmapp.calibration.detection import detect_board
 from sfmapp.calibration.epipolar_errors import epipolar_errors
-from sfmapp.calibration.rig import calibrate_rig
+from sfmapp.calibration.rig import RigCalibration, calibrate_rig
 from sfmapp.calibration.rig_adjustment import RigFit, RigView
 from sfmapp.calibration.solve import solve_views
 from sfmapp.camera.camera import Camera
@@ -40,6 +40,7 @@ from sfmapp.geometry.self_calibration import (
     focal_from_homographies,
     refine_turning_camera,
 )
+from sfmapp.scene.rig import Rig
 
 RIGS: dict[str, Callable[[np.random.Generator], RigFit]] = {
     "pinhole beside fisheye, 14 shots": lambda rng: overlapping_rig(rng, (PINHOLE, FISHEYE), 14),
@@ -123,8 +124,19 @@ def _unit(rng: np.random.Generator) -> np.ndarray:
     return unit
 
 
-def beside_opencv(folder: Path) -> dict[str, Any]:
-    """The thirteen stereo pairs of OpenCV's samples."""
+@dataclass(frozen=True)
+class Samples:
+    """The thirteen stereo pairs of OpenCV's samples: corners (54, 2) by side and number, and the rig by both."""
+
+    num: int
+    corners: dict[tuple[int, int], np.ndarray]
+    found: RigCalibration
+    ours: Rig
+    theirs: Rig
+
+
+def calibrate_samples(folder: Path) -> Samples:
+    """Find the corners, and calibrate the rig by sfmapp and by OpenCV."""
     import cv2
 
     board = Board("chessboard", 9, 6, 0.025)
@@ -151,8 +163,17 @@ def beside_opencv(folder: Path) -> dict[str, Any]:
         target, pixels[0], pixels[1], *begin[0], *begin[1], (640, 480),
         flags=cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS, criteria=(3, 500, 1e-12),
     )  # fmt: skip
-    theirs = (_camera_of(k1, d1), _camera_of(k2, d2))
-    their_pose, pair = rigid3.from_matrix(turn, shift.ravel()), found.pairs[0]
+    their_pose = rigid3.from_matrix(turn, shift.ravel())
+    theirs = Rig((_camera_of(k1, d1), _camera_of(k2, d2)), np.array([rigid3.IDENTITY, their_pose]))
+    ours = Rig(found.rig.cameras, np.array([rigid3.IDENTITY, found.pairs[0].second_from_first]))
+    return Samples(num, corners, found, ours, theirs)
+
+
+def beside_opencv(folder: Path) -> dict[str, Any]:
+    """The thirteen stereo pairs of OpenCV's samples."""
+    samples = calibrate_samples(folder)
+    num, corners, found, theirs = samples.num, samples.corners, samples.found, samples.theirs.cameras
+    their_pose, pair = samples.theirs.cam_from_rig[1], found.pairs[0]
     odd = {one.shot for one in found.odd}
     believed = [t for t in range(num) if t not in odd]
 
@@ -173,7 +194,7 @@ def beside_opencv(folder: Path) -> dict[str, Any]:
         },
         "widening": found.widening,
         "baseline_mm": {"sfmapp": 1e3 * pair.baseline[0], "sigma": 1e3 * pair.baseline[1],
-                        "OpenCV": 1e3 * float(np.linalg.norm(shift))},
+                        "OpenCV": 1e3 * float(np.linalg.norm(their_pose[4:]))},
         "apart_in_sigmas": (away / np.sqrt(np.diag(pair.covariance))).tolist(),
     }  # fmt: skip
 

@@ -11,10 +11,19 @@ import pytest
 from numpy.typing import NDArray
 
 from schemas import check_schema
+from sfmapp.camera.camera import Camera, project
+from sfmapp.camera.names import CameraModel
 from sfmapp.camera_files.reading import read_calibration
+from sfmapp.camera_files.rectified_writing import CAMERA_FILES, RectifiedCameras, write_rectified_files
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError
+from sfmapp.formats.colmap import write_model
 from sfmapp.formats.middlebury_calibration import MiddleburyCalibration, write_middlebury
+from sfmapp.geometry import rigid3
+from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.rig import Rig
+from sfmapp.scene.tracks import Tracks
+from sfmapp.stereo.rectification import plan_rectification, rectified_as_is
 
 Pixels = NDArray[np.uint8]
 NEAR, FAR = 24, 12
@@ -111,3 +120,78 @@ def test_middlebury_calibration_comes_back(tmp_path: Path) -> None:
         (tmp_path / "bad.txt").write_text(bad)
         with pytest.raises(InputError, match=r"bad\.txt"):
             read_calibration(tmp_path / "bad.txt", [(741, 500)] * 2)
+
+
+def test_pairs_out_of_a_model_and_out_of_a_video(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    photographs = tmp_path / "images"
+    photographs.mkdir()
+    for path in (*pair, pair[0]):
+        name = path.name if not (photographs / path.name).exists() else "again.png"
+        (photographs / name).write_bytes(path.read_bytes())
+    # two cameras of one row, and one in front of the first; thirty points in a plane, seen by all
+    camera = Camera(CameraModel.PINHOLE, 240, 160, np.array([200.0, 200.0, 120.0, 80.0]))
+    points = np.random.default_rng(4).uniform((-0.6, -0.4, 1.6), (0.8, 0.4, 1.8), (30, 3))
+    poses = np.tile(rigid3.IDENTITY, (3, 1))
+    poses[1, 4], poses[2, 6] = -0.1, -0.3
+    seen = [project(camera, rigid3.apply(pose, points)) for pose in poses]
+    tracks = Tracks.from_observations(np.tile(np.arange(30), 3), np.repeat(np.arange(3), 30), np.concatenate(seen))
+    model = Reconstruction.empty([camera], ["left.png", "right.png", "again.png"], np.zeros(3, np.int32), tracks)
+    model.cam_from_world[:], model.point_xyz[:], model.obs_is_inlier[:] = poses, points, True
+    write_model(tmp_path / "sparse" / "0", model)
+    folder = tmp_path / "sparse" / "0"
+    (folder / "images").symlink_to(photographs)
+    assert run(folder, "--best", "1", "-o", tmp_path / "best") == 0
+    report = json.loads((tmp_path / "best" / "report.json").read_text())
+    assert {report["pairs"][0]["left"], report["pairs"][0]["right"]} == {"left.png", "right.png"}
+    assert np.nanmedian(np.load(tmp_path / "best" / report["pairs"][0]["name"] / "disparity.npy")) > FAR - 1
+    assert run(folder, "--pair", "right", "left.png", "-o", tmp_path / "named") == 0  # the model knows their order
+    (told,) = json.loads((tmp_path / "named" / "report.json").read_text())["pairs"]
+    assert told["rectification"]["is_swapped"]
+    assert told["rectification"]["unit"] == ""
+    assert run(folder, "--pair", "left", "nobody", "-o", tmp_path / "none") == 3
+    assert run(folder, "--pair", "left", "again", "-o", tmp_path / "ahead") == 3  # one in front of the other
+
+    av = pytest.importorskip("av")
+    both = np.concatenate([cv2.imread(str(path)) for path in pair], axis=1)[..., ::-1]
+    with av.open(str(tmp_path / "film.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 480, 160, "bgr0"
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(both), "rgb24")))
+        container.mux(stream.encode())
+    calibration = pair[0].parent / "calib.txt"
+    assert run(tmp_path / "film.mkv", "--camera", calibration, "--step", "2", "-o", tmp_path / "film") == 0
+    report = json.loads((tmp_path / "film" / "report.json").read_text())
+    assert [told["name"] for told in report["pairs"]] == ["000000", "000002"]
+    assert np.nanmedian(np.load(tmp_path / "film" / "000002" / "disparity.npy")) == pytest.approx(FAR, abs=0.2)
+
+
+def test_cameras_for_other_programs_come_back(tmp_path: Path) -> None:
+    turn = rigid3.exp_so3(np.radians([0.5, -4.0, 1.0]))
+    pose = rigid3.from_matrix(turn, -turn @ [0.2, 0.01, 0.0])
+    lens = np.array([300.0, 301.0, 161.0, 119.0, -0.1, 0.02, 1e-3, -5e-4])
+    rig = Rig((Camera(CameraModel.OPENCV, 320, 240, lens),) * 2, np.array([rigid3.IDENTITY, pose]))
+    plan = plan_rectification(rig)
+    g = plan.geometry
+    assert g.baseline is not None
+    rotations = np.stack([plan.left_from_camera, plan.right_from_camera])
+    cameras = RectifiedCameras(rig, rotations, g.focal, g.cx, g.cy, g.doffs, g.baseline, (g.width, g.height))
+    assert [path.name for path in write_rectified_files(tmp_path, cameras)] == list(CAMERA_FILES)
+
+    stored = cv2.FileStorage(str(tmp_path / "rectification.yaml"), cv2.FILE_STORAGE_READ)
+    matrix = {name: stored.getNode(name).mat() for name in ("M1", "D1", "M2", "D2", "R1", "R2", "P1", "P2", "Q")}
+    points = np.random.default_rng(5).uniform((-0.5, -0.4, 1.5), (0.7, 0.4, 5.0), (50, 3))
+    flat = []
+    for side in (0, 1):  # what OpenCV makes of pixels with these is what the plan does
+        xy = project(rig.cameras[side], rigid3.apply(rig.cam_from_rig[side], points))
+        k, d, r, p = (matrix[f"{name}{side + 1}"] for name in "MDRP")
+        flat.append(cv2.undistortPoints(xy[:, None] - 0.5, k, d, R=r, P=p, criteria=(3, 100, 1e-12))[:, 0])
+        np.testing.assert_allclose(flat[side] + 0.5, plan.points(side, xy), atol=1e-5)
+    found = cv2.perspectiveTransform(np.column_stack([flat[0], flat[0][:, 0] - flat[1][:, 0]])[None], matrix["Q"])[0]
+    np.testing.assert_allclose(found, points @ plan.left_from_camera.T, atol=1e-4)
+
+    again = rectified_as_is(read_calibration(tmp_path / "calib.txt", [(g.width, g.height)] * 2).rig)
+    assert again is not None
+    assert (again.focal, again.doffs, again.baseline) == pytest.approx((g.focal, g.doffs, g.baseline))
+    one = read_calibration(tmp_path / "left.yaml", [(320, 240)]).rig.cameras[0]
+    assert one.canonical[:8] == pytest.approx(lens)

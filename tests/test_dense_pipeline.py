@@ -319,9 +319,27 @@ def test_one_photograph_many_times(tmp_path: Path) -> None:
     assert_failed(tmp_path / "out", 4, "copies")
 
 
-def test_fewer_than_three_views(tmp_path: Path) -> None:
+def test_two_views_have_to_agree_where_there_are_no_more(tmp_path: Path) -> None:
     write_wall(tmp_path, 2)
-    with pytest.raises(InputError, match="2 usable images"):
+    told: list[Event] = []
+    model, images = tmp_path / "sparse" / "0", tmp_path / "images"
+    result = dense(model, tmp_path / "out", FAST, images=images, record=False, events=Events(told.append))
+    assert any("no third can contradict" in (event.message or "") for event in told)
+    assert (result.patches.num_views == 2).all()
+    off = np.abs(result.patches.xyz[:, 2] - DEPTH) / PIXEL
+    assert np.median(off) < 1.0
+    assert np.quantile(off, 0.95) < 3.0
+    assert len(result.patches) > 0.5 * 200 * 140 / 4
+    three = replace(FAST, dense=replace(FAST.dense, min_views=3))
+    with pytest.raises(InputError, match="2 usable images") as caught:
+        dense(model, tmp_path / "strict", three, images=images, record=False)
+    assert "min_views=3" in str(caught.value.advice)
+
+
+def test_one_view_has_no_depth(tmp_path: Path) -> None:
+    write_wall(tmp_path, 2)
+    (tmp_path / "images" / "view_1.png").unlink()
+    with pytest.raises(InputError, match="1 usable images"):
         dense(tmp_path / "sparse" / "0", tmp_path / "out", FAST, images=tmp_path / "images", record=False)
 
 

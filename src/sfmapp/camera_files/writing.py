@@ -179,6 +179,14 @@ def kalibr_section(camera: Camera, name: str) -> str | None:
 
 
 def _ros(camera: Camera, name: str) -> str | None:
+    fx, fy, cx, cy = camera.canonical[:4].tolist()
+    projection = np.array([[fx, 0.0, cx - 0.5, 0.0], [0.0, fy, cy - 0.5, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    return camera_info(camera, name, np.eye(3), projection)
+
+
+def camera_info(camera: Camera, name: str, rotation: Array, projection: Array) -> str | None:
+    """ROS's camera_info of a camera, with the rotation (3, 3) and the projection (3, 4) of its rectified pictures; None
+    for a lens that ROS has no words for."""
     terms = terms_of(camera)
     if terms is None or len(terms.coefficients) > 8:
         return None
@@ -187,7 +195,6 @@ def _ros(camera: Camera, name: str) -> str | None:
     if not terms.is_fisheye:
         values += [0.0] * ((5 if len(values) <= 5 else 8) - len(values))
         kind = "plumb_bob" if len(values) == 5 else "rational_polynomial"
-    fx, fy, cx, cy = terms.intrinsics
 
     def matrix(field: str, rows: int, cols: int, entries: Sequence[float]) -> str:
         return f"{field}:\n  rows: {rows}\n  cols: {cols}\n  data: {number_list(entries)}\n"
@@ -197,6 +204,6 @@ def _ros(camera: Camera, name: str) -> str | None:
         + matrix("camera_matrix", 3, 3, terms.matrix)
         + f"distortion_model: {kind}\n"
         + matrix("distortion_coefficients", 1, len(values), values)
-        + matrix("rectification_matrix", 3, 3, np.eye(3).ravel().tolist())
-        + matrix("projection_matrix", 3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0])
+        + matrix("rectification_matrix", 3, 3, rotation.ravel().tolist())
+        + matrix("projection_matrix", 3, 4, projection.ravel().tolist())
     )

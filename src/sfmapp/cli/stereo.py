@@ -25,17 +25,23 @@ examples:
   sfmapp stereo im0.png im1.png --camera calib.txt -o depth/   Middlebury's, rectified already
   sfmapp stereo left/ right/ --camera rig/rig.json -o depth/   pairs by name, a folder for each
   sfmapp stereo kitti/00/ -o depth/                            image_2 and image_3, or image_0 and image_1
+  sfmapp stereo film.mp4 --camera rig/rig.json --step 10 -o depth/   left and right half of every tenth frame
+  sfmapp stereo out/ --pair IMG_0012 IMG_0017                  two photographs of a reconstruction: OUT/stereo
+  sfmapp stereo out/ --best 3                                  the three pairs of it that stereo has most of
   sfmapp stereo l.png r.png --focal 995 --baseline 0.193 --doffs 31.1 -o depth/   rectified, with three numbers
 
 The calibration of two cameras has any form: that of sfmapp calibrate rig, OpenCV's stereo files, Kalibr's, ROS's,
 EuRoC's, KITTI's or Middlebury's calib.txt. Where its cameras are rectified already, pictures stay as they are. Without
-one, photographs are taken to be rectified, and disparities are all that there is.
+one, photographs whose rows agree are taken as they are, and others are rectified by their matches alone; disparities
+are all that there is then. A rig that has turned since its calibration is found by matches, and corrected.
 
 Writes
   OUT/left.png, OUT/right.png   the pair, its rows epipolar lines
-  OUT/disparity.npy             x_left - x_right of each pixel of the left picture, float32 pixels, NaN for unknown
-  OUT/depth.npy                 the same in the unit of the baseline, metres, where one is known
-  OUT/report.json               how it was rectified and matched, and what is wrong with the pair"""
+  OUT/disparity.npy             x_left - x_right of each pixel of the left picture; .pfm and .png the same
+  OUT/depth.npy                 depths in the unit of the baseline, where one is known; cloud.ply, view.glb
+  OUT/calib.txt, *.yaml         the rectified cameras for Middlebury's programs, OpenCV and ROS
+  OUT/report.html               maps and how far off they may be, how the pair was rectified, what is wrong with it
+Of several pairs each has a folder in OUT; OUT/report.json tells of all."""
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -45,9 +51,26 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="Rectify two photographs, match every pixel, and measure depths.", epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    parser.add_argument("sources", metavar="SOURCE", nargs="+", help="two photographs, two folders, or a KITTI folder")
-    parser.add_argument("-o", "--output", metavar="DIR", required=True, help="output folder, new or empty")
+    parser.add_argument(
+        "sources",
+        metavar="SOURCE",
+        nargs="+",
+        help="two photographs, two folders, a KITTI folder, a side-by-side video, or a reconstruction",
+    )
+    parser.add_argument(
+        "-o", "--output", metavar="DIR", help="output folder, new or empty; of a reconstruction, OUT/stereo"
+    )
+    which = parser.add_argument_group("pairs")
+    chosen = which.add_mutually_exclusive_group()
+    chosen.add_argument("--pair", metavar="NAME", nargs=2, help="two images of a reconstruction")
+    chosen.add_argument(
+        "--best", metavar="N", type=int, default=1, help="of a reconstruction, its N best pairs; default: 1"
+    )
+    which.add_argument("--step", metavar="N", type=int, default=1, help="every N-th pair or frame; default: 1")
     cameras = parser.add_argument_group("cameras")
+    cameras.add_argument(
+        "--no-correction", action="store_true", help="hold the calibration, whatever matches say of it"
+    )
     cameras.add_argument("--camera", metavar="FILE", help="calibration of both cameras, of any form")
     cameras.add_argument("--focal", metavar="PX", type=float, help="focal length of a rectified pair, pixels")
     cameras.add_argument("--baseline", metavar="M", type=float, help="distance of its cameras, metres")
@@ -69,17 +92,19 @@ def _stereo(args: argparse.Namespace) -> int:
     limit_library_threads()
     options = options_of({
         "stereo.matcher": args.matcher, "stereo.min_disparity": args.min_disparity,
+        "stereo.correct_rig": "false" if args.no_correction else None,
         "stereo.num_disparities": args.num_disparities, "stereo.window": args.window,
     })  # fmt: skip
     load_numba_without_blas()
     from sfmapp.pipelines.stereo.run import stereo
-    from sfmapp.pipelines.stereo.sources import KnownCameras
+    from sfmapp.pipelines.stereo.sources import ChosenPairs, KnownCameras
     from sfmapp.workspace.usage import Stopwatch
 
     watch = Stopwatch(whole_process=True)
+    chosen = ChosenPairs(None if args.pair is None else tuple(args.pair), args.best, args.step)
     known = KnownCameras(args.camera, args.focal, args.baseline, args.doffs)
     with listening(args) as events:
-        result = stereo(args.sources, args.output, options, known=known, events=events, watch=watch)
+        result = stereo(args.sources, args.output, options, known=known, chosen=chosen, events=events, watch=watch)
     tell_result(args, result, lambda: _print(result))
     return 0
 
@@ -102,5 +127,6 @@ def _print_pair(pair: StereoPairReport) -> None:
     if found.quantiles_px:
         text += f", disparities {found.quantiles_px[0]:.1f} to {found.quantiles_px[-1]:.1f} px"
     if found.depths:
-        text += f", depths {found.depths[0]:.3g} to {found.depths[-1]:.3g} {how.unit} (median {found.depths[1]:.3g})"
+        nearest, middle, farthest = found.depths
+        text += f", depths {nearest:.3g} to {farthest:.3g} {how.unit or 'units'} (median {middle:.3g})"
     print(text)

@@ -60,7 +60,8 @@ def _coarse_to_fine(
 ) -> tuple[Patches, DensifyReport]:
     frame = frame_of(scene)
     grays = gray_pyramids(scene.views, num_levels, threads)
-    limits = Limits(options.min_views, options.min_views, TRUSTED, PROMISING, MAX_REFINED)
+    min_views = options.views_to_agree(len(scene.views))
+    limits = Limits(min_views, min_views, TRUSTED, PROMISING, MAX_REFINED)
     points, depth_range = _sparse_points(scene, frame), _depth_ranges(scene, frame)
     rows: list[LevelReport] = []
     waves: list[WaveReport] = []

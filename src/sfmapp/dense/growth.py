@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sfmapp.dense import filters, layers, seeds
 from sfmapp.dense.arrays import LAYERS, Cells, Images, Limits, Store
 from sfmapp.dense.expand import CANDIDATES, enter, frontier, retry, try_cells
+from sfmapp.dense.options import FEWEST_VIEWS
 from sfmapp.dense.report import WaveReport
 from sfmapp.dense.settle import settle
 from sfmapp.dense.window import make_scratch
@@ -34,8 +35,6 @@ def inverse_depth_range(depth: NDArray[np.float64], otherwise: NDArray[np.float6
     return np.array([1.0 / (MARGIN * far), MARGIN / near])
 
 
-# images that tell a depth
-FEWEST_VIEWS = 2
 # neighbours in which a corner is looked for, on the coarsest level and where that left gaps
 SEARCHED_EVERYWHERE, SEARCHED_IN_GAPS = 4, 2
 

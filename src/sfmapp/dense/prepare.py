@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.dense.options import DenseOptions
+from sfmapp.dense.options import FEWEST_VIEWS, DenseOptions
 from sfmapp.dense.photographs import STAGE, Photographs
 from sfmapp.dense.report import ViewReport, ViewsReport
 from sfmapp.dense.scene import DenseScene, DenseView, Region
@@ -88,11 +88,13 @@ def plan_views(
     neighbors, chosen = select_neighbors(focal, poses, xyz, ptr, view_idx, options.max_neighbors)
     names = [record.name for record in photographs.records]
     alone = [name for name, row in zip(names, neighbors, strict=True) if row[0] < 0]
-    if len(alone) > len(names) - options.min_views:
+    if len(alone) > len(names) - options.views_to_agree(len(names)):
         raise NoReconstructionError(
             f"hardly any of the {len(names)} images has a neighbour that shows the same thing from another place",
             "views need a baseline between them, 1 to 60 degrees as seen from what they show",
         )
+    if len(names) == FEWEST_VIEWS and options.min_views is None:
+        events.decided(STAGE, "two images: both have to agree on every patch, and no third can contradict them")
     if alone:
         events.warned(STAGE, f"{len(alone)} images have no neighbour to match with, {alone[0]} for one", names=alone)
     region = None if options.region is None else Region(np.array(options.region[:3]), np.array(options.region[3:]))
@@ -241,16 +243,21 @@ def _shrink(options: DenseOptions, width: int, height: int, focal: float, depth:
 
 def _check_count(model: Reconstruction, photographs: Photographs, options: DenseOptions) -> None:
     found, copies = len(photographs.records), len(photographs.copies)
-    if found >= options.min_views:
+    asked = options.views_to_agree(found)
+    if found >= asked:
         return
-    text = f"{found} usable images with a pose, {options.min_views} have to agree on every patch"
-    if found + copies >= options.min_views:
+    text = f"{found} usable images with a pose, {asked} have to agree on every patch"
+    if found + copies >= asked:
         raise NoReconstructionError(
             f"{text}: {copies} others are copies in the same place ({photographs.copies[0]}, ...)",
             "give photographs of the same thing from different places",
         )
     in_model = int(model.is_registered.sum())
-    raise InputError(f"{text}; the model has {in_model}", "give at least three photographs from different places")
+    if found >= FEWEST_VIEWS:
+        advice = f"leave dense.min_views={asked} out, and {found} are enough, or give more photographs"
+    else:
+        advice = "give at least two photographs from different places; from three on they correct each other"
+    raise InputError(f"{text}; the model has {in_model}", advice)
 
 
 def _check_baseline(poses: NDArray[np.float64], depth: NDArray[np.float64], photographs: Photographs) -> None:

@@ -114,8 +114,11 @@ def measure_misalignment(matches: PairMatches, geometry: RectifiedGeometry) -> M
     free = np.ones(5, np.bool_)
     step, noise = _fitted(left, right, free, scale)
     sigma = _sigmas(left, right, cells, free, (step, noise))
-    sigma[_ABOUT_Y] = np.hypot(sigma[_ABOUT_Y], _LENS_RAD)
     told = np.abs(step) > _TOLD_SIGMAS * sigma
+    # a rig that evidently turned about the other axes has turned about this one too; of one that did not, the lens may
+    # be what is seen
+    has_turned = bool(np.abs(step[[0, 2]]).max() > _TOLD_SIGMAS * _LENS_RAD)
+    told[_ABOUT_Y] &= has_turned or abs(step[_ABOUT_Y]) > _TOLD_SIGMAS * _LENS_RAD
     # what shows in rows as a whole is told by any pair; the others are left alone where they may be nothing
     free = np.array([True, bool(told[_ABOUT_Y]), True, bool(told[3]), bool(told[4])])
     if not free.all():

@@ -42,11 +42,15 @@ class PairCameras:
         rig: both, with the pose of the second in the frame of the first; None: nothing is known.
         has_baseline: the length of that pose is known.
         text: where it is from, for people.
+        unit: of that length: ``m``, or nothing of a model that has a scale of its own.
+        is_adjusted: the rig was had from these photographs themselves: matches are not held against it.
     """
 
     rig: Rig | None = None
     has_baseline: bool = True
     text: str = "nothing is known of the cameras"
+    unit: str = "m"
+    is_adjusted: bool = False
 
 
 @dataclass(frozen=True)
@@ -120,11 +124,13 @@ def prepare_pair(
     if draft.plan is not None and not is_projective:
         _check_rows(draft, (left, right), cameras, warnings)
         misalignment = _misalignment(draft)
-        if misalignment is not None and options.corrects:
+        if misalignment is not None and options.corrects and not cameras.is_adjusted:
             draft, is_corrected = _corrected(draft, misalignment, (left, right), warnings)
     if not options.is_cropped:
         _check_order(draft, names, warnings)
     pair = draft.pair
+    if pair.geometry is not None:
+        pair = replace(pair, geometry=replace(pair.geometry, unit=cameras.unit))
     if pair.geometry is not None and not cameras.has_baseline:
         pair = replace(pair, geometry=None if is_projective else replace(pair.geometry, baseline=None, unit=""))
     report = _report(pair, draft, cameras, is_swapped, warnings)

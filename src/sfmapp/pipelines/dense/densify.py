@@ -106,7 +106,7 @@ def _run(job: DenseJob, *, maps: bool, record: bool) -> DenseResult:
         patches, report = _densify(job, plan, clusters, report, is_resumed)
         dense_results.write_cloud(job, plan, patches)
         assert report.shares is not None
-        if warning := outcome.check(patches, report.shares, plan, job.options.dense.min_views):
+        if warning := outcome.check(patches, report.shares, plan, job.options.dense.views_to_agree(len(plan.records))):
             job.events.warned(STAGE, warning)
     except AsBeforeError:
         raise

@@ -290,6 +290,11 @@ def _dense_part(
         fields = MeshReport.__dataclass_fields__
         mesh_report = MeshReport(**{name: value for name, value in stages.mesh.items() if name in fields})
     document = dense_document(
-        scene, patches, stages.dense, mesh_report, cell_px=options.cell_px, min_views=options.min_views
+        scene,
+        patches,
+        stages.dense,
+        mesh_report,
+        cell_px=options.cell_px,
+        min_views=options.views_to_agree(len(scene.views)),
     )
     return document, dense_pictures(scene, patches, mesh, cell_px=options.cell_px)

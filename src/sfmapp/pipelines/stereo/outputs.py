@@ -7,12 +7,28 @@ from pathlib import Path
 
 import numpy as np
 
+from sfmapp.camera_files.rectified_writing import CAMERA_FILES, RectifiedCameras, write_rectified_files
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.formats.disparity_files import fits_kitti, write_disparity
 from sfmapp.formats.glb import write_glb
 from sfmapp.formats.ply import write_ply
 from sfmapp.stereo.measured import MeasuredPair, cloud_of, mesh_of
+from sfmapp.stereo.prepare import PreparedPair
 from sfmapp.stereo.result import DisparityMap, RectifiedPair
+
+
+def write_cameras(folder: Path, prepared: PreparedPair) -> Iterator[Path]:
+    """The cameras before and after rectification, for other programs; gives the path of each file. None where no
+    baseline is known."""
+    plan, g = prepared.plan, prepared.pair.geometry
+    if plan is None or g is None or g.baseline is None:
+        for name in CAMERA_FILES:
+            (folder / name).unlink(missing_ok=True)
+        return
+    rotations = np.stack([plan.left_from_camera, plan.right_from_camera])
+    yield from write_rectified_files(
+        folder, RectifiedCameras(plan.rig, rotations, g.focal, g.cx, g.cy, g.doffs, g.baseline, (g.width, g.height))
+    )
 
 
 def write_maps(folder: Path, found: DisparityMap, measured: MeasuredPair) -> Iterator[Path]:

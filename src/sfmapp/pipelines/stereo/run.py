@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from sfmapp.errors import InputError
+from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.atomic import replaced_file
 from sfmapp.images.rewrite import encode
-from sfmapp.pipelines.stereo.outputs import write_maps, write_models
-from sfmapp.pipelines.stereo.sources import KnownCameras, PairSource, find_pairs
+from sfmapp.images.video import is_video
+from sfmapp.pipelines.stereo.model_pairs import is_of_model, pairs_of_model
+from sfmapp.pipelines.stereo.outputs import write_cameras, write_maps, write_models
+from sfmapp.pipelines.stereo.sources import ChosenPairs, KnownCameras, PairSource, find_pairs
+from sfmapp.pipelines.stereo.video_pairs import pairs_of_video
 from sfmapp.report.stereo_document import StereoReport
 from sfmapp.report.stereo_html import stereo_page
 from sfmapp.reporting import NamedReason
@@ -58,28 +61,34 @@ class StereoResult:
 
 
 def stereo(
-    sources: Sequence[str | os.PathLike[str]], output: str | os.PathLike[str], options: Options | None = None, *,
-    known: KnownCameras | None = None, events: Events | None = None, watch: Stopwatch | None = None,
+    sources: Sequence[str | os.PathLike[str]], output: str | os.PathLike[str] | None = None,
+    options: Options | None = None, *,
+    known: KnownCameras | None = None, chosen: ChosenPairs | None = None,
+    events: Events | None = None, watch: Stopwatch | None = None,
 ) -> StereoResult:  # fmt: skip
     """Rectify and match pairs of photographs.
 
     Args:
-        sources: two photographs; two folders, whose files belong together by name; or a folder of KITTI.
+        sources: two photographs; two folders, whose files belong together by name; a folder of KITTI; a video with
+            both pictures side by side; or the workspace of a reconstruction, or a COLMAP model.
         output: a new folder, an empty one, or that of an earlier call; of several pairs, each gets a folder in it.
+            None, for a workspace alone: its folder ``stereo``.
         options: of these, ``stereo``.
-        known: what is known of the cameras; None: the photographs are rectified, and nothing else is known.
+        known: what is known of the cameras; None: nothing.
+        chosen: which of many pairs.
         events: progress, warnings and cancellation. watch: started when the run began.
 
     Raises:
         UsageError: sources that are none, or an output that holds something else.
         InputError: photographs or a calibration that cannot be used; of several pairs, all of them.
     """
-    with Job.opened(
-        STEREO, ", ".join(os.fspath(one) for one in sources), output, options, events=events, watch=watch
-    ) as job:
-        pairs = list(find_pairs(sources, known or KnownCameras()))
-        job.note_inputs({name: digest for pair in pairs for name, digest in pair.digests.items()})
-        job.events.started(STAGE, f"{len(pairs)} pairs" if len(pairs) > 1 else "matching", total=len(pairs))
+    target = _target(sources, output)
+    named = ", ".join(os.fspath(one) for one in sources)
+    with Job.opened(STEREO, named, target, options, events=events, watch=watch) as job:
+        pairs, total = _pairs(job, sources, known or KnownCameras(), chosen or ChosenPairs())
+        inputs: dict[str, str] = {}
+        job.note_inputs(inputs)
+        job.events.started(STAGE, f"{total or 'all'} pairs" if total != 1 else "matching", total=total)
         told: list[StereoPairReport] = []
         failed: list[NamedReason] = []
         last: MatchedStereo | None = None
@@ -88,13 +97,16 @@ def stereo(
                 last, report = _do_pair(job, pair)
                 told.append(report)
             except InputError as error:
-                if len(pairs) == 1:
+                if total == 1:
                     raise
                 failed.append(NamedReason(name=pair.name, reason=str(error)))
                 job.events.warned(STAGE, f"{pair.name}: {error}")
+            inputs |= pair.digests
             job.events.advanced(STAGE)
         if last is None:
-            raise InputError(f"{len(pairs)} pairs, none of which can be used: {failed[0].name}: {failed[0].reason}")
+            why = f"none of which can be used: {failed[0].name}: {failed[0].reason}" if failed else "as none is there"
+            raise InputError(f"{len(failed)} pairs, {why}")
+        job.note_inputs(inputs)
         job.events.finished(STAGE, f"{len(told)} pairs matched")
         document = StereoReport(
             run=job.facts(), pairs=told, failed=failed, usage=job.usage, warnings=job.log.warnings
@@ -102,6 +114,31 @@ def stereo(
         job.workspace.write_json(REPORT, document)
         job.workspace.save()
         return StereoResult(job.workspace.folder, document, last)
+
+
+def _target(sources: Sequence[str | os.PathLike[str]], output: str | os.PathLike[str] | None) -> Path:
+    """The folder of the results. Raises UsageError if it has to be named."""
+    if output is not None:
+        return Path(output)
+    if len(sources) == 1 and is_of_model(Path(sources[0])):
+        return Path(sources[0]) / STEREO
+    raise UsageError("disparities and depths need a folder to be written to", "give -o OUT")
+
+
+def _pairs(
+    job: Job, sources: Sequence[str | os.PathLike[str]], known: KnownCameras, chosen: ChosenPairs
+) -> tuple[Iterable[PairSource], int | None]:
+    """The pairs, and how many there are; None where only their end will tell."""
+    first = os.fspath(sources[0])
+    if len(sources) == 1 and is_of_model(Path(first)):
+        found = pairs_of_model(first, chosen.names, chosen.best, job.options)
+        return found, len(found)
+    if chosen.names is not None:
+        raise UsageError(f"--pair names images of a reconstruction, and {first} is none")
+    if len(sources) == 1 and is_video(first):
+        return pairs_of_video(first, known, chosen.step), None
+    found = list(find_pairs(sources, known))[:: chosen.step]
+    return found, len(found)
 
 
 def _do_pair(job: Job, source: PairSource) -> tuple[MatchedStereo, StereoPairReport]:
@@ -162,6 +199,7 @@ def _write(folder: Path, done: MatchedStereo) -> Iterator[Path]:
     pair = done.prepared.pair
     for name, picture in (("left.png", pair.left), ("right.png", pair.right)):
         yield _write_bytes(folder / name, encode(picture, "png"))
+    yield from write_cameras(folder, done.prepared)
     yield from write_maps(folder, done.disparity, done.measured)
     yield from write_models(folder, pair, done.disparity, done.measured)
 

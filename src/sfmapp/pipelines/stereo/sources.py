@@ -59,6 +59,25 @@ class KnownCameras:
 
 
 @dataclass(frozen=True)
+class ChosenPairs:
+    """Which of many pairs are looked at.
+
+    Attributes:
+        names: of two images of a reconstruction; None: its ``best`` pairs, so many. step: every so-many-th pair of
+            folders and frame of a video.
+    """
+
+    names: tuple[str, str] | None = None
+    best: int = 1
+    step: int = 1
+
+    def __post_init__(self) -> None:
+        for name, value in (("--best", self.best), ("--step", self.step)):
+            if value < 1:
+                raise UsageError(f"{name} is {value}, expected 1 or more")
+
+
+@dataclass(frozen=True)
 class PairSource:
     """One pair.
 
@@ -99,7 +118,10 @@ def find_pairs(sources: Sequence[str | os.PathLike[str]], known: KnownCameras) -
         yield from _of_kitti(paths[0], known)
     else:
         found = ", ".join(f"{path} ({'a folder' if path.is_dir() else 'a file'})" for path in paths) or "nothing"
-        raise UsageError(f"expected two photographs, two folders of them, or a folder of KITTI, found {found}")
+        raise UsageError(
+            "expected two photographs, two folders of them, a folder of KITTI, a video or a reconstruction, found "
+            f"{found}"
+        )
 
 
 def _of_files(

@@ -1,0 +1,149 @@
+"""Pairs of photographs out of a reconstruction: two that are named, or those that stereo has most of."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.dense.photographs import Photographs, find_photographs
+from sfmapp.errors import InputError
+from sfmapp.formats.colmap import read_model
+from sfmapp.geometry import rigid3
+from sfmapp.images.pixels import read_rgb
+from sfmapp.pipelines.dense.source import find_source, is_of_model
+from sfmapp.pipelines.stereo.sources import PairSource
+from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.rig import Rig
+from sfmapp.stereo.prepare import PairCameras
+from sfmapp.stereo.rectification import plan_rectification
+from sfmapp.workspace.layout import STEREO
+from sfmapp.workspace.options import Options
+
+__all__ = ["is_of_model", "pairs_of_model"]
+
+# under fewer degrees depths are poor, under more the two photographs look too different to be matched (Furukawa and
+# Hernandez, "Multi-view stereo: a tutorial", 2015, 2.3)
+_GOOD_DEG = (3.0, 15.0)
+# points that two photographs share before they are a pair at all, and pairs that are rectified to see what is kept
+_LEAST_SHARED, _LOOKED_AT = 20, 4
+
+
+def pairs_of_model(
+    source: str | os.PathLike[str], names: tuple[str, str] | None, best: int, options: Options
+) -> list[PairSource]:
+    """Pairs of a workspace or of a COLMAP model, with the cameras that it has.
+
+    Args:
+        names: of two images, or the ends of their names; None: the best pairs.
+        best: how many of these.
+
+    Raises:
+        UsageError, InputError: no model, or none of its photographs; images that it does not have; no pair of
+            photographs that can be rectified.
+    """
+    where = find_source(source, None, None, options, STEREO)
+    model, _ = read_model(where.model)
+    found = find_photographs(
+        model, where.images, options.images, is_upright=where.is_upright, threads=options.num_workers
+    )
+    if names is not None:
+        chosen = [(_place(names[0], found, source), _place(names[1], found, source))]
+        if chosen[0][0] == chosen[0][1]:
+            raise InputError(f"{names[0]} and {names[1]} are one image of {source}", "name two")
+    else:
+        chosen = best_pairs(model, found)[:best]
+        if not chosen:
+            raise InputError(
+                f"{source}: expected two photographs side by side that show the same, found no such pair",
+                "name two with --pair, or take photographs side by side",
+            )
+    return [_source(model, found, pair) for pair in chosen]
+
+
+def best_pairs(model: Reconstruction, photographs: Photographs) -> list[tuple[int, int]]:
+    """Positions of photographs, the pair that stereo has most of first: by the points that both show, the angle between
+    their rays, and the share of both that is kept when they are rectified."""
+    images = photographs.image_idx
+    rated = []
+    for i, shared in _shared_counts(model, images):
+        for j, count in zip(range(i + 1, len(images)), shared[i + 1 :].tolist(), strict=True):
+            if count >= _LEAST_SHARED:
+                rated.append((count * _angle_weight(model, int(images[i]), int(images[j])), i, j))
+    rated.sort(reverse=True)
+    found = []
+    for score, i, j in itertools.islice(rated, _LOOKED_AT * max(len(images), 1)):
+        try:
+            kept = min(plan_rectification(_rig(model, photographs, (i, j), leftmost=True)).kept)
+        except InputError:
+            continue  # one in front of the other
+        found.append((score * kept, i, j))
+    return [(i, j) for _, i, j in sorted(found, reverse=True)]
+
+
+def _shared_counts(model: Reconstruction, images: NDArray[np.int64]) -> list[tuple[int, NDArray[np.int64]]]:
+    """Of each photograph, how many points each of all shows with it."""
+    tracks = model.tracks
+    place = np.full(len(model.image_names), -1)
+    place[images] = np.arange(len(images))
+    kept = model.obs_is_inlier & (place[tracks.obs_image_idx] >= 0)
+    image, track = place[tracks.obs_image_idx[kept]], tracks.obs_track_idx[kept]
+    out = []
+    for i in range(len(images)):
+        is_shown = np.zeros(tracks.num_tracks, np.bool_)
+        is_shown[track[image == i]] = True
+        out.append((i, np.bincount(image[is_shown[track]], minlength=len(images))))
+    return out
+
+
+def _angle_weight(model: Reconstruction, first: int, second: int) -> float:
+    """From 0 to 1, by the median angle under which points that both show are seen."""
+    tracks = model.tracks
+    sets = [
+        tracks.obs_track_idx[obs[model.obs_is_inlier[obs]]]
+        for obs in (tracks.observations_of_image(first), tracks.observations_of_image(second))
+    ]
+    points = model.point_xyz[np.intersect1d(sets[0], sets[1])]
+    rays = [points - rigid3.center(model.cam_from_world[image]) for image in (first, second)]
+    cosine = (rays[0] * rays[1]).sum(1) / np.maximum(
+        np.linalg.norm(rays[0], axis=1) * np.linalg.norm(rays[1], axis=1), 1e-300
+    )
+    angle = float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))
+    return min(angle / _GOOD_DEG[0], 1.0) * min(_GOOD_DEG[1] / max(angle, 1e-9), 1.0)
+
+
+def _rig(model: Reconstruction, photographs: Photographs, pair: tuple[int, int], *, leftmost: bool = False) -> Rig:
+    """The two cameras as the model has them; with ``leftmost`` the one that stands to the left first."""
+    poses = [model.cam_from_world[photographs.image_idx[one]] for one in pair]
+    second = rigid3.compose(poses[1], rigid3.inverse(poses[0]))
+    if leftmost and rigid3.center(second)[0] < 0.0:
+        return _rig(model, photographs, pair[::-1])
+    return Rig(tuple(photographs.cameras[one] for one in pair), np.array([rigid3.IDENTITY, second]))
+
+
+def _place(name: str, photographs: Photographs, source: str | os.PathLike[str]) -> int:
+    """Of a photograph by the name of its image, or by the end of it where only one ends so."""
+    names = [record.name for record in photographs.records]
+    if name in names:
+        return names.index(name)
+    ending = [n for n, one in enumerate(names) if one.endswith("/" + name) or Path(one).stem == name]
+    if len(ending) == 1:
+        return ending[0]
+    some = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+    found = f"{len(ending)} that end so" if ending else f"none; it has {some}"
+    raise InputError(f"{name}: expected the name of one image with a pose of {os.fspath(source)}, found {found}")
+
+
+def _source(model: Reconstruction, photographs: Photographs, pair: tuple[int, int]) -> PairSource:
+    records = [photographs.records[one] for one in pair]
+    rig = _rig(model, photographs, pair)
+    stems = [Path(record.name).stem for record in records]
+    return PairSource(
+        "--".join(stems), records[0].name, records[1].name,
+        lambda: (read_rgb(records[0]), read_rgb(records[1])),
+        lambda: PairCameras(rig, text="of the reconstruction", unit="", is_adjusted=True),
+        {record.name: record.digest for record in records},
+    )  # fmt: skip
