@@ -182,31 +182,33 @@ def _follow_row(
     step: 1 for paths from the left and from above, -1 for those from the right and from below. begins: no row came
     before.
     """
-    base, grey, width = views.base, views.grey, views.left.shape[1]
+    width = views.left.shape[1]
     yb = y if begins else y - step
+    base, base_b = pointer(views.base[y]), pointer(views.base[yb])
+    grey, grey_b, large = pointer(views.grey[y]), pointer(views.grey[yb]), pointer(penalties.large)
     first, second, column, along = pointer(paths[0]), pointer(paths[1]), pointer(paths[2]), pointer(paths[3])
     small = u8.splat(penalties.small)
     x = 0 if step > 0 else width - 1
     diagonal_a, diagonal_b = (x - y) % width, (x + y) % width
     value_d = u8.splat(np.uint8(0))
     for n in range(width):
-        b, g = np.int64(base[y, x]), np.int64(grey[y, x])
+        b, g = np.int64(base[x]), np.int64(grey[x])
         cost = u8.load(costs, LANES * x)
         shift_a = shift_b = shift_c = shift_d = np.int64(_START)
         large_a = large_b = large_c = large_d = penalties.small
         xa, xb = x - step, x + step
         if not begins:
-            shift_c = b - base[yb, x]
-            large_c = penalties.large[abs(g - grey[yb, x])]
+            shift_c = b - base_b[x]
+            large_c = large[abs(g - grey_b[x])]
             if n > 0:
-                shift_a = b - base[yb, xa]
-                large_a = penalties.large[abs(g - grey[yb, xa])]
+                shift_a = b - base_b[xa]
+                large_a = large[abs(g - grey_b[xa])]
             if n < width - 1:
-                shift_b = b - base[yb, xb]
-                large_b = penalties.large[abs(g - grey[yb, xb])]
+                shift_b = b - base_b[xb]
+                large_b = large[abs(g - grey_b[xb])]
         if n > 0:
-            shift_d = b - base[y, xa]
-            large_d = penalties.large[abs(g - grey[y, xa])]
+            shift_d = b - base[xa]
+            large_d = large[abs(g - grey[xa])]
         slot_a, slot_b, slot_c = GAP + STRIDE * diagonal_a, GAP + STRIDE * diagonal_b, GAP + STRIDE * x
         value_a = _step(first, slot_a, shift_a, small, large_a, cost)
         value_b = _step(second, slot_b, shift_b, small, large_b, cost)
@@ -335,10 +337,12 @@ def _uniqueness(found: Found, y: Index, x: Index) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def look_again(
-    coarse: Found, least: float, texture: NDArray[np.uint16], plain: float, search: tuple[int, int], base: Ints,
-    expected: Bytes,
+    coarse: Found, ends: Floats, least: float, texture: NDArray[np.uint16], plain: float, search: tuple[int, int],
+    base: Ints, expected: Bytes,
 ) -> None:  # fmt: skip
     """Where a level looks, by what half the resolution found: ``base`` and ``expected`` (H, W) of :class:`Views`.
+
+    ends: (2, h, w) least and greatest disparity in the neighbourhood of each pixel of half the resolution.
 
     A pixel looks about the disparities of its neighbourhood; where these are too far apart to be looked at all, at its
     own and at as many as can be of those on the nearer side. It expects its own where ``texture`` (H, W) uint16 is
@@ -351,7 +355,10 @@ def look_again(
         for u in range(columns):
             start = first
             if count > LANES:
-                start = min(max(_start_of_search(coarse.disparity, v, u), first), first + count - LANES)
+                start = min(
+                    max(_start_of_search(coarse.disparity[v, u], ends[0, v, u], ends[1, v, u]), first),
+                    first + count - LANES,
+                )
             lane = np.int64(np.rint(2 * coarse.disparity[v, u])) - start
             sure = coarse.agrees[v, u] > 0 and _uniqueness(coarse, v, u) >= least
             sure = sure and lane >= 0 and lane < LANES
@@ -362,14 +369,9 @@ def look_again(
 
 
 @numba.njit(cache=True, nogil=True)
-def _start_of_search(disparity: Floats, v: Index, u: Index) -> int:
-    """Least disparity to look at from those of half the resolution about (u, v)."""
-    rows, columns = disparity.shape
-    own = 2 * disparity[v, u]
-    low = high = own
-    for j in range(max(v - 1, 0), min(v + 2, rows)):
-        for i in range(max(u - 1, 0), min(u + 2, columns)):
-            low, high = min(low, 2 * disparity[j, i]), max(high, 2 * disparity[j, i])
+def _start_of_search(disparity: float, least: float, greatest: float) -> int:
+    """Least disparity to look at from those of half the resolution."""
+    own, low, high = 2 * disparity, 2 * least, 2 * greatest
     if high - low <= LANES - 2 * ROOM:
         return int(np.rint((low + high) / 2)) - LANES // 2
     if own - low < high - own:
