@@ -25,6 +25,7 @@ from sfmapp.adjust.kernels import (
     total_loss,
 )
 from sfmapp.camera.lens import ROW
+from sfmapp.geometry.damped import solve_damped
 from sfmapp.simd.copying import copy_into
 from sfmapp.simd.f64x8 import add2
 from sfmapp.simd.pointers import pointer
@@ -127,36 +128,6 @@ def _normal_equations(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _damped_step(information: Array, gradient: Array, damping: float, size: int, step: Array) -> bool:
-    """Solve (H + damping diag H) step = -gradient by Cholesky; False where that is not positive definite."""
-    L = np.zeros((8, 8))
-    for i in range(size):
-        for j in range(i + 1):
-            total = information[8 * i + j]
-            if i == j:
-                total *= 1.0 + damping
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            if i == j:
-                if not total > 1e-14 * information[9 * i]:
-                    return False
-                L[i, i] = math.sqrt(total)
-            else:
-                L[i, j] = total / L[j, j]
-    for i in range(size):
-        total = -gradient[i]
-        for k in range(i):
-            total -= L[i, k] * step[k]
-        step[i] = total / L[i, i]
-    for i in range(size - 1, -1, -1):
-        total = step[i]
-        for k in range(i + 1, size):
-            total -= L[k, i] * step[k]
-        step[i] = total / L[i, i]
-    return True
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _refine(
     c: Array, state: Array, xyz: Array, xy: Array, loss: RobustLoss, size: int, prior_weight: float, tolerance: float,
     information: Array, residuals2: Array,
@@ -173,7 +144,7 @@ def _refine(
     images = ImageArrays(rows, none, no_mounts, block, block)
     lenses = LensArrays(canonical, np.zeros(1), camera_block, none, free_ptr, free_slot, free_column)
     new = State(new_rows, new_canonical, xyz)
-    step = np.zeros(8)
+    step, factor = np.zeros(8), np.empty((8, 8))
     fill_rows(poses, block, none, no_mounts, rows)
     focal = c[0]
     penalty = 8.0 * focal * focal  # gtsam's choice for points behind the camera
@@ -184,7 +155,7 @@ def _refine(
     damping, growth, iterations = 1e-4, 2.0, 0
     while iterations < _MAX_ITERATIONS and damping < 1e12:
         iterations += 1
-        if not _damped_step(H, g, damping, size, step):
+        if not solve_damped(H.reshape(8, 8), g[:size], damping, factor, step):
             damping *= growth
             growth *= 2.0
             continue

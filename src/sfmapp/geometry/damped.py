@@ -13,7 +13,10 @@ Array = NDArray[np.float64]
 
 @numba.njit(cache=True, nogil=True)
 def solve_damped(h: Array, g: Array, damping: float, factor: Array, step: Array) -> bool:
-    """Cholesky solution of (H + damping diag(H)) step = -g from the lower triangle of H; False if it is singular."""
+    """Cholesky solution of (H + damping diag(H)) step = -g from the lower triangle of H; False if it is singular.
+
+    The length of g says how much of the others counts: H, factor and step may be larger.
+    """
     n = g.shape[0]
     for i in range(n):
         for j in range(i + 1):
