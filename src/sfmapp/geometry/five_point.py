@@ -1,8 +1,8 @@
 """The essential matrix of unit rays in any direction: RANSAC over five pairs of them.
 
-Five pairs leave E in a four-dimensional space; its determinant and trace constraints are ten cubics in three unknowns,
-which a Groebner basis turns into an eigenvalue problem of size ten: Stewenius, Engels and Nister, "Recent developments
-on direct relative orientation", ISPRS Journal 60, 2006. Nothing in it asks that a ray has a point on the plane z = 1.
+Five pairs leave E in a four-dimensional space; its determinant and trace constraints are ten cubics in three unknowns
+x, y, z, which elimination turns into one equation of degree ten in z: Nister, "An efficient solution to the five-point
+relative pose problem", PAMI 2004. Nothing in it asks that a ray has a point on the plane z = 1.
 Samples are scored as by Torr and Zisserman, "MLESAC", CVIU 2000 (MSAC), on the angles of the rays.
 """
 
@@ -37,9 +37,14 @@ def _products(first: tuple[tuple[int, ...], ...], second: tuple[tuple[int, ...],
 
 
 _TO_SQUARE, _TO_CUBE = _products(_LINEAR, _LINEAR), _products(_SQUARE, _LINEAR)
-# multiplied by x, a basis of the quotient ring (the last ten cubic monomials) turns into these, of which the first six
-# are leading monomials, known by elimination, and the others are in the basis
-_REDUCED = np.array([_CUBE.index((a + 1, b, c)) for a, b, c in _SQUARE])
+# Monomials that are eliminated, and what is left of x, of y and of neither, by falling powers of z. The last six of the
+# first, two and two, differ by the factor z alone, which leaves three equations linear in x and y.
+_ELIMINATED = np.array([_CUBE.index(m) for m in (
+    (3, 0, 0), (0, 3, 0), (2, 1, 0), (1, 2, 0),
+    (2, 0, 1), (2, 0, 0), (0, 2, 1), (0, 2, 0), (1, 1, 1), (1, 1, 0))])  # fmt: skip
+_LEFT = np.array([_CUBE.index(m) for m in (
+    (1, 0, 2), (1, 0, 1), (1, 0, 0), (0, 1, 2), (0, 1, 1), (0, 1, 0),
+    (0, 0, 3), (0, 0, 2), (0, 0, 1), (0, 0, 0))])  # fmt: skip
 
 
 def find_essential(rays1: Array, rays2: Array, threshold: float, max_trials: int, seed: int) -> Array | None:
@@ -88,6 +93,18 @@ def _search(a: Array, b: Array, limit: float, samples: Ints) -> tuple[bool, Arra
 
 
 @numba.njit(cache=True, nogil=True)
+def essentials_of_samples(a: Array, b: Array, samples: Ints) -> Array:
+    """(K, 3, 3) what :func:`essentials_of_five` finds of each sample (S, 5) of pairs of rays (N, 3)."""
+    out = np.empty((10 * samples.shape[0], 3, 3))
+    count = 0
+    for sample in samples:
+        for essential in essentials_of_five(a[sample], b[sample]):
+            out[count] = essential
+            count += 1
+    return out[:count]
+
+
+@numba.njit(cache=True, nogil=True)
 def essentials_of_five(a: Array, b: Array) -> Array:
     """(K, 3, 3) essential matrices, K <= 10, that five pairs of rays (5, 3) allow."""
     rows = np.empty((5, 9))
@@ -100,32 +117,140 @@ def essentials_of_five(a: Array, b: Array) -> Array:
         return np.empty((0, 3, 3))
     basis = np.ascontiguousarray(vt[5:])
     constraints = _constraints(basis)
-    left = np.ascontiguousarray(constraints[:, :10])
-    if not abs(np.linalg.det(left)) > 1e-300:
+    first = constraints[:, _ELIMINATED]
+    if not abs(np.linalg.det(first)) > 1e-300:
         return np.empty((0, 3, 3))
-    reduced = np.linalg.solve(left, np.ascontiguousarray(constraints[:, 10:]))
-    action = np.zeros((10, 10))
-    for k in range(10):
-        place = _REDUCED[k]
-        if place < 10:
-            action[k] = -reduced[place]
-        else:
-            action[k, place - 10] = 1.0
-    if not np.isfinite(action).all():
-        return np.empty((0, 3, 3))
-    values, vectors = np.linalg.eig(action.astype(np.complex128))
+    linear = _linear_in_two(np.linalg.solve(first, constraints[:, _LEFT]).astype(np.float64))
+    roots = _real_roots(_determinant(linear))
     out = np.empty((10, 3, 3))
     count = 0
-    for k in range(10):
-        if abs(values[k].imag) > 1e-9 * max(1.0, abs(values[k].real)) or abs(vectors[9, k]) < 1e-12:
+    for z in roots:
+        x, y, w = _null_vector(linear, z)
+        if w == 0.0:
             continue
-        # the last four of the basis are x, y, z and 1
-        essential = basis[3].copy()
-        for m in range(3):
-            essential += (vectors[6 + m, k] / vectors[9, k]).real * basis[m]
+        essential = (x / w) * basis[0] + (y / w) * basis[1] + z * basis[2] + basis[3]
         out[count] = essential.reshape(3, 3) / np.linalg.norm(essential)
         count += 1
     return out[:count]
+
+
+@numba.njit(cache=True, nogil=True)
+def _linear_in_two(reduced: Array) -> Array:
+    """(3, 3, 5) coefficients, by rising powers of z, of three equations ``a(z) x + b(z) y + c(z) = 0``."""
+    out = np.zeros((3, 3, 5))
+    for i in range(3):
+        one, other = reduced[4 + 2 * i], reduced[5 + 2 * i]  # the first less z times the second
+        for k in range(3):
+            degree, start = (3, 6) if k == 2 else (2, 3 * k)
+            for power in range(degree + 1):
+                out[i, k, power] += one[start + degree - power]
+                out[i, k, power + 1] -= other[start + degree - power]
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _determinant(linear: Array) -> Array:
+    """(11,) coefficients, by rising powers, of the determinant of a matrix (3, 3, 5) of polynomials."""
+    out, minor = np.zeros(11), np.empty(8)
+    for i in range(3):
+        a, b = linear[(i + 1) % 3], linear[(i + 2) % 3]
+        minor[:] = 0.0
+        for k in range(4):
+            for m in range(4):
+                minor[k + m] += a[0, k] * b[1, m] - a[1, k] * b[0, m]
+        for k in range(5):
+            for m in range(7):
+                out[k + m] += linear[i, 2, k] * minor[m]
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _null_vector(linear: Array, z: float) -> tuple[float, float, float]:
+    """What the three equations at z are solved by, up to scale: the longest product of two of them."""
+    rows = np.zeros((3, 3))
+    for i in range(3):
+        for k in range(3):
+            for power in range(4, -1, -1):
+                rows[i, k] = rows[i, k] * z + linear[i, k, power]
+    best, x, y, w = -1.0, 0.0, 0.0, 0.0
+    for i in range(3):
+        a, b = rows[i], rows[(i + 1) % 3]
+        p, q, r = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        if p * p + q * q + r * r > best:
+            best, x, y, w = p * p + q * q + r * r, p, q, r
+    return x, y, w
+
+
+@numba.njit(cache=True, nogil=True)
+def _real_roots(polynomial: Array) -> Array:
+    """Simple real roots of a polynomial (n + 1,), by rising powers: those within one, and those of the reversed one."""
+    n = polynomial.shape[0] - 1
+    out, found = np.empty(2 * n), np.empty(n)
+    count = 0
+    for is_reversed in range(2):
+        for k in range(_roots_within_one(polynomial[::-1].copy() if is_reversed else polynomial, found)):
+            if is_reversed and abs(found[k]) < 1e-12:
+                continue
+            out[count] = 1.0 / found[k] if is_reversed else found[k]
+            count += 1
+    return out[:count]
+
+
+@numba.njit(cache=True, nogil=True)
+def _roots_within_one(polynomial: Array, out: Array) -> int:
+    """Fill in the roots in (-1, 1); returns how many. Those of each derivative part those of the one before."""
+    n = polynomial.shape[0] - 1
+    derivatives = np.zeros((n + 1, n + 1))  # the k-th in row k
+    for m in range(n + 1):
+        derivatives[0, m] = polynomial[m]
+    for k in range(1, n + 1):
+        for m in range(n + 1 - k):
+            derivatives[k, m] = (m + 1) * derivatives[k - 1, m + 1]
+    bounds = np.empty(n + 2)
+    count = 0
+    for k in range(n - 1, -1, -1):
+        bounds[0] = -1.0
+        for m in range(count):
+            bounds[m + 1] = out[m]
+        bounds[count + 1] = 1.0
+        last = count + 1
+        count = 0
+        low = _value(derivatives[k], n - k, bounds[0])
+        for m in range(last):
+            high = _value(derivatives[k], n - k, bounds[m + 1])
+            if (low < 0.0) != (high < 0.0):
+                out[count] = _root_between(derivatives[k], derivatives[k + 1], n - k, bounds[m], bounds[m + 1], low)
+                count += 1
+            low = high
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _value(polynomial: Array, degree: int, x: float) -> float:
+    total = polynomial[degree]
+    for k in range(degree - 1, -1, -1):
+        total = total * x + polynomial[k]
+    return float(total)
+
+
+@numba.njit(cache=True, nogil=True)
+def _root_between(polynomial: Array, slope: Array, degree: int, low: float, high: float, at_low: float) -> float:
+    """Newton's method, or a bisection where it would leave the interval, over which the sign changes once."""
+    x = 0.5 * (low + high)
+    for _ in range(80):
+        value = _value(polynomial, degree, x)
+        if (value < 0.0) == (at_low < 0.0):
+            low = x
+        else:
+            high = x
+        steep = _value(slope, degree - 1, x)
+        new = x - value / steep if steep != 0.0 else low
+        if not low < new < high:
+            new = 0.5 * (low + high)
+        if abs(new - x) <= 1e-15 * (1.0 + abs(x)):
+            return new
+        x = new
+    return x
 
 
 @numba.njit(cache=True, nogil=True)
