@@ -33,18 +33,20 @@ from sfmapp.events import Events
 from sfmapp.features.extract import FeatureOptions, extract_features
 from sfmapp.geometry import epipolar, rigid3
 from sfmapp.geometry.fundamental import refine_fundamental
+from sfmapp.geometry.fundamental_refinement import polish_fundamental
 from sfmapp.geometry.homography import guided_homography
 from sfmapp.geometry.two_rays import move_to_meet
 from sfmapp.images.folder import load_images
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.matching.descriptors import match_sift
 from sfmapp.matching.options import MatchingOptions
-from sfmapp.matching.search import Ransac, find_fundamental, find_homography, find_relative_pose, polish_fundamental
+from sfmapp.matching.search import Ransac, find_fundamental, find_homography, find_relative_pose
 from sfmapp.matching.two_view import verify_pair
 
 SETS = ("fountain-P11", "herz-jesus-P8", "lund-door")
 THRESHOLD_PX = 2.0
-NUM_SCENES, NUM_MATCHES, NOISE_PX, FOCAL = 40, 1000, 0.7, 900.0
+# medians of forty scenes differ by 5 per cent from forty to forty
+NUM_SCENES, NUM_MATCHES, NOISE_PX, FOCAL = 200, 1000, 0.7, 900.0
 # none of those that anything was chosen on
 FIRST_SEED = 1000
 Array = np.ndarray
@@ -389,6 +391,7 @@ def speed() -> list[dict[str, Any]]:
                     "program": name,
                     "cpu_ms": 1e3 * spent[name] / len(cases),
                     "median_error": float(np.median(errors[name])),
+                    "typical_error": float(np.exp(np.mean(np.log(errors[name])))),
                     "worst_error": float(np.max(errors[name])),
                 }
             )
@@ -427,11 +430,12 @@ def write(report: dict[str, Any]) -> None:
         f"{found['num_right']:.0f} of {found['num_matches']:.0f} matches are on the true plane. Mean distance from the",
         f"truth over what both pictures see, px: {distances}", "",
         f"## CPU time, {NUM_MATCHES} matches, half of them wrong, {NUM_SCENES} scenes", "",
-        "| | program | CPU ms | median error | worst error |", "|---|---|---|---|---|",
+        "Typical: the geometric mean.", "",
+        "| | program | CPU ms | median error | typical error | worst error |", "|---|---|---|---|---|---|",
     ]  # fmt: skip
     for row in report["speed"]:
         cells = (row["what"], row["program"], f"{row['cpu_ms']:.2f}", f"{row['median_error']:.4f} {row['unit']}",
-                 f"{row['worst_error']:.3f}")  # fmt: skip
+                 f"{row['typical_error']:.4f}", f"{row['worst_error']:.3f}")  # fmt: skip
         lines.append(f"| {' | '.join(cells)} |")
     RESULTS.joinpath("two_views.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfmapp.geometry import epipolar, fundamental, rigid3
+from sfmapp.geometry.relative_pose import refine_on_inliers, refine_relative_pose
 
 K1 = np.array([[900.0, 0, 512], [0, 905.0, 380], [0, 0, 1]])
 K2 = np.array([[1100.0, 0, 500], [0, 1090.0, 400], [0, 0, 1]])
@@ -73,25 +74,14 @@ def test_sampson_error_matches_opencv_and_the_definition() -> None:
     np.testing.assert_allclose(ours, theirs, rtol=1e-9)
 
 
-def test_weights_turn_the_algebraic_into_the_sampson_error() -> None:
-    """Noise in F falls towards the bound set by Sampson's minimum: reweighting may not make it worse."""
-    rng = np.random.default_rng(2)
-    ground_truth = epipolar.fundamental_from_essential(epipolar.essential_from_pose(POSE), K1, K2)
-    plain, weighted = [], []
-    for _ in range(30):
-        xn1, xn2 = make_points(60, POSE, rng)
-        xy1, xy2 = to_pixels(K1, xn1), to_pixels(K2, xn2)
-        noisy1, noisy2 = xy1 + rng.normal(0, 0.5, xy1.shape), xy2 + rng.normal(0, 0.5, xy2.shape)
-        f = fundamental.fundamental_from_points(noisy1, noisy2)
-        plain.append(np.sqrt(epipolar.sampson_errors(f, xy1, xy2).mean()))
-        for _ in range(3):
-            f = fundamental.fundamental_from_points(noisy1, noisy2, fundamental.sampson_weights(f, noisy1, noisy2))
-        weighted.append(np.sqrt(epipolar.sampson_errors(f, xy1, xy2).mean()))
-    assert np.mean(weighted) <= 1.02 * np.mean(plain)
-    # 60 points bear on 7 numbers: the error at the true points is about sigma sqrt(7 / 60)
-    expected = 0.5 * np.sqrt(7 / 60)
-    assert 0.6 * expected < np.mean(weighted) < 1.8 * expected
-    assert np.abs(ground_truth).max() > 0
+def test_truncated_sums_are_those_of_the_errors() -> None:
+    rng = np.random.default_rng(4)
+    matrices, limit = rng.normal(size=(3, 3, 3)), 0.05
+    for width in (2, 3):
+        a, b = rng.normal(size=(2, 40, width))
+        a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) if width == 3 else x for x in (a, b))
+        sums = [np.minimum(epipolar.sampson_errors(m, a, b), limit).sum() for m in matrices]
+        np.testing.assert_allclose(epipolar.truncated_sums(matrices, a, b, limit), sums, rtol=1e-12)
 
 
 @settings(max_examples=40, deadline=None)
@@ -145,7 +135,7 @@ def test_refinement_reaches_the_exact_pose_from_nearby() -> None:
     start = POSE.copy()
     start[:4] = rigid3.quaternion(rigid3.exp_so3([0.03, -0.02, 0.04]) @ rigid3.rotation_matrix(POSE))
     start[4:] += [0.05, -0.1, 0.08]
-    refined = epipolar.refine_relative_pose(start, xn1, xn2, 0.01, max_iterations=50)
+    refined = refine_relative_pose(start, xn1, xn2, 0.01, max_iterations=50)
     assert rotation_error_deg(refined, POSE) < 1e-5
     assert translation_error_deg(refined, POSE) < 1e-4
 
@@ -178,15 +168,40 @@ def test_refinement_bears_noise_and_outliers_and_is_as_good_as_the_noise_allows(
         xn2[:60] = rng.uniform(-0.5, 0.5, (60, 2))
         start = POSE.copy()
         start[4:] += [0.05, -0.05, 0.05]
-        refined = epipolar.refine_relative_pose(start, xn1, xn2, 2 * sigma)
+        refined = refine_relative_pose(start, xn1, xn2, 2 * sigma)
         errors.append(rotation_error_deg(refined, POSE))
     rms, bound = np.sqrt(np.mean(np.square(errors))), np.sqrt(np.mean(np.square(bounds)))
     # the robust weight and outliers that happen to fit cost a little
     assert 0.7 * bound < rms < 1.6 * bound
 
 
+def test_inliers_are_looked_for_anew_and_lie_in_front() -> None:
+    """Half wrong, some of them near their epipolar line behind a camera; a scene half of which is far away."""
+    rng = np.random.default_rng(6)
+    threshold = 3e-3
+    xn1, xn2 = make_points(200, POSE, rng)
+    far = rng.uniform(-0.5, 0.5, (100, 2))
+    rays = np.column_stack([far, np.ones(100)]) @ rigid3.rotation_matrix(POSE).T
+    a = np.concatenate([xn1, far]) + rng.normal(0, 1e-3, (300, 2))
+    b = np.concatenate([xn2, rays[:, :2] / rays[:, 2:]]) + rng.normal(0, 1e-3, (300, 2))
+    b[:100] = rng.uniform(-0.5, 0.5, (100, 2))
+    start = POSE + np.array([0.0, 0.0, 0.0, 0.0, 0.02, -0.02, 0.01])
+    pose, squared = refine_on_inliers(start, a, b, threshold, first_gate=2.0 * threshold, rounds=8)
+    assert np.linalg.norm(rigid3.rotation_matrix(pose) - rigid3.rotation_matrix(POSE)) < 2e-3
+    depths, angles = epipolar.ray_depths(pose, a, b)
+    taken = (depths > 0).all(1) | (angles <= threshold)
+    np.testing.assert_array_equal(np.isfinite(squared), taken)
+    errors = epipolar.sampson_errors(epipolar.essential_from_pose(pose), a, b)
+    np.testing.assert_allclose(squared[taken], errors[taken], rtol=1e-9)
+    assert (squared[100:] < threshold**2).mean() > 0.98
+    assert (depths[200:] < 0).any(1).mean() > 0.3
+    # refined on what it explains, it stays
+    again, _ = refine_on_inliers(pose, a, b, threshold, first_gate=threshold, rounds=1)
+    np.testing.assert_allclose(again, pose, atol=1e-5)
+
+
 def test_refinement_survives_nothing_to_refine() -> None:
     empty = np.empty((0, 2))
-    np.testing.assert_allclose(epipolar.refine_relative_pose(POSE, empty, empty, 1.0), POSE, atol=1e-12)
+    np.testing.assert_allclose(refine_relative_pose(POSE, empty, empty, 1.0), POSE, atol=1e-12)
     same = np.tile([[0.1, 0.2]], (20, 1))
-    assert np.isfinite(epipolar.refine_relative_pose(POSE, same, same, 1.0)).all()
+    assert np.isfinite(refine_relative_pose(POSE, same, same, 1.0)).all()

@@ -8,6 +8,7 @@ import pytest
 from sfmapp.geometry import epipolar, homography, rigid3
 from sfmapp.geometry.cheirality import choose_pose
 from sfmapp.geometry.fundamental import eight_point
+from sfmapp.geometry.relative_pose import refine_relative_pose
 from sfmapp.geometry.two_rays import METHODS, fundamental_of, move_to_meet, triangulate_pair
 
 Array = np.ndarray
@@ -228,7 +229,7 @@ def estimate(xn1: Array, xn2: Array, noise: float) -> Array:
     if not noise:
         return essential
     start = epipolar.choose_in_front(epipolar.decompose_essential(essential), xn1, xn2)[0]
-    return epipolar.essential_from_pose(epipolar.refine_relative_pose(start, xn1, xn2, 3 * noise))
+    return epipolar.essential_from_pose(refine_relative_pose(start, xn1, xn2, 3 * noise))
 
 
 def test_the_pose_is_chosen_rightly_or_called_undecidable() -> None:

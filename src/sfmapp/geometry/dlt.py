@@ -46,14 +46,12 @@ class LinearProjection:
         return int((self.singular_values[:11] > self.noise_level).sum())
 
 
-def normalizing(points: Array, weights: Array | None = None) -> Array:
+def normalizing(points: Array) -> Array:
     """(D + 1, D + 1) similarity that brings the middle of points (N, D) to the origin and their mean squared distance
-    from it to D. Points that are all one keep their scale. The weights (N,) only weigh the statistics."""
-    num_axes = points.shape[1]
-    w = np.ones(len(points)) if weights is None else weights
-    total = max(float(w.sum()), 1e-300)
-    middle = w @ points / total
-    rms = math.sqrt(float(w @ ((points - middle) ** 2).sum(1)) / total)
+    from it to D. Points that are all one keep their scale."""
+    num_axes, num = points.shape[1], max(len(points), 1)
+    middle = points.sum(0) / num
+    rms = math.sqrt(float(((points - middle) ** 2).sum()) / num)
     scale = math.sqrt(num_axes) / rms if rms > 0.0 else 1.0
     out = np.diag([scale] * num_axes + [1.0])
     out[:num_axes, num_axes] = -scale * middle

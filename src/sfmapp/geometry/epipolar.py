@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.geometry import rigid3
-from sfmapp.geometry.damped import solve_damped, turn_columns
 
 Array = NDArray[np.float64]
 
@@ -49,27 +48,32 @@ def essential_from_pose(cam2_from_cam1: ArrayLike) -> Array:
 
 
 def decompose_essential(essential: Array) -> Array:
-    """(4, 7) poses cam2_from_cam1 with unit translation that share an essential matrix (HZ result 9.19)."""
+    """(..., 4, 7) poses cam2_from_cam1 with unit translation that share an essential matrix (..., 3, 3) (HZ 9.19)."""
     u, _, vt = np.linalg.svd(essential)
-    u = u * np.sign(np.linalg.det(u))
-    vt = vt * np.sign(np.linalg.det(vt))
+    u = u * np.sign(np.linalg.det(u))[..., None, None]
+    vt = vt * np.sign(np.linalg.det(vt))[..., None, None]
     w = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    rotations = np.stack([u @ w @ vt, u @ w @ vt, u @ w.T @ vt, u @ w.T @ vt])
-    return rigid3.from_matrix(rotations, np.stack([u[:, 2], -u[:, 2], u[:, 2], -u[:, 2]]))
+    turns, t = rigid3.quaternion(np.stack([u @ w @ vt, u @ w.T @ vt], -3)), u[..., 2]
+    return np.concatenate([turns[..., [0, 0, 1, 1], :], np.stack([t, -t, t, -t], -2)], -1)
+
+
+@numba.njit(cache=True, nogil=True)
+def sampson_error(f: Array, x: float, y: float, u: float, v: float) -> float:
+    """Squared Sampson distance of the points (x, y) and (u, v) (HZ 11.9); infinite where no line is one."""
+    a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
+    b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
+    c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
+    d = f[0, 0] * u + f[1, 0] * v + f[2, 0]
+    e = f[0, 1] * u + f[1, 1] * v + f[2, 1]
+    r = u * a + v * b + c
+    denominator = a * a + b * b + d * d + e * e
+    return r * r / denominator if denominator > 0.0 else math.inf
 
 
 @numba.njit(cache=True, nogil=True)
 def _sampson_errors(f: Array, xy1: Array, xy2: Array, out: Array) -> None:
     for i in range(xy1.shape[0]):
-        x, y, u, v = xy1[i, 0], xy1[i, 1], xy2[i, 0], xy2[i, 1]
-        a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
-        b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
-        c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
-        d = f[0, 0] * u + f[1, 0] * v + f[2, 0]
-        e = f[0, 1] * u + f[1, 1] * v + f[2, 1]
-        r = u * a + v * b + c
-        denominator = a * a + b * b + d * d + e * e
-        out[i] = r * r / denominator if denominator > 0.0 else math.inf
+        out[i] = sampson_error(f, xy1[i, 0], xy1[i, 1], xy2[i, 0], xy2[i, 1])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -99,33 +103,61 @@ def sampson_errors(matrix: Array, xy1: Array, xy2: Array) -> Array:
     """
     out = np.empty(len(xy1))
     kernel = _ray_sampson_errors if xy1.shape[1] == 3 else _sampson_errors
-    kernel(np.ascontiguousarray(matrix, np.float64), *_contiguous(xy1, xy2), out)
+    kernel(np.ascontiguousarray(matrix, np.float64), *contiguous(xy1, xy2), out)
     return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _truncated_sums(matrices: Array, xy1: Array, xy2: Array, limit: float, out: Array) -> None:
+    is_ray = xy1.shape[1] == 3
+    for k in range(matrices.shape[0]):
+        total = 0.0
+        for i in range(xy1.shape[0]):
+            a, b = xy1[i], xy2[i]
+            if is_ray:
+                total += min(ray_sampson_error(matrices[k], a[0], a[1], a[2], b[0], b[1], b[2]), limit)
+            else:
+                total += min(sampson_error(matrices[k], a[0], a[1], b[0], b[1]), limit)
+        out[k] = total
+
+
+def truncated_sums(matrices: Array, xy1: Array, xy2: Array, limit: float) -> Array:
+    """(K,) sums over the points of :func:`sampson_errors`, none above a limit, of (K, 3, 3) matrices."""
+    out = np.empty(len(matrices))
+    _truncated_sums(np.ascontiguousarray(matrices, np.float64), *contiguous(xy1, xy2), limit, out)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def depths_of_rays(
+    rotation: Array, t: Array, x: float, y: float, z: float, b0: float, b1: float, b2: float
+) -> tuple[float, float, float, float]:
+    """Depths of one pair of rays, NaN where they are parallel, and tangent's two sides of the angle between them."""
+    a0 = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
+    a1 = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
+    a2 = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+    aa = a0 * a0 + a1 * a1 + a2 * a2
+    bb = b0 * b0 + b1 * b1 + b2 * b2
+    ab = a0 * b0 + a1 * b1 + a2 * b2
+    at = a0 * t[0] + a1 * t[1] + a2 * t[2]
+    bt = b0 * t[0] + b1 * t[1] + b2 * t[2]
+    c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+    det = c0 * c0 + c1 * c1 + c2 * c2  # |a x b|^2 = aa bb - ab^2 without the cancellation
+    # below 1e-6 radians the depth is noise in double precision
+    if det > 1e-12 * aa * bb:
+        return (ab * bt - bb * at) / det, (aa * bt - ab * at) / det, math.sqrt(det), ab
+    return math.nan, math.nan, math.sqrt(det), ab
 
 
 @numba.njit(cache=True, nogil=True)
 def _ray_depths(rotation: Array, t: Array, xn1: Array, xn2: Array, depths: Array, angles: Array) -> None:
     is_ray = xn1.shape[1] == 3
     for i in range(xn1.shape[0]):
-        x, y, z = xn1[i, 0], xn1[i, 1], xn1[i, 2] if is_ray else 1.0
-        a0 = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
-        a1 = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
-        a2 = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
-        b0, b1, b2 = xn2[i, 0], xn2[i, 1], xn2[i, 2] if is_ray else 1.0
-        aa = a0 * a0 + a1 * a1 + a2 * a2
-        bb = b0 * b0 + b1 * b1 + b2 * b2
-        ab = a0 * b0 + a1 * b1 + a2 * b2
-        at = a0 * t[0] + a1 * t[1] + a2 * t[2]
-        bt = b0 * t[0] + b1 * t[1] + b2 * t[2]
-        c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
-        det = c0 * c0 + c1 * c1 + c2 * c2  # |a x b|^2 = aa bb - ab^2 without the cancellation
-        angles[i] = math.atan2(math.sqrt(det), ab)
-        # below 1e-6 radians the depth is noise in double precision
-        if det > 1e-12 * aa * bb:
-            depths[i, 0] = (ab * bt - bb * at) / det
-            depths[i, 1] = (aa * bt - ab * at) / det
-        else:
-            depths[i, 0] = depths[i, 1] = math.nan
+        z1, z2 = (xn1[i, 2], xn2[i, 2]) if is_ray else (1.0, 1.0)
+        depths[i, 0], depths[i, 1], across, along = depths_of_rays(
+            rotation, t, xn1[i, 0], xn1[i, 1], z1, xn2[i, 0], xn2[i, 1], z2
+        )
+        angles[i] = math.atan2(across, along)
 
 
 def ray_depths(cam2_from_cam1: ArrayLike, xn1: Array, xn2: Array) -> tuple[Array, Array]:
@@ -143,7 +175,7 @@ def ray_depths(cam2_from_cam1: ArrayLike, xn1: Array, xn2: Array) -> tuple[Array
     pose = np.asarray(cam2_from_cam1, np.float64)
     depths, angles = np.empty((len(xn1), 2)), np.empty(len(xn1))
     rotation = np.ascontiguousarray(rigid3.rotation_matrix(pose))
-    _ray_depths(rotation, np.ascontiguousarray(pose[4:]), *_contiguous(xn1, xn2), depths, angles)
+    _ray_depths(rotation, np.ascontiguousarray(pose[4:]), *contiguous(xn1, xn2), depths, angles)
     return depths, angles
 
 
@@ -164,198 +196,8 @@ def choose_in_front(poses: Array, xn1: Array, xn2: Array) -> tuple[Array, NDArra
     return poses[best], in_front[best], tried[best][1]
 
 
-@numba.njit(cache=True, nogil=True)
-def _tangent_plane(t: Array, out: Array) -> None:
-    """Orthonormal basis (3, 2) of the plane that touches the unit sphere at t."""
-    x, y, z = abs(t[0]), abs(t[1]), abs(t[2])
-    k = 0 if x <= y and x <= z else (1 if y <= z else 2)
-    i, j = (k + 1) % 3, (k + 2) % 3
-    norm = math.sqrt(t[i] * t[i] + t[j] * t[j])
-    out[k, 0], out[i, 0], out[j, 0] = 0.0, -t[j] / norm, t[i] / norm
-    for m in range(3):
-        n, p = (m + 1) % 3, (m + 2) % 3
-        out[m, 1] = t[n] * out[p, 0] - t[p] * out[n, 0]
-
-
-@numba.njit(cache=True, nogil=True)
-def _essential_and_slopes(r: Array, t: Array, tangent: Array, e: Array) -> None:
-    """E = [t]x R in e[0] and its derivatives along exp(w) R and t + tangent b in e[1:], (6, 3, 3)."""
-    for k in range(3):
-        for m in range(6):
-            # column k of R, turned about axis m - 1 for the three of w; then crossed with t or a tangent
-            x, y, z = r[0, k], r[1, k], r[2, k]
-            if m == 1:
-                x, y, z = 0.0, -z, y
-            elif m == 2:
-                x, y, z = z, 0.0, -x
-            elif m == 3:
-                x, y, z = -y, x, 0.0
-            tx, ty, tz = t[0], t[1], t[2]
-            if m > 3:
-                tx, ty, tz = tangent[0, m - 4], tangent[1, m - 4], tangent[2, m - 4]
-            e[m, 0, k] = ty * z - tz * y
-            e[m, 1, k] = tz * x - tx * z
-            e[m, 2, k] = tx * y - ty * x
-
-
-@numba.njit(cache=True, nogil=True)
-def _pose_normal_equations(
-    r: Array, t: Array, xn1: Array, xn2: Array, scale2: float, tangent: Array, h: Array, g: Array
-) -> float:
-    """Gauss-Newton system (5, 5), lower triangle, of the Cauchy-weighted Sampson error; returns the cost."""
-    e, jacobian = np.empty((6, 3, 3)), np.empty(5)
-    _essential_and_slopes(r, t, tangent, e)
-    for k in range(5):
-        g[k] = 0.0
-        for m in range(5):
-            h[k, m] = 0.0
-    cost = 0.0
-    for i in range(xn1.shape[0]):
-        x, y, u, v = xn1[i, 0], xn1[i, 1], xn2[i, 0], xn2[i, 1]
-        a = e[0, 0, 0] * x + e[0, 0, 1] * y + e[0, 0, 2]
-        b = e[0, 1, 0] * x + e[0, 1, 1] * y + e[0, 1, 2]
-        c = e[0, 2, 0] * x + e[0, 2, 1] * y + e[0, 2, 2]
-        d = e[0, 0, 0] * u + e[0, 1, 0] * v + e[0, 2, 0]
-        f = e[0, 0, 1] * u + e[0, 1, 1] * v + e[0, 2, 1]
-        s2 = a * a + b * b + d * d + f * f
-        if s2 <= 0.0:
-            continue
-        s = 1.0 / math.sqrt(s2)
-        residual = (u * a + v * b + c) * s
-        ratio = residual * residual / scale2
-        weight = 1.0 / (1.0 + ratio)
-        cost += math.log1p(ratio)
-        for k in range(5):
-            m = k + 1
-            da = e[m, 0, 0] * x + e[m, 0, 1] * y + e[m, 0, 2]
-            db = e[m, 1, 0] * x + e[m, 1, 1] * y + e[m, 1, 2]
-            dc = e[m, 2, 0] * x + e[m, 2, 1] * y + e[m, 2, 2]
-            dd = e[m, 0, 0] * u + e[m, 1, 0] * v + e[m, 2, 0]
-            df = e[m, 0, 1] * u + e[m, 1, 1] * v + e[m, 2, 1]
-            jacobian[k] = s * (u * da + v * db + dc - residual * s * (a * da + b * db + d * dd + f * df))
-        for k in range(5):
-            g[k] += weight * jacobian[k] * residual
-            for m in range(k + 1):
-                h[k, m] += weight * jacobian[k] * jacobian[m]
-    return cost
-
-
-@numba.njit(cache=True, nogil=True)
-def _pose_normal_equations_of_rays(
-    r: Array, t: Array, rays1: Array, rays2: Array, scale2: float, tangent: Array, h: Array, g: Array
-) -> float:
-    """:func:`_pose_normal_equations` with unit rays (N, 3), of the error on the unit spheres."""
-    e, jacobian = np.empty((6, 3, 3)), np.empty(5)
-    _essential_and_slopes(r, t, tangent, e)
-    g[:], h[:] = 0.0, 0.0
-    cost = 0.0
-    line1, line2, slope1, slope2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    for i in range(rays1.shape[0]):
-        a, b = rays1[i], rays2[i]
-        _lines(e[0], a, b, line1, line2)
-        product = line2[0] * b[0] + line2[1] * b[1] + line2[2] * b[2]
-        s2 = -2.0 * product * product
-        for k in range(3):
-            s2 += line1[k] * line1[k] + line2[k] * line2[k]
-        if s2 <= 0.0:
-            continue
-        s = 1.0 / math.sqrt(s2)
-        residual = product * s
-        ratio = residual * residual / scale2
-        weight = 1.0 / (1.0 + ratio)
-        cost += math.log1p(ratio)
-        for k in range(5):
-            _lines(e[k + 1], a, b, slope1, slope2)
-            change = slope2[0] * b[0] + slope2[1] * b[1] + slope2[2] * b[2]
-            longer = -2.0 * product * change
-            for m in range(3):
-                longer += line1[m] * slope1[m] + line2[m] * slope2[m]
-            jacobian[k] = s * (change - residual * s * longer)
-        for k in range(5):
-            g[k] += weight * jacobian[k] * residual
-            for m in range(k + 1):
-                h[k, m] += weight * jacobian[k] * jacobian[m]
-    return cost
-
-
-@numba.njit(cache=True, nogil=True)
-def _lines(e: Array, a: Array, b: Array, line1: Array, line2: Array) -> None:
-    """E^T b and E a."""
-    for k in range(3):
-        line1[k] = e[0, k] * b[0] + e[1, k] * b[1] + e[2, k] * b[2]
-        line2[k] = e[k, 0] * a[0] + e[k, 1] * a[1] + e[k, 2] * a[2]
-
-
-@numba.njit(cache=True, nogil=True)
-def _linearize_pose(
-    r: Array, t: Array, xn1: Array, xn2: Array, scale2: float, tangent: Array, h: Array, g: Array
-) -> float:
-    if xn1.shape[1] == 3:
-        return _pose_normal_equations_of_rays(r, t, xn1, xn2, scale2, tangent, h, g)
-    return _pose_normal_equations(r, t, xn1, xn2, scale2, tangent, h, g)
-
-
-@numba.njit(cache=True, nogil=True)
-def _move_pose(r: Array, t: Array, tangent: Array, step: Array, new_r: Array, new_t: Array) -> None:
-    """exp(w) R by Rodrigues' formula column by column, and t moved in its tangent plane and back to the sphere."""
-    turn_columns(step, r, new_r)
-    norm = 0.0
-    for k in range(3):
-        new_t[k] = t[k] + tangent[k, 0] * step[3] + tangent[k, 1] * step[4]
-        norm += new_t[k] * new_t[k]
-    for k in range(3):
-        new_t[k] /= math.sqrt(norm)
-
-
-@numba.njit(cache=True, nogil=True)
-def _refine_pose(rotations: Array, ts: Array, xn1: Array, xn2: Array, scale2: float, max_iterations: int) -> int:
-    """Levenberg-Marquardt from rotations[0] and ts[0] of (2, 3, 3) and (2, 3); returns where the result is, 0 or 1."""
-    h, g, factor, step = np.empty((2, 5, 5)), np.empty((2, 5)), np.empty((5, 5)), np.empty(5)
-    tangent = np.empty((2, 3, 2))
-    now = 0
-    _tangent_plane(ts[now], tangent[now])
-    cost = _linearize_pose(rotations[now], ts[now], xn1, xn2, scale2, tangent[now], h[now], g[now])
-    damping = 1e-4
-    for _ in range(max_iterations):
-        new, new_cost = 1 - now, math.inf
-        if solve_damped(h[now], g[now], damping, factor, step):
-            _move_pose(rotations[now], ts[now], tangent[now], step, rotations[new], ts[new])
-            _tangent_plane(ts[new], tangent[new])
-            new_cost = _linearize_pose(rotations[new], ts[new], xn1, xn2, scale2, tangent[new], h[new], g[new])
-        if not new_cost < cost:
-            damping *= 10.0
-            if damping > 1e3:
-                break
-            continue
-        has_converged = cost - new_cost < 1e-6 * cost
-        now, cost = new, new_cost
-        damping = max(damping * 0.1, 1e-9)
-        if has_converged:
-            break
-    return now
-
-
-def refine_relative_pose(
-    cam2_from_cam1: ArrayLike, xn1: Array, xn2: Array, scale: float, max_iterations: int = 20
-) -> Array:
-    """Levenberg-Marquardt on the Cauchy-weighted Sampson error over the five degrees of freedom of a relative pose.
-
-    Args:
-        cam2_from_cam1: (7,) start with a non-zero translation.
-        xn1, xn2: (N, 2) normalised image points, or (N, 3) unit rays; outliers are borne by the robust weight.
-        scale: residual, in normalised units or radians, at which a point's weight has halved.
-
-    Returns:
-        (7,) pose with unit translation; its cost is never above that of the start.
-    """
-    pose = np.asarray(cam2_from_cam1, np.float64)
-    rotations, ts = np.empty((2, 3, 3)), np.empty((2, 3))
-    rotations[0], ts[0] = rigid3.rotation_matrix(pose), pose[4:] / np.linalg.norm(pose[4:])
-    best = _refine_pose(rotations, ts, *_contiguous(xn1, xn2), scale * scale, max_iterations)
-    return rigid3.from_matrix(rotations[best], ts[best])
-
-
-def _contiguous(xy1: ArrayLike, xy2: ArrayLike) -> tuple[Array, Array]:
+def contiguous(xy1: ArrayLike, xy2: ArrayLike) -> tuple[Array, Array]:
+    """Both as kernels take them."""
     return np.ascontiguousarray(xy1, np.float64), np.ascontiguousarray(xy2, np.float64)
 
 
@@ -363,5 +205,5 @@ def compile_kernels() -> None:
     """Compile the kernels of this module, or load them from numba's cache."""
     points = np.array([[0.1, 0.2], [0.3, -0.1]])
     sampson_errors(np.eye(3), points, points)
+    truncated_sums(np.eye(3)[None], points, points, 1.0)
     ray_depths(rigid3.IDENTITY, points, points)
-    refine_relative_pose([0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0], points, points, 1.0, max_iterations=1)

@@ -18,11 +18,11 @@ from sfmapp.geometry.epipolar import (
     decompose_essential,
     essential_from_pose,
     nearest_essential,
-    refine_relative_pose,
     sampson_errors,
 )
 from sfmapp.geometry.fit import FitInfo, inverse_or_none, matched_points
 from sfmapp.geometry.fundamental import sampson_jacobian
+from sfmapp.geometry.relative_pose import refine_relative_pose
 
 Array = NDArray[np.float64]
 

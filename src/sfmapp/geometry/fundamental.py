@@ -46,33 +46,20 @@ def rank_two(matrix: Array) -> Array:
     return unit
 
 
-def fundamental_from_points(xy1: Array, xy2: Array, weights: Array | None = None) -> Array:
+def fundamental_from_points(xy1: Array, xy2: Array) -> Array:
     """Normalised eight-point algorithm (HZ algorithm 11.1) at its quickest: F (3, 3) of rank two and unit norm.
 
     Args:
         xy1, xy2: (N, 2) corresponding pixels, N >= 8.
-        weights: (N,) factor on the squared algebraic residual of each; 1 / (Sampson's denominator) makes the minimum
-            that of Sampson's error once the weights have settled.
     """
     if len(xy1) < 8:
         raise ValueError(f"the eight-point algorithm takes at least 8 points, got {len(xy1)}")
-    t1, t2 = normalizing(xy1, weights), normalizing(xy2, weights)
+    t1, t2 = normalizing(xy1), normalizing(xy2)
     design = epipolar_rows(xy1 * t1[0, 0] + t1[:2, 2], xy2 * t2[0, 0] + t2[:2, 2])
-    weighted = design if weights is None else design * weights[:, None]
     # the eigenvector of the 9 x 9 normal matrix: the points are normalised, so squaring costs no digits that matter
-    f = np.linalg.eigh(design.T @ weighted)[1][:, 0].reshape(3, 3)
-    u, s, vt = np.linalg.svd(f)
-    f = t2.T @ (u[:, :2] * s[:2]) @ vt[:2] @ t1
+    f = t2.T @ rank_two(np.linalg.eigh(design.T @ design)[1][:, 0].reshape(3, 3)) @ t1
     unit: Array = f / np.linalg.norm(f)
     return unit
-
-
-def sampson_weights(fundamental: Array, xy1: Array, xy2: Array) -> Array:
-    """(N,) weights, largest 1, that turn algebraic residuals of F into Sampson's; for fundamental_from_points."""
-    denominator = _squared_slopes(fundamental, xy1, xy2)
-    weights = 1.0 / np.maximum(denominator, max(1e-12 * float(denominator.max()), 1e-300))
-    relative: Array = weights / weights.max()
-    return relative
 
 
 def _squared_slopes(fundamental: Array, xy1: Array, xy2: Array) -> Array:

@@ -22,7 +22,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.damped import solve_damped
 from sfmapp.geometry.epipolar import choose_in_front, ray_depths, sampson_errors
+from sfmapp.geometry.relative_pose import sampson_normal_equations
 from sfmapp.simd.copying import copy_into
 
 Array = NDArray[np.float64]
@@ -192,59 +194,19 @@ def _search(
 
 
 @numba.njit(cache=True, nogil=True)
-def _normal_equations(basis: Array, xn1: Array, xn2: Array, scale2: float, angles: Array, e: Array, hg: Array) -> float:
-    """Cauchy-weighted Gauss-Newton system of Sampson's error: h00, h01, h11, g0, g1 into hg; returns the cost."""
-    _fill_essential(basis, angles[0], angles[1], e)
-    hg[:] = 0.0
-    cost = 0.0
-    for i in range(xn1.shape[0]):
-        x, y, u, v = xn1[i, 0], xn1[i, 1], xn2[i, 0], xn2[i, 1]
-        a = e[0, 0, 0] * x + e[0, 0, 1] * y + e[0, 0, 2]
-        b = e[0, 1, 0] * x + e[0, 1, 1] * y + e[0, 1, 2]
-        c = e[0, 2, 0] * x + e[0, 2, 1] * y + e[0, 2, 2]
-        d = e[0, 0, 0] * u + e[0, 1, 0] * v + e[0, 2, 0]
-        f = e[0, 0, 1] * u + e[0, 1, 1] * v + e[0, 2, 1]
-        s2 = a * a + b * b + d * d + f * f
-        if s2 <= 0.0:
-            continue
-        s = 1.0 / math.sqrt(s2)
-        residual = (u * a + v * b + c) * s
-        weight = 1.0 / (1.0 + residual * residual / scale2)
-        cost += math.log1p(residual * residual / scale2)
-        j0 = j1 = 0.0
-        for k in range(1, 3):
-            da = e[k, 0, 0] * x + e[k, 0, 1] * y + e[k, 0, 2]
-            db = e[k, 1, 0] * x + e[k, 1, 1] * y + e[k, 1, 2]
-            dc = e[k, 2, 0] * x + e[k, 2, 1] * y + e[k, 2, 2]
-            dd = e[k, 0, 0] * u + e[k, 1, 0] * v + e[k, 2, 0]
-            df = e[k, 0, 1] * u + e[k, 1, 1] * v + e[k, 2, 1]
-            slope = s * (u * da + v * db + dc - residual * s * (a * da + b * db + d * dd + f * df))
-            if k == 1:
-                j0 = slope
-            else:
-                j1 = slope
-        hg[0] += weight * j0 * j0
-        hg[1] += weight * j0 * j1
-        hg[2] += weight * j1 * j1
-        hg[3] += weight * j0 * residual
-        hg[4] += weight * j1 * residual
-    return cost
-
-
-@numba.njit(cache=True, nogil=True)
 def _refine(basis: Array, xn1: Array, xn2: Array, scale2: float, angles: Array) -> None:
     """Levenberg-Marquardt over (phi, psi), in place."""
-    e, now, new, trial = np.empty((3, 3, 3)), np.empty(5), np.empty(5), np.empty(2)
-    cost = _normal_equations(basis, xn1, xn2, scale2, angles, e, now)
-    damping = 1e-4
+    e, h, g, factor = np.empty((3, 3, 3)), np.empty((2, 2, 2)), np.empty((2, 2)), np.empty((2, 2))
+    trial, step = np.empty(2), np.empty(2)
+    now, damping = 0, 1e-4
+    _fill_essential(basis, angles[0], angles[1], e)
+    cost = sampson_normal_equations(2, e, xn1, xn2, scale2, h[now], g[now])
     for _ in range(20):
-        h00, h11 = now[0] * (1.0 + damping), now[2] * (1.0 + damping)
-        det = h00 * h11 - now[1] * now[1]
-        new_cost = math.inf
-        if det > 0.0:
-            trial[0] = angles[0] - (h11 * now[3] - now[1] * now[4]) / det
-            trial[1] = angles[1] - (h00 * now[4] - now[1] * now[3]) / det
-            new_cost = _normal_equations(basis, xn1, xn2, scale2, trial, e, new)
+        new, new_cost = 1 - now, math.inf
+        if solve_damped(h[now], g[now], damping, factor, step):
+            trial[0], trial[1] = angles[0] + step[0], angles[1] + step[1]
+            _fill_essential(basis, trial[0], trial[1], e)
+            new_cost = sampson_normal_equations(2, e, xn1, xn2, scale2, h[new], g[new])
         if not new_cost < cost:
             damping *= 10.0
             if damping > 1e3:
@@ -252,8 +214,7 @@ def _refine(basis: Array, xn1: Array, xn2: Array, scale2: float, angles: Array) 
             continue
         has_converged = cost - new_cost < 1e-6 * cost
         copy_into(angles, trial)
-        copy_into(now, new)
-        cost = new_cost
+        now, cost = new, new_cost
         damping = max(damping * 0.1, 1e-9)
         if has_converged:
             return

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.geometry import epipolar
+from sfmapp.geometry.relative_pose import refine_relative_pose
 from sfmapp.mapping.report import FocalReport
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.tracks import Tracks
@@ -119,7 +120,7 @@ def _pair_loss(ratios: NDArray[np.float64], sample: _Sample) -> NDArray[np.float
         essential = epipolar.essential_from_fundamental(sample.fundamental, trial[0].k_matrix, trial[1].k_matrix)
         pose, _, _ = epipolar.choose_in_front(epipolar.decompose_essential(essential), x1, x2)
         # keypoints are good to about a pixel; a smaller scale would call model errors such as distortion evidence
-        pose = epipolar.refine_relative_pose(pose, x1, x2, 1.0 / focal, max_iterations=4)
+        pose = refine_relative_pose(pose, x1, x2, 1.0 / focal, max_iterations=4)
         squared = epipolar.sampson_errors(epipolar.essential_from_pose(pose), x1, x2) * focal**2
         loss[k] = np.log1p(squared).sum()
     return loss

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import bearings
 from sfmapp.geometry import epipolar, rigid3
+from sfmapp.geometry.relative_pose import refine_relative_pose
 from sfmapp.mapping.focal import matched_pixels
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.report import InitialPairReport
@@ -168,7 +169,7 @@ def _examine(
     if len(poses) == 0 or len(x1) < options.min_pose_inliers:
         return InitialPair((first, second), num_matches, 0, 0.0, nothing, "no relative pose")
     pose, _, _ = epipolar.choose_in_front(poses, x1, x2)
-    pose = epipolar.refine_relative_pose(pose, x1, x2, 1.0 / focal)
+    pose = refine_relative_pose(pose, x1, x2, 1.0 / focal)
     depths, angles = epipolar.ray_depths(pose, x1, x2)
     squared = epipolar.sampson_errors(epipolar.essential_from_pose(pose), x1, x2) * focal**2
     good = (depths > 0).all(axis=1) & (squared <= options.max_reprojection_error_px**2)

@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
+from sfmapp.geometry.fundamental_refinement import polish_fundamental
 from sfmapp.matching.binary import match_binary
 from sfmapp.matching.descriptors import match_sift
 from sfmapp.matching.euclidean import match_euclidean
 from sfmapp.matching.guided import GuidedImage, change_of_shape, match_guided
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.products import Ints
-from sfmapp.matching.search import Ransac, find_fundamental, is_significant, polish_fundamental
+from sfmapp.matching.search import Ransac, find_fundamental, is_significant
 from sfmapp.matching.second_motion import has_second_motion
 from sfmapp.scene.features import DescriptorMetric, Features
 
@@ -102,7 +103,7 @@ def _match_coarse_to_fine(
     fundamental = find_fundamental(xy1, xy2, threshold_px, ransac)
     if fundamental is None:
         return doubtful
-    fundamental, inlier = polish_fundamental(fundamental, xy1, xy2, threshold_px)
+    fundamental, inlier = polish_fundamental(fundamental, xy1, xy2, threshold_px, ransac.seed)
     extent = tuple(np.ptp(image2.shape[:, :2], axis=0))
     if inlier.sum() < max(options.min_inliers, _MIN_COARSE_SHARE * len(coarse)):
         return doubtful
@@ -112,7 +113,8 @@ def _match_coarse_to_fine(
         return doubtful
     change = change_of_shape(image1, image2, coarse[inlier])
     guided = match_guided(image1, image2, fundamental, _BAND_PER_THRESHOLD * threshold_px, change, *limits)
-    fundamental, guided_inlier = polish_fundamental(fundamental, *_points(image1, image2, guided), threshold_px)
+    xy1, xy2 = _points(image1, image2, guided)
+    fundamental, guided_inlier = polish_fundamental(fundamental, xy1, xy2, threshold_px, ransac.seed)
     promise = inlier.sum() * min(len(image1.descriptors), len(image2.descriptors)) / size
     if guided_inlier.sum() < _MIN_KEPT_PROMISE * promise:
         return doubtful

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import homography
+from sfmapp.geometry.fundamental_refinement import polish_fundamental
 from sfmapp.matching.options import MatchingOptions
-from sfmapp.matching.search import Ransac, find_fundamental, find_homography, is_significant, polish_fundamental
+from sfmapp.matching.search import Ransac, find_fundamental, find_homography, is_significant
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -74,7 +75,7 @@ def geometry_off_plane(
     found = find_fundamental(a, b, threshold, ransac)
     if found is None:
         return None
-    fundamental, explained = polish_fundamental(found, a, b, threshold)
+    fundamental, explained = polish_fundamental(found, a, b, threshold, ransac.seed)
     if explained.sum() < needed or not is_significant(explained, threshold, extent):
         return None
     return fundamental

@@ -14,28 +14,34 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, pixels_to_normalized, pixels_to_rays
 from sfmapp.geometry import epipolar, five_point, homography, rigid3
+from sfmapp.geometry.fundamental_refinement import polish_fundamental
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.search import (
     Ransac,
+    best_relative_pose,
+    essentials_of_samples,
     find_essential,
     find_fundamental,
     find_homography,
     is_significant,
     is_significant_of_rays,
-    polish_fundamental,
 )
 from sfmapp.matching.second_motion import geometry_off_plane
 from sfmapp.scene.correspondences import TwoViewConfig
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Ints = NDArray[np.int64]
 
 # COLMAP's figures for captions and time stamps burnt into photos: matches within a tenth of the diagonal from the
 # border, moved all alike, and at least seven in ten of all.
 _WATERMARK_BORDER_SHARE = 0.1
 _WATERMARK_MIN_SHARE = 0.7
-# With so many inliers among the matches there is nothing left that a second search could find.
-_CLEAN_SHARE = 0.9
+# Wrong matches that F takes up and E cannot, as it has two more numbers to fit.
+_FREER = 2
+# Samples of seven right matches that a search for F should have met: with that many it missed all with a probability of
+# 0.001. Where it had fewer, F may have gone astray, and five matches are more often right than seven.
+_SURE_SAMPLES = 6.9
 # Two views that a rotation explains so well have no baseline.
 _TURNED_SHARE = 0.9
 
@@ -102,7 +108,7 @@ def verify_pair(
         xy1, xy2: (N, 2) float64 matched pixels.
         camera1, camera2: their focals are trusted if their source is not ``default``, else only used for the pose.
         ransac: the same gives the same answer on any thread.
-        fundamental: (3, 3) that is known to be nearly right, in place of a search.
+        fundamental: (3, 3) that was polished on these matches, in place of a search.
     """
     if camera1.is_wide or camera2.is_wide:
         return _verify_rays(xy1, xy2, camera1, camera2, options, ransac)
@@ -160,8 +166,10 @@ def _verify(
     inliers = _Inliers(*(np.zeros(len(xy1), bool) for _ in range(3)))
     if fundamental is None:
         fundamental = find_fundamental(xy1, xy2, threshold, ransac)
+        if fundamental is not None:
+            fundamental, _ = polish_fundamental(fundamental, xy1, xy2, threshold, ransac.seed)
     if fundamental is not None:
-        result.fundamental, inliers.f = polish_fundamental(fundamental, xy1, xy2, threshold)
+        result.fundamental, inliers.f = fundamental, epipolar.sampson_errors(fundamental, xy1, xy2) < threshold**2
         if not is_significant(inliers.f, threshold, (camera2.width, camera2.height)):
             inliers.f[:] = False
     # a homography that holds where F does not is still worth having, so it looks at all matches in that case
@@ -199,7 +207,7 @@ class _Inliers:
 def _classify(result: TwoViewGeometry, inliers: _Inliers, is_calibrated: bool, options: MatchingOptions) -> None:
     num_f, num_e, num_h = result.num_inliers_f, result.num_inliers_e, result.num_inliers_h
     result.config = TwoViewConfig.DEGENERATE
-    if is_calibrated and num_e >= options.min_inliers and num_e >= options.min_e_f_ratio * num_f:
+    if is_calibrated and num_e >= options.min_inliers and num_e >= options.min_e_f_ratio * (num_f - _FREER):
         result.config = TwoViewConfig.CALIBRATED
         result.is_inlier = inliers.e if num_e >= num_f else inliers.f
     elif num_f >= options.min_inliers:
@@ -235,26 +243,13 @@ class _RelativePoses:
         self.scale = 2.0 * threshold / (camera1.focal + camera2.focal)
 
     def subset(self, mask: Mask) -> tuple[Array, Array]:
-        idx = np.flatnonzero(mask & self.is_valid)
-        idx = idx[:: max(-(-len(idx) // self.max_points), 1)]
+        idx = self.thinned(mask, mask)
         return self.xn1[idx], self.xn2[idx]
 
-    def best(self, groups: list[Array], a: Array, b: Array) -> Array:
-        """Refine the best of each group of poses (K, 7), then take the one of least truncated squared error.
-
-        With few points, wrong poses exist that come within the inlier threshold of all of them. Half of it tells them
-        from the right one, and so do the points that they put behind a camera.
-        """
-        bound = 0.5 * self.scale
-
-        def cost(pose: Array) -> float:
-            depths, _ = epipolar.ray_depths(pose, a, b)
-            error = epipolar.sampson_errors(epipolar.essential_from_pose(pose), a, b)
-            return float(np.where((depths > 0).all(1), np.minimum(error, bound**2), bound**2).sum())
-
-        started = [epipolar.choose_in_front(group, a, b)[0] for group in groups]
-        refined = [epipolar.refine_relative_pose(pose, a, b, 0.5 * bound) for pose in started]
-        return min(refined, key=cost)
+    def thinned(self, mask: Mask, counted: Mask) -> Ints:
+        """Positions of every so many of a mask, that of those counted (N,) no more than max_points are left."""
+        step = max(-(-int((counted & self.is_valid).sum()) // self.max_points), 1)
+        return np.flatnonzero(mask & self.is_valid)[::step]
 
 
 def _estimate_pose(
@@ -265,29 +260,35 @@ def _estimate_pose(
     ransac: Ransac,
     options: MatchingOptions,
 ) -> None:
-    """Relative pose and E from all that can suggest one: F, a search for E, the homography of a plane."""
+    """Relative pose and E from all that can suggest one: F and samples among its inliers, the homography of a plane,
+    and a search for E where F may have gone astray."""
     mask = inliers.f if inliers.f.any() else inliers.h
-    everything = poses.subset(np.ones(len(mask), bool))
-    searched = [poses.subset(mask)]
-    if is_calibrated and mask.mean() < _CLEAN_SHARE:  # F has more freedom and may have gone astray with it
-        searched.append(everything)
-    if len(searched[0][0]) < 8:
+    idx = poses.thinned(np.ones(len(mask), bool) if is_calibrated else mask, mask)
+    xn1, xn2 = poses.xn1[idx], poses.xn2[idx]
+    pool = np.flatnonzero(mask[idx])
+    if len(pool) < 8:
         return
-    groups = []
+    essentials = [essentials_of_samples(xn1[pool], xn2[pool], ransac)]
     if inliers.f.any():
-        groups.append(epipolar.decompose_essential(
-            epipolar.essential_from_fundamental(result.fundamental, poses.k1, poses.k2)))  # fmt: skip
+        essentials.append(epipolar.essential_from_fundamental(result.fundamental, poses.k1, poses.k2)[None])
     if inliers.h.sum() > 0.5 * mask.sum():  # a plane leaves F undetermined, and with it the pose that F suggests
-        groups.append(homography.motions_from_homography(result.homography, poses.k1, poses.k2).poses)
-    for a, b in searched:
-        essential = find_essential(a, b, 0.5 * poses.scale, ransac)
-        if essential is not None:
-            groups.append(epipolar.decompose_essential(essential))
-    groups = [group for group in groups if len(group)]
-    if not groups:
+        motions = homography.motions_from_homography(result.homography, poses.k1, poses.k2).poses
+        essentials += [epipolar.essential_from_pose(pose)[None] for pose in motions]
+    # with few points, wrong poses exist that come within the threshold of all: half of it tells them from the right
+    # one; a camera that is only guessed needs all of it
+    limit = 0.5 * poses.scale if is_calibrated else poses.scale
+    pose = best_relative_pose(np.concatenate(essentials), pool, xn1, xn2, limit)
+    if pose is None:
         return
-    result.cam2_from_cam1 = poses.best(groups, *(everything if is_calibrated else searched[0]))
-    result.essential = epipolar.essential_from_pose(result.cam2_from_cam1)
+    explained = epipolar.sampson_errors(epipolar.essential_from_pose(pose), xn1[pool], xn2[pool]) < poses.scale**2
+    is_astray = ransac.max_trials * mask.mean() ** 7 < _SURE_SAMPLES or explained.mean() < options.min_e_f_ratio
+    if is_calibrated and is_astray:
+        found = find_essential(xn1, xn2, 0.5 * poses.scale, ransac)
+        if found is not None:
+            both = np.stack([epipolar.essential_from_pose(pose), found])
+            pose = best_relative_pose(both, np.arange(len(xn1)), xn1, xn2, limit)
+            assert pose is not None
+    result.cam2_from_cam1, result.essential = pose, epipolar.essential_from_pose(pose)
     inliers.e = epipolar.sampson_errors(result.essential, poses.xn1, poses.xn2) < poses.scale**2
 
 
@@ -306,7 +307,10 @@ def _verify_rays(
     result.config = TwoViewConfig.DEGENERATE
     if essential is None:
         return result
-    pose = poses.best([epipolar.decompose_essential(essential)], a, b)
+    pool = np.flatnonzero(epipolar.sampson_errors(essential, a, b) < poses.scale**2)
+    pose = best_relative_pose(essential[None], pool, a, b, 0.5 * poses.scale)
+    if pose is None:
+        return result
     essential = epipolar.essential_from_pose(pose)
     depths, angles = epipolar.ray_depths(pose, poses.xn1, poses.xn2)
     # a great circle goes all round: what lies far away is in front of both within the noise

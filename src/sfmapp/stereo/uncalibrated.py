@@ -23,12 +23,12 @@ from sfmapp.geometry.dlt import homogeneous
 from sfmapp.geometry.epipolar import sampson_errors
 from sfmapp.geometry.fit import CAUCHY_SIGMAS, cauchy, minimize, robust_sigma
 from sfmapp.geometry.fundamental import sampson_jacobian
+from sfmapp.geometry.fundamental_refinement import polish_fundamental
 from sfmapp.matching.search import (
     Ransac,
     find_fundamental,
     find_homography,
     is_significant,
-    polish_fundamental,
 )
 from sfmapp.scene.rig import Rig
 from sfmapp.stereo.sparse_matches import PairMatches
@@ -97,7 +97,7 @@ def _fundamental(matches: PairMatches, sizes: tuple[Size, Size]) -> tuple[Array,
         f = find_fundamental(matches.left, matches.right, threshold, Ransac(_TRIALS, seed))
         if f is None:
             continue
-        f, inlier = polish_fundamental(f, matches.left, matches.right, threshold)
+        f, inlier = polish_fundamental(f, matches.left, matches.right, threshold, seed)
         if best is None or inlier.sum() > best[1].sum():
             best = f, inlier
     if best is None or best[1].sum() < _LEAST_INLIERS or not is_significant(best[1], threshold, sizes[1]):

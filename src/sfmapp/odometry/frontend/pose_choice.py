@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.geometry import epipolar, homography, rigid3
+from sfmapp.geometry.relative_pose import refine_relative_pose
 
 Array = NDArray[np.float64]
 
@@ -47,7 +48,7 @@ def explaining_poses(
     starts = [given, *(rigid3.from_matrix(turned, way) for way in _half_sphere(_NUM_STARTS))]
     found, costs = [], []
     for start in starts:
-        pose = epipolar.refine_relative_pose(start, xn1, xn2, 0.5 * limit_px / camera.focal)
+        pose = refine_relative_pose(start, xn1, xn2, 0.5 * limit_px / camera.focal)
         other = np.concatenate([pose[:4], -pose[4:]])
         pose, in_front, _ = epipolar.choose_in_front(np.stack([pose, other]), xn1, xn2)
         squared = camera.focal**2 * epipolar.sampson_errors(epipolar.essential_from_pose(pose), xn1, xn2)
