@@ -260,11 +260,14 @@ def test_holes_are_filled_by_what_lies_behind_and_marked() -> None:
 def test_bad_input_is_named() -> None:
     with pytest.raises(UsageError, match="0 disparities"):
         Matcher(100, 100, (0, 0))
+    with pytest.raises(UsageError, match="from 2000 to 2099 px"):
+        Matcher(100, 100, (2000, 100))
     with Matcher(60, 80, (0, 16)) as matcher:
         with pytest.raises(UsageError, match="80 x 60"):
             matcher.match(np.zeros((60, 81), np.uint8), np.zeros((60, 81), np.uint8))
         with pytest.raises(UsageError, match="float64"):
             matcher.match(np.zeros((60, 80)), np.zeros((60, 80)))  # type: ignore[arg-type]
+        assert Matcher(1, 3, (-5, 700), threads=1).match(*np.zeros((2, 1, 3), np.uint8)).density == 0.0
         flat = matcher.match(np.full((60, 80), 90, np.uint8), np.full((60, 80), 90, np.uint8))
         assert flat.density == 0.0
 

@@ -23,6 +23,8 @@ from sfmapp.stereo.slanted import refine_slanted
 # mean difference in grey from the blurred picture, about a pixel, below which there is nothing to match: a saturated
 # sky. Noise of a quarter of a grey value, the least there is after rounding, shows more
 BLANK = 0.1
+# sixteenths of disparities are 16-bit numbers where islands are looked for
+MOST_PX = 2047
 # rows are filled one by one: the median of so many pixels and rows takes the streaks out
 FILL_WINDOW = 5
 # islands of fewer pixels, whose disparities differ by more than one from all around them, are dropped
@@ -42,7 +44,7 @@ class Matcher:
         threads: 1 or 2; what is found does not depend on it.
 
     Raises:
-        UsageError: a size, a number of disparities or of threads that cannot be.
+        UsageError: a size, disparities or a number of threads that cannot be.
     """
 
     def __init__(
@@ -52,6 +54,11 @@ class Matcher:
             raise UsageError(
                 f"a matcher of {height} x {width} pixels, {search[1]} disparities and {threads} threads; expected one "
                 "of each at least, and at most two threads"
+            )
+        if search[0] < -MOST_PX or sum(search) > MOST_PX:
+            raise UsageError(
+                f"disparities from {search[0]} to {sum(search) - 1} px are asked for, the matcher sgm knows them to "
+                f"{MOST_PX} on both sides; match smaller pictures"
             )
         self.search, self.shape = search, (height, width)
         self._tolerance = round(left_right_px)
