@@ -18,7 +18,9 @@ from sfmapp.camera_files.rectified_writing import CAMERA_FILES, RectifiedCameras
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap import write_model
+from sfmapp.formats.disparity_files import read_disparity
 from sfmapp.formats.middlebury_calibration import MiddleburyCalibration, write_middlebury
+from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig
@@ -59,6 +61,12 @@ def test_a_calibrated_pair_becomes_depths(pair: tuple[Path, Path], tmp_path: Pat
     assert np.nanmedian(disparity[60:100, 120:160]) == pytest.approx(NEAR, abs=0.2)
     assert np.nanmedian(disparity[:30, 60:]) == pytest.approx(FAR, abs=0.2)
     assert np.nanmedian(depth[60:100, 120:160]) == pytest.approx(200.0 * 0.1 / NEAR, rel=0.01)
+    sigma, confidence = (np.load(tmp_path / "out" / name) for name in ("depth_sigma.npy", "confidence.npy"))
+    np.testing.assert_array_equal(np.isfinite(sigma), np.isfinite(depth) & (confidence > 0.0))
+    xyz = read_ply_geometry(tmp_path / "out" / "cloud.ply").xyz
+    assert np.median(xyz[:, 2]) == pytest.approx(200.0 * 0.1 / FAR, rel=0.02)
+    np.testing.assert_array_equal(read_disparity(tmp_path / "out" / "disparity.pfm"), disparity)
+    assert {"view.glb", "report.html", "recording.rrd"} <= {path.name for path in (tmp_path / "out").iterdir()}
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     check_schema("stereo", report)
     (told,) = report["pairs"]
@@ -81,6 +89,11 @@ def test_folders_of_pairs(pair: tuple[Path, Path], tmp_path: Path) -> None:
     assert "same picture" in report["failed"][0]["reason"]
     assert (tmp_path / "out" / "a" / "disparity.npy").is_file()
     assert not (tmp_path / "out" / "a" / "depth.npy").exists()  # no baseline
+    assert not (tmp_path / "out" / "a" / "cloud.ply").exists()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert 'href="a/report.html"' in page
+    assert "same picture" in page
+    assert "there are disparities, and no depths" in (tmp_path / "out" / "a" / "report.html").read_text()
 
 
 def test_bad_input_is_named(pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from html import escape
+from urllib.parse import quote
 
 import cv2
 import numpy as np
 
 from sfmapp.report.drawing import jpeg_url
 from sfmapp.report.page import render_page, table
+from sfmapp.report.stereo_document import StereoReport
 from sfmapp.report.stereo_pictures import (
     QUALITY,
     SHOWN_PX,
@@ -33,6 +35,29 @@ def stereo_page(report: StereoPairReport, pair: RectifiedPair, found: DisparityM
     """The page, self-contained, its pictures in it."""
     title = f"{report.left.rsplit('/', 1)[-1]} and {report.right.rsplit('/', 1)[-1]}"
     return render_page(title, _body(report, pair, found, measured))
+
+
+def pairs_page(report: StereoReport) -> str:
+    """The page of several pairs, each a line that leads to its own."""
+    return render_page(f"{len(report.pairs)} stereo pairs", _lines(report))
+
+
+def _lines(report: StereoReport) -> Iterator[str]:
+    for failed in report.failed:
+        yield f'<div class="failure"><p><b>{escape(failed.name)}</b>: {escape(failed.reason)}</p></div>'
+    head = ("pair", "matched", "right within a pixel", "sigma px", "rows off px", "depths", "warnings")
+    yield "<div class=wide><table><tr>" + "".join(f"<th>{name}</th>" for name in head) + "</tr>"
+    for pair in report.pairs:
+        rows, depths, sigma = pair.rectification.rows, pair.disparity.depths, pair.measured.median_sigma_px
+        cells = [
+            f'<a href="{quote(pair.name)}/report.html">{escape(pair.name)}</a>', f"{pair.disparity.density:.1%}",
+            f"{pair.measured.expected_right:.1%}", "" if sigma is None else f"{sigma:.3f}",
+            "" if rows is None else f"{rows.rms_px:.2f}",
+            f"{depths[0]:.3g} to {depths[-1]:.3g} {pair.measured.unit}" if depths else "",
+            escape("; ".join(pair.rectification.warnings)),
+        ]  # fmt: skip
+        yield "<tr>" + "".join(f"<td>{text}</td>" for text in cells) + "</tr>"
+    yield "</table></div>"
 
 
 def _body(report: StereoPairReport, pair: RectifiedPair, found: DisparityMap, measured: MeasuredPair) -> Iterator[str]:
@@ -114,7 +139,7 @@ def _depths(told: MeasuredReport) -> str:
         "pixels, and does not average out."
         if has_calibration
         else "To first order, sigma grows with the square of the depth. Nothing is known of the calibration's own "
-        "sigma: two ten-thousandths of the width are in the sigma of disparities in its place."
+        "sigma: a part of the width, 1.75 in ten thousand, is in the sigma of every disparity."
     )
     return table([("", name) for name in head], rows) + f"<p class=dim>{note}</p>"
 

@@ -36,9 +36,10 @@ _DARK_VARIANCE = 0.5
 _LEAST = 1e-3
 # beyond so many pixels a neighbour is another surface, however far
 _FAR_PX = 32.0
-# What calibration and rectification leave of disparities, a share of the width, where no covariance says it: 0.15 px of
-# 752. Each of the three photographs of the benchmark alone would choose between 1.5e-4 and 2.5e-4.
-RESIDUAL_SHARE = 2e-4
+# What calibration and rectification leave of disparities, a share of the width, 0.13 px of 752: bends that a lens
+# model has not, and rows that are a little off. Each of the three photographs of the benchmark alone would choose
+# between 1.25e-4 and 2.5e-4. What moves all disparities alike is the covariance of the calibration's part.
+RESIDUAL_SHARE = 1.75e-4
 # rows of a band: what is held at a time is its width times this times some twenty maps, whatever the height
 _BAND = 256
 
@@ -63,14 +64,13 @@ def disparity_error(
 ) -> DisparityError:
     """The error of each matched disparity; filled ones are guesses and have none.
 
-    With a covariance of the calibration in the pair's geometry, its part is left to
-    :func:`~sfmapp.stereo.uncertainty.depth_sigma`; without, ``RESIDUAL_SHARE`` of the width is in sigma.
+    ``RESIDUAL_SHARE`` of the width is in sigma and half width; the covariance of the calibration is not, but in
+    :func:`~sfmapp.stereo.uncertainty.depth_sigma`.
 
     Args:
         table: what scores mean, fitted by ``benchmarks/stereo_sigma.py``. threads: bands of rows at a time.
     """
-    is_calibrated = pair.geometry is not None and pair.geometry.covariance is not None
-    residual = 0.0 if is_calibrated else RESIDUAL_SHARE * found.disparity.shape[1]
+    residual = RESIDUAL_SHARE * found.disparity.shape[1]
     shape = found.disparity.shape
     result = DisparityError(*(np.full(shape, value, np.float32) for value in (np.nan, np.nan, 0.0)))
 

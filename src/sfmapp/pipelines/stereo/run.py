@@ -19,7 +19,7 @@ from sfmapp.pipelines.stereo.outputs import write_cameras, write_maps, write_mod
 from sfmapp.pipelines.stereo.sources import ChosenPairs, KnownCameras, PairSource, find_pairs
 from sfmapp.pipelines.stereo.video_pairs import pairs_of_video
 from sfmapp.report.stereo_document import StereoReport
-from sfmapp.report.stereo_html import stereo_page
+from sfmapp.report.stereo_html import pairs_page, stereo_page
 from sfmapp.reporting import NamedReason
 from sfmapp.stereo.match import match_pair
 from sfmapp.stereo.measured import MeasuredPair, measure_pair, report_of
@@ -112,6 +112,8 @@ def stereo(
             run=job.facts(), pairs=told, failed=failed, usage=job.usage, warnings=job.log.warnings
         )  # fmt: skip
         job.workspace.write_json(REPORT, document)
+        if any(pair.name for pair in told):  # each has a folder and a page of its own
+            job.workspace.write_text(PAGE, pairs_page(document))
         job.workspace.save()
         return StereoResult(job.workspace.folder, document, last)
 
