@@ -112,6 +112,8 @@ def timed(run: Callable[[StereoSet], Disparity]) -> Callable[[StereoSet], tuple[
 def markdown(report: dict[str, Any]) -> str:
     """The tables."""
     about = f"{report['date']}, {report['commit']}, {report['cpu']}, one thread"
+    if "kept" in report:
+        about += f"; {', '.join(report['kept']['matchers'])}: {report['kept']['date']}"
     lines = [
         "# Matchers of rectified pairs", "", about, "",
         "Bad-1 and bad-2: percent of pixels whose disparity is off by more than 1 or 2 px. The first three errors are",
@@ -166,12 +168,20 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", help="names of sets; all without it")
     parser.add_argument("--matchers", nargs="+", help="how the names of matchers begin; all without it")
     parser.add_argument("--peer-python", type=Path, help="an interpreter that has elas and pandora")
+    parser.add_argument("--keep", type=Path, help="results whose rows stand for what is not measured anew")
     parser.add_argument("-o", "--out", type=Path, default=RESULTS / "stereo.json")
     args = parser.parse_args()
     cv2.setNumThreads(1)
     root = Path(os.environ.get("SFMAPP_DATA", "../shared/data"))
     runs = measure(args.sets, args.matchers, args.peer_python, root)
-    report = {**describe_machine(), "runs": runs}
+    kept: dict[str, Any] = {}
+    if args.keep is not None:
+        measured = {(run["set"], run["matcher"]) for run in runs}
+        old = json.loads(args.keep.read_text(encoding="utf-8"))
+        rows = [run for run in old["runs"] if (run["set"], run["matcher"]) not in measured]
+        kept = {"kept": {"date": old["date"], "matchers": sorted({run["matcher"] for run in rows})}}
+        runs += rows
+    report = {**describe_machine(), **kept, "runs": runs}
     args.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     args.out.with_suffix(".md").write_text(markdown(report), encoding="utf-8")
 

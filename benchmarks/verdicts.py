@@ -97,6 +97,7 @@ def rows_of(folder: Path) -> list[Row]:
         "circle_centers": circle_rows,
         "uncalibrated": uncalibrated_rows,
         "planes": plane_rows,
+        "stereo": stereo_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
 
@@ -169,6 +170,31 @@ def panorama_rows(folder: Path) -> Iterator[Row]:
         ):  # fmt: skip
             if key in peer:  # a program that joins nothing has no error
                 yield Row("panorama", case, quantity, unit, "less", ours[key], program, peer[key], *about)
+
+
+def stereo_rows(folder: Path) -> Iterator[Row]:
+    """Our matchers of rectified pairs against the best of each peer's settings, quantity by quantity."""
+    report = read(folder, "stereo")
+    about = (False, report["date"][:10], report["commit"])
+    quantities: tuple[tuple[str, str, Literal["less", "more"], str], ...] = (
+        ("bad-1 of answers", "%", "less", "bad1_answered_visible"),
+        ("bad-2 of answers", "%", "less", "bad2_answered_visible"),
+        ("mean error of answers", "px", "less", "mean_answered_visible"),
+        ("density", "%", "more", "density_visible"),
+        ("bad-1 of all pixels, holes filled", "%", "less", "bad1_complete_all"),
+        ("mean error of all pixels, holes filled", "px", "less", "mean_complete_all"),
+        ("CPU time", "ms", "less", "cpu_ms"),
+    )
+    for name in dict.fromkeys(run["set"] for run in report["runs"]):
+        runs = {run["matcher"]: run for run in report["runs"] if run["set"] == name}
+        for mine, peer in (("sfmapp window", "StereoBM"), ("sfmapp", "StereoSGBM"), ("sfmapp", "ELAS"),
+                           ("sfmapp", "pandora")):  # fmt: skip
+            # defaults of StereoSGBM have no penalties: quick, and wrong
+            others = [run for key, run in runs.items() if key.startswith(peer) and key != "StereoSGBM, defaults"]
+            for quantity, unit, better, key in quantities if others else ():
+                best = (min if better == "less" else max)(run[key] for run in others)
+                case = f"{name}, {'windows' if mine.endswith('window') else 'semi-global'}"
+                yield Row("stereo", case, quantity, unit, better, runs[mine][key], peer, best, *about)
 
 
 def circle_rows(folder: Path) -> Iterator[Row]:
