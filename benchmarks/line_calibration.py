@@ -35,6 +35,8 @@ Grey = NDArray[np.uint8]
 RESULTS = Path(__file__).parent / "results" / "line_calibration.md"
 SIZE = (1280, 960)
 STRENGTHS = (-0.25, -0.1, -0.4, 0.1, 0.0, -0.02)
+# the scene whose one view leaves the principal point open: its camera gets a second photograph
+WITH_ANOTHER = 4
 BOARD = (9, 6)
 
 
@@ -77,10 +79,11 @@ def streets(num: int) -> Iterator[str]:
         rng = np.random.default_rng([seed, 0x11E5])
         strength = STRENGTHS[seed % len(STRENGTHS)]
         camera = street_camera(strength, rng.uniform(0.5, 1.3), rng.normal(0.0, 12.0, 2))
-        start = time.process_time()
         pictures = [LinePicture("street", photograph(camera, street_pose(rng), seed))]
-        start = time.process_time()
-        yield street_row(seed, camera, strength, pictures, start)
+        yield street_row(seed, camera, strength, pictures, time.process_time())
+        if seed == WITH_ANOTHER:
+            pictures.append(LinePicture("another", photograph(camera, street_pose(rng), seed + 1)))
+            yield street_row(f"{seed}, 2 photographs", camera, strength, pictures, time.process_time())
     camera = street_camera(-0.2, 0.8, np.array([10.0, -8.0]))
     rng = np.random.default_rng(0x11E6)
     pictures = [LinePicture(str(k), photograph(camera, street_pose(rng), k)) for k in range(4)]
