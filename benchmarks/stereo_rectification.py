@@ -3,12 +3,13 @@
     python benchmarks/stereo_rectification.py            # results/stereo_rectification.md
     python benchmarks/stereo_rectification.py --seeds 2 -o /tmp/new/stereo_rectification.md
 
-*Fountain*: neighbouring photographs of Strecha's fountain-P11 through the registered cameras. *Boards*: corners of the
-thirteen pairs of OpenCV's samples, each program through its own calibration of the same corners. *Rendered*: two
-cameras of different lenses that converge, at several places of rendered worlds, and the same with nothing known of
-them. Vertical parallax is y_left - y_right of matches, those of rendered pairs aligned to hundredths of a pixel in the
-rectified pictures of either program, divided by how much its rectification enlarges the photograph, so that pixels are
-those of the photographs. *Turned*: the right camera of a rendered rig is turned by 0.05 degrees after its calibration.
+*Fountain*: neighbouring photographs of Strecha's fountain-P11 through the registered cameras, and with nothing known
+of them. *Boards*: corners of the thirteen pairs of OpenCV's samples, each program through its own calibration of the
+same corners. *Rendered*: two cameras of different lenses that converge, at several places of rendered worlds.
+Vertical parallax is y_left - y_right of matches, those of rendered pairs aligned to hundredths of a pixel in the
+rectified pictures of either program, divided by how much its rectification enlarges the photograph, so that pixels
+are those of the photographs. *Turned*: the right camera of a rendered rig is turned by 0.05 degrees after its
+calibration.
 """
 
 from __future__ import annotations
@@ -243,10 +244,10 @@ def turned(seed: int) -> Iterator[dict[str, Any]]:
             truth = Rig(rig.cameras, np.array([rigid3.IDENTITY, moved]))
             calibrated, photographs = PairCameras(rig), _photographs(world, truth, pose, seed)
             still = prepare_pair(
-                *_photographs(world, rig, pose, seed), calibrated, NAMES, PrepareOptions(corrects=False)
+                *_photographs(world, rig, pose, seed), calibrated, NAMES, PrepareOptions(corrects="no")
             )
-            found = prepare_pair(*photographs, calibrated, NAMES)
-            left_alone = prepare_pair(*photographs, calibrated, NAMES, PrepareOptions(corrects=False))
+            found = prepare_pair(*photographs, calibrated, NAMES, PrepareOptions(corrects="turn"))
+            left_alone = prepare_pair(*photographs, calibrated, NAMES, PrepareOptions(corrects="no"))
             row: dict[str, Any] = {"place": place, "seed": seed, "axis": name}
             plan, measured = plan_rectification(rig), found.misalignment
             if measured is not None:

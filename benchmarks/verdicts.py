@@ -92,6 +92,7 @@ def rows_of(folder: Path) -> list[Row]:
         "two_views": two_view_rows,
         "known_points": known_point_rows,
         "rigs": rig_rows,
+        "stereo_rectification": rectification_rows,
         "panorama": panorama_rows,
         "tagged_sets": tagged_rows,
         "circle_centers": circle_rows,
@@ -298,6 +299,23 @@ def rig_rows(folder: Path) -> Iterator[Row]:
     )  # fmt: skip
 
 
+def rectification_rows(folder: Path) -> Iterator[Row]:
+    """``sfmapp stereo`` against cv2.stereoRectify: vertical parallax of rectified pairs."""
+    report = read(folder, "stereo_rectification")
+    about = ("OpenCV", report["date"][:10], report["commit"])
+    rows = {
+        f"{len(report['fountain'])} pairs of fountain-P11": report["fountain"],
+        "13 pairs of chessboards": [report["boards"]],
+        f"{len(report['rendered'])} converging pairs of two lenses": report["rendered"],
+    }
+    for case, found in rows.items():
+        ours, theirs = (math.sqrt(sum(row[name] ** 2 for row in found) / len(found)) for name in ("sfmapp", "OpenCV"))
+        yield Row(
+            "stereo_rectification", case, "vertical parallax, rms", "px", "less", ours, about[0], theirs, False,
+            *about[1:],
+        )  # fmt: skip
+
+
 def sparse_rows(folder: Path) -> Iterator[Row]:
     """``sfmapp reconstruct`` against pycolmap."""
     report = read(folder, "sparse")
@@ -462,6 +480,14 @@ def promises(folder: Path) -> Iterator[Promise]:
     yield Promise("rigs", "sigmas of a rig are those of its errors (NEES 0.9 to 1.1)", good, len(rows), date)
     odd = report["odd"]
     yield Promise("rigs", "a board that moved between exposures is named", odd["moved"], odd["trials"], date)
+    report = read(folder, "stereo_rectification")
+    rows = report["turned"]
+    good = sum(row.get("error_deg", math.inf) <= 0.005 for row in rows)
+    text = "a rig that has turned by 0.05 degrees since its calibration is found to 0.005 degrees"
+    yield Promise("stereo_rectification", text, good, len(rows), report["date"][:10])
+    good = sum(row["depth_corrected"] <= 1.1 * row["depth_undisturbed"] for row in rows)
+    text = "corrected, its depths are within 10 % of the error of a rig that has not turned"
+    yield Promise("stereo_rectification", text, good, len(rows), report["date"][:10])
     report = read(folder, "stereo_sigma")
     rows = report["runs"]["Fitted on rendered pairs, judged on photographs"]
     good = sum(60 <= row["inside_68"] <= 76 and 92 <= row["inside_95"] <= 97 for row in rows)

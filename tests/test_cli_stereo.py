@@ -135,6 +135,27 @@ def test_middlebury_calibration_comes_back(tmp_path: Path) -> None:
             read_calibration(tmp_path / "bad.txt", [(741, 500)] * 2)
 
 
+def test_rows_of_a_rectified_pair_come_together_and_disparities_stay(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    left, right = (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in pair)
+    lowered = cv2.warpAffine(right, np.array([[1.0, 0.0, 0.0], [0.004, 1.0, 0.3]]), (240, 160), flags=cv2.INTER_CUBIC)
+    cv2.imwrite(str(tmp_path / "right.png"), lowered)
+    calibration = pair[0].parent / "calib.txt"
+    for how in ("auto", "turn", "no"):
+        out = tmp_path / how
+        assert run(pair[0], tmp_path / "right.png", "--camera", calibration, "--correct", how, "-o", out) == 0
+        (told,) = json.loads((out / "report.json").read_text())["pairs"]
+        found, rows = told["rectification"]["misalignment"], told["rectification"]["rows"]
+        assert found["is_significant"]
+        assert found["rms_before_px"] > 0.4 > 0.15 > found["rms_after_px"]
+        assert found["is_corrected"] == (how != "no")
+        assert (rows["rms_px"] < 0.25) == (how != "no")
+        assert np.array_equal(cv2.imread(str(out / "left.png"), cv2.IMREAD_GRAYSCALE), left)
+        if how == "auto":
+            disparity = np.load(out / "disparity.npy")
+            assert np.nanmedian(disparity[60:100, 120:160]) == pytest.approx(NEAR, abs=0.2)
+            assert np.nanmedian(disparity[:30, 60:]) == pytest.approx(FAR, abs=0.2)
+
+
 def test_pairs_out_of_a_model_and_out_of_a_video(pair: tuple[Path, Path], tmp_path: Path) -> None:
     photographs = tmp_path / "images"
     photographs.mkdir()

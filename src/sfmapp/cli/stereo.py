@@ -69,7 +69,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     which.add_argument("--step", metavar="N", type=int, default=1, help="every N-th pair or frame; default: 1")
     cameras = parser.add_argument_group("cameras")
     cameras.add_argument(
-        "--no-correction", action="store_true", help="hold the calibration, whatever matches say of it"
+        "--correct", metavar="HOW", help="a rig that has turned since its calibration: turn, rows, no; default: auto"
     )
     cameras.add_argument("--camera", metavar="FILE", help="calibration of both cameras, of any form")
     cameras.add_argument("--focal", metavar="PX", type=float, help="focal length of a rectified pair, pixels")
@@ -92,7 +92,7 @@ def _stereo(args: argparse.Namespace) -> int:
     limit_library_threads()
     options = options_of({
         "stereo.matcher": args.matcher, "stereo.min_disparity": args.min_disparity,
-        "stereo.correct_rig": "false" if args.no_correction else None,
+        "stereo.correct_rig": args.correct,
         "stereo.num_disparities": args.num_disparities, "stereo.window": args.window,
     })  # fmt: skip
     load_numba_without_blas()

@@ -32,6 +32,9 @@ _LEAST_MATCHES, _CELLS, _ROUNDS = 60, (4, 3), 30
 _CHANCE, _TOLD_SIGMAS = 20.5, 3.0
 # of what is found: rows of rendered pairs were pulled together by so much, and by less now (stereo/alignment.py)
 _SYSTEMATIC = 0.05
+# what it may leave of all disparities, pixels: long lenses show a turn about the vertical in fractions of a row, and it
+# moves disparities by pixels
+_WORST_SHIFT_PX = 0.5
 # a turn beyond this is no calibration that has drifted: it is another rig's
 _LARGEST_DEG = 3.0
 # What of a lens's decentring is not known bends rows as a turn about the vertical does, p2 by half of it: after a good
@@ -93,12 +96,15 @@ class Misalignment:
     def right_from_left(self, baseline: float) -> Array:
         """(7,) pose of the true right camera in the frame of the rectified left one."""
         numbers = np.radians(np.concatenate([self.turn_deg, self.direction_deg]))
-        t = _translation(numbers)
-        return rigid3.from_matrix(rigid3.exp_so3(numbers[:3]), baseline * t / np.linalg.norm(t))
+        rotation, center = rigid3.exp_so3(numbers[:3]), _center(numbers)
+        return rigid3.from_matrix(rotation, -rotation @ center * (baseline / np.linalg.norm(center)))
 
 
-def measure_misalignment(matches: PairMatches, geometry: RectifiedGeometry) -> Misalignment | None:
+def measure_misalignment(
+    matches: PairMatches, geometry: RectifiedGeometry, *, has_direction: bool = True
+) -> Misalignment | None:
     """What matches of a rectified pair, refined, say against its calibration; None where there are too few.
+    ``has_direction``: the baseline's direction may have moved as well, else the right camera alone has turned.
 
     The five numbers are those of the least Sampson error under Cauchy's loss, with a prior of half a degree each.
     """
@@ -111,7 +117,7 @@ def measure_misalignment(matches: PairMatches, geometry: RectifiedGeometry) -> M
     left, right = left[kept], right[kept]
     cells = _cells(left)
     scale = 1.0 / g.focal
-    free = np.ones(5, np.bool_)
+    free = np.array([True, True, True, has_direction, has_direction])
     step, noise = _fitted(left, right, free, scale)
     sigma = _sigmas(left, right, cells, free, (step, noise))
     told = np.abs(step) > _TOLD_SIGMAS * sigma
@@ -119,8 +125,9 @@ def measure_misalignment(matches: PairMatches, geometry: RectifiedGeometry) -> M
     # be what is seen
     has_turned = bool(np.abs(step[[0, 2]]).max() > _TOLD_SIGMAS * _LENS_RAD)
     told[_ABOUT_Y] &= has_turned or abs(step[_ABOUT_Y]) > _TOLD_SIGMAS * _LENS_RAD
+    told[_ABOUT_Y] &= sigma[_ABOUT_Y] * g.focal < _WORST_SHIFT_PX
     # what shows in rows as a whole is told by any pair; the others are left alone where they may be nothing
-    free = np.array([True, bool(told[_ABOUT_Y]), True, bool(told[3]), bool(told[4])])
+    free = np.array([True, bool(told[_ABOUT_Y]), True, bool(told[3]), bool(told[4])]) & free
     if not free.all():
         step, noise = _fitted(left, right, free, scale)
         sigma = np.where(free, _sigmas(left, right, cells, free, (step, noise)), sigma)
@@ -137,16 +144,17 @@ def measure_misalignment(matches: PairMatches, geometry: RectifiedGeometry) -> M
 
 
 def _slopes(numbers: Array) -> Array:
-    """(6, 3, 3) E = [t]x R of turn and direction (5,), and its derivatives by them."""
-    rotation, t = rigid3.exp_so3(numbers[:3]), _translation(numbers)
-    turns = [rigid3.skew(t) @ rigid3.skew(axis) @ rotation for axis in np.eye(3)]
-    shifts = [-rigid3.skew(axis) @ rotation for axis in np.eye(3)[1:]]
-    return np.stack([rigid3.skew(t) @ rotation, *turns, *shifts])
+    """(6, 3, 3) E of turn and direction (5,), and its derivatives by them: with the right camera at c of the left one,
+    [-R c]x R = -R [c]x."""
+    rotation, center = rigid3.exp_so3(numbers[:3]), rigid3.skew(_center(numbers))
+    turns = [-rigid3.skew(axis) @ rotation @ center for axis in np.eye(3)]
+    shifts = [-rotation @ rigid3.skew(axis) for axis in np.eye(3)[1:]]
+    return np.stack([-rotation @ center, *turns, *shifts])
 
 
-def _translation(numbers: Array) -> Array:
-    """(3,) of the pose of the right camera, for a baseline of one: minus where it stands."""
-    return -np.array([1.0, numbers[3], numbers[4]])
+def _center(numbers: Array) -> Array:
+    """(3,) of the right camera in the frame of the left one, its x component one."""
+    return np.array([1.0, numbers[3], numbers[4]])
 
 
 def _plausible(left: Array, right: Array) -> NDArray[np.bool_]:

@@ -11,6 +11,7 @@ from sfmapp.option_checks import Range, check_options
 MatcherName = Literal["sgm", "window", "opencv-sgbm", "opencv-bm"]
 CostName = Literal["census", "zncc", "sad", "ssd"]
 WindowsName = Literal["nested", "fixed", "adaptive", "shiftable"]
+Correction = Literal["auto", "turn", "rows", "no"]
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,9 @@ class StereoOptions:
             pixel, shiftable the best of nine places about it.
         window: Side of the matching window, pixels, odd; None: what is best for the matcher; sgm has none.
         left_right_px: Disparities that differ by more when they are looked for from the other side are dropped, pixels.
-        correct_rig: Where matches say that the cameras have turned since their calibration, rectify as they say.
+        correct_rig: What is done where matches say that the cameras have turned since their calibration. turn: rectify
+            as they say; rows: bring rows together and leave disparities as they are, for a lens may be what is seen;
+            no: nothing; auto: turn, but rows of photographs that were rectified before.
         refine: Lay slanted planes through the pixels that sgm has found: errors below a pixel become smaller by a tenth
             to a quarter, and matching takes three times as long.
         fill: Fill what only one camera sees from its neighbours, and mark it so.
@@ -41,7 +44,7 @@ class StereoOptions:
     windows: WindowsName = "nested"
     window: int | None = None
     left_right_px: float = 1.0
-    correct_rig: bool = True
+    correct_rig: Correction = "auto"
     refine: bool = False
     fill: bool = False
 

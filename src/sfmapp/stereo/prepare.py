@@ -14,6 +14,7 @@ from sfmapp.scene.rig import Rig
 from sfmapp.stereo.alignment import aligned_matches
 from sfmapp.stereo.misalignment import Misalignment, measure_misalignment
 from sfmapp.stereo.opencv_matchers import gray_of
+from sfmapp.stereo.options import Correction
 from sfmapp.stereo.rectification import Rectification, plan_rectification, rectify
 from sfmapp.stereo.report import MisalignmentReport, RectificationReport, RowsReport
 from sfmapp.stereo.result import RectifiedPair
@@ -30,6 +31,8 @@ _FEW_MATCHES, _SOME_BEYOND = 20, 0.1
 # matches whose rows differ by more are not counted as such, a share of the height; rows that differ by more than a
 # pixel cost a matcher of windows more than its own error
 _GROSS_SHARE, _ROWS_OFF_PX = 0.02, 1.0
+# rows that come together by less are not worth another interpolation, pixels
+_LEAST_GAIN_PX = 0.1
 # share of a pixel that the photograph has to show
 _COVERED = 0.99
 
@@ -86,11 +89,12 @@ class PrepareOptions:
 
     Attributes:
         is_cropped: negative disparities are meant: nothing is said of them.
-        corrects: a rig that has turned since its calibration is corrected.
+        corrects: what is done about a rig that has turned since its calibration, as in
+            :class:`~sfmapp.stereo.options.StereoOptions`.
     """
 
     is_cropped: bool = False
-    corrects: bool = True
+    corrects: Correction = "auto"
 
 
 def prepare_pair(
@@ -124,8 +128,10 @@ def prepare_pair(
     if draft.plan is not None and not is_projective:
         _check_rows(draft, (left, right), cameras, warnings)
         misalignment = _misalignment(draft)
-        if misalignment is not None and options.corrects and not cameras.is_adjusted:
-            draft, is_corrected = _corrected(draft, misalignment, (left, right), warnings)
+        if misalignment is not None and options.corrects != "no" and not cameras.is_adjusted:
+            was_rectified = options.corrects == "auto" and draft.plan.is_identity
+            with_rows = was_rectified or options.corrects == "rows" or not misalignment.is_turn
+            draft, is_corrected = _corrected(draft, misalignment, (left, right), warnings, with_rows=with_rows)
     if not options.is_cropped:
         _check_order(draft, names, warnings)
     pair = draft.pair
@@ -146,11 +152,14 @@ def _needed(rig: Rig | None) -> Rig:
 
 def _drafted(left: Pixels, right: Pixels, rig: Rig | None) -> _Draft:
     """The pair as a rig makes it; None: as it is."""
-    if rig is None:
+    return _with_plan(left, right, None if rig is None else plan_rectification(rig))
+
+
+def _with_plan(left: Pixels, right: Pixels, plan: Rectification | None) -> _Draft:
+    if plan is None:
         everywhere = np.ones(left.shape[:2], np.bool_)
-        plan, pair = None, RectifiedPair(left, right, everywhere, everywhere)
+        pair = RectifiedPair(left, right, everywhere, everywhere)
     else:
-        plan = plan_rectification(rig)
         pair = rectify(plan, left, right)
     matches = match_pictures(pair.left, pair.right, pair.left_shown, pair.right_shown)
     return _Draft(pair, plan, matches, rows_of(matches, pair.left.shape[0]))
@@ -197,13 +206,17 @@ def _without_calibration(
 def _misalignment(draft: _Draft) -> Misalignment | None:
     assert draft.pair.geometry is not None
     gray = gray_of(draft.pair.left), gray_of(draft.pair.right)
-    return measure_misalignment(aligned_matches(*gray, draft.matches), draft.pair.geometry)
+    # of photographs that are rectified as they are, the left one stays as it is
+    has_direction = draft.plan is not None and not draft.plan.is_identity
+    matches = aligned_matches(*gray, draft.matches)
+    return measure_misalignment(matches, draft.pair.geometry, has_direction=has_direction)
 
 
 def _corrected(
-    draft: _Draft, found: Misalignment, photographs: tuple[Pixels, Pixels], warnings: list[str]
+    draft: _Draft, found: Misalignment, photographs: tuple[Pixels, Pixels], warnings: list[str], *, with_rows: bool
 ) -> tuple[_Draft, bool]:
-    """The pair with its rig as matches say it is, where they say so and rows agree better for it."""
+    """The pair with its rig as matches say it is, where they say so and rows agree better for it; ``with_rows``: rows
+    alone are brought together."""
     if not found.is_significant or draft.plan is None:
         return draft, False
     turn, sigma = float(np.linalg.norm(found.turn_deg)), float(np.linalg.norm(found.sigma_deg[:3]))
@@ -211,13 +224,21 @@ def _corrected(
     if found.is_foreign:
         warnings.append(f"{text}: that is not corrected, for it is more than any rig drifts")
         return draft, False
-    after = _drafted(*photographs, corrected_rig(draft.plan, found)) if found.is_turn else _with_rows(draft, found)
+    if with_rows and found.rms_px[0] - found.rms_px[1] < _LEAST_GAIN_PX:
+        return draft, False
+    after = _with_rows(draft, found) if with_rows else _with_plan(*photographs, corrected_plan(draft.plan, found))
     if after.rows is None or draft.rows is None or after.rows.rms_px > draft.rows.rms_px:
         warnings.append(f"{text}, but rows do not agree better for it: not corrected")
         return draft, False
     geometry = after.pair.geometry
     assert geometry is not None
-    if not found.is_turn:
+    if with_rows and found.is_turn:
+        warnings.append(
+            f"{text}: rows are brought together ({found.rms_px[0]:.2f} px, now {after.rows.rms_px:.2f}), disparities "
+            "are left as they are, for a lens may be what is seen. --correct turn takes it for a turn"
+        )
+        return after, True
+    if with_rows:
         warnings.append(
             f"rows differ as if the right camera were turned by {found.turn_deg[1]:+.2f} degrees about the vertical, "
             "more than a rig drifts: the lens or the rectification is not that of the calibration. Rows are brought "
@@ -256,6 +277,16 @@ def _with_rows(draft: _Draft, found: Misalignment) -> _Draft:
     after = replace(pair, right=right.reshape(pair.right.shape), right_shown=shown)
     matches = match_pictures(after.left, after.right, after.left_shown, after.right_shown)
     return _Draft(after, draft.plan, matches, rows_of(matches, geometry.height))
+
+
+def corrected_plan(plan: Rectification, found: Misalignment) -> Rectification:
+    """How photographs are rectified when the right camera is where the misalignment puts it. Of those that are
+    rectified as they are, the right one alone is turned: disparities stay those of the left one's pixels."""
+    rig = corrected_rig(plan, found)
+    if not plan.is_identity:
+        return plan_rectification(rig)
+    turn = rigid3.rotation_matrix(rig.cam_from_rig[1]).T
+    return replace(plan, rig=rig, right_from_camera=turn, is_identity=False)
 
 
 def corrected_rig(plan: Rectification, found: Misalignment) -> Rig:
