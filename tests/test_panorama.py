@@ -26,6 +26,7 @@ from sfmapp.panorama.level import level
 from sfmapp.panorama.preview import Shown, find_gains
 from sfmapp.panorama.report import TurnedPair
 from sfmapp.panorama.seams import find_seams
+from sfmapp.panorama.turning import _halves, _held_out, _Round
 from sfmapp.panorama.turning_report import judge_pairs
 from sfmapp.panorama.zooms import find_zooms, unzoomed
 from sfmapp.scene.tracks import Tracks
@@ -451,6 +452,18 @@ def test_photographs_of_two_zooms_have_a_camera_each(tmp_path: Path) -> None:
     assert any("2 photographs" in each["message"] for each in result.report.decisions)
     model, _ = read_model(tmp_path / "out" / "sparse" / "0")
     assert len(model.cameras) == 2
+
+
+def test_a_lens_without_inverse_predicts_nothing() -> None:
+    """Of two photographs that hardly differ: a fit to one half of the rays bends the lens so that others have none."""
+    tracks, rays, spread = scene(ring(40)[:2], 400, 0.3, 0)
+    bent = [LENS.with_params([330.0, 200.0, 150.0, -2.0, 0.0])]
+    state = Turned(bent, ring(40)[:2], rays)
+    fit = TurnedFit(state, np.zeros((tracks.num_observations, 2)), 0.3, ((),), np.zeros((6, 6)), 1.0, 0.0)
+    whose, none = np.zeros(2, np.int64), np.zeros(0, np.int64)
+    found = _Round(np.arange(2), [], none, tracks, whose, fit)
+    halves = _halves(tracks, spread)
+    assert _held_out(state, halves, 0, found, [()], bent) == 400.0
 
 
 def moved_pair(noise: float, by: float, spread: float, seed: int) -> tuple[TurnedPair, float]:

@@ -242,8 +242,7 @@ def _with_zooms(evidence: _Evidence) -> tuple[_Evidence, list[Camera], _Round] |
         free = [refinable(camera, distortion=1) for camera in split.priors]
         apart = _held_out(state, halves, k, rough, free, split.priors)
         shared = _held_out(replace(state, cameras=state.cameras[:num]), halves, k, one, free[:num], evidence.priors)
-        # a lens that fits one camera to two zooms may have no inverse, and predicts nothing
-        if not math.isfinite(apart) or apart >= shared:
+        if apart >= shared:
             return None
     return several
 
@@ -400,15 +399,20 @@ def _held_out(
     state: Turned, halves: Sequence[tuple[Tracks, Array]], k: int, fine: _Round, free: Sequence[tuple[str, ...]],
     priors: Sequence[Camera],
 ) -> float:  # fmt: skip
-    """Root of the mean robust square of one half, of cameras that were fitted to the other."""
+    """Root of the mean robust square of one half, of cameras that were fitted to the other; the size of a picture where
+    the lens has no inverse at some of the keypoints, and predicts nothing."""
     (mine, of_mine), (other, of_other) = halves[k], halves[1 - k]
     start = replace(state, rays=rays_of_tracks(state.cameras, state.rotations, mine, fine.camera_idx))
+    nothing = float(max(max(camera.width, camera.height) for camera in state.cameras))
+    if not np.isfinite(start.rays).all():
+        return nothing
     fit = adjust_turns(start, mine, fine.camera_idx, free, priors, of_mine)
     cameras, turned = fit.state.cameras, fit.state.rotations
     held = Turned(cameras, turned, rays_of_tracks(cameras, turned, other, fine.camera_idx))
     squares = (residuals_px(held, other, fine.camera_idx) ** 2).sum(1) / of_other**2
     scale2 = 9.0 * fine.fit.noise_px**2
-    return math.sqrt(scale2 * float(np.log1p(squares / scale2).mean()))
+    rms = math.sqrt(scale2 * float(np.log1p(squares / scale2).mean()))
+    return rms if math.isfinite(rms) else nothing
 
 
 def residuals_px(state: Turned, tracks: Tracks, camera_idx: Ints) -> Array:
