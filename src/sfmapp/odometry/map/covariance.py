@@ -83,8 +83,7 @@ def estimate_map_covariance(model: Reconstruction, num_sensors: int, loss_scale_
 def widened_by_loss(
     found: MapCovariance, model: Reconstruction, num_sensors: int, loss_scale_px: float
 ) -> MapCovariance:
-    """The covariances, and the noise that they come of, with what it adds that poses hang on which observations are
-    believed.
+    """The covariances with what it adds that poses hang on which observations are believed.
 
     In blurred pictures a good part of them is not, and what is left agrees with itself. A loss that bends later, over
     all observations, is another estimate of the same poses; were the noise what the covariances are made of, it would
@@ -109,10 +108,7 @@ def widened_by_loss(
         for half in (slice(0, 3), slice(3, 6))
     )
     growth = 1.0 + max(ratio**2 - _COVERED_SIGMAS**2, 0.0)
-    return replace(
-        found, poses=growth * found.poses, noise_px=math.sqrt(growth) * found.noise_px,
-        shared=replace(found.shared, wider_loss_sigmas=ratio),
-    )  # fmt: skip
+    return replace(found, poses=growth * found.poses, shared=replace(found.shared, wider_loss_sigmas=ratio))
 
 
 def covariance_of_refinement(given: Reconstruction, refined: Reconstruction, num_sensors: int) -> Array:

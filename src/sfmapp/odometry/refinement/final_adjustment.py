@@ -126,11 +126,11 @@ def adjust_finally(
     )
     if 1 < len(everything) <= MAX_COVARIANCE_KEYFRAMES and (options.covariance or imu is not None):
         found = estimate_map_covariance(model, num_sensors, LOSS_SIGMAS * sigma)
-        found = widened_by_loss(found, model, num_sensors, LOSS_SIGMAS * sigma)
     if imu is not None:
         final = _with_imu(final, keyframes, imu, (sigma, None if found is None else found.noise_px), events)
     if found is None or not options.covariance:
         return final
+    found = widened_by_loss(found, model, num_sensors, LOSS_SIGMAS * sigma)
     noise = found.poses if final.noise_covariance is None else final.noise_covariance
     covariance = noise + of_refinement + (0.0 if answer.pose_covariance is None else answer.pose_covariance)
     if answer.is_refined:
