@@ -46,7 +46,7 @@ from sfmapp.matching.two_view import verify_pair
 SETS = ("fountain-P11", "herz-jesus-P8", "lund-door")
 THRESHOLD_PX = 2.0
 # medians of forty scenes differ by 5 per cent from forty to forty
-NUM_SCENES, NUM_MATCHES, NOISE_PX, FOCAL = 200, 1000, 0.7, 900.0
+NUM_SCENES, NUM_MATCHES, NOISE_PX, FOCAL = 100, 1000, 0.7, 900.0
 # none of those that anything was chosen on
 FIRST_SEED = 1000
 Array = np.ndarray
