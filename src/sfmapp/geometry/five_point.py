@@ -107,20 +107,20 @@ def essentials_of_samples(a: Array, b: Array, samples: Ints) -> Array:
 @numba.njit(cache=True, nogil=True)
 def essentials_of_five(a: Array, b: Array) -> Array:
     """(K, 3, 3) essential matrices, K <= 10, that five pairs of rays (5, 3) allow."""
-    rows = np.empty((5, 9))
+    columns = np.empty((9, 5))
     for i in range(5):
         for k in range(3):
             for m in range(3):
-                rows[i, 3 * k + m] = b[i, k] * a[i, m]
-    _, singular, vt = np.linalg.svd(rows, True)
-    if not singular[4] > 1e-12 * singular[0]:
+                columns[3 * k + m, i] = b[i, k] * a[i, m]
+    basis, constraints = np.empty((4, 9)), np.empty((10, 20))
+    if not _fill_null_space(columns, basis):
         return np.empty((0, 3, 3))
-    basis = np.ascontiguousarray(vt[5:])
-    constraints = _constraints(basis)
-    first = constraints[:, _ELIMINATED]
-    if not abs(np.linalg.det(first)) > 1e-300:
+    found = _constraints(basis)
+    for k in range(10):
+        constraints[:, k], constraints[:, 10 + k] = found[:, _ELIMINATED[k]], found[:, _LEFT[k]]
+    if not _eliminate(constraints):
         return np.empty((0, 3, 3))
-    linear = _linear_in_two(np.linalg.solve(first, constraints[:, _LEFT]).astype(np.float64))
+    linear = _linear_in_two(constraints[:, 10:])
     roots = _real_roots(_determinant(linear))
     out = np.empty((10, 3, 3))
     count = 0
@@ -129,9 +129,78 @@ def essentials_of_five(a: Array, b: Array) -> Array:
         if w == 0.0:
             continue
         essential = (x / w) * basis[0] + (y / w) * basis[1] + z * basis[2] + basis[3]
-        out[count] = essential.reshape(3, 3) / np.linalg.norm(essential)
+        out[count] = essential.reshape(3, 3) / math.sqrt((essential * essential).sum())
         count += 1
     return out[:count]
+
+
+# by hand, as numba's LAPACK loads scipy.linalg, which takes longer than the five rays of a whole reconstruction
+@numba.njit(cache=True, nogil=True)
+def _fill_null_space(columns: Array, out: Array) -> bool:
+    """Fill ``out`` (4, 9) with an orthonormal basis of what is orthogonal to all columns (9, 5), which are overwritten;
+    whether they are independent. Householder's reflections with the longest column next."""
+    num, count = columns.shape
+    scale = 0.0
+    for k in range(count):
+        longest, length = k, -1.0
+        for m in range(k, count):
+            square = 0.0
+            for i in range(k, num):
+                square += columns[i, m] * columns[i, m]
+            if square > length:
+                longest, length = m, square
+        length = math.sqrt(length)
+        scale = length if k == 0 else scale
+        if not length > 1e-12 * scale:
+            return False
+        for i in range(num):
+            columns[i, k], columns[i, longest] = columns[i, longest], columns[i, k]
+        columns[k, k] += math.copysign(length, columns[k, k])  # now the normal of the mirror, from row k on
+        for m in range(k + 1, count):
+            _reflect(columns, k, columns[:, m])
+    for n in range(num - count):
+        out[n] = 0.0
+        out[n, count + n] = 1.0
+        for k in range(count - 1, -1, -1):
+            _reflect(columns, k, out[n])
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _reflect(columns: Array, k: int, vector: Array) -> None:
+    """Reflect by the normal that is in column k from row k on."""
+    dot, square = 0.0, 0.0
+    for i in range(k, columns.shape[0]):
+        dot += columns[i, k] * vector[i]
+        square += columns[i, k] * columns[i, k]
+    for i in range(k, columns.shape[0]):
+        vector[i] -= 2.0 * dot / square * columns[i, k]
+
+
+@numba.njit(cache=True, nogil=True)
+def _eliminate(equations: Array) -> bool:
+    """Make the left square of equations (n, m) the identity, by Gauss and Jordan with the largest pivot of a column
+    next; whether it is regular."""
+    num, width = equations.shape
+    for k in range(num):
+        pivot = k
+        for i in range(k + 1, num):
+            if abs(equations[i, k]) > abs(equations[pivot, k]):
+                pivot = i
+        if not abs(equations[pivot, k]) > 1e-30:
+            return False
+        for j in range(k, width):
+            equations[k, j], equations[pivot, j] = equations[pivot, j], equations[k, j]
+        inverse = 1.0 / equations[k, k]
+        for j in range(k, width):
+            equations[k, j] *= inverse
+        for i in range(num):
+            factor = equations[i, k]
+            if i == k or factor == 0.0:
+                continue
+            for j in range(k, width):
+                equations[i, j] -= factor * equations[k, j]
+    return True
 
 
 @numba.njit(cache=True, nogil=True)
