@@ -49,7 +49,7 @@ class Sample:
     """Pixels of one set and matcher.
 
     Attributes:
-        cues, errors: (N, C) and (N,) pixels, of what the matcher found.
+        cues, errors: (C, N) and (N,) pixels, of what the matcher found.
         left: (N,) of rendered pairs, what a calibration leaves of disparities; zero of photographs, whose errors have
             it in them.
         residual, step: standard deviation of what calibration leaves, and what the truth is rounded to, pixels.
@@ -68,7 +68,7 @@ class Sample:
         chosen = np.flatnonzero(known & np.isfinite(case.truth))
         if len(chosen) > PIXELS:
             chosen = np.random.default_rng(0).choice(chosen, PIXELS, replace=False)
-        self.cues = cues.reshape(-1, cues.shape[-1])[chosen]
+        self.cues = cues.reshape(len(cues), -1)[:, chosen]
         self.errors = (found.disparity - case.truth).ravel()[chosen].astype(np.float64)
         field = (
             smooth_field(case.truth.shape, self.residual, [8, seed]) if seed is not None else np.zeros(case.truth.shape)
@@ -125,14 +125,14 @@ def bent(case: StereoSet, seed: int) -> StereoSet:
 
 def fit(samples: Sequence[Sample]) -> ErrorTable:
     """A table of samples that count the same, whatever their number of pixels."""
-    cues = np.concatenate([sample.cues for sample in samples]).astype(np.float64)
+    cues = np.concatenate([sample.cues for sample in samples], axis=1).astype(np.float64)
     errors = np.abs(np.concatenate([sample.errors for sample in samples]))
     weight = np.concatenate([np.full(len(s.errors), 1.0 / max(len(s.errors), 1)) for s in samples])
     weight /= weight.sum()
-    centers, spreads = cues.mean(0), cues.std(0)
-    normal = ErrorTable(centers.tolist(), spreads.tolist(), (), (), (), (), ()).normalised(cues).astype(np.float64)
+    centers, spreads = cues.mean(1), cues.std(1)
+    normal = ErrorTable(centers.tolist(), spreads.tolist(), (), (), (), (), ()).normalised(cues).T.astype(np.float64)
     first, second = np.triu_indices(normal.shape[1])
-    design = np.column_stack([np.ones(len(cues)), normal, normal[:, first] * normal[:, second]])
+    design = np.column_stack([np.ones(len(normal)), normal, normal[:, first] * normal[:, second]])
     wanted = np.log(np.hypot(np.minimum(errors, LARGEST_PX), FLOOR_PX))
     square = (design * weight[:, None]).T @ design + RIDGE * np.eye(design.shape[1])
     weights = np.linalg.solve(square, (design * weight[:, None]).T @ wanted)

@@ -69,7 +69,7 @@ def test_bands_make_no_difference() -> None:
     found = as_map(holed)  # 300 rows: two bands
     told = disparity_error(pair, found, threads=2)
     cues, known = match_cues(pair, found)
-    sigma, _, confidence = ERROR_TABLE.read(cues[known])
+    sigma, _, confidence = ERROR_TABLE.read(cues[:, known])
     np.testing.assert_array_equal(known, np.isfinite(told.sigma))
     # box filters sum along columns in an order that depends on where they begin
     np.testing.assert_allclose(told.sigma[known], np.hypot(sigma, RESIDUAL_SHARE * WIDTH), rtol=1e-4)

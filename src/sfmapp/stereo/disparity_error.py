@@ -40,8 +40,9 @@ _FAR_PX = 32.0
 # model has not, and rows that are a little off. Each of the three photographs of the benchmark alone would choose
 # between 1.25e-4 and 2.5e-4. What moves all disparities alike is the covariance of the calibration's part.
 RESIDUAL_SHARE = 1.75e-4
-# rows of a band: what is held at a time is its width times this times some twenty maps, whatever the height
-_BAND = 256
+# rows of a band: what is held at a time is its width times this times some thirty maps, whatever the height, and most
+# of that stays in the cache
+_BAND = 64
 
 
 @dataclass(frozen=True)
@@ -77,9 +78,9 @@ def disparity_error(
     def fill(band: tuple[slice, slice, slice]) -> None:
         wide, inner, rows = band
         cues, known = match_cues(pair, found, wide)
-        told = with_residual(table.read(cues[inner][known[inner]]), residual)
+        told = with_residual(table.read(cues[:, inner]), residual)
         for field, values in zip((result.sigma, result.half_width_95, result.confidence), told, strict=True):
-            field[rows][known[inner]] = values
+            np.copyto(field[rows], values, where=known[inner])
 
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(fill, _bands(shape[0])))
@@ -93,64 +94,93 @@ def with_residual(told: tuple[Map, Map, Map], residual_px: float) -> tuple[Map, 
 
 
 def match_cues(pair: RectifiedPair, found: DisparityMap, rows: slice = slice(None)) -> tuple[Map, NDArray[np.bool_]]:
-    """The cues (R, W, 9) of the rows asked for, in the order of ``CUES``, and which pixels (R, W) were matched. Within
+    """The cues (9, R, W) of the rows asked for, in the order of ``CUES``, and which pixels (R, W) were matched. Within
     ``_AROUND`` // 2 of the first and the last row windows reach beyond them, and are mirrored."""
     left, right = (gray_of(picture[rows]).astype(np.float32) for picture in (pair.left, pair.right))
     known = (found.state[rows] == PixelState.MATCHED) & np.isfinite(found.disparity[rows])
     disparity = np.where(known, found.disparity[rows], np.float32(0.0))
-    cues = np.empty((*disparity.shape, len(CUES)), np.float32)
-    cues[..., :3], cues[..., 8] = _correlation_cues(left, right, disparity, known)
-    cues[..., 3:8] = _scatter_cues(disparity, known)
+    cues = np.empty((len(CUES), *disparity.shape), np.float32)
+    _correlation_cues(cues, left, right, disparity, known)
+    _scatter_cues(cues, disparity, known)
     return cues, known
 
 
-def _correlation_cues(left: Map, right: Map, disparity: Map, known: NDArray[np.bool_]) -> tuple[Map, Map]:
+def _correlation_cues(cues: Map, left: Map, right: Map, disparity: Map, known: NDArray[np.bool_]) -> None:
     """What the zero-mean NCC of a window says, of the disparity and of one pixel more and less: each pixel of the
     window goes by its own disparity, so that slanted surfaces match as well as others."""
     import cv2
 
     mask = known.astype(np.float32)
     share = np.maximum(_mean(mask, _WINDOW), np.float32(1e-6))
-    of_left = left * mask
-    left_mean = _mean(of_left, _WINDOW) / share
-    left_variance = np.maximum(_mean(of_left * left, _WINDOW) / share - left_mean**2, 0.0) + np.float32(_DARK_VARIANCE)
+    left *= mask
+    left_mean = _mean(left, _WINDOW) / share
+    left_variance = _variance(_mean(left * left, _WINDOW), share, left_mean)
     height, width = disparity.shape
     y = np.repeat(np.arange(height, dtype=np.float32)[:, None], width, axis=1)
+    # whole pixels and parts of one: those are the same for all three
+    place, part = cv2.convertMaps(np.arange(width, dtype=np.float32) - disparity, y, cv2.CV_16SC2)
+    place[..., 0] += 2
     ncc = []
-    for shift in (-1.0, 0.0, 1.0):
-        x = np.arange(width, dtype=np.float32) - disparity - np.float32(shift)
-        seen = cv2.remap(right, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) * mask
-        mean = _mean(seen, _WINDOW) / share
-        variance = np.maximum(_mean(seen * seen, _WINDOW) / share - mean**2, 0.0) + np.float32(_DARK_VARIANCE)
-        both = _mean(of_left * seen, _WINDOW) / share - left_mean * mean
-        ncc.append(both / np.sqrt(left_variance * variance))
-    curvature = np.maximum(2.0 * ncc[1] - ncc[0] - ncc[2], np.float32(_LEAST))
-    mismatch = np.maximum(1.0 - ncc[1], np.float32(_LEAST))
-    off_peak = np.abs(np.clip(0.5 * (ncc[2] - ncc[0]) / curvature, -1.0, 1.0))
-    cues = np.stack(
-        [0.5 * np.log((mismatch + _LEAST) / curvature), np.log(mismatch), np.log(off_peak + np.float32(0.05))], axis=-1
-    )
-    return np.asarray(cues, np.float32), np.asarray(0.5 * np.log(left_variance), np.float32)
+    for _ in range(3):
+        place[..., 0] -= 1
+        seen = cv2.remap(right, place, part, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        seen *= mask
+        mean = _mean(seen, _WINDOW)
+        mean /= share
+        both = _mean(left * seen, _WINDOW)
+        both /= share
+        both -= left_mean * mean
+        variance = _variance(_mean(np.square(seen, out=seen), _WINDOW), share, mean)
+        variance *= left_variance
+        both /= np.sqrt(variance, out=variance)
+        ncc.append(both)
+    nearer, here, farther = ncc[2], ncc[1], ncc[0]
+    curvature = np.maximum(2.0 * here - farther - nearer, np.float32(_LEAST))
+    mismatch = np.maximum(1.0 - here, np.float32(_LEAST))
+    nearer -= farther
+    nearer *= 0.5
+    nearer /= curvature
+    np.log((mismatch + np.float32(_LEAST)) / curvature, out=cues[0])
+    np.log(mismatch, out=cues[1])
+    np.log(np.minimum(np.abs(nearer, out=nearer), 1.0) + np.float32(0.05), out=cues[2])
+    np.log(left_variance, out=cues[8])
+    cues[0] *= 0.5
+    cues[8] *= 0.5
 
 
-def _scatter_cues(disparity: Map, known: NDArray[np.bool_]) -> Map:
+def _variance(square: Map, share: Map, mean: Map) -> Map:
+    """Of grey values of windows, from the mean of their squares over all pixels and their mean over known ones."""
+    square /= share
+    square -= mean * mean
+    np.maximum(square, np.float32(0.0), out=square)
+    square += np.float32(_DARK_VARIANCE)
+    return square
+
+
+def _scatter_cues(cues: Map, disparity: Map, known: NDArray[np.bool_]) -> None:
     """How disparities scatter in a small and in a wide window, how far this one is from their mean, how many are
     known, and how far behind something stands."""
     import cv2
 
-    # squares of disparities of some hundred pixels leave no digits for their scatter in single precision
-    mask, exact, scatter = known.astype(np.float32), disparity.astype(np.float64), []
-    for side in (_NEAR, _WIDE):
+    mask = known.astype(np.float32)
+    for cue, side in ((3, _NEAR), (4, _WIDE)):
         share = np.maximum(_mean(mask, side), np.float32(1e-6))
-        mean = _mean(exact, side) / share  # disparities are zero where they are not known
-        scatter.append(np.sqrt(np.maximum(_mean(exact * exact, side) / share - mean**2, 0.0)))
+        # squares of disparities of some hundred pixels leave no digits for their scatter in single precision
+        mean = cv2.boxFilter(disparity, cv2.CV_64F, (side, side), borderType=cv2.BORDER_REFLECT)
+        square = cv2.sqrBoxFilter(disparity, cv2.CV_64F, (side, side), borderType=cv2.BORDER_REFLECT)
+        mean /= share  # disparities are zero where they are not known
+        square /= share
+        square -= mean * mean
+        np.sqrt(np.maximum(square, 0.0, out=square), out=cues[cue], casting="same_kind")
+    np.abs(disparity - mean, out=cues[5], casting="same_kind")
+    cues[3:6] += np.float32(0.05)
+    np.log(cues[3:6], out=cues[3:6])
+    cues[6] = share
     nearest_to_background = np.where(known, disparity, np.float32(np.inf))
-    behind = disparity - cv2.erode(nearest_to_background, np.ones((_AROUND, _AROUND), np.uint8))
-    cues = [
-        np.log(scatter[0] + 0.05), np.log(scatter[1] + 0.05), np.log(np.abs(exact - mean) + 0.05), share,
-        np.log(np.clip(behind, 0.0, _FAR_PX) + 0.1),
-    ]  # fmt: skip
-    return np.asarray(np.stack(cues, axis=-1), np.float32)
+    np.subtract(disparity, cv2.erode(nearest_to_background, np.ones((_AROUND, _AROUND), np.uint8)), out=cues[7])
+    np.clip(cues[7], 0.0, _FAR_PX, out=cues[7])
+    cues[7] += np.float32(0.1)
+    np.log(cues[7], out=cues[7])
 
 
 def _bands(height: int) -> Iterator[tuple[slice, slice, slice]]:

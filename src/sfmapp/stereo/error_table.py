@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +19,8 @@ Map = NDArray[np.float32]
 # cues beyond so many of their standard deviations over the pairs of the fit are taken as that: a quadratic is not to be
 # followed where there was nothing
 _LIMIT = 4.0
+# pixels at a time, so that their cues stay in the nearest cache
+_BLOCK = 512
 
 
 @dataclass(frozen=True)
@@ -40,30 +43,64 @@ class ErrorTable:
     half_widths_95: Sequence[float]
     confidences: Sequence[float]
 
-    def score(self, cues: Map) -> Map:
-        """(N,) of cues (N, C): about the log of the error in pixels."""
-        weights, count = np.asarray(self.weights, np.float32), len(self.centers)
-        normal = self.normalised(cues)
-        products = np.zeros((count, count), np.float32)
-        products[np.triu_indices(count)] = weights[count + 1 :]
-        score: Map = weights[0] + ((normal @ products + weights[1 : count + 1]) * normal).sum(1)
-        return score
-
     def normalised(self, cues: NDArray[np.floating]) -> Map:
-        """Cues (N, C) less their means, in standard deviations, no farther than the fit is to be followed."""
-        centers, spreads = (np.asarray(values, np.float32) for values in (self.centers, self.spreads))
+        """Cues (C, N) less their means, in standard deviations, no farther than the fit is to be followed."""
+        centers, spreads = (np.asarray(values, np.float32)[:, None] for values in (self.centers, self.spreads))
         normal: Map = np.clip((cues - centers) / spreads, -_LIMIT, _LIMIT).astype(np.float32)
         return normal
 
     def read(self, cues: Map) -> tuple[Map, Map, Map]:
-        """Sigma, 95 per cent half width and confidence (N,) of cues (N, C), between the scores of the table by their
-        logarithm, and beyond them as at its ends."""
-        score = self.score(cues)
-        sigma, half_width = (
-            np.exp(np.interp(score, self.scores, np.log(values))).astype(np.float32)
-            for values in (self.sigmas, self.half_widths_95)
-        )
-        return sigma, half_width, np.interp(score, self.scores, self.confidences).astype(np.float32)
+        """Sigma, 95 per cent half width and confidence (...,) of cues (C, ...), between the scores of the table by
+        their logarithm, and beyond them as at its ends."""
+        values = np.stack([np.log(self.sigmas), np.log(self.half_widths_95), np.asarray(self.confidences)])
+        slopes = np.diff(values) / np.diff(self.scores)
+        turns = np.diff(slopes, prepend=0.0)
+        told = np.empty((3, int(np.prod(cues.shape[1:]))), np.float32)
+        linear = (np.asarray(numbers, np.float32) for numbers in (self.centers, self.spreads, self.weights))
+        flat = np.ascontiguousarray(cues.reshape(len(cues), -1), np.float32)
+        _read(flat, *linear, np.asarray(self.scores, np.float64), values[:, 0].copy(), turns, told)
+        np.exp(told[:2], out=told[:2])
+        sigma, half_width, confidence = told.reshape(3, *cues.shape[1:])
+        return sigma, half_width, confidence
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _read(
+    cues: Map, centers: Map, spreads: Map, weights: Map, scores: NDArray[np.float64], first: NDArray[np.float64],
+    turns: NDArray[np.float64], told: Map,
+) -> None:  # fmt: skip
+    """Three curves (3, N) at the scores of cues (C, N): straight between ``scores`` (K,), each the sum of its value at
+    the first and of what its slope changes by from there on, ``turns`` (3, K - 1). Block by block, in vectors."""
+    count, size = cues.shape
+    normal, part, score = np.empty((count, _BLOCK), np.float32), np.empty(_BLOCK, np.float32), np.empty(_BLOCK)
+    value, total = np.empty(_BLOCK, np.float32), np.empty(_BLOCK)
+    for start in range(0, size, _BLOCK):
+        length = min(_BLOCK, size - start)
+        for c in range(count):
+            for x in range(length):
+                far = (cues[c, start + x] - centers[c]) / spreads[c]
+                normal[c, x] = min(max(far, np.float32(-_LIMIT)), np.float32(_LIMIT))
+        value[:] = weights[0]
+        term = count + 1
+        for i in range(count):
+            part[:] = weights[1 + i]
+            for j in range(i, count):
+                weight = weights[term]
+                term += 1
+                for x in range(length):
+                    part[x] += weight * normal[j, x]
+            for x in range(length):
+                value[x] += part[x] * normal[i, x]
+        for x in range(length):
+            score[x] = min(max(np.float64(value[x]), scores[0]), scores[-1])
+        for curve in range(3):
+            total[:] = first[curve]
+            for k in range(len(scores) - 1):
+                turn, place = turns[curve, k], scores[k]
+                for x in range(length):
+                    total[x] += turn * max(score[x] - place, 0.0)
+            for x in range(length):
+                told[curve, start + x] = total[x]
 
 
 ERROR_TABLE = ErrorTable(
