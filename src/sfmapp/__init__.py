@@ -1,8 +1,8 @@
 """Photographs and video into cameras, points and surfaces, on an ordinary CPU, from pip alone.
 
 Three levels. One call: ``reconstruct``, ``track_sequence``, ``densify``, ``make_mesh``, what is done with their
-results, ``stitch_panorama``, ``explain_pair``, and what is known before: ``calibrate_board`` and its like. The
-stages, in memory: ``load_images``, ``extract_features``, ``match_images``, ``map_images``. The parts:
+results, ``stitch_panorama``, ``explain_pair``, ``match_stereo``, and what is known before: ``calibrate_board`` and its
+like. The stages, in memory: ``load_images``, ``extract_features``, ``match_images``, ``map_images``. The parts:
 ``adjust_bundle``, ``FactorGraph``, ``triangulate``, ``estimate_pose``, ``verify_pair``.
 
 Conventions: a pose ``cam_from_world`` is a quaternion x, y, z, w and a translation, x_cam = R x_world + t, with camera
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from sfmapp.api.planes import rectify, warp_picture
     from sfmapp.api.reconstruction import Reconstruction, load
     from sfmapp.api.stages import Matcher, extract_features, map_images, match_images
-    from sfmapp.api.views import explain_pair, reconstruct_uncalibrated, transfer_views
+    from sfmapp.api.views import explain_pair, match_stereo, reconstruct_uncalibrated, transfer_views
     from sfmapp.camera.camera import Camera
     from sfmapp.camera.names import CameraModel
     from sfmapp.errors import (
@@ -123,6 +123,7 @@ __all__ = [
     "make_mesh",
     "map_images",
     "match_images",
+    "match_stereo",
     "reconstruct",
     "reconstruct_uncalibrated",
     "rectify",
@@ -188,6 +189,7 @@ _HOMES = {
     "make_mesh": "api.jobs",
     "map_images": "api.stages",
     "match_images": "api.stages",
+    "match_stereo": "api.views",
     "reconstruct": "api.jobs",
     "reconstruct_uncalibrated": "api.views",
     "rectify": "api.planes",

@@ -1,7 +1,9 @@
-"""One call: two photographs explained, two in the place of a third, and models of photographs without a calibration."""
+"""One call: two photographs explained, or matched in every pixel; two in the place of a third; and models without a
+calibration."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -12,6 +14,8 @@ from sfmapp.workspace.options import Options
 
 if TYPE_CHECKING:
     from sfmapp.pipelines.pair import PairResult
+    from sfmapp.pipelines.stereo.run import StereoResult
+    from sfmapp.pipelines.stereo.sources import ChosenPairs, KnownCameras
     from sfmapp.pipelines.transfer import TransferResult
     from sfmapp.pipelines.uncalibrated import UncalibratedResult
 
@@ -47,6 +51,52 @@ def explain_pair(
     from sfmapp.pipelines.pair import tell_pair
 
     return tell_pair(sources, output, options, events=events)
+
+
+def match_stereo(
+    sources: Sequence[FilePath],
+    output: FilePath | None = None,
+    options: Options | None = None,
+    *,
+    camera: FilePath | KnownCameras | None = None,
+    chosen: ChosenPairs | None = None,
+    events: Events | None = None,
+    threads: int | None = None,
+) -> StereoResult:
+    """Rectify pairs of photographs, match every pixel, and measure depths and how far off they may be.
+
+    Args:
+        sources: two photographs; two folders, whose files belong together by name; a folder of KITTI; a video with both
+            pictures side by side; or the output folder of :func:`reconstruct`.
+        output: a new folder, an empty one, or that of an earlier call; of several pairs, each gets a folder in it.
+            None, for a reconstruction alone: its folder ``stereo``.
+        options: of these, ``stereo``.
+        camera: file of a calibration of both cameras, or ``sfmapp.pipelines.stereo.sources.KnownCameras`` with focal
+            length and baseline of a rectified pair; None: nothing is known, and there are disparities and no depths.
+        chosen: ``sfmapp.pipelines.stereo.sources.ChosenPairs``: which of many pairs; None: all of folders and videos,
+            the best one of a reconstruction.
+        events: told of progress, and can ask to stop.
+        threads: bands of rows measured at a time; None: as ``options.threads`` says, or one for each core.
+
+    Returns:
+        The folder, the report of all pairs, and ``last``, the arrays of the last: ``last.prepared.pair`` the rectified
+        pictures, ``last.disparity.disparity`` (H, W) pixels, ``last.measured.depth`` and ``last.measured.depth_sigma``
+        (H, W) in the unit of the baseline, NaN where unknown.
+
+    Raises:
+        UsageError: sources that are none, or an output that holds something else.
+        InputError: photographs or a calibration that cannot be used; of several pairs, all of them.
+        InterruptedRunError: ``events`` was asked to stop.
+
+    Example:
+        >>> found = sfmapp.match_stereo(["left.jpg", "right.jpg"], "depth/", camera="rig/rig.json")
+        >>> found.last.measured.depth.shape, found.report.pairs[0].measured.median_sigma_px
+    """
+    from sfmapp.pipelines.stereo.run import stereo
+    from sfmapp.pipelines.stereo.sources import KnownCameras
+
+    known = camera if isinstance(camera, KnownCameras) or camera is None else KnownCameras(os.fspath(camera))
+    return stereo(sources, output, options_with(options, threads), known=known, chosen=chosen, events=events)
 
 
 def transfer_views(

@@ -112,6 +112,12 @@ def _stereo(args: argparse.Namespace) -> int:
 def _print(result: StereoResult) -> None:
     for pair in result.report.pairs:
         _print_pair(pair)
+    film = result.report.film
+    if film is not None and film.agreeing_share is not None:
+        print(
+            f"where nothing moves, {film.agreeing_share:.1%} of the disparities agree with the frame before "
+            f"(least: {film.worst}, {film.worst_agreeing_share:.1%})"
+        )
     for each in result.report.failed:
         print(f"{each.name}: FAILED: {each.reason}")
     print(f"{took(result.output, result.report.run)}; report {result.output / 'report.json'}")

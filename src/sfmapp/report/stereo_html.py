@@ -24,7 +24,10 @@ from sfmapp.report.stereo_pictures import (
 from sfmapp.stereo.measured import MeasuredPair, MeasuredReport, rgb_of
 from sfmapp.stereo.report import StereoPairReport
 from sfmapp.stereo.result import DisparityMap, RectifiedPair
+from sfmapp.stereo.temporal import ConsistencyReport, FilmReport
 
+# of what has not moved, what the intervals let expect
+_PROMISED = 0.95
 _STYLE = """<style>.bar-of img{width:100%;height:.8rem;object-fit:fill;image-rendering:auto}
 .bar-of div{display:flex;justify-content:space-between;font-size:.8rem}
 .slider{position:relative}.slider img{width:100%;display:block}.slider img+img{position:absolute;inset:0;
@@ -45,19 +48,56 @@ def pairs_page(report: StereoReport) -> str:
 def _lines(report: StereoReport) -> Iterator[str]:
     for failed in report.failed:
         yield f'<div class="failure"><p><b>{escape(failed.name)}</b>: {escape(failed.reason)}</p></div>'
-    head = ("pair", "matched", "right within a pixel", "sigma px", "rows off px", "depths", "warnings")
-    yield "<div class=wide><table><tr>" + "".join(f"<th>{name}</th>" for name in head) + "</tr>"
+    if report.film is not None:
+        yield f"<p>{_film(report.film)}</p>"
+    has_depths, is_film = any(pair.disparity.depths for pair in report.pairs), report.film is not None
+    head = ["matched", "right within a pixel", "sigma px", "rows off px"]
+    head += ["depths"] * has_depths + ["still", "agrees with the frame before"] * is_film
+    rows = []
     for pair in report.pairs:
-        rows, depths, sigma = pair.rectification.rows, pair.disparity.depths, pair.measured.median_sigma_px
+        found, seen, sigma = pair.disparity, pair.rectification.rows, pair.measured.median_sigma_px
         cells = [
-            f'<a href="{quote(pair.name)}/report.html">{escape(pair.name)}</a>', f"{pair.disparity.density:.1%}",
-            f"{pair.measured.expected_right:.1%}", "" if sigma is None else f"{sigma:.3f}",
-            "" if rows is None else f"{rows.rms_px:.2f}",
-            f"{depths[0]:.3g} to {depths[-1]:.3g} {pair.measured.unit}" if depths else "",
-            escape("; ".join(pair.rectification.warnings)),
+            f"{found.density:.1%}", f"{pair.measured.expected_right:.1%}", "" if sigma is None else f"{sigma:.3f}",
+            "" if seen is None else f"{seen.rms_px:.2f}",
         ]  # fmt: skip
-        yield "<tr>" + "".join(f"<td>{text}</td>" for text in cells) + "</tr>"
+        if has_depths:
+            of = found.depths
+            cells.append(f"{of[0]:.3g} to {of[-1]:.3g} {_unit(pair.measured)}" if of else "")
+        if is_film:
+            cells += _agreement(pair.consistency)
+        link = f'<a href="{quote(pair.name)}/report.html">{escape(pair.name)}</a>'
+        warnings = escape("; ".join(pair.rectification.warnings))
+        middle = "".join(f"<td>{text}</td>" for text in cells)
+        rows.append(f"<tr><td class=t>{link}</td>{middle}<td class=w>{warnings}</td></tr>")
+    names = "".join(f"<th>{name}</th>" for name in head)
+    yield f"<div class=wide><table><tr><th class=t>pair</th>{names}<th class=t>warnings</th></tr>{''.join(rows)}"
     yield "</table></div>"
+
+
+def _film(film: FilmReport) -> str:
+    """What is said of a whole film."""
+    if film.agreeing_share is None or film.worst_agreeing_share is None:
+        return (
+            f"Nothing tells whether depths stay where nothing moves: in {film.num_following} frames hardly a pixel "
+            "shows what it showed in the frame before."
+        )
+    text = (
+        f"Where nothing moves, {film.kept_share:.1%} of the pixels are matched again in the next frame, and "
+        f"{film.agreeing_share:.1%} of their disparities agree within the 95 % intervals of both; they change by "
+        f"{film.median_change_px:.3f} px (medians of {film.num_compared} frames of {film.num_following} that follow "
+        "another)."
+    )
+    if film.worst_agreeing_share < _PROMISED:
+        text += f" Least agrees {escape(film.worst or '')}, with {film.worst_agreeing_share:.1%}."
+    return text
+
+
+def _agreement(found: ConsistencyReport | None) -> tuple[str, str]:
+    """Two cells: what has not moved, and how much of it agrees."""
+    if found is None:
+        return "", ""
+    share = "" if found.agreeing_share is None else f"{found.agreeing_share:.1%}"
+    return f"{found.still_share:.1%}", share
 
 
 def _body(report: StereoPairReport, pair: RectifiedPair, found: DisparityMap, measured: MeasuredPair) -> Iterator[str]:
@@ -65,14 +105,15 @@ def _body(report: StereoPairReport, pair: RectifiedPair, found: DisparityMap, me
     for warning in report.rectification.warnings:
         yield f'<div class="failure"><p>{escape(warning)}</p></div>'
     yield _summary(report)
-    yield from _maps(report, found, measured)
-    yield "<h2>How well depth is told</h2>" + _depths(report.measured)
+    yield from _maps(report, pair, found, measured)
+    if measured.depth is not None:
+        yield "<h2>How well depth is told</h2>" + _depths(report.measured)
     yield from _both_views(pair, found)
     yield "<h2>Rectification</h2>" + _rectification(report)
 
 
 def _summary(report: StereoPairReport) -> str:
-    disparity, told = report.disparity, report.measured
+    disparity, told, unit = report.disparity, report.measured, _unit(report.measured)
     text = (
         f"<p>{disparity.density:.1%} of the pixels are matched by {escape(disparity.matcher)}, which looked for "
         f"disparities from {disparity.searched[0]:g} to {disparity.searched[1]:g} px ({escape(disparity.told_by)})"
@@ -88,18 +129,28 @@ def _summary(report: StereoPairReport) -> str:
         )
     if told.least_depth is not None:
         text += (
-            f"</p><p>The rig tells depths from {told.least_depth:.3g} to {told.greatest_depth:.3g} {told.unit}: nearer "
+            f"</p><p>The rig tells depths from {told.least_depth:.3g} to {told.greatest_depth:.3g} {unit}: nearer "
             "points were not looked for, farther ones may as well be at infinity. At "
-            f"{told.ten_percent_depth:.3g} {told.unit} sigma is a tenth of the depth."
+            f"{told.ten_percent_depth:.3g} {unit} sigma is a tenth of the depth."
         )
     elif told.median_sigma_px is not None:
         text += "</p><p>No baseline is known: there are disparities, and no depths."
+    same = report.consistency
+    if same is not None and same.agreeing_share is not None:
+        text += (
+            f"</p><p>{same.still_share:.1%} of the pixels surely show what they showed in "
+            f"{escape(same.compared_with)}. Of these {same.kept_share:.1%} are matched again, and "
+            f"{same.agreeing_share:.1%} of their disparities agree within the 95 % intervals of both; they change by "
+            f"{same.median_change_px:.3f} px in the median."
+        )
     return text + "</p>"
 
 
-def _maps(report: StereoPairReport, found: DisparityMap, measured: MeasuredPair) -> Iterator[str]:
+def _maps(report: StereoPairReport, pair: RectifiedPair, found: DisparityMap, measured: MeasuredPair) -> Iterator[str]:
     yield '<h2>Maps of the left picture</h2><div class="row large">'
-    unit = report.measured.unit
+    picture = jpeg_url(rgb_of(pair.left), SHOWN_PX, QUALITY)
+    yield f'<figure><img src="{picture}" alt=""><figcaption>what the maps are of</figcaption></figure>'
+    unit = _unit(report.measured)
     if measured.depth is not None and measured.depth_sigma is not None:
         depth = np.where(measured.is_solid, measured.depth, np.nan)
         scale = scale_of(depth, is_log=True, colormap=cv2.COLORMAP_TURBO)
@@ -116,14 +167,19 @@ def _maps(report: StereoPairReport, found: DisparityMap, measured: MeasuredPair)
     yield "</div><p class=dim>Dark grey: nothing is known there.</p>"
 
 
+def _unit(told: MeasuredReport) -> str:
+    """Of depths; a model that nothing brought to metres has units of its own."""
+    return told.unit or "units"
+
+
 def _errors(values: np.ndarray) -> ColorScale:
     return scale_of(values, is_log=True, colormap=cv2.COLORMAP_INFERNO)
 
 
 def _depths(told: MeasuredReport) -> str:
     if not told.depths:
-        return "<p class=dim>No depth: no baseline is known, or nothing was matched.</p>"
-    rows, has_calibration = [], any(at.of_calibration for at in told.depths)
+        return "<p class=dim>Nothing was matched that is rather right than wrong, and told from infinity.</p>"
+    rows, has_calibration, unit = [], any(at.of_calibration for at in told.depths), _unit(told)
     for at in told.depths:
         texts = [
             f"{at.share:.0%}", f"{at.depth:.4g}", f"{at.disparity_px:.2f}", f"{at.disparity_sigma_px:.3f}",
@@ -131,8 +187,8 @@ def _depths(told: MeasuredReport) -> str:
         ]  # fmt: skip
         rows.append([("", text) for text in texts[: len(texts) - (not has_calibration)]])
     head = [
-        "nearer are", f"depth {told.unit}", "disparity px", "its sigma px", f"sigma of depth {told.unit}", "%",
-        *([f"of calibration {told.unit}"] if has_calibration else []),
+        "nearer are", f"depth {unit}", "disparity px", "its sigma px", f"sigma of depth {unit}", "%",
+        *([f"of calibration {unit}"] if has_calibration else []),
     ]  # fmt: skip
     note = (
         "To first order, sigma grows with the square of the depth. The part of the calibration is the same for all "
@@ -177,7 +233,7 @@ def _rectification(report: StereoPairReport) -> str:
         rows.append(("focal length", f"{how.focal_px:.2f} px"))
         rows.append(("disparity at infinity", f"{-(how.doffs_px or 0.0):.2f} px"))
     if how.baseline is not None:
-        rows.append(("baseline", f"{how.baseline:.6g} {how.unit}"))
+        rows.append(("baseline", f"{how.baseline:.6g} {how.unit or 'units'}"))
     if not how.is_as_given:
         rows.append(("axes turned by", f"{how.turn_deg[0]:.2f} and {how.turn_deg[1]:.2f} degrees"))
         rows.append(("kept of each photograph", f"{how.kept[0]:.0%} and {how.kept[1]:.0%}"))

@@ -56,9 +56,9 @@ class ErrorTable:
         slopes = np.diff(values) / np.diff(self.scores)
         turns = np.diff(slopes, prepend=0.0)
         told = np.empty((3, int(np.prod(cues.shape[1:]))), np.float32)
-        linear = (np.asarray(numbers, np.float32) for numbers in (self.centers, self.spreads, self.weights))
         flat = np.ascontiguousarray(cues.reshape(len(cues), -1), np.float32)
-        _read(flat, *linear, np.asarray(self.scores, np.float64), values[:, 0].copy(), turns, told)
+        centers, spreads, weights = (np.array(row, np.float32) for row in (self.centers, self.spreads, self.weights))
+        _read(flat, centers, spreads, weights, np.array(self.scores), values[:, 0].copy(), turns, told)
         np.exp(told[:2], out=told[:2])
         sigma, half_width, confidence = told.reshape(3, *cues.shape[1:])
         return sigma, half_width, confidence

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from sfmapp.reporting import Report
 from sfmapp.stereo.measured import MeasuredReport
+from sfmapp.stereo.temporal import ConsistencyReport
 
 
 class RowsReport(Report):
@@ -107,6 +108,7 @@ class StereoPairReport(Report):
     Attributes:
         name: of the pair, its folder where there are several. left, right: the photographs.
         measured: how far off disparities and depths may be.
+        consistency: of a frame of a film, how it agrees with the one before; absent of others.
         files: what was written of it, relative to the output.
     """
 
@@ -116,4 +118,5 @@ class StereoPairReport(Report):
     rectification: RectificationReport
     disparity: DisparityReport
     measured: MeasuredReport
+    consistency: ConsistencyReport | None = None
     files: Sequence[str]

@@ -68,7 +68,7 @@ def _colored(values: NDArray[np.floating], colormap: int, *, is_log: bool) -> Pi
 
 
 def _words(found: DisparityMap, told: MeasuredReport) -> str:
-    lines = [f"**{found.density:.1%}** of the pixels are matched."]
+    lines, unit = [f"**{found.density:.1%}** of the pixels are matched."], told.unit or "units"
     if told.median_sigma_px is not None:
         lines.append(
             f"A disparity is good to {told.median_sigma_px:.2f} px in the median (95 %: "
@@ -76,11 +76,11 @@ def _words(found: DisparityMap, told: MeasuredReport) -> str:
         )
     if told.least_depth is not None:
         lines.append(
-            f"Depths from {told.least_depth:.3g} to {told.greatest_depth:.3g} {told.unit} can be told; sigma is a "
-            f"tenth of the depth at {told.ten_percent_depth:.3g} {told.unit}."
+            f"Depths from {told.least_depth:.3g} to {told.greatest_depth:.3g} {unit} can be told; sigma is a "
+            f"tenth of the depth at {told.ten_percent_depth:.3g} {unit}."
         )
         lines += [
-            f"- {at.depth:.3g} {told.unit} +- {at.sigma:.2g} ({100 * at.sigma / at.depth:.2g} %)" for at in told.depths
+            f"- {at.depth:.3g} {unit} +- {at.sigma:.2g} ({100 * at.sigma / at.depth:.2g} %)" for at in told.depths
         ]
     lines.append(
         "Tabs above the scene: the photograph's colours, or the sigma of depth as a share of it, dark is good."

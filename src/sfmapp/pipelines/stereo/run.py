@@ -26,6 +26,7 @@ from sfmapp.stereo.measured import MeasuredPair, measure_pair, report_of
 from sfmapp.stereo.prepare import PreparedPair, PrepareOptions, prepare_pair
 from sfmapp.stereo.report import DisparityReport, StereoPairReport
 from sfmapp.stereo.result import DisparityMap, PixelState
+from sfmapp.stereo.temporal import Moment, compare_moments, film_report
 from sfmapp.viewer.stereo_recording import record_stereo
 from sfmapp.workspace.job import FAILED, WRITTEN, Job
 from sfmapp.workspace.layout import PAGE, REPORT, STEREO
@@ -94,7 +95,8 @@ def stereo(
         last: MatchedStereo | None = None
         for pair in pairs:
             try:
-                last, report = _do_pair(job, pair)
+                before = _moment(last) if last is not None and pair.is_frame else None
+                last, report = _do_pair(job, pair, before)
                 told.append(report)
             except InputError as error:
                 if total == 1:
@@ -109,7 +111,8 @@ def stereo(
         job.note_inputs(inputs)
         job.events.finished(STAGE, f"{len(told)} pairs matched")
         document = StereoReport(
-            run=job.facts(), pairs=told, failed=failed, usage=job.usage, warnings=job.log.warnings
+            run=job.facts(), pairs=told, failed=failed, usage=job.usage, warnings=job.log.warnings,
+            film=film_report((pair.name, pair.consistency) for pair in told if pair.consistency is not None),
         )  # fmt: skip
         job.workspace.write_json(REPORT, document)
         if any(pair.name for pair in told):  # each has a folder and a page of its own
@@ -143,7 +146,7 @@ def _pairs(
     return found, len(found)
 
 
-def _do_pair(job: Job, source: PairSource) -> tuple[MatchedStereo, StereoPairReport]:
+def _do_pair(job: Job, source: PairSource, before: Moment | None) -> tuple[MatchedStereo, StereoPairReport]:
     with job.stage("rectification"):
         left, right = source.read()
         least = job.options.stereo.min_disparity
@@ -155,6 +158,7 @@ def _do_pair(job: Job, source: PairSource) -> tuple[MatchedStereo, StereoPairRep
         disparity = match_pair(prepared.pair, job.options.stereo, matches=prepared.matches)
     with job.stage("errors"):
         done = MatchedStereo(source, prepared, disparity, measure_pair(prepared.pair, disparity, threads=job.threads))
+        consistency = None if before is None else compare_moments(before, _moment(done))
     with job.stage("files"):
         files = [
             str(path.relative_to(job.workspace.folder)) for path in _write(job.workspace.folder / source.name, done)
@@ -162,12 +166,20 @@ def _do_pair(job: Job, source: PairSource) -> tuple[MatchedStereo, StereoPairRep
     report = StereoPairReport(
         name=source.name, left=source.left, right=source.right, rectification=prepared.report,
         disparity=_disparity_report(done), measured=report_of(prepared.pair, disparity, done.measured), files=files,
+        consistency=consistency,
     )  # fmt: skip
     with job.stage("page"):
         _write_page(job.workspace.folder / source.name / PAGE, report, done)
     if not source.name:  # of a pair alone; thousands of them would take longer to draw than to match
         _record(job, report, done)
     return done, report
+
+
+def _moment(done: MatchedStereo) -> Moment:
+    pair = done.prepared.pair
+    return Moment.of(
+        done.source.name, pair.left, pair.left_shown, done.disparity, done.measured.error.half_width_95
+    )  # fmt: skip
 
 
 def _record(job: Job, report: StereoPairReport, done: MatchedStereo) -> None:

@@ -86,6 +86,7 @@ class PairSource:
         read: gives both, (H, W, 3).
         cameras: what is known of them, of the sizes of the photographs.
         digests: of the files, by name.
+        is_frame: of a film: the pair before it was taken shortly before.
     """
 
     name: str
@@ -94,6 +95,7 @@ class PairSource:
     read: Callable[[], tuple[Pixels, Pixels]]
     cameras: Callable[[], PairCameras]
     digests: dict[str, str]
+    is_frame: bool = False
 
 
 def find_pairs(sources: Sequence[str | os.PathLike[str]], known: KnownCameras) -> Iterator[PairSource]:

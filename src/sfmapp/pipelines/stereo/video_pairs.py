@@ -41,7 +41,7 @@ def pairs_of_video(video: str, known: KnownCameras, step: int) -> Iterator[PairS
             name = f"{number:06d}"
             yield PairSource(
                 name, f"{name}, left half", f"{name}, right half", partial(_halves, rgb_of(item)), lambda: cameras,
-                digests,
+                digests, is_frame=True,
             )  # fmt: skip
 
 
