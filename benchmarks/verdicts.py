@@ -151,9 +151,9 @@ def two_view_rows(folder: Path) -> Iterator[Row]:
     for (what, program), row in speed.items():
         if program in peers:
             mine = speed[what, "sfmapp"]
-            # results of before the geometric mean was told have the median
-            kind = "typical" if "typical_error" in row else "median"
-            for quantity, unit, key in (("CPU time", "ms", "cpu_ms"), (f"{kind} error", row["unit"], f"{kind}_error")):
+            for quantity, unit, key in (
+                ("CPU time", "ms", "cpu_ms"), ("typical error", row["unit"], "typical_error")
+            ):  # fmt: skip
                 case = f"{what}, 1,000 matches, half wrong"
                 yield Row("two_views", case, quantity, unit, "less", mine[key], program, row[key], *about)
 
