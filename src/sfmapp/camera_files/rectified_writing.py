@@ -34,8 +34,9 @@ class RectifiedCameras:
         rotations: (2, 3, 3) rectified from camera.
         focal, cx, cy, doffs: after, pixels, the centre of the first pixel at (0.5, 0.5); doffs is the principal
             point of the right one minus that of the left, along x.
-        baseline: distance of the centres, metres where the rig is in metres.
+        baseline: distance of the centres, in the unit of the rig.
         size: width and height of the rectified pictures.
+        is_metric: that unit is the metre.
     """
 
     rig: Rig
@@ -46,6 +47,7 @@ class RectifiedCameras:
     doffs: float
     baseline: float
     size: tuple[int, int]
+    is_metric: bool = True
 
     def projection(self, side: int) -> Array:
         """(3, 4) of the left (0) or right (1) camera, OpenCV's P1 or P2: of points in the left rectified frame."""
@@ -69,26 +71,32 @@ def write_rectified_files(folder: Path, cameras: RectifiedCameras) -> Iterator[P
     """Write a rectified pair in every form that can hold it; gives the path of each file.
 
     ``calib.txt`` is Middlebury's, ``left.yaml`` and ``right.yaml`` are ROS's camera_info (which hold a camera
-    before and after), ``rectification.yaml`` has OpenCV's M1, D1, M2, D2, R, T, R1, R2, P1, P2 and Q.
+    before and after), ``rectification.yaml`` has OpenCV's M1, D1, M2, D2, R, T, R1, R2, P1, P2 and Q. The first three
+    have lengths in millimetres and metres: of a rig without a unit the last one alone is written.
 
     Raises:
         InputError: the folder cannot be written.
     """
-    width, height = cameras.size
-    path = folder / "calib.txt"
-    write_middlebury(path, MiddleburyCalibration(
-        float(cameras.focal), float(cameras.cx) - 0.5, float(cameras.cy) - 0.5, float(cameras.doffs),
-        float(cameras.baseline), width, height,
-    ))  # fmt: skip
-    yield path
     texts = [("rectification.yaml", _opencv(cameras))]
+    if cameras.is_metric:
+        width, height = cameras.size
+        path = folder / "calib.txt"
+        write_middlebury(path, MiddleburyCalibration(
+            float(cameras.focal), float(cameras.cx) - 0.5, float(cameras.cy) - 0.5, float(cameras.doffs),
+            float(cameras.baseline), width, height,
+        ))  # fmt: skip
+        yield path
+    else:
+        texts.append(("calib.txt", None))
     for side, name in enumerate(_SIDES):
-        info = camera_info(cameras.rig.cameras[side], name, cameras.rotations[side], cameras.projection(side))
+        info = None
+        if cameras.is_metric:
+            info = camera_info(cameras.rig.cameras[side], name, cameras.rotations[side], cameras.projection(side))
         texts.append((f"{name}.yaml", info))
     for name, text in texts:
         path = folder / name
         if text is None:
-            path.unlink(missing_ok=True)  # of an earlier run with another lens
+            path.unlink(missing_ok=True)  # of an earlier run with another lens, or with metres
             continue
         with replaced_file(path) as beside:
             beside.write_text(text, encoding="utf-8")

@@ -27,7 +27,10 @@ def write_cameras(folder: Path, prepared: PreparedPair) -> Iterator[Path]:
         return
     rotations = np.stack([plan.left_from_camera, plan.right_from_camera])
     yield from write_rectified_files(
-        folder, RectifiedCameras(plan.rig, rotations, g.focal, g.cx, g.cy, g.doffs, g.baseline, (g.width, g.height))
+        folder,
+        RectifiedCameras(
+            plan.rig, rotations, g.focal, g.cx, g.cy, g.doffs, g.baseline, (g.width, g.height), is_metric=g.unit == "m"
+        ),
     )
 
 
