@@ -156,6 +156,28 @@ def test_rows_of_a_rectified_pair_come_together_and_disparities_stay(pair: tuple
             assert np.nanmedian(disparity[:30, 60:]) == pytest.approx(FAR, abs=0.2)
 
 
+def test_several_pairs_tell_one_turn_of_their_rig(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    left, right = (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in pair)
+    lower = np.array([[1.0, 0.0, 0.0], [0.004, 1.0, 0.3]])
+    (tmp_path / "l").mkdir()
+    (tmp_path / "r").mkdir()
+    for name, rows in (("a.png", slice(None)), ("b.png", slice(None, None, -1))):  # the second upside down
+        cv2.imwrite(str(tmp_path / "l" / name), left[rows])
+        lowered = cv2.warpAffine(right[rows], lower, (240, 160), flags=cv2.INTER_CUBIC)
+        cv2.imwrite(str(tmp_path / "r" / name), lowered)
+    calibration = pair[0].parent / "calib.txt"
+    assert run(tmp_path / "l" / "a.png", tmp_path / "r" / "a.png", "--camera", calibration, "-o", tmp_path / "one") == 0
+    assert run(tmp_path / "l", tmp_path / "r", "--camera", calibration, "-o", tmp_path / "both") == 0
+    (alone,) = json.loads((tmp_path / "one" / "report.json").read_text())["pairs"]
+    told = json.loads((tmp_path / "both" / "report.json").read_text())["pairs"]
+    first, second = (one["rectification"]["misalignment"] for one in told)
+    assert first["turn_deg"] == second["turn_deg"]
+    assert first["num_matches"] > 1.5 * alone["rectification"]["misalignment"]["num_matches"]
+    assert first["is_corrected"]
+    assert second["is_corrected"]
+    assert max(one["rectification"]["rows"]["rms_px"] for one in told) < 0.25
+
+
 def test_pairs_out_of_a_model_and_out_of_a_video(pair: tuple[Path, Path], tmp_path: Path) -> None:
     photographs = tmp_path / "images"
     photographs.mkdir()
@@ -182,6 +204,8 @@ def test_pairs_out_of_a_model_and_out_of_a_video(pair: tuple[Path, Path], tmp_pa
     (told,) = json.loads((tmp_path / "named" / "report.json").read_text())["pairs"]
     assert told["rectification"]["is_swapped"]
     assert told["rectification"]["unit"] == ""
+    written = {path.name for path in (tmp_path / "named" / told["name"]).iterdir()}
+    assert written & set(CAMERA_FILES) == {"rectification.yaml"}  # the others have lengths in metres
     assert run(folder, "--pair", "left", "nobody", "-o", tmp_path / "none") == 3
     assert run(folder, "--pair", "left", "again", "-o", tmp_path / "ahead") == 3  # one in front of the other
 

@@ -70,6 +70,23 @@ def test_a_rig_that_holds_is_left_alone() -> None:
     assert not any(one.is_told[1] for one in found)
 
 
+def test_what_is_left_of_a_turn_that_is_held_is_as_large_as_its_sigma() -> None:
+    """Rigs that turned about any axis, too few matches to tell how far about the vertical."""
+    pulls, sigmas = [], []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        truth = tuple(rng.normal(0.0, 0.03, 3))
+        found = measured(seen(turned(truth), rng, 300, 0.4))
+        if found.is_significant and not found.is_told[1]:
+            assert found.turn_deg[1] == 0.0
+            pulls.append(truth[1] / found.sigma_deg[1])
+            sigmas.append(found.sigma_deg[1])
+    assert len(pulls) >= 15
+    assert 0.5 < np.sqrt(np.mean(np.square(pulls))) < 1.3
+    assert np.mean(np.abs(pulls) < 1.96) >= 0.85
+    assert np.median(sigmas) < 0.05
+
+
 def test_what_a_pair_does_not_tell_is_held() -> None:
     found = measured(seen(turned((0.05, 0.02, 0.0)), np.random.default_rng(1), 150, 0.5))
     assert found.turn_deg[0] == pytest.approx(0.05, abs=0.02)

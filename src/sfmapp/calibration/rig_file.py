@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sfmapp.calibration.documents import write_document
 from sfmapp.calibration.rig import PairCalibration, RigCalibration
 from sfmapp.calibration.rig_report import RigCameraSection, RigHead, RigPair
+from sfmapp.camera_files.reading import RIG_POSE_NAMES
 from sfmapp.camera_files.rig_writing import pose_rows
 from sfmapp.geometry import rigid3
 
@@ -21,7 +22,6 @@ Array = NDArray[np.float64]
 
 FORMAT = "sfmapp rig 1"
 _SHAPE = ("bend_uu", "bend_vv", "bend_uv")
-_POSE = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
 
 
 def write_rig(path: Path, found: RigCalibration) -> None:
@@ -63,8 +63,8 @@ def rig_cameras(found: RigCalibration) -> list[RigCameraSection]:
 
 def _unknowns(found: RigCalibration) -> list[str]:
     names = [f"cam{n}.{name}" for n, one in enumerate(found.cameras) for name in one.param_names]
-    names += [f"cam{n}.{name}" for n in range(1, len(found.cameras)) for name in _POSE]
-    names += [f"board{n}.{name}" for n in range(1, len(found.world_from_board)) for name in _POSE]
+    names += [f"cam{n}.{name}" for n in range(1, len(found.cameras)) for name in RIG_POSE_NAMES]
+    names += [f"board{n}.{name}" for n in range(1, len(found.world_from_board)) for name in RIG_POSE_NAMES]
     shapes = [] if found.bend is None else [f"board{n}.{name}" for n in range(len(found.bend)) for name in _SHAPE]
     return names + shapes
 

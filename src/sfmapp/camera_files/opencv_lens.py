@@ -220,6 +220,11 @@ def sampling_map(camera: Camera, lens: FullLens | None) -> NDArray[np.float32] |
     return found.reshape(camera.height, camera.width, 2).astype(np.float32)
 
 
+def is_length(model: CameraModel) -> NDArray[np.bool_]:
+    """(P,) which parameters of a model are pixels, and grow with the picture."""
+    return np.array([kind_of(name) != "distortion" or name == "s" for name in PARAM_NAMES[model]], np.bool_)
+
+
 def scaled_to(place: str, calibrated: CalibratedCamera, size: Size) -> CalibratedCamera:
     """The camera for images of another size but the same shape, with a note if that was needed.
 
@@ -236,12 +241,11 @@ def scaled_to(place: str, calibrated: CalibratedCamera, size: Size) -> Calibrate
             f"{camera.width}x{camera.height}",
             "calibrate the camera at the size of the images, or give --camera",
         )
-    is_length = [kind_of(name) != "distortion" or name == "s" for name in PARAM_NAMES[camera.model]]
     sigma = camera.focal_sigma and camera.focal_sigma * scale
-    params = np.where(is_length, camera.params * scale, camera.params)
+    params = np.where(is_length(camera.model), camera.params * scale, camera.params)
     note = f"{place}: calibrated at {camera.width}x{camera.height}, scaled to the images' {size[0]}x{size[1]}"
     scaled = replace(camera, width=size[0], height=size[1], params=params, focal_sigma=sigma)
     if camera.prior_covariance is not None:
-        by = np.where(is_length, scale, 1.0)
+        by = np.where(is_length(camera.model), scale, 1.0)
         scaled = replace(scaled, prior_covariance=camera.prior_covariance * np.outer(by, by))
     return replace(calibrated, camera=scaled, notes=(*calibrated.notes, note))

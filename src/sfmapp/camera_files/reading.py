@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.camera_files.fields import (
     Fields,
     camera_of_fields,
@@ -25,7 +27,14 @@ from sfmapp.camera_files.fields import (
 )
 from sfmapp.camera_files.files import read_fields
 from sfmapp.camera_files.lens_types import type_fields
-from sfmapp.camera_files.opencv_lens import CalibratedCamera, FullLens, Size, camera_from_opencv, scaled_to
+from sfmapp.camera_files.opencv_lens import (
+    CalibratedCamera,
+    FullLens,
+    Size,
+    camera_from_opencv,
+    is_length,
+    scaled_to,
+)
 from sfmapp.errors import InputError
 from sfmapp.formats.text_input import nearest_rotation
 from sfmapp.geometry import rigid3
@@ -33,6 +42,8 @@ from sfmapp.scene.rig import Rig
 
 Array = NDArray[np.float64]
 
+RIG_POSE_NAMES = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
+"""Of the unknowns of a pose in a rig's file: a small motion about the camera's own axes."""
 _PAIR_NAMES = (("cam0", "cam1"), ("left", "right"), ("camera_0", "camera_1"), ("image_0", "image_1"))
 
 
@@ -46,6 +57,8 @@ class Calibration:
         frames_per_second: None if it does not say.
         lenses: for each camera of the rig the lens whose frames are to be resampled to be its own; None for none.
         notes: what was changed on the way (a lens fitted, a size scaled), one line each.
+        covariance: (P0 + P1 + 6,) squared, of two cameras that were calibrated together: parameters of the first, then
+            of the second, then turn (radians) and shift of the second one's pose about its own axes; None: unknown.
     """
 
     rig: Rig
@@ -53,6 +66,7 @@ class Calibration:
     frames_per_second: float | None = None
     lenses: tuple[FullLens | None, ...] = (None, None)
     notes: tuple[str, ...] = ()
+    covariance: Array | None = None
 
 
 def read_calibration(path: str | Path, image_sizes: Sequence[Size]) -> Calibration:
@@ -152,7 +166,32 @@ def _from_sections(place: str, fields: Fields, pair: Sequence[str], image_sizes:
             chain = rigid3.inverse(read_pose(f"{place}: T_cam0_cam1", fields["T_cam0_cam1"]))
         if chain is None:
             chain = _beside(place, fields)
-    return _of_cameras(place, cameras, image_sizes, bodies[0], chain)
+    found = _of_cameras(place, cameras, image_sizes, bodies[0], chain)
+    if len(cameras) < 2 or "unknowns" not in fields or not found.rig.is_stereo:
+        return found
+    return replace(found, covariance=_joint_covariance(place, fields, pair, cameras, found.rig.cameras))
+
+
+def _joint_covariance(
+    place: str, fields: Fields, pair: Sequence[str], stated: Sequence[CalibratedCamera], scaled: Sequence[Camera]
+) -> Array:
+    """Of the two first cameras of a rig file that names its unknowns, for cameras scaled to their images."""
+    names = fields["unknowns"]
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"{place}: unknowns: expected a list of names, found {str(names)[:80]}")
+    whole = numbers(f"{place}: covariance", fields.get("covariance"), (len(names), len(names)))
+    wanted, by = [], []
+    for name, one, other in zip(pair, stated, scaled, strict=True):
+        wanted += [f"{name}.{param}" for param in PARAM_NAMES[other.model]]
+        by.append(np.where(is_length(other.model), other.width / one.camera.width, 1.0))
+    wanted += [f"{pair[1]}.{name}" for name in RIG_POSE_NAMES]
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise InputError(f"{place}: unknowns: expected {missing[0]} among them, found {', '.join(names[:6])}, ...")
+    at = [names.index(name) for name in wanted]
+    scale = np.concatenate([*by, np.ones(len(RIG_POSE_NAMES))])
+    covariance: Array = whole[np.ix_(at, at)] * np.outer(scale, scale)
+    return covariance
 
 
 def _from_opencv_pair(place: str, fields: Fields, image_sizes: Sequence[Size]) -> Calibration:

@@ -39,7 +39,7 @@ Writes
   OUT/left.png, OUT/right.png   the pair, its rows epipolar lines
   OUT/disparity.npy             x_left - x_right of each pixel of the left picture; .pfm and .png the same
   OUT/depth.npy                 depths in the unit of the baseline, where one is known; cloud.ply, view.glb
-  OUT/calib.txt, *.yaml         the rectified cameras for Middlebury's programs, OpenCV and ROS
+  OUT/calib.txt, *.yaml         the rectified cameras for Middlebury's programs, OpenCV and ROS; without metres OpenCV's
   OUT/report.html               maps and how far off they may be, how the pair was rectified, what is wrong with it
 Of several pairs each has a folder in OUT; OUT/report.json tells of all."""
 

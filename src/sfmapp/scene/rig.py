@@ -35,6 +35,11 @@ class Rig:
         """More than one camera: lengths are known."""
         return len(self.cameras) > 1
 
+    def reversed_pair(self) -> Rig:
+        """Two cameras in the other order, in the frame of the second."""
+        first, second = self.cameras
+        return Rig((second, first), np.array([rigid3.IDENTITY, rigid3.inverse(self.cam_from_rig[1])]))
+
 
 @dataclass(frozen=True)
 class RigImages:

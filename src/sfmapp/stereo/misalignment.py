@@ -10,6 +10,7 @@ its sigma said.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 
@@ -43,6 +44,9 @@ _LARGEST_DEG = 3.0
 _LENS_RAD, _LARGEST_ABOUT_Y_DEG = 2e-4, 0.3
 # the one number that disparities hang on: the turn about y
 _ABOUT_Y = 1
+# A rig that turned did so about any axis as likely as about another: what it did about two tells the usual size of the
+# third, in a ratio that Student's t of two degrees of freedom has. Its 95 per cent over those of a Gaussian.
+_STUDENT = 4.303 / 1.960
 
 
 @dataclass(frozen=True)
@@ -54,10 +58,10 @@ class Misalignment:
         turn_deg: (3,) rotation vector that takes directions of the calibrated right camera's frame to those of the true
             one. direction_deg: (2,) by how much the baseline's direction has moved along y and z.
         sigma_deg: (5,) of these five, by leaving cells of the picture out in turn; of numbers that were held, of what
-            the pair leaves open.
+            the pair leaves open. For the turn about y that is narrowed by what the rig did about the other two axes.
         is_told: (5,) bool: the pair tells it, and it is in the correction; the others are held at the calibration's.
         is_significant: the calibration does not hold: five numbers explain what chance does once in a thousand times,
-            on matches of cells that they were not fitted to as well.
+            on matches of cells that they were not fitted to as well, and one of them is beyond three of its sigmas.
         num_matches: that it rests on. rms_px: of y_left - y_right before and after the correction, without gross ones.
     """
 
@@ -68,6 +72,11 @@ class Misalignment:
     is_significant: bool
     num_matches: int
     rms_px: tuple[float, float]
+
+    @property
+    def moved_rows_px(self) -> float:
+        """By how much it moves rows, by what it takes out of their differences."""
+        return math.sqrt(max(self.rms_px[0] ** 2 - self.rms_px[1] ** 2, 0.0))
 
     @property
     def is_turn(self) -> bool:
@@ -128,19 +137,31 @@ def measure_misalignment(
     told[_ABOUT_Y] &= sigma[_ABOUT_Y] * g.focal < _WORST_SHIFT_PX
     # what shows in rows as a whole is told by any pair; the others are left alone where they may be nothing
     free = np.array([True, bool(told[_ABOUT_Y]), True, bool(told[3]), bool(told[4])]) & free
+    by_rows = step[_ABOUT_Y]
     if not free.all():
         step, noise = _fitted(left, right, free, scale)
         sigma = np.where(free, _sigmas(left, right, cells, free, (step, noise)), sigma)
     sigma = np.hypot(sigma, _SYSTEMATIC * np.abs(step))
     sigma[_ABOUT_Y] = np.hypot(sigma[_ABOUT_Y], _LENS_RAD)
-    gain = _held_out_gain(left, right, cells, free, noise)
+    if not free[_ABOUT_Y]:
+        sigma[_ABOUT_Y] = _left_open(float(by_rows), float(sigma[_ABOUT_Y]), step[[0, 2]])
+    is_significant = bool((np.abs(step) > _TOLD_SIGMAS * sigma)[free].any())
+    is_significant &= _held_out_gain(left, right, cells, free, noise) > _CHANCE
     rms = tuple(
         float(g.focal * np.sqrt(2.0) * robust_sigma(_squared(at, left, right), 1)) for at in (np.zeros(5), step)
     )
     return Misalignment(
-        np.degrees(step[:3]), np.degrees(step[3:]), np.degrees(sigma), free, bool(gain > _CHANCE), len(left),
+        np.degrees(step[:3]), np.degrees(step[3:]), np.degrees(sigma), free, is_significant, len(left),
         (rms[0], rms[1]),
     )  # fmt: skip
+
+
+def _left_open(by_rows: float, sigma: float, others: Array) -> float:
+    """Root of the mean square of a turn about the vertical that is held, when rows say ``by_rows`` +- ``sigma`` of it
+    and the rig turned by ``others`` (2,) about the other axes: of the product of both Gaussians, about zero."""
+    prior = _STUDENT * float(np.sqrt(np.mean(others**2)))
+    share = prior**2 / (prior**2 + sigma**2)
+    return float(np.sqrt(share * sigma**2 + (share * by_rows) ** 2))
 
 
 def _slopes(numbers: Array) -> Array:

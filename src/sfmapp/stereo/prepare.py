@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from sfmapp.geometry import rigid3
 from sfmapp.planes.sampling import resampled
 from sfmapp.scene.rig import Rig
 from sfmapp.stereo.alignment import aligned_matches
+from sfmapp.stereo.calibration_error import geometry_covariance, without_turn
 from sfmapp.stereo.misalignment import Misalignment, measure_misalignment
 from sfmapp.stereo.opencv_matchers import gray_of
 from sfmapp.stereo.options import Correction
@@ -46,6 +48,8 @@ class PairCameras:
         has_baseline: the length of that pose is known.
         text: where it is from, for people.
         unit: of that length: ``m``, or nothing of a model that has a scale of its own.
+        covariance: (P0 + P1 + 6,) squared, of the parameters of both cameras and of the turn (radians) and shift of the
+            second one's pose about its own axes, as the calibration has it; None where it says nothing of it.
         is_adjusted: the rig was had from these photographs themselves: matches are not held against it.
     """
 
@@ -53,6 +57,7 @@ class PairCameras:
     has_baseline: bool = True
     text: str = "nothing is known of the cameras"
     unit: str = "m"
+    covariance: Array | None = None
     is_adjusted: bool = False
 
 
@@ -91,10 +96,12 @@ class PrepareOptions:
         is_cropped: negative disparities are meant: nothing is said of them.
         corrects: what is done about a rig that has turned since its calibration, as in
             :class:`~sfmapp.stereo.options.StereoOptions`.
+        turn: of the rig, by several pairs of it (:func:`turn_of_rig`); None: each pair tells its own.
     """
 
     is_cropped: bool = False
     corrects: Correction = "auto"
+    turn: Misalignment | None = None
 
 
 def prepare_pair(
@@ -121,13 +128,13 @@ def prepare_pair(
         if _second_is_left(cameras.rig):
             # the calibration says so: it is obeyed, and said
             left, right, is_swapped = right, left, True
-            cameras = replace(cameras, rig=_other_way_round(cameras.rig))
+            cameras = replace(cameras, rig=cameras.rig.reversed_pair())
         draft = _drafted(left, right, _needed(cameras.rig))
     misalignment = None
-    is_corrected = False
+    is_corrected = with_rows = False
     if draft.plan is not None and not is_projective:
         _check_rows(draft, (left, right), cameras, warnings)
-        misalignment = _misalignment(draft)
+        misalignment = options.turn or _misalignment(draft.plan, _aligned(draft))
         if misalignment is not None and options.corrects != "no" and not cameras.is_adjusted:
             was_rectified = options.corrects == "auto" and draft.plan.is_identity
             with_rows = was_rectified or options.corrects == "rows" or not misalignment.is_turn
@@ -136,13 +143,18 @@ def prepare_pair(
         _check_order(draft, names, warnings)
     pair = draft.pair
     if pair.geometry is not None:
-        pair = replace(pair, geometry=replace(pair.geometry, unit=cameras.unit))
+        turn = misalignment if is_corrected and misalignment is not None and not with_rows else None
+        covariance = _covariance(draft, cameras, turn, is_swapped=is_swapped)
+        pair = replace(pair, geometry=replace(pair.geometry, unit=cameras.unit, covariance=covariance))
     if pair.geometry is not None and not cameras.has_baseline:
         pair = replace(pair, geometry=None if is_projective else replace(pair.geometry, baseline=None, unit=""))
     report = _report(pair, draft, cameras, is_swapped, warnings)
     if misalignment is not None:
         report = replace(report, misalignment=misalignment_report(misalignment, is_corrected))
-    return PreparedPair(pair, draft.plan, draft.matches, misalignment, report)
+    plan = draft.plan
+    if plan is not None and pair.geometry is not None:
+        plan = replace(plan, geometry=pair.geometry)
+    return PreparedPair(pair, plan, draft.matches, misalignment, report)
 
 
 def _needed(rig: Rig | None) -> Rig:
@@ -203,13 +215,33 @@ def _without_calibration(
     return draft, replace(cameras, has_baseline=False, text="matches of the photographs alone")
 
 
-def _misalignment(draft: _Draft) -> Misalignment | None:
-    assert draft.pair.geometry is not None
-    gray = gray_of(draft.pair.left), gray_of(draft.pair.right)
+def turn_of_rig(pairs: Iterable[tuple[Pixels, Pixels]], cameras: PairCameras) -> Misalignment | None:
+    """How far a rig has turned since its calibration, by matches of several pairs of it together; None where they are
+    too few, or where nothing is known of the rig.
+
+    Args:
+        pairs: of photographs, those of the cameras in their order.
+
+    Raises:
+        InputError: cameras that cannot be rectified, or photographs of another size.
+    """
+    if cameras.rig is None or cameras.is_adjusted:
+        return None
+    is_swapped = _second_is_left(cameras.rig)
+    plan = plan_rectification(cameras.rig.reversed_pair() if is_swapped else cameras.rig)
+    found = [_aligned(_with_plan(*(pair[::-1] if is_swapped else pair), plan)) for pair in pairs]
+    none = np.zeros((0, 2))
+    left, right = [none, *(one.left for one in found)], [none, *(one.right for one in found)]
+    return _misalignment(plan, PairMatches(np.concatenate(left), np.concatenate(right)))
+
+
+def _aligned(draft: _Draft) -> PairMatches:
+    return aligned_matches(gray_of(draft.pair.left), gray_of(draft.pair.right), draft.matches)
+
+
+def _misalignment(plan: Rectification, matches: PairMatches) -> Misalignment | None:
     # of photographs that are rectified as they are, the left one stays as it is
-    has_direction = draft.plan is not None and not draft.plan.is_identity
-    matches = aligned_matches(*gray, draft.matches)
-    return measure_misalignment(matches, draft.pair.geometry, has_direction=has_direction)
+    return measure_misalignment(matches, plan.geometry, has_direction=not plan.is_identity)
 
 
 def _corrected(
@@ -219,13 +251,14 @@ def _corrected(
     alone are brought together."""
     if not found.is_significant or draft.plan is None:
         return draft, False
-    turn, sigma = float(np.linalg.norm(found.turn_deg)), float(np.linalg.norm(found.sigma_deg[:3]))
-    text = f"matches say that the right camera is turned by {turn:.3f} +- {sigma:.3f} degrees against the calibration"
+    text = f"matches say that the right camera is turned against the calibration by {_turn_text(found)}"
     if found.is_foreign:
         warnings.append(f"{text}: that is not corrected, for it is more than any rig drifts")
         return draft, False
     if with_rows and found.rms_px[0] - found.rms_px[1] < _LEAST_GAIN_PX:
         return draft, False
+    if not with_rows and found.moved_rows_px < _LEAST_GAIN_PX and not found.is_told[1]:
+        return draft, False  # it moves neither rows nor disparities by what anybody would see
     after = _with_rows(draft, found) if with_rows else _with_plan(*photographs, corrected_plan(draft.plan, found))
     if after.rows is None or draft.rows is None or after.rows.rms_px > draft.rows.rms_px:
         warnings.append(f"{text}, but rows do not agree better for it: not corrected")
@@ -245,16 +278,44 @@ def _corrected(
             f"together ({found.rms_px[0]:.2f} px, now {after.rows.rms_px:.2f}), disparities are left as they are"
         )
         return after, True
-    # what is left of a turn about the vertical moves all disparities alike
-    covariance = np.zeros((3, 3)) if geometry.covariance is None else geometry.covariance.copy()
-    covariance[2, 2] += (geometry.focal * np.radians(found.sigma_deg[1])) ** 2
-    shift = geometry.focal * np.radians(abs(float(found.turn_deg[1])))
+    about_vertical = (
+        f"disparities were off by {geometry.focal * np.radians(abs(float(found.turn_deg[1]))):.2f} px"
+        if found.is_told[1] else
+        f"disparities stay, to +- {geometry.focal * np.radians(found.sigma_deg[1]):.2f} px of one turn"
+    )  # fmt: skip
     warnings.append(
-        f"{text}: corrected. Rows differed by {found.rms_px[0]:.3f} px, now by {found.rms_px[1]:.3f}; disparities were "
-        f"off by {shift:.2f} px"
-        + ("" if found.is_told[1] else f" at most {geometry.focal * np.radians(3 * found.sigma_deg[1]):.2f}")
+        f"{text}: corrected. Rows differed by {found.rms_px[0]:.3f} px, now by {found.rms_px[1]:.3f}; {about_vertical}"
     )
-    return replace(after, pair=replace(after.pair, geometry=replace(geometry, covariance=covariance))), True
+    return after, True
+
+
+def _turn_text(found: Misalignment) -> str:
+    """Each axis with its own sigma."""
+    parts = [
+        f"{turn:+.3f} +- {sigma:.3f} degrees about {axis}" + ("" if is_told else ", not told by this pair and held")
+        for turn, sigma, is_told, axis in zip(
+            found.turn_deg, found.sigma_deg[:3], found.is_told[:3],
+            ("the baseline", "the vertical", "the optical axis"), strict=True,
+        )
+    ]  # fmt: skip
+    return "; ".join(parts)
+
+
+def _covariance(draft: _Draft, cameras: PairCameras, turn: Misalignment | None, *, is_swapped: bool) -> Array | None:
+    """(3, 3) what is not known of focal length, baseline and doffs: by the calibration, and of a turn of the rig that
+    was corrected what its matches leave; None where nothing says anything of it."""
+    plan, geometry = draft.plan, draft.pair.geometry
+    if plan is None or geometry is None or (cameras.covariance is None and turn is None):
+        return None
+    found = np.zeros((3, 3))
+    if cameras.covariance is not None:
+        # a turn that was measured is not uncertain by the calibration any more
+        is_measured = turn is not None and bool(turn.is_told[1])
+        covariance = without_turn(cameras.covariance) if is_measured else cameras.covariance
+        found = geometry_covariance(plan, covariance, is_swapped=is_swapped)
+    if turn is not None:  # about the vertical it moves all disparities alike
+        found[2, 2] += (geometry.focal * np.radians(turn.sigma_deg[1])) ** 2
+    return found
 
 
 def _with_rows(draft: _Draft, found: Misalignment) -> _Draft:
@@ -336,10 +397,6 @@ def _check_pictures(left: Pixels, right: Pixels, names: tuple[str, str]) -> None
 def _second_is_left(rig: Rig) -> bool:
     x, y, _ = rigid3.center(rig.cam_from_rig[1])
     return bool(abs(x) >= abs(y) and x < 0.0)
-
-
-def _other_way_round(rig: Rig) -> Rig:
-    return Rig(rig.cameras[::-1], np.array([rigid3.IDENTITY, rigid3.inverse(rig.cam_from_rig[1])]))
 
 
 def _are_off(rows: RowsReport) -> bool:

@@ -23,7 +23,8 @@ from sfmapp.report.stereo_html import pairs_page, stereo_page
 from sfmapp.reporting import NamedReason
 from sfmapp.stereo.match import match_pair
 from sfmapp.stereo.measured import MeasuredPair, measure_pair, report_of
-from sfmapp.stereo.prepare import PreparedPair, PrepareOptions, prepare_pair
+from sfmapp.stereo.misalignment import Misalignment
+from sfmapp.stereo.prepare import PairCameras, PreparedPair, PrepareOptions, prepare_pair, turn_of_rig
 from sfmapp.stereo.report import DisparityReport, StereoPairReport
 from sfmapp.stereo.result import DisparityMap, PixelState
 from sfmapp.stereo.temporal import Moment, compare_moments, film_report
@@ -35,6 +36,8 @@ from sfmapp.workspace.usage import Stopwatch
 
 STAGE = STEREO
 _QUANTILES = (0.01, 0.5, 0.99)
+# pairs that tell how far their rig has turned: each takes as long as it takes to be rectified
+_PAIRS_OF_TURN = 6
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,7 @@ def stereo(
     named = ", ".join(os.fspath(one) for one in sources)
     with Job.opened(STEREO, named, target, options, events=events, watch=watch) as job:
         pairs, total = _pairs(job, sources, known or KnownCameras(), chosen or ChosenPairs())
+        turn = _turn(job, pairs) if isinstance(pairs, list) else None
         inputs: dict[str, str] = {}
         job.note_inputs(inputs)
         job.events.started(STAGE, f"{total or 'all'} pairs" if total != 1 else "matching", total=total)
@@ -96,7 +100,7 @@ def stereo(
         for pair in pairs:
             try:
                 before = _moment(last) if last is not None and pair.is_frame else None
-                last, report = _do_pair(job, pair, before)
+                last, report = _do_pair(job, pair, turn, before)
                 told.append(report)
             except InputError as error:
                 if total == 1:
@@ -146,11 +150,34 @@ def _pairs(
     return found, len(found)
 
 
-def _do_pair(job: Job, source: PairSource, before: Moment | None) -> tuple[MatchedStereo, StereoPairReport]:
+def _turn(job: Job, pairs: Sequence[PairSource]) -> Misalignment | None:
+    """How far the rig of several pairs has turned, by some of them together; None of one pair, or of several rigs."""
+    if len(pairs) < 2 or job.options.stereo.correct_rig == "no":
+        return None
+    some = [pairs[n] for n in np.unique(np.linspace(0, len(pairs) - 1, _PAIRS_OF_TURN).round().astype(int)).tolist()]
+    with job.stage("rectification"):
+        try:
+            cameras = [one.cameras() for one in some]
+            if len({_sizes(one) for one in cameras}) > 1:
+                return None
+            return turn_of_rig((one.read() for one in some), cameras[0])
+        except InputError:
+            return None  # named of the pair that has it
+
+
+def _sizes(cameras: PairCameras) -> tuple[tuple[int, int], ...]:
+    return () if cameras.rig is None else tuple((one.width, one.height) for one in cameras.rig.cameras)
+
+
+def _do_pair(
+    job: Job, source: PairSource, turn: Misalignment | None, before: Moment | None
+) -> tuple[MatchedStereo, StereoPairReport]:
     with job.stage("rectification"):
         left, right = source.read()
         least = job.options.stereo.min_disparity
-        how = PrepareOptions(is_cropped=least is not None and least < 0, corrects=job.options.stereo.correct_rig)
+        how = PrepareOptions(
+            is_cropped=least is not None and least < 0, corrects=job.options.stereo.correct_rig, turn=turn
+        )
         prepared = prepare_pair(left, right, source.cameras(), (source.left, source.right), how)
         for warning in prepared.report.warnings:
             job.events.warned(STAGE, warning)

@@ -215,7 +215,10 @@ def _of_calibration(found: Calibration, place: str) -> PairCameras:
     cameras = tuple(
         _exact(camera, lens) for camera, lens in zip(found.rig.cameras, found.lenses, strict=True)
     )  # fmt: skip
-    return PairCameras(rig=Rig(cameras, found.rig.cam_from_rig), text=place)
+    # of a lens that is read with more coefficients than its simpler stand-in nothing is stated
+    sizes = sum(len(camera.params) for camera in cameras) + 6
+    covariance = found.covariance if found.covariance is not None and len(found.covariance) == sizes else None
+    return PairCameras(rig=Rig(cameras, found.rig.cam_from_rig), text=place, covariance=covariance)
 
 
 def _exact(camera: Camera, lens: object) -> Camera:
