@@ -223,10 +223,10 @@ def test_positions_on_a_line_leave_the_turn_about_it_to_the_level_of_photographs
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
-    """A lean copy of benchmarks/surveys.py: one in ten positions wrong, all kinds; 200 surveys are in its results."""
+    """A lean copy of benchmarks/surveys.py: one in ten positions wrong, three kinds; 800 surveys are in its results."""
     outcomes = [
         surveys.run(kind, receiver, seed, 0.1)
-        for kind in surveys.KINDS for receiver in ("phone", "rtk") for seed in (11,)
+        for kind in ("grid", "orbit", "walk") for receiver in ("phone", "rtk") for seed in (11,)
     ]  # fmt: skip
     done = [outcome for outcome in outcomes if outcome is not None]
     assert len(done) == 6
