@@ -147,6 +147,19 @@ def test_slanted_planes_are_found_to_a_fraction_of_a_pixel(first: int, count: in
     assert np.isnan(found.disparity[found.state == PixelState.UNKNOWN]).all()
 
 
+@pytest.mark.parametrize(("slope", "share"), [(0.35, 0.96), (0.5, 0.7), (-0.5, 0.9)])
+def test_steep_planes_are_found_where_much_of_the_search_leads_out_of_the_picture(slope: float, share: float) -> None:
+    x = np.arange(320)[None] + np.zeros((160, 1))
+    truth = 6.3 + slope * x - min(slope, 0.0) * 319
+    found = _match(*_pair_of(truth, noise=2.0), (0, int(truth.max()) + 5))
+    inside = (x - truth > 8) & (x < 310)
+    matched = inside & (found.state == PixelState.MATCHED)
+    # before disparities that lead into the picture went first: 0.78, 0.44 and 0.79
+    assert matched.sum() > share * inside.sum()
+    assert (np.abs(found.disparity - truth)[matched] > 1).mean() < 0.01
+    assert found.uniqueness.min() >= 0.0
+
+
 def test_what_only_the_left_camera_sees_is_not_matched() -> None:
     truth = np.full((100, 200), 5.0)
     truth[30:70, 80:140] = 25.0

@@ -259,6 +259,10 @@ def decide(
 ) -> None:
     """Disparities of the rows first to last - 1, and whether the right picture finds the same but for a tolerance.
 
+    Of disparities that lead into the right picture, as long as there are any: what leads out of it has the cost of a
+    match that is neither good nor bad, and a steep surface, which the other view shows half as wide, matches no better.
+    Those that lead out still are rivals, which make it less unique.
+
     Between whole pixels by two lines of opposite slope (equiangular fit). ``cost``, ``label``: scratch (W + 2 M,) of a
     row of the right picture, uint8 and int16.
     """
@@ -273,8 +277,11 @@ def decide(
         for x in range(width):
             value = u8.add(u8.load(above, LANES * x), u8.load(below, LANES * x))
             u8.store(above, LANES * x, value)
-            best = u8.lowest(value)
-            k = u8.first_bit(u8.lanes_equal(value, u8.splat(best)))
+            seen, last_seen = value, x - np.int64(base[y, x])
+            if last_seen >= 0 and (last_seen < LANES - 1 or last_seen >= width):
+                seen = u8.within(value, last_seen - width + 1, last_seen + 1, u8.splat(np.uint8(255)))
+            best = u8.lowest(seen)
+            k = u8.first_bit(u8.lanes_equal(seen, u8.splat(best)))
             found.best[y, x] = best
             found.elsewhere[y, x] = u8.lowest(u8.hide(value, k))
             found.bend[y, x] = np.int16(k)
@@ -290,10 +297,10 @@ def decide(
                     shift = np.float32(0.5) * np.float32(before - after) / np.float32(rise)
             found.disparity[y, x] = np.float32(disparity) + shift
             found.bend[y, x] = np.int16(bend)
-            seen = x - disparity
-            agrees = seen >= 0 and seen < width
+            place = x - disparity
+            agrees = place >= 0 and place < width
             if agrees:
-                agrees = abs(np.int64(right_label[corner - seen]) - disparity) <= tolerance
+                agrees = abs(np.int64(right_label[corner - place]) - disparity) <= tolerance
             found.agrees[y, x] = np.uint8(agrees)
 
 
@@ -330,9 +337,9 @@ def noise_of(grey: Bytes, counts: NDArray[np.int64]) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _uniqueness(found: Found, y: Index, x: Index) -> float:
-    """1 - best / elsewhere; 0 where all costs are zero."""
+    """1 - best / elsewhere; 0 where all costs are zero, or what leads out of the right picture is cheaper."""
     best, elsewhere = np.float32(found.best[y, x]), np.float32(found.elsewhere[y, x])
-    return float((elsewhere - best) / max(elsewhere, np.float32(1.0)))
+    return float(max(elsewhere - best, np.float32(0.0)) / max(elsewhere, np.float32(1.0)))
 
 
 @numba.njit(cache=True, nogil=True)
