@@ -79,9 +79,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     matching = parser.add_argument_group("matching")
     matching.add_argument("--matcher", metavar="NAME", help="sgm, window, opencv-sgbm or opencv-bm; default: sgm")
-    matching.add_argument(
-        "--min-disparity", metavar="PX", help="least disparity looked for; default: as sparse matches tell"
-    )
+    matching.add_argument("--min-disparity", metavar="PX", help="least disparity looked for; default: as matches tell")
     matching.add_argument("--num-disparities", metavar="N", help="how many from there on")
     matching.add_argument("--window", metavar="PX", help="side of the window, odd; default: the matcher's own")
     add_output_flags(parser, has_log=True)

@@ -21,9 +21,9 @@ class StereoOptions:
     Attributes:
         matcher: sgm is our semi-global matching; window takes the best disparity of each pixel alone by windows about
             it; opencv-sgbm and opencv-bm are OpenCV's StereoSGBM and StereoBM.
-        min_disparity: Least disparity x_left - x_right that is looked for, pixels; may be negative. None: as sparse
-            matches tell.
-        num_disparities: How many from there on, pixels. None: as sparse matches tell.
+        min_disparity: Least disparity x_left - x_right that is looked for, pixels; may be negative. None: as matches
+            tell.
+        num_disparities: How many from there on, pixels. None: as matches tell.
         cost: What two pixels of windows cost: bits of their census, 1 - ZNCC, absolute or squared differences.
         windows: nested adds three windows of rising size, fixed has one, adaptive the best of several sizes for each
             pixel, shiftable the best of nine places about it.
