@@ -76,6 +76,15 @@ def test_a_calibrated_pair_becomes_depths(pair: tuple[Path, Path], tmp_path: Pat
     assert told["disparity"]["searched"][0] <= FAR <= NEAR <= told["disparity"]["searched"][1]
 
 
+def test_a_baseline_may_have_a_unit(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    depths = []
+    for baseline in ("10cm", "0.1"):
+        assert run(*pair, "--focal", "200", "--baseline", baseline, "-o", tmp_path / baseline) == 0
+        depths.append(np.load(tmp_path / baseline / "depth.npy"))
+    np.testing.assert_array_equal(*depths)
+    assert np.nanmedian(depths[0][60:100, 120:160]) == pytest.approx(200.0 * 0.1 / NEAR, rel=0.01)
+
+
 def test_folders_of_pairs(pair: tuple[Path, Path], tmp_path: Path) -> None:
     for side, path in zip(("l", "r"), pair, strict=True):
         (tmp_path / side).mkdir()
@@ -114,6 +123,7 @@ def test_bad_input_is_named(pair: tuple[Path, Path], tmp_path: Path, capsys: pyt
         ([left, tmp_path / "gone.png"], 3, "found nothing there"),
         ([left, right, "--baseline", "0.1"], 2, "need the focal length"),
         ([left, right, "--focal", "-3"], 2, "expected more than 0"),
+        ([left, right, "--focal", "200", "--baseline", "10furlongs"], 2, "expected a number and its unit"),
         ([left, right, "--camera", calibration, "--focal", "3"], 2, "both say"),
         ([left, right, "--window", "4"], 2, "odd"),
     ]

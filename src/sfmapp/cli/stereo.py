@@ -73,7 +73,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     cameras.add_argument("--camera", metavar="FILE", help="calibration of both cameras, of any form")
     cameras.add_argument("--focal", metavar="PX", type=float, help="focal length of a rectified pair, pixels")
-    cameras.add_argument("--baseline", metavar="M", type=float, help="distance of its cameras, metres")
+    cameras.add_argument("--baseline", metavar="B", help="distance of its cameras: 12cm, or a number of metres")
     cameras.add_argument(
         "--doffs", metavar="PX", type=float, help="its principal points along x, right minus left; default: 0"
     )
@@ -100,11 +100,22 @@ def _stereo(args: argparse.Namespace) -> int:
 
     watch = Stopwatch(whole_process=True)
     chosen = ChosenPairs(None if args.pair is None else tuple(args.pair), args.best, args.step)
-    known = KnownCameras(args.camera, args.focal, args.baseline, args.doffs)
+    baseline = None if args.baseline is None else _metres(args.baseline)
+    known = KnownCameras(args.camera, args.focal, baseline, args.doffs)
     with listening(args) as events:
         result = stereo(args.sources, args.output, options, known=known, chosen=chosen, events=events, watch=watch)
     tell_result(args, result, lambda: _print(result))
     return 0
+
+
+def _metres(text: str) -> float:
+    """Of a length with its unit, or of a number."""
+    from sfmapp.planes.lengths import parse_length
+
+    try:
+        return float(text)
+    except ValueError:
+        return parse_length(text)
 
 
 def _print(result: StereoResult) -> None:
@@ -118,7 +129,7 @@ def _print(result: StereoResult) -> None:
         )
     for each in result.report.failed:
         print(f"{each.name}: FAILED: {each.reason}")
-    print(f"{took(result.output, result.report.run)}; report {result.output / 'report.json'}")
+    print(f"{took(result.output, result.report.run)}; report {result.output / 'report.html'}")
 
 
 def _print_pair(pair: StereoPairReport) -> None:
