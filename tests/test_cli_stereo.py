@@ -22,10 +22,16 @@ from sfmapp.formats.disparity_files import read_disparity
 from sfmapp.formats.middlebury_calibration import MiddleburyCalibration, write_middlebury
 from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.geodesy import LocalFrame
+from sfmapp.georeference.world_frame import Georeference, ModelPlace, write_georeference
+from sfmapp.pipelines.stereo.model_pairs import metre_sigma_of_run
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.tracks import Tracks
+from sfmapp.stereo.depth import depth_of_disparity
+from sfmapp.stereo.prepare import PairCameras, prepare_pair
 from sfmapp.stereo.rectification import plan_rectification, rectified_as_is
+from sfmapp.stereo.uncertainty import depth_sigma
 
 Pixels = NDArray[np.uint8]
 NEAR, FAR = 24, 12
@@ -232,6 +238,34 @@ def test_pairs_out_of_a_model_and_out_of_a_video(pair: tuple[Path, Path], tmp_pa
     report = json.loads((tmp_path / "film" / "report.json").read_text())
     assert [told["name"] for told in report["pairs"]] == ["000000", "000002"]
     assert np.nanmedian(np.load(tmp_path / "film" / "000002" / "disparity.npy")) == pytest.approx(FAR, abs=0.2)
+
+
+def test_metres_are_those_of_the_run_that_made_the_model(tmp_path: Path) -> None:
+    assert metre_sigma_of_run(tmp_path) is None
+    untold = {"model": 0, "reason": "too few", "bars": [], "findings": []}
+    other = {"model": 1, "reason": "", "metres_per_unit": 0.4, "sigma_share": 0.01, "bars": [], "findings": []}
+    report: dict[str, object] = {"stages": {"units": {"scales": [untold, other], "levels": []}}}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    assert metre_sigma_of_run(tmp_path) is None
+    report["stages"] = {"units": {"scales": [{**other, "model": 0}], "levels": []}}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    assert metre_sigma_of_run(tmp_path) == 0.01
+    place = ModelPlace(
+        model=0, source="gps", scale=1.0, rotation=(0.0, 0.0, 0.0, 1.0), translation_m=(0.0, 0.0, 0.0),
+        scale_sigma_share=0.2, rotation_sigma_deg=(0.1, 0.1, 0.1), position_sigma_m=(1.0, 1.0, 2.0),
+        common_offset_sigma_m=(0.0, 0.0, 0.0),
+    )  # fmt: skip
+    write_georeference(tmp_path, Georeference.about(LocalFrame(48.0, 8.0, 100.0), "ellipsoidal", [place]))
+    assert metre_sigma_of_run(tmp_path) == 0.2
+
+
+def test_lengths_that_are_told_to_a_share_tell_depths_to_it(pair: tuple[Path, Path]) -> None:
+    left, right = (cv2.imread(str(path)) for path in pair)
+    camera = Camera(CameraModel.PINHOLE, 240, 160, np.array([200.0, 200.0, 120.0, 80.0]))
+    rig = Rig((camera, camera), np.array([rigid3.IDENTITY, [0.0, 0.0, 0.0, 1.0, -0.1, 0.0, 0.0]]))
+    g = prepare_pair(left, right, PairCameras(rig, length_sigma=0.05, is_adjusted=True), ("l", "r")).pair.geometry
+    assert g is not None
+    assert float(depth_sigma(g, FAR, 0.0) / depth_of_disparity(FAR, g)) == pytest.approx(0.05)
 
 
 def test_cameras_for_other_programs_come_back(tmp_path: Path) -> None:

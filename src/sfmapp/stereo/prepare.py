@@ -50,6 +50,7 @@ class PairCameras:
         unit: of that length: ``m``, or nothing of a model that has a scale of its own.
         covariance: (P0 + P1 + 6,) squared, of the parameters of both cameras and of the turn (radians) and shift of the
             second one's pose about its own axes, as the calibration has it; None where it says nothing of it.
+        length_sigma: standard deviation of all its lengths together, as a share.
         is_adjusted: the rig was had from these photographs themselves: matches are not held against it.
     """
 
@@ -58,6 +59,7 @@ class PairCameras:
     text: str = "nothing is known of the cameras"
     unit: str = "m"
     covariance: Array | None = None
+    length_sigma: float = 0.0
     is_adjusted: bool = False
 
 
@@ -305,7 +307,8 @@ def _covariance(draft: _Draft, cameras: PairCameras, turn: Misalignment | None, 
     """(3, 3) what is not known of focal length, baseline and doffs: by the calibration, and of a turn of the rig that
     was corrected what its matches leave; None where nothing says anything of it."""
     plan, geometry = draft.plan, draft.pair.geometry
-    if plan is None or geometry is None or (cameras.covariance is None and turn is None):
+    is_silent = cameras.covariance is None and turn is None and not cameras.length_sigma
+    if plan is None or geometry is None or is_silent:
         return None
     found = np.zeros((3, 3))
     if cameras.covariance is not None:
@@ -313,6 +316,7 @@ def _covariance(draft: _Draft, cameras: PairCameras, turn: Misalignment | None, 
         is_measured = turn is not None and bool(turn.is_told[1])
         covariance = without_turn(cameras.covariance) if is_measured else cameras.covariance
         found = geometry_covariance(plan, covariance, is_swapped=is_swapped)
+    found[1, 1] += (cameras.length_sigma * (geometry.baseline or 0.0)) ** 2
     if turn is not None:  # about the vertical it moves all disparities alike
         found[2, 2] += (geometry.focal * np.radians(turn.sigma_deg[1])) ** 2
     return found

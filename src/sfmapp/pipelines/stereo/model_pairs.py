@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from sfmapp.dense.photographs import Photographs, find_photographs
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap import read_model
+from sfmapp.formats.text_input import read_json_object
 from sfmapp.geometry import rigid3
+from sfmapp.georeference.world_frame import read_georeference
 from sfmapp.images.pixels import read_rgb
 from sfmapp.pipelines.dense.source import find_source, is_of_model
 from sfmapp.pipelines.stereo.sources import PairSource
@@ -20,11 +22,13 @@ from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig
 from sfmapp.stereo.prepare import PairCameras
 from sfmapp.stereo.rectification import plan_rectification
-from sfmapp.workspace.layout import STEREO
+from sfmapp.workspace.layout import REPORT, STEREO
 from sfmapp.workspace.options import Options
 
 __all__ = ["is_of_model", "pairs_of_model"]
 
+# the largest model of a run, whose pairs these are
+_MODEL = 0
 # under fewer degrees depths are poor, under more the two photographs look too different to be matched (Furukawa and
 # Hernandez, "Multi-view stereo: a tutorial", 2015, 2.3)
 _GOOD_DEG = (3.0, 15.0)
@@ -61,7 +65,8 @@ def pairs_of_model(
                 f"{source}: expected two photographs side by side that show the same, found no such pair",
                 "name two with --pair, or take photographs side by side",
             )
-    return [_source(model, found, pair) for pair in chosen]
+    sigma = metre_sigma_of_run(where.output)
+    return [_source(model, found, pair, sigma) for pair in chosen]
 
 
 def best_pairs(model: Reconstruction, photographs: Photographs) -> list[tuple[int, int]]:
@@ -137,13 +142,37 @@ def _place(name: str, photographs: Photographs, source: str | os.PathLike[str]) 
     raise InputError(f"{name}: expected the name of one image with a pose of {os.fspath(source)}, found {found}")
 
 
-def _source(model: Reconstruction, photographs: Photographs, pair: tuple[int, int]) -> PairSource:
+def metre_sigma_of_run(run: Path) -> float | None:
+    """Standard deviation of lengths, as a share, of the model of a run that was put into the world or has its metres
+    by known lengths; None where its unit is its own.
+
+    Raises:
+        InputError: what the run says of it is damaged.
+    """
+    placed = read_georeference(run)
+    place = None if placed is None else placed.place_of(_MODEL)
+    if place is not None:
+        return place.scale_sigma_share
+    path = run / REPORT
+    stages = read_json_object(path).get("stages") if path.is_file() else None
+    units = stages.get("units") if isinstance(stages, dict) else None
+    scales = units.get("scales") if isinstance(units, dict) else None
+    told = [one.get("sigma_share") for one in scales or () if isinstance(one, dict) and one.get("model") == _MODEL]
+    return next((float(one) for one in told if isinstance(one, int | float)), None)
+
+
+def _source(
+    model: Reconstruction, photographs: Photographs, pair: tuple[int, int], metre_sigma: float | None
+) -> PairSource:
     records = [photographs.records[one] for one in pair]
     rig = _rig(model, photographs, pair)
     stems = [Path(record.name).stem for record in records]
     return PairSource(
         "--".join(stems), records[0].name, records[1].name,
         lambda: (read_rgb(records[0]), read_rgb(records[1])),
-        lambda: PairCameras(rig, text="of the reconstruction", unit="", is_adjusted=True),
+        lambda: PairCameras(
+            rig, text="of the reconstruction", unit="" if metre_sigma is None else "m",
+            length_sigma=metre_sigma or 0.0, is_adjusted=True,
+        ),
         {record.name: record.digest for record in records},
     )  # fmt: skip
