@@ -151,6 +151,8 @@ def test_colours_go_from_end_to_end_and_unknown_is_grey() -> None:
     expected = cv2.applyColorMap(np.array([[0, 128, 255]], np.uint8), cv2.COLORMAP_TURBO)[0, :, ::-1]
     np.testing.assert_array_equal(colors[:3], expected)
     assert tuple(colors[3]) == (52, 54, 58)
+    reversed_colors = replace(scale, is_reversed=True).colors(np.array([scale.high, scale.low, np.nan]))
+    np.testing.assert_array_equal(reversed_colors, colors[[0, 2, 3]])
 
 
 @pytest.mark.real

@@ -67,19 +67,22 @@ def _curves(report: DesignReport) -> Iterator[str]:
 
 
 def _rig(report: DesignReport, rig: RigStudy) -> str:
-    rows = []
+    rows, has_terms = [], bool(report.baseline_error or report.focal_error_px)
     for row in rig.rows:
         far = "infinity" if row.farthest is None else f"{row.farthest:.7g}"
         spread = None if row.spread is None else f"{row.spread:.6g}"
         texts = [
             f"{row.depth:g}", f"{row.disparity_px:.3f}", f"{row.nearest:.7g}", far, spread, f"{row.of_disparity:.4g}",
-            f"{row.of_baseline:.4g}", f"{row.of_focal:.4g}", f"{row.total:.4g}", f"{row.common_share:.0%}",
         ]  # fmt: skip
+        if has_terms:
+            texts += [f"{row.of_baseline:.4g}", f"{row.of_focal:.4g}", f"{row.total:.4g}"]
+        texts.append(f"{row.common_share:.0%}")
         rows.append([("", text) for text in texts])
     unit = report.unit
     head = [
         f"depth {unit}", "disparity px", f"nearest {unit}", f"farthest {unit}", f"between {unit}",
-        f"of disparity {unit}", f"of baseline {unit}", f"of focal length {unit}", f"all three {unit}", "in common",
+        f"of disparity {unit}" if has_terms else f"error, first order {unit}",
+        *([f"of baseline {unit}", f"of focal length {unit}", f"all three {unit}"] if has_terms else []), "in common",
     ]  # fmt: skip
     text = (
         f"<p>Both see points from {rig.least_depth:.4g} {unit}; from {rig.greatest_depth:.4g} {unit} on, a point may "

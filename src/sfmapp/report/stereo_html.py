@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from html import escape
 from urllib.parse import quote
 
@@ -129,9 +130,9 @@ def _summary(report: StereoPairReport) -> str:
         )
     if told.least_depth is not None:
         text += (
-            f"</p><p>The rig tells depths from {told.least_depth:.3g} to {told.greatest_depth:.3g} {unit}: nearer "
+            f"</p><p>The rig tells depths from {told.least_depth:.3g} to {_length(told.greatest_depth)} {unit}: nearer "
             "points were not looked for, farther ones may as well be at infinity. At "
-            f"{told.ten_percent_depth:.3g} {unit} sigma is a tenth of the depth."
+            f"{_length(told.ten_percent_depth)} {unit} sigma is a tenth of the depth."
         )
     elif told.median_sigma_px is not None:
         text += "</p><p>No baseline is known: there are disparities, and no depths."
@@ -153,7 +154,7 @@ def _maps(report: StereoPairReport, pair: RectifiedPair, found: DisparityMap, me
     unit = _unit(report.measured)
     if measured.depth is not None and measured.depth_sigma is not None:
         depth = np.where(measured.is_solid, measured.depth, np.nan)
-        scale = scale_of(depth, is_log=True, colormap=cv2.COLORMAP_TURBO)
+        scale = replace(scale_of(depth, is_log=True), is_reversed=True)  # what is near is red, as of disparities
         yield map_figure(depth, scale, f"depth, {unit}: what is rather right than wrong, and told from infinity")
         with np.errstate(invalid="ignore"):
             percent = 100.0 * measured.depth_sigma / measured.depth
@@ -164,12 +165,17 @@ def _maps(report: StereoPairReport, pair: RectifiedPair, found: DisparityMap, me
     confidence = np.where(np.isfinite(sigma), measured.error.confidence, np.nan)
     scale = ColorScale(0.0, 1.0, colormap=cv2.COLORMAP_VIRIDIS)
     yield map_figure(confidence, scale, "confidence: chance to be right within a pixel")
-    yield "</div><p class=dim>Dark grey: nothing is known there.</p>"
+    yield "</div><p class=dim>Red is near, of depths and disparities. Dark grey: nothing is known there.</p>"
 
 
 def _unit(told: MeasuredReport) -> str:
     """Of depths; a model that nothing brought to metres has units of its own."""
     return told.unit or "units"
+
+
+def _length(value: float | None) -> str:
+    """With three digits, and all of those before the point."""
+    return "" if value is None else f"{value:.3g}" if value < 1000.0 else f"{value:,.0f}"
 
 
 def _errors(values: np.ndarray) -> ColorScale:

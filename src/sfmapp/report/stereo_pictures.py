@@ -23,13 +23,14 @@ _NUM_ROWS, _DOTS = 9, 7
 
 @dataclass(frozen=True)
 class ColorScale:
-    """How values are coloured: the ends of the bar in values, whether the colours go by the logarithm, and the map of
-    OpenCV."""
+    """How values are coloured: the ends of the bar in values, whether the colours go by the logarithm, the map of
+    OpenCV, and whether it runs the other way."""
 
     low: float
     high: float
     is_log: bool = False
     colormap: int = cv2.COLORMAP_TURBO
+    is_reversed: bool = False
 
     def colors(self, values: NDArray[np.floating]) -> Pixels:
         """(..., 3) RGB of values (...); grey where there is none."""
@@ -39,6 +40,8 @@ class ColorScale:
             place = np.log(np.maximum(place, 1e-12))
             low, high = float(np.log(low)), float(np.log(high))
         share = np.clip((place - low) / max(high - low, 1e-12), 0.0, 1.0)
+        if self.is_reversed:
+            share = 1.0 - share
         index = np.rint(255.0 * np.nan_to_num(share)).astype(np.uint8)
         table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], self.colormap)[:, 0, ::-1]
         out: Pixels = table[index]
@@ -49,7 +52,7 @@ class ColorScale:
         """A strip of the colours with both ends, as HTML."""
         ramp = np.geomspace(self.low, self.high, 256) if self.is_log else np.linspace(self.low, self.high, 256)
         strip = np.repeat(self.colors(ramp)[None], 12, axis=0)
-        middle = float(ramp[128])
+        middle = float(np.sqrt(self.low * self.high)) if self.is_log else 0.5 * (self.low + self.high)
         ends = "".join(f"<span>{value:.3g}</span>" for value in (self.low, middle, self.high))
         return f'<div class="bar-of"><img src="{jpeg_url(strip, 256, 95)}" alt=""><div>{ends}</div></div>'
 

@@ -30,13 +30,12 @@ def _replay(
     (left, scale), (right, _) = (shrunk(rgb_of(picture), _SHOWN_PX) for picture in (pair.left, pair.right))
     step = max(1, max(found.disparity.shape) // _SHOWN_PX)
     sigma = measured.error.sigma
+    confidence = np.where(np.isfinite(sigma), measured.error.confidence, np.float32(np.nan))
     maps = [
-        _colored(values[::step, ::step], colormap, is_log=is_log)
-        for values, colormap, is_log in (
-            (found.disparity, cv2.COLORMAP_TURBO, False), (sigma, cv2.COLORMAP_INFERNO, True),
-            (np.where(np.isfinite(sigma), measured.error.confidence, np.nan), cv2.COLORMAP_VIRIDIS, False),
-        )
-    ]  # fmt: skip
+        _colored(found.disparity[::step, ::step], cv2.COLORMAP_TURBO),
+        _errors(sigma[::step, ::step]),
+        _colored(confidence[::step, ::step], cv2.COLORMAP_VIRIDIS, (0.0, 1.0)),
+    ]
     xyz, rgb = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     reach, sigma_rgb = np.zeros(0, np.float32), rgb
     pinhole, baseline = [1.0, 0.0, 0.0, 0.0], 0.0
@@ -45,7 +44,7 @@ def _replay(
         reach = measured.depth_sigma[measured.is_solid]
         chosen = np.arange(0, len(xyz), max(1, len(xyz) // _POINTS))
         xyz, rgb, reach = xyz[chosen], rgb[chosen], reach[chosen]
-        sigma_rgb = _colored(reach / np.maximum(xyz[:, 2], 1e-9), cv2.COLORMAP_INFERNO, is_log=True)
+        sigma_rgb = _errors(reach / np.maximum(xyz[:, 2], 1e-9))
         of = pair.geometry
         pinhole = [of.focal * scale[0], of.cx * scale[0], of.cy * scale[1], of.doffs * scale[0]]
         baseline = float(of.baseline or 0.0)
@@ -55,12 +54,18 @@ def _replay(
     )  # fmt: skip
 
 
-def _colored(values: NDArray[np.floating], colormap: int, *, is_log: bool) -> Pixels:
-    """(..., 3) RGB between the hundredths of the values; grey where there is none."""
+def _errors(values: NDArray[np.floating]) -> Pixels:
+    """Their colours, by the logarithm."""
+    return _colored(np.log(np.maximum(values, 1e-9)), cv2.COLORMAP_INFERNO)
+
+
+def _colored(values: NDArray[np.floating], colormap: int, ends: tuple[float, float] | None = None) -> Pixels:
+    """(..., 3) RGB of values (...) between two ends; None: between their hundredths. Grey where there is none."""
     known = np.isfinite(values)
-    place = np.log(np.maximum(values, 1e-9)) if is_log else values
-    low, high = np.quantile(place[known], (0.01, 0.99)) if known.any() else (0.0, 1.0)
-    share = np.clip((np.where(known, place, low) - low) / max(high - low, 1e-9), 0.0, 1.0)
+    low, high = ends or (0.0, 1.0)
+    if ends is None and known.any():
+        low, high = (float(value) for value in np.quantile(values[known], (0.01, 0.99)))
+    share = np.clip((np.where(known, values, low) - low) / max(high - low, 1e-9), 0.0, 1.0)
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], colormap)[:, 0, ::-1]
     out: Pixels = table[np.rint(255.0 * share).astype(np.uint8)]
     out[~known] = 52
@@ -80,9 +85,10 @@ def _words(found: DisparityMap, told: MeasuredReport) -> str:
             f"tenth of the depth at {told.ten_percent_depth:.3g} {unit}."
         )
         lines += [
-            f"- {at.depth:.3g} {unit} +- {at.sigma:.2g} ({100 * at.sigma / at.depth:.2g} %)" for at in told.depths
+            f"- {at.depth:.3g} \u00b1 {at.sigma:.2g} {unit} ({100 * at.sigma / at.depth:.2g} %)" for at in told.depths
         ]
-    lines.append(
-        "Tabs above the scene: the photograph's colours, or the sigma of depth as a share of it, dark is good."
-    )
+    if told.depths:
+        lines.append("Tabs above the scene: the photograph's colours, or sigma as a share of the depth, dark is good.")
+    elif told.least_depth is None:
+        lines.append("No baseline is known: there are disparities, and no depths.")
     return "\n\n".join(lines)

@@ -76,7 +76,7 @@ def _blueprint(replay: StereoReplay) -> rrb.Blueprint:
 
 
 def _eye(replay: StereoReplay) -> rrb.EyeControls3D:
-    """From beside the cameras, a little above."""
+    """From behind the cameras, beside them and a little above, so that they are seen."""
     target = np.median(replay.xyz, axis=0).astype(np.float64)
-    position = target + target[2] * np.array([-0.45, -0.3, -0.85])
+    position = target + target[2] * np.array([-0.5, -0.35, -1.25])
     return rrb.EyeControls3D(position=position, look_target=target, eye_up=[0.0, -1.0, 0.0])
