@@ -74,6 +74,59 @@ def test_edges_are_found_to_a_fraction_of_a_pixel() -> None:
     assert len(find_arcs(np.full((64, 64), 90, np.uint8))) == 0
 
 
+def four_fields(shift_px: float, turn_deg: float) -> np.ndarray:
+    """Two dark and two bright fields that meet in (160, 120), the lower two beside the upper ones, or turned away."""
+    y, x = np.mgrid[: 4 * 240, : 4 * 320] / 4 + 0.125
+    lower = 160 + shift_px + (y - 120) * math.tan(math.radians(turn_deg))
+    is_bright = (x > np.where(y < 120, 160, lower)) ^ (y > 120)
+    grey = cv2.GaussianBlur(np.where(is_bright, 200.0, 60.0), (0, 0), 2.4)
+    return np.asarray(cv2.resize(grey, (320, 240), interpolation=cv2.INTER_AREA).round().astype(np.uint8))
+
+
+@pytest.mark.parametrize(("shift_px", "turn_deg", "num"), [(0.0, 0.0, 2), (2.0, 0.0, 3), (0.0, 12.0, 3)])
+def test_edges_that_change_sides_are_one_line_where_they_go_on(shift_px: float, turn_deg: float, num: int) -> None:
+    arcs = find_arcs(four_fields(shift_px, turn_deg))
+    assert len(arcs) == num
+    across = arcs.points[np.ptp(arcs.points[..., 0], axis=1) > 200]
+    assert len(across) == 1  # the horizontal line goes on in each
+    assert np.abs(across[0, :, 1] - 120.0).max() < 0.1
+
+
+BOARD_MIDDLE = np.array([5.0, 3.5])
+
+
+def seen_board(camera: Camera, cam_from_board: np.ndarray, depth: float) -> np.ndarray:
+    """(H, W) uint8 of 10 x 7 fields, 1 each, parallel to the picture; the camera records light by its square root."""
+    at = (np.arange(3 * SIZE[1])[:, None] / 3 + 1 / 6, np.arange(3 * SIZE[0]) / 3 + 1 / 6)
+    grid = np.stack(np.broadcast_arrays(at[1], at[0]), -1).reshape(-1, 2)
+    rays = pixels_to_rays(camera, grid)
+    board = (depth * rays[:, :2] / rays[:, 2:]) @ cam_from_board
+    fields = np.floor(board + BOARD_MIDDLE).astype(int)
+    is_dark = (fields >= 0).all(1) & (fields < [10, 7]).all(1) & (fields.sum(1) % 2 == 0)
+    light = cv2.GaussianBlur(np.where(is_dark, 0.02, 0.9).reshape(3 * SIZE[1], -1), (0, 0), 3.0)
+    grey = 255 * np.sqrt(cv2.resize(light, SIZE, interpolation=cv2.INTER_AREA))
+    noise = np.random.default_rng(0).normal(0, 1.0, grey.shape)
+    return np.clip(grey + noise, 0, 255).round().astype(np.uint8)
+
+
+def test_lines_of_a_board_are_whole_and_where_they_are_though_bright_fields_have_grown() -> None:
+    camera, depth = division_camera(), 9.5
+    roll = rigid3.exp_so3([0.0, 0.0, 0.15])[:2, :2]
+    arcs = find_arcs(seen_board(camera, roll, depth))
+    scale = FOCAL / depth
+    long = arcs.take(arcs.length_px > 5.0 * scale).points
+    rays = pixels_to_rays(camera, long.reshape(-1, 2))
+    board = ((depth * rays[:, :2] / rays[:, 2:]) @ roll).reshape(long.shape) + BOARD_MIDDLE
+    kind = np.ptp(board, axis=1).argmin(1)  # which coordinate of the board a line keeps
+    kept = np.take_along_axis(board, kind[:, None, None], 2)[..., 0]
+    number = kept.mean(1).round()
+    assert sorted(number[kind == 0]) == list(range(1, 10))
+    assert sorted(number[kind == 1]) == list(range(1, 7))
+    off_px = (kept - number[:, None]) * scale
+    assert np.sqrt((off_px**2).mean()) < 0.06
+    assert np.abs(off_px).max() < 0.2
+
+
 def test_points_of_a_line_have_one_plane() -> None:
     camera = division_camera()
     arcs = seen_lines(camera, AXES, ACROSS, 30, 1, noise_px=0.0)

@@ -4,6 +4,8 @@ Under the division model a straight line of the world is an arc of a circle, wha
 (Fitzgibbon, CVPR 2001), so chains are cut where they leave a circle, before anything is known of the lens. Edge points
 are maxima of the gradient along the nearer axis of the grid, refined by a parabola, and linked where each is the
 other's best neighbour (Grompone von Gioi and Randall, "A sub-pixel edge detector", IPOL 2017, after Devernay 1995).
+
+A chain ends where dark and light change sides: :mod:`sfmapp.calibration.line_joining` goes on there.
 """
 
 from __future__ import annotations
@@ -14,6 +16,9 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from sfmapp.calibration.circle_arcs import find_spans, fit_circle
+from sfmapp.calibration.line_joining import LEAST_PIECE_PX, join_pieces
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -29,11 +34,8 @@ _BLUR_PX = 1.0
 _NOISE_SIGMAS = 4.5
 # Gradients in grey levels a pixel below which nothing is an edge (rounding to 8 bits), and above which everything is.
 _LEAST_GRADIENT, _SURE_GRADIENT = 1.5, 12.0
-# An arc: shortest length as a share of the longer side and in pixels, rms and largest distance of its points.
+# Shortest arc, as a share of the longer side and in pixels.
 _LEAST_SHARE, _LEAST_PX = 0.025, 30.0
-_MOST_RMS_PX, _MOST_OFF_PX = 0.45, 1.2
-# Points in a row that may be off before an arc ends.
-_PATIENCE = 3
 # Most arcs of one photograph, the longest: what more of them add is below what the lens model leaves.
 MOST_ARCS = 1200
 
@@ -89,7 +91,8 @@ def find_arcs(grey: Grey, mask: NDArray[np.bool_] | None = None) -> Arcs:
     least = max(_LEAST_PX, _LEAST_SHARE * max(smooth.shape))
     # the circle of a line has a radius of at least 1 / sqrt(-lambda), which no lens makes less than the half diagonal
     radius = 0.5 * math.hypot(*smooth.shape)
-    points, rms = _arcs(xy, ends, least, radius)
+    xy, ends = join_pieces(xy, find_spans(xy, ends, LEAST_PIECE_PX, radius))
+    points, rms = _arcs(xy, find_spans(xy, ends, least, radius))
     factor = np.array([grey.shape[1] / size[0], grey.shape[0] / size[1]])
     points *= factor
     length = np.hypot(*(points[:, -1] - points[:, 0]).T)
@@ -183,99 +186,13 @@ def _chains(xy: Array, normal: Array, number: NDArray[np.int32]) -> tuple[Array,
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit_circle(xy: Array, first: int, last: int, circle: Array) -> float:
-    """Fit ``y = a + b x + c (x^2 + y^2)`` in the frame of the chord of the points first to last (excluded).
-
-    circle (7,) becomes the frame's origin and direction, and a, b, c: exact for circles, linear, and well posed also
-    for straight lines. Returns the rms distance, infinite where there is no chord.
-    """
-    ox, oy = xy[first, 0], xy[first, 1]
-    ux, uy = xy[last - 1, 0] - ox, xy[last - 1, 1] - oy
-    length = math.sqrt(ux * ux + uy * uy)
-    if length < 4.0:
-        return math.inf
-    ux, uy = ux / length, uy / length
-    circle[0], circle[1], circle[2], circle[3] = ox, oy, ux, uy
-    n = float(last - first)
-    sx = sq = sy = sxx = sxq = sqq = sxy = sqy = syy = 0.0
-    for i in range(first, last):
-        dx, dy = xy[i, 0] - ox, xy[i, 1] - oy
-        x, y = (ux * dx + uy * dy) / length - 0.5, (ux * dy - uy * dx) / length
-        q = x * x + y * y
-        sx, sq, sy = sx + x, sq + q, sy + y
-        sxx, sxq, sqq = sxx + x * x, sxq + x * q, sqq + q * q
-        sxy, sqy, syy = sxy + x * y, sqy + q * y, syy + y * y
-    mx, mq, my = sx / n, sq / n, sy / n
-    cxx, cxq, cqq = sxx / n - mx * mx, sxq / n - mx * mq, sqq / n - mq * mq
-    cxy, cqy, cyy = sxy / n - mx * my, sqy / n - mq * my, syy / n - my * my
-    det = cxx * cqq - cxq * cxq
-    if not det > 1e-12:
-        return math.inf
-    b, c = (cxy * cqq - cqy * cxq) / det, (cqy * cxx - cxy * cxq) / det
-    circle[4], circle[5], circle[6] = (my - b * mx - c * mq) * length, b, c / length
-    return length * math.sqrt(max(cyy - b * cxy - c * cqy, 0.0))
-
-
-@numba.njit(cache=True, nogil=True)
-def _off(circle: Array, x: float, y: float, length: float) -> float:
-    """Distance of a point from a fitted circle."""
-    dx, dy = x - circle[0], y - circle[1]
-    u = circle[2] * dx + circle[3] * dy - 0.5 * length
-    v = circle[2] * dy - circle[3] * dx
-    c = circle[6]
-    value = v - circle[4] - circle[5] * u - c * (u * u + v * v)
-    gu, gv = circle[5] + 2.0 * c * u, 1.0 - 2.0 * c * v
-    return float(abs(value) / math.sqrt(gu * gu + gv * gv))
-
-
-@numba.njit(cache=True, nogil=True)
-def _grow(xy: Array, first: int, end: int, circle: Array) -> int:
-    """How far from a point on its chain stays on one circle: the place behind the last point of the arc."""
-    last = min(first + 12, end)
-    if last - first < 12 or _fit_circle(xy, first, last, circle) > _MOST_RMS_PX:
-        return first
-    while True:
-        span = math.hypot(xy[last - 1, 0] - xy[first, 0], xy[last - 1, 1] - xy[first, 1])
-        # a short arc does not know its curvature: look a third further at most, then fit again
-        reach = min(end, last + max((last - first) // 3, 4))
-        grown, missed = last, 0
-        for i in range(last, reach):
-            if _off(circle, xy[i, 0], xy[i, 1], span) > _MOST_OFF_PX:
-                missed += 1
-                if missed > _PATIENCE:
-                    break
-            else:
-                grown, missed = i + 1, 0
-        if grown == last:
-            return last
-        if _fit_circle(xy, first, grown, circle) > _MOST_RMS_PX:
-            _fit_circle(xy, first, last, circle)
-            return last
-        last = grown
-
-
-@numba.njit(cache=True, nogil=True)
-def _arcs(xy: Array, starts: NDArray[np.int64], least: float, radius: float) -> tuple[Array, Array]:
-    """(N, KNOTS, 2) points and (N,) rms of the arcs of all chains."""
-    most = int(len(xy) / least) + 1
-    points, rms = np.empty((most, KNOTS, 2)), np.empty(most)
-    circle, count = np.empty(7), 0
-    for chain in range(len(starts) - 1):
-        first, end = starts[chain], starts[chain + 1]
-        while end - first >= least * 0.7:
-            last = _grow(xy, first, end, circle)
-            if last == first:
-                first += 4
-                continue
-            length = math.hypot(xy[last - 1, 0] - xy[first, 0], xy[last - 1, 1] - xy[first, 1])
-            if length >= least:
-                error = _fit_circle(xy, first, last, circle)
-                if error <= _MOST_RMS_PX and 2.0 * abs(circle[6]) * radius <= 1.0:
-                    _sum_up(xy, first, last, points[count])
-                    rms[count] = error
-                    count += 1
-            first = last
-    return points[:count], rms[:count]
+def _arcs(xy: Array, spans: NDArray[np.int64]) -> tuple[Array, Array]:
+    """(N, KNOTS, 2) points and (N,) rms of arcs."""
+    points, rms, circle = np.empty((len(spans), KNOTS, 2)), np.empty(len(spans)), np.empty(7)
+    for k in range(len(spans)):
+        rms[k] = fit_circle(xy, spans[k, 0], spans[k, 1], circle)
+        _sum_up(xy, spans[k, 0], spans[k, 1], points[k])
+    return points, rms
 
 
 @numba.njit(cache=True, nogil=True)
