@@ -1,23 +1,28 @@
 """``sfmapp warp`` and ``sfmapp rectify`` beside OpenCV's warpPerspective: what sampling makes of a picture, and its CPU
 time.
 
-    python benchmarks/planes.py
+    SFMAPP_DATA=... python benchmarks/planes.py
 
-The world is a plane of fine detail, eight times as fine as the picture of it. A picture is its mean over pixels; so is
-what a perfect sampling would make of it, which is rendered from the fine plane, 16 x 16 samples a pixel. The error is
-the rms difference from that, in grey levels, away from borders. OpenCV samples by lines, cubics and Lanczos's windows
-of 8 x 8, none of which averages where a picture shrinks (INTER_AREA is INTER_LINEAR in warpPerspective); so it is also
-given the picture shrunk by resize with INTER_AREA to the scale that it has in the middle, as one would do by hand.
-CPU time is the median of seven, in turns, of the sampling alone, on one thread.
+The world is a plane of fine detail, eight times as fine as the picture of it: blobs of every size with words on them,
+flat shapes with sharp edges, and a photograph (of strecha-courtyard, repeated as in mirrors where it ends). A picture
+is its mean over pixels; so is what a perfect sampling would make of it, which is rendered from the fine plane, 16 x 16
+samples a pixel. The error is the rms difference from that, in grey levels, away from borders. OpenCV samples by lines,
+cubics and Lanczos's windows of 8 x 8, none of which averages where a picture shrinks (INTER_AREA is INTER_LINEAR in
+warpPerspective); so it is also given the picture shrunk by resize with INTER_AREA to the scale that it has in the
+middle, as one would do by hand.
+CPU time is the median of seven, in turns, of the sampling of words alone, on one thread.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -26,7 +31,7 @@ from numpy.typing import NDArray
 
 from machine import RESULTS, describe_machine
 from sfmapp.planes.rectify import Area, take_plane
-from sfmapp.planes.view import PlaneView, view_of_corners
+from sfmapp.planes.view import view_of_corners
 from sfmapp.planes.warp import put_picture
 
 Array = NDArray[np.float64]
@@ -50,7 +55,24 @@ RECTIFIES = (
 )
 
 
-def plane(size: tuple[int, int], seed: int) -> Pixels:
+@dataclass(frozen=True)
+class Case:
+    """A picture of so many pixels, seen by a homography in a result of so many, both (width, height)."""
+
+    name: str
+    picture: tuple[int, int]
+    seed: int
+    homography: Array
+    result: tuple[int, int]
+
+    @property
+    def scale(self) -> float:
+        """Pixels of the result to one of the picture, in its middle."""
+        weight = self.homography[2] @ [0.5 * self.picture[0], 0.5 * self.picture[1], 1.0]
+        return float(np.sqrt(abs(np.linalg.det(self.homography) / weight**3)))
+
+
+def words(size: tuple[int, int], seed: int) -> Pixels:
     """(8 h, 8 w) of a plane: blobs of every size, and words, whose edges are sharp."""
     rng = np.random.default_rng(seed)
     width, height = size[0] * FINE, size[1] * FINE
@@ -64,6 +86,27 @@ def plane(size: tuple[int, int], seed: int) -> Pixels:
         tall = float(rng.uniform(0.1, 0.8)) * FINE
         cv2.putText(out, "sampling", place, cv2.FONT_HERSHEY_SIMPLEX, tall, int(rng.integers(0, 256)), int(tall) + 1)
     return out
+
+
+def shapes(size: tuple[int, int], seed: int) -> Pixels:
+    """(8 h, 8 w) of a plane: triangles of one colour each, from two pixels of the picture to half of it."""
+    rng = np.random.default_rng(seed)
+    width, height = size[0] * FINE, size[1] * FINE
+    out = np.full((height, width), 128, np.uint8)
+    for n in range(1500):
+        reach = 0.25 * height * (8.0 * FINE / height) ** (n / 1500.0)
+        corners = rng.uniform(0.0, (width, height)) + rng.normal(size=(3, 2)) * reach
+        cv2.fillConvexPoly(out, np.rint(corners).astype(np.int32), int(rng.integers(0, 256)))
+    return out
+
+
+def photograph(data: Path, size: tuple[int, int]) -> Pixels:
+    """(8 h, 8 w) of a plane: a photograph, mirrored at its borders."""
+    name = sorted((data / "strecha-courtyard-21" / "images").iterdir())[0]
+    gray = np.asarray(cv2.imread(str(name), cv2.IMREAD_GRAYSCALE))
+    wanted = size[1] * FINE, size[0] * FINE
+    more = [(0, max(0, there - here)) for there, here in zip(wanted, gray.shape, strict=True)]
+    return np.ascontiguousarray(np.pad(gray, more, mode="symmetric")[: wanted[0], : wanted[1]])
 
 
 def mean_of(fine: Pixels) -> Pixels:
@@ -98,59 +141,75 @@ def by_opencv(picture: Pixels, homography: Array, size: tuple[int, int], flag: i
     return np.asarray(cv2.warpPerspective(picture, shifted(homography), size, flags=flag))
 
 
-def measure() -> list[dict[str, Any]]:
+def measure(data: Path) -> list[dict[str, Any]]:
     """Every case by every program."""
     cv2.setNumThreads(1)
     rows = []
     for seed, (name, size, corners) in enumerate(WARPS):
         view = view_of_corners(corners, size)
-        fine = plane(size, seed)
         canvas = np.zeros(PHOTOGRAPH[::-1], np.uint8)
-        rows += _case(f"warp, picture {name}", fine, view.homography, PHOTOGRAPH,
-                      lambda picture, view=view, canvas=canvas: put_picture(picture, canvas, view)[0])  # fmt: skip
+        case = Case(f"warp, picture {name}", size, seed, view.homography, PHOTOGRAPH)
+        rows += compare(case, data, lambda picture, view=view, canvas=canvas: put_picture(picture, canvas, view)[0])
     for seed, (name, shown, corners) in enumerate(RECTIFIES, 10):
         # the photograph is the picture here, and the plane straight on the result
-        inverse = PlaneView(np.linalg.inv(view_of_corners(corners, shown).homography))
-        fine = plane(PHOTOGRAPH, seed)
+        seen = view_of_corners(corners, shown)
         area = Area(0.0, 0.0, *map(float, shown), *shown)
-        seen = PlaneView(np.linalg.inv(inverse.homography))
-        rows += _case(f"rectify, photograph {name}", fine, inverse.homography, shown,
-                      lambda picture, seen=seen, area=area: take_plane(picture, seen, area)[0])  # fmt: skip
+        case = Case(f"rectify, photograph {name}", PHOTOGRAPH, seed, np.linalg.inv(seen.homography), shown)
+        rows += compare(case, data, lambda picture, seen=seen, area=area: take_plane(picture, seen, area)[0])
     return rows
 
 
-def _case(
-    case: str, fine: Pixels, homography: Array, size: tuple[int, int], ours: Callable[[Pixels], Pixels]
-) -> list[dict[str, Any]]:
-    picture = mean_of(fine)
-    exact = perfect(fine, homography, size)
-    inside = cv2.warpPerspective(np.full(picture.shape, 255, np.uint8), shifted(homography), size) == 255
-    inside = cv2.erode(inside.astype(np.uint8), np.ones((BORDER, BORDER), np.uint8), borderValue=0) > 0
-    middle = homography @ [0.5 * picture.shape[1], 0.5 * picture.shape[0], 1.0]
-    scale = float(np.sqrt(abs(np.linalg.det(homography) / middle[2] ** 3)))
-    programs: dict[str, Callable[[], Pixels]] = {"sfmapp": lambda: ours(picture)}
-    for flag in FLAGS:
-        programs[f"OpenCV, {flag}"] = lambda flag=flag: by_opencv(picture, homography, size, FLAGS[flag], 1.0)
-        if scale < 0.9:
-            programs[f"OpenCV, area, {flag}"] = lambda flag=flag: by_opencv(
-                picture, homography, size, FLAGS[flag], scale
+def compare(case: Case, data: Path, ours: Callable[[Pixels], Pixels]) -> list[dict[str, Any]]:
+    """Errors on each plane, and CPU times on the first, of every program."""
+    planes = {
+        "words": lambda: words(case.picture, case.seed), "shapes": lambda: shapes(case.picture, case.seed),
+        "photograph": lambda: photograph(data, case.picture),
+    }  # fmt: skip
+    rows: dict[str, dict[str, Any]] = {}
+    for name, make in planes.items():
+        fine = make()
+        picture = mean_of(fine)
+        exact = perfect(fine, case.homography, case.result)
+        inside = (
+            cv2.warpPerspective(np.full(picture.shape, 255, np.uint8), shifted(case.homography), case.result) == 255
+        )
+        inside = cv2.erode(inside.astype(np.uint8), np.ones((BORDER, BORDER), np.uint8), borderValue=0) > 0
+        programs = programs_for(case, picture, ours)
+        for program, run in programs.items():
+            left = (run().astype(np.float64) - exact)[inside]
+            row = rows.setdefault(
+                program, {"case": case.name, "program": program, "scale": case.scale, "rms": {}, "worst": {}}
             )
-    found = {program: run() for program, run in programs.items()}
+            row["rms"][name] = float(np.sqrt((left**2).mean()))
+            row["worst"][name] = float(np.percentile(np.abs(left), 99.9))
+        if name == "words":
+            for program, spent in cpu_times(programs).items():
+                rows[program]["cpu_ms"] = spent
+    for row in rows.values():
+        print(row, file=sys.stderr)
+    return list(rows.values())
+
+
+def programs_for(case: Case, picture: Pixels, ours: Callable[[Pixels], Pixels]) -> dict[str, Callable[[], Pixels]]:
+    programs: dict[str, Callable[[], Pixels]] = {"sfmapp": lambda: ours(picture)}
+    for name, flag in FLAGS.items():
+        shrinks = {f"OpenCV, {name}": 1.0} | ({f"OpenCV, area, {name}": case.scale} if case.scale < 0.9 else {})
+        for program, shrink in shrinks.items():
+            programs[program] = lambda flag=flag, shrink=shrink: by_opencv(
+                picture, case.homography, case.result, flag, shrink
+            )
+    return programs
+
+
+def cpu_times(programs: dict[str, Callable[[], Pixels]]) -> dict[str, float]:
+    """Milliseconds."""
     took: dict[str, list[float]] = {program: [] for program in programs}
     for _ in range(RUNS):
         for program, run in programs.items():
             before = time.process_time()
             run()
             took[program].append(1000.0 * (time.process_time() - before))
-    out = []
-    for program, pixels in found.items():
-        left = (pixels.astype(np.float64) - exact)[inside]
-        out.append({
-            "case": case, "program": program, "scale": scale, "rms": float(np.sqrt((left**2).mean())),
-            "worst": float(np.percentile(np.abs(left), 99.9)), "cpu_ms": float(np.median(took[program])),
-        })  # fmt: skip
-        print(out[-1], file=sys.stderr)
-    return out
+    return {program: float(np.median(each)) for program, each in took.items()}
 
 
 def write(report: dict[str, Any]) -> None:
@@ -158,20 +217,20 @@ def write(report: dict[str, Any]) -> None:
     machine = f"{report['date']}, commit {report['commit']}, {report['cpu']}, {report['cores']} cores."
     lines = [
         "# Planes: what sampling makes of a picture", "", machine, "",
-        "| case | scale in the middle | program | rms, grey levels | 99.9 % | CPU ms |", "|---|---|---|---|---|---|",
+        "rms (and 99.9 %) in grey levels.", "",
+        "| case | scale in the middle | program | words | shapes | photograph | CPU ms |",
+        "|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     for row in report["sampling"]:
-        lines.append(
-            f"| {row['case']} | {row['scale']:.2f} | {row['program']} | {row['rms']:.2f} | {row['worst']:.0f} | "
-            f"{row['cpu_ms']:.1f} |"
-        )
+        errors = " | ".join(f"{rms:.2f} ({row['worst'][name]:.0f})" for name, rms in row["rms"].items())
+        lines.append(f"| {row['case']} | {row['scale']:.2f} | {row['program']} | {errors} | {row['cpu_ms']:.1f} |")
     (RESULTS / "planes.md").write_text("\n".join(lines) + "\n")
     (RESULTS / "planes.json").write_text(json.dumps(report, indent=1) + "\n")
 
 
 def main() -> None:
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
-    write({**describe_machine(), "sampling": measure()})
+    write({**describe_machine(), "sampling": measure(Path(os.environ["SFMAPP_DATA"]))})
 
 
 if __name__ == "__main__":

@@ -265,9 +265,9 @@ def plane_rows(folder: Path) -> Iterator[Row]:
     for row in report["sampling"]:
         mine, peer = ours[row["case"]], row["program"]
         if peer != "sfmapp":
-            yield Row(
-                "planes", row["case"], "sampling, rms", "grey levels", "less", mine["rms"], peer, row["rms"], *about
-            )
+            for picture, rms in row["rms"].items():
+                what = f"rms on {picture}"
+                yield Row("planes", row["case"], what, "grey levels", "less", mine["rms"][picture], peer, rms, *about)
             yield Row("planes", row["case"], "CPU time", "ms", "less", mine["cpu_ms"], peer, row["cpu_ms"], *about)
 
 

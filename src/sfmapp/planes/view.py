@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -42,7 +43,7 @@ class PlaneView:
     def seen(self, ab: Array) -> Array:
         """Pixels (N, 2) of points of the plane (N, 2); NaN at and beyond its horizon, and where the lens does not
         look."""
-        flat = _mapped(self.homography, ab)
+        flat = _mapped(np.ascontiguousarray(self.homography, np.float64), np.ascontiguousarray(ab, np.float64))
         if self.camera is None:
             return flat
         flat[~((flat**2).sum(1) < self._reach**2)] = np.nan
@@ -55,17 +56,20 @@ class PlaneView:
             flat = pixels_to_normalized(self.camera, pixels)
             flat[~((flat**2).sum(1) < self._reach**2)] = np.nan
         # the last coordinate is one over the weight of the point, which is positive in front
-        return _mapped(np.asarray(np.linalg.inv(self.homography), np.float64), flat)
+        inverse = np.ascontiguousarray(np.linalg.inv(self.homography), np.float64)
+        return _mapped(inverse, np.ascontiguousarray(flat, np.float64))
 
 
+@numba.njit(cache=True, nogil=True)
 def _mapped(homography: Array, xy: Array) -> Array:
-    """(N, 2) points through a homography; NaN where the last coordinate is not positive. A row of numbers for each
-    coordinate: of short vectors side by side numpy makes four times the work."""
-    x, y, weight = homography[:, :2] @ xy.T + homography[:, 2:]
-    out = np.empty_like(xy)
-    unit = 1.0 / np.where(weight > 0.0, weight, np.nan)
-    np.multiply(x, unit, out=out[:, 0])
-    np.multiply(y, unit, out=out[:, 1])
+    """(N, 2) points through a homography; NaN where the last coordinate is not positive."""
+    out = np.empty(xy.shape)
+    for n in range(xy.shape[0]):
+        x, y = xy[n, 0], xy[n, 1]
+        weight = homography[2, 0] * x + homography[2, 1] * y + homography[2, 2]
+        unit = 1.0 / weight if weight > 0.0 else math.nan
+        out[n, 0] = unit * (homography[0, 0] * x + homography[0, 1] * y + homography[0, 2])
+        out[n, 1] = unit * (homography[1, 0] * x + homography[1, 1] * y + homography[1, 2])
     return out
 
 
