@@ -160,6 +160,19 @@ def test_steep_planes_are_found_where_much_of_the_search_leads_out_of_the_pictur
     assert found.uniqueness.min() >= 0.0
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_unrelated_pictures_give_no_dense_map_though_few_disparities_are_searched(seed: int) -> None:
+    flat = np.full((160, 240), 6.0)
+    left, right = _pair_of(flat, seed)
+    other, _ = _pair_of(flat, seed + 7)
+    # 0.35 to 0.5 where these sixteen are not held against others
+    assert _match(other, right, (0, 16)).density < 0.15
+    found = _match(left, right, (0, 16))
+    assert found.density > 0.85
+    assert np.nanmin(found.disparity) >= -0.5
+    assert np.nanmax(found.disparity) <= 15.5
+
+
 def test_what_only_the_left_camera_sees_is_not_matched() -> None:
     truth = np.full((100, 200), 5.0)
     truth[30:70, 80:140] = 25.0

@@ -17,7 +17,7 @@ from sfmapp.stereo.opencv_matchers import gray_of
 from sfmapp.stereo.options import StereoOptions
 from sfmapp.stereo.result import DisparityMap, PixelState, RectifiedPair
 from sfmapp.stereo.semiglobal import BLANK_WINDOW, LEAST_UNIQUENESS, Level
-from sfmapp.stereo.semiglobal_kernels import NOISE_BINS, collect, even_out, noise_of, report
+from sfmapp.stereo.semiglobal_kernels import LANES, NOISE_BINS, collect, even_out, noise_of, report
 from sfmapp.stereo.slanted import refine_slanted
 
 # mean difference in grey from the blurred picture, about a pixel, below which there is nothing to match: a saturated
@@ -62,7 +62,10 @@ class Matcher:
             )
         self.search, self.shape = search, (height, width)
         self._tolerance = round(left_right_px)
-        self._level = Level(height, width, search)
+        # a vector holds so many disparities whatever is asked: those about a narrow search are its rivals, for of few
+        # disparities one fits by chance
+        rivals = max(0, LANES - search[1])
+        self._level = Level(height, width, (search[0] - rivals // 2, search[1] + rivals))
         self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
         self._grey = np.empty((2, height, width), np.uint8)
         self._kept = np.empty((height, width), np.int16)
@@ -96,7 +99,7 @@ class Matcher:
         """
         left, right = self._gray(left, 0), self._gray(right, 1)
         found = self._level.match(left, right, self._tolerance, self._pool)
-        collect(found, LEAST_UNIQUENESS, self._level.wide_texture, BLANK * BLANK_WINDOW**2, self._kept)
+        collect(found, LEAST_UNIQUENESS, self._level.wide_texture, BLANK * BLANK_WINDOW**2, self.search, self._kept)
         cv2.filterSpeckles(self._kept, -32768, LEAST_ISLAND, 16 * ISLAND_STEP_PX)
         report(found, self._kept, self._disparity, self._state, self._measures)
         even_out(self._disparity, self._scratch)

@@ -387,13 +387,18 @@ def _start_of_search(disparity: float, least: float, greatest: float) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def collect(found: Found, least: float, texture: NDArray[np.uint16], blank: float, out: Ints) -> None:
-    """Sixteenths of disparities (H, W) int16 that both views tell, whose uniqueness is not below ``least``, and whose
-    ``texture`` (H, W) is not below ``blank``; -32768 for others."""
+def collect(
+    found: Found, least: float, texture: NDArray[np.uint16], blank: float, search: tuple[int, int], out: Ints
+) -> None:
+    """Sixteenths of disparities (H, W) int16 that both views tell, whose uniqueness is not below ``least``, whose
+    ``texture`` (H, W) is not below ``blank``, and which are among those asked for (the least, and how many); -32768 for
+    others."""
     height, width = out.shape
+    low, high = search[0] - 0.5, search[0] + search[1] - 0.5
     for y in range(height):
         for x in range(width):
             sure = found.agrees[y, x] > 0 and texture[y, x] >= blank and _uniqueness(found, y, x) >= least
+            sure = sure and low <= found.disparity[y, x] <= high
             out[y, x] = np.int16(np.rint(16 * found.disparity[y, x])) if sure else np.int16(-32768)
 
 
