@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from machine import ROOT
+from sfmapp.images.pixels import as_gray
 from sfmapp.stereo.match import match_pair
-from sfmapp.stereo.opencv_matchers import gray_of
 from sfmapp.stereo.options import StereoOptions
 from sfmapp.stereo.windows import best_disparities
 from stereo_pairs import StereoSet, rendered_set, shots
@@ -54,7 +54,7 @@ def labelled(picture: NDArray[np.uint8], title: str) -> NDArray[np.uint8]:
 
 def main() -> None:
     case = rendered_set(next(shot for shot in shots() if shot.name == SHOT))
-    left, right = gray_of(case.pair.left), gray_of(case.pair.right)
+    left, right = as_gray(case.pair.left), as_gray(case.pair.right)
     panels = [labelled(cv2.cvtColor(left, cv2.COLOR_GRAY2BGR), "left photograph")]
     panels += [panel(best_disparities(left, right, case.search, options).disparity, case, name)
                for name, options in PANELS]  # fmt: skip

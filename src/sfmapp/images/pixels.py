@@ -47,7 +47,7 @@ def read_picture(record: ImageRecord) -> Picture:
     """
     color, alpha = _decode(record)
     mask = _alpha_mask(alpha) if record.has_alpha else None
-    return Picture(_as_rgb(color), _as_gray(color), _combine(read_mask_file(record), mask))
+    return Picture(as_rgb(color), as_gray(color), _combine(read_mask_file(record), mask))
 
 
 def read_on_white(record: ImageRecord) -> tuple[Pixels, NDArray[np.bool_] | None]:
@@ -57,7 +57,7 @@ def read_on_white(record: ImageRecord) -> tuple[Pixels, NDArray[np.bool_] | None
         InputError: as :func:`read_picture`.
     """
     color, alpha = _decode(record)
-    rgb, mask = _as_rgb(color), _alpha_mask(alpha) if record.has_alpha else None
+    rgb, mask = as_rgb(color), _alpha_mask(alpha) if record.has_alpha else None
     if alpha is not None and mask is not None:
         opacity = alpha[..., None].astype(np.uint16)
         rgb = ((rgb * opacity + 255 * (255 - opacity) + 127) // 255).astype(np.uint8)
@@ -66,18 +66,18 @@ def read_on_white(record: ImageRecord) -> tuple[Pixels, NDArray[np.bool_] | None
 
 def read_rgb(record: ImageRecord) -> Pixels:
     """(H, W, 3) uint8 colours of a photograph. Raises InputError as :func:`read_picture` does."""
-    return _as_rgb(_decode(record)[0])
+    return as_rgb(_decode(record)[0])
 
 
 def read_gray(record: ImageRecord) -> Pixels:
     """(H, W) uint8 grey values of a photograph. Raises InputError as :func:`read_picture` does."""
-    return _as_gray(_decode(record)[0])
+    return as_gray(_decode(record)[0])
 
 
 def read_rgb_and_gray(record: ImageRecord) -> tuple[Pixels, Pixels]:
     """(H, W, 3) and (H, W) uint8 from one decoding. Raises InputError as :func:`read_picture` does."""
     color = _decode(record)[0]
-    return _as_rgb(color), _as_gray(color)
+    return as_rgb(color), as_gray(color)
 
 
 def read_mask(record: ImageRecord) -> NDArray[np.bool_] | None:
@@ -90,13 +90,15 @@ def read_mask(record: ImageRecord) -> NDArray[np.bool_] | None:
     return _combine(read_mask_file(record), _alpha_mask(alpha))
 
 
-def _as_rgb(pixels: Pixels) -> Pixels:
+def as_rgb(pixels: Pixels) -> Pixels:
+    """(H, W, 3) of pixels that may be grey."""
     import cv2
 
     return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB) if pixels.ndim == 2 else pixels
 
 
-def _as_gray(pixels: Pixels) -> Pixels:
+def as_gray(pixels: Pixels) -> Pixels:
+    """(H, W) of pixels that may be RGB."""
     import cv2
 
     return pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)

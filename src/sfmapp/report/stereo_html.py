@@ -10,6 +10,7 @@ from urllib.parse import quote
 import cv2
 import numpy as np
 
+from sfmapp.images.pixels import as_rgb
 from sfmapp.report.drawing import jpeg_url
 from sfmapp.report.page import render_page, table
 from sfmapp.report.stereo_document import StereoReport
@@ -22,7 +23,7 @@ from sfmapp.report.stereo_pictures import (
     rows_across,
     scale_of,
 )
-from sfmapp.stereo.measured import MeasuredPair, MeasuredReport, rgb_of
+from sfmapp.stereo.measured import MeasuredPair, MeasuredReport
 from sfmapp.stereo.report import StereoPairReport
 from sfmapp.stereo.result import DisparityMap, RectifiedPair
 from sfmapp.stereo.temporal import ConsistencyReport, FilmReport
@@ -149,7 +150,7 @@ def _summary(report: StereoPairReport) -> str:
 
 def _maps(report: StereoPairReport, pair: RectifiedPair, found: DisparityMap, measured: MeasuredPair) -> Iterator[str]:
     yield '<h2>Maps of the left picture</h2><div class="row large">'
-    picture = jpeg_url(rgb_of(pair.left), SHOWN_PX, QUALITY)
+    picture = jpeg_url(as_rgb(pair.left), SHOWN_PX, QUALITY)
     yield f'<figure><img src="{picture}" alt=""><figcaption>what the maps are of</figcaption></figure>'
     unit = _unit(report.measured)
     if measured.depth is not None and measured.depth_sigma is not None:
@@ -211,7 +212,7 @@ def _both_views(pair: RectifiedPair, found: DisparityMap) -> Iterator[str]:
     shift = round(float(np.median(known))) if known.size else 0
     yield '<h2>Both views</h2><figure><div class="slider">'
     for picture in (pair.left, pair.right):
-        yield f'<img src="{jpeg_url(rgb_of(picture), SHOWN_PX, QUALITY)}" alt="">'
+        yield f'<img src="{jpeg_url(as_rgb(picture), SHOWN_PX, QUALITY)}" alt="">'
     yield (
         '</div><input type="range" min="0" max="100" value="50" aria-label="left or right" '
         "oninput=\"this.previousElementSibling.style.setProperty('--cut',this.value+'%')\">"

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.images.pixels import as_rgb
 from sfmapp.report.drawing import jpeg_url, shrunk
-from sfmapp.stereo.measured import rgb_of
 from sfmapp.stereo.result import DisparityMap, PixelState, RectifiedPair
 
 Pixels = NDArray[np.uint8]
@@ -75,7 +75,7 @@ def map_figure(values: NDArray[np.floating], scale: ColorScale, caption: str) ->
 def anaglyph(pair: RectifiedPair, shift: int) -> Pixels:
     """For glasses of red before the left eye and cyan before the right one; of what has the disparity ``shift``, both
     pictures coincide, and it is seen in the plane of the screen."""
-    left, right = (rgb_of(picture) for picture in (pair.left, pair.right))
+    left, right = (as_rgb(picture) for picture in (pair.left, pair.right))
     moved = np.zeros_like(right)
     width = left.shape[1]
     if 0 <= shift < width:
@@ -89,8 +89,8 @@ def anaglyph(pair: RectifiedPair, shift: int) -> Pixels:
 
 def rows_across(pair: RectifiedPair, found: DisparityMap) -> Pixels:
     """Both pictures side by side with some rows across both, and on each some pixels with their matches."""
-    left, scale = shrunk(rgb_of(pair.left), SHOWN_PX)
-    right, _ = shrunk(rgb_of(pair.right), SHOWN_PX)
+    left, scale = shrunk(as_rgb(pair.left), SHOWN_PX)
+    right, _ = shrunk(as_rgb(pair.right), SHOWN_PX)
     height, width = left.shape[:2]
     canvas = np.concatenate([left, np.full((height, 8, 3), 255, np.uint8), right], axis=1)
     for n in range(_NUM_ROWS):

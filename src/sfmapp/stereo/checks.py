@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.stereo.result import RectifiedPair
+
 Disparity = NDArray[np.float32]
 
 # OpenCV's speckle filter takes whole numbers
@@ -59,3 +61,12 @@ def _fill_rows(disparity: Disparity) -> Disparity:
     row = np.arange(height)[:, None]
     filled: Disparity = np.fmin(padded[row, before + 1], padded[row, behind + 1])
     return filled
+
+
+def seen_by_both(disparity: Disparity, pair: RectifiedPair) -> NDArray[np.bool_]:
+    """(H, W) where there is a disparity and neither photograph ends before the pixel or its partner."""
+    width = disparity.shape[1]
+    place = np.arange(width) - np.nan_to_num(disparity)
+    column = np.clip(np.rint(place), 0, width - 1).astype(np.int64)
+    shown = pair.left_shown & np.take_along_axis(pair.right_shown, column, 1)
+    return np.asarray(np.isfinite(disparity) & shown, np.bool_)

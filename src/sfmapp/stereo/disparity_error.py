@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.images.pixels import as_gray
 from sfmapp.stereo.error_table import ERROR_TABLE, ErrorTable
-from sfmapp.stereo.opencv_matchers import gray_of
 from sfmapp.stereo.result import DisparityMap, PixelState, RectifiedPair
 
 Map = NDArray[np.float32]
@@ -96,7 +96,7 @@ def with_residual(told: tuple[Map, Map, Map], residual_px: float) -> tuple[Map, 
 def match_cues(pair: RectifiedPair, found: DisparityMap, rows: slice = slice(None)) -> tuple[Map, NDArray[np.bool_]]:
     """The cues (9, R, W) of the rows asked for, in the order of ``CUES``, and which pixels (R, W) were matched. Within
     ``_AROUND`` // 2 of the first and the last row windows reach beyond them, and are mirrored."""
-    left, right = (gray_of(picture[rows]).astype(np.float32) for picture in (pair.left, pair.right))
+    left, right = (as_gray(picture[rows]).astype(np.float32) for picture in (pair.left, pair.right))
     known = (found.state[rows] == PixelState.MATCHED) & np.isfinite(found.disparity[rows])
     disparity = np.where(known, found.disparity[rows], np.float32(0.0))
     cues = np.empty((len(CUES), *disparity.shape), np.float32)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from sfmapp.dense.expand import CONTRAST, LEAST_CONTRAST
 from sfmapp.errors import UsageError
-from sfmapp.stereo.checks import fill_holes
-from sfmapp.stereo.opencv_matchers import gray_of
+from sfmapp.images.pixels import as_gray
+from sfmapp.stereo.checks import fill_holes, seen_by_both
 from sfmapp.stereo.options import StereoOptions
 from sfmapp.stereo.result import DisparityMap, PixelState, RectifiedPair
 from sfmapp.stereo.semiglobal import BLANK_WINDOW, LEAST_UNIQUENESS, Level
@@ -136,9 +136,9 @@ def match_by_sgm(pair: RectifiedPair, options: StereoOptions, search: tuple[int,
         found = matcher.match(pair.left, pair.right)
     hide_unseen(found, pair)
     if options.refine:
-        left = gray_of(pair.left)
+        left = as_gray(pair.left)
         contrast = CONTRAST * noise_of(left, np.empty(NOISE_BINS, np.int64)) + LEAST_CONTRAST
-        disparity = refine_slanted(left, gray_of(pair.right), found.disparity, contrast, threads=2)
+        disparity = refine_slanted(left, as_gray(pair.right), found.disparity, contrast, threads=2)
         even_out(disparity, np.empty_like(disparity))
         found = replace(found, disparity=disparity)
     if options.fill:
@@ -161,10 +161,7 @@ def hide_unseen(found: DisparityMap, pair: RectifiedPair) -> None:
     """Take back disparities of pixels that one of the photographs does not reach."""
     if pair.left_shown.all() and pair.right_shown.all():
         return
-    width = found.disparity.shape[1]
-    seen = np.arange(width) - np.nan_to_num(found.disparity)
-    column = np.clip(np.rint(seen), 0, width - 1).astype(np.int64)
-    shown = pair.left_shown & np.take_along_axis(pair.right_shown, column, 1)
-    found.state[~shown] = PixelState.UNKNOWN
+    hidden = ~seen_by_both(found.disparity, pair)
+    found.state[hidden] = PixelState.UNKNOWN
     for values in (found.disparity, found.cost, found.curvature):
-        values[~shown] = np.nan
+        values[hidden] = np.nan

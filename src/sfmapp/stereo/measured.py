@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.images.pixels import as_rgb
 from sfmapp.reporting import Report
 from sfmapp.scene.mesh import Mesh, vertex_normals
 from sfmapp.stereo.depth import depth_of_disparity, points_of_depth
@@ -145,7 +146,7 @@ def cloud_of(pair: RectifiedPair, measured: MeasuredPair) -> tuple[Map, NDArray[
     assert measured.depth is not None
     assert pair.geometry is not None
     use = measured.is_solid
-    return points_of_depth(measured.depth, pair.geometry)[use], rgb_of(pair.left)[use]
+    return points_of_depth(measured.depth, pair.geometry)[use], as_rgb(pair.left)[use]
 
 
 def mesh_of(pair: RectifiedPair, found: DisparityMap, measured: MeasuredPair) -> Mesh:
@@ -168,12 +169,7 @@ def mesh_of(pair: RectifiedPair, found: DisparityMap, measured: MeasuredPair) ->
     faces = faces.reshape(-1, 3).astype(np.int32)
     xyz = points_of_depth(measured.depth, pair.geometry)[grid].reshape(-1, 3)[used].astype(np.float64)
     uv = np.stack(np.meshgrid((columns + 0.5) / width, (rows + 0.5) / height), axis=-1).reshape(-1, 2)[used]
-    picture = rgb_of(pair.left)
+    picture = as_rgb(pair.left)
     return Mesh(
         xyz, faces, vertex_normals(xyz, faces), picture[grid].reshape(-1, 3)[used], uv.astype(np.float32), picture
     )
-
-
-def rgb_of(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W, 3) of a picture that may be grey."""
-    return picture if picture.ndim == 3 else np.repeat(picture[:, :, None], 3, axis=2)

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.images.pixels import as_gray
+from sfmapp.stereo.checks import seen_by_both
 from sfmapp.stereo.options import StereoOptions
 from sfmapp.stereo.result import DisparityMap, PixelState, RectifiedPair
 
@@ -45,18 +47,8 @@ def match_by_bm(pair: RectifiedPair, options: StereoOptions, search: tuple[int, 
     matcher = cv2.StereoBM.create(numDisparities=count, blockSize=max(options.window or _BM_WINDOW, 5))
     matcher.setMinDisparity(first)
     matcher.setDisp12MaxDiff(round(options.left_right_px))
-    left, right = gray_of(pair.left), gray_of(pair.right)
+    left, right = as_gray(pair.left), as_gray(pair.right)
     return _matched(matcher, left, right, (first, count), pair, "opencv-bm")
-
-
-def gray_of(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W) grey values of a picture (H, W) or (H, W, 3) RGB."""
-    import cv2
-
-    if picture.ndim == 2:
-        return picture
-    gray: NDArray[np.uint8] = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-    return gray
 
 
 def _whole_sixteens(search: tuple[int, int]) -> tuple[int, int]:
@@ -76,13 +68,11 @@ def _matched(
     wide = [cv2.copyMakeBorder(one, 0, 0, before, behind, cv2.BORDER_REPLICATE) for one in (left, right)]
     fixed = matcher.compute(*wide)[:, before : before + left.shape[1]]
     disparity = fixed.astype(np.float32) / np.float32(_FRACTIONS)
-    height, width = disparity.shape
-    known = (fixed >= first * _FRACTIONS) & pair.left_shown
     # what it found beyond the border is of its own making
-    x = np.arange(width, dtype=np.float32) + 0.5 - disparity
-    known &= (x >= 0.0) & (x <= width)
-    column = np.clip(x, 0, width - 1).astype(np.int64)
-    known &= pair.right_shown[np.arange(height)[:, None], column]
+    x = np.arange(disparity.shape[1], dtype=np.float32) + 0.5 - disparity
+    known = (fixed >= first * _FRACTIONS) & (x >= 0.0) & (x <= disparity.shape[1])
+    disparity[~known] = np.nan
+    known = seen_by_both(disparity, pair)
     disparity[~known] = np.nan
     unknown = np.full(disparity.shape, np.nan, np.float32)
     state = np.where(known, np.uint8(PixelState.MATCHED), np.uint8(PixelState.UNKNOWN)).astype(np.uint8)

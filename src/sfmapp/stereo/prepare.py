@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
 from sfmapp.geometry import rigid3
+from sfmapp.images.pixels import as_gray
 from sfmapp.planes.sampling import resampled
 from sfmapp.scene.rig import Rig
 from sfmapp.stereo.alignment import aligned_matches
 from sfmapp.stereo.calibration_error import geometry_covariance, without_turn
 from sfmapp.stereo.misalignment import Misalignment, measure_misalignment
-from sfmapp.stereo.opencv_matchers import gray_of
 from sfmapp.stereo.options import Correction
 from sfmapp.stereo.rectification import Rectification, plan_rectification, rectify
 from sfmapp.stereo.report import MisalignmentReport, RectificationReport, RowsReport
@@ -238,7 +238,7 @@ def turn_of_rig(pairs: Iterable[tuple[Pixels, Pixels]], cameras: PairCameras) ->
 
 
 def _aligned(draft: _Draft) -> PairMatches:
-    return aligned_matches(gray_of(draft.pair.left), gray_of(draft.pair.right), draft.matches)
+    return aligned_matches(as_gray(draft.pair.left), as_gray(draft.pair.right), draft.matches)
 
 
 def _misalignment(plan: Rectification, matches: PairMatches) -> Misalignment | None:

@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.features.extract import FeatureOptions, features_from_picture
-from sfmapp.images.pixels import Picture
+from sfmapp.images.pixels import as_gray
 from sfmapp.matching.guided import GuidedImage, background_of, match_guided
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.stereo.alignment import aligned_matches
 from sfmapp.stereo.depth import baseline_of
-from sfmapp.stereo.opencv_matchers import gray_of
 from sfmapp.stereo.result import RectifiedGeometry, RectifiedPair
-from sfmapp.stereo.sparse_matches import PairMatches
+from sfmapp.stereo.sparse_matches import PairMatches, picture_of
 
 Array = NDArray[np.float64]
 
@@ -60,11 +59,10 @@ def match_along_rows(pair: RectifiedPair, row_px: float = 1.0) -> PairMatches:
     Where both windows align, the right end is moved there; others are left out, as are those that then are off the row.
     """
     shown = (pair.left_shown, pair.right_shown)
-    gray = [gray_of(picture) for picture in (pair.left, pair.right)]
+    gray = [as_gray(picture) for picture in (pair.left, pair.right)]
     images = []
     for one, mask in zip(gray, shown, strict=True):
-        picture = Picture(np.repeat(one[..., None], 3, axis=2), one, None if mask.all() else mask)
-        features = features_from_picture(picture, FeatureOptions(max_num_orientations=1))[0]
+        features = features_from_picture(picture_of(one, mask), FeatureOptions(max_num_orientations=1))[0]
         if not len(features):
             return PairMatches(np.zeros((0, 2)), np.zeros((0, 2)))
         images.append(GuidedImage.of(features, background_of(features)))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.features.extract import FeatureOptions, features_from_picture
-from sfmapp.images.pixels import Picture
+from sfmapp.images.pixels import Picture, as_gray, as_rgb
 from sfmapp.matching.descriptors import match_sift
 from sfmapp.matching.options import MatchingOptions
 
@@ -58,7 +58,7 @@ def match_pictures(
     """
     options = FeatureOptions(max_num_features=_NUM_FEATURES, max_size_px=_SIZE_PX, max_num_orientations=1)
     found = [
-        features_from_picture(_picture(pixels, shown), options)[0]
+        features_from_picture(picture_of(pixels, shown), options)[0]
         for pixels, shown in ((left, left_shown), (right, right_shown))
     ]
     limits = MatchingOptions()
@@ -69,8 +69,6 @@ def match_pictures(
     return PairMatches(xy[0], xy[1])
 
 
-def _picture(pixels: NDArray[np.uint8], shown: NDArray[np.bool_] | None) -> Picture:
-    from sfmapp.stereo.opencv_matchers import gray_of
-
-    rgb = np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels
-    return Picture(rgb, gray_of(pixels), None if shown is None or shown.all() else shown)
+def picture_of(pixels: NDArray[np.uint8], shown: NDArray[np.bool_] | None) -> Picture:
+    """What features are found in: a picture (H, W) or (H, W, 3), its mask where it does not show all."""
+    return Picture(as_rgb(pixels), as_gray(pixels), None if shown is None or shown.all() else shown)

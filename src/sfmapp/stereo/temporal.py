@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.images.pixels import as_gray
 from sfmapp.reporting import Report
-from sfmapp.stereo.opencv_matchers import gray_of
 from sfmapp.stereo.result import DisparityMap, PixelState
 
 Map = NDArray[np.float32]
@@ -86,7 +86,7 @@ class Moment:
     def of(name: str, left: NDArray[np.uint8], shown: Mask, found: DisparityMap, half_width_95: Map) -> Moment:
         """Of a matched pair; filled pixels are guesses, and left out."""
         disparity = np.where(found.state == PixelState.MATCHED, found.disparity, np.float32(np.nan))
-        return Moment(name, gray_of(left), shown, disparity, half_width_95)
+        return Moment(name, as_gray(left), shown, disparity, half_width_95)
 
 
 def compare_moments(before: Moment, now: Moment) -> ConsistencyReport:

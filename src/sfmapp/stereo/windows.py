@@ -13,9 +13,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.stereo.checks import beside_steps, fill_holes, without_speckles
+from sfmapp.images.pixels import as_gray
+from sfmapp.stereo.checks import beside_steps, fill_holes, seen_by_both, without_speckles
 from sfmapp.stereo.costs import GREATEST, NUMBERS, planes_of
-from sfmapp.stereo.opencv_matchers import gray_of
 from sfmapp.stereo.options import StereoOptions, WindowsName
 from sfmapp.stereo.result import DisparityMap, PixelState, RectifiedPair
 from sfmapp.stereo.window_kernels import LEAST, SUM, Found, Search, Windows, match_rows
@@ -46,8 +46,8 @@ def match_by_windows(pair: RectifiedPair, options: StereoOptions, search: tuple[
         search: the least disparity, and how many from there on.
     """
     sides = window_sides(options)
-    found = best_disparities(gray_of(pair.left), gray_of(pair.right), search, options)
-    seen = _seen_by_both(found.disparity, pair)
+    found = best_disparities(as_gray(pair.left), as_gray(pair.right), search, options)
+    seen = seen_by_both(found.disparity, pair)
     unique = found.uniqueness >= _LEAST_UNIQUENESS
     disparity = np.where(seen & unique, found.disparity, np.float32(np.nan))
     disparity[beside_steps(disparity, _STEP_SIDE, _STEP_PX)] = np.nan
@@ -102,12 +102,3 @@ def best_disparities(
     found = Found(*(np.full(left.shape, np.nan, np.float32) for _ in range(4)))
     match_rows(NUMBERS[options.cost], planes, looked_for, windows, (0, left.shape[0]), found)
     return found
-
-
-def _seen_by_both(disparity: NDArray[np.float32], pair: RectifiedPair) -> NDArray[np.bool_]:
-    """Where there is a disparity, and neither photograph ends before it."""
-    height, width = disparity.shape
-    seen = np.isfinite(disparity) & pair.left_shown
-    place = np.arange(width) - np.nan_to_num(disparity)
-    column = np.clip(np.rint(place), 0, width - 1).astype(np.int64)
-    return np.asarray(seen & pair.right_shown[np.arange(height)[:, None], column], np.bool_)

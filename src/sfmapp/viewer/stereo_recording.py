@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.stereo.measured import MeasuredPair, MeasuredReport, cloud_of, rgb_of
+from sfmapp.images.pixels import as_rgb
+from sfmapp.stereo.measured import MeasuredPair, MeasuredReport, cloud_of
 from sfmapp.stereo.result import DisparityMap, RectifiedPair
 from sfmapp.viewer.photos import shrunk
 from sfmapp.viewer.recording import RecordingReport, record_in_child
@@ -27,7 +28,7 @@ def record_stereo(
 def _replay(
     title: str, pair: RectifiedPair, found: DisparityMap, measured: MeasuredPair, told: MeasuredReport
 ) -> StereoReplay:
-    (left, scale), (right, _) = (shrunk(rgb_of(picture), _SHOWN_PX) for picture in (pair.left, pair.right))
+    (left, scale), (right, _) = (shrunk(as_rgb(picture), _SHOWN_PX) for picture in (pair.left, pair.right))
     step = max(1, max(found.disparity.shape) // _SHOWN_PX)
     sigma = measured.error.sigma
     confidence = np.where(np.isfinite(sigma), measured.error.confidence, np.float32(np.nan))
