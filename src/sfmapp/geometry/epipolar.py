@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from sfmapp.geometry import rigid3
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 
 def essential_from_fundamental(fundamental: Array, k1: Array, k2: Array) -> Array:
@@ -160,6 +161,20 @@ def _ray_depths(rotation: Array, t: Array, xn1: Array, xn2: Array, depths: Array
         angles[i] = math.atan2(across, along)
 
 
+@numba.njit(cache=True, nogil=True)
+def _count_in_front(rotations: Array, ts: Array, xn1: Array, xn2: Array, counts: Ints) -> None:
+    is_ray = xn1.shape[1] == 3
+    for k in range(rotations.shape[0]):
+        counts[k] = 0
+        for i in range(xn1.shape[0]):
+            z1, z2 = (xn1[i, 2], xn2[i, 2]) if is_ray else (1.0, 1.0)
+            first, second, _, _ = depths_of_rays(
+                rotations[k], ts[k], xn1[i, 0], xn1[i, 1], z1, xn2[i, 0], xn2[i, 1], z2
+            )
+            if first > 0.0 and second > 0.0:
+                counts[k] += 1
+
+
 def ray_depths(cam2_from_cam1: ArrayLike, xn1: Array, xn2: Array) -> tuple[Array, Array]:
     """Where pairs of rays come closest (the linear midpoint), and the angles between them.
 
@@ -190,10 +205,13 @@ def choose_in_front(poses: Array, xn1: Array, xn2: Array) -> tuple[Array, NDArra
         The pose (7,), (N,) which points lie in front of both cameras, (N,) angles between the rays in radians.
         The first of equals wins.
     """
-    tried = [ray_depths(pose, xn1, xn2) for pose in poses]
-    in_front = np.array([(depths > 0).all(1) for depths, _ in tried])
-    best = int(np.argmax(in_front.sum(1)))
-    return poses[best], in_front[best], tried[best][1]
+    poses = np.asarray(poses, np.float64)
+    counts = np.empty(len(poses), np.int64)
+    rotations, ts = np.ascontiguousarray(rigid3.rotation_matrix(poses)), np.ascontiguousarray(poses[:, 4:])
+    _count_in_front(rotations, ts, *contiguous(xn1, xn2), counts)
+    best = poses[int(np.argmax(counts))]
+    depths, angles = ray_depths(best, xn1, xn2)
+    return best, (depths[:, 0] > 0) & (depths[:, 1] > 0), angles
 
 
 def contiguous(xy1: ArrayLike, xy2: ArrayLike) -> tuple[Array, Array]:
@@ -206,4 +224,4 @@ def compile_kernels() -> None:
     points = np.array([[0.1, 0.2], [0.3, -0.1]])
     sampson_errors(np.eye(3), points, points)
     truncated_sums(np.eye(3)[None], points, points, 1.0)
-    ray_depths(rigid3.IDENTITY, points, points)
+    choose_in_front(rigid3.IDENTITY[None], points, points)

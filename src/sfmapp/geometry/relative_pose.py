@@ -71,7 +71,7 @@ def sampson_normal_equations(num: int, e: Array, xn1: Array, xn2: Array, scale2:
         g[k] = 0.0
         for m in range(num):
             h[k, m] = 0.0
-    cost = 0.0
+    cost, product = 0.0, 1.0
     for i in range(xn1.shape[0]):
         x, y, u, v = xn1[i, 0], xn1[i, 1], xn2[i, 0], xn2[i, 1]
         a = e[0, 0, 0] * x + e[0, 0, 1] * y + e[0, 0, 2]
@@ -86,20 +86,25 @@ def sampson_normal_equations(num: int, e: Array, xn1: Array, xn2: Array, scale2:
         residual = (u * a + v * b + c) * s
         ratio = residual * residual / scale2
         weight = 1.0 / (1.0 + ratio)
-        cost += math.log1p(ratio)
+        product *= 1.0 + ratio
+        if product > 1e100:  # one logarithm for many points
+            cost += math.log(product)
+            product = 1.0
+        # the residual's derivatives by the entries of the matrix
+        bend = residual * s * s
+        p, q, r, t = s * u - bend * a, s * v - bend * b, bend * d, bend * f
+        e00, e01, e10, e11, e20, e21 = p * x - u * r, p * y - u * t, q * x - v * r, q * y - v * t, s * x - r, s * y - t
         for k in range(num):
             m = k + 1
-            da = e[m, 0, 0] * x + e[m, 0, 1] * y + e[m, 0, 2]
-            db = e[m, 1, 0] * x + e[m, 1, 1] * y + e[m, 1, 2]
-            dc = e[m, 2, 0] * x + e[m, 2, 1] * y + e[m, 2, 2]
-            dd = e[m, 0, 0] * u + e[m, 1, 0] * v + e[m, 2, 0]
-            df = e[m, 0, 1] * u + e[m, 1, 1] * v + e[m, 2, 1]
-            jacobian[k] = s * (u * da + v * db + dc - residual * s * (a * da + b * db + d * dd + f * df))
+            row1 = e00 * e[m, 0, 0] + e01 * e[m, 0, 1] + p * e[m, 0, 2]
+            row2 = e10 * e[m, 1, 0] + e11 * e[m, 1, 1] + q * e[m, 1, 2]
+            row3 = e20 * e[m, 2, 0] + e21 * e[m, 2, 1] + s * e[m, 2, 2]
+            jacobian[k] = row1 + row2 + row3
         for k in range(num):
             g[k] += weight * jacobian[k] * residual
             for m in range(k + 1):
                 h[k, m] += weight * jacobian[k] * jacobian[m]
-    return cost
+    return cost + math.log(product)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import epipolar, five_point
-from sfmapp.geometry.fit import CAUCHY_SIGMAS, robust_sigma
+from sfmapp.geometry.fit import CAUCHY_SIGMAS, HEAVY_TAILS, robust_sigma
 from sfmapp.geometry.relative_pose import refine_on_inliers, refine_relative_pose
 
 Array = NDArray[np.float64]
@@ -21,9 +21,6 @@ Ints = NDArray[np.int64]
 # refined on so many of these, and the best of that on all, in so many rounds. A third of the samples ends in the wrong
 # one of two valleys in 7 of 84 runs over pairs of a narrow field of view, these in 1.
 _SAMPLES, _REFINED, _FEW, _ROUNDS = 15, 4, 200, 8
-# Root of the mean square of inliers over their sigma by the median: 0.9 to 1.1 of normal noise (120 scenes), 1.5 to 2.5
-# of keypoints of photographs (53 pairs). Where tails are that heavy, the loss has to bend; elsewhere squares are best.
-_HEAVY_TAILS = 1.25
 # what the threshold of normalised image points becomes where OpenCV expects pixels
 _SEARCH_PX = 2.0
 
@@ -207,6 +204,6 @@ def best_relative_pose(essentials: Array, pool: Ints, xn1: Array, xn2: Array, th
     if inlier.sum() < 8:
         return best
     sigma = max(robust_sigma(squared[inlier], 1), 1e-3 * threshold)
-    if math.sqrt(float(squared[inlier].mean())) < _HEAVY_TAILS * sigma:
+    if math.sqrt(float(squared[inlier].mean())) < HEAVY_TAILS * sigma:
         return best
     return refine_relative_pose(best, xn1[inlier], xn2[inlier], CAUCHY_SIGMAS * sigma)
