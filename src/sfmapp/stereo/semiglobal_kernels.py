@@ -26,8 +26,8 @@ GAP = 32
 STRIDE = LANES + GAP
 # bases that differ by more share too few disparities to hand costs over
 MOST_SHIFT = GAP - 2
-# what leads out of the right picture costs at most so many times what the best in it does: where there is nothing to
-# tell disparities apart by, that they lead into the picture speaks for none of them
+# what leads out of the right picture costs no less than the best in it, and at most so many times as much: where there
+# is nothing to tell disparities apart by, that they lead into the picture speaks for none of them
 UNSEEN_OVER_SEEN = 3
 # the mean of two pixels on opposite sides of one is of its surface where it is off by less
 SAME_SURFACE_PX = 1.0
@@ -141,7 +141,7 @@ def _smooth_costs(views: Views, unseen: np.uint8, y: Index, raw: Bytes, costs: P
         first, last = x - b - width + 1, x - b + 1
         if first > 0 or last < LANES:
             seen = u8.lowest(u8.within(cost, first, last, u8.splat(np.uint8(255))))
-            most = min(np.int64(unseen), UNSEEN_OVER_SEEN * np.int64(seen))
+            most = min(max(np.int64(unseen), np.int64(seen)), UNSEEN_OVER_SEEN * np.int64(seen))
             cost = u8.within(cost, first, last, u8.splat(np.uint8(most)))
         u8.store(costs, LANES * x, u8.add(cost, u8.load(doubt, LANES * np.int64(views.expected[y, x]))))
 
