@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sfmapp.calibration.boards import Board
 from sfmapp.calibration.markers import marker_bits
 from sfmapp.errors import UsageError
-from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.atomic import write_bytes
 
 # width and height in millimetres, upright
 PAPERS = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
@@ -94,8 +94,7 @@ def write_board(path: Path, board: Board, paper: str) -> None:
     shapes.append(Rectangle(sheet[0] - _MARGIN_MM - _RULER_MM, below - 0.5, _RULER_MM, 0.5))
     caption = f"{board.text()}  print at 100 %, without fitting to the page; the line is {_RULER_MM:.0f} mm long"
     text = (_MARGIN_MM, below, caption)
-    with replaced_file(path) as beside:
-        beside.write_bytes(_svg(sheet, shapes, text) if kind == ".svg" else _pdf(sheet, shapes, text))
+    write_bytes(path, _svg(sheet, shapes, text) if kind == ".svg" else _pdf(sheet, shapes, text))
 
 
 def _room(paper: str) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sfmapp.dense.prepare import DensePlan
 from sfmapp.dense.scene import Patches
 from sfmapp.events import Events
-from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.atomic import replaced_file, write_array, write_bytes
 from sfmapp.geometry import rigid3
 
 STAGE = "maps"
@@ -99,8 +99,8 @@ def write_maps(folder: Path, plan: DensePlan, patches: Patches, cell_px: int, ev
             max(0.75 * cell_px, 1.0),
         )  # fmt: skip
         base = folder / plan.names[m]
-        _write_array(base.with_name(f"{base.name}.depth.npy"), depth)
-        _write_array(base.with_name(f"{base.name}.normal.npy"), normals)
+        write_array(base.with_name(f"{base.name}.depth.npy"), depth)
+        write_array(base.with_name(f"{base.name}.normal.npy"), normals)
         _write_picture(base.with_name(f"{base.name}.depth.png"), depth_picture(depth))
         _write_picture(base.with_name(f"{base.name}.normal.png"), normal_picture(normals))
         events.advanced(STAGE)
@@ -131,17 +131,11 @@ def normal_picture(normals: NDArray[np.float32]) -> NDArray[np.uint8]:
     return shown
 
 
-def _write_array(path: Path, array: NDArray[np.float32]) -> None:
-    with replaced_file(path) as beside, beside.open("wb") as file:
-        np.save(file, array, allow_pickle=False)
-
-
 def _write_picture(path: Path, rgb: NDArray[np.uint8]) -> None:
     import cv2
 
     _, data = cv2.imencode(".png", rgb[:, :, ::-1])
-    with replaced_file(path) as beside:
-        beside.write_bytes(bytes(data))
+    write_bytes(path, bytes(data))
 
 
 def _write_cameras(path: Path, plan: DensePlan) -> None:

@@ -7,8 +7,12 @@ import shutil
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from sfmapp.errors import InputError, remedy
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 @contextmanager
@@ -30,6 +34,20 @@ def replaced_file(path: Path) -> Iterator[Path]:
             beside.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}", remedy(error)) from error
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all; raises as :func:`replaced_file`."""
+    with replaced_file(path) as beside:
+        beside.write_bytes(data)
+
+
+def write_array(path: Path, array: NDArray[Any]) -> None:
+    """Write an array as NumPy's file, whole or not at all; raises as :func:`replaced_file`."""
+    import numpy as np
+
+    with replaced_file(path) as beside, beside.open("wb") as stream:
+        np.save(stream, array, allow_pickle=False)
 
 
 @contextmanager

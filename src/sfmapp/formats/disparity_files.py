@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import InputError, remedy
-from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.atomic import write_array, write_bytes
 
 Disparity = NDArray[np.float32]
 
@@ -38,14 +38,10 @@ def write_disparity(path: str | Path, disparity: Disparity) -> None:
             f"{path}: KITTI's PNG holds disparities from 1/256 to 65535/256 pixels, found {low:g} to {high:g}",
             "Write a PFM or an NPY file.",
         )
-    with replaced_file(path) as beside:
-        if suffix == ".npy":
-            with beside.open("wb") as out:
-                np.save(out, values, allow_pickle=False)
-        elif suffix == ".pfm":
-            beside.write_bytes(_pfm(values))
-        else:
-            beside.write_bytes(_kitti(values))
+    if suffix == ".npy":
+        write_array(path, values)
+    else:
+        write_bytes(path, _pfm(values) if suffix == ".pfm" else _kitti(values))
 
 
 def read_disparity(path: str | Path) -> Disparity:

@@ -86,6 +86,25 @@ def natural_key(name: str) -> tuple[Any, ...]:
     return tuple((int(part), "") if i % 2 else (-1, part) for i, part in enumerate(parts)), name
 
 
+def position_of_name(name: str, names: Sequence[str], whose: str) -> int:
+    """Of an image by its name, or by the end of it where only one ends so.
+
+    Args:
+        whose: ``of`` what the images are, for the message.
+
+    Raises:
+        InputError: no image has that name, or several end so.
+    """
+    if name in names:
+        return names.index(name)
+    ending = [n for n, one in enumerate(names) if one.endswith("/" + name) or Path(one).stem == name]
+    if len(ending) == 1:
+        return ending[0]
+    some = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+    found = f"{len(ending)} that end so" if ending else f"none; it has {some}"
+    raise InputError(f"{name}: expected the name of one image {whose}, found {found}")
+
+
 def is_picture(path: Path) -> bool:
     """Whether a file is a picture by its ending; one without an ending, by its first bytes."""
     ending = path.suffix.lower()

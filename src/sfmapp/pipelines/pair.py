@@ -19,6 +19,7 @@ from sfmapp.formats.database import Database
 from sfmapp.images.folder import describe_images, load_images
 from sfmapp.images.image_set import ImageRecord
 from sfmapp.images.pixels import read_rgb
+from sfmapp.images.sources import position_of_name
 from sfmapp.matching.stage import MatchedPair, split_pairs
 from sfmapp.report.pair_html import PairReport, pair_page
 from sfmapp.twoview.story import Story, tell_story
@@ -135,7 +136,7 @@ def _of_workspace(
     )
     with Database(folder / "database.db", read_only=True) as database:
         cameras, every, whose = database.read_images()
-    i, j = sorted(_position(name, every, folder) for name in wanted)
+    i, j = sorted(position_of_name(name, every, f"of {folder}") for name in wanted)
     if i == j:
         raise InputError(f"{wanted[0]} and {wanted[1]} are one image of {folder}", "name two")
     pair = (every[i], every[j])
@@ -151,18 +152,6 @@ def _of_workspace(
             raise InputError(f"{reasons[0][0]}: expected a photograph in {root}, found: {reasons[0][1]}")
         first, second = (record for record in records if record is not None)
         return _tell(job, _Source((first, second), _with_model(folder, (views[0], views[1])), known, options))
-
-
-def _position(name: str, names: Sequence[str], folder: Path) -> int:
-    """Of an image by its name, or by the end of it where only one ends so."""
-    if name in names:
-        return names.index(name)
-    ending = [n for n, one in enumerate(names) if one.endswith("/" + name) or Path(one).stem == name]
-    if len(ending) == 1:
-        return ending[0]
-    some = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-    found = f"{len(ending)} that end so" if ending else f"none; it has {some}"
-    raise InputError(f"{name}: expected the name of one image of {folder}, found {found}")
 
 
 def _with_model(folder: Path, views: tuple[View, View]) -> tuple[View, View]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import NoReconstructionError, UsageError
 from sfmapp.events import Events
-from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.atomic import write_bytes
 from sfmapp.formats.colmap import MODEL_FILES
 from sfmapp.formats.gpano import Sphere, with_gpano
 from sfmapp.geometry import rigid3
@@ -189,8 +189,7 @@ def _frames_of(run: Run, video: str) -> Path:
         for before in folder.glob("*.png"):
             before.unlink()
         for frame in pick_frames(video, run.events):
-            with replaced_file(folder / f"{frame.name}.png") as beside:
-                beside.write_bytes(encode(frame.pixels, "png"))
+            write_bytes(folder / f"{frame.name}.png", encode(frame.pixels, "png"))
     workspace.finish(PICKING, run.usage.get(PICKING))
     run.save_first(workspace.save)
     return folder
@@ -299,8 +298,7 @@ def _write_picture(path: Path, drawn: StitchedPicture, layout: PictureLayout) ->
     data = encode(drawn.pixels, layout.format)
     if drawn.canvas.projection == "spherical":
         data = with_gpano(data, _sphere(drawn.canvas))
-    with replaced_file(path) as beside:
-        beside.write_bytes(data)
+    write_bytes(path, data)
 
 
 def _sphere(canvas: Canvas) -> Sphere:

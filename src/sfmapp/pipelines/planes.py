@@ -15,7 +15,7 @@ from sfmapp.calibration.one_view import HAND_SIGMA_PX
 from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
-from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.atomic import write_bytes
 from sfmapp.geometry.orientation import upright_pixels
 from sfmapp.geometry.rectangle import RectangleShape
 from sfmapp.images.folder import load_images
@@ -378,5 +378,4 @@ def _result_name(record: ImageRecord) -> str:
 
 
 def _write(job: Job, name: str, data: bytes) -> None:
-    with replaced_file(job.workspace.folder / name) as beside:
-        beside.write_bytes(data)
+    write_bytes(job.workspace.folder / name, data)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.features.extract import extract_features
-from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.atomic import write_bytes
 from sfmapp.images.folder import load_images
 from sfmapp.images.image_set import ImageRecord, ImageSet
 from sfmapp.images.pixels import read_rgb
@@ -148,8 +148,7 @@ def _told(
         )  # fmt: skip
         told = replace(told, new_view=view)
     with job.stage("files"):
-        with replaced_file(job.workspace.folder / PICTURE) as beside:
-            beside.write_bytes(encode(drawn.pixels, "jpeg"))
+        write_bytes(job.workspace.folder / PICTURE, encode(drawn.pixels, "jpeg"))
         recorded = record_transfer(job.workspace.recording, told, views, (*pictures, drawn.pixels))
         job.workspace.note(recording=FAILED if recorded.problem else WRITTEN)
         if recorded.problem:

@@ -29,7 +29,7 @@ from sfmapp.dense.photographs import Photographs, find_photographs
 from sfmapp.dense.undistort import resample
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
-from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.atomic import replaced_file, write_bytes
 from sfmapp.formats.colmap import MODEL_FILES, read_model
 from sfmapp.images.folder import load_images
 from sfmapp.images.image_set import ImageRecord
@@ -312,8 +312,7 @@ def _write_photographs(job: _Job) -> None:
 
 
 def _write(path: Path, data: bytes) -> None:
-    with replaced_file(path) as beside:
-        beside.write_bytes(data)
+    write_bytes(path, data)
 
 
 def _undistorted(record: ImageRecord, pictures: list[Undistortion]) -> Iterator[tuple[bytes, NDArray[np.bool_] | None]]:

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.atomic import write_bytes
 
 Array = NDArray[np.float64]
 Color = tuple[int, int, int]
@@ -108,8 +108,7 @@ class Drawing:
     def write_png(self, path: Path) -> None:
         """Raises InputError if the file cannot be written."""
         encoded = cv2.imencode(".png", self.pixels()[:, :, ::-1])[1]
-        with replaced_file(path) as beside:
-            beside.write_bytes(encoded.tobytes())
+        write_bytes(path, encoded.tobytes())
 
     def _fixed(self, points: Array | Sequence[Sequence[float]]) -> NDArray[np.int32]:
         # the pixel (0, 0) of OpenCV has its centre there, ours its corner

@@ -131,7 +131,7 @@ def prepare_pair(
             # the calibration says so: it is obeyed, and said
             left, right, is_swapped = right, left, True
             cameras = replace(cameras, rig=cameras.rig.reversed_pair())
-        draft = _drafted(left, right, _needed(cameras.rig))
+        draft = _drafted(left, right, cameras.rig)
     misalignment = None
     is_corrected = with_rows = False
     if draft.plan is not None and not is_projective:
@@ -157,11 +157,6 @@ def prepare_pair(
     if plan is not None and pair.geometry is not None:
         plan = replace(plan, geometry=pair.geometry)
     return PreparedPair(pair, plan, draft.matches, misalignment, report)
-
-
-def _needed(rig: Rig | None) -> Rig:
-    assert rig is not None
-    return rig
 
 
 def _drafted(left: Pixels, right: Pixels, rig: Rig | None) -> _Draft:

@@ -33,7 +33,7 @@ from sfmapp.camera.names import CameraModel
 from sfmapp.camera_files.photographs import Photograph, read_given_cameras
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
-from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.atomic import write_bytes
 from sfmapp.formats.known_points import read_known_points, read_marker_places, read_marks
 from sfmapp.images.folder import describe_images
 from sfmapp.images.image_set import ImageOptions, ImageRecord
@@ -376,7 +376,6 @@ def _tell(warnings: Sequence[str], events: Events) -> None:
 
 
 def _write(workspace: Workspace, picture: bytes, page: str, report: str) -> None:
-    with replaced_file(workspace.folder / PICTURE) as beside:
-        beside.write_bytes(picture)
+    write_bytes(workspace.folder / PICTURE, picture)
     workspace.write_text(PAGE, page)
     workspace.write_text(REPORT, report)

@@ -16,6 +16,7 @@ from sfmapp.formats.text_input import read_json_object
 from sfmapp.geometry import rigid3
 from sfmapp.georeference.world_frame import read_georeference
 from sfmapp.images.pixels import read_rgb
+from sfmapp.images.sources import position_of_name
 from sfmapp.pipelines.dense.source import find_source, is_of_model
 from sfmapp.pipelines.stereo.sources import PairSource
 from sfmapp.scene.reconstruction import Reconstruction
@@ -55,7 +56,9 @@ def pairs_of_model(
         model, where.images, options.images, is_upright=where.is_upright, threads=options.num_workers
     )
     if names is not None:
-        chosen = [(_place(names[0], found, source), _place(names[1], found, source))]
+        every = [record.name for record in found.records]
+        whose = f"with a pose of {os.fspath(source)}"
+        chosen = [(position_of_name(names[0], every, whose), position_of_name(names[1], every, whose))]
         if chosen[0][0] == chosen[0][1]:
             raise InputError(f"{names[0]} and {names[1]} are one image of {source}", "name two")
     else:
@@ -127,19 +130,6 @@ def _rig(model: Reconstruction, photographs: Photographs, pair: tuple[int, int],
     if leftmost and rigid3.center(second)[0] < 0.0:
         return _rig(model, photographs, pair[::-1])
     return Rig(tuple(photographs.cameras[one] for one in pair), np.array([rigid3.IDENTITY, second]))
-
-
-def _place(name: str, photographs: Photographs, source: str | os.PathLike[str]) -> int:
-    """Of a photograph by the name of its image, or by the end of it where only one ends so."""
-    names = [record.name for record in photographs.records]
-    if name in names:
-        return names.index(name)
-    ending = [n for n, one in enumerate(names) if one.endswith("/" + name) or Path(one).stem == name]
-    if len(ending) == 1:
-        return ending[0]
-    some = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-    found = f"{len(ending)} that end so" if ending else f"none; it has {some}"
-    raise InputError(f"{name}: expected the name of one image with a pose of {os.fspath(source)}, found {found}")
 
 
 def metre_sigma_of_run(run: Path) -> float | None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sfmapp.camera_files.rectified_writing import CAMERA_FILES, RectifiedCameras, write_rectified_files
-from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.atomic import write_array
 from sfmapp.formats.disparity_files import fits_kitti, write_disparity
 from sfmapp.formats.glb import write_glb
 from sfmapp.formats.ply import write_ply
@@ -53,8 +53,7 @@ def write_maps(folder: Path, found: DisparityMap, measured: MeasuredPair) -> Ite
         if array is None:
             path.unlink(missing_ok=True)  # of an earlier run with a baseline
             continue
-        with replaced_file(path) as beside, beside.open("wb") as stream:
-            np.save(stream, array, allow_pickle=False)
+        write_array(path, array)
         yield path
 
 

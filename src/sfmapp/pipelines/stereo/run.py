@@ -11,7 +11,7 @@ import numpy as np
 
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
-from sfmapp.formats.atomic import replaced_file
+from sfmapp.formats.atomic import write_bytes
 from sfmapp.images.rewrite import encode
 from sfmapp.images.video import is_video
 from sfmapp.pipelines.stereo.model_pairs import is_of_model, pairs_of_model
@@ -97,10 +97,10 @@ def stereo(
         told: list[StereoPairReport] = []
         failed: list[NamedReason] = []
         last: MatchedStereo | None = None
+        before: Moment | None = None
         for pair in pairs:
             try:
-                before = _moment(last) if last is not None and pair.is_frame else None
-                last, report = _do_pair(job, pair, turn, before)
+                last, report, before = _do_pair(job, pair, turn, before)
                 told.append(report)
             except InputError as error:
                 if total == 1:
@@ -171,7 +171,8 @@ def _sizes(cameras: PairCameras) -> tuple[tuple[int, int], ...]:
 
 def _do_pair(
     job: Job, source: PairSource, turn: Misalignment | None, before: Moment | None
-) -> tuple[MatchedStereo, StereoPairReport]:
+) -> tuple[MatchedStereo, StereoPairReport, Moment | None]:
+    """The pair, what is told of it, and what is kept of a frame until the next."""
     with job.stage("rectification"):
         left, right = source.read()
         least = job.options.stereo.min_disparity
@@ -185,7 +186,8 @@ def _do_pair(
         disparity = match_pair(prepared.pair, job.options.stereo, matches=prepared.matches)
     with job.stage("errors"):
         done = MatchedStereo(source, prepared, disparity, measure_pair(prepared.pair, disparity, threads=job.threads))
-        consistency = None if before is None else compare_moments(before, _moment(done))
+        now = _moment(done) if source.is_frame else None
+        consistency = None if before is None or now is None else compare_moments(before, now)
     with job.stage("files"):
         files = [
             str(path.relative_to(job.workspace.folder)) for path in _write(job.workspace.folder / source.name, done)
@@ -196,10 +198,11 @@ def _do_pair(
         consistency=consistency,
     )  # fmt: skip
     with job.stage("page"):
-        _write_page(job.workspace.folder / source.name / PAGE, report, done)
+        page = stereo_page(report, prepared.pair, disparity, done.measured)
+        write_bytes(job.workspace.folder / source.name / PAGE, page.encode())
     if not source.name:  # of a pair alone; thousands of them would take longer to draw than to match
         _record(job, report, done)
-    return done, report
+    return done, report, now
 
 
 def _moment(done: MatchedStereo) -> Moment:
@@ -239,18 +242,8 @@ def _write(folder: Path, done: MatchedStereo) -> Iterator[Path]:
     """Write the files of a pair; gives the path of each."""
     pair = done.prepared.pair
     for name, picture in (("left.png", pair.left), ("right.png", pair.right)):
-        yield _write_bytes(folder / name, encode(picture, "png"))
+        write_bytes(folder / name, encode(picture, "png"))
+        yield folder / name
     yield from write_cameras(folder, done.prepared)
     yield from write_maps(folder, done.disparity, done.measured)
     yield from write_models(folder, pair, done.disparity, done.measured)
-
-
-def _write_page(path: Path, report: StereoPairReport, done: MatchedStereo) -> None:
-    """The page of a pair, whole or not at all."""
-    _write_bytes(path, stereo_page(report, done.prepared.pair, done.disparity, done.measured).encode())
-
-
-def _write_bytes(path: Path, data: bytes) -> Path:
-    with replaced_file(path) as beside:
-        beside.write_bytes(data)
-    return path
