@@ -42,6 +42,18 @@ def solve_damped(h: Array, g: Array, damping: float, factor: Array, step: Array)
 
 
 @numba.njit(cache=True, nogil=True)
+def judge_step(cost: float, new_cost: float, damping: float) -> tuple[bool, bool, float]:
+    """Whether a step is taken, whether it was the last, and the damping of the next.
+
+    The last is one that gains less than a millionth, or that gains nothing although it was damped a thousandfold.
+    """
+    if not new_cost < cost:
+        damping *= 10.0
+        return False, damping > 1e3, damping
+    return True, cost - new_cost < 1e-6 * cost, max(damping * 0.1, 1e-9)
+
+
+@numba.njit(cache=True, nogil=True)
 def turn_columns(w: Array, columns: Array, out: Array) -> None:
     """exp(w) times each column of a matrix (3, K), by Rodrigues' formula."""
     wx, wy, wz = w[0], w[1], w[2]

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.geometry.damped import solve_damped, turn_columns
+from sfmapp.geometry.damped import judge_step, solve_damped, turn_columns
 from sfmapp.geometry.dlt import normalizing
 from sfmapp.geometry.epipolar import contiguous, sampson_error, sampson_errors, truncated_sums
 from sfmapp.geometry.fit import CAUCHY_SIGMAS, HEAVY_TAILS, robust_sigma
@@ -71,15 +71,10 @@ def _refine(states: Array, a: Array, b: Array, scale2: float, max_iterations: in
             states[new, 6, 0] = states[now, 6, 0] + step[6]
             _matrix_and_slopes(states[new], e)
             new_cost = sampson_normal_equations(7, e, a, b, scale2, h[new], g[new])
-        if not new_cost < cost:
-            damping *= 10.0
-            if damping > 1e3:
-                break
-            continue
-        has_converged = cost - new_cost < 1e-6 * cost
-        now, cost = new, new_cost
-        damping = max(damping * 0.1, 1e-9)
-        if has_converged:
+        is_better, is_last, damping = judge_step(cost, new_cost, damping)
+        if is_better:
+            now, cost = new, new_cost
+        if is_last:
             break
     if now == 1:
         copy_into(states[0], states[1])

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.geometry import rigid3
-from sfmapp.geometry.damped import solve_damped
+from sfmapp.geometry.damped import judge_step, solve_damped
 from sfmapp.geometry.epipolar import choose_in_front, ray_depths, sampson_errors
 from sfmapp.geometry.relative_pose import sampson_normal_equations
 from sfmapp.simd.copying import copy_into
@@ -207,16 +207,11 @@ def _refine(basis: Array, xn1: Array, xn2: Array, scale2: float, angles: Array) 
             trial[0], trial[1] = angles[0] + step[0], angles[1] + step[1]
             _fill_essential(basis, trial[0], trial[1], e)
             new_cost = sampson_normal_equations(2, e, xn1, xn2, scale2, h[new], g[new])
-        if not new_cost < cost:
-            damping *= 10.0
-            if damping > 1e3:
-                return
-            continue
-        has_converged = cost - new_cost < 1e-6 * cost
-        copy_into(angles, trial)
-        now, cost = new, new_cost
-        damping = max(damping * 0.1, 1e-9)
-        if has_converged:
+        is_better, is_last, damping = judge_step(cost, new_cost, damping)
+        if is_better:
+            copy_into(angles, trial)
+            now, cost = new, new_cost
+        if is_last:
             return
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.geometry import rigid3
-from sfmapp.geometry.damped import solve_damped, turn_columns
+from sfmapp.geometry.damped import judge_step, solve_damped, turn_columns
 from sfmapp.geometry.epipolar import contiguous, depths_of_rays, ray_sampson_error, sampson_error
 from sfmapp.simd.copying import copy_into
 
@@ -188,15 +188,10 @@ def _refine_pose(rotations: Array, ts: Array, xn1: Array, xn2: Array, scale2: fl
             _move_pose(rotations[now], ts[now], tangent[now], step, rotations[new], ts[new])
             _tangent_plane(ts[new], tangent[new])
             new_cost = _linearize_pose(rotations[new], ts[new], xn1, xn2, scale2, tangent[new], h[new], g[new])
-        if not new_cost < cost:
-            damping *= 10.0
-            if damping > 1e3:
-                break
-            continue
-        has_converged = cost - new_cost < 1e-6 * cost
-        now, cost = new, new_cost
-        damping = max(damping * 0.1, 1e-9)
-        if has_converged:
+        is_better, is_last, damping = judge_step(cost, new_cost, damping)
+        if is_better:
+            now, cost = new, new_cost
+        if is_last:
             break
     return now
 
