@@ -42,11 +42,7 @@ class _RowModel(models.PrimitiveModel):  # type: ignore[misc]
 @intrinsic
 def load(typingctx: Any, base: Any, index: Any) -> Any:
     """``base[index : index + 16]`` of a pointer to float32."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return llvm.load(builder, builder.gep(args[0], [args[1]]), FLOATS, 4)
-
-    return row(base, types.intp), codegen
+    return row(base, types.intp), llvm.loading(FLOATS, 4)
 
 
 @intrinsic
@@ -63,22 +59,13 @@ def load_bytes(typingctx: Any, base: Any, index: Any) -> Any:
 @intrinsic
 def store(typingctx: Any, base: Any, index: Any, value: Any) -> Any:
     """``base[index : index + 16] = value`` of a pointer to float32."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        llvm.store(builder, args[2], builder.gep(args[0], [args[1]]), 4)
-        return context.get_dummy_value()
-
-    return types.void(base, types.intp, value), codegen
+    return types.void(base, types.intp, value), llvm.storing(4)
 
 
 @intrinsic
 def splat(typingctx: Any, scalar: Any) -> Any:
     """The same float32 in all lanes."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return llvm.splat(builder, args[0], FLOATS)
-
-    return row(types.float32), codegen
+    return row(types.float32), llvm.splatting(FLOATS)
 
 
 @intrinsic

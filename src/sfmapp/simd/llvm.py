@@ -5,6 +5,7 @@ Each function here adds instructions to the code that an intrinsic generates; no
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
@@ -13,7 +14,7 @@ from numba.core import cgutils
 
 BYTE, I16, I32, I64 = ir.IntType(8), ir.IntType(16), ir.IntType(32), ir.IntType(64)
 F32, F64 = ir.FloatType(), ir.DoubleType()
-_SUFFIXES = {F32: "f32", F64: "f64", I32: "i32"}
+_SUFFIXES = {F32: "f32", F64: "f64", BYTE: "i8", I32: "i32"}
 
 
 def int64(value: int) -> Any:
@@ -61,3 +62,31 @@ def intrinsic(builder: Any, name: str, kind: Any, args: list[Any]) -> Any:
     full = f"llvm.{name}.v{kind.count}{_SUFFIXES[kind.element]}"
     declared = ir.FunctionType(kind, [kind] * len(args))
     return builder.call(cgutils.get_or_insert_function(builder.module, declared, full), args)
+
+
+def loading(kind: Any, align: int) -> Callable[..., Any]:
+    """Code of an intrinsic (base, index) that loads a vector of a kind from there on."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return load(builder, builder.gep(args[0], [args[1]]), kind, align)
+
+    return codegen
+
+
+def storing(align: int) -> Callable[..., Any]:
+    """Code of an intrinsic (base, index, vector) that stores it from there on."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        store(builder, args[2], builder.gep(args[0], [args[1]]), align)
+        return context.get_dummy_value()
+
+    return codegen
+
+
+def splatting(kind: Any) -> Callable[..., Any]:
+    """Code of an intrinsic (scalar) that makes all lanes of a vector of a kind."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return splat(builder, args[0], kind)
+
+    return codegen

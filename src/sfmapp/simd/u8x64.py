@@ -44,7 +44,7 @@ def _call(builder: Any, name: str, result: Any, args: list[Any]) -> Any:
 
 def _binary(name: str) -> Callable[..., Any]:
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _call(builder, f"llvm.{name}.v{WIDTH}i8", _BYTES, list(args))
+        return llvm.intrinsic(builder, name, _BYTES, list(args))
 
     return codegen
 
@@ -52,32 +52,19 @@ def _binary(name: str) -> Callable[..., Any]:
 @intrinsic
 def load(typingctx: Any, base: Any, index: Any) -> Any:
     """``base[index : index + 64]`` of a pointer to uint8."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return llvm.load(builder, builder.gep(args[0], [args[1]]), _BYTES, 1)
-
-    return vector(base, types.intp), codegen
+    return vector(base, types.intp), llvm.loading(_BYTES, 1)
 
 
 @intrinsic
 def store(typingctx: Any, base: Any, index: Any, value: Any) -> Any:
     """``base[index : index + 64] = value`` of a pointer to uint8."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        llvm.store(builder, args[2], builder.gep(args[0], [args[1]]), 1)
-        return context.get_dummy_value()
-
-    return types.void(base, types.intp, value), codegen
+    return types.void(base, types.intp, value), llvm.storing(1)
 
 
 @intrinsic
 def splat(typingctx: Any, scalar: Any) -> Any:
     """The same byte in all lanes."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return llvm.splat(builder, args[0], _BYTES)
-
-    return vector(types.uint8), codegen
+    return vector(types.uint8), llvm.splatting(_BYTES)
 
 
 @intrinsic
