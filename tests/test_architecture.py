@@ -27,6 +27,7 @@ FLOORS = (
     ("workspace",),
     ("report", "viewer"),
     ("odometry",),
+    ("carve",),
     ("surface",),
     ("stereo",),
     ("dense",),

@@ -1,0 +1,1 @@
+"""Volumes out of photographs from all sides: silhouettes, shadows, colours, planes."""

@@ -1,0 +1,103 @@
+"""A volume as an octree: cells that are wholly inside, and finest cells that its surface passes through."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Codes = NDArray[np.uint64]
+
+# levels whose codes fit: three bits a level, in 63 bits
+MAX_DEPTH = 21
+
+
+@dataclass(frozen=True)
+class Octree:
+    """A solid in a cube. What is in neither list is empty.
+
+    A cell of level l is one of 2**l along each side; its code interleaves the bits of its place, x in bit 0, y in bit
+    1, z in bit 2 (Morton, 1966), so that the code of its parent is its own shifted right by three.
+
+    Attributes:
+        low: (3,) corner of the cube where all coordinates are least, world.
+        side: of the cube, units of the world.
+        depth: level of the finest cells.
+        full: for each level 0 to ``depth`` the codes (N,) uint64, ascending, of cells wholly inside whose parents are
+            not.
+        surface: (N,) uint64 ascending codes of finest cells that are neither wholly inside nor wholly outside.
+    """
+
+    low: Array
+    side: float
+    depth: int
+    full: tuple[Codes, ...]
+    surface: Codes
+
+    @property
+    def cell(self) -> float:
+        """Side of a finest cell, units of the world."""
+        return self.side / 2.0**self.depth
+
+    def volume_bounds(self) -> tuple[float, float]:
+        """Volume without and with the cells at the surface, cubic units of the world."""
+        inner = sum(len(codes) * (self.side / 2.0**level) ** 3 for level, codes in enumerate(self.full))
+        return float(inner), float(inner + len(self.surface) * self.cell**3)
+
+    def centers(self, codes: Codes, level: int | None = None) -> Array:
+        """(N, 3) world places of the middles of cells of a level, by default the finest."""
+        level = self.depth if level is None else level
+        return np.asarray(self.low + (places_of(codes) + 0.5) * (self.side / 2.0**level))
+
+
+@numba.njit(cache=True, nogil=True)
+def spread_bits(v: np.uint64) -> np.uint64:
+    """The lowest 21 bits of a number with two zeros between each and the next."""
+    v = np.uint64(v) & np.uint64(0x1FFFFF)
+    v = (v | (v << np.uint64(32))) & np.uint64(0x1F00000000FFFF)
+    v = (v | (v << np.uint64(16))) & np.uint64(0x1F0000FF0000FF)
+    v = (v | (v << np.uint64(8))) & np.uint64(0x100F00F00F00F00F)
+    v = (v | (v << np.uint64(4))) & np.uint64(0x10C30C30C30C30C3)
+    return (v | (v << np.uint64(2))) & np.uint64(0x1249249249249249)
+
+
+@numba.njit(cache=True, nogil=True)
+def gather_bits(v: np.uint64) -> np.uint64:
+    """Every third bit of a number, the inverse of :func:`spread_bits`."""
+    v = np.uint64(v) & np.uint64(0x1249249249249249)
+    v = (v ^ (v >> np.uint64(2))) & np.uint64(0x10C30C30C30C30C3)
+    v = (v ^ (v >> np.uint64(4))) & np.uint64(0x100F00F00F00F00F)
+    v = (v ^ (v >> np.uint64(8))) & np.uint64(0x1F0000FF0000FF)
+    v = (v ^ (v >> np.uint64(16))) & np.uint64(0x1F00000000FFFF)
+    return (v ^ (v >> np.uint64(32))) & np.uint64(0x1FFFFF)
+
+
+@numba.njit(cache=True, nogil=True)
+def _codes(places: NDArray[np.int64], out: Codes) -> None:
+    for i in range(places.shape[0]):
+        x, y, z = np.uint64(places[i, 0]), np.uint64(places[i, 1]), np.uint64(places[i, 2])
+        out[i] = spread_bits(x) | (spread_bits(y) << np.uint64(1)) | (spread_bits(z) << np.uint64(2))
+
+
+@numba.njit(cache=True, nogil=True)
+def _places(codes: Codes, out: NDArray[np.int64]) -> None:
+    for i in range(codes.shape[0]):
+        for axis in range(3):
+            out[i, axis] = np.int64(gather_bits(codes[i] >> np.uint64(axis)))
+
+
+def codes_of(places: NDArray[np.integer]) -> Codes:
+    """Codes (N,) of cells at places (N, 3), counted from 0 along each axis."""
+    out = np.empty(len(places), np.uint64)
+    _codes(np.ascontiguousarray(places, np.int64), out)
+    return out
+
+
+def places_of(codes: Codes) -> NDArray[np.int64]:
+    """Places (N, 3) of cells with codes (N,)."""
+    out = np.empty((len(codes), 3), np.int64)
+    _places(np.ascontiguousarray(codes, np.uint64), out)
+    return out

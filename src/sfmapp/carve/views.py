@@ -1,0 +1,107 @@
+"""Cameras that carve: a 3x4 matrix and a lens each, so that matrices which may not be decomposed are cameras too."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sfmapp.camera import lens
+from sfmapp.camera.camera import Camera
+from sfmapp.errors import InputError
+from sfmapp.geometry import rigid3
+
+Array = NDArray[np.float64]
+
+# a view as a row for kernels: twelve numbers of the 3x4 matrix, row by row, and the lens
+ROW = 12 + lens.ROW
+# smallest singular value of the left 3x3 part of a camera matrix against its largest, below which it has no centre
+_FLAT = 1e-12
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph's camera: pixel = lens(outer @ (X, 1)).
+
+    A calibrated camera has its pose in ``outer`` and its intrinsics in ``lens_row``. A projection matrix that is known
+    only as a whole stands in ``outer`` as it is, before a lens that changes nothing.
+
+    Attributes:
+        name: of the photograph.
+        width, height: pixels.
+        outer: (3, 4) from the world into the frame that the lens takes; its third row gives the depth, positive in
+            front of the camera, in units of the world.
+        lens_row: (17,) of :mod:`sfmapp.camera.lens`.
+        camera, cam_from_world: what the two were made of, pose (7,); None for a matrix.
+    """
+
+    name: str
+    width: int
+    height: int
+    outer: Array
+    lens_row: Array
+    camera: Camera | None = None
+    cam_from_world: Array | None = None
+
+    @cached_property
+    def row(self) -> Array:
+        """(29,) float64, what kernels take."""
+        return np.concatenate([self.outer.ravel(), self.lens_row])
+
+    @cached_property
+    def center(self) -> Array:
+        """(3,) place of the camera, world."""
+        return np.asarray(-np.linalg.solve(self.outer[:, :3], self.outer[:, 3]))
+
+    @cached_property
+    def axis(self) -> Array:
+        """(3,) unit direction of looking, world."""
+        return np.asarray(self.outer[2, :3] / np.linalg.norm(self.outer[2, :3]))
+
+
+def view_of_camera(name: str, camera: Camera, cam_from_world: ArrayLike) -> View:
+    """The view of a calibrated camera with a pose (7,), x y z w and translation."""
+    pose = np.asarray(cam_from_world, np.float64)
+    outer = np.column_stack([rigid3.rotation_matrix(pose), pose[4:]])
+    return View(name, camera.width, camera.height, outer, camera.canonical, camera, pose)
+
+
+def view_of_matrix(name: str, matrix: ArrayLike, width: int, height: int) -> View:
+    """The view of a projection matrix (3, 4) to pixels whose first has its centre at (0.5, 0.5), used as it is.
+
+    Its scale and sign are free; they are set so that depths are distances along the axis, positive in front of the
+    camera (Hartley and Zisserman, "Multiple View Geometry", 2003, eq. 6.15).
+
+    Raises:
+        InputError: the matrix has another shape, is not finite, or has its centre at infinity.
+    """
+    p = np.array(matrix, np.float64)
+    if p.shape != (3, 4) or not np.isfinite(p).all():
+        raise InputError(f"{name}: expected a 3x4 projection matrix of finite numbers, found shape {p.shape}")
+    sizes = np.linalg.svd(p[:, :3], compute_uv=False)
+    if sizes[-1] <= _FLAT * sizes[0]:
+        raise InputError(f"{name}: its projection matrix has no finite centre", "parallel projections cannot carve yet")
+    p *= np.sign(np.linalg.det(p[:, :3])) / np.linalg.norm(p[2, :3])
+    plain = np.zeros(lens.ROW)
+    plain[:2] = 1.0
+    return View(name, width, height, p, plain)
+
+
+@numba.njit(cache=True, nogil=True)
+def project_point(row: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Pixel (u, v) and depth of a world point in the view of a row (29,); NaN pixels where the lens does not look."""
+    a = row[0] * x + row[1] * y + row[2] * z + row[3]
+    b = row[4] * x + row[5] * y + row[6] * z + row[7]
+    c = row[8] * x + row[9] * y + row[10] * z + row[11]
+    u, v = lens.project(row[12:], a, b, c)
+    return u, v, c
+
+
+@numba.njit(cache=True, nogil=True)
+def project_points(row: Array, xyz: Array, out: Array) -> None:
+    """Pixels and depths (N, 3) of world points (N, 3), see :func:`project_point`, into ``out``."""
+    for i in range(xyz.shape[0]):
+        out[i, 0], out[i, 1], out[i, 2] = project_point(row, xyz[i, 0], xyz[i, 1], xyz[i, 2])
