@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from carving_scenes import around, ball, pixel_centers, silhouette_of
 from sfmapp.carve.octree import Octree, codes_of, places_of
-from sfmapp.carve.views import project_points, view_of_matrix
+from sfmapp.carve.views import project_points, view_of_matrix, views_of_matrices
 from sfmapp.errors import InputError
 
 
@@ -56,3 +56,14 @@ def test_volume_lies_between_its_bounds() -> None:
     tree = Octree(np.zeros(3), 2.0, 2, full, np.array([9, 10], np.uint64))
     assert tree.volume_bounds() == pytest.approx((2.125, 2.375))
     assert tree.centers(tree.surface) == pytest.approx(np.array([[1.75, 0.25, 0.25], [1.25, 0.75, 0.25]]))
+
+
+def test_matrices_of_a_mirrored_world_look_ahead() -> None:
+    views = around(8)
+    mirror = np.diag([1.0, 1.0, -1.0, 1.0])
+    matrices = np.array([view.camera.k_matrix @ view.outer @ mirror for view in views if view.camera is not None])
+    out = np.empty((1, 3))
+    for sign in (1.0, -1.0):
+        for view in views_of_matrices([v.name for v in views], sign * matrices, [(v.width, v.height) for v in views]):
+            project_points(view.row, np.zeros((1, 3)), out)
+            assert out[0] == pytest.approx([80.0, 60.0, 5.0])

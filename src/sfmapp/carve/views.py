@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numba
@@ -69,11 +70,32 @@ def view_of_camera(name: str, camera: Camera, cam_from_world: ArrayLike) -> View
     return View(name, camera.width, camera.height, outer, camera.canonical, camera, pose)
 
 
+def views_of_matrices(names: Sequence[str], matrices: ArrayLike, sizes: Sequence[tuple[int, int]]) -> list[View]:
+    """The views of projection matrices (V, 3, 4) of one object to pictures of some sizes (width, height).
+
+    The sign of a matrix tells front from behind only in a world that is not mirrored, and worlds of matrices often are
+    (a turntable's that turns the other way): what the middles of most pictures look at is taken to be in front.
+
+    Raises:
+        InputError: as :func:`view_of_matrix`.
+    """
+    given = np.asarray(matrices, np.float64)
+    views = [view_of_matrix(name, p, *size) for name, p, size in zip(names, given, sizes, strict=True)]
+    rays = np.array([np.linalg.solve(v.outer[:, :3], [0.5 * v.width, 0.5 * v.height, 1.0]) for v in views])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None]
+    centers = np.array([view.center for view in views])
+    # the place that is nearest to all of these lines
+    target = np.linalg.lstsq(across.sum(axis=0), np.einsum("vij,vj->i", across, centers), rcond=None)[0]
+    behind = np.einsum("vc,vc->v", [view.axis for view in views], target - centers) < 0.0
+    return [replace(v, outer=-v.outer) for v in views] if behind.sum() > 0.5 * len(views) else views
+
+
 def view_of_matrix(name: str, matrix: ArrayLike, width: int, height: int) -> View:
     """The view of a projection matrix (3, 4) to pixels whose first has its centre at (0.5, 0.5), used as it is.
 
     Its scale and sign are free; they are set so that depths are distances along the axis, positive in front of the
-    camera (Hartley and Zisserman, "Multiple View Geometry", 2003, eq. 6.15).
+    camera if the world is not mirrored (Hartley and Zisserman, "Multiple View Geometry", 2003, eq. 6.15).
 
     Raises:
         InputError: the matrix has another shape, is not finite, or has its centre at infinity.

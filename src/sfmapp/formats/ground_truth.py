@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -16,6 +17,7 @@ from sfmapp.errors import InputError
 from sfmapp.evaluation.poses import match_names
 from sfmapp.formats.colmap import has_model, read_model_poses
 from sfmapp.formats.colmap_model import checked_camera
+from sfmapp.formats.middlebury_multiview import find_middlebury, read_middlebury
 from sfmapp.formats.nerfstudio import read_nerfstudio_poses
 from sfmapp.formats.text_input import finite_array, nearest_rotation, read_json_object
 from sfmapp.formats.trajectory_input import read_tum
@@ -45,7 +47,8 @@ class GroundTruth:
     def for_images(self, image_names: Sequence[str]) -> GroundTruth:
         """The same with the names of our images, where they are found; other entries keep theirs.
 
-        Names are matched in full, then by file name, then without the suffix, then as numbers (timestamps).
+        Names are matched in full, then by file name, then without the suffix, then as numbers (timestamps); where all
+        this finds nothing, by the whole number that a name ends in (``00003`` and ``mask_00003.png``).
 
         Raises:
             InputError: not a single image is found.
@@ -57,6 +60,8 @@ class GroundTruth:
             if not math.isnan(number) and number in number_of and number_of[number] not in index:
                 index[k] = number_of[number]
         if not (index >= 0).any():
+            index = _by_last_number(image_names, self.names)
+        if not (index >= 0).any():
             raise InputError(
                 f"{self.path}: expected cameras of images such as {', '.join(image_names[:3])}; found "
                 f"{', '.join(self.names[:3]) or 'none'}: no name fits",
@@ -64,6 +69,24 @@ class GroundTruth:
             )
         names = [image_names[i] if i >= 0 else name for i, name in zip(index, self.names, strict=True)]
         return replace(self, names=tuple(names))
+
+
+def _by_last_number(names: Sequence[str], reference_names: Sequence[str]) -> NDArray[np.int64]:
+    """Positions in ``names`` of reference names, by the digits that they end in; -1 where they are not unique."""
+
+    def places(of: Sequence[str]) -> dict[int, list[int]]:
+        found: dict[int, list[int]] = {}
+        for i, name in enumerate(of):
+            if match := re.search(r"(\d+)\D*$", PurePosixPath(name).stem):
+                found.setdefault(int(match[1]), []).append(i)
+        return found
+
+    ours, theirs = places(names), places(reference_names)
+    index = np.full(len(reference_names), -1, np.int64)
+    for number, of in theirs.items():
+        if len(of) == len(ours.get(number, ())) == 1:
+            index[of[0]] = ours[number][0]
+    return index
 
 
 def _number(text: str) -> float:
@@ -74,8 +97,8 @@ def _number(text: str) -> float:
 
 
 def read_ground_truth(path: str | Path) -> GroundTruth:
-    """Read reference cameras: a COLMAP model, ``cameras.json``, ``transforms.json``, a folder with one of them, or a
-    trajectory.
+    """Read reference cameras: a COLMAP model, ``cameras.json``, ``transforms.json``, Middlebury's ``NAME_par.txt``, a
+    folder with one of them, or a trajectory.
 
     ``cameras.json`` holds a list ``cameras`` of ``file``, ``R_w2c``, ``t_w2c`` (``x_cam = R X + t``), ``K`` and
     ``dist`` (k1, k2, p1, p2 or null), with pixel centres at whole numbers as OpenCV has them: half a pixel is added to
@@ -87,11 +110,13 @@ def read_ground_truth(path: str | Path) -> GroundTruth:
     path = Path(path)
     if path.is_dir():
         inside = [path / name for name in _INSIDE if has_model(path / name) or (path / name).is_file()]
-        path = next(iter(inside), path)
+        path = next(iter(inside), find_middlebury(path) or path)
     if path.is_dir():
         return _ground_truth(path, *read_model_poses(path))
     if not path.exists():
         raise InputError(f"{path}: expected a COLMAP model, cameras.json or TUM trajectory, found nothing")
+    if path.name.endswith("_par.txt"):
+        return _ground_truth(path, *read_middlebury(path))
     if path.suffix.lower() != ".json":
         names, poses = read_tum(path)
         if not names:

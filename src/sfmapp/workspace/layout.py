@@ -6,6 +6,7 @@ from sfmapp.images.products import FORMAT_NAME, MANIFEST
 
 __all__ = [
     "CALIBRATE",
+    "CARVE",
     "DENSE",
     "FORMAT",
     "LOCATE",
@@ -32,7 +33,7 @@ FORMAT = f"{FORMAT_NAME} 1"
 RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "refine", "dense", "undistort"
 CALIBRATE, LOCATE, PAIR, PANORAMA = "calibrate", "locate", "pair", "panorama"
 TRANSFER, UNCALIBRATED = "transfer", "uncalibrated"
-WARP, RECTIFY, STEREO = "warp", "rectify", "stereo"
+WARP, RECTIFY, STEREO, CARVE = "warp", "rectify", "stereo", "carve"
 # a report for programs, and the page for people beside it
 LOCK, REPORT, PAGE = ".lock", "report.json", "report.html"
 # where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0

@@ -1,0 +1,1 @@
+"""Photographs from all sides to a closed volume."""
