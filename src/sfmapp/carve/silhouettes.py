@@ -1,11 +1,60 @@
-"""What a photograph says of where the object is: the signed distance of each pixel to its outline."""
+"""What a photograph says of where the object is: the signed distance of each pixel to its outline.
+
+:func:`find_silhouettes` takes what there is: an alpha channel, mask files, photographs that are masks themselves, or
+the background, whose colours are learned from all photographs together.
+"""
 
 from __future__ import annotations
 
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sfmapp.carve.backgrounds import MAX_LEARNED, ColorModel, learn_colors, object_mask
+from sfmapp.carve.masks_report import MasksReport, PhotographMask
+from sfmapp.carve.outlines import Coverage, coverage_of_mask, refined_coverage, signed_distance
+from sfmapp.errors import InputError
+from sfmapp.images.pixels import read_mask_coverage, read_rgb, read_with_alpha
+from sfmapp.option_checks import check_options
+
+if TYPE_CHECKING:
+    from sfmapp.carve.views import View
+    from sfmapp.events import Events
+    from sfmapp.images.image_set import ImageRecord, ImageSet
+
+STAGE = "masks"
+T = TypeVar("T")
+
+# standard deviations of outlines against exact ones: tests/test_carve_outlines.py
+_SIGMA_PX = {"alpha": 0.1, "mask": 0.2, "background": 0.3}
+# more of the edge of the picture than this inside, and more than of the whole: the mask is the background's
+_INVERTED = 0.5
+# what is seen of the object is at least this share of a photograph, for outlines to mean anything
+_LEAST_SHARE = 1e-5
+# share of pixels that are black or white to the last level, from which on a photograph is a mask itself
+_TWO_VALUED = 0.98
+_NAMES_SHOWN = 3
+
+
+@dataclass(frozen=True)
+class MaskOptions:
+    """Options of the stage ``masks``.
+
+    Attributes:
+        mask_source: Where the object is told from: alpha, mask files, or the colours of the background; auto takes the
+            first that is there.
+    """
+
+    mask_source: Literal["auto", "alpha", "mask", "background"] = "auto"
+
+    def __post_init__(self) -> None:
+        check_options("masks", self, {})
 
 
 @dataclass(frozen=True)
@@ -32,3 +81,201 @@ class Silhouette:
     def inside(self) -> NDArray[np.bool_]:
         """(H, W) pixels whose centre shows the object."""
         return np.asarray(self.distance > 0.0)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What was found in one photograph: coverage (H, W), what told it, and how probably it is right."""
+
+    coverage: Coverage
+    source: str
+    confidence: float
+
+
+def find_silhouettes(
+    images: ImageSet,
+    views: Sequence[View] | None,
+    options: MaskOptions,
+    events: Events,
+    *,
+    threads: int | None = None,
+) -> tuple[list[Silhouette], MasksReport]:
+    """The object's silhouette in each photograph.
+
+    Args:
+        images: the photographs, with their mask files.
+        views: their cameras, in the same order; None: silhouettes are not compared with each other.
+        options: see :class:`MaskOptions`.
+        events: told of progress, of what was taken, and of silhouettes that cannot be right.
+        threads: photographs at a time; the result does not depend on it.
+
+    Returns:
+        Silhouettes in the order of the photographs, and the report. One that is empty, full or inverted is known
+        nowhere, so that it carves nothing, and the report says so.
+
+    Raises:
+        InputError: a photograph or a mask cannot be read, what was asked for is not there, or no silhouette is usable.
+    """
+    start = time.monotonic()
+    workers = threads or min(8, os.cpu_count() or 1)
+    records = images.images
+    if not records:
+        raise InputError("silhouettes: expected photographs, found none")
+    events.started(STAGE, f"silhouettes in {len(records)} photographs", total=len(records))
+    source = _choose_source(records, options)
+    model = _learn(records, source, workers, events)
+
+    def work(record: ImageRecord) -> tuple[Silhouette, PhotographMask]:
+        return _with_problem(record, _find(record, source, model))
+
+    found = _each(work, records, workers, lambda record: events.advanced(STAGE, message=record.name))
+    silhouettes, entries = [each for each, _ in found], [entry for _, entry in found]
+    warnings = _warn(entries, events)
+    report = MasksReport(
+        masks=entries, color_error=None if model is None else model.error, warnings=warnings,
+        wall_s=round(time.monotonic() - start, 3),
+    )  # fmt: skip
+    events.finished(STAGE, f"{len(entries)} silhouettes by {source}", **report)
+    return silhouettes, report
+
+
+def _each(
+    work: Callable[[ImageRecord], T], records: Sequence[ImageRecord], workers: int, done: Callable[[ImageRecord], None]
+) -> list[T]:
+    """Results in the order of the photographs, in several threads."""
+    with ThreadPoolExecutor(max(1, workers)) as pool:
+        jobs = [pool.submit(work, record) for record in records]
+        results = []
+        try:
+            for record, job in zip(records, jobs, strict=True):
+                results.append(job.result())
+                done(record)
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    return results
+
+
+def _choose_source(records: Sequence[ImageRecord], options: MaskOptions) -> str:
+    """What tells the object, for all photographs alike."""
+    if options.mask_source != "auto":
+        return options.mask_source
+    if any(_has_mask(record) for record in records):
+        return "mask"
+    alphas = [read_with_alpha(record)[1] for record in _spread(records, 3) if record.has_alpha]
+    if any(alpha is not None for alpha in alphas):
+        return "alpha"
+    if all(is_mask(read_rgb(record)) for record in _spread(records, 3)):
+        return "picture"
+    return "background"
+
+
+def _has_mask(record: ImageRecord) -> bool:
+    return record.mask_path is not None or (record.source is not None and record.source.mask(record.name) is not None)
+
+
+def is_mask(picture: NDArray[np.uint8]) -> bool:
+    """Whether a photograph (H, W, 3) is a mask itself: grey, and nearly all of it black or white, with both in it."""
+    gray = picture[..., 0]
+    if (picture != gray[..., None]).any():
+        return False
+    white = int(gray.max())
+    num_black, num_white = np.count_nonzero(gray == 0), np.count_nonzero(gray == white)
+    return bool(min(num_black, num_white) > 0 and white > 0 and num_black + num_white >= _TWO_VALUED * gray.size)
+
+
+def _spread(records: Sequence[ImageRecord], num: int) -> list[ImageRecord]:
+    """So many of the photographs, evenly from first to last."""
+    picked = np.unique(np.linspace(0, len(records) - 1, min(num, len(records))).round().astype(int))
+    return [records[i] for i in picked]
+
+
+def _learn(records: Sequence[ImageRecord], source: str, workers: int, events: Events) -> ColorModel | None:
+    """Colours of object and background, where these are asked.
+
+    Raises:
+        InputError: nothing stands out of the background.
+    """
+    if source != "background":
+        return None
+    pictures = _each(read_rgb, _spread(records, MAX_LEARNED), workers, lambda record: events.raise_if_cancelled())
+    model = learn_colors(pictures)
+    if model is None:
+        raise InputError(
+            f"no object stands out of the background of {records[0].name} and {len(records) - 1} others",
+            "give masks (--mask-path), or photographs with an alpha channel",
+        )
+    events.decided(
+        STAGE, f"object and background by their colours, which overlap by {100 * model.error:.1f} %",
+        color_error=model.error, num_photographs=len(pictures),
+    )  # fmt: skip
+    return model
+
+
+def _find(record: ImageRecord, source: str, model: ColorModel | None) -> _Found | None:
+    """What the source says of a photograph; None if it says nothing."""
+    if source == "mask":
+        levels = read_mask_coverage(record)
+        return None if levels is None else _Found(_coverage(levels), "mask", 1.0)
+    if source == "picture":
+        levels = read_rgb(record)[..., 0]
+        return _Found(_coverage(np.where(levels >= max(1, levels.max() / 2), 255, 0).astype(np.uint8)), "mask", 1.0)
+    if source == "alpha":
+        _, alpha = read_with_alpha(record)
+        return None if alpha is None else _Found(_coverage(alpha), "alpha", 1.0)
+    assert model is not None
+    picture = read_rgb(record)
+    coverage = refined_coverage(picture, object_mask(picture, model))
+    return _Found(coverage, "background", float(np.clip(1.0 - model.error, 0.5, 1.0)))
+
+
+def _coverage(levels: NDArray[np.uint8]) -> Coverage:
+    """Shares of pixels in eight bits as coverage; those of whole pixels with their steps smoothed."""
+    if np.isin(levels, (0, levels.max())).all():
+        return coverage_of_mask(levels > 0)
+    return np.asarray(levels, np.float32) / np.float32(255.0)
+
+
+def _with_problem(record: ImageRecord, found: _Found | None) -> tuple[Silhouette, PhotographMask]:
+    """The silhouette of what was found, known nowhere if it cannot be right."""
+    if found is None:
+        found = _Found(np.zeros((record.height, record.width), np.float32), "none", 0.5)
+    inside = found.coverage > 0.5
+    edge = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])
+    share, border_share = float(inside.mean()), float(edge.mean())
+    problem = ""
+    if found.source == "none":
+        problem = "has no mask"
+    elif share < _LEAST_SHARE:
+        problem = "is empty"
+    elif share > 1.0 - _LEAST_SHARE:
+        problem = "is full"
+    elif border_share > _INVERTED and border_share > share:
+        problem = "is inverted: the object is what it leaves out"
+    silhouette = Silhouette(
+        signed_distance(found.coverage), np.zeros(inside.shape, bool) if problem else None,
+        0.5 if problem else found.confidence, _SIGMA_PX.get(found.source, 0.5), found.source,
+    )  # fmt: skip
+    entry = PhotographMask(
+        name=record.name, source=found.source, share=share, border_share=border_share,
+        confidence=silhouette.confidence, outline_sigma_px=silhouette.outline_sigma_px, problem=problem,
+    )  # fmt: skip
+    return silhouette, entry
+
+
+def _warn(entries: Sequence[PhotographMask], events: Events) -> list[str]:
+    """Name the silhouettes that carve nothing.
+
+    Raises:
+        InputError: none is left.
+    """
+    bad = [entry for entry in entries if entry.problem]
+    warnings = [f"the mask of {entry.name} {entry.problem}" for entry in bad]
+    if len(bad) == len(entries):
+        raise InputError(
+            f"no silhouette is usable: {'; '.join(warnings[:_NAMES_SHOWN])}",
+            "masks are white where the object is, and black elsewhere; `sfmapp masks` draws what is found",
+        )
+    for line in warnings:
+        events.warned(STAGE, f"{line}: it carves nothing")
+    return warnings

@@ -80,6 +80,17 @@ def read_rgb_and_gray(record: ImageRecord) -> tuple[Pixels, Pixels]:
     return as_rgb(color), as_gray(color)
 
 
+def read_with_alpha(record: ImageRecord) -> tuple[Pixels, Pixels | None]:
+    """(H, W, 3) uint8 colours as they are stored and the alpha channel (H, W) uint8, None where the file has none or
+    it says the same everywhere.
+
+    Raises:
+        InputError: as :func:`read_picture`.
+    """
+    color, alpha = _decode(record)
+    return as_rgb(color), None if _alpha_mask(alpha) is None else alpha
+
+
 def read_mask(record: ImageRecord) -> NDArray[np.bool_] | None:
     """(H, W) bool, True where the picture may be used, from its mask file and its alpha channel; None for everywhere.
 
@@ -248,12 +259,50 @@ def read_mask_file(record: ImageRecord) -> NDArray[np.bool_] | None:
     Raises:
         InputError: the mask cannot be read.
     """
+    levels = _mask_levels(record)
+    if levels is None:
+        return None
+    mask = (levels > 0).astype(np.uint8)
+    if mask.shape != (record.height, record.width):
+        import cv2
+
+        mask = cv2.resize(mask, (record.width, record.height), interpolation=cv2.INTER_NEAREST)
+    return mask.astype(bool)
+
+
+def read_mask_coverage(record: ImageRecord) -> Pixels | None:
+    """(H, W) uint8 share of each pixel that the mask file leaves open, 255 for all of it; None if there is no file.
+
+    Masks of two values are 0 and 255, whichever they are; those of another size are scaled, shares of pixels kept.
+
+    Raises:
+        InputError: the mask cannot be read.
+    """
+    levels = _mask_levels(record)
+    if levels is None:
+        return None
+    # what never comes to half of white has labels in it, and not shares
+    if levels.max(initial=0) < 128:
+        levels = np.where(levels > 0, 255, 0).astype(np.uint8)
+    if levels.shape != (record.height, record.width):
+        import cv2
+
+        shrinks = levels.shape[0] > record.height
+        method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        levels = cv2.resize(levels, (record.width, record.height), interpolation=method)
+    return levels
+
+
+def _mask_levels(record: ImageRecord) -> Pixels | None:
+    """(H, W) uint8 of the mask as its file has it, turned like the photograph, of its own size; None without a mask.
+
+    Raises:
+        InputError: the mask cannot be read.
+    """
     if record.source is not None:
         return _given_mask(record, record.source)
     if record.mask_path is None:
         return None
-    import cv2
-
     try:
         data = record.mask_path.read_bytes()
         header = read_header(data)
@@ -265,15 +314,15 @@ def read_mask_file(record: ImageRecord) -> NDArray[np.bool_] | None:
     raw = decode_bytes(data, header) if fit is not None else None
     if raw is None:
         raise InputError(f"mask {record.mask_path} of {record.name} cannot be decoded or has another shape")
-    mask = (raw[..., :3].any(axis=2) if raw.ndim == 3 else raw > 0).astype(np.uint8)
+    gray = raw[..., :3].max(axis=2) if raw.ndim == 3 else raw
+    # what is open at all stays so in eight bits
+    levels = np.maximum(to_8_bits(gray), gray > 0)
     if fit == "turned":
-        mask = upright_pixels(mask, INVERSE[record.orientation] if record.turn == 1 else record.turn)
-    if mask.shape != (record.height, record.width):
-        mask = cv2.resize(mask, (record.width, record.height), interpolation=cv2.INTER_NEAREST)
-    return mask.astype(bool)
+        levels = upright_pixels(levels, INVERSE[record.orientation] if record.turn == 1 else record.turn)
+    return levels
 
 
-def _given_mask(record: ImageRecord, source: ImageSource) -> NDArray[np.bool_] | None:
+def _given_mask(record: ImageRecord, source: ImageSource) -> Pixels | None:
     given = source.mask(record.name)
     if given is None:
         return None
@@ -282,8 +331,7 @@ def _given_mask(record: ImageRecord, source: ImageSource) -> NDArray[np.bool_] |
         raise InputError(
             f"mask of {record.name}: expected an array of shape ({record.height}, {record.width}), found {mask.shape}"
         )
-    is_open: NDArray[np.bool_] = mask != 0
-    return is_open
+    return mask if mask.dtype == np.uint8 else (mask != 0).astype(np.uint8)
 
 
 def mask_fit(header: Header, record: ImageRecord) -> str | None:

@@ -1,0 +1,120 @@
+"""Silhouettes from alpha, mask files, masks for photographs and backgrounds, and masks that cannot be right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from carving_photographs import coverage_of, photograph
+from carving_scenes import around, ball, both, box
+from sfmapp.carve.masks_report import MasksReport
+from sfmapp.carve.silhouettes import MaskOptions, Silhouette, find_silhouettes
+from sfmapp.errors import InputError
+from sfmapp.events import Events
+from sfmapp.images.image_set import ImageOptions
+from sfmapp.images.load import load_images
+
+SOLID = both(ball(0.5, (0.5, 0.2, 0.1)), box((0.3, 0.4, 0.6), (-0.4, 0.0, 0.0)))
+COVERAGES = [coverage_of(view, SOLID, 5) for view in around(6, width=96, height=72)]
+PHOTOGRAPHS = [photograph(coverage, seed) for seed, coverage in enumerate(COVERAGES)]
+
+
+def found_in(
+    pictures: list[NDArray[np.uint8]], masks: list[NDArray[np.uint8]] | None = None
+) -> tuple[list[Silhouette], MasksReport]:
+    named = {f"{i}.png": picture for i, picture in enumerate(pictures)}
+    given = {f"{i}.png": mask for i, mask in enumerate(masks or [])}
+    images, _ = load_images(named, ImageOptions(), Events(), masks=given)
+    return find_silhouettes(images, None, MaskOptions(), Events())
+
+
+def bytes_of(coverage: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.asarray((255.0 * coverage).round(), np.uint8)
+
+
+def agreement(silhouette: Silhouette, coverage: NDArray[np.float32]) -> float:
+    """Intersection over union."""
+    inside, true = silhouette.inside, coverage > 0.5
+    return float((inside & true).sum() / (inside | true).sum())
+
+
+def test_alpha_is_coverage() -> None:
+    pictures = [np.dstack([p, bytes_of(c)]) for p, c in zip(PHOTOGRAPHS, COVERAGES, strict=True)]
+    silhouettes, report = found_in(pictures)
+    assert {mask.source for mask in report.masks} == {"alpha"}
+    for silhouette, coverage in zip(silhouettes, COVERAGES, strict=True):
+        assert agreement(silhouette, coverage) > 0.999
+        # beside the outline coverage tells the distance: an edge along the pixels moves it by one over one pixel
+        mixed = (coverage > 0.2) & (coverage < 0.8)
+        assert np.abs(silhouette.distance[mixed]).max() < 0.75
+
+
+def test_soft_and_hard_masks() -> None:
+    for masks in ([bytes_of(c) for c in COVERAGES], [(c > 0.5).astype(np.uint8) for c in COVERAGES]):
+        silhouettes, report = found_in(PHOTOGRAPHS, masks)
+        assert {mask.source for mask in report.masks} == {"mask"}
+        assert min(agreement(s, c) for s, c in zip(silhouettes, COVERAGES, strict=True)) > 0.985
+
+
+def test_photographs_may_be_masks() -> None:
+    silhouettes, report = found_in([bytes_of((c > 0.5).astype(np.float32)) for c in COVERAGES])
+    assert {mask.source for mask in report.masks} == {"mask"}
+    assert min(agreement(s, c) for s, c in zip(silhouettes, COVERAGES, strict=True)) > 0.985
+
+
+def test_background_is_learned() -> None:
+    silhouettes, report = found_in(PHOTOGRAPHS)
+    assert {mask.source for mask in report.masks} == {"background"}
+    assert report.color_error is not None
+    assert report.color_error < 0.02
+    assert min(agreement(s, c) for s, c in zip(silhouettes, COVERAGES, strict=True)) > 0.98
+
+
+def test_results_do_not_depend_on_threads() -> None:
+    images, _ = load_images({f"{i}.png": p for i, p in enumerate(PHOTOGRAPHS)}, ImageOptions(), Events())
+    one, three = (find_silhouettes(images, None, MaskOptions(), Events(), threads=n)[0] for n in (1, 3))
+    assert all(a.distance.tobytes() == b.distance.tobytes() for a, b in zip(one, three, strict=True))
+
+
+@pytest.mark.parametrize("kind", ["empty", "full", "inverted", "missing"])
+def test_masks_that_cannot_be_right_carve_nothing_and_are_named(kind: str) -> None:
+    masks = [bytes_of(coverage) for coverage in COVERAGES]
+    bad = {"empty": masks[2] * 0, "full": masks[2] * 0 + 255, "inverted": 255 - masks[2], "missing": masks[2]}
+    masks[2] = bad[kind]
+    named = {f"{i}.png": p for i, p in enumerate(PHOTOGRAPHS)}
+    given = {f"{i}.png": mask for i, mask in enumerate(masks) if kind != "missing" or i != 2}
+    images, _ = load_images(named, ImageOptions(), Events(), masks=given)
+    silhouettes, report = find_silhouettes(images, None, MaskOptions(), Events())
+    assert ["2.png" in line for line in report.warnings] == [True]
+    assert {"missing": "no mask"}.get(kind, kind) in report.warnings[0]
+    known = silhouettes[2].known
+    assert known is not None
+    assert not known.any()
+    assert all(silhouettes[i].known is None for i in range(6) if i != 2)
+
+
+def test_all_masks_inverted_is_refused() -> None:
+    with pytest.raises(InputError, match="inverted"):
+        found_in(PHOTOGRAPHS, [255 - bytes_of(coverage) for coverage in COVERAGES])
+
+
+def test_without_an_object_nothing_is_found() -> None:
+    empty = [photograph(np.zeros_like(coverage), seed) for seed, coverage in enumerate(COVERAGES)]
+    with pytest.raises(InputError, match=r"stands out|usable"):
+        found_in(empty)
+
+
+def test_a_mask_of_twice_the_size_keeps_shares_of_pixels(tmp_path: Path) -> None:
+    for i, (picture, coverage) in enumerate(zip(PHOTOGRAPHS, COVERAGES, strict=True)):
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / f"{i}.png"), picture[..., ::-1])
+        large = np.repeat(np.repeat(bytes_of(coverage), 2, axis=0), 2, axis=1)
+        cv2.imwrite(str(tmp_path / "masks" / f"{i}.png"), large)
+    pattern = str(tmp_path / "*.png")
+    images, _ = load_images(pattern, ImageOptions(mask_path=str(tmp_path / "masks")), Events())
+    silhouettes, _ = find_silhouettes(images, None, MaskOptions(), Events())
+    assert min(agreement(s, c) for s, c in zip(silhouettes, COVERAGES, strict=True)) > 0.999
