@@ -1,0 +1,180 @@
+"""The visual hull as a function of space: how far inside all silhouettes a point is."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt
+
+from sfmapp.camera import lens
+from sfmapp.camera.camera import pixels_to_rays
+from sfmapp.carve.carving_kernels import STEPS, Fields, hull_distances, hull_slopes
+from sfmapp.carve.silhouettes import Silhouette
+from sfmapp.carve.views import View
+from sfmapp.errors import InputError
+
+Array = NDArray[np.float64]
+
+# samples along the longer side of a picture from which a lens's largest slope is taken, and what is added to it for
+# slopes between the samples: a lens of which it is more changes its focal length by a tenth within a 64th of a picture
+_SAMPLES, _BETWEEN = 64, 1.1
+# points for a thread at a time: enough that starting it costs nothing, few enough that all threads end together
+_CHUNK = 1 << 15
+
+
+@dataclass(frozen=True)
+class Hull:
+    """Silhouettes and their cameras, ready for kernels.
+
+    Attributes:
+        fields: what the kernels read, view by view in ``order``.
+        order: (N,) positions of the views as they were given; each is as far in direction from those before it as can
+            be, so that a cell that is outside is soon told to be.
+        min_views: views that have to show a point inside for it to be in the hull.
+        misses: views that may show it outside.
+    """
+
+    fields: Fields
+    order: NDArray[np.int64]
+    min_views: int
+    misses: int
+
+    def __len__(self) -> int:
+        return len(self.order)
+
+    def distance(self, xyz: ArrayLike, threads: int | None = None) -> Array:
+        """Signed distances (N,) of points (N, 3) to the hull, positive inside, units of the world.
+
+        That of a view is its silhouette's distance in pixels by what a pixel is at the point's depth, and the hull's
+        is the least of all views' that see the point: exact in sign, near the surface a close bound in size. Infinite
+        where nothing but ``misses`` limits it, -inf where fewer than ``min_views`` see the point.
+        """
+        points = np.ascontiguousarray(xyz, np.float64)
+        out = np.empty(len(points))
+
+        def run(begin: int) -> None:
+            part = slice(begin, begin + _CHUNK)
+            hull_distances(self.fields, points[part], self.min_views, self.misses, out[part])
+
+        with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+            list(pool.map(run, range(0, len(points), _CHUNK)))
+        return out
+
+    def normals(self, xyz: ArrayLike, step: float, threads: int | None = None) -> NDArray[np.float32]:
+        """Outward unit normals (N, 3) of the hull at points (N, 3) on it: of the cone that bounds it there, by central
+        differences over a step in units of the world; zero where a silhouette is flat."""
+        points = np.ascontiguousarray(xyz, np.float64)
+        out = np.empty((len(points), 3), np.float32)
+
+        def run(begin: int) -> None:
+            part = slice(begin, begin + _CHUNK)
+            hull_slopes(self.fields, points[part], step, self.misses, out[part])
+
+        with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+            list(pool.map(run, range(0, len(points), _CHUNK)))
+        return out
+
+
+def hull_of(
+    views: Sequence[View], silhouettes: Sequence[Silhouette], *, min_views: int | None = None, misses: int = 0
+) -> Hull:
+    """The hull of silhouettes.
+
+    Args:
+        views, silhouettes: one of each for a photograph.
+        min_views: see :class:`Hull`; None: half of the views, and two at least if there are two. Where few look, as
+            beyond the pictures of most, the cones of these few would be left standing.
+        misses: see :class:`Hull`.
+
+    Raises:
+        InputError: their numbers or sizes differ, there is no view, or a distance is no number.
+    """
+    if len(views) != len(silhouettes) or not views:
+        raise InputError(f"expected a silhouette for each view, found {len(silhouettes)} for {len(views)} views")
+    for view, silhouette in zip(views, silhouettes, strict=True):
+        if silhouette.distance.shape != (view.height, view.width):
+            height, width = silhouette.distance.shape
+            raise InputError(
+                f"{view.name}: its silhouette has {width} x {height} pixels, its camera {view.width} x {view.height}",
+                "masks have to be as large as the photographs of their cameras",
+            )
+        if np.isnan(silhouette.distance).any():
+            raise InputError(f"{view.name}: distances to its outline that are no numbers")
+    order = _far_apart(views)
+    chosen = [(views[i], silhouettes[i]) for i in order]
+    sizes = np.array([[view.height, view.width] for view, _ in chosen], np.int64)
+    starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))]).astype(np.int64)
+    distance = np.empty(starts[-1], np.int16)
+    unknown = [(k, s.known) for k, (_, s) in enumerate(chosen) if s.known is not None and not s.known.all()]
+    known_starts = np.full(len(views), -1, np.int64)
+    known = np.empty(sum(mask.size for _, mask in unknown), np.int16)
+    for k, (_, silhouette) in enumerate(chosen):
+        distance[starts[k] : starts[k + 1]] = _steps(silhouette.distance).ravel()
+    begin = 0
+    for k, mask in unknown:
+        signed = distance_transform_edt(mask) - distance_transform_edt(~mask)
+        known_starts[k] = begin
+        known[begin : begin + mask.size] = _steps(signed - 0.5 * np.sign(signed)).ravel()
+        begin += mask.size
+    fields = Fields(
+        np.stack([view.row for view, _ in chosen]),
+        np.stack([_lens_bounds(view) for view, _ in chosen]),
+        sizes,
+        starts[:-1].copy(),
+        distance,
+        known_starts,
+        known,
+    )
+    least = max(2, (len(views) + 1) // 2) if min_views is None else min_views
+    return Hull(fields, np.array(order), min(least, len(views)), misses)
+
+
+def _steps(distance: ArrayLike) -> NDArray[np.int16]:
+    """Distances in whole steps; what is not zero stays on its side of it."""
+    scaled = np.clip(np.asarray(distance, np.float32) * np.float32(STEPS), -32767.0, 32767.0)
+    return np.asarray(np.where(scaled > 0.0, np.maximum(np.rint(scaled), 1.0), np.rint(scaled)), np.int16)
+
+
+def _far_apart(views: Sequence[View]) -> list[int]:
+    """Positions of views, each the one whose axis is farthest from all before it, up to its sign: two photographs from
+    opposite sides show nearly the same outline."""
+    axes = np.stack([view.axis for view in views])
+    order, nearest = [0], np.abs(axes @ axes[0])
+    while len(order) < len(views):
+        nearest[order[-1]] = np.inf
+        order.append(int(np.argmin(nearest)))
+        nearest = np.maximum(nearest, np.abs(axes @ axes[order[-1]]))
+    return order
+
+
+def _lens_bounds(view: View) -> Array:
+    """(5,) what bounds the picture of a cell: most pixels to a radian (0 of lenses that change nothing, whose pictures
+    of cells are exact), the axis (3,) of a cone in the lens's frame that holds all that is seen, and its half angle."""
+    if view.lens_row[lens.FAMILY] == lens.BROWN and not view.lens_row[4 : lens.FAMILY].any():
+        return np.zeros(5)
+    if view.camera is None:
+        raise InputError(f"{view.name}: a lens that distorts without a camera")
+    step = max(view.width, view.height) / _SAMPLES
+    u = np.linspace(0.0, view.width, int(np.ceil(view.width / step)) + 1)
+    v = np.linspace(0.0, view.height, int(np.ceil(view.height / step)) + 1)
+    pixels = np.stack(np.meshgrid(u, v), axis=-1)
+    rays = pixels_to_rays(view.camera, pixels.reshape(-1, 2)).reshape(*pixels.shape[:2], 3)
+    most = 0.0
+    for first, second in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]), (np.s_[:-1, :-1], np.s_[1:, 1:])):
+        apart = np.linalg.norm(pixels[first] - pixels[second], axis=-1)
+        turned = 2.0 * np.arcsin(np.clip(0.5 * np.linalg.norm(rays[first] - rays[second], axis=-1), 0.0, 1.0))
+        ratio = apart / np.where(turned > 0.0, turned, np.nan)
+        if np.isfinite(ratio).any():
+            most = max(most, float(np.nanmax(ratio)))
+    seen = rays[np.isfinite(rays).all(axis=-1)]
+    if not len(seen) or most == 0.0:
+        raise InputError(f"{view.name}: its lens has no rays for its pixels")
+    axis = seen.mean(axis=0)
+    axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 0.0 else np.array([0.0, 0.0, 1.0])
+    half = float(np.arccos(np.clip((seen @ axis).min(), -1.0, 1.0)))
+    return np.array([most * _BETWEEN, *axis, half * _BETWEEN])
