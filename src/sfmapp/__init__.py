@@ -1,9 +1,9 @@
 """Photographs and video into cameras, points and surfaces, on an ordinary CPU, from pip alone.
 
 Three levels. One call: ``reconstruct``, ``track_sequence``, ``densify``, ``make_mesh``, what is done with their
-results, ``stitch_panorama``, ``explain_pair``, ``match_stereo``, and what is known before: ``calibrate_board`` and its
-like. The stages, in memory: ``load_images``, ``extract_features``, ``match_images``, ``map_images``. The parts:
-``adjust_bundle``, ``FactorGraph``, ``triangulate``, ``estimate_pose``, ``verify_pair``.
+results, ``stitch_panorama``, ``explain_pair``, ``match_stereo``, ``carve_volume``, and what is known before:
+``calibrate_board`` and its like. The stages, in memory: ``load_images``, ``extract_features``, ``match_images``,
+``map_images``. The parts: ``adjust_bundle``, ``FactorGraph``, ``triangulate``, ``estimate_pose``, ``verify_pair``.
 
 Conventions: a pose ``cam_from_world`` is a quaternion x, y, z, w and a translation, x_cam = R x_world + t, with camera
 axes x right, y down, z forward. The centre of the top-left pixel is (0.5, 0.5). ``events``, ``threads`` and ``seed``
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from sfmapp.api.reconstruction import Reconstruction, load
     from sfmapp.api.stages import Matcher, extract_features, map_images, match_images
     from sfmapp.api.views import explain_pair, match_stereo, reconstruct_uncalibrated, transfer_views
+    from sfmapp.api.volumes import carve_volume
     from sfmapp.camera.camera import Camera
     from sfmapp.camera.names import CameraModel
     from sfmapp.errors import (
@@ -109,6 +110,7 @@ __all__ = [
     "calibrate_lines",
     "calibrate_rig",
     "calibrate_target",
+    "carve_volume",
     "compare_cameras",
     "densify",
     "estimate_pose",
@@ -175,6 +177,7 @@ _HOMES = {
     "calibrate_lines": "api.calibration",
     "calibrate_rig": "api.calibration",
     "calibrate_target": "api.calibration",
+    "carve_volume": "api.volumes",
     "compare_cameras": "api.calibration",
     "densify": "api.jobs",
     "estimate_pose": "api.geometry",

@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from sfmapp.adjust.options import AdjustOptions
+from sfmapp.carve.silhouettes import MaskOptions
+from sfmapp.carve.space_carving import CarveOptions
 from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import SfmError, UsageError
 from sfmapp.features.extract import FeatureOptions
@@ -49,6 +51,7 @@ class Options:
         dense, surface: those of patches and of the mesh that is made of them.
         sequence, odometry, scale: those of odometry.
         stereo: those of matching rectified pairs.
+        masks, carve: those of silhouettes, and of the volume that they leave.
         seed: where every random choice starts; the same seed gives the same bytes.
         threads: worker threads; None: as many as the process has cores. Results do not depend on it.
         min_registered: fail (exit code 5) when fewer images are registered; None: any model will do.
@@ -70,6 +73,8 @@ class Options:
     odometry: OdometryOptions = field(default_factory=OdometryOptions)
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     stereo: StereoOptions = field(default_factory=StereoOptions)
+    masks: MaskOptions = field(default_factory=MaskOptions)
+    carve: CarveOptions = field(default_factory=CarveOptions)
     seed: int = 0
     threads: int | None = None
     min_registered: int | None = None

@@ -1,0 +1,160 @@
+"""Colours of a carved surface, from the photographs that show each place best."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.carve.rendering import depth_of_mesh, overlap
+from sfmapp.carve.silhouettes import Silhouette
+from sfmapp.carve.views import View, project_point
+from sfmapp.events import Events
+from sfmapp.reporting import Report
+from sfmapp.scene.mesh import Mesh
+
+Array = NDArray[np.float64]
+Pixels = NDArray[np.uint8]
+
+STAGE = "colors"
+# a view may see the surface this much from the side
+_SMALLEST_COSINE = 0.1
+# weights fall with this power of the cosine over the depth: the best view counts, its neighbours soften the borders
+_SHARPNESS = 4
+# pixels from the outline below which a colour may be mixed with the background
+_CLEAR_PX = 2.0
+# places that no view shows take the mean colour of so many that are near
+_NEAREST = 4
+_GREY = 192
+
+
+class ViewFit(Report):
+    """How well the result fits one silhouette.
+
+    Attributes:
+        iou: of the silhouette and the result as this view shows it.
+        over_px, under_px: pixels that the result alone covers, and the silhouette alone.
+        source: how the silhouette was found.
+    """
+
+    name: str
+    iou: float
+    over_px: int
+    under_px: int
+    source: str
+
+
+class ColoringReport(Report):
+    """Where the colours are from.
+
+    Attributes:
+        seen_share: of the vertices, those that a photograph shows; the others have the colour of what is near.
+        median_views: that show a vertex.
+        views: how well the surface fits each silhouette.
+    """
+
+    seen_share: float
+    median_views: float
+    views: Sequence[ViewFit]
+
+
+def color_surface(
+    mesh: Mesh, cell: float, views: Sequence[View], silhouettes: Sequence[Silhouette],
+    read: Callable[[int], Pixels], events: Events | None = None, *, threads: int = 1,
+) -> tuple[Pixels, ColoringReport]:  # fmt: skip
+    """The colour of each vertex of a mesh: the mean of the views in which it is not hidden, weighted by the fourth
+    power of the cosine under which they see it over their distance.
+
+    Args:
+        mesh: closed, with normals outward.
+        cell: side of the cells that it is made of, units of the world: what lies less deep is not hidden.
+        views: V of them, with their silhouettes, in pixels of the photographs.
+        read: gives the photograph (H, W, 3) of a view.
+        events: progress and cancellation.
+        threads: views at a time; the result does not depend on it.
+
+    Returns:
+        (N, 3) uint8, and the report, with the overlap of each silhouette and the mesh.
+    """
+    events = events or Events()
+    events.started(STAGE, f"colours of {len(mesh.xyz)} vertices", total=len(views))
+    total, weight = np.zeros((len(mesh.xyz), 3)), np.zeros(len(mesh.xyz))
+    count = np.zeros(len(mesh.xyz), np.int32)
+    normal = np.ascontiguousarray(mesh.normal, np.float64)
+
+    def work(v: int) -> tuple[Array, ViewFit]:
+        view, silhouette = views[v], silhouettes[v]
+        depth = depth_of_mesh(view, mesh.xyz, mesh.faces)
+        iou, over, under = overlap(depth, silhouette)
+        seen = np.zeros((len(mesh.xyz), 4))
+        _look(view.row, view.center, mesh.xyz, normal, depth, read(v), silhouette.distance, cell, seen)
+        return seen, ViewFit(name=view.name, iou=iou, over_px=over, under_px=under, source=silhouette.source)
+
+    fits = []
+    with ThreadPoolExecutor(threads) as pool:
+        # so many at a time, as each holds an array of all vertices
+        for first in range(0, len(views), threads):
+            for seen, fit in pool.map(work, range(first, min(first + threads, len(views)))):
+                total += seen[:, :3] * seen[:, 3:]
+                weight += seen[:, 3]
+                count += seen[:, 3] > 0.0
+                fits.append(fit)
+                events.advanced(STAGE)
+            events.raise_if_cancelled()
+    is_seen = weight > 0.0
+    report = ColoringReport(
+        seen_share=float(is_seen.mean()) if len(is_seen) else 0.0,
+        median_views=float(np.median(count)) if len(count) else 0.0, views=fits,
+    )  # fmt: skip
+    events.finished(STAGE, f"{report.seen_share:.1%} of the vertices seen")
+    rgb = np.full((len(mesh.xyz), 3), float(_GREY))
+    rgb[is_seen] = total[is_seen] / weight[is_seen, None]
+    _fill(mesh.xyz, rgb, is_seen)
+    return np.rint(rgb).astype(np.uint8), report
+
+
+def _fill(xyz: Array, rgb: Array, is_seen: NDArray[np.bool_]) -> None:
+    """Give vertices that no view shows (in place) the mean colour of the nearest that one does."""
+    from scipy.spatial import cKDTree
+
+    if is_seen.all() or is_seen.sum() < _NEAREST:
+        return
+    _, nearest = cKDTree(xyz[is_seen]).query(xyz[~is_seen], k=_NEAREST)
+    rgb[~is_seen] = rgb[is_seen][nearest].mean(axis=1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _look(
+    row: Array, center: Array, xyz: Array, normal: Array, depth: NDArray[np.float32], rgb: Pixels,
+    distance: NDArray[np.float32], cell: float, out: Array,
+) -> None:  # fmt: skip
+    """Colours and weights (N, 4) of the vertices that a view shows; zeros of the others."""
+    height, width = depth.shape
+    for n in range(xyz.shape[0]):
+        x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
+        dx, dy, dz = center[0] - x, center[1] - y, center[2] - z
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        cosine = (normal[n, 0] * dx + normal[n, 1] * dy + normal[n, 2] * dz) / max(length, 1e-300)
+        if cosine < _SMALLEST_COSINE:
+            continue
+        u, v, ahead = project_point(row, x, y, z)
+        if not (ahead > 0.0 and 0.5 <= u <= width - 0.5 and 0.5 <= v <= height - 0.5):
+            continue
+        col, line = min(int(u - 0.5), width - 2), min(int(v - 0.5), height - 2)
+        # the surface falls away behind a pixel's centre by what it is slanted
+        slack = cell * (1.0 + 1.0 / cosine)
+        if max(depth[line, col], depth[line, col + 1], depth[line + 1, col], depth[line + 1, col + 1]) < ahead - slack:
+            continue
+        fu, fv = u - 0.5 - col, v - 0.5 - line
+        clear = (1.0 - fv) * ((1.0 - fu) * distance[line, col] + fu * distance[line, col + 1]) + fv * (
+            (1.0 - fu) * distance[line + 1, col] + fu * distance[line + 1, col + 1]
+        )
+        share = min(max(clear / _CLEAR_PX, 0.01), 1.0) if clear == clear else 1.0
+        for c in range(3):
+            above = (1.0 - fu) * rgb[line, col, c] + fu * rgb[line, col + 1, c]
+            below = (1.0 - fu) * rgb[line + 1, col, c] + fu * rgb[line + 1, col + 1, c]
+            out[n, c] = (1.0 - fv) * above + fv * below
+        out[n, 3] = share * (cosine * cell / length) ** _SHARPNESS

@@ -1,0 +1,102 @@
+"""``sfmapp carve``: photographs from all sides to a closed volume."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from sfmapp.cli.common import (
+    add_output_flags,
+    limit_library_threads,
+    listening,
+    load_numba_without_blas,
+    options_of,
+    tell_result,
+    took,
+)
+
+if TYPE_CHECKING:
+    from sfmapp.pipelines.carve.run import CarveResult
+
+EXAMPLES = """\
+examples:
+  sfmapp carve out/                                   a reconstruction: OUT/carve
+  sfmapp carve lego/ -o volume/                       photographs and their cameras.json or transforms.json
+  sfmapp carve dinosaur/ -o volume/ --cells 512       photographs and a file of 3x4 projection matrices
+  sfmapp carve photos/ -o volume/ --mask-path masks/  masks named IMAGE.png, the object white
+  sfmapp carve masks/ --poses poses.txt --camera PINHOLE,258.65,258.25,159.8,128.15 -o volume/
+
+Where an object is in the photographs is told by their alpha channel, by masks, or by a background that all have in
+common (sfmapp masks shows it). What all silhouettes leave standing is the volume: exact from outside, blind to hollows
+that no outline shows.
+
+Writes
+  OUT/mesh.ply, OUT/mesh.glb   the closed surface, in colours of the photographs
+  OUT/octree.npz               the volume as cells
+  OUT/report.html              how well it fits each silhouette, its slices, volume and area, what is wrong
+  OUT/recording.rrd            how it was carved, level by level
+The same command again goes on where an earlier one was stopped."""
+
+
+def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the commands of this family to the parser."""
+    parser = commands.add_parser(
+        "carve", help="photographs from all sides to a closed volume, by silhouettes",
+        description="Carve a closed volume out of photographs with known cameras.", epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument(
+        "source", metavar="SOURCE", help="a workspace, a COLMAP model, or a folder of photographs with their cameras"
+    )
+    parser.add_argument("-o", "--output", metavar="OUT", help="output folder, new or empty; of a model, SOURCE/carve")
+    cameras = parser.add_argument_group("photographs and cameras")
+    cameras.add_argument("--images", metavar="DIR", help="folder of the photographs, where SOURCE does not hold them")
+    cameras.add_argument("--poses", metavar="FILE", help="poses or projection matrices, where SOURCE holds none")
+    cameras.add_argument("--camera", metavar="MODEL,...|FILE", help="the lens, where poses come without one")
+    cameras.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; the object is white")
+    cameras.add_argument("--mask-source", metavar="NAME", help="alpha, mask or background; default: what is there")
+    volume = parser.add_argument_group("volume")
+    volume.add_argument("--cells", metavar="N", help="finest cells along the longest side; default: 256")
+    volume.add_argument(
+        "--box", metavar=("X", "Y", "Z", "X", "Y", "Z"), type=float, nargs=6,
+        help="lower and upper corners of the box that the object is in; default: as the silhouettes say",
+    )  # fmt: skip
+    volume.add_argument("--misses", metavar="K", help="silhouettes that may miss a place that is kept; default: 0")
+    volume.add_argument("--threads", metavar="N", help="default: all cores; results do not depend on it")
+    volume.add_argument("--no-recording", action="store_true", help="do not write recording.rrd")
+    add_output_flags(parser, has_log=True)
+    parser.set_defaults(run=_carve)
+
+
+def _carve(args: argparse.Namespace) -> int:
+    limit_library_threads()
+    options = options_of({
+        "images.camera": args.camera, "images.mask_path": args.mask_path, "masks.mask_source": args.mask_source,
+        "carve.cells": args.cells, "carve.misses": args.misses, "threads": args.threads,
+    })  # fmt: skip
+    load_numba_without_blas()
+    from sfmapp.pipelines.carve.run import CarveInput, carve
+    from sfmapp.workspace.usage import Stopwatch
+
+    watch = Stopwatch(whole_process=True)
+    what = CarveInput(args.source, args.images, args.poses, args.box)
+    with listening(args) as events:
+        result = carve(what, args.output, options, record=not args.no_recording, events=events, watch=watch)
+    tell_result(args, result, lambda: _print(result))
+    return 0
+
+
+def _print(result: CarveResult) -> None:
+    report = result.report
+    fits = sorted(fit.iou for fit in report.colors.views)
+    print(
+        f"{report.num_views} photographs, silhouettes by {report.masks.masks[0].source}; the volume covers them by "
+        f"{fits[len(fits) // 2]:.1%} (least {fits[0]:.1%})"
+    )
+    carving, surface = report.carving, report.surface
+    print(
+        f"{carving.cells} cells along the side, {carving.share_of_dense:.2%} of them looked at; volume "
+        f"{surface.volume:.5g} ({carving.volume_low:.5g} to {carving.volume_high:.5g}), area {surface.area:.5g}"
+    )
+    print(f"{surface.num_faces} triangles, {report.colors.seen_share:.1%} of the vertices in colours of photographs")
+    print(took(result.output, report.run))

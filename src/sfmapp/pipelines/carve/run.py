@@ -1,0 +1,264 @@
+"""Photographs from all sides to a closed surface: silhouettes, box, octree, mesh, colours, one after another."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.carve.box import Box, cameras_inside, find_box, user_box
+from sfmapp.carve.coloring import ColoringReport, color_surface
+from sfmapp.carve.files import read_octree
+from sfmapp.carve.hull import Hull, hull_of
+from sfmapp.carve.isosurface import surface_of
+from sfmapp.carve.octree import Octree
+from sfmapp.carve.silhouettes import Silhouette, find_silhouettes
+from sfmapp.carve.space_carving import CarvingReport, carve_hull
+from sfmapp.errors import InputError, NoReconstructionError, UsageError
+from sfmapp.events import Events
+from sfmapp.images.image_set import ImageSet
+from sfmapp.images.pixels import read_rgb
+from sfmapp.pipelines.carve.outputs import CARVING, OCTREE, write_volume
+from sfmapp.pipelines.carve.sources import CarveSource, find_views
+from sfmapp.pipelines.dense.source import is_of_model
+from sfmapp.report.carve_document import BoxFacts, CarveReport, SurfaceFacts
+from sfmapp.reporting import NamedReason, from_plain
+from sfmapp.scene.mesh import Mesh, face_areas
+from sfmapp.workspace.job import Job
+from sfmapp.workspace.keys import input_key, stage_key
+from sfmapp.workspace.layout import CARVE, REPORT
+from sfmapp.workspace.options import Options
+from sfmapp.workspace.usage import Stopwatch
+
+FilePath = str | os.PathLike[str]
+STAGE = CARVE
+_NAMES_SHOWN = 4
+# what the user's box may leave out of that of the silhouettes, as a share of its side, before it is said
+_CUT = 0.05
+# a photograph whose silhouette the result fits so much worse than most is named
+_FAR_BELOW = 0.1
+
+
+@dataclass(frozen=True)
+class CarveInput:
+    """What is carved.
+
+    Attributes:
+        source: a workspace, a COLMAP model, or a folder of photographs with their cameras.
+        images, poses: see :func:`sfmapp.pipelines.carve.sources.find_views`.
+        box: lower x, y, z and upper ones of the box that the object is in; None: as the silhouettes say.
+    """
+
+    source: FilePath
+    images: FilePath | None = None
+    poses: FilePath | None = None
+    box: Sequence[float] | None = None
+
+
+@dataclass(frozen=True)
+class CarveResult:
+    """What was found and written.
+
+    Attributes:
+        output: the folder. report: what is in ``report.json``.
+        octree: the volume. mesh: its closed surface, in colours.
+    """
+
+    output: Path
+    report: CarveReport
+    octree: Octree
+    mesh: Mesh
+
+
+@dataclass(frozen=True)
+class CarvedVolume:
+    """A volume when all is done, for files, page and recording."""
+
+    source: CarveSource
+    silhouettes: Sequence[Silhouette]
+    box: Box
+    octree: Octree
+    hull: Hull
+    mesh: Mesh
+
+
+def carve(
+    what: CarveInput, output: FilePath | None = None, options: Options | None = None, *,
+    record: bool = True, events: Events | None = None, watch: Stopwatch | None = None,
+) -> CarveResult:  # fmt: skip
+    """Carve a volume out of photographs from all sides.
+
+    Args:
+        what: the photographs and their cameras.
+        output: a new folder, an empty one, or that of an earlier call; None, for a workspace or a model alone: its
+            folder ``carve``.
+        options: of these ``masks``, ``carve``, ``images`` and ``threads``.
+        record: write ``recording.rrd``.
+        events: progress, warnings and cancellation. watch: started when the run began.
+
+    Raises:
+        UsageError: photographs without cameras, or an output that holds something else.
+        InputError: photographs, cameras, masks or a box that cannot be used.
+        NoReconstructionError: nothing is left of the volume.
+        InterruptedRunError: ``events`` was asked to stop; the same call resumes.
+    """
+    with Job.opened(CARVE, what.source, _target(what, output), options, events=events, watch=watch) as job:
+        with job.stage("views"):
+            source = find_views(what.source, what.images, what.poses, job.options, job.events)
+        job.note_inputs({record.name: record.digest for record in source.records})
+        with job.stage("masks"):
+            images = ImageSet(source.records, ())
+            silhouettes, masks = find_silhouettes(
+                images, source.views, job.options.masks, job.events, threads=job.threads
+            )
+        with job.stage("box"):
+            box = _box(what, source, silhouettes, job)
+        hull, octree, carving = _carve(job, source, silhouettes, box)
+        mesh, colors = _surface(job, source, silhouettes, hull, octree)
+        volume = CarvedVolume(source, silhouettes, box, octree, hull, mesh)
+        _warn(job, volume, carving, colors)
+        with job.stage("files"):
+            files = write_volume(job.workspace.folder, octree, mesh)
+        report = CarveReport(
+            run=job.facts(), cameras=source.cameras, num_views=len(source.views),
+            left_out=[NamedReason(name=name, reason=reason) for name, reason in source.left_out], masks=masks,
+            box=BoxFacts(low=box.low.tolist(), high=box.high.tolist(), told_by=box.told_by, apart=box.apart),
+            carving=carving, surface=_facts(mesh), colors=colors, files=files, usage=job.usage,
+            warnings=job.log.warnings,
+        )  # fmt: skip
+        job.workspace.write_json(REPORT, report)
+        job.workspace.save()
+        return CarveResult(job.workspace.folder, report, octree, mesh)
+
+
+def _target(what: CarveInput, output: FilePath | None) -> Path:
+    """The folder of the results. Raises UsageError if it has to be named."""
+    if output is not None:
+        return Path(output)
+    if what.poses is None and is_of_model(Path(what.source)):
+        return Path(what.source) / CARVE
+    raise UsageError("a volume needs a folder to be written to", "give -o OUT")
+
+
+def _box(what: CarveInput, source: CarveSource, silhouettes: Sequence[Silhouette], job: Job) -> Box:
+    """The user's box, held against that of the silhouettes, or the latter."""
+    given = None if what.box is None else user_box(what.box[:3], what.box[3:])
+    try:
+        found = find_box(source.views, silhouettes, source.points, job.events)
+    except InputError:
+        if given is None:
+            raise
+        return given
+    if given is not None:
+        if not ((given.low < found.high) & (given.high > found.low)).all():
+            raise InputError(
+                f"--box: expected a box around the object, found none of it in there: the silhouettes meet between "
+                f"{_corner(found.low)} and {_corner(found.high)}",
+                "leave --box out, or give one that holds it",
+            )
+        cut = np.maximum(given.low - found.low, found.high - given.high).max()
+        if cut > _CUT * found.extent:
+            job.events.warned(
+                "box",
+                f"the box leaves out what silhouettes allow, by up to {cut:.3g}: they meet between "
+                f"{_corner(found.low)} and {_corner(found.high)}",
+            )
+        found = given
+    inside = cameras_inside(found, source.views)
+    if len(inside) > 0.5 * len(source.views):
+        raise InputError(
+            f"{len(inside)} of {len(source.views)} cameras stand inside the volume: an object is carved from outside",
+            "check that masks show the object and not the background, or give its box: --box X Y Z X Y Z",
+        )
+    if inside:
+        job.events.warned("box", f"cameras stand inside the volume: {', '.join(inside[:_NAMES_SHOWN])}")
+    return found
+
+
+def _corner(at: NDArray[np.float64]) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in at) + ")"
+
+
+def _carve(
+    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], box: Box
+) -> tuple[Hull, Octree, CarvingReport]:  # fmt: skip
+    """The octree, that of an earlier call where it was finished with the same inputs and options."""
+    options, folder = job.options.carve, job.workspace.folder
+    names = [view.name for view in source.views]
+    hull = hull_of(source.views, silhouettes, min_views=options.min_views, misses=options.misses)
+    low, side = box.cube()
+    key = stage_key(
+        (__name__,), options, [input_key(record) for record in source.records], _digest(silhouettes),
+        [view.row.tolist() for view in source.views], low.tolist(), side, box.low.tolist(), box.high.tolist(),
+    )  # fmt: skip
+    if job.workspace.is_current(STAGE, key):
+        try:
+            found = read_octree(folder / OCTREE), from_plain(CarvingReport, job.workspace.read_json(CARVING))
+            job.events.decided(STAGE, "the volume was carved by an earlier call")
+            return hull, *found
+        except (InputError, ValueError):
+            pass  # taken away or damaged: carved again
+    with job.stage(STAGE, key):
+        octree, report = carve_hull(hull, names, low, side, options, job.events, threads=job.threads)
+        job.events.raise_if_cancelled()
+        write_volume(folder, octree)
+        job.workspace.write_json(CARVING, report)
+    return hull, octree, report
+
+
+def _digest(silhouettes: Sequence[Silhouette]) -> str:
+    digest = hashlib.blake2b(digest_size=16)
+    for silhouette in silhouettes:
+        digest.update(silhouette.distance.tobytes())
+        if silhouette.known is not None:
+            digest.update(np.packbits(silhouette.known).tobytes())
+    return digest.hexdigest()
+
+
+def _surface(
+    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], hull: Hull, octree: Octree
+) -> tuple[Mesh, ColoringReport]:
+    with job.stage("surface"):
+        mesh = surface_of(
+            octree, lambda xyz: hull.distance(xyz, job.threads),
+            lambda xyz: hull.normals(xyz, octree.cell, job.threads), job.events,
+        )  # fmt: skip
+        if not len(mesh.faces):
+            raise NoReconstructionError(
+                "nothing is left of the volume at this resolution", "ask for more cells: --cells"
+            )
+    with job.stage("colors"):
+        rgb, colors = color_surface(
+            mesh, octree.cell, source.views, silhouettes, lambda v: read_rgb(source.records[v]), job.events,
+            threads=job.threads,
+        )  # fmt: skip
+    return Mesh(mesh.xyz, mesh.faces, mesh.normal, rgb), colors
+
+
+def _warn(job: Job, volume: CarvedVolume, carving: CarvingReport, colors: ColoringReport) -> None:
+    if carving.touches_box and volume.box.told_by != "user":
+        job.events.warned(STAGE, "the volume reaches the border of its box, which cuts it off: give a larger --box")
+    typical = float(np.median([fit.iou for fit in colors.views]))
+    odd = [fit for fit in colors.views if fit.iou < typical - _FAR_BELOW]
+    if odd:
+        named = ", ".join(f"{fit.name} ({fit.iou:.2f})" for fit in odd[:_NAMES_SHOWN])
+        job.events.warned(
+            STAGE,
+            f"the volume fits some silhouettes worse than most ({typical:.2f}): {named}: their cameras or masks are "
+            "doubtful",
+        )
+
+
+def _facts(mesh: Mesh) -> SurfaceFacts:
+    """Size of a closed mesh, by the divergence theorem."""
+    a, b, c = (mesh.xyz[mesh.faces[:, corner]] - mesh.xyz.mean(axis=0) for corner in range(3))
+    return SurfaceFacts(
+        num_vertices=len(mesh.xyz), num_faces=len(mesh.faces), low=mesh.xyz.min(axis=0).tolist(),
+        high=mesh.xyz.max(axis=0).tolist(), area=float(face_areas(mesh.xyz, mesh.faces).sum()),
+        volume=float(np.einsum("fc,fc->", a, np.cross(b, c)) / 6.0),
+    )  # fmt: skip

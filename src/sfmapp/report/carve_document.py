@@ -1,0 +1,64 @@
+"""The report of ``sfmapp carve``, as a type."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from sfmapp.carve.coloring import ColoringReport
+from sfmapp.carve.masks_report import MasksReport
+from sfmapp.carve.space_carving import CarvingReport
+from sfmapp.report.model import LogLine, RunFacts
+from sfmapp.reporting import NamedReason, Report, Usage
+
+
+class BoxFacts(Report):
+    """Where the object was looked for.
+
+    Attributes:
+        low, high: corners, world. told_by: ``silhouettes``, ``points`` of a reconstruction, or ``user``.
+        apart: photographs whose silhouettes meet with no others.
+    """
+
+    low: Sequence[float]
+    high: Sequence[float]
+    told_by: str
+    apart: Sequence[str]
+
+
+class SurfaceFacts(Report):
+    """The closed surface.
+
+    Attributes:
+        low, high: corners of the box around it, world.
+        area, volume: square and cubic units of the world.
+    """
+
+    num_vertices: int
+    num_faces: int
+    low: Sequence[float]
+    high: Sequence[float]
+    area: float
+    volume: float
+
+
+class CarveReport(Report):
+    """The report of ``sfmapp carve``.
+
+    Attributes:
+        cameras: what they are, in words. left_out: photographs without a camera, and cameras without a photograph.
+        files: what was written, in the folder of the run.
+        usage: of each step.
+    """
+
+    run: RunFacts
+    cameras: str
+    num_views: int
+    left_out: Sequence[NamedReason]
+    masks: MasksReport
+    box: BoxFacts
+    carving: CarvingReport
+    surface: SurfaceFacts
+    colors: ColoringReport
+    files: Sequence[str]
+    usage: Mapping[str, Usage]
+    warnings: Sequence[LogLine]

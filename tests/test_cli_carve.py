@@ -1,0 +1,134 @@
+"""``sfmapp carve`` from the command line, on photographs of a solid whose shape is known."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import sfmapp
+from carving_scenes import around, box, mask_of
+from sfmapp.carve.files import read_octree
+from sfmapp.cli.main import main
+from sfmapp.errors import InputError
+from sfmapp.formats.ply_reader import read_ply_geometry
+from sfmapp.geometry import rigid3
+
+VIEWS = around(10, width=120, height=90)
+VOLUME = 1.6 * 1.2 * 1.0
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A box, red where x is positive and blue elsewhere, with an alpha channel."""
+    folder = tmp_path_factory.mktemp("box")
+    (folder / "images").mkdir()
+    cameras = []
+    for view in VIEWS:
+        assert view.camera is not None
+        shown = mask_of(view, box())
+        rgba = np.zeros((*shown.shape, 4), np.uint8)
+        rgba[shown, 2] = 200 if view.center[0] > 0.0 else 30
+        rgba[shown, 3] = 255
+        cv2.imwrite(str(folder / "images" / view.name), rgba)
+        k = view.camera.k_matrix - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        cameras.append({
+            "file": f"images/{view.name}", "K": k.tolist(), "R_w2c": view.outer[:, :3].tolist(),
+            "t_w2c": view.outer[:, 3].tolist(), "width": view.width, "height": view.height,
+        })  # fmt: skip
+    (folder / "cameras.json").write_text(json.dumps({"cameras": cameras}))
+    return folder
+
+
+def carve(*args: object) -> int:
+    return main(["carve", *map(str, args), "--cells", "32", "--no-recording", "-q"])
+
+
+@pytest.fixture(scope="module")
+def carved(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("out") / "volume"
+    assert carve(photographs, "-o", folder) == 0
+    return folder
+
+
+def test_the_volume_is_the_solids_and_a_little_more(carved: Path) -> None:
+    report = json.loads((carved / "report.json").read_text())
+    low, high = report["carving"]["volume_low"], report["carving"]["volume_high"]
+    # the hull of ten outlines is a few per cent more than the solid, and cells are a twelfth of its height
+    assert high > VOLUME
+    assert low < report["surface"]["volume"] < high
+    assert VOLUME < report["surface"]["volume"] < 1.2 * VOLUME
+    assert min(view["iou"] for view in report["colors"]["views"]) > 0.94
+    assert report["box"]["told_by"] == "silhouettes"
+    octree = read_octree(carved / "octree.npz")
+    assert octree.volume_bounds() == pytest.approx((low, high))
+
+
+def test_the_mesh_has_the_colours_of_what_looks_at_it(carved: Path) -> None:
+    mesh = read_ply_geometry(carved / "mesh.ply")
+    assert mesh.rgb is not None
+    assert mesh.normal is not None
+    red, x = mesh.rgb[:, 0].astype(float), mesh.normal[:, 0]
+    assert red[x > 0.9].mean() > 150.0
+    assert red[x < -0.9].mean() < 80.0
+    assert (carved / "mesh.glb").stat().st_size > 10_000
+
+
+def test_the_same_call_goes_on_with_the_octree(photographs: Path, carved: Path, tmp_path: Path) -> None:
+    shutil.copytree(carved, tmp_path / "again")
+    before = (tmp_path / "again" / "mesh.ply").read_bytes()
+    found = sfmapp.carve_volume(
+        photographs, tmp_path / "again", sfmapp.load_options(settings=["carve.cells=32"]), threads=1
+    )
+    assert "carve" not in found.report.usage
+    assert (tmp_path / "again" / "mesh.ply").read_bytes() == before
+    (tmp_path / "again" / "octree.npz").write_bytes(b"damaged")
+    assert carve(photographs, "-o", tmp_path / "again", "--threads", 3) == 0
+    assert (tmp_path / "again" / "mesh.ply").read_bytes() == before
+
+
+def test_what_cannot_be_carved_is_refused(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert carve(photographs, "-o", tmp_path / "a", "--box", 3, 3, 3, 4, 4, 4) == 3
+    assert "found none of it in there" in capsys.readouterr().err
+    assert carve(photographs) == 2
+    assert "give -o OUT" in capsys.readouterr().err
+    folder = tmp_path / "inside"
+    shutil.copytree(photographs, folder)
+    document = json.loads((folder / "cameras.json").read_text())
+    for camera in document["cameras"]:  # turned about: the object is behind
+        turn = np.diag([-1.0, 1.0, -1.0])
+        camera["R_w2c"] = (turn @ camera["R_w2c"]).tolist()
+        camera["t_w2c"] = (turn @ camera["t_w2c"]).tolist()
+    (folder / "cameras.json").write_text(json.dumps(document))
+    assert carve(folder, "-o", tmp_path / "b") == 3
+    assert "no place in common" in capsys.readouterr().err
+
+
+def test_a_turned_camera_is_named(photographs: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "turned"
+    shutil.copytree(photographs, folder)
+    document = json.loads((folder / "cameras.json").read_text())
+    camera = document["cameras"][4]
+    turn = rigid3.rotation_matrix(np.array([0.0, np.sin(np.radians(2.5)), 0.0, np.cos(np.radians(2.5)), 0, 0, 0]))
+    camera["R_w2c"] = (turn @ camera["R_w2c"]).tolist()
+    camera["t_w2c"] = (turn @ camera["t_w2c"]).tolist()
+    (folder / "cameras.json").write_text(json.dumps(document))
+    assert carve(folder, "-o", tmp_path / "c") == 0
+    report = json.loads((tmp_path / "c" / "report.json").read_text())
+    assert any(VIEWS[4].name in line["message"] for line in report["warnings"])
+
+
+def test_damaged_octrees_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "octree.npz"
+    path.write_bytes(b"PK nothing")
+    with pytest.raises(InputError, match="expected the octree"):
+        read_octree(path)
+    np.savez(path, low=np.zeros(3), side=1.0, full=np.zeros(2, np.int64), level_starts=np.array([0, 2]), surface=[1])
+    with pytest.raises(InputError, match="other arrays"):
+        read_octree(path)
