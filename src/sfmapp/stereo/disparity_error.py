@@ -12,7 +12,7 @@ many are below one pixel. What a calibration leaves is the same for neighbours a
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -99,42 +99,42 @@ def match_cues(pair: RectifiedPair, found: DisparityMap, rows: slice = slice(Non
     left, right = (as_gray(picture[rows]).astype(np.float32) for picture in (pair.left, pair.right))
     known = (found.state[rows] == PixelState.MATCHED) & np.isfinite(found.disparity[rows])
     disparity = np.where(known, found.disparity[rows], np.float32(0.0))
+    return cues_of(left, _shifted(right, disparity), disparity, known), known
+
+
+def cues_of(picture: Map, seen: Iterable[Map], disparity: Map, known: NDArray[np.bool_]) -> Map:
+    """The cues (9, H, W) of a picture (H, W) float32, of what others show at its disparities, and these.
+
+    Args:
+        picture: grey values; what is not known of it becomes zero.
+        seen: three pictures (H, W), used up one by one: what another photograph shows where the disparity is one pixel
+            less, as it is, and one more.
+        disparity: (H, W) pixels, zero where it is not known.
+        known: (H, W).
+    """
     cues = np.empty((len(CUES), *disparity.shape), np.float32)
-    _correlation_cues(cues, left, right, disparity, known)
+    _correlation_cues(cues, picture, seen, known)
     _scatter_cues(cues, disparity, known)
-    return cues, known
+    return cues
 
 
-def _correlation_cues(cues: Map, left: Map, right: Map, disparity: Map, known: NDArray[np.bool_]) -> None:
-    """What the zero-mean NCC of a window says, of the disparity and of one pixel more and less: each pixel of the
-    window goes by its own disparity, so that slanted surfaces match as well as others."""
+def _shifted(right: Map, disparity: Map) -> Iterator[Map]:
+    """What the right picture shows at a disparity of one pixel less, at this one, and at one of one pixel more."""
     import cv2
 
-    mask = known.astype(np.float32)
-    share = np.maximum(_mean(mask, _WINDOW), np.float32(1e-6))
-    left *= mask
-    left_mean = _mean(left, _WINDOW) / share
-    left_variance = _variance(_mean(left * left, _WINDOW), share, left_mean)
     height, width = disparity.shape
     y = np.repeat(np.arange(height, dtype=np.float32)[:, None], width, axis=1)
     # whole pixels and parts of one: those are the same for all three
     place, part = cv2.convertMaps(np.arange(width, dtype=np.float32) - disparity, y, cv2.CV_16SC2)
     place[..., 0] += 2
-    ncc = []
     for _ in range(3):
         place[..., 0] -= 1
-        seen = cv2.remap(right, place, part, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        seen *= mask
-        mean = _mean(seen, _WINDOW)
-        mean /= share
-        both = _mean(left * seen, _WINDOW)
-        both /= share
-        both -= left_mean * mean
-        variance = _variance(_mean(np.square(seen, out=seen), _WINDOW), share, mean)
-        variance *= left_variance
-        both /= np.sqrt(variance, out=variance)
-        ncc.append(both)
-    nearer, here, farther = ncc[2], ncc[1], ncc[0]
+        yield cv2.remap(right, place, part, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _correlation_cues(cues: Map, left: Map, pictures: Iterable[Map], known: NDArray[np.bool_]) -> None:
+    """What the zero-mean NCC of a window says, of the disparity and of one pixel more and less."""
+    (farther, here, nearer), variance = correlations(left, pictures, known)
     curvature = np.maximum(2.0 * here - farther - nearer, np.float32(_LEAST))
     mismatch = np.maximum(1.0 - here, np.float32(_LEAST))
     nearer -= farther
@@ -143,9 +143,33 @@ def _correlation_cues(cues: Map, left: Map, right: Map, disparity: Map, known: N
     np.log((mismatch + np.float32(_LEAST)) / curvature, out=cues[0])
     np.log(mismatch, out=cues[1])
     np.log(np.minimum(np.abs(nearer, out=nearer), 1.0) + np.float32(0.05), out=cues[2])
-    np.log(left_variance, out=cues[8])
+    np.log(variance, out=cues[8])
     cues[0] *= 0.5
     cues[8] *= 0.5
+
+
+def correlations(picture: Map, pictures: Iterable[Map], known: NDArray[np.bool_]) -> tuple[list[Map], Map]:
+    """The zero-mean NCC of the window about each pixel with each of some pictures (H, W), and the window's variance in
+    squared grey values. Each pixel of the window goes by its own disparity, so that slanted surfaces match as well as
+    others; where it has none (``known``) it does not count, and ``picture`` becomes zero."""
+    mask = known.astype(np.float32)
+    share = np.maximum(_mean(mask, _WINDOW), np.float32(1e-6))
+    picture *= mask
+    own_mean = _mean(picture, _WINDOW) / share
+    own_variance = _variance(_mean(picture * picture, _WINDOW), share, own_mean)
+    ncc = []
+    for seen in pictures:
+        seen *= mask
+        mean = _mean(seen, _WINDOW)
+        mean /= share
+        both = _mean(picture * seen, _WINDOW)
+        both /= share
+        both -= own_mean * mean
+        variance = _variance(_mean(np.square(seen, out=seen), _WINDOW), share, mean)
+        variance *= own_variance
+        both /= np.sqrt(variance, out=variance)
+        ncc.append(both)
+    return ncc, own_variance
 
 
 def _variance(square: Map, share: Map, mean: Map) -> Map:

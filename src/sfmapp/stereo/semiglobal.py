@@ -94,6 +94,66 @@ def _compare(picture: Bytes, y: int, stride: int, row: NDArray[np.uint32]) -> No
                 row[x] = np.uint32((row[x] << np.uint32(1)) | np.uint32(other[x + shift] < middle[x + _PAD]))
 
 
+def describe(grey: Bytes, padded: Bytes, blurred: Bytes, bits: NDArray[np.uint32], margin: int, out: Words) -> None:
+    """Both census transforms of a picture (H, W) into ``out``.
+
+    padded, blurred: (H + 8, W + 8) uint8, which become the picture with its border carried on, and that one blurred.
+    bits, margin: of :func:`census`.
+    """
+    cv2.copyMakeBorder(grey, _PAD, _PAD, _PAD, _PAD, cv2.BORDER_REPLICATE, dst=padded)
+    cv2.GaussianBlur(padded, (5, 5), BLUR_PX, dst=blurred)
+    census(padded, blurred, bits, margin, out)
+
+
+def usual_penalties() -> Penalties:
+    """SMALL, and LARGE less the more two pixels differ."""
+    large = [max(SMALL + 1, round(LARGE / (1.0 + difference / FALL_GREY))) for difference in range(256)]
+    return Penalties(np.uint8(SMALL), np.array(large, np.uint8))
+
+
+def doubt_of(count: int) -> Bytes:
+    """(65, 64): what lanes cost more by their distance from the expected one, and 255 of those beyond the first so
+    many."""
+    doubt = np.zeros((LANES + 1, LANES), np.uint8)
+    lanes = np.arange(LANES)
+    doubt[:LANES] = np.minimum(np.abs(lanes[:, None] - lanes), MOST_DOUBT)
+    doubt[:, count:] = 255
+    return doubt
+
+
+def rows_at_a_time(height: int, width: int) -> tuple[int, int]:
+    """Rows of a ring of costs that RING_BYTES hold, and how many of a strip they are."""
+    ring = min(height, max(4 * OVERLAP, RING_BYTES // (3 * width * LANES)))
+    return ring, height if ring == height else ring - OVERLAP
+
+
+def follow_strips(
+    views: Views, penalties: Penalties, rows: Rows, strip: int, paths: tuple[Bytes, Bytes],
+    fill: Callable[[int, int, int], None], settle: Callable[[int, int, int], None], pool: Executor | None,
+) -> None:  # fmt: skip
+    """Sum the costs of all rows along eight paths, a strip of rows at a time.
+
+    Args:
+        paths: scratch (4, GAP + STRIDE W) of the paths from above and from below.
+        fill: makes the costs of the rows from the first to before the last in the ring; the third number, 0 or 1, says
+            which of two that may work at once it is.
+        settle: likewise takes what was found from the sums in ``rows.above`` and ``rows.below``.
+        pool: does two things at a time.
+    """
+    done, height = 0, views.grey.shape[0]
+    for start in range(0, height, strip):
+        last, end = min(start + len(rows.costs), height), min(start + strip, height)
+        mid, half = (done + last) // 2, (start + end) // 2
+        both(pool, partial(fill, done, mid, 0), partial(fill, mid, last, 1))
+        both(
+            pool,
+            partial(follow_down, views, penalties, done, last, paths[0], rows),
+            partial(follow_up, views, penalties, start, last, paths[1], rows),
+        )
+        both(pool, partial(settle, start, half, 0), partial(settle, half, end, 1))
+        done = last
+
+
 class Level:
     """One resolution: its arrays, which serve picture after picture, and its matching."""
 
@@ -103,8 +163,7 @@ class Level:
         self.search = first, count = search
         shape = (height, width)
         # a strip is worked on at a time, and the coarser levels are done before this one begins: they share its memory
-        ring = min(height, max(4 * OVERLAP, RING_BYTES // (3 * width * LANES)))
-        self.strip = height if ring == height else ring - OVERLAP
+        ring, self.strip = rows_at_a_time(height, width)
         size = 3 * ring * width * LANES
         memory = np.empty(max(size, RING_BYTES), np.uint8) if memory is None else memory
         self.rows = Rows(*memory[:size].reshape(3, ring, width, LANES))
@@ -124,16 +183,12 @@ class Level:
         self.counts = np.empty(NOISE_BINS, np.int64)
         self.bits = np.empty((2, 2, width), np.uint32)
         right = np.zeros((height, width + 2 * self.margin), np.uint64)
-        doubt = np.zeros((LANES + 1, LANES), np.uint8)
-        lanes = np.arange(LANES)
-        doubt[:LANES] = np.minimum(np.abs(lanes[:, None] - lanes), MOST_DOUBT)
-        doubt[:, count:] = 255
+        doubt = doubt_of(count)
         self.views = Views(
             np.empty(shape, np.uint64), right, np.empty(shape, np.uint8), np.full(shape, first, np.int16),
             np.full(shape, LANES, np.uint8), doubt,
         )  # fmt: skip
-        large = [max(SMALL + 1, round(LARGE / (1.0 + difference / FALL_GREY))) for difference in range(256)]
-        self.penalties = Penalties(np.uint8(SMALL), np.array(large, np.uint8))
+        self.penalties = usual_penalties()
         length = GAP + STRIDE * width
         self.raw = np.empty((2, 4, length), np.uint8)
         self.down, self.up = np.empty((4, length), np.uint8), np.empty((4, length), np.uint8)
@@ -151,7 +206,7 @@ class Level:
             tolerance: by how many pixels what the right picture finds may differ.
             pool: does two things at a time; what is found does not depend on it.
         """
-        views, rows, height = self.views, self.rows, self.views.grey.shape[0]
+        views, rows = self.views, self.rows
         both(
             pool,
             partial(self._transform, 0, left, 0, views.left),
@@ -163,33 +218,19 @@ class Level:
             cv2.boxFilter(self.fine, cv2.CV_16U, (side, side), dst=sums, normalize=False)
         if self.coarse is not None:
             self._look_again(self.coarse, left, right, tolerance, pool)
-        done, unseen = 0, np.uint8(UNSEEN)
-        for start in range(0, height, self.strip):
-            last, end = min(start + len(rows.costs), height), min(start + self.strip, height)
-            mid, half = (done + last) // 2, (start + end) // 2
-            both(
-                pool,
-                partial(fill_costs, views, unseen, done, mid, self.raw[0], rows),
-                partial(fill_costs, views, unseen, mid, last, self.raw[1], rows),
-            )
-            both(
-                pool,
-                partial(follow_down, views, self.penalties, done, last, self.down, rows),
-                partial(follow_up, views, self.penalties, start, last, self.up, rows),
-            )
-            both(
-                pool,
-                partial(decide, views, tolerance, start, half, rows, self.cost[0], self.label[0], self.found),
-                partial(decide, views, tolerance, half, end, rows, self.cost[1], self.label[1], self.found),
-            )
-            done = last
+        unseen = np.uint8(UNSEEN)
+
+        def fill(first: int, last: int, part: int) -> None:
+            fill_costs(views, unseen, first, last, self.raw[part], rows)
+
+        def settle(first: int, last: int, part: int) -> None:
+            decide(views, tolerance, first, last, rows, self.cost[part], self.label[part], self.found)
+
+        follow_strips(views, self.penalties, rows, self.strip, (self.down, self.up), fill, settle, pool)
         return self.found
 
     def _transform(self, side: int, grey: Bytes, margin: int, out: Words) -> None:
-        padded, blurred = self.padded[side], self.blurred[side]
-        cv2.copyMakeBorder(grey, _PAD, _PAD, _PAD, _PAD, cv2.BORDER_REPLICATE, dst=padded)
-        cv2.GaussianBlur(padded, (5, 5), BLUR_PX, dst=blurred)
-        census(padded, blurred, self.bits[side], margin, out)
+        describe(grey, self.padded[side], self.blurred[side], self.bits[side], margin, out)
 
     def _look_again(self, coarse: Level, left: Bytes, right: Bytes, tolerance: int, pool: Executor | None) -> None:
         height, width = coarse.views.grey.shape

@@ -118,39 +118,60 @@ def _raw_costs(views: Views, y: Index, out: Pointer) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _smooth_costs(views: Views, unseen: np.uint8, y: Index, raw: Bytes, costs: Pointer) -> None:
-    """Costs of row y: weighted means, 1 2 1 both ways, of raw costs of three rows; the cost of the unseen put in."""
-    base, (height, width) = views.base, views.left.shape
+def smooth_columns(base: Ints, y: Index, raw: Bytes) -> None:
+    """Weighted means, 1 2 1, of row y of a ring of raw costs (4, GAP + STRIDE W) and of those above and below it, into
+    its last row."""
+    height, width = base.shape
     above, below = max(y - 1, 0), min(y + 1, height - 1)
     row_a, row_b, row_c = pointer(raw[above % 3]), pointer(raw[y % 3]), pointer(raw[below % 3])
-    middle, doubt = pointer(raw[3]), pointer(views.doubt)
+    middle = pointer(raw[3])
     for x in range(width):
         at, b = GAP + STRIDE * x, np.int64(base[y, x])
         own = u8.load(row_b, at)
         both = u8.mean(_beside(row_a, at, b - base[above, x], own), _beside(row_c, at, b - base[below, x], own))
         u8.store(middle, at, u8.mean(both, own))
+
+
+@numba.njit(cache=True, nogil=True)
+def smoothed(base: Ints, y: Index, x: Index, middle: Pointer) -> Any:
+    """Costs of a pixel: the weighted mean, 1 2 1, of those in a row that :func:`smooth_columns` has made."""
+    at, b = GAP + STRIDE * x, np.int64(base[y, x])
+    own = u8.load(middle, at)
+    left, right = max(x - 1, 0), min(x + 1, base.shape[1] - 1)
+    both = u8.mean(
+        _beside(middle, GAP + STRIDE * left, b - base[y, left], own),
+        _beside(middle, GAP + STRIDE * right, b - base[y, right], own),
+    )
+    return u8.mean(both, own)
+
+
+@numba.njit(cache=True, nogil=True)
+def _smooth_costs(views: Views, unseen: np.uint8, y: Index, raw: Bytes, costs: Pointer) -> None:
+    """Costs of row y: weighted means, 1 2 1 both ways, of raw costs of three rows; the cost of the unseen put in."""
+    base, width = views.base, views.left.shape[1]
+    middle, doubt = pointer(raw[3]), pointer(views.doubt)
+    smooth_columns(base, y, raw)
     for x in range(width):
-        at, b = GAP + STRIDE * x, np.int64(base[y, x])
-        own = u8.load(middle, at)
-        left, right = max(x - 1, 0), min(x + 1, width - 1)
-        both = u8.mean(
-            _beside(middle, GAP + STRIDE * left, b - base[y, left], own),
-            _beside(middle, GAP + STRIDE * right, b - base[y, right], own),
-        )
-        cost = u8.mean(both, own)
+        b = np.int64(base[y, x])
+        cost = smoothed(base, y, x, middle)
         first, last = x - b - width + 1, x - b + 1
         if first > 0 or last < LANES:
             seen = u8.lowest(u8.within(cost, first, last, u8.splat(np.uint8(255))))
-            most = min(max(np.int64(unseen), np.int64(seen)), UNSEEN_OVER_SEEN * np.int64(seen))
-            cost = u8.within(cost, first, last, u8.splat(np.uint8(most)))
+            cost = u8.within(cost, first, last, u8.splat(cost_of_unseen(unseen, seen)))
         u8.store(costs, LANES * x, u8.add(cost, u8.load(doubt, LANES * np.int64(views.expected[y, x]))))
+
+
+@numba.njit(cache=True, nogil=True)
+def cost_of_unseen(unseen: np.uint8, seen: np.uint8) -> np.uint8:
+    """Of what leads out of the other picture, by the least cost of what leads into it."""
+    return np.uint8(min(max(np.int64(unseen), np.int64(seen)), UNSEEN_OVER_SEEN * np.int64(seen)))
 
 
 @numba.njit(cache=True, nogil=True)
 def fill_costs(views: Views, unseen: np.uint8, first: Index, last: Index, raw: Bytes, rows: Rows) -> None:
     """Costs of the rows first to last - 1; ``raw``: scratch (4, GAP + STRIDE W)."""
     height, ring = views.left.shape[0], rows.costs.shape[0]
-    _clear(raw)
+    clear(raw)
     for y in range(max(first - 1, 0), min(first + 1, height)):
         _raw_costs(views, y, pointer(raw[y % 3]))
     for y in range(first, last):
@@ -237,7 +258,7 @@ def follow_down(views: Views, penalties: Penalties, first: Index, last: Index, p
     """Paths from above through the rows first to last - 1, which go on from where ``paths`` (4, GAP + STRIDE W) is."""
     ring = rows.costs.shape[0]
     if first == 0:
-        _clear(paths)
+        clear(paths)
     for y in range(first, last):
         costs, sums = pointer(rows.costs[y % ring]), pointer(rows.above[y % ring])
         _follow_row(views, penalties, y, 1, y == 0, paths, costs, sums)
@@ -247,10 +268,21 @@ def follow_down(views: Views, penalties: Penalties, first: Index, last: Index, p
 def follow_up(views: Views, penalties: Penalties, first: Index, last: Index, paths: Bytes, rows: Rows) -> None:
     """Paths from below that begin in row last - 1 and end in row first; ``paths`` is scratch."""
     ring = rows.costs.shape[0]
-    _clear(paths)
+    clear(paths)
     for y in range(last - 1, first - 1, -1):
         costs, sums = pointer(rows.costs[y % ring]), pointer(rows.below[y % ring])
         _follow_row(views, penalties, y, -1, y == last - 1, paths, costs, sums)
+
+
+@numba.njit(cache=True, nogil=True)
+def between_lanes(sums: Pointer, at: Index, best: np.int64) -> tuple[np.float32, np.int64]:
+    """How far beside the best of costs the least is, by two lines of opposite slope (equiangular fit), and their second
+    difference."""
+    before, after = np.int64(sums[at - 1]), np.int64(sums[at + 1])
+    shift, rise = np.float32(0.0), max(before, after) - best
+    if rise > 0 and max(before, after) < 255:
+        shift = np.float32(0.5) * np.float32(before - after) / np.float32(rise)
+    return shift, before + after - 2 * best
 
 
 @numba.njit(cache=True, nogil=True)
@@ -291,10 +323,7 @@ def decide(
             best, disparity = np.int64(found.best[y, x]), base[y, x] + k
             shift, bend = np.float32(0.0), np.int64(0)
             if k > 0 and k < LANES - 1:
-                before, after = np.int64(above[LANES * x + k - 1]), np.int64(above[LANES * x + k + 1])
-                bend, rise = before + after - 2 * best, max(before, after) - best
-                if rise > 0 and max(before, after) < 255:
-                    shift = np.float32(0.5) * np.float32(before - after) / np.float32(rise)
+                shift, bend = between_lanes(above, LANES * x + k, best)
             found.disparity[y, x] = np.float32(disparity) + shift
             found.bend[y, x] = np.int16(bend)
             place = x - disparity
@@ -305,7 +334,8 @@ def decide(
 
 
 @numba.njit(cache=True, nogil=True)
-def _clear(rows: Bytes) -> None:
+def clear(rows: Bytes) -> None:
+    """Fill with 255, the cost of what is not looked at."""
     flat = rows.reshape(-1)
     for n in range(flat.shape[0]):
         flat[n] = np.uint8(255)
