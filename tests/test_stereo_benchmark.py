@@ -38,3 +38,11 @@ def test_scores_of_a_known_map() -> None:
     assert scores["mean_answered_visible"] == pytest.approx(6.5 / 8)
     assert scores["wrong_or_none_visible"] == pytest.approx(40.0)
     assert scores["bad1_complete_all"] == pytest.approx(100.0 * 2 / 12)
+    # filled: 2 2 2 3.5 2 2 2 7 4 4 4 4; all of it searched, and 3.5 rounds to 4
+    assert scores["searched_all"] == pytest.approx(100.0)
+    assert scores["mean_searched_all"] == pytest.approx(6.5 / 12)
+    assert scores["mean_whole_all"] == pytest.approx(7.0 / 12)
+    narrow = stereo.scores(found, stereo_pairs.StereoSet("", case.pair, truth + 0.25, visible, (0, 3)))
+    assert narrow["searched_all"] == pytest.approx(100.0 * 8 / 12)
+    assert narrow["mean_searched_all"] == pytest.approx((1.25 + 4.75 + 6 * 0.25) / 8)
+    assert "mean_whole_all" not in narrow

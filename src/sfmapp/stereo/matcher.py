@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from sfmapp.dense.expand import CONTRAST, LEAST_CONTRAST
 from sfmapp.errors import UsageError
 from sfmapp.images.pixels import as_gray
-from sfmapp.stereo.checks import fill_holes, seen_by_both
+from sfmapp.stereo.checks import seen_by_both
+from sfmapp.stereo.filling import fill_by_planes
 from sfmapp.stereo.options import StereoOptions
 from sfmapp.stereo.result import DisparityMap, PixelState, RectifiedPair
 from sfmapp.stereo.semiglobal import BLANK_WINDOW, LEAST_UNIQUENESS, Level
@@ -25,8 +26,6 @@ from sfmapp.stereo.slanted import refine_slanted
 BLANK = 0.1
 # sixteenths of disparities are 16-bit numbers where islands are looked for
 MOST_PX = 2047
-# rows are filled one by one: the median of so many pixels and rows takes the streaks out
-FILL_WINDOW = 5
 # islands of fewer pixels, whose disparities differ by more than one from all around them, are dropped
 LEAST_ISLAND, ISLAND_STEP_PX = 100, 1
 
@@ -147,13 +146,12 @@ def match_by_sgm(pair: RectifiedPair, options: StereoOptions, search: tuple[int,
 
 
 def fill(found: DisparityMap, pair: RectifiedPair) -> None:
-    """Put the lesser disparity of both sides of its row into what was not matched, and the median about it there."""
+    """Put surfaces from beside it into what was not matched."""
     empty = np.isnan(found.disparity)
     if empty.all():
         return
-    full = fill_holes(found.disparity)
     filled = empty & pair.left_shown
-    found.disparity[filled] = cv2.medianBlur(full, FILL_WINDOW)[filled]
+    found.disparity[filled] = fill_by_planes(found.disparity)[filled]
     found.state[filled] = PixelState.FILLED
 
 

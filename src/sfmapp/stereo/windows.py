@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.images.pixels import as_gray
-from sfmapp.stereo.checks import beside_steps, fill_holes, seen_by_both, without_speckles
+from sfmapp.stereo.checks import beside_steps, seen_by_both, without_speckles
 from sfmapp.stereo.costs import GREATEST, NUMBERS, planes_of
+from sfmapp.stereo.filling import fill_by_planes
 from sfmapp.stereo.options import StereoOptions, WindowsName
 from sfmapp.stereo.result import DisparityMap, PixelState, RectifiedPair
 from sfmapp.stereo.window_kernels import LEAST, SUM, Found, Search, Windows, match_rows
@@ -62,7 +63,7 @@ def match_by_windows(pair: RectifiedPair, options: StereoOptions, search: tuple[
     if options.fill and matched.any():
         weak = np.where(seen & (found.uniqueness >= _LEAST_OF_FILLING), found.disparity, np.float32(np.nan))
         weak = without_speckles(np.where(matched, disparity, weak), _SPECKLE, _SPECKLE_STEP_PX)
-        disparity = fill_holes(np.where(matched, disparity, weak))
+        disparity = fill_by_planes(np.where(matched, disparity, weak))
         filled = ~matched & pair.left_shown
         state[filled] = PixelState.FILLED
         disparity[~matched & ~filled] = np.nan
