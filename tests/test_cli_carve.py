@@ -17,6 +17,7 @@ from sfmapp.cli.main import main
 from sfmapp.errors import InputError
 from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.geometry import rigid3
+from sfmapp.report.carve_pictures import slice_picture
 
 VIEWS = around(10, width=120, height=90)
 VOLUME = 1.6 * 1.2 * 1.0
@@ -132,3 +133,16 @@ def test_damaged_octrees_are_named(tmp_path: Path) -> None:
     np.savez(path, low=np.zeros(3), side=1.0, full=np.zeros(2, np.int64), level_starts=np.array([0, 2]), surface=[1])
     with pytest.raises(InputError, match="other arrays"):
         read_octree(path)
+
+
+def test_the_page_shows_photographs_slices_and_levels(carved: Path) -> None:
+    page = (carved / "report.html").read_text()
+    assert page.count("data:image/jpeg") >= 3 * 4 + 3
+    assert all(view.name in page for view in VIEWS)
+    octree = read_octree(carved / "octree.npz")
+    ends = (np.array([-0.8, -0.6, -0.5]), np.array([0.8, 0.6, 0.5]))
+    # a slice across z: 1.6 to the right and 1.2 up, in a picture of 1.1 times 1.6; without and with the border's cells
+    picture, truth = slice_picture(octree, 2, 0.0, ends), 1.6 * 1.2 / 1.76**2
+    inked, border = (picture < 250).any(axis=2).mean(), (picture == [30, 34, 40]).all(axis=2).mean()
+    assert 0.85 * truth < inked - border < 1.1 * truth
+    assert truth < inked < 1.25 * truth

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.carve.rendering import depth_of_mesh, overlap
+from sfmapp.carve.rendering import overlap, show_mesh
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View, project_point
 from sfmapp.events import Events
@@ -87,7 +87,7 @@ def color_surface(
 
     def work(v: int) -> tuple[Array, ViewFit]:
         view, silhouette = views[v], silhouettes[v]
-        depth = depth_of_mesh(view, mesh.xyz, mesh.faces)
+        depth = show_mesh(view, mesh.xyz, mesh.faces).depth
         iou, over, under = overlap(depth, silhouette)
         seen = np.zeros((len(mesh.xyz), 4))
         _look(view.row, view.center, mesh.xyz, normal, depth, read(v), silhouette.distance, cell, seen)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +14,21 @@ from sfmapp.carve.views import View, project_points
 Array = NDArray[np.float64]
 
 
-def depth_of_mesh(view: View, xyz: Array, faces: NDArray[np.int32]) -> NDArray[np.float32]:
-    """(H, W) depth of the nearest of triangles (F, 3) behind each pixel's centre, units of the world; inf for none.
+@dataclass(frozen=True)
+class Shown:
+    """What a view shows of a mesh.
+
+    Attributes:
+        depth: (H, W) of the nearest triangle behind each pixel's centre, units of the world; inf for none.
+        face: (H, W) int32 that triangle; -1 for none.
+    """
+
+    depth: NDArray[np.float32]
+    face: NDArray[np.int32]
+
+
+def show_mesh(view: View, xyz: Array, faces: NDArray[np.int32]) -> Shown:
+    """What a view shows of triangles (F, 3) between places (N, 3).
 
     Corners are projected by the lens, and triangles are flat between them: they are to be small against what the lens
     bends. A triangle with a corner that the lens does not see is left out.
@@ -21,8 +36,9 @@ def depth_of_mesh(view: View, xyz: Array, faces: NDArray[np.int32]) -> NDArray[n
     seen = np.empty((len(xyz), 3))
     project_points(view.row, np.ascontiguousarray(xyz, np.float64), seen)
     depth = np.full((view.height, view.width), np.inf, np.float32)
-    _rasterize(seen, faces, depth)
-    return depth
+    face = np.full(depth.shape, -1, np.int32)
+    _rasterize(seen, faces, depth, face)
+    return Shown(depth, face)
 
 
 def overlap(depth: NDArray[np.float32], silhouette: Silhouette) -> tuple[float, int, int]:
@@ -41,8 +57,8 @@ def overlap(depth: NDArray[np.float32], silhouette: Silhouette) -> tuple[float, 
 
 
 @numba.njit(cache=True, nogil=True)
-def _rasterize(seen: Array, faces: NDArray[np.int32], depth: NDArray[np.float32]) -> None:
-    """Least depths (in place) of triangles whose corners are at pixels and depths (N, 3)."""
+def _rasterize(seen: Array, faces: NDArray[np.int32], depth: NDArray[np.float32], face: NDArray[np.int32]) -> None:
+    """Least depths, and whose they are (in place), of triangles whose corners are at pixels and depths (N, 3)."""
     height, width = depth.shape
     for n in range(faces.shape[0]):
         i, j, k = faces[n, 0], faces[n, 1], faces[n, 2]
@@ -69,3 +85,4 @@ def _rasterize(seen: Array, faces: NDArray[np.int32], depth: NDArray[np.float32]
                 z = np.float32(1.0 / (wa / az + wb / bz + wc / cz))
                 if z < depth[row, col]:
                     depth[row, col] = z
+                    face[row, col] = n

@@ -62,3 +62,4 @@ class CarveReport(Report):
     files: Sequence[str]
     usage: Mapping[str, Usage]
     warnings: Sequence[LogLine]
+    decisions: Sequence[LogLine]

@@ -27,11 +27,12 @@ from sfmapp.pipelines.carve.outputs import CARVING, OCTREE, write_volume
 from sfmapp.pipelines.carve.sources import CarveSource, find_views
 from sfmapp.pipelines.dense.source import is_of_model
 from sfmapp.report.carve_document import BoxFacts, CarveReport, SurfaceFacts
+from sfmapp.report.carve_html import carve_page
 from sfmapp.reporting import NamedReason, from_plain
 from sfmapp.scene.mesh import Mesh, face_areas
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.keys import input_key, stage_key
-from sfmapp.workspace.layout import CARVE, REPORT
+from sfmapp.workspace.layout import CARVE, PAGE, REPORT
 from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
 
@@ -129,8 +130,11 @@ def carve(
             left_out=[NamedReason(name=name, reason=reason) for name, reason in source.left_out], masks=masks,
             box=BoxFacts(low=box.low.tolist(), high=box.high.tolist(), told_by=box.told_by, apart=box.apart),
             carving=carving, surface=_facts(mesh), colors=colors, files=files, usage=job.usage,
-            warnings=job.log.warnings,
+            warnings=job.log.warnings, decisions=job.log.decisions,
         )  # fmt: skip
+        with job.measured("page"):
+            page = carve_page(report, source.views, silhouettes, octree, mesh, lambda v: read_rgb(source.records[v]))
+            job.workspace.write_text(PAGE, page)
         job.workspace.write_json(REPORT, report)
         job.workspace.save()
         return CarveResult(job.workspace.folder, report, octree, mesh)

@@ -1,0 +1,150 @@
+"""The page of a carved volume: how well it fits its silhouettes, what it looks like, how it was carved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.carve.octree import Octree
+from sfmapp.carve.silhouettes import Silhouette
+from sfmapp.carve.views import View
+from sfmapp.report.carve_document import CarveReport
+from sfmapp.report.carve_pictures import cropped, overlap_picture, result_pictures, slice_picture
+from sfmapp.report.drawing import jpeg_url
+from sfmapp.report.page import log_table, render_page, table, usage_table
+from sfmapp.scene.mesh import Mesh
+
+Pixels = NDArray[np.uint8]
+
+# photographs that are shown: evenly spread, and of those that fit worst the first
+_NUM_SHOWN, _NUM_WORST = 4, 2
+_SHOWN_PX, _QUALITY = 640, 85
+_STYLE = """<style>.trio{display:grid;grid-template-columns:repeat(3,1fr);gap:.8rem;margin-bottom:1rem}
+.key{display:inline-block;width:.8rem;height:.8rem;vertical-align:-.1rem;margin:0 .25rem 0 .6rem}</style>"""
+
+
+def carve_page(
+    report: CarveReport, views: Sequence[View], silhouettes: Sequence[Silhouette], octree: Octree, mesh: Mesh,
+    read: Callable[[int], Pixels],
+) -> str:  # fmt: skip
+    """The page, self-contained, its pictures in it; ``read`` gives the photograph of a view."""
+    title = f"A volume of {report.num_views} photographs"
+    return render_page(title, _body(report, views, silhouettes, octree, mesh, read))
+
+
+def _body(
+    report: CarveReport, views: Sequence[View], silhouettes: Sequence[Silhouette], octree: Octree, mesh: Mesh,
+    read: Callable[[int], Pixels],
+) -> Iterator[str]:  # fmt: skip
+    yield _STYLE
+    for line in report.warnings:
+        yield f'<div class="failure"><p>{escape(line.message or "")}</p></div>'
+    yield _summary(report)
+    yield from _photographs(report, views, silhouettes, mesh, read)
+    yield from _fits(report)
+    yield from _slices(octree, mesh)
+    yield _levels(report)
+    yield log_table("Decisions", report.decisions)
+    yield usage_table(report.usage, report.run)
+
+
+def _summary(report: CarveReport) -> str:
+    fits = [fit.iou for fit in report.colors.views]
+    carving, surface = report.carving, report.surface
+    size = " x ".join(f"{high - low:.4g}" for low, high in zip(surface.low, surface.high, strict=True))
+    text = (
+        f"<p>Seen again by its {report.num_views} photographs, the volume covers their silhouettes by "
+        f"{np.median(fits):.2%} in the median (intersection over union; least {min(fits):.2%}). Cameras: "
+        f"{escape(report.cameras)}.</p><p>Its closed surface of {surface.num_faces:,} triangles measures {size}, with "
+        f"a volume of {surface.volume:.5g} and an area of {surface.area:.5g}, in units of the world. The hull's volume "
+        f"lies between {carving.volume_low:.5g}, cells that are wholly inside, and {carving.volume_high:.5g}, with "
+        f"those at the surface. The object itself may be smaller: what no outline shows, such as the inside of a cup, "
+        "stays filled.</p>"
+    )
+    if report.box.told_by != "silhouettes":
+        text += f"<p>The box was told by {escape(report.box.told_by)}.</p>"
+    colors = report.colors
+    if colors.seen_share < 1.0:
+        text += (
+            f"<p>{colors.seen_share:.1%} of the vertices have the colours of photographs that show them "
+            f"({colors.median_views:.0f} in the median); the others those of what is near.</p>"
+        )
+    return text
+
+
+def _photographs(
+    report: CarveReport, views: Sequence[View], silhouettes: Sequence[Silhouette], mesh: Mesh,
+    read: Callable[[int], Pixels],
+) -> Iterator[str]:  # fmt: skip
+    fits = np.array([fit.iou for fit in report.colors.views])
+    spread = np.unique(np.linspace(0, len(views) - 1, _NUM_SHOWN + 1)[:-1].round().astype(int)).tolist()
+    chosen = [*spread, *(i for i in np.argsort(fits, kind="stable")[:_NUM_WORST].tolist() if i not in spread)]
+    yield "<h2>Photographs and what was carved</h2>"
+    yield (
+        '<p class=dim>Left the photograph, pale outside its silhouette: <span class=key style="background:#eb3c28">'
+        '</span>covered by the volume alone, <span class=key style="background:#286eff"></span>by the silhouette '
+        "alone. In the middle the volume in colours, right its shape lit from the camera. The last ones fit worst.</p>"
+    )
+    for v in chosen:
+        shown, colors, shape = result_pictures(views[v], mesh)
+        pictures = [overlap_picture(read(v), shown, silhouettes[v]), colors, shape]
+        captions = [f"{report.colors.views[v].name}: {fits[v]:.2%}", "", ""]
+        yield "<div class=trio>"
+        for picture, caption in zip(cropped(pictures, shown, silhouettes[v]), captions, strict=True):
+            url = jpeg_url(picture, _SHOWN_PX, _QUALITY)
+            yield f'<figure><img src="{url}" alt=""><figcaption>{escape(caption)}</figcaption></figure>'
+        yield "</div>"
+
+
+def _fits(report: CarveReport) -> Iterator[str]:
+    head = [
+        ("t", "photograph"),
+        ("", "overlap"),
+        ("", "volume alone px"),
+        ("", "silhouette alone px"),
+        ("t", "told by"),
+    ]
+    problems = {mask.name: mask.problem for mask in report.masks.masks}
+    rows = [
+        [
+            ("t", fit.name), ("", f"{fit.iou:.2%}"), ("", fit.over_px), ("", fit.under_px),
+            ("w", fit.source + (f": {problems[fit.name]}" if problems.get(fit.name) else "")),
+        ]
+        for fit in report.colors.views
+    ]  # fmt: skip
+    yield f"<details><summary>All {len(rows)} photographs</summary>{table(head, rows)}</details>"
+    for entry in report.left_out:
+        yield f"<p class=dim>{escape(entry.name)}: {escape(entry.reason)}</p>"
+
+
+def _slices(octree: Octree, mesh: Mesh) -> Iterator[str]:
+    yield "<h2>Slices</h2><div class=trio>"
+    low, high = mesh.xyz.min(axis=0), mesh.xyz.max(axis=0)
+    for axis, at in enumerate((0.5 * (low + high)).tolist()):
+        url = jpeg_url(slice_picture(octree, axis, at, (low, high)), _SHOWN_PX, 92)
+        names = ["xyz"[(axis + n) % 3] for n in range(3)]
+        caption = f"{names[0]} = {at:.4g}; {names[1]} to the right, {names[2]} up"
+        yield f'<figure><img src="{url}" alt=""><figcaption>{caption}</figcaption></figure>'
+    yield "</div><p class=dim>Cells wholly inside, large ones pale and small ones dark; black: at the surface.</p>"
+
+
+def _levels(report: CarveReport) -> str:
+    carving = report.carving
+    head = [
+        ("", name) for name in ("level", "side", "cells", "looked at", "full", "carved", "seen by too few", "split")
+    ]
+    rows = [
+        [
+            ("", level.level), ("", f"{level.side:.4g}"), ("", f"{8.0**level.level:.3g}"), ("", f"{level.looked_at:,}"),
+            ("", f"{level.full:,}"), ("", f"{level.carved:,}"), ("", f"{level.unseen:,}"), ("", f"{level.split:,}"),
+        ]
+        for level in carving.levels
+    ]  # fmt: skip
+    return (
+        f"<h2>How it was carved</h2><p>{carving.cells} cells along the side of the cube: {carving.share_of_dense:.2%} "
+        f"of those of a dense grid were looked at, in {carving.num_questions:,} questions to a photograph.</p>"
+        + table(head, rows)
+    )
