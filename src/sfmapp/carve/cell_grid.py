@@ -1,0 +1,91 @@
+"""A volume as a dense window of finest cells, for what has to look along rays through all of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.carve.octree import Codes, Octree, codes_of, places_of
+
+Cells = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class CellGrid:
+    """The part of an octree's finest level that is not empty.
+
+    Attributes:
+        tree: the octree that it was made of.
+        first: (3,) int64 place, among all finest cells, of the window's cell 0, 0, 0.
+        filled: (X, Y, Z) uint8, 1 where the cell belongs to the volume, wholly or in part.
+    """
+
+    tree: Octree
+    first: NDArray[np.int64]
+    filled: Cells
+
+    @property
+    def volume(self) -> float:
+        """Of all filled cells, cubic units of the world."""
+        return float(np.count_nonzero(self.filled)) * self.tree.cell**3
+
+    @property
+    def low(self) -> NDArray[np.float64]:
+        """(3,) world corner of the window."""
+        return np.asarray(self.tree.low + self.first * self.tree.cell)
+
+    @property
+    def middle(self) -> NDArray[np.float64]:
+        """(3,) world middle of the window."""
+        return np.asarray(self.low + 0.5 * self.tree.cell * np.array(self.filled.shape))
+
+    def holds(self, xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether points (N, 3) are in filled cells."""
+        at = np.floor((xyz - self.low) / self.tree.cell).astype(np.int64)
+        is_there = np.asarray(((at >= 0) & (at < self.filled.shape)).all(axis=1))
+        filled = np.zeros(len(xyz), np.bool_)
+        filled[is_there] = self.filled[tuple(at[is_there].T)] == 1
+        return filled
+
+
+def grid_of(tree: Octree) -> CellGrid:
+    """The window that holds all of an octree; one empty cell if there is nothing in it."""
+    parts = [places_of(codes) << (tree.depth - level) for level, codes in enumerate(tree.full)]
+    lows = [*parts, places_of(tree.surface)]
+    highs = [at + (1 << (tree.depth - level)) for level, at in enumerate(parts)] + [lows[-1] + 1]
+    if not any(len(at) for at in lows):
+        return CellGrid(tree, np.zeros(3, np.int64), np.zeros((1, 1, 1), np.uint8))
+    first = np.concatenate(lows).min(axis=0)
+    filled = np.zeros(np.concatenate(highs).max(axis=0) - first, np.uint8)
+    for level, at in enumerate(parts):
+        side = 1 << (tree.depth - level)
+        for x, y, z in at - first:
+            filled[x : x + side, y : y + side, z : z + side] = 1
+    filled[tuple((lows[-1] - first).T)] = 1
+    return CellGrid(tree, first, filled)
+
+
+def octree_of(grid: CellGrid) -> Octree:
+    """The octree of what is left in a window: cells beside one that was taken away are at the surface now."""
+    tree = grid.tree
+    padded = np.pad(grid.filled, 1)
+    inner = padded[1:-1, 1:-1, 1:-1].astype(bool)
+    for axis in range(3):
+        inner &= np.roll(padded, 1, axis)[1:-1, 1:-1, 1:-1] & np.roll(padded, -1, axis)[1:-1, 1:-1, 1:-1] == 1
+    kept = np.sort(codes_of(np.argwhere(grid.filled) + grid.first))
+    whole = np.sort(codes_of(np.argwhere(inner) + grid.first))
+    whole = np.setdiff1d(whole, tree.surface, assume_unique=True)
+    return Octree(tree.low, tree.side, tree.depth, merged(whole, tree.depth), np.setdiff1d(kept, whole, True))
+
+
+def merged(codes: Codes, depth: int) -> tuple[Codes, ...]:
+    """Finest cells, codes (N,) ascending, as lists for levels 0 to ``depth``: eight of one parent become the parent."""
+    levels = []
+    for _ in range(depth):
+        parents, counts = np.unique(codes >> np.uint64(3), return_counts=True)
+        parents = parents[counts == 8]
+        levels.append(codes[~np.isin(codes >> np.uint64(3), parents)])
+        codes = parents
+    return (codes, *reversed(levels))

@@ -1,0 +1,233 @@
+"""Volumes made smaller by shadows, where camera and light both vouch that nothing is there.
+
+After Savarese, Andreetto, Rushmeier, Bernardini and Perona, "3D reconstruction by shadow carving: theory and practical
+evaluation", IJCV 71(3), 2007. What follows is their argument for cells of finite size.
+
+Let U hold the object O, and let R be a part of U such that
+
+1. every pixel that R may touch in a photograph is in shadow under a light l, and
+2. from every point of R, straight ways to the camera c, to l, and to all directions up to an angle a beyond l as seen
+   from c (in the plane of point, c and l), meet nothing of U but R.
+
+Camera and light have a common direction d that leads nearer to both. If there were points of O in R, then the one
+farthest along d would be seen by the camera and be lit, as whatever could hide it would be one of O farther along d.
+Its normal n turns towards c, and towards l' at the end of the fan; since l lies between the two,
+``n l >= (n c) sin(a) / sin(angle(c, l) + a)``: beside a photograph that is lit from the camera, its brightness in the
+photograph under l is no less than that quotient of sines. That is no shadow, so R is empty. All such R together are one
+again, and it is found by taking from what is dark all that lies behind a held place for the camera or for the fan.
+
+This holds for surfaces that are smooth to the eye of the camera. At an edge, surfaces may turn from one that only the
+light sees to one that only the camera sees. Edges of interior angles above that between light and camera cannot, which
+is why pairs of a light and a camera far apart are left out (``max_angle_deg``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from sfmapp.carve.cell_grid import CellGrid, grid_of, octree_of
+from sfmapp.carve.octree import Octree
+from sfmapp.carve.shadow_kernels import Planes, angles_of_all, find_held, take_free
+from sfmapp.carve.views import View
+from sfmapp.errors import InputError
+from sfmapp.events import Events
+from sfmapp.option_checks import Range, check_options
+from sfmapp.reporting import Report
+
+Array = NDArray[np.float64]
+# finest level whose window of dense cells is held in memory, some of them at a time
+MAX_DEPTH = 9
+# samples in half planes, in finest cells where the volume has its middle
+_STEP = 0.75
+# a sweep over all views that takes away less than this share of the cells is the last
+_SETTLED = 1e-3
+
+
+@dataclass(frozen=True)
+class ShadowOptions:
+    """Options of the stage ``shadows``.
+
+    Attributes:
+        fan_deg: Angle beyond a light from which a place has to be free too, degrees. The larger, the brighter may a
+            shadow be that is told from a surface which hardly turns towards the light, and the less is carved.
+        max_angle_deg: Light and camera farther apart, as seen from the object, are not used together, degrees: no edge
+            of the object may be sharper.
+        margin_px: Blur of the photographs: how far beyond itself a lit place brightens the picture, pixels.
+        max_sweeps: Times that all photographs are gone through at most.
+    """
+
+    fan_deg: float = 2.0
+    max_angle_deg: float = 75.0
+    margin_px: float = 0.5
+    max_sweeps: int = 4
+
+    def __post_init__(self) -> None:
+        check_options("shadows", self, {
+            "fan_deg": Range(0.5, 30.0), "max_angle_deg": Range(5.0, 90.0), "margin_px": Range(0.0),
+            "max_sweeps": Range(1),
+        })  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Shadow:
+    """What one photograph under one light shows to be in shadow.
+
+    Attributes:
+        view: index of its camera.
+        light: (3,) place of the light, world.
+        dark: (H, W) bool, True only where the object is seen and no light falls on it.
+        light_name: for reports.
+    """
+
+    view: int
+    light: Array
+    dark: NDArray[np.bool_]
+    light_name: str = ""
+
+
+class ShadowCarvingReport(Report):
+    """What shadows took away.
+
+    Attributes:
+        num_pairs: photographs under a light that were used. num_too_far: left out, light and camera too far apart.
+        sweeps: cells taken away in each passage of all photographs.
+        cells_before, cells_after: of the finest level.
+        volume_before, volume_after: of these, cubic units of the world.
+    """
+
+    num_pairs: int
+    num_too_far: int
+    sweeps: Sequence[int]
+    cells_before: int
+    cells_after: int
+    volume_before: float
+    volume_after: float
+
+
+def carve_shadows(
+    tree: Octree, views: Sequence[View], shadows: Sequence[Shadow], options: ShadowOptions | None = None,
+    events: Events | None = None, *, threads: int = 2,
+) -> tuple[Octree, ShadowCarvingReport]:  # fmt: skip
+    """Take cells away that cannot belong to the object, as the camera would see them lit.
+
+    Args:
+        tree: holds the object wholly, such as its hull; at most 512 cells on a side.
+        views: cameras.
+        shadows: what is dark in their photographs, in any order; nothing but the object throws shadows on it.
+        options, events: as for every stage.
+        threads: do not change the result.
+
+    Returns:
+        the smaller volume and its report.
+
+    Raises:
+        InputError: a mask has another size than its view, or the octree is too fine.
+    """
+    options = options or ShadowOptions()
+    events = events or Events()
+    _check(tree, views, shadows)
+    grid = grid_of(tree)
+    by_view: dict[int, list[Shadow]] = {}
+    used = [s for s in shadows if _angle_deg(grid, views[s.view], s) <= options.max_angle_deg]
+    for shadow in used:
+        by_view.setdefault(shadow.view, []).append(shadow)
+    before, sweeps = int(np.count_nonzero(grid.filled)), list[int]()
+    events.started("shadows", f"{len(used)} photographs under lights", options.max_sweeps * len(by_view))
+    left = before
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        while used and len(sweeps) < options.max_sweeps and (not sweeps or sweeps[-1] > _SETTLED * left):
+            taken = 0
+            for view, of_view in sorted(by_view.items()):
+                taken += _carve_by_view(grid, views[view], of_view, options, pool)
+                events.advanced("shadows", message=views[view].name)
+            sweeps.append(taken)
+            left -= taken
+    report = ShadowCarvingReport(
+        num_pairs=len(used), num_too_far=len(shadows) - len(used), sweeps=sweeps, cells_before=before, cells_after=left,
+        volume_before=before * tree.cell**3, volume_after=left * tree.cell**3,
+    )  # fmt: skip
+    events.finished("shadows", f"{100.0 * (before - left) / max(before, 1):.1f} % of the hull taken away", **report)
+    return (octree_of(grid) if left < before else tree), report
+
+
+def _check(tree: Octree, views: Sequence[View], shadows: Sequence[Shadow]) -> None:
+    if tree.depth > MAX_DEPTH:
+        raise InputError(
+            f"shadows carve up to {2**MAX_DEPTH} cells on a side, the volume has {2**tree.depth}", "ask for fewer cells"
+        )
+    for shadow in shadows:
+        view = views[shadow.view]
+        if shadow.dark.shape != (view.height, view.width):
+            raise InputError(
+                f"{view.name}: expected a shadow mask of {view.width} x {view.height} pixels, found "
+                f"{shadow.dark.shape[1]} x {shadow.dark.shape[0]}"
+            )
+
+
+def _angle_deg(grid: CellGrid, view: View, shadow: Shadow) -> float:
+    """Between camera and light as seen from the middle of the volume."""
+    a, b = view.center - grid.middle, shadow.light - grid.middle
+    return float(np.degrees(np.arccos(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), -1.0, 1.0))))
+
+
+def reach_of(dark: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """(H, W) pixels from the centre of each pixel to that of the nearest that is not dark or is beyond the picture."""
+    return np.asarray(distance_transform_edt(np.pad(dark, 1))[1:-1, 1:-1], np.float32)
+
+
+def _planes(grid: CellGrid, camera: Array, light: Array, fan_deg: float) -> Planes:
+    """Half planes about the line from a camera to a light, wide and fine enough for all cells of a window."""
+    base = float(np.linalg.norm(light - camera))
+    axis = (light - camera) / base
+    # counted from the middle of the volume, so that angles do not jump
+    first = grid.middle - camera
+    first -= (first @ axis) * axis
+    first /= np.linalg.norm(first)
+    near, away = np.linalg.norm(grid.middle - camera), np.linalg.norm(grid.middle - light)
+    at = np.arctan2((grid.middle - camera) @ first, (grid.middle - camera) @ axis)
+    step = _STEP * grid.tree.cell / np.array([near * np.sin(at), near, away])
+    axes = np.stack([axis, first, np.cross(axis, first)])
+    planes = Planes(camera, light, axes, base, np.zeros(3), step, np.zeros(3, np.int64), 0.0)
+    low, high = _ranges(grid, planes)
+    low, high = low - 2.0 * step, high + 2.0 * step
+    # along a way to the light, in samples: what the fan opens while the angle at the camera goes on by one
+    between = np.sin(np.arccos((camera - grid.middle) @ (light - grid.middle) / (near * away)))
+    spread = np.tan(np.radians(fan_deg)) * near * step[1] / (between * away * step[2])
+    return planes._replace(low=low, num=np.ceil((high - low) / step).astype(np.int64) + 1, spread=float(spread))
+
+
+def _ranges(grid: CellGrid, planes: Planes) -> tuple[Array, Array]:
+    """Least and largest angles (3,) on the faces of a window."""
+    t = np.linspace(0.0, 1.0, 17)
+    a, b = (side.ravel() for side in np.meshgrid(t, t))
+    faces = [np.insert(np.stack([a, b], axis=1), axis, end, axis=1) for axis in range(3) for end in (0.0, 1.0)]
+    angles = np.empty((6 * len(a), 3))
+    angles_of_all(planes, grid.low + np.vstack(faces) * np.array(grid.filled.shape) * grid.tree.cell, angles)
+    return angles.min(axis=0), angles.max(axis=0)
+
+
+def _carve_by_view(
+    grid: CellGrid, view: View, shadows: Sequence[Shadow], options: ShadowOptions, pool: ThreadPoolExecutor
+) -> int:
+    """Take away what the photographs of one camera vouch for, each by itself against the volume as it was before; how
+    many cells that is. What several volumes lack, the object lacks."""
+    empty = np.zeros(grid.filled.shape, np.uint8)
+
+    def carve(shadow: Shadow) -> None:
+        planes = _planes(grid, view.center, shadow.light, options.fan_deg)
+        first = np.empty(planes.num[:2], np.int32)
+        find_held(
+            planes, view.row, reach_of(shadow.dark), options.margin_px, grid.low, grid.tree.cell, grid.filled, first
+        )
+        take_free(planes, grid.low, grid.tree.cell, grid.filled, first, empty)
+
+    # all write the same number, in any order
+    list(pool.map(carve, shadows))
+    grid.filled[empty == 1] = 0
+    return int(np.count_nonzero(empty))

@@ -1,0 +1,210 @@
+"""Which cells a camera and a light both vouch for: kernels of :mod:`sfmapp.carve.shadow_carving`.
+
+Camera and light are taken as a pair of views. A half plane that ends in the line through both holds whole ways to the
+camera and to the light, so each is looked at by itself; in it a place is two angles, one at the camera and one at the
+light, and the ways are lines along which one of them does not change. So nothing is interpolated along a way.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.carve.cell_grid import Cells
+from sfmapp.carve.views import project_point
+
+Array = NDArray[np.float64]
+Map = NDArray[np.int32]
+
+# columns that a held place may not be looked for in: nothing there may be taken away
+_LIT = -1
+
+
+class Planes(NamedTuple):
+    """Half planes about the line from a camera to a light, and the angles in them. Angles are radians.
+
+    Attributes:
+        camera, light: (3,) places.
+        axes: (3, 3) rows: unit vector from camera to light, and two across it, from which half planes are counted.
+        base: distance of the two.
+        low: (3,) least angle about the line, at the camera, at the light.
+        step: (3,) from one sample to the next. num: (3,) int64 samples of each.
+        spread: by how many samples at the light a shadow grows with each at the camera.
+    """
+
+    camera: Array
+    light: Array
+    axes: Array
+    base: float
+    low: Array
+    step: Array
+    num: NDArray[np.int64]
+    spread: float
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def angles_of(planes: Planes, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Of a place: about the line; at the camera from the direction of the light; at the light from the camera's."""
+    dx, dy, dz = x - planes.camera[0], y - planes.camera[1], z - planes.camera[2]
+    a = planes.axes
+    along = a[0, 0] * dx + a[0, 1] * dy + a[0, 2] * dz
+    p = a[1, 0] * dx + a[1, 1] * dy + a[1, 2] * dz
+    q = a[2, 0] * dx + a[2, 1] * dy + a[2, 2] * dz
+    across = math.sqrt(p * p + q * q)
+    return math.atan2(q, p), math.atan2(across, along), math.atan2(across, planes.base - along)
+
+
+@numba.njit(cache=True, nogil=True)
+def angles_of_all(planes: Planes, xyz: Array, out: Array) -> None:
+    """:func:`angles_of` places (N, 3), into (N, 3)."""
+    for n in range(xyz.shape[0]):
+        out[n, 0], out[n, 1], out[n, 2] = angles_of(planes, xyz[n, 0], xyz[n, 1], xyz[n, 2])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _is_dark(planes: Planes, row: Array, reach: NDArray[np.float32], margin: float, about: float, at: float) -> bool:
+    """Whether all that the camera sees between a direction's neighbours is dark, and a margin of pixels beside it."""
+    u, v = _seen(planes, row, about, at)
+    height, width = reach.shape
+    if not (u >= 0.0 and v >= 0.0 and u < width and v < height):
+        return False
+    i, j = int(v), int(u)
+    if reach[i, j] <= 0.0:
+        return False
+    a, b = _seen(planes, row, about + planes.step[0], at)
+    c, d = _seen(planes, row, about, at + planes.step[1])
+    half = 0.5 * (math.hypot(a - u, b - v) + math.hypot(c - u, d - v))
+    # a pixel reaches half its diagonal beyond its centre
+    free = float(reach[i, j]) - math.hypot(u - j - 0.5, v - i - 0.5)
+    return free > half + math.sqrt(0.5) + margin
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _seen(planes: Planes, row: Array, about: float, at: float) -> tuple[float, float]:
+    """Pixel of a direction from the camera."""
+    along, across = math.cos(at) * planes.base, math.sin(at) * planes.base
+    p, q = math.cos(about) * across, math.sin(about) * across
+    a, c = planes.axes, planes.camera
+    u, v, depth = project_point(
+        row, c[0] + along * a[0, 0] + p * a[1, 0] + q * a[2, 0], c[1] + along * a[0, 1] + p * a[1, 1] + q * a[2, 1],
+        c[2] + along * a[0, 2] + p * a[1, 2] + q * a[2, 2],
+    )  # fmt: skip
+    return (u, v) if depth > 0.0 else (-1.0, -1.0)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def find_held(
+    planes: Planes, row: Array, reach: NDArray[np.float32], margin: float, low: Array, cell: float, filled: Cells,
+    first: Map,
+) -> None:  # fmt: skip
+    """How far from the camera each direction is free of what may be there.
+
+    What a lit pixel shows is held, all along its ray, and so is what lies behind a held place as seen from the camera
+    or from the light, as far as the volume reaches.
+
+    Args:
+        planes: of camera and light. row: (29,) of the view.
+        reach: (H, W) pixels from each pixel's centre to the nearest one that is not dark. margin: pixels.
+        low, cell, filled: the window of cells: corner (3,), side, (X, Y, Z).
+        first: (A, C) int32 filled for each angle about the line and at the camera: the first sample at the light that
+            is held, as many as there are samples where none is, -1 where the direction is not dark.
+    """
+    num_about, num_camera, num_light = planes.num[0], planes.num[1], planes.num[2]
+    shaded = np.empty(num_light, np.bool_)
+    dark = np.empty(num_camera, np.bool_)
+    # tangents of angles at the light, of which the places on a ray follow
+    cotangents = np.empty(num_light)
+    for k in range(num_light):
+        cotangents[k] = 1.0 / math.tan(planes.low[2] + k * planes.step[2])
+    for i in range(num_about):
+        about = planes.low[0] + i * planes.step[0]
+        last = -1
+        for j in range(num_camera):
+            dark[j] = _is_dark(planes, row, reach, margin, about, planes.low[1] + j * planes.step[1])
+            first[i, j] = _LIT
+            if dark[j]:
+                last = j
+        shaded[:] = False
+        spread = 0.0
+        # nearest to the light first
+        for j in range(last + 1):
+            _hold_on_ray(planes, about, planes.low[1] + j * planes.step[1], cotangents, low, cell, filled, shaded,
+                         not dark[j], first[i], j)  # fmt: skip
+            spread += planes.spread
+            while spread >= 1.0:
+                for k in range(num_light - 1):
+                    shaded[k] |= shaded[k + 1]
+                spread -= 1.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _hold_on_ray(
+    planes: Planes, about: float, at: float, cotangents: Array, low: Array, cell: float, filled: Cells,
+    shaded: NDArray[np.bool_], is_held: bool, first: Map, j: int,
+) -> None:  # fmt: skip
+    """One direction from the camera, from near to far: whether a sample is held, and shades what lies behind it."""
+    a, c = planes.axes, planes.camera
+    p, q = math.cos(about), math.sin(about)
+    # in cells from the window's corner: direction along the line, and across
+    ax, ay, az = a[0, 0] / cell, a[0, 1] / cell, a[0, 2] / cell
+    px, py, pz = (
+        (p * a[1, 0] + q * a[2, 0]) / cell, (p * a[1, 1] + q * a[2, 1]) / cell, (p * a[1, 2] + q * a[2, 2]) / cell,
+    )  # fmt: skip
+    ox, oy, oz = (c[0] - low[0]) / cell, (c[1] - low[1]) / cell, (c[2] - low[2]) / cell
+    cotangent = 1.0 / math.tan(at)
+    nx, ny, nz = filled.shape
+    if not is_held:
+        first[j] = shaded.shape[0]
+    for k in range(shaded.shape[0]):
+        # base = across (cot at camera + cot at light)
+        total = cotangent + cotangents[k]
+        if total <= 0.0:
+            break
+        across = planes.base / total
+        along = across * cotangent
+        x, y, z = ox + along * ax + across * px, oy + along * ay + across * py, oz + along * az + across * pz
+        if not (0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz) or filled[int(x), int(y), int(z)] == 0:
+            continue
+        if shaded[k] and not is_held:
+            is_held = True
+            first[j] = k
+        if is_held:
+            shaded[k] = True
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def take_free(planes: Planes, low: Array, cell: float, filled: Cells, first: Map, out: Cells) -> None:
+    """Mark with 1 in ``out`` (X, Y, Z) the filled cells that are free wherever the planes pass through them."""
+    half = math.sqrt(0.75) * cell
+    for i in range(filled.shape[0]):
+        for j in range(filled.shape[1]):
+            for k in range(filled.shape[2]):
+                if filled[i, j, k] == 0:
+                    continue
+                x, y, z = low[0] + (i + 0.5) * cell, low[1] + (j + 0.5) * cell, low[2] + (k + 0.5) * cell
+                if _is_free(planes, first, x, y, z, half):
+                    out[i, j, k] = 1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _is_free(planes: Planes, first: Map, x: float, y: float, z: float, half: float) -> bool:
+    """Whether a ball lies before everything that is held in all directions that meet it."""
+    about, camera, light = angles_of(planes, x, y, z)
+    a = (about - planes.low[0]) / planes.step[0]
+    c = (camera - planes.low[1]) / planes.step[1]
+    b, d = round(a), round(c)
+    if b < 0 or d < 0 or b >= first.shape[0] or d >= first.shape[1] or first[b, d] < 0:
+        return False
+    near = math.sqrt((x - planes.camera[0]) ** 2 + (y - planes.camera[1]) ** 2 + (z - planes.camera[2]) ** 2)
+    away = math.sqrt((x - planes.light[0]) ** 2 + (y - planes.light[1]) ** 2 + (z - planes.light[2]) ** 2)
+    wide, high = half / (near * math.sin(camera) * planes.step[0]), half / (near * planes.step[1])
+    deepest = (light - planes.low[2]) / planes.step[2] + half / (away * planes.step[2])
+    for s in range(math.floor(a - wide), math.ceil(a + wide) + 1):
+        for t in range(math.floor(c - high), math.ceil(c + high) + 1):
+            if s < 0 or t < 0 or s >= first.shape[0] or t >= first.shape[1] or first[s, t] <= deepest:
+                return False
+    return True

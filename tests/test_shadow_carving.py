@@ -1,0 +1,132 @@
+"""Shadows take away what is not there, and nothing that is: on rendered solids of exact shape."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rendered_worlds.lit_solids import Rig, around, lamps_at
+from rendered_worlds.solids import BALL, BOX, Rendering, Solid, render, shape
+from sfmapp.carve.cell_grid import grid_of, octree_of
+from sfmapp.carve.octree import Octree, codes_of
+from sfmapp.carve.outlines import signed_distance
+from sfmapp.carve.shadow_carving import Shadow, ShadowOptions, carve_shadows
+from sfmapp.carve.silhouettes import Silhouette
+from sfmapp.carve.space_carving import CarveOptions, carve
+from sfmapp.carve.views import View, view_of_camera
+from sfmapp.errors import InputError
+
+Array = NDArray[np.float64]
+CELLS = 64
+
+
+def block_with_cavity() -> Solid:
+    """Three quarters of a box, open in front."""
+    return Solid(
+        np.array([
+            shape(BOX, (0, 0, 0), (0.55, 0.55, 0.55), rounding=0.1),
+            shape(BOX, (0.45, 0, 0), (0.6, 0.38, 0.38), taken=True),
+        ]),
+        1.0,
+    )  # fmt: skip
+
+
+def ball() -> Solid:
+    return Solid(np.array([shape(BALL, (0, 0, 0), 0.8)]), 1.0)
+
+
+def rendered(solid: Solid, rig: Rig) -> list[Rendering]:
+    return [render(solid, rig.camera, pose, lamps_at(lamps)) for pose, lamps in zip(rig.poses, rig.lamps, strict=True)]
+
+
+def views_of(rig: Rig) -> list[View]:
+    return [view_of_camera(str(i), rig.camera, pose) for i, pose in enumerate(rig.poses)]
+
+
+def exact_shadows(rig: Rig, pictures: list[Rendering]) -> list[Shadow]:
+    return [
+        Shadow(i, rig.lamps[i][k], (picture.cover == 1.0) & (light == 0.0))
+        for i, picture in enumerate(pictures)
+        for k, light in enumerate(picture.light)
+    ]
+
+
+@cache
+def scene(name: str) -> tuple[Solid, list[View], list[Shadow], Octree]:
+    """Solid, views, exact shadows, hull."""
+    solid = block_with_cavity() if name == "block" else ball()
+    rig = around(16, 3, width=160)
+    pictures = rendered(solid, rig)
+    views = views_of(rig)
+    hull, _ = carve(
+        views, [Silhouette(signed_distance(p.cover)) for p in pictures], [-1.0] * 3, 2.0, CarveOptions(CELLS)
+    )
+    return solid, views, exact_shadows(rig, pictures), hull
+
+
+def surface_points(solid: Solid, num: int) -> Array:
+    """Points drawn in the cube and brought to the surface along the gradient of its distance."""
+    xyz = np.random.default_rng(1).uniform(-1.0, 1.0, (num, 3))
+    for _ in range(40):
+        steps = 1e-5 * np.eye(3)
+        gradient = np.stack([solid.distance(xyz + e) - solid.distance(xyz - e) for e in steps], axis=1) / 2e-5
+        xyz = xyz - solid.distance(xyz)[:, None] * gradient
+    return np.asarray(xyz[np.abs(solid.distance(xyz)) < 1e-4])
+
+
+def test_shadows_open_a_cavity_and_leave_its_walls() -> None:
+    solid, views, shadows, hull = scene("block")
+    carved, report = carve_shadows(hull, views, shadows)
+    before, after = grid_of(hull), grid_of(carved)
+    true = solid.volume(96)
+    # what is left of the hull's error; cells are coarse here, and the surface's are wholly counted
+    assert 0.3 < (after.volume - true) / (before.volume - true) < 0.9
+    assert report.cells_before - report.cells_after == sum(report.sweeps)
+    points = surface_points(solid, 20000)
+    assert len(points) > 10000
+    assert not (before.holds(points) & ~after.holds(points)).any()
+
+
+def test_a_ball_lit_from_all_sides_stays_whole() -> None:
+    solid, views, shadows, hull = scene("ball")
+    assert sum(int(shadow.dark.sum()) for shadow in shadows) > 1000
+    carved, _ = carve_shadows(hull, views, shadows)
+    points = surface_points(solid, 20000)
+    assert not (grid_of(hull).holds(points) & ~grid_of(carved).holds(points)).any()
+
+
+def test_threads_and_order_do_not_change_the_volume() -> None:
+    _, views, shadows, hull = scene("block")
+    one, _ = carve_shadows(hull, views, shadows, threads=1)
+    other, _ = carve_shadows(hull, views, shadows[::-1], threads=3)
+    assert one.surface.tobytes() == other.surface.tobytes()
+    assert [a.tobytes() for a in one.full] == [a.tobytes() for a in other.full]
+
+
+def test_lights_far_from_the_camera_are_left_out() -> None:
+    _, views, shadows, hull = scene("block")
+    behind = [replace(shadow, light=-views[shadow.view].center) for shadow in shadows[:4]]
+    carved, report = carve_shadows(hull, views, behind)
+    assert (report.num_pairs, report.num_too_far) == (0, 4)
+    assert carved is hull
+
+
+def test_a_mask_of_another_size_is_named() -> None:
+    _, views, shadows, hull = scene("block")
+    with pytest.raises(InputError, match=r"160 x 120 pixels, found 10 x 20"):
+        carve_shadows(hull, views, [replace(shadows[0], dark=np.zeros((20, 10), np.bool_))], ShadowOptions())
+
+
+def test_a_tree_and_its_grid_are_one() -> None:
+    full = (np.array([], np.uint64), np.array([0], np.uint64), np.array([8], np.uint64), np.array([], np.uint64))
+    tree = Octree(np.zeros(3), 2.0, 3, full, np.sort(codes_of(np.array([[6, 0, 0], [7, 3, 1]]))))
+    grid = grid_of(tree)
+    assert grid.volume == pytest.approx(tree.volume_bounds()[1])
+    again = octree_of(grid)
+    assert grid_of(again).filled.tobytes() == grid.filled.tobytes()
+    # what has six neighbours: the middle of the cube of four, and the cell of it that leads into the cube of two
+    assert sum(len(codes) * 8 ** (3 - level) for level, codes in enumerate(again.full)) == 8 + 1
