@@ -74,6 +74,10 @@ class InputError(SfmError):
     exit_code = 3
 
 
+class EpipoleInPictureError(InputError):
+    """Two photographs of which one camera sees the other, or would: no plane shows epipolar lines as rows."""
+
+
 class NoReconstructionError(SfmError):
     """The photographs were read but hold no reconstruction. The report is still written.
 

@@ -136,7 +136,11 @@ def _print_pair(pair: StereoPairReport) -> None:
     how, found = pair.rectification, pair.disparity
     start = f"{pair.name}: " if pair.name else ""
     rows = "" if how.rows is None else f", rows agree to {how.rows.rms_px:.2f} px"
-    made = "as they are" if how.is_as_given else f"turned by {how.turn_deg[0]:.2f} and {how.turn_deg[1]:.2f} degrees"
+    made = f"turned by {how.turn_deg[0]:.2f} and {how.turn_deg[1]:.2f} degrees"
+    if how.is_as_given:
+        made = "as they are"
+    elif how.is_polar:
+        made = "about the baseline"
     print(f"{start}{how.width} x {how.height} pixels, rectified {made}{rows}")
     text = f"{found.matcher}: {found.density:.1%} of the pixels matched"
     if found.quantiles_px:

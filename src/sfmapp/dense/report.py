@@ -93,12 +93,29 @@ class SeedsReport(Report):
     corners: int
 
 
+class TwoViewsReport(Report):
+    """Two views, to which growing patches and stereo have put their hands.
+
+    Attributes:
+        by_stereo, by_growth: patches of each. of_stereo_share: of the cells of both views that either covers, those
+            that stereo does; of_growth_share: the same of patches that grew.
+        is_stereo_first: what the other one found was taken where it left a gap.
+    """
+
+    by_stereo: int
+    by_growth: int
+    of_stereo_share: float
+    of_growth_share: float
+    is_stereo_first: bool
+
+
 class DensifyReport(Report):
     """What came of the patches of some views.
 
     Attributes:
         levels: the coarsest first.
         funnel: what was accepted, what each filter took away, and what was left.
+        two_views: absent where there are more, or where stereo cannot rectify them.
     """
 
     num_patches: int
@@ -106,6 +123,7 @@ class DensifyReport(Report):
     waves: Sequence[WaveReport]
     seeds: SeedsReport
     funnel: Sequence[Step]
+    two_views: TwoViewsReport | None = None
 
 
 class SharesReport(Report):

@@ -153,3 +153,9 @@ class Patches:
             self.xyz[idx], self.normal[idx], self.rgb[idx], self.score[idx], self.sigma[idx], self.size[idx],
             self.wave[idx], view_ptr, self.view_idx[source],
         )  # fmt: skip
+
+    def with_more(self, other: Patches) -> Patches:
+        """Those of another cloud of the same views behind these."""
+        names = ("xyz", "normal", "rgb", "score", "sigma", "size", "wave", "view_idx")
+        values = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names}
+        return Patches(**values, view_ptr=np.concatenate([self.view_ptr, other.view_ptr[1:] + self.view_ptr[-1]]))

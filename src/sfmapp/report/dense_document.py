@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.dense.report import LevelReport, SeedsReport, WaveReport
+from sfmapp.dense.report import LevelReport, SeedsReport, TwoViewsReport, WaveReport
 from sfmapp.dense.scene import DenseScene, Patches
 from sfmapp.report.coverage import coverage
 from sfmapp.report.document import check
@@ -32,6 +32,8 @@ class Densified(Protocol):
     def waves(self) -> Sequence[WaveReport]: ...
     @property
     def funnel(self) -> Sequence[Step]: ...
+    @property
+    def two_views(self) -> TwoViewsReport | None: ...
 
 
 def dense_document(
@@ -63,6 +65,7 @@ def dense_document(
         histograms=histograms,
         images=images,
         mesh=mesh_report,
+        two_views=dense_report.two_views,
     )
 
 

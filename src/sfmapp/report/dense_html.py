@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sfmapp.dense.report import LevelReport, WaveReport
+from sfmapp.dense.report import LevelReport, TwoViewsReport, WaveReport
 from sfmapp.report.document import check_contradictions
 from sfmapp.report.model import CoverageReport, DenseHistograms, DensePart, DenseRunReport
 from sfmapp.report.page import check_table, failure_box, log_table, render_page, table, usage_table
@@ -105,11 +105,24 @@ def _images(images: Sequence[CoverageReport]) -> str:
 
 
 def _growth(document: DensePart) -> str:
-    parts = ["<h2>How the patches came about</h2>", _levels(document.levels), _waves(document.waves)]
+    parts = ["<h2>How the patches came about</h2>", _two_views(document.two_views)]
+    parts += [_levels(document.levels), _waves(document.waves)]
     seeds = ", ".join(f"{count} from {_SEEDS.get(name, name)}" for name, count in document.seeds.items())
     parts.append(f"<p>Seeds of the finest level: {escape(seeds)}.</p>")
     parts.append(_funnel("What was taken away again", "patches", document.funnel[:-1], document.num_patches))
     return "".join(parts)
+
+
+def _two_views(found: TwoViewsReport | None) -> str:
+    if found is None:
+        return ""
+    shares = f"{100 * found.of_stereo_share:.0f}", f"{100 * found.of_growth_share:.0f}"
+    first, second = ("stereo", "growth") if found.is_stereo_first else ("growth", "stereo")
+    return (
+        f"<p>Two photographs: {found.by_stereo} patches are by stereo, their disparities pixel by pixel, and "
+        f"{found.by_growth} by growth, as below. Of what either covers stereo has {shares[0]} %, growth {shares[1]} %: "
+        f"{first} was taken, and {second} where that left gaps.</p>"
+    )
 
 
 _SEEDS = {"carried": "the coarser level", "points": "sparse points", "corners": "corners matched along epipolar lines"}

@@ -19,6 +19,7 @@ from sfmapp.dense.report import (
     LevelReport,
     SeedsReport,
     SharesReport,
+    TwoViewsReport,
     ViewsReport,
     WaveReport,
 )
@@ -220,6 +221,7 @@ class DensePart(Report):
         funnel: what was accepted, what each step took away, and what was left.
         images: a row for each view.
         mesh: None without.
+        two_views: absent where there are more, or where stereo cannot rectify them.
     """
 
     num_patches: int
@@ -232,6 +234,7 @@ class DensePart(Report):
     histograms: DenseHistograms
     images: Sequence[CoverageReport]
     mesh: MeshReport | None
+    two_views: TwoViewsReport | None = None
 
 
 class DenseReport(CloudNumbers):
@@ -246,6 +249,7 @@ class DenseReport(CloudNumbers):
     waves: Sequence[WaveReport] = ()
     funnel: Sequence[Step] = ()
     seeds: SeedsReport | None = None
+    two_views: TwoViewsReport | None = None
     shares: SharesReport | None = None
     run: RunUsage
 

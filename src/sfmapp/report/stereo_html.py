@@ -110,7 +110,7 @@ def _body(report: StereoPairReport, pair: RectifiedPair, found: DisparityMap, me
     yield from _maps(report, pair, found, measured)
     if measured.depth is not None:
         yield "<h2>How well depth is told</h2>" + _depths(report.measured)
-    yield from _both_views(pair, found)
+    yield from _both_views(pair, found, is_polar=report.rectification.is_polar)
     yield "<h2>Rectification</h2>" + _rectification(report)
 
 
@@ -207,7 +207,7 @@ def _depths(told: MeasuredReport) -> str:
     return table([("", name) for name in head], rows) + f"<p class=dim>{note}</p>"
 
 
-def _both_views(pair: RectifiedPair, found: DisparityMap) -> Iterator[str]:
+def _both_views(pair: RectifiedPair, found: DisparityMap, *, is_polar: bool) -> Iterator[str]:
     known = found.disparity[np.isfinite(found.disparity)]
     shift = round(float(np.median(known))) if known.size else 0
     yield '<h2>Both views</h2><figure><div class="slider">'
@@ -216,9 +216,12 @@ def _both_views(pair: RectifiedPair, found: DisparityMap) -> Iterator[str]:
     yield (
         '</div><input type="range" min="0" max="100" value="50" aria-label="left or right" '
         "oninput=\"this.previousElementSibling.style.setProperty('--cut',this.value+'%')\">"
-        "<figcaption>left of the handle the left picture, right of it the right one: whatever crosses it "
-        "has to stay on its row</figcaption></figure>"
+        "<figcaption>left of the handle the left picture, right of it the right one: "
+        + ("what is near grows away from the epipole" if is_polar else "whatever crosses it has to stay on its row")
+        + "</figcaption></figure>"
     )
+    if is_polar:
+        return
     yield (
         f'<figure><img src="{jpeg_url(rows_across(pair, found), 2 * SHOWN_PX, QUALITY)}" alt=""><figcaption>some rows '
         "across both pictures, and on each some pixels with their matches</figcaption></figure>"
@@ -241,7 +244,9 @@ def _rectification(report: StereoPairReport) -> str:
         rows.append(("disparity at infinity", f"{-(how.doffs_px or 0.0):.2f} px"))
     if how.baseline is not None:
         rows.append(("baseline", f"{how.baseline:.6g} {how.unit or 'units'}"))
-    if not how.is_as_given:
+    if how.is_polar:
+        rows.append(("rows", "half-planes about the baseline, one camera in front of the other"))
+    elif not how.is_as_given:
         rows.append(("axes turned by", f"{how.turn_deg[0]:.2f} and {how.turn_deg[1]:.2f} degrees"))
         rows.append(("kept of each photograph", f"{how.kept[0]:.0%} and {how.kept[1]:.0%}"))
     if how.rows is not None:

@@ -35,6 +35,12 @@ class Rig:
         """More than one camera: lengths are known."""
         return len(self.cameras) > 1
 
+    @property
+    def second_is_left(self) -> bool:
+        """Of two cameras side by side, the second stands to the left of the first as that one sees it."""
+        x, y, _ = rigid3.center(self.cam_from_rig[1])
+        return bool(abs(x) >= abs(y) and x < 0.0)
+
     def reversed_pair(self) -> Rig:
         """Two cameras in the other order, in the frame of the second."""
         first, second = self.cameras

@@ -88,9 +88,12 @@ class MeasuredReport(Report):
 
 def measure_pair(pair: RectifiedPair, found: DisparityMap, *, threads: int = 1) -> MeasuredPair:
     """Depths and errors of a matched pair."""
-    error = disparity_error(pair, found, threads=threads)
+    return measured_of(pair.geometry, found, disparity_error(pair, found, threads=threads))
+
+
+def measured_of(geometry: RectifiedGeometry | None, found: DisparityMap, error: DisparityError) -> MeasuredPair:
+    """The same with errors that are known."""
     is_solid = (error.confidence >= _LEAST_CONFIDENCE) & (found.state == PixelState.MATCHED)
-    geometry = pair.geometry
     if geometry is None or geometry.baseline is None:
         return MeasuredPair(error, None, None, is_solid)
     depth = depth_of_disparity(found.disparity, geometry)

@@ -116,6 +116,8 @@ def prepare_pair(
         names: of the photographs, for messages.
 
     Raises:
+        EpipoleInPictureError: one camera stands in front of the other: :func:`~sfmapp.stereo.polar_pair.prepare_polar`
+            takes them, if their calibration is known.
         InputError: one photograph twice, one without any contrast, cameras that cannot be rectified or are not those of
             the photographs, photographs that share too little, or left and right in the wrong order.
     """
@@ -127,7 +129,7 @@ def prepare_pair(
         draft, cameras = _without_calibration(left, right, cameras, names, warnings)
         is_projective = draft.plan is not None
     else:
-        if _second_is_left(cameras.rig):
+        if cameras.rig.second_is_left:
             # the calibration says so: it is obeyed, and said
             left, right, is_swapped = right, left, True
             cameras = replace(cameras, rig=cameras.rig.reversed_pair())
@@ -193,7 +195,7 @@ def _without_calibration(
         told = f"{names[0]} and {names[1]} have different sizes"
     sizes = (left.shape[1], left.shape[0]), (right.shape[1], right.shape[0])
     found = rig_from_matches(matches, sizes)
-    if _second_is_left(found.rig):
+    if found.rig.second_is_left:
         raise InputError(
             f"{names[0]}, {names[1]}: the second photograph was taken to the left of the first: left and right are "
             "swapped",
@@ -224,7 +226,7 @@ def turn_of_rig(pairs: Iterable[tuple[Pixels, Pixels]], cameras: PairCameras) ->
     """
     if cameras.rig is None or cameras.is_adjusted:
         return None
-    is_swapped = _second_is_left(cameras.rig)
+    is_swapped = cameras.rig.second_is_left
     plan = plan_rectification(cameras.rig.reversed_pair() if is_swapped else cameras.rig)
     found = [_aligned(_with_plan(*(pair[::-1] if is_swapped else pair), plan)) for pair in pairs]
     none = np.zeros((0, 2))
@@ -391,11 +393,6 @@ def _check_pictures(left: Pixels, right: Pixels, names: tuple[str, str]) -> None
                 f"{name}: expected a photograph, found one brightness all over ({low:.0f} to {high:.0f}): nothing in "
                 "it can be found again"
             )
-
-
-def _second_is_left(rig: Rig) -> bool:
-    x, y, _ = rigid3.center(rig.cam_from_rig[1])
-    return bool(abs(x) >= abs(y) and x < 0.0)
 
 
 def _are_off(rows: RowsReport) -> bool:

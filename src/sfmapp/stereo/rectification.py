@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, pixels_to_rays, project
 from sfmapp.dense.undistort import resample
-from sfmapp.errors import InputError
+from sfmapp.errors import EpipoleInPictureError, InputError
 from sfmapp.geometry import rigid3
 from sfmapp.scene.rig import Rig
 from sfmapp.stereo.result import RectifiedGeometry, RectifiedPair
@@ -113,8 +113,9 @@ def plan_rectification(rig: Rig) -> Rectification:
         rig: two cameras, the left one first; the second's pose is that of the right one in the left one's frame.
 
     Raises:
-        InputError: the cameras stand at one place, the second is to the left of the first, one sees the other (an
-            epipole is in a picture), or the pictures share too little.
+        EpipoleInPictureError: one sees the other, or would.
+        InputError: the cameras stand at one place, the second is to the left of the first, or the pictures share too
+            little.
     """
     as_is = rectified_as_is(rig)
     if as_is is not None:
@@ -153,6 +154,7 @@ def _rotations(rig: Rig) -> tuple[Array, Array]:
     axes = np.array([0.0, 0.0, 1.0]) + right_from_left.T[:, 2]
     forward = axes - (axes @ along) * along
     if not np.linalg.norm(forward) > 1e-6:
+        _refuse_epipole(rig.cameras[0], along)
         raise InputError("the two cameras look in opposite directions: nothing is seen by both")
     forward /= np.linalg.norm(forward)
     if abs(along[0]) >= abs(along[1]) and along[0] < 0.0:
@@ -172,7 +174,7 @@ def _refuse_epipole(camera: Camera, towards: Array) -> None:
     axis = towards if towards[2] > 0.0 else -towards
     x, y = project(camera, axis[None])[0]
     if 0.0 <= x <= camera.width and 0.0 <= y <= camera.height:
-        raise InputError(
+        raise EpipoleInPictureError(
             f"an epipole is inside the photograph, at ({x:.0f}, {y:.0f}): one camera stands in front of the other, and "
             "epipolar lines meet there, so that no plane shows them as rows",
             "take photographs side by side; sfmapp reconstruct and sfmapp dense take such pairs",

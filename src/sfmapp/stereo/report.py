@@ -54,6 +54,8 @@ class RectificationReport(Report):
             camera is known.
         baseline: distance of the centres; absent where nothing tells it. unit: of that and of depths.
         is_as_given: the photographs were rectified already.
+        is_polar: rows are half-planes about the baseline; sizes and focal length are those of the left photograph,
+            which what was found is brought back to.
         is_swapped: the photographs were taken in the other order, as the calibration says.
         is_turned: the cameras stand one above the other, and the pictures are laid on their side.
         kept: share of each photograph that is kept. scale: pixels of the result to one of the photograph, along a side.
@@ -73,6 +75,7 @@ class RectificationReport(Report):
     baseline: float | None = None
     unit: str
     is_as_given: bool
+    is_polar: bool = False
     is_swapped: bool
     is_turned: bool
     kept: tuple[float, float]

@@ -17,6 +17,7 @@ from sfmapp.dense import outcome
 from sfmapp.dense.clusters import Cluster, in_core, make_clusters, merge_clusters
 from sfmapp.dense.densify import densify
 from sfmapp.dense.files import read_patches
+from sfmapp.dense.options import FEWEST_VIEWS
 from sfmapp.dense.prepare import DensePlan, load_scene
 from sfmapp.dense.report import ClusterReport
 from sfmapp.dense.scene import Patches
@@ -26,6 +27,7 @@ from sfmapp.pipelines.dense import results as dense_results
 from sfmapp.pipelines.dense.results import STAGE
 from sfmapp.pipelines.dense.source import DenseJob, calibrate_source, dense_job, find_source, model_digest, plan_source
 from sfmapp.report.model import DenseReport, Outcome
+from sfmapp.stereo.patches import densify_pair
 from sfmapp.workspace.kernels import compile_dense_kernels
 from sfmapp.workspace.keys import input_key, stage_key
 from sfmapp.workspace.manifest import AsBeforeError
@@ -167,7 +169,7 @@ def _densify(
     shares = outcome.judge(patches, texture, points, options.cell_px)
     return patches, replace(
         report, clusters=told, levels=total.levels, waves=total.waves, funnel=total.funnel, seeds=total.seeds,
-        shares=shares, **dense_results.summary(patches),
+        two_views=total.two_views, shares=shares, **dense_results.summary(patches),
     )  # fmt: skip
 
 
@@ -177,7 +179,9 @@ def _densify_cluster(job: DenseJob, plan: DensePlan, cluster: Cluster) -> tuple[
         plan, cluster.views, core=None if is_whole else cluster.core, threads=job.threads, events=job.events
     )
     texture = [outcome.textured_pixels(scene.views[at]) for at in np.searchsorted(cluster.views, cluster.core)]
-    patches, row = densify(scene, job.options.dense, threads=job.threads, events=job.events)
+    is_pair = is_whole and len(scene.views) == FEWEST_VIEWS
+    make = densify_pair if is_pair else densify
+    patches, row = make(scene, job.options.dense, threads=job.threads, events=job.events)
     # all of them are of the core: hundreds of megabytes that need no copy
     mine = patches if is_whole else in_core(patches, cluster)
     return mine, dense_results.PartReport(**row, texture=texture, num_points=len(scene.point_xyz))

@@ -195,6 +195,7 @@ def summed(reports: Sequence[DensifyReport]) -> DensifyReport:
         waves=waves,
         seeds=_added([report.seeds for report in reports]),
         funnel=[Step(name=name, count=count) for name, count in funnel.items()],
+        two_views=reports[0].two_views,
     )
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from sfmapp.errors import InputError, UsageError
+from sfmapp.errors import EpipoleInPictureError, InputError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.atomic import write_bytes
 from sfmapp.images.rewrite import encode
@@ -21,9 +21,12 @@ from sfmapp.pipelines.stereo.video_pairs import pairs_of_video
 from sfmapp.report.stereo_document import StereoReport
 from sfmapp.report.stereo_html import pairs_page, stereo_page
 from sfmapp.reporting import NamedReason
+from sfmapp.stereo.disparity_error import disparity_error
 from sfmapp.stereo.match import match_pair
 from sfmapp.stereo.measured import MeasuredPair, measure_pair, report_of
 from sfmapp.stereo.misalignment import Misalignment
+from sfmapp.stereo.polar import on_photograph
+from sfmapp.stereo.polar_pair import prepare_polar
 from sfmapp.stereo.prepare import PairCameras, PreparedPair, PrepareOptions, prepare_pair, turn_of_rig
 from sfmapp.stereo.report import DisparityReport, StereoPairReport
 from sfmapp.stereo.result import DisparityMap, PixelState
@@ -179,13 +182,28 @@ def _do_pair(
         how = PrepareOptions(
             is_cropped=least is not None and least < 0, corrects=job.options.stereo.correct_rig, turn=turn
         )
-        prepared = prepare_pair(left, right, source.cameras(), (source.left, source.right), how)
+        cameras, polar = source.cameras(), None
+        try:
+            prepared = prepare_pair(left, right, cameras, (source.left, source.right), how)
+        except EpipoleInPictureError:
+            if cameras.rig is None:
+                raise
+            prepared, polar = prepare_polar(left, right, cameras)
         for warning in prepared.report.warnings:
             job.events.warned(STAGE, warning)
     with job.stage("matching"):
         disparity = match_pair(prepared.pair, job.options.stereo, matches=prepared.matches)
     with job.stage("errors"):
-        done = MatchedStereo(source, prepared, disparity, measure_pair(prepared.pair, disparity, threads=job.threads))
+        if polar is None:
+            measured = measure_pair(prepared.pair, disparity, threads=job.threads)
+        else:
+            error = disparity_error(prepared.pair, disparity, threads=job.threads)
+            pair, disparity, measured = on_photograph(
+                polar, prepared.pair, disparity, error, (left, right), prepared.report.unit,
+                has_baseline=cameras.has_baseline,
+            )  # fmt: skip
+            prepared = replace(prepared, pair=pair)
+        done = MatchedStereo(source, prepared, disparity, measured)
         now = _moment(done) if source.is_frame else None
         consistency = None if before is None or now is None else compare_moments(before, now)
     with job.stage("files"):
