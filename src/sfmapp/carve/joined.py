@@ -1,0 +1,411 @@
+"""One closed surface out of silhouettes and patches: each tells what the other cannot.
+
+Silhouettes bound the object from outside, to a fraction of a pixel, with or without texture, and know nothing of what
+lies within their cones. Patches lie in concavities, and leave open what has no texture or was not seen. Here a patch
+also says that its line of sight is free, and that behind it is something.
+
+The solid is where u > 0, of the u between -1 and 1 in the hull that minimises
+
+    area of the surface + trust / band * volume integral of the sum over sights of |u - what the sight says|,
+
+which is convex (Zach, Pock and Bischof, "A globally optimal algorithm for robust TV-L1 range image integration", ICCV
+2007, with votes in bins as Zach, "Fast and high quality fusion of depth maps", 3DPVT 2008, has them). Without votes the
+surface that is least wins, as under a statue; but what is left has to fill every silhouette (Kolev and Cremers,
+"Integration of multiview stereo and silhouettes via convex functionals on convex domains", ECCV 2008): where it does
+not, the hull is put back along the rays, unless patches are seen through it.
+
+The lattice is that of an octree's corners, from coarse to fine, and at each level only nodes near a surface are there.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sfmapp.carve.hull import Hull
+from sfmapp.carve.joined_kernels import BINS, EMPTY, FULL, find_flow, find_value, mark_behind, paint, vote
+from sfmapp.carve.octree import Codes, Octree, codes_of, places_of
+from sfmapp.carve.sight import Sight
+from sfmapp.carve.silhouettes import Silhouette
+from sfmapp.carve.views import View
+from sfmapp.errors import InputError, NoReconstructionError
+from sfmapp.events import Events
+from sfmapp.geometry import rigid3
+from sfmapp.option_checks import Range, check_options, positive
+from sfmapp.reporting import Report
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Ids = NDArray[np.int32]
+
+STAGE = "join"
+# level that is there as a whole
+_WHOLE = 5
+# Patches are known to a pixel or two; a band narrower than two cells would fall between the nodes.
+_BAND_PX, _BAND_CELLS = 2.0, 2.0
+# steps of Chambolle and Pock (2011): their product times the squared norm of the slope, 12 at most, stays below 1
+_STEP = 0.28
+# iterations by level: a coarse level has the large areas to move, a fine one only what a cell of the coarser one is
+_ITERATIONS, _FEWEST_ITERATIONS = 320, 40
+# silhouettes are held to what is left from the level of so many cells on, once things are as large as cells
+_FILL_LEVEL = 6
+# a pixel is uncovered so far inside its outline, in pixels beside the width of a cell
+_MARGIN_PX = 2.0
+# what is put back along uncovered rays counts as so many sights
+_FILL_VOTES = 4.0
+_CHUNK = 1 << 15
+_RANGES = {"cells": Range(32, 4096), "trust": positive(100.0)}
+
+
+@dataclass(frozen=True)
+class JoinOptions:
+    """Options of joining silhouettes with patches.
+
+    Attributes:
+        cells: finest cells along the side of the cube, rounded up to a power of two.
+        trust: how much surface a sight of the band's width is worth; less is smoother and closes more.
+    """
+
+    cells: int = 256
+    trust: float = 1.5
+
+    def __post_init__(self) -> None:
+        check_options(STAGE, self, _RANGES)
+
+    @property
+    def depth(self) -> int:
+        """Level of the finest cells."""
+        return int(self.cells - 1).bit_length()
+
+
+class JoinReport(Report):
+    """How silhouettes and patches were joined.
+
+    Attributes:
+        cells: finest ones along the side of the cube. num_nodes: of its lattice that were there at each level, from
+            the coarsest.
+        num_sights: photographs that see patches.
+        band: within which distances to patches are averaged, units of the world.
+        hull_volume, volume: of the hull and of what is left of it, cubic units of the world.
+        filled_share: of the nodes in the hull near the surface, those that were put back for silhouettes.
+    """
+
+    cells: int
+    num_nodes: Sequence[int]
+    num_sights: int
+    band: float
+    hull_volume: float
+    volume: float
+    filled_share: float
+
+
+@dataclass
+class _Level:
+    """Nodes (N) of the lattice of a level: places, their sorted codes, and what is known of them."""
+
+    places: NDArray[np.int64]
+    codes: Codes
+    xyz: Array
+    hull: Array
+    votes: NDArray[np.uint8]
+    extra: Floats
+    value: Floats
+    after: Ids
+    prior: Ids
+    flagged: NDArray[np.bool_]
+
+    def find(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Positions (M,) of nodes at places (M, 3), -1 where none is."""
+        wanted = codes_of(places)
+        at = np.minimum(np.searchsorted(self.codes, wanted), len(self.codes) - 1)
+        return np.where((self.codes[at] == wanted) & (places >= 0).all(axis=1), at, -1)
+
+
+class _Cube(NamedTuple):
+    low: Array
+    side: float
+
+
+@dataclass(frozen=True)
+class Joined:
+    """What came of it.
+
+    Attributes:
+        tree: the solid.
+        levels: nodes of the lattice, coarse to fine.
+    """
+
+    tree: Octree
+    levels: tuple[_Level, ...]
+    band: float
+
+    def distance(self, xyz: ArrayLike) -> Array:
+        """Signed distances (N,) at corners (N, 3) of the finest cells, positive inside, units of the world; not beyond
+        the band."""
+        places = np.rint((np.asarray(xyz) - self.tree.low) / self.tree.cell).astype(np.int64)
+        out = np.full(len(places), -self.band)
+        left = np.arange(len(places))
+        for up, level in enumerate(reversed(self.levels)):
+            at = level.find((places[left] + (1 << up >> 1)) >> up)
+            known = at >= 0
+            value = np.minimum(level.value[at[known]] * self.band, level.hull[at[known]])
+            out[left[known]] = value if up == 0 else np.where(value > 0.0, self.band, -self.band)
+            left = left[~known]
+        return out
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What photographs say of an object.
+
+    Attributes:
+        views, silhouettes: one of each for a photograph.
+        hull: of these, :func:`sfmapp.carve.hull.hull_of`.
+        sights: what photographs see of patches, see :mod:`sfmapp.carve.sight`.
+    """
+
+    views: Sequence[View]
+    silhouettes: Sequence[Silhouette]
+    hull: Hull
+    sights: Sequence[Sight]
+
+
+def join(
+    evidence: Evidence, low: ArrayLike, side: float, options: JoinOptions | None = None, *,
+    events: Events | None = None, threads: int | None = None,
+) -> tuple[Joined, JoinReport]:  # fmt: skip
+    """The solid in a cube that silhouettes and patches leave.
+
+    Args:
+        evidence: silhouettes and sights.
+        low: (3,) corner of the cube where all coordinates are least, world.
+        side: of the cube, units of the world.
+        options: by default :class:`JoinOptions`.
+        events: progress and cancellation.
+        threads: how many; by default one a processor. The result is the same bytes for any.
+
+    Raises:
+        InputError: there are no sights.
+        NoReconstructionError: nothing is left.
+        InterruptedRunError: ``events`` was asked to stop.
+    """
+    options, events, sights = options or JoinOptions(), events or Events(), evidence.sights
+    if not sights:
+        raise InputError("expected photographs that see patches, found none")
+    depth = options.depth
+    cube = _Cube(np.array(low, np.float64), float(side))
+    band = max(
+        _BAND_PX * float(np.median([sight.pixel for sight in sights])), _BAND_CELLS * side / 2.0**depth
+    )  # fmt: skip
+    levels: list[_Level] = []
+    first = min(_WHOLE, depth)
+    events.started(STAGE, f"{len(sights)} photographs that see patches", total=depth - first + 1)
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        for number in range(first, depth + 1):
+            level = _begin(number, levels[-1] if levels else None, cube, evidence.hull, pool)
+            cell = side / 2.0**number
+            width = max(band, _BAND_CELLS * cell)
+            level.votes = _votes(level.xyz, sights, width, pool)
+            is_outside = level.hull <= 0.0
+            level.value[is_outside] = np.maximum(level.hull[is_outside] / width, -1.0)
+            weight, iterations = options.trust * cell / band, _iterations(number)
+            _solve(level, weight, iterations, events, pool)
+            if number >= _FILL_LEVEL and _fill(level, evidence, cell, pool):
+                _solve(level, weight, iterations, events, pool)
+            level.flagged = _near_surface(level, cell)
+            levels.append(level)
+            events.advanced(STAGE, message=f"{2**number} cells a side, {len(level.codes)} nodes")
+    tree = _tree(levels, cube, depth)
+    last = levels[-1]
+    if not len(tree.surface):
+        raise NoReconstructionError(
+            "nothing is left of the hull: patches are seen through all of it",
+            "look at the patches: are they of these photographs and this model?",
+        )
+    report = JoinReport(
+        cells=2**depth, num_nodes=[len(level.codes) for level in levels], num_sights=len(sights), band=band,
+        hull_volume=_hull_volume(levels, side), volume=float(np.mean(tree.volume_bounds())),
+        filled_share=float((last.extra > 0.0).sum() / max(1, (last.hull > 0.0).sum())),
+    )  # fmt: skip
+    events.finished(STAGE, f"{100 * report.volume / report.hull_volume:.0f} % of the hull is left", **report)
+    return Joined(tree, tuple(levels), band), report
+
+
+def _iterations(number: int) -> int:
+    return max(_FEWEST_ITERATIONS, _ITERATIONS >> max(0, number - _FILL_LEVEL))
+
+
+def _begin(number: int, above: _Level | None, cube: _Cube, hull: Hull, pool: ThreadPoolExecutor) -> _Level:
+    """Nodes of a level, without votes: all of them, or those around the nodes near a surface of the level above."""
+    size = 2**number
+    if above is None:
+        side = np.arange(size + 1)
+        places = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
+        codes = np.sort(codes_of(places))
+    else:
+        flagged = above.places[above.flagged]
+        parts = []
+        for x in (-1, 0, 1):
+            for y in (-1, 0, 1):
+                for z in (-1, 0, 1):
+                    moved = 2 * flagged + (x, y, z)
+                    parts.append(codes_of(moved[((moved >= 0) & (moved <= size)).all(axis=1)]))
+        codes = np.unique(np.concatenate(parts))
+    places = places_of(codes)
+    num = len(codes)
+    xyz = cube.low + (cube.side / size) * places
+    distance = np.empty(num)
+
+    def measure(first: int, last: int) -> None:
+        distance[first:last] = hull.distance(xyz[first:last], 1)
+
+    _in_parts(measure, num, pool)
+    level = _Level(
+        places, codes, xyz, distance, np.empty((0, BINS), np.uint8), np.zeros(num, np.float32),
+        np.ones(num, np.float32), np.empty((num, 3), np.int32), np.empty((num, 3), np.int32), np.zeros(num, np.bool_),
+    )  # fmt: skip
+    if above is not None:
+        at = above.find(places >> 1)
+        other = above.find((places + 1) >> 1)
+        at, other = np.where(at >= 0, at, other), np.where(other >= 0, other, at)
+        level.value = 0.5 * (above.value[at] + above.value[other])
+        level.extra = np.maximum(above.extra[at], above.extra[other])
+    beyond = np.where(level.value > 0.0, FULL, EMPTY)
+    for axis in range(3):
+        step = np.eye(3, dtype=np.int64)[axis]
+        for sign, column in ((1, level.after), (-1, level.prior)):
+            found = level.find(places + sign * step)
+            is_outside = (places[:, axis] + sign < 0) | (places[:, axis] + sign > size)
+            column[:, axis] = np.where(found >= 0, found, np.where(is_outside, EMPTY, beyond))
+    return level
+
+
+def _votes(xyz: Array, sights: Sequence[Sight], band: float, pool: ThreadPoolExecutor) -> NDArray[np.uint8]:
+    votes = np.zeros((len(xyz), BINS), np.uint8)
+    outers = [
+        np.column_stack([rigid3.rotation_matrix(sight.cam_from_world), sight.cam_from_world[4:]]) for sight in sights
+    ]
+
+    def run(first: int, last: int) -> None:
+        for sight, outer in zip(sights, outers, strict=True):
+            vote(xyz[first:last], outer, sight.k, sight.depth, sight.normal, band, votes[first:last])
+
+    _in_parts(run, len(xyz), pool)
+    return votes
+
+
+def _in_parts(run: Callable[[int, int], None], num: int, pool: ThreadPoolExecutor) -> None:
+    """Call ``run(first, last)`` for parts of a range on threads."""
+    if num <= _CHUNK:
+        run(0, num)
+    else:
+        list(pool.map(lambda first: run(first, min(num, first + _CHUNK)), range(0, num, _CHUNK)))
+
+
+def _solve(level: _Level, weight: float, iterations: int, events: Events, pool: ThreadPoolExecutor) -> None:
+    """Move the values of a level towards the least of the energy (Chambolle and Pock, 2011, algorithm 1)."""
+    num = len(level.codes)
+    is_fixed = level.hull <= 0.0
+    value, before, flow = level.value, level.value.copy(), np.zeros((num, 3), np.float32)
+    for _ in range(iterations):
+        events.raise_if_cancelled()
+        _in_parts(lambda a, b: find_flow(a, b, value, before, level.after, _STEP, flow), num, pool)
+        _in_parts(
+            lambda a, b: find_value(
+                a, b, flow, level.prior, level.votes, level.extra, is_fixed, weight, _STEP, value, before
+            ),
+            num, pool,
+        )  # fmt: skip
+
+
+def _fill(level: _Level, evidence: Evidence, cell: float, pool: ThreadPoolExecutor) -> bool:
+    """Put the hull back along rays inside silhouettes that meet nothing; whether there were any."""
+    solid = level.xyz[level.value > 0.0]
+    is_open = (level.hull > 0.0) & (level.votes[:, 0] <= level.votes[:, 1:].sum(axis=1))
+    idx = np.flatnonzero(is_open)
+    xyz = level.xyz[idx]
+
+    def look(v: int) -> NDArray[np.bool_]:
+        view, silhouette = evidence.views[v], evidence.silhouettes[v]
+        covered = np.zeros(silhouette.distance.shape, np.bool_)
+        paint(view.row, solid, cell, covered)
+        missing = ~covered & (silhouette.distance > _MARGIN_PX)
+        if silhouette.known is not None:
+            missing &= silhouette.known
+        marked = np.zeros(len(idx), np.bool_)
+        if missing.any():
+            mark_behind(view.row, xyz, missing, marked)
+        return marked
+
+    marked = np.zeros(len(idx), np.bool_)
+    for part in pool.map(look, range(len(evidence.views))):
+        marked |= part
+    level.extra[idx[marked]] = _FILL_VOTES
+    return bool(marked.any())
+
+
+def _near_surface(level: _Level, cell: float) -> NDArray[np.bool_]:
+    """Nodes around which a finer level has to look: near a patch, the hull's surface, or a change of sign."""
+    near = (level.votes[:, 3 : BINS - 3] > 0).any(axis=1) & (level.hull > -cell)
+    near |= np.abs(level.hull) < cell
+    inside = level.value > 0.0
+    near |= (np.abs(level.value) < 0.5) & (level.hull > 0.0)
+    for column in (level.after, level.prior):
+        for axis in range(3):
+            at = column[:, axis]
+            other = np.where(at >= 0, inside[at], at == FULL)
+            near |= other != inside
+    return near
+
+
+def _tree(levels: Sequence[_Level], cube: _Cube, depth: int) -> Octree:
+    """The octree of the solid, from the cells of the coarsest level down."""
+    first = depth - len(levels) + 1
+    full: list[list[Codes]] = [[] for _ in range(depth + 1)]
+    corners = np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)])
+    cells = places_of(np.arange(8**first, dtype=np.uint64))
+    surface = np.empty(0, np.uint64)
+    for number, level in zip(range(first, depth + 1), levels, strict=True):
+        at = level.find((cells[:, None] + corners).reshape(-1, 3)).reshape(-1, 8)
+        inside = (level.value[at] > 0.0) & (level.hull[at] > 0.0)
+        if number == depth:
+            full[number].append(codes_of(cells[inside.all(axis=1)]))
+            surface = np.sort(codes_of(cells[inside.any(axis=1) & ~inside.all(axis=1)]))
+            break
+        is_split = level.flagged[at]
+        whole = ~is_split.any(axis=1)
+        full[number].append(codes_of(cells[whole & inside[:, 0]]))
+        # of a cell that is split, the child at a corner is there below if that corner is near a surface
+        children = (2 * cells[:, None] + corners)[~whole]
+        below, is_full = is_split[~whole], inside[~whole]
+        full[number + 1].append(codes_of(children[~below & is_full]))
+        cells = children[below]
+    return Octree(cube.low, cube.side, depth, _merged(full), surface)
+
+
+def _merged(parts: Sequence[Sequence[Codes]]) -> tuple[Codes, ...]:
+    """Codes of each level, ascending, eight that make up a parent in place of it."""
+    full = [np.sort(np.concatenate([np.empty(0, np.uint64), *part])) for part in parts]
+    for number in range(len(full) - 1, 0, -1):
+        parents, counts = np.unique(full[number] >> np.uint64(3), return_counts=True)
+        whole = parents[counts == 8]
+        full[number] = full[number][~np.isin(full[number] >> np.uint64(3), whole)]
+        full[number - 1] = np.sort(np.concatenate([full[number - 1], whole]))
+    return tuple(full)
+
+
+def _hull_volume(levels: Sequence[_Level], side: float) -> float:
+    """Of the hull, by nodes: each stands for the cell about it at the finest level that has it."""
+    total, first = 0.0, round(np.log2(levels[0].places.max()))
+    for k, level in enumerate(levels):
+        counted = level.hull > 0.0
+        if k + 1 < len(levels):
+            counted &= ~level.flagged
+        total += float(counted.sum()) * (side / 2.0 ** (first + k)) ** 3
+    return total

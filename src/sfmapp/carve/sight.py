@@ -1,0 +1,124 @@
+"""How far photographs look: depth maps of the patches that they see, for :mod:`sfmapp.carve.joined`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sfmapp.carve.views import View
+from sfmapp.dense.maps import splat_view
+from sfmapp.dense.scene import Patches
+from sfmapp.errors import InputError
+from sfmapp.geometry import rigid3
+
+Array = NDArray[np.float64]
+
+# patches of a view by which it is told how far apart they lie in its picture
+_SAMPLED = 4000
+# a patch is drawn so far from its centre, a side, in distances to its nearest neighbour: squares that meet, as
+# ``sfmapp dense --maps`` draws them, and a pixel at least
+_REACH = 0.75
+# neighbours of a point by which its spacing is told where nothing else tells it
+_NUM_AROUND = 6
+
+
+@dataclass(frozen=True)
+class Sight:
+    """The surface that one photograph sees, through a camera without distortion.
+
+    Attributes:
+        k: (4,) ``fx, fy, cx, cy`` in pixels of the map, the centre of the top-left one (0.5, 0.5).
+        cam_from_world: (7,).
+        depth: (H, W) float32, units of the world, NaN where no patch is known.
+        normal: (H, W, 3) float32 in the frame of the camera, towards it.
+        pixel: what a pixel measures at the patches, units of the world; the median.
+    """
+
+    k: Array
+    cam_from_world: Array
+    depth: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    pixel: float
+
+
+def sights_of_patches(views: Sequence[View], patches: Patches, names: Sequence[str]) -> list[Sight]:
+    """What each photograph sees of the patches that it is trusted with.
+
+    Args:
+        views: calibrated cameras; those of other names than the patches' see nothing, and have no sight here.
+        patches: of the same world.
+        names: of the photographs that the patches count.
+
+    Raises:
+        InputError: no view has a patch, or one that has is a matrix without a camera.
+    """
+    patch_idx = np.repeat(np.arange(len(patches)), patches.num_views)
+    position = {name: m for m, name in enumerate(names)}
+    sights = []
+    for view in views:
+        if view.name not in position:
+            continue
+        mine = patch_idx[patches.view_idx == position[view.name]]
+        if len(mine):
+            sights.append(_sight(view, patches.xyz[mine], patches.normal[mine], patches.size[mine]))
+    if not sights:
+        raise InputError(
+            f"expected patches that the {len(views)} photographs see, found none",
+            "photographs and patches have to be of the same model, with the same names",
+        )
+    return sights
+
+
+def sights_of_points(views: Sequence[View], xyz: ArrayLike, normal: ArrayLike) -> list[Sight]:
+    """What photographs see of oriented points (N, 3) with outward normals (N, 3): those that face them, and of several
+    along a ray the nearest.
+
+    Raises:
+        InputError: no view sees a point, there are fewer than seven, or a view is a matrix without a camera.
+    """
+    from scipy.spatial import cKDTree
+
+    points, normals = np.asarray(xyz, np.float64), np.asarray(normal, np.float32)
+    if points.shape != normals.shape or points.ndim != 2 or len(points) <= _NUM_AROUND:
+        raise InputError(f"expected points with normals, more than {_NUM_AROUND}, found {points.shape}")
+    distance = cKDTree(points).query(points, k=[_NUM_AROUND + 1])[0][:, 0]
+    size = (distance * np.sqrt(np.pi / _NUM_AROUND)).astype(np.float32)
+    sights = [_sight(view, points, normals, size) for view in views]
+    sights = [sight for sight in sights if np.isfinite(sight.depth).any()]
+    if not sights:
+        raise InputError(f"expected points that the {len(views)} photographs see, found none of {len(points)}")
+    return sights
+
+
+def _sight(view: View, xyz: Array, normal: NDArray[np.float32], size: NDArray[np.float32]) -> Sight:
+    """Draw patches (N) into a view at the resolution that they were found at."""
+    if view.camera is None or view.cam_from_world is None:
+        raise InputError(
+            f"{view.name}: patches need a camera with a lens and a pose, found a projection matrix",
+            "join patches with views of a model, or carve without them",
+        )
+    seen = rigid3.apply(view.cam_from_world, xyz)
+    is_ahead = seen[:, 2] > 0.0
+    focal = float(np.median(seen[is_ahead, 2] / size[is_ahead])) if is_ahead.any() else 1.0
+    fx, fy, cx, cy = view.camera.k_matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+    scale = min(1.0, focal / float(np.sqrt(fx * fy)))
+    width, height = max(1, round(view.width * scale)), max(1, round(view.height * scale))
+    k = np.array([fx, fy, cx, cy]) * np.tile([width / view.width, height / view.height], 2)
+    pixels = seen[is_ahead, :2] / seen[is_ahead, 2:] * k[:2] + k[2:]
+    reach = max(1.0, _REACH * _distance_apart(pixels))
+    depth, normals = splat_view(k, view.cam_from_world, width, height, xyz, normal, reach)
+    pixel = float(np.median(seen[is_ahead, 2])) / float(np.sqrt(k[0] * k[1])) if is_ahead.any() else np.inf
+    return Sight(k, view.cam_from_world, depth, normals, pixel)
+
+
+def _distance_apart(pixels: Array) -> float:
+    """Median distance from a pixel (N, 2) to the one nearest to it."""
+    from scipy.spatial import cKDTree
+
+    if len(pixels) < 2:
+        return 0.0
+    asked = pixels[:: max(1, len(pixels) // _SAMPLED)]
+    return float(np.median(cKDTree(pixels).query(asked, k=[2])[0]))
