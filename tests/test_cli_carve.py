@@ -13,11 +13,14 @@ import pytest
 import sfmapp
 from carving_scenes import around, box, mask_of
 from sfmapp.carve.files import read_octree
+from sfmapp.carve.octree import Octree
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError
 from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.geometry import rigid3
 from sfmapp.report.carve_pictures import slice_picture
+from sfmapp.scene.mesh import Mesh, face_areas
+from sfmapp.viewer.carve_recording import faces_of_level
 
 VIEWS = around(10, width=120, height=90)
 VOLUME = 1.6 * 1.2 * 1.0
@@ -86,6 +89,7 @@ def test_the_same_call_goes_on_with_the_octree(photographs: Path, carved: Path, 
         photographs, tmp_path / "again", sfmapp.load_options(settings=["carve.cells=32"]), threads=1
     )
     assert "carve" not in found.report.usage
+    assert (tmp_path / "again" / "recording.rrd").read_bytes()[:4] == b"RRF2"
     assert (tmp_path / "again" / "mesh.ply").read_bytes() == before
     (tmp_path / "again" / "octree.npz").write_bytes(b"damaged")
     assert carve(photographs, "-o", tmp_path / "again", "--threads", 3) == 0
@@ -146,3 +150,19 @@ def test_the_page_shows_photographs_slices_and_levels(carved: Path) -> None:
     inked, border = (picture < 250).any(axis=2).mean(), (picture == [30, 34, 40]).all(axis=2).mean()
     assert 0.85 * truth < inked - border < 1.1 * truth
     assert truth < inked < 1.25 * truth
+
+
+def test_cells_of_a_level_are_drawn_by_their_open_faces() -> None:
+    # two cells of level 1 side by side along x, one full and one with a finest cell in it
+    octree = Octree(np.zeros(3), 4.0, 2, (_codes(), _codes(0), _codes()), _codes(8))
+    corners, rgb, faces = faces_of_level(octree, 1)
+    assert len(corners) == len(rgb) == 4 * 10
+    mesh = Mesh((corners + 2.0).astype(np.float64), faces, np.zeros(corners.shape, np.float32), rgb)
+    assert face_areas(mesh.xyz, mesh.faces).sum() == pytest.approx(10 * 4.0)
+    a, b, c = (mesh.xyz[mesh.faces[:, corner]] for corner in range(3))
+    assert np.einsum("fc,fc->", a, np.cross(b, c)) / 6.0 == pytest.approx(16.0)  # outward all around
+    assert len(faces_of_level(octree, 2)[2]) == 2 * (6 * 4 + 6 - 2)  # eight cells and one beside them
+
+
+def _codes(*codes: int) -> np.ndarray:
+    return np.array(codes, np.uint64)

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.camera.camera import pixels_to_rays
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View
 from sfmapp.errors import InputError
 from sfmapp.events import Events
-from sfmapp.geometry import rigid3
 
 Array = NDArray[np.float64]
 
@@ -155,12 +153,12 @@ def _planes(view: View, silhouette: Silhouette) -> Array:
         return np.zeros((0, 3))
     ends = np.stack([np.r_[left - _MARGIN_PX, right + _MARGIN_PX], np.r_[rows, rows] + 0.5], axis=1)
     edge = np.array([0.0, 0.5 + _MARGIN_PX])
-    rays = _rays(view, np.concatenate([ends - edge, ends + edge]))
+    rays = view.rays(np.concatenate([ends - edge, ends + edge]))
     rays = rays[np.isfinite(rays).all(axis=1)]
     ahead = rays.mean(axis=0)
     ahead /= np.linalg.norm(ahead)
     middle = np.array([[0.5 * (left.min() + right.max()), 0.5 * (rows[0] + rows[-1]) + 0.5]])
-    at, beside = _rays(view, np.concatenate([middle, middle + np.array([1.0, 0.0])]))
+    at, beside = view.rays(np.concatenate([middle, middle + np.array([1.0, 0.0])]))
     across = beside - at
     across -= (across @ ahead) * ahead
     across /= np.linalg.norm(across)
@@ -176,14 +174,6 @@ def _planes(view: View, silhouette: Silhouette) -> Array:
     reach = (flat @ along.T).max(axis=0)
     normals = along @ np.stack([across, down]) - reach[:, None] * ahead
     return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
-
-
-def _rays(view: View, xy: Array) -> Array:
-    """(N, 3) unit directions in the world of pixels (N, 2); NaN where the lens has none."""
-    if view.camera is not None and view.cam_from_world is not None:
-        return np.asarray(pixels_to_rays(view.camera, xy) @ rigid3.rotation_matrix(view.cam_from_world))
-    rays = np.linalg.solve(view.outer[:, :3], np.column_stack([xy, np.ones(len(xy))]).T).T
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
 def _apart(cones: Sequence[Array], centers: Array, names: Sequence[str]) -> list[int]:

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.camera import lens
-from sfmapp.camera.camera import Camera
+from sfmapp.camera.camera import Camera, pixels_to_rays
 from sfmapp.errors import InputError
 from sfmapp.geometry import rigid3
+from sfmapp.geometry.upright import up_direction
 
 Array = NDArray[np.float64]
 
@@ -61,6 +62,32 @@ class View:
     def axis(self) -> Array:
         """(3,) unit direction of looking, world."""
         return np.asarray(self.outer[2, :3] / np.linalg.norm(self.outer[2, :3]))
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Its world is seen as in a mirror: it has a left-handed frame, as some matrices have."""
+        return bool(np.linalg.det(self.outer[:, :3]) < 0.0)
+
+    def rays(self, xy: Array) -> Array:
+        """(N, 3) unit directions in the world of pixels (N, 2); NaN where the lens has none."""
+        if self.camera is not None and self.cam_from_world is not None:
+            return np.asarray(pixels_to_rays(self.camera, xy) @ rigid3.rotation_matrix(self.cam_from_world))
+        rays = np.linalg.solve(self.outer[:, :3], np.column_stack([xy, np.ones(len(xy))]).T).T
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def up_of_views(views: Sequence[View]) -> Array:
+    """(3,) unit vector that was probably up when photographs were taken, see
+    :func:`sfmapp.geometry.upright.up_direction`."""
+    poses = []
+    for view in views:
+        middle, lower = np.array([[0.5, 0.5], [0.5, 0.75]]) * [view.width, view.height]
+        ahead, below = view.rays(np.array([middle, lower]))
+        down = below - (below @ ahead) * ahead
+        down /= np.linalg.norm(down)
+        # the horizontal axis counts as a line, so that it may be turned about in a mirrored world
+        poses.append(np.concatenate([rigid3.quaternion(np.stack([np.cross(down, ahead), down, ahead])), np.zeros(3)]))
+    return up_direction(np.array(poses))
 
 
 def view_of_camera(name: str, camera: Camera, cam_from_world: ArrayLike) -> View:

@@ -60,6 +60,12 @@ def main(kind: str, folder: str, output: str, threads: str) -> None:
 
         write_stereo_rrd(StereoReplay.load(Path(folder)), Path(output))
         return
+    if kind == "carve":
+        from sfmapp.viewer.carve_replay import CarveReplay
+        from sfmapp.viewer.carve_rrd import write_carve_rrd
+
+        write_carve_rrd(CarveReplay.load(Path(folder)), Path(output))
+        return
     from sfmapp.viewer.replay import Replay
     from sfmapp.viewer.rrd import write_rrd
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sfmapp.carve.files import write_octree
-from sfmapp.carve.octree import Octree
+import numpy as np
+from numpy.typing import NDArray
+
 from sfmapp.formats.glb import write_glb
 from sfmapp.formats.mesh_ply import write_mesh_ply
 from sfmapp.scene.mesh import Mesh
@@ -15,11 +16,8 @@ OCTREE, MESH_PLY, MESH_GLB = "octree.npz", "mesh.ply", "mesh.glb"
 CARVING = "octree.json"
 
 
-def write_volume(folder: Path, octree: Octree, mesh: Mesh | None = None) -> list[str]:
-    """The octree and, once there is one, the mesh; gives the names of the files."""
-    if mesh is None:
-        write_octree(folder / OCTREE, octree)
-        return [OCTREE]
+def write_surface(folder: Path, mesh: Mesh, up: NDArray[np.float64]) -> list[str]:
+    """The mesh for programs and for viewers; gives the names of the files. ``up``: (3,) in the world."""
     write_mesh_ply(folder / MESH_PLY, mesh)
-    write_glb(folder / MESH_GLB, mesh)
-    return [OCTREE, MESH_PLY, MESH_GLB]
+    write_glb(folder / MESH_GLB, mesh, is_z_up=bool(up[2] > np.sqrt(0.5)))
+    return [MESH_PLY, MESH_GLB]

@@ -13,24 +13,26 @@ from numpy.typing import NDArray
 
 from sfmapp.carve.box import Box, cameras_inside, find_box, user_box
 from sfmapp.carve.coloring import ColoringReport, color_surface
-from sfmapp.carve.files import read_octree
+from sfmapp.carve.files import read_octree, write_octree
 from sfmapp.carve.hull import Hull, hull_of
 from sfmapp.carve.isosurface import surface_of
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette, find_silhouettes
-from sfmapp.carve.space_carving import CarvingReport, carve_hull
+from sfmapp.carve.space_carving import CarvingReport, LevelCounts, carve_hull
+from sfmapp.carve.views import up_of_views
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.images.image_set import ImageSet
 from sfmapp.images.pixels import read_rgb
-from sfmapp.pipelines.carve.outputs import CARVING, OCTREE, write_volume
+from sfmapp.pipelines.carve.outputs import CARVING, OCTREE, write_surface
 from sfmapp.pipelines.carve.sources import CarveSource, find_views
 from sfmapp.pipelines.dense.source import is_of_model
 from sfmapp.report.carve_document import BoxFacts, CarveReport, SurfaceFacts
 from sfmapp.report.carve_html import carve_page
 from sfmapp.reporting import NamedReason, from_plain
 from sfmapp.scene.mesh import Mesh, face_areas
-from sfmapp.workspace.job import Job
+from sfmapp.viewer.carve_recording import record_carving
+from sfmapp.workspace.job import FAILED, NOT_WANTED, WRITTEN, Job
 from sfmapp.workspace.keys import input_key, stage_key
 from sfmapp.workspace.layout import CARVE, PAGE, REPORT
 from sfmapp.workspace.options import Options
@@ -124,7 +126,7 @@ def carve(
         volume = CarvedVolume(source, silhouettes, box, octree, hull, mesh)
         _warn(job, volume, carving, colors)
         with job.stage("files"):
-            files = write_volume(job.workspace.folder, octree, mesh)
+            files = [OCTREE, *write_surface(job.workspace.folder, mesh, up_of_views(source.views))]
         report = CarveReport(
             run=job.facts(), cameras=source.cameras, num_views=len(source.views),
             left_out=[NamedReason(name=name, reason=reason) for name, reason in source.left_out], masks=masks,
@@ -135,6 +137,7 @@ def carve(
         with job.measured("page"):
             page = carve_page(report, source.views, silhouettes, octree, mesh, lambda v: read_rgb(source.records[v]))
             job.workspace.write_text(PAGE, page)
+        _record(job, volume, report, record=record)
         job.workspace.write_json(REPORT, report)
         job.workspace.save()
         return CarveResult(job.workspace.folder, report, octree, mesh)
@@ -210,7 +213,7 @@ def _carve(
     with job.stage(STAGE, key):
         octree, report = carve_hull(hull, names, low, side, options, job.events, threads=job.threads)
         job.events.raise_if_cancelled()
-        write_volume(folder, octree)
+        write_octree(folder / OCTREE, octree)
         job.workspace.write_json(CARVING, report)
     return hull, octree, report
 
@@ -245,6 +248,10 @@ def _surface(
 
 
 def _warn(job: Job, volume: CarvedVolume, carving: CarvingReport, colors: ColoringReport) -> None:
+    if any(view.is_mirrored for view in volume.source.views):
+        job.events.warned(
+            STAGE, "the world of these cameras is mirrored: in it, and in the files, the object is as a mirror shows it"
+        )
     if carving.touches_box and volume.box.told_by != "user":
         job.events.warned(STAGE, "the volume reaches the border of its box, which cuts it off: give a larger --box")
     typical = float(np.median([fit.iou for fit in colors.views]))
@@ -256,6 +263,38 @@ def _warn(job: Job, volume: CarvedVolume, carving: CarvingReport, colors: Colori
             f"the volume fits some silhouettes worse than most ({typical:.2f}): {named}: their cameras or masks are "
             "doubtful",
         )
+
+
+def _record(job: Job, volume: CarvedVolume, report: CarveReport, *, record: bool) -> None:
+    if not record:
+        job.workspace.note(recording=NOT_WANTED)
+        return
+    records = volume.source.records
+    with job.measured("recording"):
+        recorded = record_carving(
+            job.workspace.recording, _story(report), volume.source.views, volume.silhouettes, volume.octree,
+            volume.mesh, [_level_text(level) for level in report.carving.levels], lambda v: read_rgb(records[v]),
+        )  # fmt: skip
+    job.workspace.note(recording=FAILED if recorded.problem else WRITTEN)
+    if recorded.problem:
+        job.events.warned("recording", f"no recording: {recorded.problem}")
+
+
+def _story(report: CarveReport) -> str:
+    fits, surface = [fit.iou for fit in report.colors.views], report.surface
+    return (
+        f"**{report.num_views} photographs**; the volume covers their silhouettes by {np.median(fits):.2%} in the "
+        f"median, {min(fits):.2%} at least.\n\nVolume {surface.volume:.5g}, area {surface.area:.5g}, "
+        f"{surface.num_faces:,} triangles.\n\nThe timeline *level* carves it: yellow cells are split on, green ones "
+        "are wholly inside."
+    )
+
+
+def _level_text(level: LevelCounts) -> str:
+    return (
+        f"**Level {level.level}**: cells of {level.side:.4g}\n\n{level.looked_at:,} looked at: {level.carved:,} carved "
+        f"away, {level.full:,} wholly inside, {level.split:,} split"
+    )
 
 
 def _facts(mesh: Mesh) -> SurfaceFacts:
