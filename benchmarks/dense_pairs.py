@@ -57,10 +57,10 @@ RENDERED = (
     ("gallery, wide", gallery_world(1), (-1.2, -1.5, 1.4), (60.0, -10.0), 0.5, 12.0),
 )
 PHOTOGRAPHS = (
-    ("fountain-P11", (("0004", "0005"), ("0003", "0005"), ("0003", "0006"), ("0007", "0009"))),
+    ("fountain-P11", (("0004", "0005"), ("0003", "0006"), ("0007", "0009"))),
     (
         "strecha-courtyard-21",
-        (("entry_0002", "entry_0003"), ("entry_0004", "entry_0006"), ("entry_0007", "entry_0008")),
+        (("entry_0000", "entry_0001"), ("entry_0005", "entry_0006"), ("entry_0007", "entry_0009")),
     ),
 )
 # photographs that have to agree on what is true

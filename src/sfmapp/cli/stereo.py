@@ -40,6 +40,7 @@ Writes
   OUT/disparity.npy             x_left - x_right of each pixel of the left picture; .pfm and .png the same
   OUT/depth.npy                 depths in the unit of the baseline, where one is known; cloud.ply, view.glb
   OUT/calib.txt, *.yaml         the rectified cameras for Middlebury's programs, OpenCV and ROS; without metres OpenCV's
+  OUT/rectification_maps.*      with --maps, for cv2.remap and as .npz; sparse.csv and .ply with --sparse
   OUT/report.html               maps and how far off they may be, how the pair was rectified, what is wrong with it
 Of several pairs each has a folder in OUT; OUT/report.json tells of all."""
 
@@ -82,6 +83,11 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     matching.add_argument("--min-disparity", metavar="PX", help="least disparity looked for; default: as matches tell")
     matching.add_argument("--num-disparities", metavar="N", help="how many from there on")
     matching.add_argument("--window", metavar="PX", help="side of the window, odd; default: the matcher's own")
+    more = parser.add_argument_group("what is written")
+    more.add_argument("--maps", action="store_true", help="where each pixel of the rectified pictures comes from too")
+    more.add_argument(
+        "--sparse", action="store_true", help="points of keypoints alone too, with covariances: sparse.csv, sparse.ply"
+    )
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_stereo)
 
@@ -94,7 +100,7 @@ def _stereo(args: argparse.Namespace) -> int:
         "stereo.num_disparities": args.num_disparities, "stereo.window": args.window,
     })  # fmt: skip
     load_numba_without_blas()
-    from sfmapp.pipelines.stereo.run import stereo
+    from sfmapp.pipelines.stereo.run import AlsoWritten, stereo
     from sfmapp.pipelines.stereo.sources import ChosenPairs, KnownCameras
     from sfmapp.workspace.usage import Stopwatch
 
@@ -103,7 +109,10 @@ def _stereo(args: argparse.Namespace) -> int:
     baseline = None if args.baseline is None else _metres(args.baseline)
     known = KnownCameras(args.camera, args.focal, baseline, args.doffs)
     with listening(args) as events:
-        result = stereo(args.sources, args.output, options, known=known, chosen=chosen, events=events, watch=watch)
+        result = stereo(
+            args.sources, args.output, options,
+            known=known, chosen=chosen, also=AlsoWritten(args.maps, args.sparse), events=events, watch=watch,
+        )  # fmt: skip
     tell_result(args, result, lambda: _print(result))
     return 0
 

@@ -27,7 +27,7 @@ from sfmapp.reporting import Usage
 from sfmapp.workspace.listeners import DecisionLog, EventLog
 from sfmapp.workspace.manifest import recorded_versions
 from sfmapp.workspace.options import Options, options_to_dict, with_absolute_paths
-from sfmapp.workspace.usage import Stopwatch
+from sfmapp.workspace.usage import Stopwatch, added
 from sfmapp.workspace.workspace import Workspace, open_workspace
 
 # what the manifest says of a recording
@@ -119,10 +119,10 @@ class Job:
 
     @contextmanager
     def measured(self, name: str) -> Iterator[None]:
-        """Measure a step that is done in any case."""
+        """Measure a step that is done in any case; of one that is done again and again the sum is kept."""
         watch = Stopwatch()
         yield
-        self.usage[name] = watch.read()
+        self.usage[name] = added(self.usage.get(name), watch.read())
 
     def save_first(self, write: Callable[[], object]) -> None:
         """Write what matters most; where the disk is full, once more without the recording."""

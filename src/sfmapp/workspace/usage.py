@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import time
+from dataclasses import replace
 
 from sfmapp.reporting import Usage
 
@@ -25,6 +26,13 @@ class Stopwatch:
             cpu_s=round(_cpu_s() - self._cpu, 4),
             peak_memory_mb=round(max(_peak_mb(resource.RUSAGE_SELF), _peak_mb(resource.RUSAGE_CHILDREN)), 1),
         )
+
+
+def added(before: Usage | None, now: Usage) -> Usage:
+    """What a step has taken that is done again; the peak of memory is that of the process anyway."""
+    if before is None:
+        return now
+    return replace(now, wall_s=round(before.wall_s + now.wall_s, 4), cpu_s=round(before.cpu_s + now.cpu_s, 4))
 
 
 def _process_age_s() -> float:

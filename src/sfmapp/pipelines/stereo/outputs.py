@@ -8,13 +8,22 @@ from pathlib import Path
 import numpy as np
 
 from sfmapp.camera_files.rectified_writing import CAMERA_FILES, RectifiedCameras, write_rectified_files
-from sfmapp.formats.atomic import write_array
+from sfmapp.formats.atomic import write_array, write_bytes
 from sfmapp.formats.disparity_files import fits_kitti, write_disparity
 from sfmapp.formats.glb import write_glb
 from sfmapp.formats.ply import write_ply
+from sfmapp.formats.sampling_maps import SAMPLING_MAPS, write_sampling_maps
+from sfmapp.images.pixels import as_rgb
 from sfmapp.stereo.measured import MeasuredPair, cloud_of, mesh_of
 from sfmapp.stereo.prepare import PreparedPair
 from sfmapp.stereo.result import DisparityMap, RectifiedPair
+from sfmapp.stereo.sparse import sparse_points
+
+SPARSE = ("sparse.csv", "sparse.ply")
+"""Of keypoints alone."""
+
+_COVARIANCES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_COLUMNS = ("x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz", "left_x", "left_y", "right_x", "right_y")
 
 
 def write_cameras(folder: Path, prepared: PreparedPair) -> Iterator[Path]:
@@ -68,3 +77,31 @@ def write_models(folder: Path, pair: RectifiedPair, found: DisparityMap, measure
     yield cloud
     write_glb(mesh, mesh_of(pair, found, measured))
     yield mesh
+
+
+def write_sampling(folder: Path, prepared: PreparedPair, *, wanted: bool) -> Iterator[Path]:
+    """Where pixels of the pair come from, if that is wanted and a plane rectifies it; gives the path of each file."""
+    if not wanted or prepared.plan is None:
+        for name in SAMPLING_MAPS:
+            (folder / name).unlink(missing_ok=True)
+        return
+    yield from write_sampling_maps(folder, *(prepared.plan.sampling_map(side).astype(np.float32) for side in (0, 1)))
+
+
+def write_sparse(folder: Path, pair: RectifiedPair, *, wanted: bool) -> Iterator[Path]:
+    """Points of keypoints alone with their covariances, where they are wanted; gives the path of each."""
+    table, cloud = (folder / name for name in SPARSE)
+    if not wanted or pair.geometry is None or pair.geometry.baseline is None:
+        for path in (table, cloud):
+            path.unlink(missing_ok=True)
+        return
+    found = sparse_points(pair)
+    rows = np.column_stack([
+        found.xyz, *(found.covariance[:, i, j] for i, j in _COVARIANCES), found.matches.left, found.matches.right
+    ])  # fmt: skip
+    lines = [",".join(_COLUMNS), *(",".join(f"{value:.9g}" for value in row) for row in rows)]
+    write_bytes(table, "\n".join([*lines, ""]).encode())
+    yield table
+    x, y = found.matches.left.astype(np.int64).T
+    write_ply(cloud, found.xyz, as_rgb(pair.left)[y, x])
+    yield cloud

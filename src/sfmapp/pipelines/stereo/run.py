@@ -15,7 +15,7 @@ from sfmapp.formats.atomic import write_bytes
 from sfmapp.images.rewrite import encode
 from sfmapp.images.video import is_video
 from sfmapp.pipelines.stereo.model_pairs import is_of_model, pairs_of_model
-from sfmapp.pipelines.stereo.outputs import write_cameras, write_maps, write_models
+from sfmapp.pipelines.stereo.outputs import write_cameras, write_maps, write_models, write_sampling, write_sparse
 from sfmapp.pipelines.stereo.sources import ChosenPairs, KnownCameras, PairSource, find_pairs
 from sfmapp.pipelines.stereo.video_pairs import pairs_of_video
 from sfmapp.report.stereo_document import StereoReport
@@ -67,10 +67,23 @@ class StereoResult:
     last: MatchedStereo
 
 
+@dataclass(frozen=True)
+class AlsoWritten:
+    """Beside the usual files.
+
+    Attributes:
+        maps: where each pixel of the rectified pictures comes from. sparse: points of keypoints alone, with their
+            covariances.
+    """
+
+    maps: bool = False
+    sparse: bool = False
+
+
 def stereo(
     sources: Sequence[str | os.PathLike[str]], output: str | os.PathLike[str] | None = None,
     options: Options | None = None, *,
-    known: KnownCameras | None = None, chosen: ChosenPairs | None = None,
+    known: KnownCameras | None = None, chosen: ChosenPairs | None = None, also: AlsoWritten | None = None,
     events: Events | None = None, watch: Stopwatch | None = None,
 ) -> StereoResult:  # fmt: skip
     """Rectify and match pairs of photographs.
@@ -83,6 +96,7 @@ def stereo(
         options: of these, ``stereo``.
         known: what is known of the cameras; None: nothing.
         chosen: which of many pairs.
+        also: what is written beside the usual files; None: nothing.
         events: progress, warnings and cancellation. watch: started when the run began.
 
     Raises:
@@ -103,7 +117,7 @@ def stereo(
         before: Moment | None = None
         for pair in pairs:
             try:
-                last, report, before = _do_pair(job, pair, turn, before)
+                last, report, before = _do_pair(job, pair, turn, also or AlsoWritten(), before)
                 told.append(report)
             except InputError as error:
                 if total == 1:
@@ -173,7 +187,7 @@ def _sizes(cameras: PairCameras) -> tuple[tuple[int, int], ...]:
 
 
 def _do_pair(
-    job: Job, source: PairSource, turn: Misalignment | None, before: Moment | None
+    job: Job, source: PairSource, turn: Misalignment | None, also: AlsoWritten, before: Moment | None
 ) -> tuple[MatchedStereo, StereoPairReport, Moment | None]:
     """The pair, what is told of it, and what is kept of a frame until the next."""
     with job.stage("rectification"):
@@ -208,7 +222,8 @@ def _do_pair(
         consistency = None if before is None or now is None else compare_moments(before, now)
     with job.stage("files"):
         files = [
-            str(path.relative_to(job.workspace.folder)) for path in _write(job.workspace.folder / source.name, done)
+            str(path.relative_to(job.workspace.folder))
+            for path in _write(job.workspace.folder / source.name, done, also)
         ]
     report = StereoPairReport(
         name=source.name, left=source.left, right=source.right, rectification=prepared.report,
@@ -256,7 +271,7 @@ def _disparity_report(done: MatchedStereo) -> DisparityReport:
     )  # fmt: skip
 
 
-def _write(folder: Path, done: MatchedStereo) -> Iterator[Path]:
+def _write(folder: Path, done: MatchedStereo, also: AlsoWritten) -> Iterator[Path]:
     """Write the files of a pair; gives the path of each."""
     pair = done.prepared.pair
     for name, picture in (("left.png", pair.left), ("right.png", pair.right)):
@@ -265,3 +280,5 @@ def _write(folder: Path, done: MatchedStereo) -> Iterator[Path]:
     yield from write_cameras(folder, done.prepared)
     yield from write_maps(folder, done.disparity, done.measured)
     yield from write_models(folder, pair, done.disparity, done.measured)
+    yield from write_sampling(folder, done.prepared, wanted=also.maps)
+    yield from write_sparse(folder, pair, wanted=also.sparse and not done.prepared.report.is_polar)
