@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from sfmapp.camera import lens
 from sfmapp.carve.octree import gather_bits
-from sfmapp.carve.views import project_point
 
 Array = NDArray[np.float64]
 Codes = NDArray[np.uint64]
@@ -72,7 +71,7 @@ class Cells(NamedTuple):
     missed: NDArray[np.uint16]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, inline="always")
 def reading(pixels: NDArray[np.int16], start: int, height: int, width: int, u: float, v: float) -> float:
     """Distance in pixels at a place in a picture, between pixel centres by lines, beyond the last ones theirs."""
     x = min(max(u - 0.5, 0.0), width - 1.0)
@@ -276,84 +275,95 @@ def split(
 
 
 @numba.njit(cache=True, nogil=True)
+def _lens_distance(fields: Fields, view: int, a: float, b: float, c: float) -> tuple[float, float, float]:
+    """Pixel of a point in the camera's frame by any lens, and what a pixel is there."""
+    u, v = lens.project(fields.rows[view, 12:], a, b, c)
+    return u, v, math.sqrt(a * a + b * b + c * c) / float(fields.lenses[view, 0])
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
 def view_distance(fields: Fields, view: int, x: float, y: float, z: float) -> float:
     """Signed distance of a point to the cone of a silhouette, units of the world; NaN where the view does not tell."""
-    row, height, width = fields.rows[view], fields.sizes[view, 0], fields.sizes[view, 1]
-    u, v, depth = project_point(row, x, y, z)
-    is_plain = fields.lenses[view, 0] == 0.0
-    if not (u >= 0.0 and v >= 0.0 and u <= width and v <= height) or (is_plain and depth <= 0.0):
+    rows, height, width = fields.rows, fields.sizes[view, 0], fields.sizes[view, 1]
+    a = rows[view, 0] * x + rows[view, 1] * y + rows[view, 2] * z + rows[view, 3]
+    b = rows[view, 4] * x + rows[view, 5] * y + rows[view, 6] * z + rows[view, 7]
+    c = rows[view, 8] * x + rows[view, 9] * y + rows[view, 10] * z + rows[view, 11]
+    if fields.lenses[view, 0] > 0.0:
+        u, v, pixel = _lens_distance(fields, view, a, b, c)
+    else:
+        if c <= 0.0:
+            return math.nan
+        p, q, fx, fy = a / c, b / c, rows[view, 12], rows[view, 13]
+        u, v, pixel = fx * p + rows[view, 14], fy * q + rows[view, 15], 0.0
+    if not (u >= 0.0 and v >= 0.0 and u <= width and v <= height):
         return math.nan
     start = fields.known_starts[view]
     if start >= 0 and not reading(fields.known, start, height, width, u, v) > 0.0:
         return math.nan
     d = reading(fields.distance, fields.starts[view], height, width, u, v)
-    if is_plain:
+    if pixel == 0.0:
         # the mean size of a pixel: squared singular values of the derivative of pixels by places sum up to this
-        p, q = (u - row[14]) / row[12], (v - row[15]) / row[13]
         total = 0.0
         for j in range(3):
-            total += (row[12] * (row[j] - p * row[8 + j])) ** 2 + (row[13] * (row[4 + j] - q * row[8 + j])) ** 2
-        return d * depth / math.sqrt(float(0.5 * total))
-    a = row[0] * x + row[1] * y + row[2] * z + row[3]
-    b = row[4] * x + row[5] * y + row[6] * z + row[7]
-    return d * math.sqrt(a * a + b * b + depth * depth) / float(fields.lenses[view, 0])
+            s, t = fx * (rows[view, j] - p * rows[view, 8 + j]), fy * (rows[view, 4 + j] - q * rows[view, 8 + j])
+            total += s * s + t * t
+        pixel = c / math.sqrt(0.5 * total)
+    return d * pixel
 
 
 @numba.njit(cache=True, nogil=True)
-def _least(fields: Fields, xyz: Array, misses: int, least: Array, views: NDArray[np.int64]) -> int:
-    """Fill the misses + 1 least distances of views at a point, ascending, and whose they are; how many views tell."""
-    seen = 0
-    for k in range(misses + 1):
-        least[k], views[k] = math.inf, -1
+def hull_distances(
+    fields: Fields, xyz: Array, min_views: int, misses: int, out: Array, owners: NDArray[np.int32]
+) -> None:
+    """Signed distances (N,) of points (N, 3) to the hull into ``out``, and the views that they are from, or -1, into
+    ``owners``. View by view, so that what is read of a picture is near to what was read before."""
+    best = np.full((xyz.shape[0], misses + 1), math.inf)
+    whose = np.full((xyz.shape[0], misses + 1), -1, np.int32)
+    seen = np.zeros(xyz.shape[0], np.int32)
     for view in range(fields.rows.shape[0]):
-        d = view_distance(fields, view, xyz[0], xyz[1], xyz[2])
-        if math.isnan(d):
-            continue
-        seen += 1
-        if d < least[misses]:
-            k = misses
-            while k > 0 and least[k - 1] > d:
-                least[k], views[k] = least[k - 1], views[k - 1]
-                k -= 1
-            least[k], views[k] = d, view
-    return seen
-
-
-@numba.njit(cache=True, nogil=True)
-def hull_distances(fields: Fields, xyz: Array, min_views: int, misses: int, out: Array) -> None:
-    """Signed distances (N,) of points (N, 3) to the hull into ``out``."""
-    least, views = np.empty(misses + 1), np.empty(misses + 1, np.int64)
-    for i in range(xyz.shape[0]):
-        seen = _least(fields, xyz[i], misses, least, views)
-        out[i] = -math.inf if seen < min_views else least[misses]
-
-
-@numba.njit(cache=True, nogil=True)
-def point_votes(fields: Fields, xyz: Array, out: NDArray[np.int8]) -> None:
-    """What each view says of points (N, 3), INSIDE, OUTSIDE or UNSEEN, into ``out`` (N, V)."""
-    for i in range(xyz.shape[0]):
-        for view in range(fields.rows.shape[0]):
+        for i in range(xyz.shape[0]):
             d = view_distance(fields, view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
-            out[i, view] = UNSEEN if math.isnan(d) else INSIDE if d > 0.0 else OUTSIDE
+            if math.isnan(d):
+                continue
+            seen[i] += 1
+            k = misses
+            if d >= best[i, k]:
+                continue
+            while k > 0 and best[i, k - 1] > d:
+                best[i, k], whose[i, k] = best[i, k - 1], whose[i, k - 1]
+                k -= 1
+            best[i, k], whose[i, k] = d, view
+    for i in range(xyz.shape[0]):
+        out[i] = -math.inf if seen[i] < min_views else best[i, misses]
+        owners[i] = whose[i, misses]
 
 
 @numba.njit(cache=True, nogil=True)
-def hull_slopes(fields: Fields, xyz: Array, step: float, misses: int, out: NDArray[np.float32]) -> None:
-    """Outward unit normals (N, 3) at points (N, 3) on the hull into ``out``, zero where there is none."""
-    least, views, slope, at = np.empty(misses + 1), np.empty(misses + 1, np.int64), np.empty(3), np.empty(3)
+def view_distances(fields: Fields, xyz: Array, out: NDArray[np.float32]) -> None:
+    """Signed distances of points (N, 3) to the cone of each view's silhouette into ``out`` (N, V), NaN where a view
+    does not tell."""
+    for view in range(fields.rows.shape[0]):
+        for i in range(xyz.shape[0]):
+            out[i, view] = view_distance(fields, view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
+
+
+@numba.njit(cache=True, nogil=True)
+def cone_slopes(fields: Fields, xyz: Array, owners: NDArray[np.int32], step: float, out: NDArray[np.float32]) -> None:
+    """Outward unit normals (N, 3) at points (N, 3) of the cones of their views into ``out``, zero where there is
+    none."""
+    slope, at = np.empty(3), np.empty(3)
     for i in range(xyz.shape[0]):
-        _least(fields, xyz[i], misses, least, views)
-        view, total = views[misses], 0.0
+        total = 0.0
         for axis in range(3):
             slope[axis] = 0.0
-            if view < 0:
+            if owners[i] < 0:
                 continue
             for k in range(3):
                 at[k] = xyz[i, k]
             at[axis] = xyz[i, axis] + step
-            ahead = view_distance(fields, view, at[0], at[1], at[2])
+            ahead = view_distance(fields, owners[i], at[0], at[1], at[2])
             at[axis] = xyz[i, axis] - step
-            behind = view_distance(fields, view, at[0], at[1], at[2])
+            behind = view_distance(fields, owners[i], at[0], at[1], at[2])
             if not (math.isnan(ahead) or math.isnan(behind)):
                 slope[axis] = behind - ahead
             total += slope[axis] ** 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 
 from sfmapp.camera import lens
 from sfmapp.camera.camera import pixels_to_rays
-from sfmapp.carve.carving_kernels import STEPS, Fields, hull_distances, hull_slopes
+from sfmapp.carve.carving_kernels import STEPS, Fields, cone_slopes, hull_distances, view_distances
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View
 from sfmapp.errors import InputError
@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 # samples along the longer side of a picture from which a lens's largest slope is taken, and what is added to it for
 # slopes between the samples: a lens of which it is more changes its focal length by a tenth within a 64th of a picture
 _SAMPLES, _BETWEEN = 64, 1.1
-# points for a thread at a time: enough that starting it costs nothing, few enough that all threads end together
-_CHUNK = 1 << 15
+# points for a thread at a time: enough that starting it costs nothing, few enough that neighbours are read together
+_CHUNK = 1 << 13
 
 
 @dataclass(frozen=True)
@@ -54,30 +54,48 @@ class Hull:
         is the least of all views' that see the point: exact in sign, near the surface a close bound in size. Infinite
         where nothing but ``misses`` limits it, -inf where fewer than ``min_views`` see the point.
         """
-        points = np.ascontiguousarray(xyz, np.float64)
-        out = np.empty(len(points))
-
-        def run(begin: int) -> None:
-            part = slice(begin, begin + _CHUNK)
-            hull_distances(self.fields, points[part], self.min_views, self.misses, out[part])
-
-        with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-            list(pool.map(run, range(0, len(points), _CHUNK)))
-        return out
+        return self._ask(xyz, threads)[0]
 
     def normals(self, xyz: ArrayLike, step: float, threads: int | None = None) -> NDArray[np.float32]:
         """Outward unit normals (N, 3) of the hull at points (N, 3) on it: of the cone that bounds it there, by central
         differences over a step in units of the world; zero where a silhouette is flat."""
         points = np.ascontiguousarray(xyz, np.float64)
+        owners = self._ask(points, threads)[1]
         out = np.empty((len(points), 3), np.float32)
 
-        def run(begin: int) -> None:
-            part = slice(begin, begin + _CHUNK)
-            hull_slopes(self.fields, points[part], step, self.misses, out[part])
+        def run(part: slice) -> None:
+            cone_slopes(self.fields, points[part], owners[part], step, out[part])
 
-        with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-            list(pool.map(run, range(0, len(points), _CHUNK)))
+        _in_parts(run, len(points), threads)
         return out
+
+    def distance_by_view(self, xyz: ArrayLike, threads: int | None = None) -> NDArray[np.float32]:
+        """Signed distances (N, V) of points (N, 3) to the cone of each silhouette, in the order in which views were
+        given, positive inside, units of the world; NaN where a view does not tell."""
+        points = np.ascontiguousarray(xyz, np.float64)
+        out = np.empty((len(points), len(self)), np.float32)
+        _in_parts(lambda part: view_distances(self.fields, points[part], out[part]), len(points), threads)
+        result = np.empty_like(out)
+        result[:, self.order] = out
+        return result
+
+    def _ask(self, xyz: ArrayLike, threads: int | None) -> tuple[Array, NDArray[np.int32]]:
+        """Distances (N,) of points (N, 3), and the views, as in ``fields``, that they are from."""
+        points = np.ascontiguousarray(xyz, np.float64)
+        out, owners = np.empty(len(points)), np.empty(len(points), np.int32)
+
+        def run(part: slice) -> None:
+            hull_distances(self.fields, points[part], self.min_views, self.misses, out[part], owners[part])
+
+        _in_parts(run, len(points), threads)
+        return out, owners
+
+
+def _in_parts(run: Callable[[slice], None], num: int, threads: int | None) -> None:
+    """Do something with parts of so many points on all threads."""
+    parts = [slice(begin, begin + _CHUNK) for begin in range(0, num, _CHUNK)]
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        list(pool.map(run, parts))
 
 
 def hull_of(

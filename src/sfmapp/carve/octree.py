@@ -47,6 +47,14 @@ class Octree:
         inner = sum(len(codes) * (self.side / 2.0**level) ** 3 for level, codes in enumerate(self.full))
         return float(inner), float(inner + len(self.surface) * self.cell**3)
 
+    def finest_full(self) -> Codes:
+        """Codes of finest cells that are in full ones: many, where the octree is deep."""
+        parts = []
+        for level, codes in enumerate(self.full):
+            num = 8 ** (self.depth - level)
+            parts.append((codes[:, None] * np.uint64(num) + np.arange(num, dtype=np.uint64)).ravel())
+        return np.concatenate(parts).astype(np.uint64)
+
     def centers(self, codes: Codes, level: int | None = None) -> Array:
         """(N, 3) world places of the middles of cells of a level, by default the finest."""
         level = self.depth if level is None else level

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfmapp.carve.carving_kernels import INSIDE, OUTSIDE, UNSEEN, Cells, point_votes, split
+from sfmapp.carve.carving_kernels import Cells, split
 from sfmapp.carve.hull import Hull, hull_of
 from sfmapp.carve.octree import MAX_DEPTH, Codes, Octree, codes_of
 from sfmapp.carve.silhouettes import Silhouette
@@ -278,26 +278,25 @@ def at_faces(codes: Codes, level: int) -> NDArray[np.bool_]:
 def _blame(hull: Hull, names: Sequence[str], low: NDArray[np.float64], side: float) -> tuple[str, str]:
     """Why nothing is left, and what to do: which silhouettes take away what all others let stand."""
     grid = np.stack(np.meshgrid(*[np.arange(_COARSE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    votes = np.empty((len(grid), len(hull)), np.int8)
-    point_votes(hull.fields, low + side * (grid + 0.5) / _COARSE, votes)
-    told = [names[i] for i in hull.order]
-    outside, num_seen = votes == OUTSIDE, (votes != UNSEEN).sum(axis=1)
+    distance = hull.distance_by_view(low + side * (grid + 0.5) / _COARSE)
+    outside, num_seen = distance <= 0.0, np.isfinite(distance).sum(axis=1)
     if num_seen.max() < hull.min_views:
         return (
             f"no place in the volume is seen by {hull.min_views} photographs",
             "the volume misses the object, or the cameras look elsewhere: give another box",
         )
-    empty = [name for name, shows in zip(told, (votes == INSIDE).any(axis=0), strict=True) if not shows]
+    is_shown = (distance > 0.0).sum(axis=0) > 0
+    empty = [name for name, shows in zip(names, is_shown.tolist(), strict=True) if not shows]
     if empty:
         return (
             f"nothing is left: {_some(empty)} show no object in the volume",
             "look at their masks (empty, or inverted?), or give another box",
         )
     spared = outside.sum(axis=1)
-    spared[num_seen < hull.min_views] = len(told)
+    spared[num_seen < hull.min_views] = len(names)
     least = int(spared.min())
     culprits = outside[spared == least].sum(axis=0)
-    worst = [told[i] for i in np.argsort(-culprits, kind="stable")[:least]] if least else told
+    worst = [names[i] for i in np.argsort(-culprits, kind="stable")[:least]] if least else list(names)
     return (
         f"nothing is left: each place is outside {max(least, 1)} silhouettes or more, most often those of "
         f"{_some(worst)}",
