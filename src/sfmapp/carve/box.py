@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.carve.octree import Codes, Octree
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View
 from sfmapp.errors import InputError
@@ -55,6 +56,10 @@ class Box:
         """Low corner (3,) and side of a cube around it with a little free space on all sides."""
         side = (1.0 + 2.0 * _AROUND) * self.extent
         return 0.5 * (self.low + self.high) - 0.5 * side, side
+
+    def distance(self, xyz: Array) -> Array:
+        """(N,) signed distances of points (N, 3) to its faces, positive inside: exact there, a lower bound outside."""
+        return np.asarray(np.minimum(xyz - self.low, self.high - xyz).min(axis=1))
 
     def holds(self, xyz: Array) -> NDArray[np.bool_]:
         """(N,) bool of points (N, 3)."""
@@ -113,6 +118,46 @@ def cameras_inside(box: Box, views: Sequence[View]) -> list[str]:
     """Names of views whose cameras stand inside the box."""
     is_inside = box.holds(np.array([view.center for view in views]))
     return [view.name for view, inside in zip(views, is_inside, strict=True) if inside]
+
+
+def clip_octree(octree: Octree, box: Box) -> Octree:
+    """The part of a volume in a box: cells that a face cuts are split down to the finest, which are of the surface."""
+    full: list[Codes] = []
+    pending: Codes = np.zeros(0, np.uint64)
+    for level, codes in enumerate(octree.full):
+        candidates = np.concatenate([codes, pending])
+        is_inside, is_cut = _against(octree, candidates, level, box)
+        full.append(np.sort(candidates[is_inside]))
+        if level < octree.depth:
+            children = (candidates[is_cut] << np.uint64(3))[:, None] + np.arange(8, dtype=np.uint64)
+            pending = np.asarray(children.ravel(), np.uint64)
+        else:
+            pending = candidates[is_cut]
+    is_inside, is_cut = _against(octree, octree.surface, octree.depth, box)
+    surface = np.sort(np.concatenate([octree.surface[is_inside | is_cut], pending]))
+    return Octree(octree.low, octree.side, octree.depth, tuple(full), surface)
+
+
+def _against(octree: Octree, codes: Codes, level: int, box: Box) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which cells of a level are wholly in a box, and which its faces cut."""
+    half = 0.5 * octree.side / 2.0**level
+    centers = octree.centers(codes, level)
+    is_inside = np.asarray(((centers - half >= box.low) & (centers + half <= box.high)).all(axis=1))
+    is_outside = np.asarray(((centers + half <= box.low) | (centers - half >= box.high)).any(axis=1))
+    return is_inside, ~is_inside & ~is_outside
+
+
+def tightened(box: Box, octree: Octree) -> Box:
+    """The part of a box that a coarse volume fills, with a cell of it around."""
+    low, high = box.high.copy(), box.low.copy()
+    for level, codes in enumerate([*octree.full, octree.surface]):
+        if len(codes):
+            at = min(level, octree.depth)
+            half = 0.5 * octree.side / 2.0**at
+            centers = octree.centers(codes, at)
+            low = np.minimum(low, centers.min(axis=0) - half)
+            high = np.maximum(high, centers.max(axis=0) + half)
+    return replace(box, low=np.maximum(low - octree.cell, box.low), high=np.minimum(high + octree.cell, box.high))
 
 
 @dataclass(frozen=True)

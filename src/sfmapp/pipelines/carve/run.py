@@ -5,17 +5,17 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.carve.box import Box, cameras_inside, find_box, user_box
+from sfmapp.carve.box import Box, cameras_inside, clip_octree, find_box, tightened, user_box
 from sfmapp.carve.coloring import ColoringReport, color_surface
 from sfmapp.carve.files import read_octree, write_octree
 from sfmapp.carve.hull import Hull, hull_of
-from sfmapp.carve.isosurface import surface_of
+from sfmapp.carve.isosurface import Distance, Normals, surface_of
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette, find_silhouettes
 from sfmapp.carve.space_carving import CarvingReport, LevelCounts, carve_hull
@@ -38,11 +38,14 @@ from sfmapp.workspace.layout import CARVE, PAGE, REPORT
 from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
 
+Array = NDArray[np.float64]
 FilePath = str | os.PathLike[str]
 STAGE = CARVE
 _NAMES_SHOWN = 4
 # what the user's box may leave out of that of the silhouettes, as a share of its side, before it is said
 _CUT = 0.05
+# cells along the side of the volume that tells how much of its box is filled
+_COARSE = 64
 # a photograph whose silhouette the result fits so much worse than most is named
 _FAR_BELOW = 0.1
 
@@ -122,7 +125,7 @@ def carve(
         with job.stage("box"):
             box = _box(what, source, silhouettes, job)
         hull, octree, carving = _carve(job, source, silhouettes, box)
-        mesh, colors = _surface(job, source, silhouettes, hull, octree)
+        mesh, colors = _surface(job, source, silhouettes, hull, octree, box)
         volume = CarvedVolume(source, silhouettes, box, octree, hull, mesh)
         _warn(job, volume, carving, colors)
         with job.stage("files"):
@@ -187,7 +190,7 @@ def _box(what: CarveInput, source: CarveSource, silhouettes: Sequence[Silhouette
     return found
 
 
-def _corner(at: NDArray[np.float64]) -> str:
+def _corner(at: Array) -> str:
     return "(" + ", ".join(f"{value:.4g}" for value in at) + ")"
 
 
@@ -196,12 +199,10 @@ def _carve(
 ) -> tuple[Hull, Octree, CarvingReport]:  # fmt: skip
     """The octree, that of an earlier call where it was finished with the same inputs and options."""
     options, folder = job.options.carve, job.workspace.folder
-    names = [view.name for view in source.views]
     hull = hull_of(source.views, silhouettes, min_views=options.min_views, misses=options.misses)
-    low, side = box.cube()
     key = stage_key(
         (__name__,), options, [input_key(record) for record in source.records], _digest(silhouettes),
-        [view.row.tolist() for view in source.views], low.tolist(), side, box.low.tolist(), box.high.tolist(),
+        [view.row.tolist() for view in source.views], box.low.tolist(), box.high.tolist(), box.told_by,
     )  # fmt: skip
     if job.workspace.is_current(STAGE, key):
         try:
@@ -211,11 +212,26 @@ def _carve(
         except (InputError, ValueError):
             pass  # taken away or damaged: carved again
     with job.stage(STAGE, key):
-        octree, report = carve_hull(hull, names, low, side, options, job.events, threads=job.threads)
+        octree, report = _carved(job, source, hull, box)
         job.events.raise_if_cancelled()
         write_octree(folder / OCTREE, octree)
         job.workspace.write_json(CARVING, report)
     return hull, octree, report
+
+
+def _carved(job: Job, source: CarveSource, hull: Hull, box: Box) -> tuple[Octree, CarvingReport]:
+    """The volume in a box that a user gave; in one that silhouettes tell, which is loose, in what a coarse volume fills
+    of it."""
+    names, options = [view.name for view in source.views], job.options.carve
+    if box.told_by != "user" and options.cells > _COARSE:
+        coarse, _ = carve_hull(hull, names, *box.cube(), replace(options, cells=_COARSE), Events(), threads=job.threads)
+        box = tightened(box, coarse)
+    octree, report = carve_hull(hull, names, *box.cube(), options, job.events, threads=job.threads)
+    if box.told_by == "user":
+        octree = clip_octree(octree, box)
+        low, high = octree.volume_bounds()
+        report = replace(report, volume_low=low, volume_high=high)
+    return octree, report
 
 
 def _digest(silhouettes: Sequence[Silhouette]) -> str:
@@ -228,13 +244,10 @@ def _digest(silhouettes: Sequence[Silhouette]) -> str:
 
 
 def _surface(
-    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], hull: Hull, octree: Octree
+    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], hull: Hull, octree: Octree, box: Box
 ) -> tuple[Mesh, ColoringReport]:
     with job.stage("surface"):
-        mesh = surface_of(
-            octree, lambda xyz: hull.distance(xyz, job.threads),
-            lambda xyz: hull.normals(xyz, octree.cell, job.threads), job.events,
-        )  # fmt: skip
+        mesh = surface_of(octree, *_shape(job, hull, octree, box), job.events)
         if not len(mesh.faces):
             raise NoReconstructionError(
                 "nothing is left of the volume at this resolution", "ask for more cells: --cells"
@@ -247,6 +260,22 @@ def _surface(
     return Mesh(mesh.xyz, mesh.faces, mesh.normal, rgb), colors
 
 
+def _shape(job: Job, hull: Hull, octree: Octree, box: Box) -> tuple[Distance, Normals]:
+    """Signed distance and normals of the hull, cut off by the box of a user."""
+
+    def distance(xyz: Array) -> Array:
+        found = hull.distance(xyz, job.threads)
+        return np.minimum(found, box.distance(xyz)) if box.told_by == "user" else found
+
+    def normals(xyz: Array) -> NDArray[np.float32]:
+        found = hull.normals(xyz, octree.cell, job.threads)
+        if box.told_by == "user":  # on its faces triangles tell them
+            found[box.distance(xyz) < 0.5 * octree.cell] = 0.0
+        return found
+
+    return distance, normals
+
+
 def _warn(job: Job, volume: CarvedVolume, carving: CarvingReport, colors: ColoringReport) -> None:
     if any(view.is_mirrored for view in volume.source.views):
         job.events.warned(
@@ -256,7 +285,7 @@ def _warn(job: Job, volume: CarvedVolume, carving: CarvingReport, colors: Colori
         job.events.warned(STAGE, "the volume reaches the border of its box, which cuts it off: give a larger --box")
     typical = float(np.median([fit.iou for fit in colors.views]))
     odd = [fit for fit in colors.views if fit.iou < typical - _FAR_BELOW]
-    if odd:
+    if odd and volume.box.told_by != "user":  # what a box leaves out is missed by all
         named = ", ".join(f"{fit.name} ({fit.iou:.2f})" for fit in odd[:_NAMES_SHOWN])
         job.events.warned(
             STAGE,
