@@ -30,6 +30,8 @@ _RARE = 2e-6
 # probability that a colour is neither's own: keeps a colour never seen from saying anything
 _STRAY = 1e-7
 _ROUNDS = 4
+# the background is dark below this share of the object's brightness: shadows on the object are about as dark
+_DARK = 0.4
 # evidence is averaged over so many pixels a side: noise is that of single pixels
 _WINDOW = 3
 # specks and holes below this share of the object are filled: a hole that is none pierces the solid, while one that is
@@ -46,10 +48,12 @@ class ColorModel:
     Attributes:
         evidence: (32768,) float32 logarithm of how much more often the object has a colour than the background.
         error: share of pixels that colour alone tells wrongly, both sides weighed alike.
+        is_dark: the background is so dark against the object that shadows on this look like it.
     """
 
     evidence: NDArray[np.float32]
     error: float
+    is_dark: bool
 
 
 def learn_colors(pictures: Sequence[Pixels]) -> ColorModel | None:
@@ -126,7 +130,14 @@ def _model_of(
 ) -> ColorModel:
     found = _histogram([index[mask] for index, mask in zip(colors, masks, strict=True)], shaded=False)
     evidence = np.log(found + _STRAY) - np.log(background + _STRAY)
-    return ColorModel(evidence.astype(np.float32), float(0.5 * np.minimum(found, background).sum()))
+    error = float(0.5 * np.minimum(found, background).sum())
+    return ColorModel(evidence.astype(np.float32), error, _brightness(background) < _DARK * _brightness(found))
+
+
+def _brightness(colors: NDArray[np.float64]) -> float:
+    """Mean of the three channels, in levels, of colours with probabilities (32768,)."""
+    grid = colors.reshape(_LEVELS, _LEVELS, _LEVELS)
+    return float(sum(np.arange(_LEVELS) @ grid.sum(axis=others) for others in ((1, 2), (0, 2), (0, 1))) / 3.0)
 
 
 def _smooth_evidence(index: NDArray[np.int32], model: ColorModel) -> NDArray[np.float32]:

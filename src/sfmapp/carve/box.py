@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.carve.octree import Codes, Octree
-from sfmapp.carve.silhouettes import Silhouette
+from sfmapp.carve.outlines import Silhouette
 from sfmapp.carve.views import View
 from sfmapp.errors import InputError
 from sfmapp.events import Events

@@ -12,12 +12,15 @@ class PhotographMask(Report):
 
     Attributes:
         name: of the photograph.
-        source: what told it: ``alpha``, ``mask``, ``background``, ``grabcut``; ``none`` where nothing did.
+        source: what told it: ``alpha``, ``mask``, ``background``, ``dark background``; ``none`` where nothing did.
         share: of the pixels that are inside.
         border_share: of the pixels along the edge of the picture that are inside.
         confidence: between 0.5 and 1, see :class:`sfmapp.carve.silhouettes.Silhouette`.
         outline_sigma_px: standard deviation of the outline.
         problem: what is wrong with it, empty if nothing is known to be; such a silhouette carves nothing.
+        spilled, filled: share of the silhouette that was taken away, and filled, as the others speak against it.
+        doubtful: share of holes that may be none, and were left.
+        turned_deg: angle by which its camera seems to be turned; absent where it does not.
     """
 
     name: str
@@ -27,6 +30,10 @@ class PhotographMask(Report):
     confidence: float
     outline_sigma_px: float
     problem: str
+    spilled: float
+    filled: float
+    doubtful: float
+    turned_deg: float | None = None
 
 
 class MasksReport(Report):
@@ -36,11 +43,13 @@ class MasksReport(Report):
         masks: in the order of the photographs.
         color_error: share of pixels that colour alone would tell wrongly, by the overlap of the colours of object and
             background; None where colours were not asked.
+        is_compared: with cameras, silhouettes are held against each other.
         warnings: lines for the user.
         wall_s: seconds that it took.
     """
 
     masks: Sequence[PhotographMask]
     color_error: float | None
+    is_compared: bool
     warnings: Sequence[str]
     wall_s: float

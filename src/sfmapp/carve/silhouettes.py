@@ -10,15 +10,16 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.carve.backgrounds import MAX_LEARNED, ColorModel, learn_colors, object_mask
+from sfmapp.carve.consistency import compare
 from sfmapp.carve.masks_report import MasksReport, PhotographMask
-from sfmapp.carve.outlines import Coverage, coverage_of_mask, refined_coverage, signed_distance
+from sfmapp.carve.outlines import Coverage, Silhouette, coverage_of_mask, refined_coverage, signed_distance
 from sfmapp.errors import InputError
 from sfmapp.images.pixels import read_mask_coverage, read_rgb, read_with_alpha
 from sfmapp.option_checks import check_options
@@ -28,11 +29,13 @@ if TYPE_CHECKING:
     from sfmapp.events import Events
     from sfmapp.images.image_set import ImageRecord, ImageSet
 
+__all__ = ["MaskOptions", "Silhouette", "find_silhouettes"]
+
 STAGE = "masks"
 T = TypeVar("T")
 
 # standard deviations of outlines against exact ones: tests/test_carve_outlines.py
-_SIGMA_PX = {"alpha": 0.1, "mask": 0.2, "background": 0.3}
+_SIGMA_PX = {"alpha": 0.1, "mask": 0.2, "background": 0.3, "dark background": 0.3}
 # more of the edge of the picture than this inside, and more than of the whole: the mask is the background's
 _INVERTED = 0.5
 # what is seen of the object is at least this share of a photograph, for outlines to mean anything
@@ -40,6 +43,8 @@ _LEAST_SHARE = 1e-5
 # share of pixels that are black or white to the last level, from which on a photograph is a mask itself
 _TWO_VALUED = 0.98
 _NAMES_SHOWN = 3
+# share of a silhouette above which a spill or a hole is told
+_WORTH_A_LINE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -55,32 +60,6 @@ class MaskOptions:
 
     def __post_init__(self) -> None:
         check_options("masks", self, {})
-
-
-@dataclass(frozen=True)
-class Silhouette:
-    """The object's outline in one photograph.
-
-    Attributes:
-        distance: (H, W) float32 pixels from the centre of each pixel to the outline, positive inside, to a fraction of
-            a pixel near it; +inf everywhere if there is no outside, -inf if there is no object.
-        known: (H, W) bool, False where the picture cannot tell (a hand in front, a hole in the lens's field): nothing
-            is carved there; None for everywhere. Beyond the picture nothing is ever known.
-        confidence: between 0.5 and 1: how probable it is that a pixel far from the outline is told rightly.
-        outline_sigma_px: standard deviation of the outline's place, pixels.
-        source: how it was found, in a word for reports: ``alpha``, ``mask``, ``background``, ...
-    """
-
-    distance: NDArray[np.float32]
-    known: NDArray[np.bool_] | None = None
-    confidence: float = 1.0
-    outline_sigma_px: float = 0.5
-    source: str = "mask"
-
-    @property
-    def inside(self) -> NDArray[np.bool_]:
-        """(H, W) pixels whose centre shows the object."""
-        return np.asarray(self.distance > 0.0)
 
 
 @dataclass(frozen=True)
@@ -129,11 +108,14 @@ def find_silhouettes(
         return _with_problem(record, _find(record, source, model))
 
     found = _each(work, records, workers, lambda record: events.advanced(STAGE, message=record.name))
+    warnings = _warn([entry for _, entry in found], events)
+    if views is not None:
+        found, more = _compared(views, found, workers, events)
+        warnings += more
     silhouettes, entries = [each for each, _ in found], [entry for _, entry in found]
-    warnings = _warn(entries, events)
     report = MasksReport(
-        masks=entries, color_error=None if model is None else model.error, warnings=warnings,
-        wall_s=round(time.monotonic() - start, 3),
+        masks=entries, color_error=None if model is None else model.error, is_compared=views is not None,
+        warnings=warnings, wall_s=round(time.monotonic() - start, 3),
     )  # fmt: skip
     events.finished(STAGE, f"{len(entries)} silhouettes by {source}", **report)
     return silhouettes, report
@@ -226,7 +208,8 @@ def _find(record: ImageRecord, source: str, model: ColorModel | None) -> _Found 
     assert model is not None
     picture = read_rgb(record)
     coverage = refined_coverage(picture, object_mask(picture, model))
-    return _Found(coverage, "background", float(np.clip(1.0 - model.error, 0.5, 1.0)))
+    source = "dark background" if model.is_dark else "background"
+    return _Found(coverage, source, float(np.clip(1.0 - model.error, 0.5, 1.0)))
 
 
 def _coverage(levels: NDArray[np.uint8]) -> Coverage:
@@ -259,6 +242,7 @@ def _with_problem(record: ImageRecord, found: _Found | None) -> tuple[Silhouette
     entry = PhotographMask(
         name=record.name, source=found.source, share=share, border_share=border_share,
         confidence=silhouette.confidence, outline_sigma_px=silhouette.outline_sigma_px, problem=problem,
+        spilled=0.0, filled=0.0, doubtful=0.0,
     )  # fmt: skip
     return silhouette, entry
 
@@ -279,3 +263,45 @@ def _warn(entries: Sequence[PhotographMask], events: Events) -> list[str]:
     for line in warnings:
         events.warned(STAGE, f"{line}: it carves nothing")
     return warnings
+
+
+def _compared(
+    views: Sequence[View], found: Sequence[tuple[Silhouette, PhotographMask]], workers: int, events: Events
+) -> tuple[list[tuple[Silhouette, PhotographMask]], list[str]]:
+    """Silhouettes after what the others say of them, and lines for the user."""
+    # an alpha channel was rendered or cut by hand: it is told what speaks against it, and left as it is
+    repairs = any(silhouette.source != "alpha" for silhouette, _ in found)
+    verdicts = compare(views, [each for each, _ in found], repairs=repairs, workers=workers, events=events)
+    result, warnings = [], []
+    for (_, entry), verdict in zip(found, verdicts, strict=True):
+        told = replace(
+            entry, spilled=verdict.spilled, filled=verdict.filled, doubtful=verdict.doubtful,
+            turned_deg=verdict.turned_deg,
+            problem=entry.problem or verdict.problem, confidence=verdict.silhouette.confidence,
+        )  # fmt: skip
+        if verdict.problem:
+            warnings.append(f"{entry.name} {verdict.problem}")
+            events.warned(STAGE, f"{warnings[-1]}; it carves nothing")
+        result.append((verdict.silhouette, told))
+    return result, warnings + _told_of_repairs([entry for _, entry in result], repairs, events)
+
+
+def _told_of_repairs(entries: Sequence[PhotographMask], repairs: bool, events: Events) -> list[str]:
+    """Lines on spills and holes that the other silhouettes speak against."""
+    lines = []
+    done = {"spilled": "taken away", "filled": "filled"} if repairs else {}
+    kinds = {
+        "spilled": "spill over what the others hold",
+        "filled": "have holes where all others hold something",
+        "doubtful": "have narrow holes that no other looks through",
+    }
+    if not repairs:
+        del kinds["doubtful"]
+    for share, what in kinds.items():
+        which = sorted((entry for entry in entries if entry[share] > _WORTH_A_LINE), key=lambda entry: -entry[share])
+        if which:
+            named = ", ".join(f"{entry.name} ({100 * entry[share]:.1f} %)" for entry in which[:_NAMES_SHOWN])
+            more = f" and {len(which) - _NAMES_SHOWN} more" if len(which) > _NAMES_SHOWN else ""
+            lines.append(f"{len(which)} silhouettes {what}, {done.get(share, 'left as they are')}: {named}{more}")
+            events.decided(STAGE, lines[-1])
+    return lines
