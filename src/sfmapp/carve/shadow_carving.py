@@ -46,7 +46,7 @@ MAX_DEPTH = 9
 # samples in half planes, in finest cells where the volume has its middle
 _STEP = 0.75
 # a sweep over all views that takes away less than this share of the cells is the last
-_SETTLED = 1e-3
+_SETTLED = 5e-3
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def carve_shadows(
     _check(tree, views, shadows)
     grid = grid_of(tree)
     by_view: dict[int, list[Shadow]] = {}
-    used = [s for s in shadows if _angle_deg(grid, views[s.view], s) <= options.max_angle_deg]
+    used = [s for s in shadows if angle_deg(grid.middle, views[s.view], s.light) <= options.max_angle_deg]
     for shadow in used:
         by_view.setdefault(shadow.view, []).append(shadow)
     before, sweeps = int(np.count_nonzero(grid.filled)), list[int]()
@@ -170,9 +170,9 @@ def _check(tree: Octree, views: Sequence[View], shadows: Sequence[Shadow]) -> No
             )
 
 
-def _angle_deg(grid: CellGrid, view: View, shadow: Shadow) -> float:
-    """Between camera and light as seen from the middle of the volume."""
-    a, b = view.center - grid.middle, shadow.light - grid.middle
+def angle_deg(place: Array, view: View, light: Array) -> float:
+    """Between a camera and a light (3,) as seen from a place (3,), degrees."""
+    a, b = view.center - place, light - place
     return float(np.degrees(np.arccos(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), -1.0, 1.0))))
 
 
@@ -221,11 +221,9 @@ def _carve_by_view(
 
     def carve(shadow: Shadow) -> None:
         planes = _planes(grid, view.center, shadow.light, options.fan_deg)
-        first = np.empty(planes.num[:2], np.int32)
-        find_held(
-            planes, view.row, reach_of(shadow.dark), options.margin_px, grid.low, grid.tree.cell, grid.filled, first
-        )
-        take_free(planes, grid.low, grid.tree.cell, grid.filled, first, empty)
+        first, reach = np.empty(planes.num[:2], np.int32), reach_of(shadow.dark)
+        find_held(planes, view.row, reach, options.margin_px, grid.low, grid.tree.cell, grid.filled, first)
+        take_free(planes, view.row, reach, grid.low, grid.tree.cell, grid.filled, first, empty)
 
     # all write the same number, in any order
     list(pool.map(carve, shadows))

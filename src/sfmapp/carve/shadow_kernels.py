@@ -177,16 +177,24 @@ def _hold_on_ray(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def take_free(planes: Planes, low: Array, cell: float, filled: Cells, first: Map, out: Cells) -> None:
+def take_free(
+    planes: Planes, row: Array, reach: NDArray[np.float32], low: Array, cell: float, filled: Cells, first: Map,
+    out: Cells,
+) -> None:  # fmt: skip
     """Mark with 1 in ``out`` (X, Y, Z) the filled cells that are free wherever the planes pass through them."""
     half = math.sqrt(0.75) * cell
+    height, width = reach.shape
     for i in range(filled.shape[0]):
         for j in range(filled.shape[1]):
             for k in range(filled.shape[2]):
                 if filled[i, j, k] == 0:
                     continue
                 x, y, z = low[0] + (i + 0.5) * cell, low[1] + (j + 0.5) * cell, low[2] + (k + 0.5) * cell
-                if _is_free(planes, first, x, y, z, half):
+                # most are seen where nothing is dark, which is quickly told
+                u, v, depth = project_point(row, x, y, z)
+                if not (depth > 0.0 and u >= 0.0 and v >= 0.0 and u < width and v < height):
+                    continue
+                if reach[int(v), int(u)] > 0.0 and _is_free(planes, first, x, y, z, half):
                     out[i, j, k] = 1
 
 

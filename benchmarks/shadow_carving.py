@@ -1,0 +1,204 @@
+"""Volumes by silhouettes alone and by shadows too, of rendered solids of exact shape, photographed with noise.
+
+    python benchmarks/shadow_carving.py                          # all scenes and densities
+    python benchmarks/shadow_carving.py --only house 24x4     # rows of a scene and a density
+    python benchmarks/shadow_carving.py --picture FILE.png    # photographs, shadows and slices side by side
+
+Densities are those of Savarese et al.: 24 positions by 4 lights, 72 by 8, 16 by 4. Lamps and thresholds were set on the
+house; the jug and the drawn solids were not looked at before. See benchmarks/README.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from machine import RESULTS, describe_machine
+from rendered_worlds.lit_solids import Rig, around, drawn, house, jug, lamps_at
+from rendered_worlds.solids import Rendering, Solid, photograph, render
+from sfmapp.carve.cell_grid import grid_of
+from sfmapp.carve.octree import Octree
+from sfmapp.carve.outlines import signed_distance
+from sfmapp.carve.shadow_carving import Shadow, ShadowOptions, angle_deg, carve_shadows
+from sfmapp.carve.shadows import LitPhotograph, find_shadows
+from sfmapp.carve.silhouettes import Silhouette
+from sfmapp.carve.space_carving import CarveOptions, carve
+from sfmapp.carve.views import View, view_of_camera
+from sfmapp.geometry import rigid3
+
+Array = NDArray[np.float64]
+
+DENSITIES = {"24x4": (24, 4), "72x8": (72, 8), "16x4": (16, 4)}
+ROWS = (
+    *(("house", density, seed) for density in DENSITIES for seed in (0,)),
+    *(("jug", density, 0) for density in DENSITIES),
+    ("house", "16x4", 1), ("house", "16x4", 2),
+    ("drawn 1", "16x4", 0), ("drawn 2", "16x4", 0), ("drawn 3", "24x4", 0),
+)  # fmt: skip
+WIDTH, CELLS, NOISE_GREY = 480, 128, 2.0
+# sides of the cube that each solid fits in with room to spare
+SIDE = 1.9
+POINTS = 200_000
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A solid as it is seen: the first picture of each rendering is lit from the camera."""
+
+    solid: Solid
+    rig: Rig
+    views: list[View]
+    pictures: list[Rendering]
+
+
+def scene_of(name: str, density: str, width: int = WIDTH) -> Scene:
+    """Render a solid from all positions under all lamps."""
+    solid = house() if name == "house" else jug() if name == "jug" else drawn(int(name.split()[1]))
+    rig = around(*DENSITIES[density], width=width)
+
+    def one(i: int) -> Rendering:
+        places = np.vstack([rigid3.center(rig.poses[i]), rig.lamps[i]])
+        return render(solid, rig.camera, rig.poses[i], lamps_at(places))
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        pictures = list(pool.map(one, range(len(rig.poses))))
+    views = [view_of_camera(f"{i:03d}.png", rig.camera, pose) for i, pose in enumerate(rig.poses)]
+    return Scene(solid, rig, views, pictures)
+
+
+def hull_of_scene(scene: Scene, cells: int = CELLS) -> Octree:
+    """By silhouettes alone."""
+    silhouettes = [Silhouette(signed_distance(picture.cover)) for picture in scene.pictures]
+    return carve(scene.views, silhouettes, [-0.5 * SIDE] * 3, SIDE, CarveOptions(cells))[0]
+
+
+def shadows_of(scene: Scene, seed: int, options: ShadowOptions) -> tuple[list[Shadow], list[dict[str, Any]]]:
+    """Found in photographs with noise."""
+    photographs = []
+    for i, (picture, lamps) in enumerate(zip(scene.pictures, scene.rig.lamps, strict=True)):
+        lit, *under = (photograph(light, NOISE_GREY, [seed, i, k]) for k, light in enumerate(picture.light))
+        angles = [angle_deg(np.zeros(3), scene.views[i], lamp) for lamp in lamps]
+        photographs.append(LitPhotograph(lit, under, picture.cover, angles))
+    names = [f"lamp {k + 1}" for k in range(len(scene.rig.lamps[0]))]
+    masks, reports = find_shadows(photographs, names, fan_deg=options.fan_deg)
+    shadows = [
+        Shadow(i, scene.rig.lamps[i][k], dark, names[k]) for i, row in enumerate(masks) for k, dark in enumerate(row)
+    ]
+    return shadows, [dict(report) for report in reports]
+
+
+def surface_points(solid: Solid, num: int = POINTS) -> Array:
+    """Points drawn in the cube and brought to the surface along the gradient of its distance."""
+    xyz = np.random.default_rng(1).uniform(-0.5 * SIDE, 0.5 * SIDE, (num, 3))
+    for _ in range(40):
+        steps = 1e-5 * np.eye(3)
+        gradient = np.stack([solid.distance(xyz + e) - solid.distance(xyz - e) for e in steps], axis=1) / 2e-5
+        xyz = xyz - solid.distance(xyz)[:, None] * gradient
+    return np.asarray(xyz[np.abs(solid.distance(xyz)) < 1e-4])
+
+
+def measure(scene: Scene, hull: Octree, seed: int) -> tuple[dict[str, Any], Octree]:
+    """Volume of hull and carved volume, each in the middle of its bounds, against the true one; points taken away."""
+    options = ShadowOptions()
+    shadows, lights = shadows_of(scene, seed, options)
+    start = time.process_time()
+    carved, report = carve_shadows(hull, scene.views, shadows, options)
+    cpu_s = time.process_time() - start
+    true = scene.solid.volume()
+    hull_error, error = (float(np.mean(tree.volume_bounds())) - true for tree in (hull, carved))
+    points = surface_points(scene.solid)
+    lost = grid_of(hull).holds(points) & ~grid_of(carved).holds(points)
+    # found dark where light falls: what noise and blur have done
+    wrong = sum(
+        int((shadow.dark & (scene.pictures[shadow.view].light[1 + n % len(lights)] > 0.0)).sum())
+        for n, shadow in enumerate(shadows)
+    )
+    row = {
+        "true_volume": true, "hull_error_percent": 100.0 * hull_error / true, "error_percent": 100.0 * error / true,
+        "below_hull_percent": 100.0 * (1.0 - error / hull_error), "points": len(points), "points_lost": int(lost.sum()),
+        "lit_pixels_called_dark": wrong, "dark_pixels": sum(int(s.dark.sum()) for s in shadows), "cpu_s": cpu_s,
+        "sweeps": list(report.sweeps), "lights": lights,
+    }  # fmt: skip
+    return row, carved
+
+
+def rows(only: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Each scene is rendered once for all seeds."""
+    wanted = [row for row in ROWS if all(word in row for word in only)]
+    for name, density in dict.fromkeys(row[:2] for row in wanted):
+        scene = scene_of(name, density)
+        hull = hull_of_scene(scene)
+        for seed in (row[2] for row in wanted if row[:2] == (name, density)):
+            row, _ = measure(scene, hull, seed)
+            yield {"scene": name, "density": density, "seed": seed, **row}
+
+
+def table(measured: Sequence[dict[str, Any]]) -> str:
+    """Markdown."""
+    head = (
+        "| scene | positions x lights | seed | hull's error | with shadows | below | true points taken away | CPU s |"
+    )
+    lines = [head, "|---|---|---|---|---|---|---|---|"]
+    for row in measured:
+        lines.append(
+            f"| {row['scene']} | {row['density']} | {row['seed']} | {row['hull_error_percent']:.1f} % | "
+            f"{row['error_percent']:.1f} % | {row['below_hull_percent']:.1f} % | {row['points_lost']} of "
+            f"{row['points']:,} | {row['cpu_s']:.0f} |"
+        )
+    return "\n".join(lines)
+
+
+def picture(path: Path) -> None:
+    """House from one side: lit from the camera, under a lamp, its shadows, and slices of hull and carved volume."""
+    scene = scene_of("house", "24x4", 320)
+    hull = hull_of_scene(scene)
+    shadows, _ = shadows_of(scene, 0, ShadowOptions())
+    carved, _ = carve_shadows(hull, scene.views, shadows)
+    first, before, after = scene.pictures[3], grid_of(hull), grid_of(carved)
+    photos = [photograph(first.light[k], NOISE_GREY, [0, 3, k]) for k in (0, 1)]
+    photos.append(np.where(shadows[3 * 4].dark, 255, photos[1] // 2).astype(np.uint8))
+    slices = []
+    axis = (np.arange(480) + 0.5) / 480 * SIDE - 0.5 * SIDE
+    for height in (0.0, 0.1, 0.3):
+        x, y = np.meshgrid(axis, -axis)
+        xyz = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
+        grey = 235 - 75 * before.holds(xyz) - 75 * after.holds(xyz) - 75 * (scene.solid.distance(xyz) < 0.0)
+        slices.append(grey.reshape(480, 480).astype(np.uint8))
+    upper = np.hstack([cv2.resize(photo, (640, 480)) for photo in photos])
+    lower = np.hstack([cv2.resize(piece, (640, 640)) for piece in slices])
+    cv2.imwrite(str(path), np.vstack([upper, lower]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="NAME", help="scene and density of the rows to measure"
+    )
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="only draw this")
+    args = parser.parse_args()
+    if args.picture:
+        picture(args.picture)
+        return
+    path = RESULTS / "shadow_carving.json"
+    measured = []
+    for row in rows(args.only):
+        measured.append(row)
+        print(table([row]).splitlines()[-1], flush=True)
+    if not args.only:
+        path.write_text(json.dumps({**describe_machine(), "rows": measured}, indent=1) + "\n", encoding="utf-8")
+        path.with_suffix(".md").write_text(table(measured) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

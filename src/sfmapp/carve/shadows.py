@@ -1,0 +1,184 @@
+"""Shadows in a photograph under one light, found against the same photograph lit from the camera.
+
+Both show the same pixels of the same surface, so their quotient is free of its colour: ``g (n l) / (n c)`` where the
+light l falls, n being the surface's normal, c the camera's direction, g the quotient of the lights' powers; 0 in the
+shadow. What leans towards the light enough for :mod:`sfmapp.carve.shadow_carving` to tell is brighter than
+``g sin(fan) / sin(angle + fan)``. Dark is what stays below a share of that, whatever noise has done to both pictures.
+
+Where the quotient says nothing, nothing is called dark: surfaces that are very dark themselves, where noise alone is as
+bright as what is asked for; and surfaces that mirror, which may look dark though they are lit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, label
+
+from sfmapp.carve.outlines import Coverage
+from sfmapp.reporting import Report
+
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Levels = NDArray[np.float64]
+
+# standard deviations of noise by which both pictures may be off: of a hundred thousand pixels three
+_CERTAIN = 4.0
+# of the least brightness of a lit surface what a shadow may have: light falls off with distance within the object, and
+# is sent on by its other parts
+_SHARE = 0.5
+# shares of an object's pixels that cannot be told, from which it is said
+_NOTEWORTHY = 0.05
+# grey levels from which a picture says only that there was more light
+_FULL = 252
+# pixels about a mirrored light where its image may still outshine the surface, in its radii, and at least
+_HALO, _LEAST_HALO_PX = 2.0, 4
+# quotient of a picture under a light, against that of the brightest tenth, from which the surface counts as lit
+_LIT = 0.25
+
+
+class DetectionReport(Report):
+    """What could be told of shadows in the photographs of one light.
+
+    Attributes:
+        light: its name.
+        gain: typical quotient of a photograph under it and the one that is lit from the camera, in linear brightness.
+        noise_grey: standard deviation of the noise, grey levels.
+        dark_share: of the object's pixels, in shadow. too_dark_share: of surfaces too dark to be told.
+        mirror_share: about the mirrored images of lights.
+    """
+
+    light: str
+    gain: float
+    noise_grey: float
+    dark_share: float
+    too_dark_share: float
+    mirror_share: float
+
+
+@dataclass(frozen=True)
+class LitPhotograph:
+    """A photograph lit from the camera, and those under lights, from the same place.
+
+    Attributes:
+        lit: (H, W) uint8, or (H, W, 3).
+        under: as many of the same shape as there are lights.
+        coverage: (H, W) float32 share of each pixel that shows the object.
+        angles_deg: between camera and each light, as seen from the object.
+    """
+
+    lit: Picture
+    under: Sequence[Picture]
+    coverage: Coverage
+    angles_deg: Sequence[float]
+
+
+def find_shadows(
+    photographs: Sequence[LitPhotograph], names: Sequence[str], *, fan_deg: float
+) -> tuple[list[list[Mask]], list[DetectionReport]]:
+    """Pixels that are certainly in shadow.
+
+    Args:
+        photographs: of one camera from different places, each under the same lights, exposed alike; grey values are
+            those of sRGB.
+        names: of the lights.
+        fan_deg: as in :class:`~sfmapp.carve.shadow_carving.ShadowOptions`.
+
+    Returns:
+        for each photograph a mask (H, W) for each light, and a report for each light.
+    """
+    num = len(names)
+    sigmas = [noise_of([p.under[k] for p in photographs]) for k in range(num)]
+    sigma_lit = noise_of([p.lit for p in photographs])
+    gains = [_gain(photographs, k) for k in range(num)]
+    counts = np.zeros((num, 4))
+    masks: list[list[Mask]] = []
+    for photograph in photographs:
+        inside = photograph.coverage >= 1.0
+        least = linear(_grey(photograph.lit) - _CERTAIN * sigma_lit)
+        mirrors = _mirrors(photograph) & inside
+        masks.append([])
+        for k, (sigma, gain) in enumerate(zip(sigmas, gains, strict=True)):
+            limit = _SHARE * gain * least * quotient_of_lean(photograph.angles_deg[k], fan_deg)
+            # what no light at all may look like
+            too_dark = inside & (limit <= linear(np.array(_CERTAIN * sigma)))
+            dark = inside & ~too_dark & ~mirrors & (linear(_grey(photograph.under[k]) + _CERTAIN * sigma) < limit)
+            masks[-1].append(dark)
+            counts[k] += [mask.sum() for mask in (inside, dark, too_dark, mirrors)]
+    reports = [
+        DetectionReport(light=name, gain=gain, noise_grey=sigma, dark_share=float(row[1] / max(row[0], 1.0)),
+                        too_dark_share=float(row[2] / max(row[0], 1.0)), mirror_share=float(row[3] / max(row[0], 1.0)))
+        for name, gain, sigma, row in zip(names, gains, sigmas, counts, strict=True)
+    ]  # fmt: skip
+    return masks, reports
+
+
+def doubts_of(reports: Sequence[DetectionReport]) -> list[str]:
+    """What has to be said of surfaces whose shadows cannot be told, in sentences."""
+    doubts = []
+    dark = max((report.too_dark_share for report in reports), default=0.0)
+    mirror = max((report.mirror_share for report in reports), default=0.0)
+    if dark > _NOTEWORTHY:
+        doubts.append(f"{dark:.0%} of the object is too dark to tell shadows on it: nothing is carved there by shadows")
+    if mirror > _NOTEWORTHY:
+        doubts.append(f"{mirror:.0%} of the object mirrors its lights: nothing is carved there by shadows")
+    return doubts
+
+
+def quotient_of_lean(angle_deg: float, fan_deg: float) -> float:
+    """Least ``(n l) / (n c)`` of a surface that is seen from the camera and from ``fan_deg`` beyond the light."""
+    return float(np.sin(np.radians(fan_deg)) / np.sin(np.radians(angle_deg + fan_deg)))
+
+
+def linear(grey: Levels) -> Levels:
+    """Brightness, 1 is white, of grey levels 0 to 255 on the curve of sRGB (IEC 61966-2-1); what is below is 0."""
+    v = np.clip(grey / 255.0, 0.0, None)
+    return np.asarray(np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4))
+
+
+def noise_of(pictures: Sequence[Picture]) -> float:
+    """Standard deviation of the noise of pictures, grey levels: of differences that steady slopes do not make
+    (Immerkaer, "Fast noise variance estimation", CVIU 64, 1996), robustly, where pictures are not black or white."""
+    found = []
+    for picture in pictures:
+        v = _grey(picture)
+        difference = v[:-2, :-2] + v[2:, :-2] + v[:-2, 2:] + v[2:, 2:] + 4.0 * v[1:-1, 1:-1]
+        difference -= 2.0 * (v[1:-1, :-2] + v[1:-1, 2:] + v[:-2, 1:-1] + v[2:, 1:-1])
+        usable = (v[1:-1, 1:-1] > 8.0) & (v[1:-1, 1:-1] < _FULL)
+        if usable.any():
+            found.append(float(1.4826 * np.median(np.abs(difference[usable])) / 6.0))
+    # rounding to whole levels is noise as well
+    return max(float(np.median(found)) if found else 0.0, float(12.0**-0.5))
+
+
+def _grey(picture: Picture) -> Levels:
+    values = picture.astype(np.float64)
+    return np.asarray(values.mean(axis=2) if values.ndim == 3 else values)
+
+
+def _gain(photographs: Sequence[LitPhotograph], k: int) -> float:
+    """Quotient of brightness where a light falls, the median of what is not much darker than the brightest tenth."""
+    quotients = []
+    for photograph in photographs:
+        lit = _grey(photograph.lit)
+        usable = (photograph.coverage >= 1.0) & (lit > 32.0) & (lit < _FULL)
+        quotients.append(linear(_grey(photograph.under[k])[usable]) / linear(lit[usable]))
+    values = np.concatenate(quotients) if quotients else np.empty(0)
+    if not len(values):
+        return 0.0
+    return float(np.median(values[values > _LIT * np.quantile(values, 0.9)]))
+
+
+def _mirrors(photograph: LitPhotograph) -> Mask:
+    """Pixels about the mirrored images of lights. Where what mirrors shows none, it is dark under the camera's light as
+    well, and too dark to be told."""
+    pictures = [_grey(photograph.lit), *map(_grey, photograph.under)]
+    full = np.max(pictures, axis=0) >= _FULL
+    if full.any():
+        radius = max(_LEAST_HALO_PX, int(_HALO * np.sqrt(full.sum() / np.pi / max(label(full)[1], 1))))
+        y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+        full = binary_dilation(full, x * x + y * y <= radius * radius)
+    return np.asarray(full)
