@@ -9,11 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
+from dense_scenes import CAMERA, poses, wall_with_box_and_bars
+from rendered_worlds.rendering import Optics, Renderer
 from sfmapp.camera.camera import Camera, project
 from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InputError
 from sfmapp.geometry import rigid3
 from sfmapp.scene.rig import Rig
+from sfmapp.stereo.prepare import PairCameras, prepare_pair
 from sfmapp.stereo.rectification import plan_rectification, rectified_as_is, rectify
 
 PINHOLE = Camera(CameraModel.PINHOLE, 640, 480, np.array([500.0, 500.0, 322.0, 238.0]))
@@ -115,3 +118,22 @@ def test_rigs_that_cannot_be_rectified_are_named() -> None:
         plan_rectification(rig_of(PINHOLE, PINHOLE, (60.0, 0.0, 0.0), (0.2, 0.0, 0.0)))
     with pytest.raises(InputError, match="has 10 x 10"):
         rectify(plan_rectification(RIGS["one above the other"]), *[np.zeros((10, 10), np.uint8)] * 2)
+
+
+def test_photographs_of_unknown_cameras_far_from_rectified_and_in_either_order() -> None:
+    """Rows 30 px apart are no rows of a rectified pair, and nobody said which photograph is the left one."""
+    first = poses(5)[2]
+    tilt = rigid3.from_matrix(rigid3.exp_so3(np.radians([6.0, 2.0, 3.0])), np.array([-0.5, 0.05, 0.0]))
+    photographs = [
+        Renderer(wall_with_box_and_bars(), CAMERA).photograph(pose, Optics(noise_sigma=1.0), [7, side])
+        for side, pose in enumerate((first, rigid3.compose(tilt, first)))
+    ]
+    for order in ((0, 1), (1, 0)):
+        left, right = (photographs[side] for side in order)
+        made = prepare_pair(left, right, PairCameras(), ("a.png", "b.png"))
+        assert made.report.is_swapped == (order == (1, 0))
+        assert made.report.rows is not None
+        assert made.report.rows.rms_px < 1.0
+        assert not made.report.is_as_given
+        assert any("not rectified" in warning for warning in made.report.warnings)
+        assert any("b.png was taken to the left of a.png" in warning for warning in made.report.warnings) == order[0]

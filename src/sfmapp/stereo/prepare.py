@@ -126,7 +126,7 @@ def prepare_pair(
     warnings: list[str] = []
     is_swapped, is_projective = False, False
     if cameras.rig is None:
-        draft, cameras = _without_calibration(left, right, cameras, names, warnings)
+        draft, cameras, is_swapped = _without_calibration(left, right, cameras, names, warnings)
         is_projective = draft.plan is not None
     else:
         if cameras.rig.second_is_left:
@@ -143,7 +143,7 @@ def prepare_pair(
             was_rectified = options.corrects == "auto" and draft.plan.is_identity
             with_rows = was_rectified or options.corrects == "rows" or not misalignment.is_turn
             draft, is_corrected = _corrected(draft, misalignment, (left, right), warnings, with_rows=with_rows)
-    if not options.is_cropped:
+    if not (options.is_cropped or is_projective):  # infinity of a projective pair is a guess
         _check_order(draft, names, warnings)
     pair = draft.pair
     if pair.geometry is not None:
@@ -178,40 +178,44 @@ def _with_plan(left: Pixels, right: Pixels, plan: Rectification | None) -> _Draf
 
 def _without_calibration(
     left: Pixels, right: Pixels, cameras: PairCameras, names: tuple[str, str], warnings: list[str]
-) -> tuple[_Draft, PairCameras]:
+) -> tuple[_Draft, PairCameras, bool]:
     """Photographs of which nothing is known: taken as they are where their rows agree, rectified by their matches where
-    they do not."""
-    told = ""
-    if left.shape[:2] == right.shape[:2]:
-        draft = _drafted(left, right, None)
-        if draft.rows is None:
-            warnings.append("too little of one photograph is found again in the other to tell whether rows agree")
-            return draft, cameras
-        if not _are_off(draft.rows):
-            return draft, replace(cameras, has_baseline=False, text=f"{cameras.text}: their rows agree as they are")
-        matches, told = draft.matches, f"their rows differ by {draft.rows.rms_px:.1f} px"
-    else:
-        matches = match_pictures(left, right)
-        told = f"{names[0]} and {names[1]} have different sizes"
+    they do not; and whether the second was taken to the left of the first: nobody said which is which."""
     sizes = (left.shape[1], left.shape[0]), (right.shape[1], right.shape[0])
-    found = rig_from_matches(matches, sizes)
-    if found.rig.second_is_left:
-        raise InputError(
-            f"{names[0]}, {names[1]}: the second photograph was taken to the left of the first: left and right are "
-            "swapped",
-            "give them the other way round",
+    if sizes[0] == sizes[1]:
+        draft = _drafted(left, right, None)
+        if draft.rows is not None and not _are_off(draft.rows):
+            text = f"{cameras.text}: their rows agree as they are"
+            return draft, replace(cameras, has_baseline=False, text=text), False
+        try:
+            found = rig_from_matches(draft.matches, sizes)
+        except InputError:
+            if draft.rows is not None:
+                raise
+            # nor do they say anything else: a pair that shows too little for keypoints may be rectified all the same
+            warnings.append("too little of one photograph is found again in the other to tell whether rows agree")
+            return draft, cameras, False
+        told = "hardly a row agrees" if draft.rows is None else f"their rows differ by {draft.rows.rms_px:.1f} px"
+    else:
+        found = rig_from_matches(match_pictures(left, right), sizes)
+        told = f"{names[0]} and {names[1]} have different sizes"
+    rig = found.rig
+    if is_swapped := rig.second_is_left:
+        rig, left, right = rig.reversed_pair(), right, left
+        warnings.append(
+            f"{names[1]} was taken to the left of {names[0]}: left and right are swapped, and taken the other way round"
         )
-    focals = [camera.focal for camera in found.rig.cameras]
+    focals = [camera.focal for camera in rig.cameras]
     warnings.append(
         f"the photographs are not rectified ({told}): rectified by {int(found.is_inlier.sum())} matches alone, as if "
         f"their focal lengths were {focals[0]:.0f} and {focals[1]:.0f} px. Depths are up to a projective "
         "transformation; --camera with the calibration of both makes them metric"
     )
-    draft = _drafted(left, right, found.rig)
+    draft = _drafted(left, right, rig)
     if draft.rows is None or _are_off(draft.rows):
         rows = "too few" if draft.rows is None else f"rows differ by {draft.rows.rms_px:.1f} px"
         warnings.append(f"rows of the pair do not agree after that either ({rows}): a lens bends them, or things moved")
-    return draft, replace(cameras, has_baseline=False, text="matches of the photographs alone")
+    return draft, replace(cameras, has_baseline=False, text="matches of the photographs alone"), is_swapped
 
 
 def turn_of_rig(pairs: Iterable[tuple[Pixels, Pixels]], cameras: PairCameras) -> Misalignment | None:
