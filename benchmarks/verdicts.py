@@ -502,6 +502,10 @@ def promises(folder: Path) -> Iterator[Promise]:
     good = sum(60 <= row["inside_68"] <= 76 and 92 <= row["inside_95"] <= 97 for row in rows)
     text = "intervals of 68 and 95 % of disparities hold 60 to 76 and 92 to 97 % of the errors on photographs"
     yield Promise("stereo_sigma", text, good, len(rows), report["date"][:10])
+    report = read(folder, "stereo_filled_sigma")
+    rows = report["runs"]["Photographs"]
+    good = sum(60 <= row["inside_68"] <= 76 and 92 <= row["inside_95"] <= 97 for row in rows)
+    yield Promise("stereo_filled_sigma", "the same of those that were filled in", good, len(rows), report["date"][:10])
     report = read(folder, "calibration")
     rows, date = report["trials"], report["date"][:10]
     good = sum(0.9 <= row["nees"] <= 1.1 and row["projections_covered"] >= 0.93 for row in rows)

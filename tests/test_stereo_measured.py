@@ -13,6 +13,7 @@ from sfmapp.formats.glb import write_glb
 from sfmapp.report.stereo_pictures import ColorScale, anaglyph, scale_of
 from sfmapp.stereo.disparity_error import CUES, RESIDUAL_SHARE, disparity_error, match_cues
 from sfmapp.stereo.error_table import ERROR_TABLE
+from sfmapp.stereo.filled_error import FILLED_CUES, FILLED_TABLE
 from sfmapp.stereo.match import match_pair
 from sfmapp.stereo.measured import cloud_of, measure_pair, mesh_of, report_of
 from sfmapp.stereo.options import StereoOptions
@@ -87,12 +88,15 @@ def test_the_covariance_of_a_calibration_is_in_depth_alone() -> None:
     np.testing.assert_allclose(with_it.depth_sigma, expected, rtol=1e-4)
 
 
-def test_filled_pixels_have_no_sigma() -> None:
+def test_filled_pixels_are_less_sure_in_no_cloud_and_not_among_matches() -> None:
     pair, truth = drawn_pair(3.0)
     found = as_map(truth)
     found.state[50:60] = PixelState.FILLED
     told = measure_pair(pair, found)
-    assert np.isnan(told.error.sigma[50:60]).all()
+    assert np.isfinite(told.error.sigma[50:60]).all()
+    matched = np.median(told.error.sigma[found.state == PixelState.MATCHED])
+    assert np.median(told.error.sigma[50:60]) > 1.3 * matched
+    assert report_of(pair, found, told).median_sigma_px == pytest.approx(float(matched))
     assert np.isfinite(told.depth[50:60]).all()
     assert not told.is_solid[50:60].any()
 
@@ -174,3 +178,32 @@ def test_true_errors_are_inside_as_often_as_it_is_told(data_root: Path, name: st
     assert 0.60 < inside_68.mean() < 0.76
     assert 0.92 < inside_95.mean() < 0.97
     assert abs(told.confidence[counted].mean() - (error[counted] < 1.0).mean()) < 0.04
+
+
+def filled_map(first: int, last: int, nearer: float) -> DisparityMap:
+    """A wall, and from column ``last`` on something ``nearer``; what is before it was not matched."""
+    disparity = np.full((60, 160), 12.0, np.float32)
+    disparity[:, last:] += nearer
+    found = as_map(disparity)
+    found.state[:, first:last] = PixelState.FILLED
+    return found
+
+
+def test_filled_disparities_are_the_less_sure_the_wider_their_hole_and_the_farther_apart_its_ends() -> None:
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 255, (60, 160), dtype=np.uint8)
+    shown = np.ones(picture.shape, np.bool_)
+    pair = RectifiedPair(picture, picture, shown, shown)
+    narrow, wide, step = (
+        disparity_error(pair, filled_map(*of)) for of in ((77, 80, 0.0), (40, 80, 0.0), (70, 80, 10.0))
+    )
+    for error, first in ((narrow, 77), (wide, 40), (step, 70)):
+        hole = np.s_[:, first:80]
+        assert np.isfinite(error.sigma).all()
+        assert (error.half_width_95[hole] > error.sigma[hole]).all()
+        assert ((error.confidence[hole] > 0.0) & (error.confidence[hole] < 1.0)).all()
+    assert narrow.sigma[:, 78].max() < 0.7 * wide.sigma[:, 60].min()
+    assert narrow.half_width_95[:, 78].max() < 0.5 * step.half_width_95[:, 78].min()
+    # the other side of the step is within the interval
+    assert step.half_width_95[:, 78].min() > 5.0
+    assert len(FILLED_TABLE.sigma) == 1 + len(FILLED_CUES)

@@ -594,3 +594,43 @@ def look_alike_world(seed: int = 0, *, has_background: bool = True) -> World:
             size = [float(v) for v in (*rng.uniform(0.4, 0.9, 2), rng.uniform(0.6, 2.0))]
             build.box(foot, size, (skin, skin, plain), yaw_deg=float(rng.uniform(0, 90)))
     return build.build()
+
+
+def cluttered_world(seed: int = 0) -> World:
+    """Boards, slats and boxes of all sizes that hide one another, up to 5 m along +x from the origin at 1.4 m above the
+    floor, before a wall askew: whatever is seen has something else behind it."""
+    rng = np.random.default_rng([seed, 0xC1077E])
+    build = WorldBuilder(rng)
+    kinds = (textures.machine, textures.books, textures.carton, textures.poster, textures.picture, textures.leaves,
+             textures.planks, textures.bricks, textures.carpet, textures.plaster)  # fmt: skip
+    skins = [Skin(build.texture(kind(rng)), float(rng.uniform(0.4, 1.2))) for kind in kinds]
+    floor = Skin(build.texture(textures.carpet(rng)), 1.5, build.texture(textures.dirt(rng)), 2.3)
+    build.quad((-1.0, 12.0, 0.0), (9.0, 0.0, 0.0), (0.0, -24.0, 0.0), floor)
+    askew = np.radians(rng.uniform(-25.0, 25.0))
+    wall = skins[int(rng.integers(len(skins)))]
+    build.wall((6.0, 0.0, 4.0), (-np.cos(askew), np.sin(askew), 0.0), 24.0, 10.0, wall)
+    for _ in range(45):
+        distance = float(np.exp(rng.uniform(np.log(1.3), np.log(4.8))))
+        centre = distance * np.array([1.0, *rng.uniform((-0.6, -0.4), (0.6, 0.4))]) + (0.0, 0.0, 1.4)
+        size = np.exp(rng.uniform(np.log(0.04), np.log(0.45), 2)) * distance / 2.0
+        _board(build, centre, rng.uniform((-50.0, -35.0, -60.0), (50.0, 35.0, 60.0)), size, skins)
+    for _ in range(8):
+        x = float(rng.uniform(2.0, 5.0))
+        sides = [float(v) for v in rng.uniform(0.2, 0.7, 3)]
+        foot = (x, float(rng.uniform(-0.6, 0.6) * x), 0.0)
+        build.box(foot, sides, skins[int(rng.integers(len(skins)))], yaw_deg=float(rng.uniform(0, 90)))
+    return build.build()
+
+
+def _board(build: WorldBuilder, centre: ArrayLike, turn_deg: ArrayLike, size: ArrayLike, skins: Sequence[Skin]) -> None:
+    """A rectangle that faces the origin but for a turn about the vertical, a tilt, and a roll in its plane."""
+    yaw, tilt, roll = np.radians(turn_deg)
+    normal = -np.array([np.cos(yaw) * np.cos(tilt), np.sin(yaw) * np.cos(tilt), np.sin(tilt)])
+    across = np.cross(UP, normal)
+    across /= np.linalg.norm(across)
+    upwards = np.cross(normal, across)
+    right = np.cos(roll) * across + np.sin(roll) * upwards
+    up = np.cross(normal, right)
+    width, height = np.asarray(size, np.float64)
+    corner = np.asarray(centre, np.float64) - right * width / 2 + up * height / 2
+    build.quad(corner, right * width, -up * height, skins[int(build.rng.integers(len(skins)))])

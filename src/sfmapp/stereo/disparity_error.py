@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from sfmapp.images.pixels import as_gray
 from sfmapp.stereo.error_table import ERROR_TABLE, ErrorTable
+from sfmapp.stereo.filled_error import FILLED_TABLE, filled_cues
 from sfmapp.stereo.result import DisparityMap, PixelState, RectifiedPair
 
 Map = NDArray[np.float32]
@@ -47,12 +48,12 @@ _BAND = 64
 
 @dataclass(frozen=True)
 class DisparityError:
-    """Of each pixel (H, W) float32; NaN where it was not matched.
+    """Of each pixel (H, W) float32; NaN where there is no disparity.
 
     Attributes:
         sigma: the error is below it in 68 per cent of the pixels that are given this one, pixels.
         half_width_95: the same in 95 per cent. More than twice as much where the match itself is in doubt.
-        confidence: share of such pixels whose error is below one pixel, 0 to 1; 0 where there is no match.
+        confidence: share of such pixels whose error is below one pixel, 0 to 1; 0 where there is no disparity.
     """
 
     sigma: Map
@@ -63,7 +64,7 @@ class DisparityError:
 def disparity_error(
     pair: RectifiedPair, found: DisparityMap, *, table: ErrorTable = ERROR_TABLE, threads: int = 1
 ) -> DisparityError:
-    """The error of each matched disparity; filled ones are guesses and have none.
+    """The error of each disparity, by what the pictures say of matches and by what lies about filled ones.
 
     ``RESIDUAL_SHARE`` of the width is in sigma and half width; the covariance of the calibration is not, but in
     :func:`~sfmapp.stereo.uncertainty.depth_sigma`.
@@ -84,6 +85,11 @@ def disparity_error(
 
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(fill, _bands(shape[0])))
+    if (found.state == PixelState.FILLED).any():
+        cues, place = filled_cues(found)
+        told = with_residual(FILLED_TABLE.read(cues), residual)
+        for field, values in zip((result.sigma, result.half_width_95, result.confidence), told, strict=True):
+            field.ravel()[place] = values
     return result
 
 

@@ -103,7 +103,7 @@ def measured_of(geometry: RectifiedGeometry | None, found: DisparityMap, error: 
 
 def report_of(pair: RectifiedPair, found: DisparityMap, measured: MeasuredPair) -> MeasuredReport:
     """What a report says of it."""
-    matched = np.isfinite(measured.error.sigma)
+    matched = (found.state == PixelState.MATCHED) & np.isfinite(measured.error.sigma)
     confidence = measured.error.confidence[matched]
     told: dict[str, float] = {}
     depths: list[DepthAt] = []
