@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from sfmapp.api.reconstruction import Reconstruction, load
     from sfmapp.api.stages import Matcher, extract_features, map_images, match_images
     from sfmapp.api.views import explain_pair, match_stereo, reconstruct_uncalibrated, transfer_views
-    from sfmapp.api.volumes import carve_volume
+    from sfmapp.api.volumes import carve_volume, find_masks
     from sfmapp.camera.camera import Camera
     from sfmapp.camera.names import CameraModel
     from sfmapp.errors import (
@@ -118,6 +118,7 @@ __all__ = [
     "explain_pair",
     "export",
     "extract_features",
+    "find_masks",
     "load",
     "load_images",
     "load_options",
@@ -183,6 +184,7 @@ _HOMES = {
     "estimate_pose": "api.geometry",
     "evaluate": "api.jobs",
     "explain_pair": "api.views",
+    "find_masks": "api.volumes",
     "export": "api.jobs",
     "extract_features": "api.stages",
     "load": "api.reconstruction",

@@ -1,4 +1,4 @@
-"""One call: photographs from all sides to a closed volume."""
+"""One call: photographs from all sides to a closed volume, and photographs of an object to its masks."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from sfmapp.events import Events
 from sfmapp.workspace.options import Options
 
 if TYPE_CHECKING:
+    from sfmapp.pipelines.carve.masks import MasksResult
     from sfmapp.pipelines.carve.run import CarveResult
 
 
@@ -58,3 +59,39 @@ def carve_volume(
 
     what = CarveInput(source, images, poses, None if box is None else tuple(box))
     return carve(what, output, options_with(options, threads), events=events)
+
+
+def find_masks(
+    source: FilePath,
+    output: FilePath,
+    options: Options | None = None,
+    *,
+    images: FilePath | None = None,
+    poses: FilePath | None = None,
+    events: Events | None = None,
+    threads: int | None = None,
+) -> MasksResult:
+    """Write masks of an object in photographs, white where it is.
+
+    Args:
+        source: as of :func:`carve_volume`, or photographs without cameras.
+        output: a new folder, an empty one, or that of an earlier call.
+        options: of these ``masks``, ``images`` and ``threads``.
+        images, poses: as of :func:`carve_volume`.
+        events: told of progress, and can ask to stop.
+        threads: photographs at a time; None: as ``options.threads`` says, or one for each core.
+
+    Returns:
+        The folder, the report and ``silhouettes``, with distances to outlines to a fraction of a pixel.
+
+    Raises:
+        UsageError: an output that holds something else.
+        InputError: photographs, cameras or masks that cannot be used.
+
+    Example:
+        >>> found = sfmapp.find_masks("turntable/", "masks/")
+        >>> found.silhouettes[0].inside.mean(), [mask.confidence for mask in found.report.masks.masks]
+    """
+    from sfmapp.pipelines.carve.masks import MasksInput, find_masks
+
+    return find_masks(MasksInput(source, images, poses), output, options_with(options, threads), events=events)

@@ -294,7 +294,12 @@ def _spilled(inside: Mask, found: _Evidence) -> Mask:
     empty = (found.least >= _AGAINST).astype(np.uint8)
     _, pieces = cv2.connectedComponents(empty & (found.distance > 0.0), connectivity=8)
     deep = np.unique(pieces[(empty > 0) & (found.distance > _MARGIN_PX)])
-    return inside & _as_pixels(np.isin(pieces, deep[deep > 0]), inside.shape)
+    spill = inside & _as_pixels(np.isin(pieces, deep[deep > 0]), inside.shape)
+    # and whole pieces, of whatever size, that are mostly so, such as the crumbs that this leaves
+    num, pieces, facts, _ = cv2.connectedComponentsWithStats((inside & ~spill).astype(np.uint8), connectivity=8)
+    against = np.bincount(pieces.ravel(), _as_pixels(empty > 0, inside.shape).ravel(), num)
+    crumbs = np.flatnonzero(against >= 0.5 * facts[:, cv2.CC_STAT_AREA])
+    return np.asarray(spill | np.isin(pieces, crumbs[crumbs > 0]))
 
 
 class _Holes:

@@ -17,6 +17,7 @@ class PhotographMask(Report):
         border_share: of the pixels along the edge of the picture that are inside.
         confidence: between 0.5 and 1, see :class:`sfmapp.carve.silhouettes.Silhouette`.
         outline_sigma_px: standard deviation of the outline.
+        is_usable: the mask is neither missing, empty, full nor inverted, whatever its camera.
         problem: what is wrong with it, empty if nothing is known to be; such a silhouette carves nothing.
         spilled, filled: share of the silhouette that was taken away, and filled, as the others speak against it.
         doubtful: share of holes that may be none, and were left.
@@ -29,6 +30,7 @@ class PhotographMask(Report):
     border_share: float
     confidence: float
     outline_sigma_px: float
+    is_usable: bool
     problem: str
     spilled: float
     filled: float

@@ -242,7 +242,7 @@ def _with_problem(record: ImageRecord, found: _Found | None) -> tuple[Silhouette
     entry = PhotographMask(
         name=record.name, source=found.source, share=share, border_share=border_share,
         confidence=silhouette.confidence, outline_sigma_px=silhouette.outline_sigma_px, problem=problem,
-        spilled=0.0, filled=0.0, doubtful=0.0,
+        is_usable=not problem, spilled=0.0, filled=0.0, doubtful=0.0,
     )  # fmt: skip
     return silhouette, entry
 

@@ -12,6 +12,7 @@ __all__ = [
     "LOCATE",
     "LOCK",
     "MANIFEST",
+    "MASKS",
     "ODOMETRY",
     "PAGE",
     "PAIR",
@@ -33,7 +34,7 @@ FORMAT = f"{FORMAT_NAME} 1"
 RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "refine", "dense", "undistort"
 CALIBRATE, LOCATE, PAIR, PANORAMA = "calibrate", "locate", "pair", "panorama"
 TRANSFER, UNCALIBRATED = "transfer", "uncalibrated"
-WARP, RECTIFY, STEREO, CARVE = "warp", "rectify", "stereo", "carve"
+WARP, RECTIFY, STEREO, CARVE, MASKS = "warp", "rectify", "stereo", "carve", "masks"
 # a report for programs, and the page for people beside it
 LOCK, REPORT, PAGE = ".lock", "report.json", "report.html"
 # where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0
