@@ -37,7 +37,7 @@ from sfmapp.carve.views import View
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.option_checks import Range, check_options, positive
+from sfmapp.option_checks import check_options, positive
 from sfmapp.reporting import Report
 
 Array = NDArray[np.float64]
@@ -53,14 +53,14 @@ _BAND_PX, _BAND_CELLS = 2.0, 2.0
 _STEP = 0.28
 # iterations by level: a coarse level has the large areas to move, a fine one only what a cell of the coarser one is
 _ITERATIONS, _FEWEST_ITERATIONS = 320, 40
-# silhouettes are held to what is left from the level of so many cells on, once things are as large as cells
-_FILL_LEVEL = 6
+# how often what is left is held to the silhouettes at each level: what is put back may lay bare what lies behind
+_ROUNDS = 3
 # a pixel is uncovered so far inside its outline, in pixels beside the width of a cell
-_MARGIN_PX = 2.0
+_MARGIN_PX = 1.0
 # what is put back along uncovered rays counts as so many sights
 _FILL_VOTES = 4.0
 _CHUNK = 1 << 15
-_RANGES = {"cells": Range(32, 4096), "trust": positive(100.0)}
+_RANGES = {"trust": positive(100.0)}
 
 
 @dataclass(frozen=True)
@@ -68,20 +68,13 @@ class JoinOptions:
     """Options of joining silhouettes with patches.
 
     Attributes:
-        cells: finest cells along the side of the cube, rounded up to a power of two.
         trust: how much surface a sight of the band's width is worth; less is smoother and closes more.
     """
 
-    cells: int = 256
     trust: float = 1.5
 
     def __post_init__(self) -> None:
         check_options(STAGE, self, _RANGES)
-
-    @property
-    def depth(self) -> int:
-        """Level of the finest cells."""
-        return int(self.cells - 1).bit_length()
 
 
 class JoinReport(Report):
@@ -154,7 +147,8 @@ class Joined:
         for up, level in enumerate(reversed(self.levels)):
             at = level.find((places[left] + (1 << up >> 1)) >> up)
             known = at >= 0
-            value = np.minimum(level.value[at[known]] * self.band, level.hull[at[known]])
+            hull = level.hull[at[known]]
+            value = np.where(hull > 0.0, np.minimum(level.value[at[known]] * self.band, hull), hull)
             out[left[known]] = value if up == 0 else np.where(value > 0.0, self.band, -self.band)
             left = left[~known]
         return out
@@ -177,7 +171,7 @@ class Evidence:
 
 
 def join(
-    evidence: Evidence, low: ArrayLike, side: float, options: JoinOptions | None = None, *,
+    evidence: Evidence, low: ArrayLike, side: float, cells: int = 256, options: JoinOptions | None = None, *,
     events: Events | None = None, threads: int | None = None,
 ) -> tuple[Joined, JoinReport]:  # fmt: skip
     """The solid in a cube that silhouettes and patches leave.
@@ -186,6 +180,7 @@ def join(
         evidence: silhouettes and sights.
         low: (3,) corner of the cube where all coordinates are least, world.
         side: of the cube, units of the world.
+        cells: finest ones along its side, rounded up to a power of two, 32 or more.
         options: by default :class:`JoinOptions`.
         events: progress and cancellation.
         threads: how many; by default one a processor. The result is the same bytes for any.
@@ -198,25 +193,25 @@ def join(
     options, events, sights = options or JoinOptions(), events or Events(), evidence.sights
     if not sights:
         raise InputError("expected photographs that see patches, found none")
-    depth = options.depth
+    depth = max(_WHOLE, int(cells - 1).bit_length())
     cube = _Cube(np.array(low, np.float64), float(side))
     band = max(
         _BAND_PX * float(np.median([sight.pixel for sight in sights])), _BAND_CELLS * side / 2.0**depth
     )  # fmt: skip
     levels: list[_Level] = []
-    first = min(_WHOLE, depth)
-    events.started(STAGE, f"{len(sights)} photographs that see patches", total=depth - first + 1)
+    events.started(STAGE, f"{len(sights)} photographs that see patches", total=depth - _WHOLE + 1)
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        for number in range(first, depth + 1):
+        for number in range(_WHOLE, depth + 1):
             level = _begin(number, levels[-1] if levels else None, cube, evidence.hull, pool)
             cell = side / 2.0**number
             width = max(band, _BAND_CELLS * cell)
             level.votes = _votes(level.xyz, sights, width, pool)
-            is_outside = level.hull <= 0.0
-            level.value[is_outside] = np.maximum(level.hull[is_outside] / width, -1.0)
+            _hold_outside(level, width)
             weight, iterations = options.trust * cell / band, _iterations(number)
             _solve(level, weight, iterations, events, pool)
-            if number >= _FILL_LEVEL and _fill(level, evidence, cell, pool):
+            for _ in range(_ROUNDS):
+                if not _fill(level, evidence, cell, pool):
+                    break
                 _solve(level, weight, iterations, events, pool)
             level.flagged = _near_surface(level, cell)
             levels.append(level)
@@ -238,7 +233,7 @@ def join(
 
 
 def _iterations(number: int) -> int:
-    return max(_FEWEST_ITERATIONS, _ITERATIONS >> max(0, number - _FILL_LEVEL))
+    return max(_FEWEST_ITERATIONS, _ITERATIONS >> max(0, number - _WHOLE - 1))
 
 
 def _begin(number: int, above: _Level | None, cube: _Cube, hull: Hull, pool: ThreadPoolExecutor) -> _Level:
@@ -300,6 +295,16 @@ def _votes(xyz: Array, sights: Sequence[Sight], band: float, pool: ThreadPoolExe
     return votes
 
 
+def _hold_outside(level: _Level, band: float) -> None:
+    """Empty what is outside of the hull.
+
+    Beside patches the values go over smoothly, so that the surface stays where both tell it to a fraction of a cell.
+    Elsewhere they jump: the hull's surface has to cost as much as any other, or what is hidden would stay full.
+    """
+    is_outside, is_told = level.hull <= 0.0, (level.votes[:, 1 : BINS - 1] > 0).any(axis=1)
+    level.value[is_outside] = np.where(is_told, np.maximum(level.hull / band, -1.0), -1.0)[is_outside]
+
+
 def _in_parts(run: Callable[[int, int], None], num: int, pool: ThreadPoolExecutor) -> None:
     """Call ``run(first, last)`` for parts of a range on threads."""
     if num <= _CHUNK:
@@ -325,7 +330,7 @@ def _solve(level: _Level, weight: float, iterations: int, events: Events, pool: 
 
 
 def _fill(level: _Level, evidence: Evidence, cell: float, pool: ThreadPoolExecutor) -> bool:
-    """Put the hull back along rays inside silhouettes that meet nothing; whether there were any."""
+    """Put the hull back along rays inside silhouettes that meet nothing; whether there was any to put back."""
     solid = level.xyz[level.value > 0.0]
     is_open = (level.hull > 0.0) & (level.votes[:, 0] <= level.votes[:, 1:].sum(axis=1))
     idx = np.flatnonzero(is_open)
@@ -334,7 +339,7 @@ def _fill(level: _Level, evidence: Evidence, cell: float, pool: ThreadPoolExecut
     def look(v: int) -> NDArray[np.bool_]:
         view, silhouette = evidence.views[v], evidence.silhouettes[v]
         covered = np.zeros(silhouette.distance.shape, np.bool_)
-        paint(view.row, solid, cell, covered)
+        paint(view.row, solid, 0.87 * cell, covered)
         missing = ~covered & (silhouette.distance > _MARGIN_PX)
         if silhouette.known is not None:
             missing &= silhouette.known
@@ -346,8 +351,9 @@ def _fill(level: _Level, evidence: Evidence, cell: float, pool: ThreadPoolExecut
     marked = np.zeros(len(idx), np.bool_)
     for part in pool.map(look, range(len(evidence.views))):
         marked |= part
-    level.extra[idx[marked]] = _FILL_VOTES
-    return bool(marked.any())
+    is_new = marked & (level.extra[idx] == 0.0)
+    level.extra[idx[is_new]] = _FILL_VOTES
+    return bool(is_new.any())
 
 
 def _near_surface(level: _Level, cell: float) -> NDArray[np.bool_]:
