@@ -99,6 +99,7 @@ def rows_of(folder: Path) -> list[Row]:
         "uncalibrated": uncalibrated_rows,
         "planes": plane_rows,
         "stereo": stereo_rows,
+        "dense_pairs": pair_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
 
@@ -322,6 +323,17 @@ def rectification_rows(folder: Path) -> Iterator[Row]:
         yield Row(
             "stereo_rectification", case, "vertical parallax, rms", "px", "less", ours, about[0], theirs, False,
             *about[1:],
+        )  # fmt: skip
+
+
+def pair_rows(folder: Path) -> Iterator[Row]:
+    """``sfmapp dense`` of two photographs, beside what it was: patches that grow, alone."""
+    report = read(folder, "dense_pairs")
+    for row in report["pairs"]:
+        ours, theirs = (100.0 * row[way]["right"] for way in ("both", "growth"))
+        yield Row(
+            "dense_pairs", row["pair"], "right within a pixel of disparity", "%", "more", ours, "growth alone", theirs,
+            False, report["date"][:10], report["commit"],
         )  # fmt: skip
 
 
