@@ -115,6 +115,24 @@ def test_what_cannot_be_carved_is_refused(
     assert "no place in common" in capsys.readouterr().err
 
 
+def test_nothing_is_carved_through_the_hole_of_a_mask(photographs: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "hole"
+    shutil.copytree(photographs, folder)
+    path = folder / "images" / VIEWS[2].name
+    rgba = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert rgba is not None
+    rgba[38:50, 52:66] = 0
+    cv2.imwrite(str(path), rgba)
+    assert carve(folder, "-o", tmp_path / "mended") == 0
+    report = json.loads((tmp_path / "mended" / "report.json").read_text())
+    assert [one["name"] for one in report["tolerance"]["doubted"]] == [VIEWS[2].name]
+    assert report["surface"]["volume"] > VOLUME
+    assert carve(folder, "-o", tmp_path / "kept", "--keep-holes") == 0
+    kept = json.loads((tmp_path / "kept" / "report.json").read_text())
+    assert "tolerance" not in kept
+    assert kept["surface"]["volume"] < 0.95 * report["surface"]["volume"]
+
+
 def test_a_turned_camera_is_named(photographs: Path, tmp_path: Path) -> None:
     folder = tmp_path / "turned"
     shutil.copytree(photographs, folder)

@@ -37,6 +37,7 @@ class ViewFit(Report):
     Attributes:
         iou: of the silhouette and the result as this view shows it.
         over_px, under_px: pixels that the result alone covers, and the silhouette alone.
+        under_share: the latter, as a share of the silhouette.
         source: how the silhouette was found.
     """
 
@@ -44,6 +45,7 @@ class ViewFit(Report):
     iou: float
     over_px: int
     under_px: int
+    under_share: float
     source: str
 
 
@@ -91,7 +93,11 @@ def color_surface(
         iou, over, under = overlap(depth, silhouette)
         seen = np.zeros((len(mesh.xyz), 4))
         _look(view.row, view.center, mesh.xyz, normal, depth, read(v), silhouette.distance, cell, seen)
-        return seen, ViewFit(name=view.name, iou=iou, over_px=over, under_px=under, source=silhouette.source)
+        fit = ViewFit(
+            name=view.name, iou=iou, over_px=over, under_px=under,
+            under_share=under / max(int(silhouette.inside.sum()), 1), source=silhouette.source,
+        )  # fmt: skip
+        return seen, fit
 
     fits = []
     with ThreadPoolExecutor(threads) as pool:

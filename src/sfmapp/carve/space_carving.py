@@ -43,13 +43,15 @@ class CarveOptions:
         min_views: photographs that have to look at a place for anything to be left there; None: half of them. Where
             fewer look, as beyond the pictures of most, their cones would be left standing; how much was taken away for
             that is in the report.
-        misses: silhouettes that may miss a place that is kept. Each makes the hull larger; for masks with holes
-            :mod:`sfmapp.carve.tolerance` finds these instead.
+        misses: silhouettes that may miss a place that is kept. Each makes the hull larger.
+        doubts_holes: carve nothing through holes of masks that no other photograph shows, and name them, see
+            :mod:`sfmapp.carve.tolerance`. A gap of the object that one photograph alone looks through is filled.
     """
 
     cells: int = 256
     min_views: int | None = None
     misses: int = 0
+    doubts_holes: bool = True
 
     def __post_init__(self) -> None:
         check_options(STAGE, self, _RANGES)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from sfmapp.carve.coloring import ColoringReport
 from sfmapp.carve.masks_report import MasksReport
 from sfmapp.carve.space_carving import CarvingReport
+from sfmapp.carve.tolerance import ToleranceReport
 from sfmapp.report.model import LogLine, RunFacts
 from sfmapp.reporting import NamedReason, Report, Usage
 
@@ -46,6 +47,7 @@ class CarveReport(Report):
 
     Attributes:
         cameras: what they are, in words. left_out: photographs without a camera, and cameras without a photograph.
+        tolerance: holes of masks through which nothing was carved; absent where that was not asked for.
         files: what was written, in the folder of the run.
         usage: of each step.
     """
@@ -56,6 +58,7 @@ class CarveReport(Report):
     left_out: Sequence[NamedReason]
     masks: MasksReport
     box: BoxFacts
+    tolerance: ToleranceReport | None = None
     carving: CarvingReport
     surface: SurfaceFacts
     colors: ColoringReport

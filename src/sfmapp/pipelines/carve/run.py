@@ -19,6 +19,7 @@ from sfmapp.carve.isosurface import Distance, Normals, surface_of
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette, find_silhouettes
 from sfmapp.carve.space_carving import CarvingReport, LevelCounts, carve_hull
+from sfmapp.carve.tolerance import doubt_holes
 from sfmapp.carve.views import up_of_views
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
@@ -44,6 +45,8 @@ STAGE = CARVE
 _NAMES_SHOWN = 4
 # what the user's box may leave out of that of the silhouettes, as a share of its side, before it is said
 _CUT = 0.05
+# of a silhouette; the volume leaves less than 4 % of those of good masks and cameras, at 128 cells or more
+_UNCOVERED = 0.08
 # cells along the side of the volume that tells how much of its box is filled
 _COARSE = 64
 # a photograph whose silhouette the result fits so much worse than most is named
@@ -124,6 +127,10 @@ def carve(
             )
         with job.stage("box"):
             box = _box(what, source, silhouettes, job)
+        tolerance = None
+        if job.options.carve.doubts_holes:
+            with job.stage("tolerance"):
+                silhouettes, tolerance = doubt_holes(source.views, silhouettes, *box.cube(), job.events)
         hull, octree, carving = _carve(job, source, silhouettes, box)
         mesh, colors = _surface(job, source, silhouettes, hull, octree, box)
         volume = CarvedVolume(source, silhouettes, box, octree, hull, mesh)
@@ -134,7 +141,7 @@ def carve(
             run=job.facts(), cameras=source.cameras, num_views=len(source.views),
             left_out=[NamedReason(name=name, reason=reason) for name, reason in source.left_out], masks=masks,
             box=BoxFacts(low=box.low.tolist(), high=box.high.tolist(), told_by=box.told_by, apart=box.apart),
-            carving=carving, surface=_facts(mesh), colors=colors, files=files, usage=job.usage,
+            tolerance=tolerance, carving=carving, surface=_facts(mesh), colors=colors, files=files, usage=job.usage,
             warnings=job.log.warnings, decisions=job.log.decisions,
         )  # fmt: skip
         with job.measured("page"):
@@ -284,6 +291,13 @@ def _warn(job: Job, volume: CarvedVolume, carving: CarvingReport, colors: Colori
     if carving.touches_box and volume.box.told_by != "user":
         job.events.warned(STAGE, "the volume reaches the border of its box, which cuts it off: give a larger --box")
     typical = float(np.median([fit.iou for fit in colors.views]))
+    uncovered = float(np.median([fit.under_share for fit in colors.views]))
+    if uncovered > _UNCOVERED and volume.box.told_by != "user":
+        job.events.warned(
+            STAGE,
+            f"the volume leaves {uncovered:.0%} of the typical silhouette uncovered: others take away what each shows, "
+            "as cameras or masks contradict each other",
+        )
     odd = [fit for fit in colors.views if fit.iou < typical - _FAR_BELOW]
     if odd and volume.box.told_by != "user":  # what a box leaves out is missed by all
         named = ", ".join(f"{fit.name} ({fit.iou:.2f})" for fit in odd[:_NAMES_SHOWN])
