@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -12,6 +16,7 @@ from numpy.typing import NDArray
 from rendered_worlds.lit_solids import Rig, around, lamps_at
 from rendered_worlds.solids import BALL, BOX, Rendering, Solid, photograph, render, shape
 from sfmapp.carve.cell_grid import grid_of, octree_of
+from sfmapp.carve.files import read_octree
 from sfmapp.carve.octree import Octree, codes_of
 from sfmapp.carve.outlines import signed_distance
 from sfmapp.carve.shadow_carving import Shadow, ShadowOptions, angle_deg, carve_shadows
@@ -19,7 +24,9 @@ from sfmapp.carve.shadows import DetectionReport, LitPhotograph, doubts_of, find
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.space_carving import CarveOptions, carve
 from sfmapp.carve.views import View, view_of_camera
+from sfmapp.cli.main import main
 from sfmapp.errors import InputError
+from sfmapp.formats.lights_file import read_lights
 from sfmapp.geometry import rigid3
 
 Array = NDArray[np.float64]
@@ -147,7 +154,7 @@ def photographed(
         lit, *under = (photograph(light, noise, [seed, i, k]) for k, light in enumerate(picture.light))
         view = view_of_camera("", rig.camera, pose)
         angles = [angle_deg(np.zeros(3), view, lamp) for lamp in rig.lamps[i]]
-        photographs.append(LitPhotograph(lit, under, picture.cover, angles))
+        photographs.append(LitPhotograph(lit, under, picture.cover == 1.0, angles))
     masks, reports = find_shadows(photographs, ["a", "b", "c"], fan_deg=2.0)
     return [Shadow(i, rig.lamps[i][k], dark) for i, row in enumerate(masks) for k, dark in enumerate(row)], reports
 
@@ -185,6 +192,68 @@ def test_black_and_mirroring_surfaces_are_left_alone_and_named() -> None:
     found, reports = photographed(pictures, rig, 0)
     assert not any(shadow.dark.any() for shadow in found)
     assert all(report.mirror_share > 0.0 for report in reports)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photographs of the block with alpha and cameras, and under each lamp alone."""
+    folder = tmp_path_factory.mktemp("block")
+    rig, (_, views, _, _, pictures) = around(16, 3, width=160), scene("block")
+    cameras = []
+    for i, (view, picture) in enumerate(zip(views, pictures, strict=True)):
+        grey = [photograph(light, 2.0, [i, k]) for k, light in enumerate(picture.light)]
+        alpha = (255.0 * picture.cover).round().astype(np.uint8)
+        for name, value in zip("abc", grey[1:], strict=True):
+            (folder / name).mkdir(exist_ok=True)
+            cv2.imwrite(str(folder / name / f"{i:03d}.png"), value)
+        (folder / "images").mkdir(exist_ok=True)
+        cv2.imwrite(str(folder / "images" / f"{i:03d}.png"), np.dstack([grey[0]] * 3 + [alpha]))
+        k = rig.camera.k_matrix - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        cameras.append({
+            "file": f"images/{i:03d}.png", "K": k.tolist(), "R_w2c": view.outer[:, :3].tolist(),
+            "t_w2c": view.outer[:, 3].tolist(), "width": view.width, "height": view.height,
+        })  # fmt: skip
+    (folder / "cameras.json").write_text(json.dumps({"cameras": cameras}))
+    beside = [rigid3.apply(rig.poses[0], lamp) for lamp in rig.lamps[0]]
+    lights = [
+        {"name": f"lamp {name}", "photographs": name, "position": place.tolist(), "frame": "camera"}
+        for name, place in zip("abc", beside, strict=True)
+    ]
+    (folder / "lights.json").write_text(json.dumps({"lights": lights}))
+    return folder
+
+
+def test_the_command_carves_by_lights(folder: Path, tmp_path: Path) -> None:
+    args = ["carve", str(folder), "-o", str(tmp_path / "out"), "--cells", str(CELLS), "--no-recording", "-q"]
+    assert main([*args, "--lights", str(folder / "lights.json")]) == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    hull = report["carving"]["volume_low"], report["carving"]["volume_high"]
+    carved = read_octree(tmp_path / "out" / "octree_shadows.npz").volume_bounds()
+    true = scene("block")[0].volume(96)
+    assert 0.3 < (np.mean(carved) - true) / (np.mean(hull) - true) < 0.9
+    # of a mesh that is not closed the volume would be none of these
+    assert carved[0] < report["surface"]["volume"] < carved[1]
+    assert [light["light"] for light in report["shadows"]["lights"]] == ["lamp a", "lamp b", "lamp c"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"lights": []}, 'expected a list of lights under "lights"'),
+        ({"lights": [{"photographs": "a"}]}, 'light 1: expected "position", found photographs'),
+        ({"lights": [{"photographs": "z", "position": [0, 0, 1]}]}, "expected a folder of photographs beside the file"),
+        ({"lights": [{"photographs": "a", "position": [0, 1]}]}, "position: expected 3 finite numbers"),
+        (
+            {"lights": [{"photographs": "a", "position": [0, 0, 1], "frame": "lamp"}]},
+            "expected a frame of world or camera",
+        ),
+    ],
+)
+def test_a_wrong_file_of_lights_is_named(folder: Path, change: dict[str, object], said: str) -> None:
+    path = folder / "wrong.json"
+    path.write_text(json.dumps(change))
+    with pytest.raises(InputError, match=re.escape(said)):
+        read_lights(path)
 
 
 def test_noise_is_measured() -> None:

@@ -18,7 +18,7 @@ DISTANCE = 5.0
 # heights of the lowest and the highest camera, shares of the distance: 20 degrees below to 65 above the horizon
 LOWEST, HIGHEST = -0.35, 0.9
 # where lamps stand about the camera, as seen from the solid: degrees to the right and above
-LAMPS_DEG = ((-45, 10), (-20, 25), (22, -8), (45, 20), (0, 42), (-30, -12), (62, 0), (10, 15))
+LAMPS_DEG = ((-60, 0), (60, 0), (0, 60), (0, -60), (-25, 25), (25, 25), (25, -25), (-25, -25))
 X, Y = (0.0, np.pi / 2, 0.0), (np.pi / 2, 0.0, 0.0)
 
 

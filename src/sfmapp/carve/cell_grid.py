@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
 from sfmapp.carve.octree import Codes, Octree, codes_of, places_of
 
+Array = NDArray[np.float64]
 Cells = NDArray[np.uint8]
 
 
@@ -32,16 +35,16 @@ class CellGrid:
         return float(np.count_nonzero(self.filled)) * self.tree.cell**3
 
     @property
-    def low(self) -> NDArray[np.float64]:
+    def low(self) -> Array:
         """(3,) world corner of the window."""
         return np.asarray(self.tree.low + self.first * self.tree.cell)
 
     @property
-    def middle(self) -> NDArray[np.float64]:
+    def middle(self) -> Array:
         """(3,) world middle of the window."""
         return np.asarray(self.low + 0.5 * self.tree.cell * np.array(self.filled.shape))
 
-    def holds(self, xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def holds(self, xyz: Array) -> NDArray[np.bool_]:
         """Whether points (N, 3) are in filled cells."""
         at = np.floor((xyz - self.low) / self.tree.cell).astype(np.int64)
         is_there = np.asarray(((at >= 0) & (at < self.filled.shape)).all(axis=1))
@@ -65,6 +68,25 @@ def grid_of(tree: Octree) -> CellGrid:
             filled[x : x + side, y : y + side, z : z + side] = 1
     filled[tuple((lows[-1] - first).T)] = 1
     return CellGrid(tree, first, filled)
+
+
+def depth_under(before: CellGrid, after: CellGrid) -> Callable[[Array], Array]:
+    """How far points (N, 3) inside a volume are from what was taken away of it, world units, (N,), negative there.
+
+    The steps of cells are smoothed by one cell.
+    """
+    left = np.zeros(before.filled.shape, np.uint8)
+    at = after.first - before.first
+    left[tuple(slice(a, a + n) for a, n in zip(at, after.filled.shape, strict=True))] = after.filled
+    taken = (before.filled == 1) & (left == 0)
+    cells = distance_transform_edt(~taken) - distance_transform_edt(taken)
+    smooth = gaussian_filter((cells - 0.5 * np.sign(cells)).astype(np.float32), 1.0)
+
+    def depth(xyz: Array) -> Array:
+        place = (xyz - before.low) / before.tree.cell - 0.5
+        return np.asarray(before.tree.cell * map_coordinates(smooth, place.T, order=1, mode="nearest"), np.float64)
+
+    return depth
 
 
 def octree_of(grid: CellGrid) -> Octree:

@@ -11,6 +11,7 @@ bright as what is asked for; and surfaces that mirror, which may look dark thoug
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, label
 
-from sfmapp.carve.outlines import Coverage
 from sfmapp.reporting import Report
 
 Picture = NDArray[np.uint8]
@@ -66,13 +66,13 @@ class LitPhotograph:
     Attributes:
         lit: (H, W) uint8, or (H, W, 3).
         under: as many of the same shape as there are lights.
-        coverage: (H, W) float32 share of each pixel that shows the object.
+        inside: (H, W) bool pixels that show nothing but the object.
         angles_deg: between camera and each light, as seen from the object.
     """
 
     lit: Picture
     under: Sequence[Picture]
-    coverage: Coverage
+    inside: Mask
     angles_deg: Sequence[float]
 
 
@@ -97,7 +97,7 @@ def find_shadows(
     counts = np.zeros((num, 4))
     masks: list[list[Mask]] = []
     for photograph in photographs:
-        inside = photograph.coverage >= 1.0
+        inside = photograph.inside
         least = linear(_grey(photograph.lit) - _CERTAIN * sigma_lit)
         mirrors = _mirrors(photograph) & inside
         masks.append([])
@@ -151,7 +151,7 @@ def noise_of(pictures: Sequence[Picture]) -> float:
         if usable.any():
             found.append(float(1.4826 * np.median(np.abs(difference[usable])) / 6.0))
     # rounding to whole levels is noise as well
-    return max(float(np.median(found)) if found else 0.0, float(12.0**-0.5))
+    return max(float(np.median(found)) if found else 0.0, math.sqrt(1.0 / 12.0))
 
 
 def _grey(picture: Picture) -> Levels:
@@ -164,7 +164,7 @@ def _gain(photographs: Sequence[LitPhotograph], k: int) -> float:
     quotients = []
     for photograph in photographs:
         lit = _grey(photograph.lit)
-        usable = (photograph.coverage >= 1.0) & (lit > 32.0) & (lit < _FULL)
+        usable = photograph.inside & (lit > 32.0) & (lit < _FULL)
         quotients.append(linear(_grey(photograph.under[k])[usable]) / linear(lit[usable]))
     values = np.concatenate(quotients) if quotients else np.empty(0)
     if not len(values):

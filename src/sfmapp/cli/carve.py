@@ -24,15 +24,17 @@ examples:
   sfmapp carve lego/ -o volume/                       photographs and their cameras.json or transforms.json
   sfmapp carve dinosaur/ -o volume/ --cells 512       photographs and a file of 3x4 projection matrices
   sfmapp carve photos/ -o volume/ --mask-path masks/  masks named IMAGE.png, the object white
+  sfmapp carve figure/ --lights lights.json -o volume/  photographs under single lights too: hollows by their shadows
   sfmapp carve masks/ --poses poses.txt --camera PINHOLE,258.65,258.25,159.8,128.15 -o volume/
 
 Where an object is in the photographs is told by their alpha channel, by masks, or by a background that all have in
 common (sfmapp masks shows it). What all silhouettes leave standing is the volume: exact from outside, blind to hollows
-that no outline shows.
+that no outline shows. --lights FILE takes photographs under one light at a time as well: what camera and light both
+would see lit, and is dark, is not there.
 
 Writes
   OUT/mesh.ply, OUT/mesh.glb   the closed surface, in colours of the photographs
-  OUT/octree.npz               the volume as cells
+  OUT/octree.npz               the volume as cells; what shadows have left of it: OUT/octree_shadows.npz
   OUT/report.html              how well it fits each silhouette, its slices, volume and area, what is wrong
   OUT/recording.rrd            how it was carved, level by level
 The same command again goes on where an earlier one was stopped."""
@@ -55,6 +57,9 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     cameras.add_argument("--camera", metavar="MODEL,...|FILE", help="the lens, where poses come without one")
     cameras.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; the object is white")
     cameras.add_argument("--mask-source", metavar="NAME", help="alpha, mask or background; default: what is there")
+    cameras.add_argument(
+        "--lights", metavar="FILE", help="JSON file of photographs under single lights, whose shadows carve hollows"
+    )
     volume = parser.add_argument_group("volume")
     volume.add_argument("--cells", metavar="N", help="finest cells along the longest side; default: 256")
     volume.add_argument(
@@ -81,7 +86,7 @@ def _carve(args: argparse.Namespace) -> int:
     from sfmapp.workspace.usage import Stopwatch
 
     watch = Stopwatch(whole_process=True)
-    what = CarveInput(args.source, args.images, args.poses, args.box)
+    what = CarveInput(args.source, args.images, args.poses, args.box, args.lights)
     with listening(args) as events:
         result = carve(what, args.output, options, record=not args.no_recording, events=events, watch=watch)
     tell_result(args, result, lambda: _print(result))
@@ -96,6 +101,12 @@ def _print(result: CarveResult) -> None:
         f"{fits[len(fits) // 2]:.1%} (least {fits[0]:.1%})"
     )
     carving, surface = report.carving, report.surface
+    if report.shadows:
+        taken = report.shadows.carving
+        print(
+            f"shadows of {len(report.shadows.lights)} lights took away "
+            f"{1.0 - taken.volume_after / taken.volume_before:.1%} of what silhouettes left"
+        )
     print(
         f"{carving.cells} cells along the side, {carving.share_of_dense:.2%} of them looked at; volume "
         f"{surface.volume:.5g} ({carving.volume_low:.5g} to {carving.volume_high:.5g}), area {surface.area:.5g}"

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 
 from sfmapp.carve.coloring import ColoringReport
 from sfmapp.carve.masks_report import MasksReport
+from sfmapp.carve.shadow_carving import ShadowCarvingReport
+from sfmapp.carve.shadows import DetectionReport
 from sfmapp.carve.space_carving import CarvingReport
 from sfmapp.carve.tolerance import ToleranceReport
 from sfmapp.report.model import LogLine, RunFacts
@@ -42,12 +44,24 @@ class SurfaceFacts(Report):
     volume: float
 
 
+class ShadowsReport(Report):
+    """What single lights said of a volume.
+
+    Attributes:
+        carving: what was taken away. lights: what could be told of their shadows.
+    """
+
+    carving: ShadowCarvingReport
+    lights: Sequence[DetectionReport]
+
+
 class CarveReport(Report):
     """The report of ``sfmapp carve``.
 
     Attributes:
         cameras: what they are, in words. left_out: photographs without a camera, and cameras without a photograph.
         tolerance: holes of masks through which nothing was carved; absent where that was not asked for.
+        shadows: what photographs under single lights took away; absent without.
         files: what was written, in the folder of the run.
         usage: of each step.
     """
@@ -66,3 +80,4 @@ class CarveReport(Report):
     usage: Mapping[str, Usage]
     warnings: Sequence[LogLine]
     decisions: Sequence[LogLine]
+    shadows: ShadowsReport | None = None

@@ -66,6 +66,22 @@ def _summary(report: CarveReport) -> str:
     )
     if report.box.told_by != "silhouettes":
         text += f"<p>The box was told by {escape(report.box.told_by)}.</p>"
+    if report.shadows is not None:
+        taken = report.shadows.carving
+        told = "; ".join(
+            f"{light.light} {light.dark_share:.0%} in shadow"
+            + (
+                f", {light.too_dark_share + light.mirror_share:.0%} not to be told"
+                if light.too_dark_share + light.mirror_share > 0.005
+                else ""
+            )
+            for light in report.shadows.lights
+        )
+        text += (
+            f"<p>Shadows took away {1.0 - taken.volume_after / taken.volume_before:.1%} of what silhouettes left, by "
+            f"{taken.num_pairs} photographs under single lights ({escape(told)}). What is left still holds the object, "
+            "as far as its edges are no sharper than the angle between light and camera.</p>"
+        )
     colors = report.colors
     if colors.seen_share < 1.0:
         text += (

@@ -25,7 +25,8 @@ from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.images.image_set import ImageSet
 from sfmapp.images.pixels import read_rgb
-from sfmapp.pipelines.carve.outputs import CARVING, OCTREE, write_surface
+from sfmapp.pipelines.carve.lights import carve_by_lights
+from sfmapp.pipelines.carve.outputs import CARVING, OCTREE, SHADOWED, write_surface
 from sfmapp.pipelines.carve.sources import CarveSource, find_views
 from sfmapp.pipelines.dense.source import is_of_model
 from sfmapp.report.carve_document import BoxFacts, CarveReport, SurfaceFacts
@@ -60,6 +61,7 @@ class CarveInput:
     Attributes:
         source: a workspace, a COLMAP model, or a folder of photographs with their cameras.
         images, poses: see :func:`sfmapp.pipelines.carve.sources.find_views`.
+        lights: file of photographs under single lights, see :mod:`sfmapp.formats.lights_file`.
         box: lower x, y, z and upper ones of the box that the object is in; None: as the silhouettes say.
     """
 
@@ -67,6 +69,7 @@ class CarveInput:
     images: FilePath | None = None
     poses: FilePath | None = None
     box: Sequence[float] | None = None
+    lights: FilePath | None = None
 
 
 @dataclass(frozen=True)
@@ -132,17 +135,28 @@ def carve(
             with job.stage("tolerance"):
                 silhouettes, tolerance = doubt_holes(source.views, silhouettes, *box.cube(), job.events)
         hull, octree, carving = _carve(job, source, silhouettes, box)
-        mesh, colors = _surface(job, source, silhouettes, hull, octree, box)
+        shadows, taken = None, None
+        if what.lights is not None:
+            with job.stage("shadows"):
+                octree, shadows, taken = carve_by_lights(
+                    Path(what.lights), source, silhouettes, octree, job.events, job.threads
+                )
+                write_octree(job.workspace.folder / SHADOWED, octree)
+        mesh, colors = _surface(job, source, silhouettes, octree, _shape(job, hull, octree, box, taken))
         volume = CarvedVolume(source, silhouettes, box, octree, hull, mesh)
         _warn(job, volume, carving, colors)
         with job.stage("files"):
-            files = [OCTREE, *write_surface(job.workspace.folder, mesh, up_of_views(source.views))]
+            files = [
+                OCTREE,
+                *([SHADOWED] if shadows else []),
+                *write_surface(job.workspace.folder, mesh, up_of_views(source.views)),
+            ]
         report = CarveReport(
             run=job.facts(), cameras=source.cameras, num_views=len(source.views),
             left_out=[NamedReason(name=name, reason=reason) for name, reason in source.left_out], masks=masks,
             box=BoxFacts(low=box.low.tolist(), high=box.high.tolist(), told_by=box.told_by, apart=box.apart),
             tolerance=tolerance, carving=carving, surface=_facts(mesh), colors=colors, files=files, usage=job.usage,
-            warnings=job.log.warnings, decisions=job.log.decisions,
+            warnings=job.log.warnings, decisions=job.log.decisions, shadows=shadows,
         )  # fmt: skip
         with job.measured("page"):
             page = carve_page(report, source.views, silhouettes, octree, mesh, lambda v: read_rgb(source.records[v]))
@@ -251,10 +265,10 @@ def _digest(silhouettes: Sequence[Silhouette]) -> str:
 
 
 def _surface(
-    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], hull: Hull, octree: Octree, box: Box
+    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], octree: Octree, shape: tuple[Distance, Normals]
 ) -> tuple[Mesh, ColoringReport]:
     with job.stage("surface"):
-        mesh = surface_of(octree, *_shape(job, hull, octree, box), job.events)
+        mesh = surface_of(octree, *shape, job.events)
         if not len(mesh.faces):
             raise NoReconstructionError(
                 "nothing is left of the volume at this resolution", "ask for more cells: --cells"
@@ -267,17 +281,22 @@ def _surface(
     return Mesh(mesh.xyz, mesh.faces, mesh.normal, rgb), colors
 
 
-def _shape(job: Job, hull: Hull, octree: Octree, box: Box) -> tuple[Distance, Normals]:
-    """Signed distance and normals of the hull, cut off by the box of a user."""
+def _shape(job: Job, hull: Hull, octree: Octree, box: Box, taken: Distance | None) -> tuple[Distance, Normals]:
+    """Signed distance and normals of the hull, cut off by the box of a user and by what shadows have taken away."""
+
+    def cut(xyz: Array) -> Array:
+        found = np.full(len(xyz), np.inf)
+        if box.told_by == "user":
+            found = np.minimum(found, box.distance(xyz))
+        return found if taken is None else np.minimum(found, taken(xyz))
 
     def distance(xyz: Array) -> Array:
-        found = hull.distance(xyz, job.threads)
-        return np.minimum(found, box.distance(xyz)) if box.told_by == "user" else found
+        return np.minimum(hull.distance(xyz, job.threads), cut(xyz))
 
     def normals(xyz: Array) -> NDArray[np.float32]:
         found = hull.normals(xyz, octree.cell, job.threads)
-        if box.told_by == "user":  # on its faces triangles tell them
-            found[box.distance(xyz) < 0.5 * octree.cell] = 0.0
+        # where the hull was cut, triangles tell them
+        found[cut(xyz) < 0.5 * octree.cell] = 0.0
         return found
 
     return distance, normals
