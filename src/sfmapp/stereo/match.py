@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+from sfmapp.stereo.chance import chance_text
 from sfmapp.stereo.matcher import match_by_sgm
 from sfmapp.stereo.opencv_matchers import match_by_bm, match_by_sgbm
 from sfmapp.stereo.options import MatcherName, StereoOptions
@@ -31,8 +32,14 @@ def match_pair(
         pair: whose rows are epipolar lines.
         options: which matcher, and what it looks for.
         matches: sparse matches of the pair's pictures, which tell where to search; None: they are found if needed.
+
+    Returns:
+        The map; ``info["chance"]`` says so where no more is matched than chance would.
     """
     options = options or StereoOptions()
     search, told_by = search_range(pair, options, matches)
     found = MATCHERS[options.matcher](pair, options, search)
-    return replace(found, info={**found.info, "range_told_by": told_by})
+    quick = replace(options, refine=False, fill=False)
+    chance = chance_text(pair, found, lambda turned: MATCHERS[options.matcher](turned, quick, search))
+    told = {"range_told_by": told_by} | ({} if chance is None else {"chance": chance})
+    return replace(found, info={**found.info, **told})

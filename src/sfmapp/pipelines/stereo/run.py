@@ -207,6 +207,8 @@ def _do_pair(
             job.events.warned(STAGE, warning)
     with job.stage("matching"):
         disparity = match_pair(prepared.pair, job.options.stereo, matches=prepared.matches)
+        if "chance" in disparity.info:
+            job.events.warned(STAGE, disparity.info["chance"])
     with job.stage("errors"):
         if polar is None:
             measured = measure_pair(prepared.pair, disparity, threads=job.threads)
