@@ -28,9 +28,11 @@ from sfmapp.pipelines.stereo.model_pairs import metre_sigma_of_run
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.tracks import Tracks
+from sfmapp.stereo import prepare
 from sfmapp.stereo.depth import depth_of_disparity
 from sfmapp.stereo.prepare import PairCameras, prepare_pair
 from sfmapp.stereo.rectification import plan_rectification, rectified_as_is
+from sfmapp.stereo.sparse_matches import match_pictures
 from sfmapp.stereo.uncertainty import depth_sigma
 
 Pixels = NDArray[np.uint8]
@@ -172,7 +174,11 @@ def test_rows_of_a_rectified_pair_come_together_and_disparities_stay(pair: tuple
             assert np.nanmedian(disparity[:30, 60:]) == pytest.approx(FAR, abs=0.2)
 
 
-def test_several_pairs_tell_one_turn_of_their_rig(pair: tuple[Path, Path], tmp_path: Path) -> None:
+def test_several_pairs_tell_one_turn_of_their_rig(
+    pair: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+    monkeypatch.setattr(prepare, "match_pictures", lambda *pictures: calls.append(1) or match_pictures(*pictures))
     left, right = (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in pair)
     lower = np.array([[1.0, 0.0, 0.0], [0.004, 1.0, 0.3]])
     (tmp_path / "l").mkdir()
@@ -183,7 +189,9 @@ def test_several_pairs_tell_one_turn_of_their_rig(pair: tuple[Path, Path], tmp_p
         cv2.imwrite(str(tmp_path / "r" / name), lowered)
     calibration = pair[0].parent / "calib.txt"
     assert run(tmp_path / "l" / "a.png", tmp_path / "r" / "a.png", "--camera", calibration, "-o", tmp_path / "one") == 0
+    calls.clear()
     assert run(tmp_path / "l", tmp_path / "r", "--camera", calibration, "-o", tmp_path / "both") == 0
+    assert len(calls) == 2  # no pair is matched twice, for its turn and for its rows after it
     (alone,) = json.loads((tmp_path / "one" / "report.json").read_text())["pairs"]
     told = json.loads((tmp_path / "both" / "report.json").read_text())["pairs"]
     first, second = (one["rectification"]["misalignment"] for one in told)

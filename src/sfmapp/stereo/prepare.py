@@ -99,11 +99,26 @@ class PrepareOptions:
         corrects: what is done about a rig that has turned since its calibration, as in
             :class:`~sfmapp.stereo.options.StereoOptions`.
         turn: of the rig, by several pairs of it (:func:`turn_of_rig`); None: each pair tells its own.
+        matches: of the pair as its calibration rectifies it, where they are known from there; None: they are found.
     """
 
     is_cropped: bool = False
     corrects: Correction = "auto"
     turn: Misalignment | None = None
+    matches: PairMatches | None = None
+
+
+@dataclass(frozen=True)
+class RigTurn:
+    """How far a rig has turned since its calibration.
+
+    Attributes:
+        found: by all pairs together; None where they tell too little.
+        matches: of each pair, as the calibration rectifies it.
+    """
+
+    found: Misalignment | None
+    matches: tuple[PairMatches, ...]
 
 
 def prepare_pair(
@@ -133,7 +148,7 @@ def prepare_pair(
             # the calibration says so: it is obeyed, and said
             left, right, is_swapped = right, left, True
             cameras = replace(cameras, rig=cameras.rig.reversed_pair())
-        draft = _drafted(left, right, cameras.rig)
+        draft = _drafted(left, right, cameras.rig, options.matches)
     misalignment = None
     is_corrected = with_rows = False
     if draft.plan is not None and not is_projective:
@@ -161,18 +176,21 @@ def prepare_pair(
     return PreparedPair(pair, plan, draft.matches, misalignment, report)
 
 
-def _drafted(left: Pixels, right: Pixels, rig: Rig | None) -> _Draft:
+def _drafted(left: Pixels, right: Pixels, rig: Rig | None, matches: PairMatches | None = None) -> _Draft:
     """The pair as a rig makes it; None: as it is."""
-    return _with_plan(left, right, None if rig is None else plan_rectification(rig))
+    return _with_plan(left, right, None if rig is None else plan_rectification(rig), matches)
 
 
-def _with_plan(left: Pixels, right: Pixels, plan: Rectification | None) -> _Draft:
+def _with_plan(
+    left: Pixels, right: Pixels, plan: Rectification | None, matches: PairMatches | None = None
+) -> _Draft:  # fmt: skip
     if plan is None:
         everywhere = np.ones(left.shape[:2], np.bool_)
         pair = RectifiedPair(left, right, everywhere, everywhere)
     else:
         pair = rectify(plan, left, right)
-    matches = match_pictures(pair.left, pair.right, pair.left_shown, pair.right_shown)
+    if matches is None:
+        matches = match_pictures(pair.left, pair.right, pair.left_shown, pair.right_shown)
     return _Draft(pair, plan, matches, rows_of(matches, pair.left.shape[0]))
 
 
@@ -218,9 +236,8 @@ def _without_calibration(
     return draft, replace(cameras, has_baseline=False, text="matches of the photographs alone"), is_swapped
 
 
-def turn_of_rig(pairs: Iterable[tuple[Pixels, Pixels]], cameras: PairCameras) -> Misalignment | None:
-    """How far a rig has turned since its calibration, by matches of several pairs of it together; None where they are
-    too few, or where nothing is known of the rig.
+def turn_of_rig(pairs: Iterable[tuple[Pixels, Pixels]], cameras: PairCameras) -> RigTurn:
+    """How far a rig has turned since its calibration, by matches of several pairs of it together.
 
     Args:
         pairs: of photographs, those of the cameras in their order.
@@ -229,13 +246,16 @@ def turn_of_rig(pairs: Iterable[tuple[Pixels, Pixels]], cameras: PairCameras) ->
         InputError: cameras that cannot be rectified, or photographs of another size.
     """
     if cameras.rig is None or cameras.is_adjusted:
-        return None
+        return RigTurn(None, ())
     is_swapped = cameras.rig.second_is_left
     plan = plan_rectification(cameras.rig.reversed_pair() if is_swapped else cameras.rig)
-    found = [_aligned(_with_plan(*(pair[::-1] if is_swapped else pair), plan)) for pair in pairs]
-    none = np.zeros((0, 2))
-    left, right = [none, *(one.left for one in found)], [none, *(one.right for one in found)]
-    return _misalignment(plan, PairMatches(np.concatenate(left), np.concatenate(right)))
+    found, matches = [PairMatches(np.zeros((0, 2)), np.zeros((0, 2)))], []
+    for pair in pairs:
+        draft = _with_plan(*(pair[::-1] if is_swapped else pair), plan)
+        found.append(_aligned(draft))
+        matches.append(draft.matches)
+    left, right = (np.concatenate([getattr(one, side) for one in found]) for side in ("left", "right"))
+    return RigTurn(_misalignment(plan, PairMatches(left, right)), tuple(matches))
 
 
 def _aligned(draft: _Draft) -> PairMatches:
@@ -262,7 +282,11 @@ def _corrected(
         return draft, False
     if not with_rows and found.moved_rows_px < _LEAST_GAIN_PX and not found.is_told[1]:
         return draft, False  # it moves neither rows nor disparities by what anybody would see
-    after = _with_rows(draft, found) if with_rows else _with_plan(*photographs, corrected_plan(draft.plan, found))
+    if with_rows:
+        after = _with_rows(draft, found)
+    else:
+        plan = corrected_plan(draft.plan, found)
+        after = _with_plan(*photographs, plan, _carried(draft.matches, draft.plan, plan))
     if after.rows is None or draft.rows is None or after.rows.rms_px > draft.rows.rms_px:
         warnings.append(f"{text}, but rows do not agree better for it: not corrected")
         return draft, False
@@ -341,8 +365,22 @@ def _with_rows(draft: _Draft, found: Misalignment) -> _Draft:
         shown[place] = tile.cover > _COVERED
     shown &= pair.right_shown
     after = replace(pair, right=right.reshape(pair.right.shape), right_shown=shown)
-    matches = match_pictures(after.left, after.right, after.left_shown, after.right_shown)
+    # to first order a row goes by as much as the one that it came from does
+    column, row = np.clip(draft.matches.right, 0, (geometry.width - 1, geometry.height - 1)).astype(np.int64).T
+    ends = draft.matches.right - np.stack([np.zeros(len(row)), rows[row, column] - row - 0.5], 1)
+    matches = PairMatches(draft.matches.left, ends)
     return _Draft(after, draft.plan, matches, rows_of(matches, geometry.height))
+
+
+def _carried(matches: PairMatches, before: Rectification, after: Rectification) -> PairMatches:
+    """Matches of a pair that one plan rectifies where another one has them."""
+    ends = []
+    for side, xy in enumerate((matches.left, matches.right)):
+        turn = after.rotation(side) @ before.rotation(side).T
+        homography = after.camera_matrix(side) @ turn @ np.linalg.inv(before.camera_matrix(side))
+        moved = np.column_stack([xy, np.ones(len(xy))]) @ homography.T
+        ends.append(moved[:, :2] / moved[:, 2:])
+    return PairMatches(ends[0], ends[1])
 
 
 def corrected_plan(plan: Rectification, found: Misalignment) -> Rectification:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +25,6 @@ from sfmapp.reporting import NamedReason
 from sfmapp.stereo.disparity_error import disparity_error
 from sfmapp.stereo.match import match_pair
 from sfmapp.stereo.measured import MeasuredPair, measure_pair, report_of
-from sfmapp.stereo.misalignment import Misalignment
 from sfmapp.stereo.polar import on_photograph
 from sfmapp.stereo.polar_pair import prepare_polar
 from sfmapp.stereo.prepare import PairCameras, PreparedPair, PrepareOptions, prepare_pair, turn_of_rig
@@ -39,8 +39,9 @@ from sfmapp.workspace.usage import Stopwatch
 
 STAGE = STEREO
 _QUANTILES = (0.01, 0.5, 0.99)
-# pairs that tell how far their rig has turned: each takes as long as it takes to be rectified
-_PAIRS_OF_TURN = 6
+# pairs that tell how far their rig has turned, and of a film frames from its beginning: they are rectified once more
+# for it, and matched once
+_PAIRS_OF_TURN, _FRAMES_OF_TURN = 12, 6
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ def stereo(
     named = ", ".join(os.fspath(one) for one in sources)
     with Job.opened(STEREO, named, target, options, events=events, watch=watch) as job:
         pairs, total = _pairs(job, sources, known or KnownCameras(), chosen or ChosenPairs())
-        turn = _turn(job, pairs) if isinstance(pairs, list) else None
+        pairs, turns = _turns(job, pairs)
         inputs: dict[str, str] = {}
         job.note_inputs(inputs)
         job.events.started(STAGE, f"{total or 'all'} pairs" if total != 1 else "matching", total=total)
@@ -115,8 +116,9 @@ def stereo(
         failed: list[NamedReason] = []
         last: MatchedStereo | None = None
         before: Moment | None = None
-        for pair in pairs:
+        for number, pair in enumerate(pairs):
             try:
+                turn = turns.get(number, turns.get(None, PrepareOptions()))
                 last, report, before = _do_pair(job, pair, turn, also or AlsoWritten(), before)
                 told.append(report)
             except InputError as error:
@@ -167,19 +169,34 @@ def _pairs(
     return found, len(found)
 
 
-def _turn(job: Job, pairs: Sequence[PairSource]) -> Misalignment | None:
-    """How far the rig of several pairs has turned, by some of them together; None of one pair, or of several rigs."""
-    if len(pairs) < 2 or job.options.stereo.correct_rig == "no":
-        return None
-    some = [pairs[n] for n in np.unique(np.linspace(0, len(pairs) - 1, _PAIRS_OF_TURN).round().astype(int)).tolist()]
+def _turns(
+    job: Job, pairs: Iterable[PairSource]
+) -> tuple[Iterable[PairSource], dict[int | None, PrepareOptions]]:  # fmt: skip
+    """How far the rig of several pairs has turned, by some of them together: what is known of the pairs at some places,
+    and under None of the others; nothing of one pair, or of several rigs. Gives all pairs back."""
+    if job.options.stereo.correct_rig == "no":
+        return pairs, {}
+    if isinstance(pairs, list):
+        places = np.unique(np.linspace(0, len(pairs) - 1, _PAIRS_OF_TURN).round().astype(int)).tolist()
+        some = [pairs[n] for n in places]
+    else:  # a film, whose frames come one after another
+        following = iter(pairs)
+        some = list(itertools.islice(following, _FRAMES_OF_TURN))
+        places, pairs = list(range(len(some))), itertools.chain(some, following)
+    if len(some) < 2:
+        return pairs, {}
     with job.stage("rectification"):
         try:
             cameras = [one.cameras() for one in some]
             if len({_sizes(one) for one in cameras}) > 1:
-                return None
-            return turn_of_rig((one.read() for one in some), cameras[0])
+                return pairs, {}
+            turn = turn_of_rig((one.read() for one in some), cameras[0])
         except InputError:
-            return None  # named of the pair that has it
+            return pairs, {}  # named of the pair that has it
+    told: dict[int | None, PrepareOptions] = {None: PrepareOptions(turn=turn.found)}
+    for place, matches in zip(places, turn.matches, strict=False):  # none of cameras that the photographs told
+        told[place] = PrepareOptions(turn=turn.found, matches=matches)
+    return pairs, told
 
 
 def _sizes(cameras: PairCameras) -> tuple[tuple[int, int], ...]:
@@ -187,15 +204,13 @@ def _sizes(cameras: PairCameras) -> tuple[tuple[int, int], ...]:
 
 
 def _do_pair(
-    job: Job, source: PairSource, turn: Misalignment | None, also: AlsoWritten, before: Moment | None
+    job: Job, source: PairSource, known: PrepareOptions, also: AlsoWritten, before: Moment | None
 ) -> tuple[MatchedStereo, StereoPairReport, Moment | None]:
     """The pair, what is told of it, and what is kept of a frame until the next."""
     with job.stage("rectification"):
         left, right = source.read()
         least = job.options.stereo.min_disparity
-        how = PrepareOptions(
-            is_cropped=least is not None and least < 0, corrects=job.options.stereo.correct_rig, turn=turn
-        )
+        how = replace(known, is_cropped=least is not None and least < 0, corrects=job.options.stereo.correct_rig)
         cameras, polar = source.cameras(), None
         try:
             prepared = prepare_pair(left, right, cameras, (source.left, source.right), how)
