@@ -82,6 +82,13 @@ def test_the_mesh_has_the_colours_of_what_looks_at_it(carved: Path) -> None:
     assert (carved / "mesh.glb").stat().st_size > 10_000
 
 
+def test_photographs_are_its_texture(photographs: Path, tmp_path: Path) -> None:
+    assert carve(photographs, "-o", tmp_path, "--texture") == 0
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["texture"]["seen"] > 0.8
+    assert b"\xff\xd8\xff" in (tmp_path / "mesh.glb").read_bytes()
+
+
 def test_the_same_call_goes_on_with_the_octree(photographs: Path, carved: Path, tmp_path: Path) -> None:
     shutil.copytree(carved, tmp_path / "again")
     before = (tmp_path / "again" / "mesh.ply").read_bytes()
@@ -89,6 +96,7 @@ def test_the_same_call_goes_on_with_the_octree(photographs: Path, carved: Path, 
         photographs, tmp_path / "again", sfmapp.load_options(settings=["carve.cells=32"]), threads=1
     )
     assert "carve" not in found.report.usage
+    assert found.report.texture is None
     assert (tmp_path / "again" / "recording.rrd").read_bytes()[:4] == b"RRF2"
     assert (tmp_path / "again" / "mesh.ply").read_bytes() == before
     (tmp_path / "again" / "octree.npz").write_bytes(b"damaged")

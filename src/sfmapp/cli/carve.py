@@ -68,6 +68,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )  # fmt: skip
     volume.add_argument("--misses", metavar="K", help="silhouettes that may miss a place that is kept; default: 0")
     volume.add_argument("--keep-holes", action="store_true", help="carve through holes that one mask alone has, too")
+    volume.add_argument("--texture", action="store_true", help="texture mesh.glb with the photographs")
     volume.add_argument("--threads", metavar="N", help="default: all cores; results do not depend on it")
     volume.add_argument("--no-recording", action="store_true", help="do not write recording.rrd")
     add_output_flags(parser, has_log=True)
@@ -80,6 +81,7 @@ def _carve(args: argparse.Namespace) -> int:
         "images.camera": args.camera, "images.mask_path": args.mask_path, "masks.mask_source": args.mask_source,
         "carve.cells": args.cells, "carve.misses": args.misses,
         "carve.doubts_holes": "false" if args.keep_holes else None, "threads": args.threads,
+        "surface.texture": "true" if args.texture else None,
     })  # fmt: skip
     load_numba_without_blas()
     from sfmapp.pipelines.carve.run import CarveInput, carve

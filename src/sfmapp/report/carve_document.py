@@ -12,6 +12,7 @@ from sfmapp.carve.space_carving import CarvingReport
 from sfmapp.carve.tolerance import ToleranceReport
 from sfmapp.report.model import LogLine, RunFacts
 from sfmapp.reporting import NamedReason, Report, Usage
+from sfmapp.surface.report import TextureReport
 
 
 class BoxFacts(Report):
@@ -62,6 +63,7 @@ class CarveReport(Report):
         cameras: what they are, in words. left_out: photographs without a camera, and cameras without a photograph.
         tolerance: holes of masks through which nothing was carved; absent where that was not asked for.
         shadows: what photographs under single lights took away; absent without.
+        texture: that of the GLB; absent where vertices have the colours.
         files: what was written, in the folder of the run.
         usage: of each step.
     """
@@ -76,6 +78,7 @@ class CarveReport(Report):
     carving: CarvingReport
     surface: SurfaceFacts
     colors: ColoringReport
+    texture: TextureReport | None = None
     files: Sequence[str]
     usage: Mapping[str, Usage]
     warnings: Sequence[LogLine]

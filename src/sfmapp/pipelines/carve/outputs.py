@@ -18,8 +18,9 @@ SHADOWED = "octree_shadows.npz"
 CARVING = "octree.json"
 
 
-def write_surface(folder: Path, mesh: Mesh, up: NDArray[np.float64]) -> list[str]:
-    """The mesh for programs and for viewers; gives the names of the files. ``up``: (3,) in the world."""
+def write_surface(folder: Path, mesh: Mesh, shown: Mesh, up: NDArray[np.float64]) -> list[str]:
+    """The mesh for programs, closed and with coloured vertices, and the one for viewers, which may have a texture and
+    is cut apart then; gives the names of the files. ``up``: (3,) in the world."""
     write_mesh_ply(folder / MESH_PLY, mesh)
-    write_glb(folder / MESH_GLB, mesh, is_z_up=bool(up[2] > np.sqrt(0.5)))
+    write_glb(folder / MESH_GLB, shown, is_z_up=bool(up[2] > np.sqrt(0.5)))
     return [MESH_PLY, MESH_GLB]

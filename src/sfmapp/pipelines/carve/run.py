@@ -28,6 +28,7 @@ from sfmapp.images.pixels import read_rgb
 from sfmapp.pipelines.carve.lights import carve_by_lights
 from sfmapp.pipelines.carve.outputs import CARVING, OCTREE, SHADOWED, write_surface
 from sfmapp.pipelines.carve.sources import CarveSource, find_views
+from sfmapp.pipelines.carve.texture import with_texture
 from sfmapp.pipelines.dense.source import is_of_model
 from sfmapp.report.carve_document import BoxFacts, CarveReport, SurfaceFacts
 from sfmapp.report.carve_html import carve_page
@@ -109,7 +110,7 @@ def carve(
         what: the photographs and their cameras.
         output: a new folder, an empty one, or that of an earlier call; None, for a workspace or a model alone: its
             folder ``carve``.
-        options: of these ``masks``, ``carve``, ``images`` and ``threads``.
+        options: of these ``masks``, ``carve``, ``surface`` (its texture), ``images`` and ``threads``.
         record: write ``recording.rrd``.
         events: progress, warnings and cancellation. watch: started when the run began.
 
@@ -145,18 +146,19 @@ def carve(
         mesh, colors = _surface(job, source, silhouettes, octree, _shape(job, hull, octree, box, taken))
         volume = CarvedVolume(source, silhouettes, box, octree, hull, mesh)
         _warn(job, volume, carving, colors)
+        shown, texture = mesh, None
+        if job.options.surface.texture:
+            with job.stage("texture"):
+                shown, texture = with_texture(job, source, mesh)
         with job.stage("files"):
-            files = [
-                OCTREE,
-                *([SHADOWED] if shadows else []),
-                *write_surface(job.workspace.folder, mesh, up_of_views(source.views)),
-            ]
+            surface = write_surface(job.workspace.folder, mesh, shown, up_of_views(source.views))
+            files = [OCTREE, *([SHADOWED] if shadows else []), *surface]
         report = CarveReport(
             run=job.facts(), cameras=source.cameras, num_views=len(source.views),
             left_out=[NamedReason(name=name, reason=reason) for name, reason in source.left_out], masks=masks,
             box=BoxFacts(low=box.low.tolist(), high=box.high.tolist(), told_by=box.told_by, apart=box.apart),
-            tolerance=tolerance, carving=carving, surface=_facts(mesh), colors=colors, files=files, usage=job.usage,
-            warnings=job.log.warnings, decisions=job.log.decisions, shadows=shadows,
+            tolerance=tolerance, carving=carving, shadows=shadows, surface=_facts(mesh), colors=colors, texture=texture,
+            files=files, usage=job.usage, warnings=job.log.warnings, decisions=job.log.decisions,
         )  # fmt: skip
         with job.measured("page"):
             page = carve_page(report, source.views, silhouettes, octree, mesh, lambda v: read_rgb(source.records[v]))
