@@ -13,7 +13,7 @@ from sfmapp.carve.isosurface import surface_of
 from sfmapp.carve.joined import Evidence, Joined, JoinReport, join
 from sfmapp.carve.joined_kernels import BINS, FULL, find_value, paint
 from sfmapp.carve.octree import places_of
-from sfmapp.carve.sight import Sight, sights_of_patches, sights_of_points
+from sfmapp.carve.sight import Sight, sights_of_patches
 from sfmapp.carve.views import View, view_of_matrix
 from sfmapp.dense.scene import Patches
 from sfmapp.errors import InputError, NoReconstructionError
@@ -195,7 +195,7 @@ def test_the_step_towards_votes_is_the_least_of_its_energy() -> None:
     assert (before == start).all()
 
 
-def test_sights_of_patches_and_of_points_see_the_surface() -> None:
+def test_sights_of_patches_show_the_surface() -> None:
     views = views_around()[:4]
     rng = np.random.default_rng(2)
     xyz = rng.normal(size=(20_000, 3))
@@ -212,9 +212,7 @@ def test_sights_of_patches_and_of_points_see_the_surface() -> None:
     )  # fmt: skip
     names = [view.name for view in views[:3]]
     by_patches = sights_of_patches(views, patches, names)
-    by_points = sights_of_points(views, xyz, normal)
     assert len(by_patches) == 3
-    assert len(by_points) >= 3
     for view, sight in zip(views, by_patches, strict=False):
         exact = sight_of(view, ball())
         # its pixels are those of the patches, coarser than the photograph's
@@ -225,4 +223,4 @@ def test_sights_of_patches_and_of_points_see_the_surface() -> None:
     with pytest.raises(InputError, match="found none"):
         sights_of_patches(views, patches, ["other"] * 3)
     with pytest.raises(InputError, match="projection matrix"):
-        sights_of_points([view_of_matrix("p", view.outer, 40, 30) for view in views], xyz, normal)
+        sights_of_patches([view_of_matrix(view.name, view.outer, 40, 30) for view in views], patches, names)

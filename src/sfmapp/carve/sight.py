@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sfmapp.carve.views import View
 from sfmapp.dense.maps import splat_view
@@ -21,8 +21,6 @@ _SAMPLED = 4000
 # a patch is drawn so far from its centre, a side, in distances to its nearest neighbour: squares that meet, as
 # ``sfmapp dense --maps`` draws them, and a pixel at least
 _REACH = 0.75
-# neighbours of a point by which its spacing is told where nothing else tells it
-_NUM_AROUND = 6
 
 
 @dataclass(frozen=True)
@@ -47,6 +45,9 @@ class Sight:
 def sights_of_patches(views: Sequence[View], patches: Patches, names: Sequence[str]) -> list[Sight]:
     """What each photograph sees of the patches that it is trusted with.
 
+    A cloud that does not say who sees its points will not do: what has no texture has no points either, and behind it
+    others would be seen that are hidden in truth.
+
     Args:
         views: calibrated cameras; those of other names than the patches' see nothing, and have no sight here.
         patches: of the same world.
@@ -69,27 +70,6 @@ def sights_of_patches(views: Sequence[View], patches: Patches, names: Sequence[s
             f"expected patches that the {len(views)} photographs see, found none",
             "photographs and patches have to be of the same model, with the same names",
         )
-    return sights
-
-
-def sights_of_points(views: Sequence[View], xyz: ArrayLike, normal: ArrayLike) -> list[Sight]:
-    """What photographs see of oriented points (N, 3) with outward normals (N, 3): those that face them, and of several
-    along a ray the nearest.
-
-    Raises:
-        InputError: no view sees a point, there are fewer than seven, or a view is a matrix without a camera.
-    """
-    from scipy.spatial import cKDTree
-
-    points, normals = np.asarray(xyz, np.float64), np.asarray(normal, np.float32)
-    if points.shape != normals.shape or points.ndim != 2 or len(points) <= _NUM_AROUND:
-        raise InputError(f"expected points with normals, more than {_NUM_AROUND}, found {points.shape}")
-    distance = cKDTree(points).query(points, k=[_NUM_AROUND + 1])[0][:, 0]
-    size = (distance * np.sqrt(np.pi / _NUM_AROUND)).astype(np.float32)
-    sights = [_sight(view, points, normals, size) for view in views]
-    sights = [sight for sight in sights if np.isfinite(sight.depth).any()]
-    if not sights:
-        raise InputError(f"expected points that the {len(views)} photographs see, found none of {len(points)}")
     return sights
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from sfmapp.carve.coloring import ColoringReport
+from sfmapp.carve.joined import JoinReport
 from sfmapp.carve.masks_report import MasksReport
 from sfmapp.carve.shadow_carving import ShadowCarvingReport
 from sfmapp.carve.shadows import DetectionReport
@@ -64,6 +65,7 @@ class CarveReport(Report):
         tolerance: holes of masks through which nothing was carved; absent where that was not asked for.
         shadows: what photographs under single lights took away; absent without.
         texture: that of the GLB; absent where vertices have the colours.
+        joining: what patches did to it; absent without.
         files: what was written, in the folder of the run.
         usage: of each step.
     """
@@ -84,3 +86,4 @@ class CarveReport(Report):
     warnings: Sequence[LogLine]
     decisions: Sequence[LogLine]
     shadows: ShadowsReport | None = None
+    joining: JoinReport | None = None

@@ -14,6 +14,8 @@ from sfmapp.scene.mesh import Mesh
 OCTREE, MESH_PLY, MESH_GLB = "octree.npz", "mesh.ply", "mesh.glb"
 # what shadows have left of the octree
 SHADOWED = "octree_shadows.npz"
+# what is left with patches
+JOINED = "joined.npz"
 # what carving said of itself, for a call that resumes
 CARVING = "octree.json"
 

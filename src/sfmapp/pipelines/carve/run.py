@@ -16,6 +16,7 @@ from sfmapp.carve.coloring import ColoringReport, color_surface
 from sfmapp.carve.files import read_octree, write_octree
 from sfmapp.carve.hull import Hull, hull_of
 from sfmapp.carve.isosurface import Distance, Normals, surface_of
+from sfmapp.carve.joined import Joined
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette, find_silhouettes
 from sfmapp.carve.space_carving import CarvingReport, LevelCounts, carve_hull
@@ -25,8 +26,9 @@ from sfmapp.errors import InputError, NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.images.image_set import ImageSet
 from sfmapp.images.pixels import read_rgb
+from sfmapp.pipelines.carve.joining import Photographs, find_patches, join_patches
 from sfmapp.pipelines.carve.lights import carve_by_lights
-from sfmapp.pipelines.carve.outputs import CARVING, OCTREE, SHADOWED, write_surface
+from sfmapp.pipelines.carve.outputs import CARVING, JOINED, OCTREE, SHADOWED, write_surface
 from sfmapp.pipelines.carve.sources import CarveSource, find_views
 from sfmapp.pipelines.carve.texture import with_texture
 from sfmapp.pipelines.dense.source import is_of_model
@@ -64,6 +66,8 @@ class CarveInput:
         images, poses: see :func:`sfmapp.pipelines.carve.sources.find_views`.
         lights: file of photographs under single lights, see :mod:`sfmapp.formats.lights_file`.
         box: lower x, y, z and upper ones of the box that the object is in; None: as the silhouettes say.
+        with_dense: patches to join with the silhouettes: a ``patches.npz``, the workspace that holds one, or "" for
+            that of ``source``; None: silhouettes alone.
     """
 
     source: FilePath
@@ -71,6 +75,7 @@ class CarveInput:
     poses: FilePath | None = None
     box: Sequence[float] | None = None
     lights: FilePath | None = None
+    with_dense: FilePath | None = None
 
 
 @dataclass(frozen=True)
@@ -120,6 +125,7 @@ def carve(
         NoReconstructionError: nothing is left of the volume.
         InterruptedRunError: ``events`` was asked to stop; the same call resumes.
     """
+    patches = _patches(what)
     with Job.opened(CARVE, what.source, _target(what, output), options, events=events, watch=watch) as job:
         with job.stage("views"):
             source = find_views(what.source, what.images, what.poses, job.options, job.events)
@@ -143,7 +149,13 @@ def carve(
                     Path(what.lights), source, silhouettes, octree, job.events, job.threads
                 )
                 write_octree(job.workspace.folder / SHADOWED, octree)
-        mesh, colors = _surface(job, source, silhouettes, octree, _shape(job, hull, octree, box, taken))
+        shape: tuple[Distance, Normals | None] = _shape(job, hull, octree, box, taken)
+        joining = None
+        if patches is not None:
+            joined, joining = join_patches(job, patches, Photographs(source.views, silhouettes, hull), octree)
+            octree, shape = _joined_shape(joined, box)
+            write_octree(job.workspace.folder / JOINED, octree)
+        mesh, colors = _surface(job, source, silhouettes, octree, shape)
         volume = CarvedVolume(source, silhouettes, box, octree, hull, mesh)
         _warn(job, volume, carving, colors)
         shown, texture = mesh, None
@@ -152,13 +164,13 @@ def carve(
                 shown, texture = with_texture(job, source, mesh)
         with job.stage("files"):
             surface = write_surface(job.workspace.folder, mesh, shown, up_of_views(source.views))
-            files = [OCTREE, *([SHADOWED] if shadows else []), *surface]
+            files = [OCTREE, *([SHADOWED] if shadows else []), *([JOINED] if joining else []), *surface]
         report = CarveReport(
             run=job.facts(), cameras=source.cameras, num_views=len(source.views),
             left_out=[NamedReason(name=name, reason=reason) for name, reason in source.left_out], masks=masks,
             box=BoxFacts(low=box.low.tolist(), high=box.high.tolist(), told_by=box.told_by, apart=box.apart),
             tolerance=tolerance, carving=carving, shadows=shadows, surface=_facts(mesh), colors=colors, texture=texture,
-            files=files, usage=job.usage, warnings=job.log.warnings, decisions=job.log.decisions,
+            files=files, usage=job.usage, warnings=job.log.warnings, decisions=job.log.decisions, joining=joining,
         )  # fmt: skip
         with job.measured("page"):
             page = carve_page(report, source.views, silhouettes, octree, mesh, lambda v: read_rgb(source.records[v]))
@@ -167,6 +179,15 @@ def carve(
         job.workspace.write_json(REPORT, report)
         job.workspace.save()
         return CarveResult(job.workspace.folder, report, octree, mesh)
+
+
+def _patches(what: CarveInput) -> Path | None:
+    """The file of patches, if any. Raises UsageError beside lights, InputError if there is no such file."""
+    if what.with_dense is None:
+        return None
+    if what.lights is not None:
+        raise UsageError("patches and shadows cannot be joined", "give either --with-dense or --lights")
+    return find_patches(what.source, what.with_dense)
 
 
 def _target(what: CarveInput, output: FilePath | None) -> Path:
@@ -267,8 +288,9 @@ def _digest(silhouettes: Sequence[Silhouette]) -> str:
 
 
 def _surface(
-    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], octree: Octree, shape: tuple[Distance, Normals]
-) -> tuple[Mesh, ColoringReport]:
+    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], octree: Octree,
+    shape: tuple[Distance, Normals | None],
+) -> tuple[Mesh, ColoringReport]:  # fmt: skip
     with job.stage("surface"):
         mesh = surface_of(octree, *shape, job.events)
         if not len(mesh.faces):
@@ -302,6 +324,13 @@ def _shape(job: Job, hull: Hull, octree: Octree, box: Box, taken: Distance | Non
         return found
 
     return distance, normals
+
+
+def _joined_shape(joined: Joined, box: Box) -> tuple[Octree, tuple[Distance, None]]:
+    """Octree and signed distance of what silhouettes and patches leave, cut off by the box of a user."""
+    if box.told_by != "user":
+        return joined.tree, (joined.distance, None)
+    return clip_octree(joined.tree, box), (lambda xyz: np.minimum(joined.distance(xyz), box.distance(xyz)), None)
 
 
 def _warn(job: Job, volume: CarvedVolume, carving: CarvingReport, colors: ColoringReport) -> None:
