@@ -101,10 +101,10 @@ def write_maps(folder: Path, plan: DensePlan, patches: Patches, cell_px: int, ev
         base = folder / plan.names[m]
         write_array(base.with_name(f"{base.name}.depth.npy"), depth)
         write_array(base.with_name(f"{base.name}.normal.npy"), normals)
-        _write_picture(base.with_name(f"{base.name}.depth.png"), depth_picture(depth))
-        _write_picture(base.with_name(f"{base.name}.normal.png"), normal_picture(normals))
+        write_picture(base.with_name(f"{base.name}.depth.png"), depth_picture(depth))
+        write_picture(base.with_name(f"{base.name}.normal.png"), normal_picture(normals))
         events.advanced(STAGE)
-    _write_cameras(folder / "views.json", plan)
+    write_cameras(folder / "views.json", plan)
     events.finished(STAGE, f"{len(plan.records)} views")
 
 
@@ -131,14 +131,16 @@ def normal_picture(normals: NDArray[np.float32]) -> NDArray[np.uint8]:
     return shown
 
 
-def _write_picture(path: Path, rgb: NDArray[np.uint8]) -> None:
+def write_picture(path: Path, rgb: NDArray[np.uint8]) -> None:
+    """Write a PNG of (H, W, 3) RGB."""
     import cv2
 
     _, data = cv2.imencode(".png", rgb[:, :, ::-1])
     write_bytes(path, bytes(data))
 
 
-def _write_cameras(path: Path, plan: DensePlan) -> None:
+def write_cameras(path: Path, plan: DensePlan) -> None:
+    """Write names, sizes, calibrations and poses of the undistorted views at working resolution as JSON."""
     import json
 
     rows = [

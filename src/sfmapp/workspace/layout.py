@@ -22,6 +22,7 @@ __all__ = [
     "REFINE",
     "REPORT",
     "STEREO",
+    "SWEEP",
     "TRANSFER",
     "UNCALIBRATED",
     "UNDISTORT",
@@ -35,6 +36,7 @@ RECONSTRUCT, ODOMETRY, REFINE, DENSE, UNDISTORT = "reconstruct", "odometry", "re
 CALIBRATE, LOCATE, PAIR, PANORAMA = "calibrate", "locate", "pair", "panorama"
 TRANSFER, UNCALIBRATED = "transfer", "uncalibrated"
 WARP, RECTIFY, STEREO, CARVE, MASKS = "warp", "rectify", "stereo", "carve", "masks"
+SWEEP = "sweep"
 # a report for programs, and the page for people beside it
 LOCK, REPORT, PAGE = ".lock", "report.json", "report.html"
 # where the photographs of a COLMAP model are by its custom, from MODEL and from PROJECT/sparse/0

@@ -1,0 +1,216 @@
+"""A model and its photographs to a depth map of each, by sweeping planes; maps of several views confirm each other.
+
+Photographs are read when their turn comes, and maps wait in files until their neighbours are there, so that memory does
+not grow with the number of photographs.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.carve.plane_sweep import NEIGHBORS, SweptDepth, sweep_view
+from sfmapp.carve.sweep_agreement import confirm
+from sfmapp.dense.maps import depth_picture, write_cameras, write_picture
+from sfmapp.dense.photographs import find_photographs
+from sfmapp.dense.prepare import DensePlan, load_scene, plan_views
+from sfmapp.dense.report import ViewsReport
+from sfmapp.dense.scene import DenseView
+from sfmapp.errors import NoReconstructionError
+from sfmapp.events import Events
+from sfmapp.formats.atomic import write_array
+from sfmapp.formats.colmap import read_model
+from sfmapp.pipelines.dense.source import DenseSource, find_source
+from sfmapp.report.sweep_document import SweepReport, SweptView
+from sfmapp.reporting import NamedReason
+from sfmapp.workspace.job import Job
+from sfmapp.workspace.layout import REPORT, SWEEP
+from sfmapp.workspace.options import Options
+from sfmapp.workspace.usage import Stopwatch
+
+STAGE = SWEEP
+MAPS = "maps"
+# where maps wait until others have confirmed them
+_UNCONFIRMED = "unconfirmed"
+Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """What was written.
+
+    Attributes:
+        output: the folder. report: what is in ``report.json``.
+    """
+
+    output: Path
+    report: SweepReport
+
+
+@dataclass(kw_only=True)
+class _Job(Job):
+    """A sweep under way.
+
+    Attributes:
+        plan: the views. swept: of each its map without the arrays, None where it has none.
+        left_out: photographs without a map, and why.
+    """
+
+    plan: DensePlan = field(init=False)
+    swept: list[SweptDepth | None] = field(default_factory=list)
+    left_out: list[NamedReason] = field(default_factory=list)
+
+    def waiting(self, view: int, what: str) -> Path:
+        """File of a map that is not confirmed yet."""
+        return self.workspace.folder / _UNCONFIRMED / f"{view}.{what}.npy"
+
+
+def sweep(
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    options: Options | None = None,
+    *,
+    images: str | os.PathLike[str] | None = None,
+    events: Events | None = None,
+    watch: Stopwatch | None = None,
+) -> SweepResult:
+    """Write a depth map of every photograph of a model, with sigma and confidence.
+
+    ``OUTPUT/maps`` gets ``NAME.depth.npy``, ``NAME.sigma.npy`` (H, W) float32 in units of the world, NaN where nothing
+    is known, ``NAME.confidence.npy``, a picture ``NAME.depth.png``, and ``views.json`` with the cameras of the maps.
+
+    Args:
+        source: a workspace, or the folder of a COLMAP model.
+        output: a new folder, an empty one, or that of an earlier call.
+        options: ``dense.level`` and ``dense.ground_sampling`` for the size of the maps, masks, and ``threads``.
+        images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
+        events: progress, warnings and cancellation.
+        watch: started when the run began.
+
+    Raises:
+        UsageError: an output that holds something else.
+        InputError: no model, or too few of its photographs are there.
+        NoReconstructionError: the photographs have no baseline, or no map has a depth.
+        InterruptedRunError: ``events`` was asked to stop.
+    """
+    where = find_source(source, output, images, options or Options(), SWEEP)
+    with _Job.opened(SWEEP, where.images, where.output, where.options, events=events, watch=watch) as job:
+        with job.stage("views"):
+            views = _plan(job, where)
+        job.note_inputs({})
+        try:
+            with job.stage(STAGE):
+                _sweep_all(job)
+            with job.stage("agreement"):
+                maps = _confirm_all(job)
+        finally:
+            shutil.rmtree(job.workspace.folder / _UNCONFIRMED, ignore_errors=True)
+        write_cameras(job.workspace.folder / MAPS / "views.json", job.plan)
+        report = SweepReport(
+            run=job.facts(), views=views, maps=maps, left_out=job.left_out, usage=job.usage, warnings=job.log.warnings
+        )
+        job.workspace.write_json(REPORT, report)
+        job.workspace.save()
+        if not any(each.confirmed > 0.0 for each in maps):
+            raise NoReconstructionError(
+                f"no photograph of {where.images} has a depth that others confirm",
+                "check that the cameras are those of the photographs, and that neighbours show the same thing",
+            )
+        return SweepResult(job.workspace.folder, report)
+
+
+def _plan(job: _Job, where: DenseSource) -> ViewsReport:
+    model, _ = read_model(where.model, job.events)
+    photographs = find_photographs(
+        model, where.images, job.options.images, is_upright=where.is_upright, threads=job.threads, events=job.events
+    )
+    job.plan, views = plan_views(model, photographs, job.options.dense, job.events)
+    return views
+
+
+def _others(plan: DensePlan, view: int) -> list[int]:
+    return [int(m) for m in plan.neighbors[view] if m >= 0][:NEIGHBORS]
+
+
+def _sweep_all(job: _Job) -> None:
+    """A map of every view, left to wait in files."""
+    plan, events = job.plan, job.events
+    (job.workspace.folder / _UNCONFIRMED).mkdir(exist_ok=True)
+    events.started(STAGE, f"planes through {len(plan.records)} photographs", total=len(plan.records))
+    with ThreadPoolExecutor(1) as pool:
+        for view in range(len(plan.records)):
+            events.raise_if_cancelled()
+            wanted = np.unique([view, *_others(plan, view)])
+            # what is read quietly is a part of this step
+            scene = load_scene(plan, wanted, threads=job.threads)
+            try:
+                found = sweep_view(scene, int(np.searchsorted(wanted, view)), pool if job.threads > 1 else None)
+            except NoReconstructionError as failure:
+                job.left_out.append(NamedReason(name=plan.names[view], reason=str(failure)))
+                job.swept.append(None)
+                continue
+            finally:
+                events.advanced(STAGE)
+            for what, values in (("depth", found.depth), ("sigma", found.sigma), ("confidence", found.confidence)):
+                write_array(job.waiting(view, what), values)
+            nothing = np.empty((0, 0), np.float32)
+            names = tuple(int(wanted[m]) for m in found.neighbors)
+            job.swept.append(SweptDepth(nothing, nothing, nothing, nothing, found.planes, names))
+    events.finished(STAGE, f"{len(plan.records) - len(job.left_out)} maps")
+    if job.left_out:
+        events.warned(STAGE, f"{len(job.left_out)} photographs have no map: {job.left_out[0].reason}")
+
+
+def _confirm_all(job: _Job) -> list[SweptView]:
+    """Write what others confirm of each map: one at least, and no fewer than contradict."""
+    plan, events = job.plan, job.events
+    rows = []
+    events.started("agreement", "maps against each other", total=len(plan.records))
+    for view, swept in enumerate(job.swept):
+        events.raise_if_cancelled()
+        events.advanced("agreement")
+        if swept is None:
+            continue
+        own = _map(job, view, swept)
+        sides = [m for m in plan.neighbors[view] if m >= 0 and job.swept[m] is not None]
+        agree, against = confirm(_camera(plan, view), own, [_other(job, int(m)) for m in sides])
+        kept = (agree > 0) & (agree >= against)
+        depth, sigma = (np.where(kept, values, np.float32(np.nan)) for values in (own.depth, own.sigma))
+        base = job.workspace.folder / MAPS / plan.names[view]
+        confidence = np.where(kept, own.confidence, np.float32(0.0))
+        for what, values in (("depth", depth), ("sigma", sigma), ("confidence", confidence)):
+            write_array(base.with_name(f"{base.name}.{what}.npy"), values)
+        write_picture(base.with_name(f"{base.name}.depth.png"), depth_picture(depth))
+        farthest, nearest = swept.planes.depth(np.array([0, swept.planes.count - 1]))
+        rows.append(SweptView(
+            name=plan.names[view], neighbors=[plan.names[m] for m in swept.neighbors], num_planes=swept.planes.count,
+            near=float(nearest), far=float(farthest),
+            answered=float(np.isfinite(own.depth).mean()), confirmed=float(kept.mean()),
+            median_sigma=float(np.median(sigma[kept] / depth[kept])) if kept.any() else None,
+        ))  # fmt: skip
+    events.finished("agreement", f"{len(rows)} maps written")
+    return rows
+
+
+def _map(job: _Job, view: int, swept: SweptDepth) -> SweptDepth:
+    depth, sigma, confidence = (np.load(job.waiting(view, what)) for what in ("depth", "sigma", "confidence"))
+    return SweptDepth(depth, sigma, confidence, depth, swept.planes, swept.neighbors)
+
+
+def _other(job: _Job, view: int) -> tuple[DenseView, SweptDepth]:
+    swept = job.swept[view]
+    assert swept is not None
+    depth = np.load(job.waiting(view, "depth"))
+    return _camera(job.plan, view), SweptDepth(depth, depth, depth, depth, swept.planes, swept.neighbors)
+
+
+def _camera(plan: DensePlan, view: int) -> DenseView:
+    """The view without its pixels."""
+    canvas = plan.canvases[view]
+    return DenseView(plan.names[view], np.empty((0, 0, 3), np.uint8), None, canvas.k, plan.cam_from_world[view])

@@ -1,0 +1,69 @@
+"""``sfmapp sweep`` from the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dense_models import DEPTH, write_wall
+from sfmapp.cli.main import main
+from sfmapp.geometry import rigid3
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wall")
+    write_wall(folder, 4)
+    return folder
+
+
+def swept(wall: Path, out: Path, *flags: str) -> int:
+    return main(["sweep", str(wall / "sparse" / "0"), "-o", str(out), *flags])
+
+
+def test_depth_maps_of_a_wall_are_those_of_its_plane(
+    wall: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "depth"
+    assert swept(wall, out, "--threads", "2") == 0
+    assert "4 depth maps" in capsys.readouterr().out
+    views = json.loads((out / "maps" / "views.json").read_text())
+    report = json.loads((out / "report.json").read_text())
+    assert len(views) == len(report["maps"]) == 4
+    for view, row in zip(views, report["maps"], strict=True):
+        base = out / "maps" / view["name"]
+        depth, sigma, confidence = (
+            np.load(base.with_name(f"{base.name}.{what}.npy")) for what in ("depth", "sigma", "confidence")
+        )
+        known = np.isfinite(depth)
+        assert known.mean() == pytest.approx(row["confirmed"])
+        assert known.mean() > 0.75
+        assert (known == np.isfinite(sigma)).all()
+        assert (known == (confidence > 0.0)).all()
+        v, u = np.mgrid[: view["height"], : view["width"]] + 0.5
+        fx, fy, cx, cy = view["k"]
+        pose = np.array(view["cam_from_world"])
+        rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1) @ rigid3.rotation_matrix(pose)
+        true = (DEPTH - rigid3.center(pose)[2]) / rays[..., 2]
+        step = (1.0 / row["near"] - 1.0 / row["far"]) / (row["num_planes"] - 1)
+        off = np.abs(1.0 / depth - 1.0 / true)[known] / step
+        # in planes, for on pictures so small one is some per cent of the depth
+        assert np.median(off) < 0.15
+        assert np.quantile(off, 0.95) < 0.5
+        assert (base.with_name(f"{base.name}.depth.png")).is_file()
+    assert not (out / "unconfirmed").exists()
+
+
+def test_bytes_do_not_depend_on_threads(wall: Path, tmp_path: Path) -> None:
+    for threads in ("1", "2"):
+        assert swept(wall, tmp_path / threads, "--threads", threads, "--level", "1", "-q") == 0
+    for name in ("view_0.png.depth.npy", "view_3.png.sigma.npy"):
+        assert (tmp_path / "1" / "maps" / name).read_bytes() == (tmp_path / "2" / "maps" / name).read_bytes()
+
+
+def test_what_is_no_model_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sweep", str(tmp_path), "-o", str(tmp_path / "out")]) != 0
+    assert "expected a workspace of sfmapp or a COLMAP model" in capsys.readouterr().err
