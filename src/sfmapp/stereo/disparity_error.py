@@ -159,19 +159,19 @@ def correlations(picture: Map, pictures: Iterable[Map], known: NDArray[np.bool_]
     squared grey values. Each pixel of the window goes by its own disparity, so that slanted surfaces match as well as
     others; where it has none (``known``) it does not count, and ``picture`` becomes zero."""
     mask = known.astype(np.float32)
-    share = np.maximum(_mean(mask, _WINDOW), np.float32(1e-6))
+    share = np.maximum(window_mean(mask, _WINDOW), np.float32(1e-6))
     picture *= mask
-    own_mean = _mean(picture, _WINDOW) / share
-    own_variance = _variance(_mean(picture * picture, _WINDOW), share, own_mean)
+    own_mean = window_mean(picture, _WINDOW) / share
+    own_variance = _variance(window_mean(picture * picture, _WINDOW), share, own_mean)
     ncc = []
     for seen in pictures:
         seen *= mask
-        mean = _mean(seen, _WINDOW)
+        mean = window_mean(seen, _WINDOW)
         mean /= share
-        both = _mean(picture * seen, _WINDOW)
+        both = window_mean(picture * seen, _WINDOW)
         both /= share
         both -= own_mean * mean
-        variance = _variance(_mean(np.square(seen, out=seen), _WINDOW), share, mean)
+        variance = _variance(window_mean(np.square(seen, out=seen), _WINDOW), share, mean)
         variance *= own_variance
         both /= np.sqrt(variance, out=variance)
         ncc.append(both)
@@ -194,7 +194,7 @@ def _scatter_cues(cues: Map, disparity: Map, known: NDArray[np.bool_]) -> None:
 
     mask = known.astype(np.float32)
     for cue, side in ((3, _NEAR), (4, _WIDE)):
-        share = np.maximum(_mean(mask, side), np.float32(1e-6))
+        share = np.maximum(window_mean(mask, side), np.float32(1e-6))
         # squares of disparities of some hundred pixels leave no digits for their scatter in single precision
         mean = cv2.boxFilter(disparity, cv2.CV_64F, (side, side), borderType=cv2.BORDER_REFLECT)
         square = cv2.sqrBoxFilter(disparity, cv2.CV_64F, (side, side), borderType=cv2.BORDER_REFLECT)
@@ -222,7 +222,8 @@ def _bands(height: int) -> Iterator[tuple[slice, slice, slice]]:
         yield slice(first, min(end + margin, height)), slice(start - first, end - first), slice(start, end)
 
 
-def _mean(values: NDArray[Any], side: int) -> NDArray[Any]:
+def window_mean(values: NDArray[Any], side: int) -> NDArray[Any]:
+    """Mean of each pixel's window (H, W), mirrored at the border; of the type of the values."""
     import cv2
 
     mean: NDArray[Any] = cv2.boxFilter(values, -1, (side, side), normalize=True, borderType=cv2.BORDER_REFLECT)

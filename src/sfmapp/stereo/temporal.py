@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sfmapp.images.pixels import as_gray
 from sfmapp.reporting import Report
+from sfmapp.stereo.disparity_error import window_mean
 from sfmapp.stereo.result import DisparityMap, PixelState
 
 Map = NDArray[np.float32]
@@ -139,15 +140,8 @@ def still_pixels(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> Mask:
     both = first + second
     dx, dy = (cv2.Sobel(both, cv2.CV_32F, *order, ksize=1, scale=0.25) for order in ((1, 0), (0, 1)))
     change = second - first
-    change -= _mean(change)
-    xx, xy, yy = _mean(dx * dx), _mean(dx * dy), _mean(dy * dy)
+    change -= window_mean(change, _WINDOW)
+    xx, xy, yy = window_mean(dx * dx, _WINDOW), window_mean(dx * dy, _WINDOW), window_mean(dy * dy, _WINDOW)
     least = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-    is_still: Mask = _mean(change * change) < _STILL_PX**2 * least
+    is_still: Mask = window_mean(change * change, _WINDOW) < _STILL_PX**2 * least
     return is_still
-
-
-def _mean(values: Map) -> Map:
-    import cv2
-
-    mean: Map = cv2.boxFilter(values, -1, (_WINDOW, _WINDOW), normalize=True, borderType=cv2.BORDER_REFLECT)
-    return mean

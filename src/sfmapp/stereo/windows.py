@@ -9,6 +9,7 @@ to where it fits best, on the pixel or half its side off in eight directions (Ka
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,5 +102,12 @@ def best_disparities(
     )  # fmt: skip
     looked_for = Search(first, count, stride, reach[0], beyond, shift, steps, float(options.left_right_px))
     found = Found(*(np.full(left.shape, np.nan, np.float32) for _ in range(4)))
-    match_rows(NUMBERS[options.cost], planes, looked_for, windows, (0, left.shape[0]), found)
+    middle = left.shape[0] // 2
+
+    def match(rows: tuple[int, int]) -> None:
+        match_rows(NUMBERS[options.cost], planes, looked_for, windows, rows, found)
+
+    # sums are whole numbers: what is found does not depend on where they begin
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(match, ((0, middle), (middle, left.shape[0]))))
     return found
