@@ -100,6 +100,7 @@ def rows_of(folder: Path) -> list[Row]:
         "planes": plane_rows,
         "stereo": stereo_rows,
         "dense_pairs": pair_rows,
+        "carving": carving_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
 
@@ -277,6 +278,32 @@ def plane_rows(folder: Path) -> Iterator[Row]:
                 what = f"rms on {picture}"
                 yield Row("planes", row["case"], what, "grey levels", "less", mine["rms"][picture], peer, rms, *about)
             yield Row("planes", row["case"], "CPU time", "ms", "less", mine["cpu_ms"], peer, row["cpu_ms"], *about)
+
+
+def carving_rows(folder: Path) -> Iterator[Row]:
+    """Space carving against dense grids and, of silhouettes with holes and spills, against strict carving."""
+    report = read(folder, "carving")
+    about = (False, report["date"][:10], report["commit"])
+    grid = report["grid"]
+    for case, what, unit, figures in (
+        (f"dinosaur, {grid['cells']} cells", "CPU time", "s", grid["cpu_s"]),
+        (f"dinosaur, {grid['fine_cells']} cells", "memory of the cells", "MB", grid["fine_mb"]),
+    ):
+        for peer, value in figures.items():
+            if peer != "sfmapp":
+                yield Row("carving", case, what, unit, "less", figures["sfmapp"], peer, value, *about)
+    for run in report["dinosaur"]:
+        case = f"dinosaur, {run['cells']} cells, {'whole' if 'triangles' in run else 'octree'}"
+        yield Row("carving", case, "CPU time", "s", "less", run["cpu_s"], "", None, *about)
+        yield Row("carving", case, "peak memory", "MB", "less", run["peak_mb"], "", None, *about)
+    for run in report["bunny"]["runs"]:
+        case = f"bunny, {run['cells']} cells"
+        yield Row("carving", case, "IoU of silhouettes, least", "%", "more", 100.0 * min(run["iou"]), "", None, *about)
+    for case, kind in dict.fromkeys((row["case"], row["kind"]) for row in report["tolerance"]):
+        mine = [row for row in report["tolerance"] if (row["case"], row["kind"]) == (case, kind)]
+        ours, strict = (100.0 * min(row[how] for row in mine) for how in ("tolerant", "strict"))
+        what = f"masks with {kind}s, IoU with the clean hull, least"
+        yield Row("carving", case, what, "%", "more", ours, "strict carving", strict, *about)
 
 
 def known_point_rows(folder: Path) -> Iterator[Row]:

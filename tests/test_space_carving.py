@@ -136,6 +136,16 @@ def test_what_is_not_known_is_not_carved() -> None:
     assert (strict > 0.0).sum() < 0.7 * whole
 
 
+def test_silhouettes_that_know_nothing_are_as_if_they_were_not_there() -> None:
+    views = around(7)
+    silhouettes = [silhouette_of(view, ball()) for view in views]
+    nothing = Silhouette(np.full((120, 160), -np.inf, np.float32), np.zeros((120, 160), bool))
+    with_them, _ = carve(views, [*silhouettes[:3], *[nothing] * 4], LOW, SIDE, CarveOptions(cells=CELLS))
+    without, _ = carve(views[:3], silhouettes[:3], LOW, SIDE, CarveOptions(cells=CELLS))
+    assert with_them.surface.tobytes() == without.surface.tobytes()
+    assert [codes.tobytes() for codes in with_them.full] == [codes.tobytes() for codes in without.full]
+
+
 def test_a_miss_that_is_allowed_carves_nothing() -> None:
     views = around(8)
     silhouettes = [silhouette_of(view, ball()) for view in views]

@@ -203,8 +203,11 @@ def judge(fields: Fields, view: int, x: float, y: float, z: float, half: float) 
         k = reading(fields.known, known, height, width, u, v)
         if k < -radius - _SLACK:
             return UNSEEN
-        if k <= radius + _SLACK:
-            is_whole = is_whole and side_of_box(fields.known, known, size, u0, u1, v0, v1) == INSIDE
+        if k <= radius + _SLACK and is_whole:
+            side = side_of_box(fields.known, known, size, u0, u1, v0, v1)
+            if side == OUTSIDE:
+                return UNSEEN
+            is_whole = side == INSIDE
     if d > radius + _SLACK:
         return INSIDE if is_whole else PARTLY
     if not is_whole:

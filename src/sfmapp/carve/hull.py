@@ -105,8 +105,8 @@ def hull_of(
 
     Args:
         views, silhouettes: one of each for a photograph.
-        min_views: see :class:`Hull`; None: half of the views, and two at least if there are two. Where few look, as
-            beyond the pictures of most, the cones of these few would be left standing.
+        min_views: see :class:`Hull`; None: half of the views that know anything, and two at least if there are two.
+            Where few look, as beyond the pictures of most, the cones of these few would be left standing.
         misses: see :class:`Hull`.
 
     Raises:
@@ -135,7 +135,10 @@ def hull_of(
         distance[starts[k] : starts[k + 1]] = _steps(silhouette.distance).ravel()
     begin = 0
     for k, mask in unknown:
-        signed = distance_transform_edt(mask) - distance_transform_edt(~mask)
+        # where nothing at all is known there is no border to be away from
+        signed = (
+            distance_transform_edt(mask) - distance_transform_edt(~mask) if mask.any() else np.full(mask.shape, -np.inf)
+        )
         known_starts[k] = begin
         known[begin : begin + mask.size] = _steps(signed - 0.5 * np.sign(signed)).ravel()
         begin += mask.size
@@ -148,7 +151,8 @@ def hull_of(
         known_starts,
         known,
     )
-    least = max(2, (len(views) + 1) // 2) if min_views is None else min_views
+    num_telling = sum(s.known is None or bool(s.known.any()) for s in silhouettes)
+    least = max(2, (num_telling + 1) // 2) if min_views is None else min_views
     return Hull(fields, np.array(order), min(least, len(views)), misses)
 
 
