@@ -99,6 +99,7 @@ def rows_of(folder: Path) -> list[Row]:
         "uncalibrated": uncalibrated_rows,
         "planes": plane_rows,
         "stereo": stereo_rows,
+        "stereo_exposure": exposure_rows,
         "dense_pairs": pair_rows,
         "carving": carving_rows,
     }
@@ -207,6 +208,17 @@ def stereo_rows(folder: Path) -> Iterator[Row]:
                 case = f"{name}, {'windows' if mine.endswith('window') else 'semi-global'}"
                 best = (min if better == "less" else max)(told)
                 yield Row("stereo", case, quantity, unit, better, own, peer, best, *about)
+
+
+def exposure_rows(folder: Path) -> Iterator[Row]:
+    """Semi-global matching of pairs that are exposed differently, against StereoSGBM."""
+    report = read(folder, "stereo_exposure")
+    about = (False, report["date"][:10], report["commit"])
+    runs = {(run["set"], run["change"], run["matcher"]): run for run in report["runs"]}
+    for name, change in dict.fromkeys((run["set"], run["change"]) for run in report["runs"]):
+        own, peer = (runs[name, change, matcher]["none_or_bad1"] for matcher in ("sfmapp", "StereoSGBM"))
+        case = f"{name}, right picture: {change}"
+        yield Row("stereo_exposure", case, "none or bad-1", "%", "less", own, "StereoSGBM", peer, *about)
 
 
 def circle_rows(folder: Path) -> Iterator[Row]:
