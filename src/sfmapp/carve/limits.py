@@ -1,0 +1,251 @@
+"""What a carved surface cannot tell: where only outlines vouch for it, what no photograph sees, where to stand next.
+
+Bounds are those that silhouettes prove. The object lies inside the hull, so its volume is no more than the hull's; a
+sheet of paper can have the same silhouettes as a block, so there is no least volume. Each ray inside a silhouette goes
+through the surface twice, no nearer than it enters the hull, so its area is no less than twice the integral of the
+squared distance over the solid angle; a rough surface may have any area, so there is no largest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.carve.joined_kernels import BINS, vote
+from sfmapp.carve.rendering import show_mesh
+from sfmapp.carve.sight import Sight
+from sfmapp.carve.silhouettes import Silhouette
+from sfmapp.carve.views import View, project_points
+from sfmapp.geometry import rigid3
+from sfmapp.reporting import Report
+from sfmapp.scene.mesh import Mesh, face_areas, face_vectors
+from sfmapp.surface.trim import pieces
+
+Array = NDArray[np.float64]
+
+# who vouches for a piece of the surface
+UNSEEN, OUTLINES, PATCHES = 0, 1, 2
+# a view sees a surface that is this much turned towards it, as ``sfmapp dense`` asks for
+_SMALLEST_COSINE = 0.2
+# a place is hidden if the surface in front of it is nearer by more than this, in edges of triangles
+_HIDDEN_EDGES = 2.0
+# outlines are believed within so many of their sigmas
+_SIGMAS = 3.0
+# directions that are tried for the next photograph, spread evenly over the sphere
+_NUM_TRIED = 96
+# unseen places are listed from this share of the whole surface on
+_SMALLEST_HOLLOW = 0.002
+
+
+class Hollow(Report):
+    """A piece of the surface that no photograph sees.
+
+    Attributes:
+        at: its middle, world. faces: unit direction in which it looks, from where a camera might see it.
+        share: of the whole surface.
+    """
+
+    at: Sequence[float]
+    faces: Sequence[float]
+    share: float
+
+
+class NextView(Report):
+    """Where a photograph would help.
+
+    Attributes:
+        place: of a camera that looks at the middle of the object, world.
+        gain_share: of the surface, what is turned to it that no photograph sees.
+    """
+
+    place: Sequence[float]
+    gain_share: float
+
+
+class LimitsReport(Report):
+    """What is not known of a surface.
+
+    Attributes:
+        patches_share, outlines_share, unseen_share: of its area, what patches vouch for; what photographs see, but
+            only outlines bound, so that a hollow may be there; and what no photograph sees.
+        hollows: the largest unseen pieces. next_views: places for photographs, the most useful first.
+        volume_high: the object has no more, cubic units of the world. area_low: no less, square units.
+    """
+
+    patches_share: float
+    outlines_share: float
+    unseen_share: float
+    hollows: Sequence[Hollow]
+    next_views: Sequence[NextView]
+    volume_high: float
+    area_low: float
+
+
+@dataclass(frozen=True)
+class Known:
+    """Triangles (F) of a surface and what is known of them.
+
+    Attributes:
+        kind: (F,) ``UNSEEN``, ``OUTLINES`` or ``PATCHES``.
+        centers, normals: (F, 3), world. areas: (F,).
+        num_seeing: (F,) photographs that see it.
+    """
+
+    kind: NDArray[np.int8]
+    centers: Array
+    normals: Array
+    areas: Array
+    num_seeing: NDArray[np.int32]
+
+
+def find_known(mesh: Mesh, views: Sequence[View], sights: Sequence[Sight] = (), band: float = 0.0) -> Known:
+    """Who vouches for each triangle.
+
+    Args:
+        mesh: closed.
+        views: the photographs.
+        sights: what they see of patches, if there are any. band: within which a patch vouches, units of the world.
+    """
+    vectors = face_vectors(mesh.xyz, mesh.faces)
+    areas = np.linalg.norm(vectors, axis=1)
+    normals = vectors / np.maximum(areas, 1e-300)[:, None]
+    centers = np.ascontiguousarray(mesh.xyz[mesh.faces].mean(axis=1))
+    edge = float(np.sqrt(np.median(areas)) * 1.5)
+    seeing = np.zeros(len(areas), np.int32)
+    for view in views:
+        seeing += _sees(view, mesh, centers, normals, edge)
+    votes = np.zeros((len(areas), BINS), np.uint8)
+    for sight in sights:
+        outer = np.column_stack([rigid3.rotation_matrix(sight.cam_from_world), sight.cam_from_world[4:]])
+        vote(centers, outer, sight.k, sight.depth, sight.normal, band, votes)
+    kind = np.where(seeing > 0, OUTLINES, UNSEEN).astype(np.int8)
+    kind[(votes[:, 1 : BINS - 1] > 0).any(axis=1)] = PATCHES
+    return Known(kind, centers, normals, areas, seeing)
+
+
+def _sees(view: View, mesh: Mesh, centers: Array, normals: Array, edge: float) -> NDArray[np.bool_]:
+    """Which triangles (F,) a view shows from in front, unhidden."""
+    shown = show_mesh(view, mesh.xyz, mesh.faces)
+    seen = np.empty((len(centers), 3))
+    project_points(view.row, centers, seen)
+    toward = view.center - centers
+    away = np.linalg.norm(toward, axis=1)
+    in_front = (toward * normals).sum(axis=1) > _SMALLEST_COSINE * away
+    inside = (seen[:, :2] >= 0.0).all(axis=1) & (seen[:, 0] < view.width) & (seen[:, 1] < view.height)
+    found = in_front & inside & (seen[:, 2] > 0.0)
+    u, v = seen[found, 0].astype(int), seen[found, 1].astype(int)
+    found[found] = seen[found, 2] <= shown.depth[v, u] + _HIDDEN_EDGES * edge
+    return np.asarray(found)
+
+
+def find_limits(
+    mesh: Mesh, hull_mesh: Mesh, views: Sequence[View], silhouettes: Sequence[Silhouette], known: Known
+) -> LimitsReport:
+    """What is not known of a surface.
+
+    Args:
+        mesh: the surface, of which ``known`` tells. hull_mesh: that of the hull, which may be the same.
+        views, silhouettes: one of each for a photograph.
+    """
+    total = float(known.areas.sum())
+    shares = [float(known.areas[known.kind == kind].sum()) / total for kind in (UNSEEN, OUTLINES, PATCHES)]
+    return LimitsReport(
+        unseen_share=shares[UNSEEN], outlines_share=shares[OUTLINES], patches_share=shares[PATCHES],
+        hollows=_hollows(mesh, known), next_views=_next_views(mesh, views, known),
+        volume_high=_volume_high(hull_mesh, views, silhouettes), area_low=_area_low(hull_mesh, views, silhouettes),
+    )  # fmt: skip
+
+
+def _hollows(mesh: Mesh, known: Known) -> list[Hollow]:
+    idx = np.flatnonzero(known.kind == UNSEEN)
+    if not len(idx):
+        return []
+    piece = pieces(mesh.faces[idx], len(mesh.xyz))
+    areas = np.bincount(piece, known.areas[idx])
+    found = []
+    for number in np.argsort(-areas, kind="stable"):
+        share = float(areas[number] / known.areas.sum())
+        if share < _SMALLEST_HOLLOW:
+            break
+        mine = idx[piece == number]
+        weight = known.areas[mine, None]
+        way = (weight * known.normals[mine]).sum(axis=0)
+        way = way / max(float(np.linalg.norm(way)), 1e-300)
+        at = (weight * known.centers[mine]).sum(axis=0) / weight.sum()
+        found.append(Hollow(at=at.tolist(), faces=way.tolist(), share=share))
+    return found
+
+
+def _next_views(mesh: Mesh, views: Sequence[View], known: Known, num: int = 3) -> list[NextView]:
+    """Places on the sphere that the photographs were taken from, one after another, each for what those before leave.
+
+    What hides what is not asked: the surface before an unseen hollow is one that nobody has seen.
+    """
+    middle = (mesh.xyz.min(axis=0) + mesh.xyz.max(axis=0)) / 2.0
+    away = float(np.median([np.linalg.norm(view.center - middle) for view in views]))
+    n = np.arange(_NUM_TRIED)
+    height, turn = 1.0 - (2.0 * n + 1.0) / _NUM_TRIED, n * np.pi * (3.0 - np.sqrt(5.0))
+    flat = np.sqrt(1.0 - height**2)
+    tried = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
+    toward = middle + away * tried
+    unseen = np.flatnonzero(known.kind == UNSEEN)
+    found: list[NextView] = []
+    for _ in range(num):
+        shown = [_faces(known, unseen, place) for place in toward]
+        gains = [float(known.areas[unseen[s]].sum()) for s in shown]
+        best = int(np.argmax(gains))
+        share = gains[best] / float(known.areas.sum())
+        if share < _SMALLEST_HOLLOW:
+            break
+        found.append(NextView(place=toward[best].tolist(), gain_share=share))
+        unseen = unseen[~shown[best]]
+    return found
+
+
+def _faces(known: Known, idx: NDArray[np.int64], place: Array) -> NDArray[np.bool_]:
+    """Which triangles of some are turned towards a place."""
+    way = place - known.centers[idx]
+    along = (way * known.normals[idx]).sum(axis=1)
+    return np.asarray(along > _SMALLEST_COSINE * np.linalg.norm(way, axis=1))
+
+
+def _volume_high(hull_mesh: Mesh, views: Sequence[View], silhouettes: Sequence[Silhouette]) -> float:
+    """Of the hull with its outlines farther out by three sigmas."""
+    a, b, c = (hull_mesh.xyz[hull_mesh.faces[:, k]] - hull_mesh.xyz.mean(axis=0) for k in range(3))
+    volume = float(np.einsum("fc,fc->", a, np.cross(b, c)) / 6.0)
+    middle = hull_mesh.xyz.mean(axis=0)
+    widths = []
+    for view, silhouette in zip(views, silhouettes, strict=True):
+        here = np.empty((2, 3))
+        # a step across the axis by a small share of the depth
+        across = np.linalg.svd(view.axis[None])[2][1]
+        depth = float(np.linalg.norm(middle - view.center))
+        project_points(view.row, np.stack([middle, middle + 1e-3 * depth * across]), here)
+        px = float(np.linalg.norm(here[1, :2] - here[0, :2]))
+        widths.append(_SIGMAS * silhouette.outline_sigma_px * 1e-3 * depth / px)
+    return volume + float(np.median(widths)) * float(face_areas(hull_mesh.xyz, hull_mesh.faces).sum())
+
+
+def _area_low(hull_mesh: Mesh, views: Sequence[View], silhouettes: Sequence[Silhouette]) -> float:
+    """The largest over the views of twice the integral of squared distance over solid angle, three sigmas inside."""
+    best = 0.0
+    for view, silhouette in zip(views, silhouettes, strict=True):
+        if view.camera is None:  # angles of a matrix that may not be decomposed are not known
+            continue
+        shown = show_mesh(view, hull_mesh.xyz, hull_mesh.faces).depth
+        sure = silhouette.distance > _SIGMAS * silhouette.outline_sigma_px + 0.5
+        if silhouette.known is not None:
+            sure &= silhouette.known
+        v, u = np.nonzero(sure & np.isfinite(shown))
+        if not len(u):
+            continue
+        # r^2 dOmega of a pixel on a plane at depth z is z^2 / (fx fy) times the cosine to the axis
+        fx, fy, cx, cy = view.camera.k_matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+        x, y = (u + 0.5 - cx) / fx, (v + 0.5 - cy) / fy
+        cosine = 1.0 / np.sqrt(1.0 + x**2 + y**2)
+        depth = shown[v, u].astype(np.float64)
+        best = max(best, 2.0 * float((depth**2 * cosine).sum() / (fx * fy)))
+    return best
