@@ -102,6 +102,7 @@ def rows_of(folder: Path) -> list[Row]:
         "stereo_exposure": exposure_rows,
         "dense_pairs": pair_rows,
         "carving": carving_rows,
+        "masks": mask_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
 
@@ -316,6 +317,16 @@ def carving_rows(folder: Path) -> Iterator[Row]:
         ours, strict = (100.0 * min(row[how] for row in mine) for how in ("tolerant", "strict"))
         what = f"masks with {kind}s, IoU with the clean hull, least"
         yield Row("carving", case, what, "%", "more", ours, "strict carving", strict, *about)
+
+
+def mask_rows(folder: Path) -> Iterator[Row]:
+    """Silhouettes by shared colours against GrabCut, which is told where the object is."""
+    report = read(folder, "masks")
+    about, peer = (False, report["date"][:10], report["commit"]), "GrabCut with the true rectangle"
+    for row in report["rows"]:
+        case = f"lego before {row['background']}"
+        yield Row("masks", case, "IoU", "%", "more", 100 * row["iou"], peer, 100 * row["peer_iou"], *about)
+        yield Row("masks", case, "CPU time", "ms", "less", row["cpu_ms"], peer, row["peer_cpu_ms"], *about)
 
 
 def known_point_rows(folder: Path) -> Iterator[Row]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from carving_photographs import coverage_of, photograph
 from carving_scenes import around, ball, both, box
+from sfmapp.carve.graph_cut import cut_by_mask
 from sfmapp.carve.masks_report import MasksReport
 from sfmapp.carve.silhouettes import MaskOptions, Silhouette, find_silhouettes
 from sfmapp.errors import InputError
@@ -20,16 +21,17 @@ from sfmapp.images.load import load_images
 
 SOLID = both(ball(0.5, (0.5, 0.2, 0.1)), box((0.3, 0.4, 0.6), (-0.4, 0.0, 0.0)))
 COVERAGES = [coverage_of(view, SOLID, 5) for view in around(6, width=96, height=72)]
+AUTO = MaskOptions()
 PHOTOGRAPHS = [photograph(coverage, seed) for seed, coverage in enumerate(COVERAGES)]
 
 
 def found_in(
-    pictures: list[NDArray[np.uint8]], masks: list[NDArray[np.uint8]] | None = None
+    pictures: list[NDArray[np.uint8]], masks: list[NDArray[np.uint8]] | None = None, options: MaskOptions = AUTO
 ) -> tuple[list[Silhouette], MasksReport]:
     named = {f"{i}.png": picture for i, picture in enumerate(pictures)}
     given = {f"{i}.png": mask for i, mask in enumerate(masks or [])}
     images, _ = load_images(named, ImageOptions(), Events(), masks=given)
-    return find_silhouettes(images, None, MaskOptions(), Events())
+    return find_silhouettes(images, None, options, Events())
 
 
 def bytes_of(coverage: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -37,8 +39,12 @@ def bytes_of(coverage: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def agreement(silhouette: Silhouette, coverage: NDArray[np.float32]) -> float:
+    return agreement_of(silhouette.inside, coverage)
+
+
+def agreement_of(inside: NDArray[np.bool_], coverage: NDArray[np.float32]) -> float:
     """Intersection over union."""
-    inside, true = silhouette.inside, coverage > 0.5
+    true = coverage > 0.5
     return float((inside & true).sum() / (inside | true).sum())
 
 
@@ -72,6 +78,23 @@ def test_background_is_learned() -> None:
     assert report.color_error is not None
     assert report.color_error < 0.02
     assert min(agreement(s, c) for s, c in zip(silhouettes, COVERAGES, strict=True)) > 0.98
+
+
+def test_a_cut_mends_a_rough_mask() -> None:
+    for seed, (picture, coverage) in enumerate(zip(PHOTOGRAPHS[:3], COVERAGES, strict=False)):
+        rng, true = np.random.default_rng(seed), coverage > 0.5
+        holes = np.kron(rng.random((18, 24)) < 0.2, np.ones((4, 4), bool))
+        wide = cv2.dilate(true.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        rough = np.where(rng.random(true.shape[1]) < 0.5, true & ~holes, wide & ~holes)
+        cut = cut_by_mask(picture, rough)
+        assert agreement_of(rough, coverage) < 0.85
+        assert agreement_of(cut, coverage) > 0.95
+
+
+def test_grabcut_needs_no_other_photographs() -> None:
+    silhouettes, report = found_in(PHOTOGRAPHS[:1], options=MaskOptions(mask_source="grabcut"))
+    assert report.masks[0].source == "grabcut"
+    assert agreement(silhouettes[0], COVERAGES[0]) > 0.97
 
 
 def test_results_do_not_depend_on_threads() -> None:

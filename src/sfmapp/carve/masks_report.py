@@ -12,7 +12,8 @@ class PhotographMask(Report):
 
     Attributes:
         name: of the photograph.
-        source: what told it: ``alpha``, ``mask``, ``background``, ``dark background``; ``none`` where nothing did.
+        source: what told it: ``alpha``, ``mask``, ``background``, ``dark background``, ``grabcut``; ``none`` where
+            nothing did.
         share: of the pixels that are inside.
         border_share: of the pixels along the edge of the picture that are inside.
         confidence: between 0.5 and 1, see :class:`sfmapp.carve.silhouettes.Silhouette`.

@@ -176,6 +176,13 @@ def refined_coverage(picture: NDArray[np.uint8], mask: NDArray[np.bool_]) -> Cov
     import cv2
 
     plain = coverage_of_mask(mask)
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return plain
+    cut = np.s_[
+        max(rows[0] - _WINDOW, 0) : rows[-1] + _WINDOW + 1, max(columns[0] - _WINDOW, 0) : columns[-1] + _WINDOW + 1
+    ]
+    whole, picture, mask, plain = plain, picture[cut], mask[cut], plain[cut]
     square = np.ones((2 * _REACH + 1,) * 2, np.uint8)
     core = cv2.erode(mask.astype(np.uint8), square)
     outer = 1 - cv2.dilate(mask.astype(np.uint8), square)
@@ -187,7 +194,8 @@ def refined_coverage(picture: NDArray[np.uint8], mask: NDArray[np.bool_]) -> Cov
     length = np.einsum("hwc,hwc->hw", across, across)
     share = np.einsum("hwc,hwc->hw", color - outer_mean, across) / np.maximum(length, 1e-6)
     tells = near_core & near_outer & (length > _CONTRAST**2 * (inner_spread + outer_spread)) & (core + outer == 0)
-    return np.asarray(np.where(tells, np.clip(share, 0.0, 1.0), plain), np.float32)
+    whole[cut] = np.where(tells, np.clip(share, 0.0, 1.0), plain)
+    return whole
 
 
 def _local_colors(

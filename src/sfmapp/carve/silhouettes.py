@@ -16,16 +16,17 @@ from typing import TYPE_CHECKING, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.carve.backgrounds import MAX_LEARNED, ColorModel, learn_colors, object_mask
+from sfmapp.carve.backgrounds import MAX_LEARNED, ColorModel, learn_colors, object_mask, without_specks
 from sfmapp.carve.consistency import compare
+from sfmapp.carve.graph_cut import cut_by_mask, cut_by_rectangle
 from sfmapp.carve.masks_report import MasksReport, PhotographMask
 from sfmapp.carve.outlines import Coverage, Silhouette, coverage_of_mask, refined_coverage, signed_distance
+from sfmapp.carve.views import View, project_points
 from sfmapp.errors import InputError
 from sfmapp.images.pixels import read_mask_coverage, read_rgb, read_with_alpha
 from sfmapp.option_checks import check_options
 
 if TYPE_CHECKING:
-    from sfmapp.carve.views import View
     from sfmapp.events import Events
     from sfmapp.images.image_set import ImageRecord, ImageSet
 
@@ -35,7 +36,7 @@ STAGE = "masks"
 T = TypeVar("T")
 
 # standard deviations of outlines against exact ones: tests/test_carve_outlines.py
-_SIGMA_PX = {"alpha": 0.1, "mask": 0.2, "background": 0.3, "dark background": 0.3}
+_SIGMA_PX = {"alpha": 0.1, "mask": 0.2, "background": 0.3, "dark background": 0.3, "grabcut": 0.5}
 # more of the edge of the picture than this inside, and more than of the whole: the mask is the background's
 _INVERTED = 0.5
 # what is seen of the object is at least this share of a photograph, for outlines to mean anything
@@ -43,6 +44,12 @@ _LEAST_SHARE = 1e-5
 # share of pixels that are black or white to the last level, from which on a photograph is a mask itself
 _TWO_VALUED = 0.98
 _NAMES_SHOWN = 3
+# colours that overlap by more than this are not all: neighbours that look alike are kept together then
+_TELLING = 0.005
+# share of the shorter side along the edges where GrabCut expects no object, and its confidence (benchmarks/masks.py)
+_EDGE, _GRABCUT = 0.04, 0.95
+# points that tell where the object is
+_FEW_POINTS = 16
 # share of a silhouette above which a spill or a hole is told
 _WORTH_A_LINE = 1e-3
 
@@ -53,10 +60,11 @@ class MaskOptions:
 
     Attributes:
         mask_source: Where the object is told from: alpha, mask files, or the colours of the background; auto takes the
-            first that is there.
+            first that is there. grabcut, which has to be asked for, cuts it out of each photograph by itself, within
+            what the points of a reconstruction span, or all of the picture but its edges.
     """
 
-    mask_source: Literal["auto", "alpha", "mask", "background"] = "auto"
+    mask_source: Literal["auto", "alpha", "mask", "background", "grabcut"] = "auto"
 
     def __post_init__(self) -> None:
         check_options("masks", self, {})
@@ -77,6 +85,7 @@ def find_silhouettes(
     options: MaskOptions,
     events: Events,
     *,
+    points: NDArray[np.float64] | None = None,
     threads: int | None = None,
 ) -> tuple[list[Silhouette], MasksReport]:
     """The object's silhouette in each photograph.
@@ -86,6 +95,7 @@ def find_silhouettes(
         views: their cameras, in the same order; None: silhouettes are not compared with each other.
         options: see :class:`MaskOptions`.
         events: told of progress, of what was taken, and of silhouettes that cannot be right.
+        points: (N, 3) points of a reconstruction: GrabCut looks for the object where they are.
         threads: photographs at a time; the result does not depend on it.
 
     Returns:
@@ -103,9 +113,11 @@ def find_silhouettes(
     events.started(STAGE, f"silhouettes in {len(records)} photographs", total=len(records))
     source = _choose_source(records, options)
     model = _learn(records, source, workers, events)
+    index = {record.name: i for i, record in enumerate(records)}
 
     def work(record: ImageRecord) -> tuple[Silhouette, PhotographMask]:
-        return _with_problem(record, _find(record, source, model))
+        view = None if views is None else views[index[record.name]]
+        return _with_problem(record, _find(record, source, model, _rectangle(record, view, points)))
 
     found = _each(work, records, workers, lambda record: events.advanced(STAGE, message=record.name))
     warnings = _warn([entry for _, entry in found], events)
@@ -194,7 +206,9 @@ def _learn(records: Sequence[ImageRecord], source: str, workers: int, events: Ev
     return model
 
 
-def _find(record: ImageRecord, source: str, model: ColorModel | None) -> _Found | None:
+def _find(
+    record: ImageRecord, source: str, model: ColorModel | None, rectangle: tuple[int, int, int, int]
+) -> _Found | None:
     """What the source says of a photograph; None if it says nothing."""
     if source == "mask":
         levels = read_mask_coverage(record)
@@ -205,11 +219,33 @@ def _find(record: ImageRecord, source: str, model: ColorModel | None) -> _Found 
     if source == "alpha":
         _, alpha = read_with_alpha(record)
         return None if alpha is None else _Found(_coverage(alpha), "alpha", 1.0)
-    assert model is not None
     picture = read_rgb(record)
-    coverage = refined_coverage(picture, object_mask(picture, model))
+    if source == "grabcut":
+        coverage = refined_coverage(picture, without_specks(cut_by_rectangle(picture, rectangle)))
+        return _Found(coverage, "grabcut", _GRABCUT)
+    assert model is not None
+    mask = object_mask(picture, model)
+    if model.error > _TELLING:
+        mask = without_specks(cut_by_mask(picture, mask))
+    coverage = refined_coverage(picture, mask)
     source = "dark background" if model.is_dark else "background"
     return _Found(coverage, source, float(np.clip(1.0 - model.error, 0.5, 1.0)))
+
+
+def _rectangle(record: ImageRecord, view: View | None, points: NDArray[np.float64] | None) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of what the object lies within: what most points span, or all but the edges."""
+    edge = max(2, round(_EDGE * min(record.width, record.height)))
+    left, top, right, bottom = edge, edge, record.width - edge, record.height - edge
+    if view is not None and points is not None and len(points) >= _FEW_POINTS:
+        seen = np.empty((len(points), 3))
+        project_points(view.row, np.ascontiguousarray(points, np.float64), seen)
+        shown = seen[(seen[:, 2] > 0.0) & np.isfinite(seen).all(axis=1), :2]
+        if len(shown) >= _FEW_POINTS:
+            (x0, y0), (x1, y1) = np.quantile(shown, (0.02, 0.98), axis=0)
+            around = 0.1 * max(x1 - x0, y1 - y0)
+            left, right = max(left, int(x0 - around)), min(right, int(x1 + around) + 1)
+            top, bottom = max(top, int(y0 - around)), min(bottom, int(y1 + around) + 1)
+    return left, top, right, bottom
 
 
 def _coverage(levels: NDArray[np.uint8]) -> Coverage:
@@ -274,15 +310,18 @@ def _compared(
     verdicts = compare(views, [each for each, _ in found], repairs=repairs, workers=workers, events=events)
     result, warnings = [], []
     for (_, entry), verdict in zip(found, verdicts, strict=True):
+        # what others speak against was wrong, whatever has become of it
+        wrong = verdict.spilled + verdict.filled + 0.5 * verdict.doubtful
+        silhouette = replace(verdict.silhouette, confidence=max(0.5, verdict.silhouette.confidence - wrong))
         told = replace(
             entry, spilled=verdict.spilled, filled=verdict.filled, doubtful=verdict.doubtful,
             turned_deg=verdict.turned_deg,
-            problem=entry.problem or verdict.problem, confidence=verdict.silhouette.confidence,
+            problem=entry.problem or verdict.problem, confidence=silhouette.confidence,
         )  # fmt: skip
         if verdict.problem:
             warnings.append(f"{entry.name} {verdict.problem}")
             events.warned(STAGE, f"{warnings[-1]}; it carves nothing")
-        result.append((verdict.silhouette, told))
+        result.append((silhouette, told))
     return result, warnings + _told_of_repairs([entry for _, entry in result], repairs, events)
 
 

@@ -58,7 +58,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     cameras.add_argument("--poses", metavar="FILE", help="poses or projection matrices, where SOURCE holds none")
     cameras.add_argument("--camera", metavar="MODEL,...|FILE", help="the lens, where poses come without one")
     cameras.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; the object is white")
-    cameras.add_argument("--mask-source", metavar="NAME", help="alpha, mask or background; default: what is there")
+    cameras.add_argument("--mask-source", metavar="NAME", help="alpha, mask, background or grabcut")
     cameras.add_argument(
         "--lights", metavar="FILE", help="JSON file of photographs under single lights, whose shadows carve hollows"
     )

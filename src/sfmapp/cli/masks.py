@@ -46,7 +46,11 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--poses", metavar="FILE", help="poses or projection matrices, where SOURCE holds none")
     parser.add_argument("--camera", metavar="MODEL,...|FILE", help="the lens, where poses come without one")
     parser.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; the object is white")
-    parser.add_argument("--mask-source", metavar="NAME", help="alpha, mask or background; default: what is there")
+    parser.add_argument(
+        "--mask-source",
+        metavar="NAME",
+        help="alpha, mask, background or grabcut; default: what is there",
+    )
     parser.add_argument("--threads", metavar="N", help="default: all cores; results do not depend on it")
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_masks)

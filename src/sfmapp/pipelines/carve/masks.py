@@ -7,6 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sfmapp.carve.silhouettes import Silhouette, find_silhouettes
 from sfmapp.carve.views import View
 from sfmapp.errors import InputError, UsageError
@@ -71,11 +74,11 @@ def find_masks(
         InputError: photographs, cameras or masks that cannot be used.
     """
     with Job.opened(MASKS, what.source, output, options, events=events, watch=watch) as job:
-        records, views, cameras = _photographs(what, job)
+        records, views, points, cameras = _photographs(what, job)
         job.note_inputs({record.name: record.digest for record in records})
         with job.stage("masks"):
             silhouettes, masks = find_silhouettes(
-                ImageSet(records, ()), views, job.options.masks, job.events, threads=job.threads
+                ImageSet(records, ()), views, job.options.masks, job.events, points=points, threads=job.threads
             )
         with job.stage("files"):
             is_usable = [entry.is_usable for entry in masks.masks]
@@ -91,8 +94,10 @@ def find_masks(
         return MasksResult(job.workspace.folder, report, silhouettes)
 
 
-def _photographs(what: MasksInput, job: Job) -> tuple[tuple[ImageRecord, ...], tuple[View, ...] | None, str]:
-    """Photographs, their cameras where these are known, and what they are in words."""
+def _photographs(
+    what: MasksInput, job: Job
+) -> tuple[tuple[ImageRecord, ...], tuple[View, ...] | None, NDArray[np.float64] | None, str]:
+    """Photographs, where they are known their cameras and points (N, 3), and what cameras are in words."""
     with job.stage("views"):
         try:
             found = find_views(what.source, what.images, what.poses, job.options, job.events)
@@ -100,13 +105,13 @@ def _photographs(what: MasksInput, job: Job) -> tuple[tuple[ImageRecord, ...], t
             if what.poses is not None:
                 raise
         else:
-            return found.records, found.views, found.cameras
+            return found.records, found.views, found.points, found.cameras
         inside = Path(what.source) / "images"
         folder = what.images if what.images is not None else inside if inside.is_dir() else what.source
         images, _ = load_images(folder, job.options.images, job.events, threads=job.threads)
         if not images.images:
             raise InputError(f"{os.fspath(folder)}: expected photographs, found none")
-        return images.images, None, "no cameras: silhouettes are not held against each other"
+        return images.images, None, None, "no cameras: silhouettes are not held against each other"
 
 
 def _write(

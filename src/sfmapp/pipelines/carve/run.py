@@ -133,7 +133,7 @@ def carve(
         with job.stage("masks"):
             images = ImageSet(source.records, ())
             silhouettes, masks = find_silhouettes(
-                images, source.views, job.options.masks, job.events, threads=job.threads
+                images, source.views, job.options.masks, job.events, points=source.points, threads=job.threads
             )
         with job.stage("box"):
             box = _box(what, source, silhouettes, job)
