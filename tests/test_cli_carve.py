@@ -104,6 +104,40 @@ def test_the_same_call_goes_on_with_the_octree(photographs: Path, carved: Path, 
     assert (tmp_path / "again" / "mesh.ply").read_bytes() == before
 
 
+def test_a_call_that_was_stopped_goes_on(photographs: Path, tmp_path: Path) -> None:
+    events = sfmapp.Events()
+
+    def stop(event: sfmapp.Event) -> None:
+        if event.kind == "started" and event.stage == "surface":
+            events.cancel()
+
+    events.subscribe(stop)
+    options = sfmapp.load_options(settings=["carve.cells=32"])
+    with pytest.raises(sfmapp.InterruptedRunError):
+        sfmapp.carve_volume(photographs, tmp_path / "out", options, events=events)
+    assert not (tmp_path / "out" / "mesh.ply").exists()
+    found = sfmapp.carve_volume(photographs, tmp_path / "out", options)
+    assert "carve" not in found.report.usage
+    assert VOLUME < found.report.surface.volume < 1.2 * VOLUME
+
+
+def test_a_box_cuts_the_volume(photographs: Path, tmp_path: Path) -> None:
+    options = sfmapp.load_options(settings=["carve.cells=32"])
+    found = sfmapp.carve_volume(photographs, tmp_path / "cut", options, box=[-0.9, -0.8, -0.7, 0, 1, 1])
+    assert found.mesh.xyz[:, 0].max() == pytest.approx(0.0, abs=0.05 * found.octree.cell)
+    low, high = found.octree.volume_bounds()
+    assert low < found.report.surface.volume < high
+    # half of the solid, and half of what ten silhouettes leave around it, which is not the same on all sides
+    assert 0.5 * VOLUME < found.report.surface.volume < 0.65 * VOLUME
+    assert any("the box leaves out" in (line.message or "") for line in found.report.warnings)
+    # what the box cuts is a plane, and is closed
+    at_plane = found.mesh.xyz[:, 0] > -0.1 * found.octree.cell
+    assert at_plane.any()
+    assert (found.mesh.normal[at_plane, 0] > 0.3).all()
+    edges = np.sort(found.mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+
+
 def test_what_cannot_be_carved_is_refused(
     photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,0 +1,164 @@
+"""The solid that is left of a box: by silhouettes, then by shadows, or by silhouettes and patches together."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.carve.box import Box, clip_octree, tightened
+from sfmapp.carve.files import read_octree, write_octree
+from sfmapp.carve.hull import Hull, hull_of
+from sfmapp.carve.isosurface import Distance, Normals
+from sfmapp.carve.joined import Joined, JoinReport
+from sfmapp.carve.octree import Octree
+from sfmapp.carve.silhouettes import Silhouette
+from sfmapp.carve.space_carving import CarvingReport, carve_hull
+from sfmapp.errors import InputError, NoReconstructionError
+from sfmapp.events import Events
+from sfmapp.pipelines.carve.joining import Photographs, join_patches
+from sfmapp.pipelines.carve.lights import carve_by_lights
+from sfmapp.pipelines.carve.outputs import CARVING, JOINED, OCTREE, SHADOWED
+from sfmapp.pipelines.carve.sources import CarveSource
+from sfmapp.report.carve_document import ShadowsReport
+from sfmapp.reporting import from_plain
+from sfmapp.workspace.job import Job
+from sfmapp.workspace.keys import input_key, stage_key
+from sfmapp.workspace.layout import CARVE
+
+Array = NDArray[np.float64]
+FilePath = str | os.PathLike[str]
+STAGE = CARVE
+# cells along the side of the volume that tells how much of its box is filled
+_COARSE = 64
+
+
+@dataclass(frozen=True)
+class Solid:
+    """What is left.
+
+    Attributes:
+        octree: its cells. distance, normals: of its surface, see :func:`sfmapp.carve.isosurface.surface_of`.
+        carving: how silhouettes carved it. shadows, joining: what shadows and patches did; None without.
+        files: names of the octrees that were written.
+    """
+
+    octree: Octree
+    distance: Distance
+    normals: Normals | None
+    carving: CarvingReport
+    shadows: ShadowsReport | None
+    joining: JoinReport | None
+    files: tuple[str, ...]
+
+
+def find_solid(
+    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], box: Box, *,
+    lights: FilePath | None = None, patches: Path | None = None,
+) -> Solid:  # fmt: skip
+    """Carve a box by silhouettes, and by what else there is.
+
+    Args:
+        lights: file of photographs under single lights. patches: file of dense patches. Not both.
+    """
+    hull, octree, carving = _carve(job, source, silhouettes, box)
+    folder = job.workspace.folder
+    if lights is not None:
+        with job.stage("shadows"):
+            octree, shadows, taken = carve_by_lights(Path(lights), source, silhouettes, octree, job.events, job.threads)
+            write_octree(folder / SHADOWED, octree)
+        shape = _shape(job, hull, octree, box, taken)
+        return Solid(octree, *shape, carving, shadows, None, (OCTREE, SHADOWED))
+    if patches is not None:
+        joined, joining = join_patches(job, patches, Photographs(source.views, silhouettes, hull), octree)
+        octree, distance = _joined_shape(joined, box)
+        write_octree(folder / JOINED, octree)
+        return Solid(octree, distance, None, carving, None, joining, (OCTREE, JOINED))
+    return Solid(octree, *_shape(job, hull, octree, box, None), carving, None, None, (OCTREE,))
+
+
+def _carve(
+    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], box: Box
+) -> tuple[Hull, Octree, CarvingReport]:  # fmt: skip
+    """The octree, that of an earlier call where it was finished with the same inputs and options."""
+    options, folder = job.options.carve, job.workspace.folder
+    hull = hull_of(source.views, silhouettes, min_views=options.min_views, misses=options.misses)
+    key = stage_key(
+        (__name__,), options, [input_key(record) for record in source.records], _digest(silhouettes),
+        [view.row.tolist() for view in source.views], box.low.tolist(), box.high.tolist(), box.told_by,
+    )  # fmt: skip
+    if job.workspace.is_current(STAGE, key):
+        try:
+            found = read_octree(folder / OCTREE), from_plain(CarvingReport, job.workspace.read_json(CARVING))
+            job.events.decided(STAGE, "the volume was carved by an earlier call")
+            return hull, *found
+        except (InputError, ValueError):
+            pass  # taken away or damaged: carved again
+    with job.stage(STAGE, key):
+        octree, report = _carved(job, source, hull, box)
+        job.events.raise_if_cancelled()
+        write_octree(folder / OCTREE, octree)
+        job.workspace.write_json(CARVING, report)
+    job.workspace.save()  # a call that is stopped from here on need not carve again
+    return hull, octree, report
+
+
+def _carved(job: Job, source: CarveSource, hull: Hull, box: Box) -> tuple[Octree, CarvingReport]:
+    """The volume in a box that a user gave; in one that silhouettes tell, which is loose, in what a coarse volume fills
+    of it."""
+    names, options = [view.name for view in source.views], job.options.carve
+    if box.told_by != "user" and options.cells > _COARSE:
+        coarse, _ = carve_hull(hull, names, *box.cube(), replace(options, cells=_COARSE), Events(), threads=job.threads)
+        box = tightened(box, coarse)
+    try:
+        octree, report = carve_hull(hull, names, *box.cube(), options, job.events, threads=job.threads)
+    except NoReconstructionError:
+        job.events.raise_if_cancelled()  # nothing is left of what was not looked at
+        raise
+    if box.told_by == "user":
+        octree = clip_octree(octree, box)
+        low, high = octree.volume_bounds()
+        report = replace(report, volume_low=low, volume_high=high)
+    return octree, report
+
+
+def _digest(silhouettes: Sequence[Silhouette]) -> str:
+    digest = hashlib.blake2b(digest_size=16)
+    for silhouette in silhouettes:
+        digest.update(silhouette.distance.tobytes())
+        if silhouette.known is not None:
+            digest.update(np.packbits(silhouette.known).tobytes())
+    return digest.hexdigest()
+
+
+def _shape(job: Job, hull: Hull, octree: Octree, box: Box, taken: Distance | None) -> tuple[Distance, Normals]:
+    """Signed distance and normals of the hull, cut off by the box of a user and by what shadows have taken away."""
+
+    def cut(xyz: Array) -> Array:
+        found = np.full(len(xyz), np.inf)
+        if box.told_by == "user":
+            found = np.minimum(found, box.distance(xyz))
+        return found if taken is None else np.minimum(found, taken(xyz))
+
+    def distance(xyz: Array) -> Array:
+        return np.minimum(hull.distance(xyz, job.threads), cut(xyz))
+
+    def normals(xyz: Array) -> NDArray[np.float32]:
+        found = hull.normals(xyz, octree.cell, job.threads)
+        # where the hull was cut, triangles tell them
+        found[cut(xyz) < 0.5 * octree.cell] = 0.0
+        return found
+
+    return distance, normals
+
+
+def _joined_shape(joined: Joined, box: Box) -> tuple[Octree, Distance]:
+    """Octree and signed distance of what silhouettes and patches leave, cut off by the box of a user."""
+    if box.told_by != "user":
+        return joined.tree, joined.distance
+    return clip_octree(joined.tree, box), lambda xyz: np.minimum(joined.distance(xyz), box.distance(xyz))
