@@ -68,6 +68,10 @@ def test_the_volume_is_the_solids_and_a_little_more(carved: Path) -> None:
     assert VOLUME < report["surface"]["volume"] < 1.2 * VOLUME
     assert min(view["iou"] for view in report["colors"]["views"]) > 0.94
     assert report["box"]["told_by"] == "silhouettes"
+    # the box is a solid of 1.92 with an area of 7.52, seen from 20 degrees above and 10 below
+    assert report["limits"]["volume_high"] > VOLUME
+    assert report["limits"]["area_low"] < 7.52
+    assert 0.0 < report["limits"]["unseen_share"] < 0.35
     octree = read_octree(carved / "octree.npz")
     assert octree.volume_bounds() == pytest.approx((low, high))
 
@@ -203,6 +207,7 @@ def test_the_page_shows_photographs_slices_and_levels(carved: Path) -> None:
     page = (carved / "report.html").read_text()
     assert page.count("data:image/jpeg") >= 3 * 4 + 3
     assert all(view.name in page for view in VIEWS)
+    assert "a photograph from here" in page
     octree = read_octree(carved / "octree.npz")
     ends = (np.array([-0.8, -0.6, -0.5]), np.array([0.8, 0.6, 0.5]))
     # a slice across z: 1.6 to the right and 1.2 up, in a picture of 1.1 times 1.6; without and with the border's cells

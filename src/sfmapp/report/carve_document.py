@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from sfmapp.carve.coloring import ColoringReport
 from sfmapp.carve.joined import JoinReport
+from sfmapp.carve.limits import LimitsReport
 from sfmapp.carve.masks_report import MasksReport
 from sfmapp.carve.shadow_carving import ShadowCarvingReport
 from sfmapp.carve.shadows import DetectionReport
@@ -64,6 +65,7 @@ class CarveReport(Report):
         cameras: what they are, in words. left_out: photographs without a camera, and cameras without a photograph.
         tolerance: holes of masks through which nothing was carved; absent where that was not asked for.
         shadows: what photographs under single lights took away; absent without.
+        limits: what is not known of the surface, and where to photograph from next; absent with a box or patches.
         texture: that of the GLB; absent where vertices have the colours.
         joining: what patches did to it; absent without.
         files: what was written, in the folder of the run.
@@ -80,6 +82,7 @@ class CarveReport(Report):
     carving: CarvingReport
     surface: SurfaceFacts
     colors: ColoringReport
+    limits: LimitsReport | None = None
     texture: TextureReport | None = None
     files: Sequence[str]
     usage: Mapping[str, Usage]

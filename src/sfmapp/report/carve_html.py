@@ -8,6 +8,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.carve.limits import LimitsReport
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View
@@ -21,6 +22,7 @@ Pixels = NDArray[np.uint8]
 
 # photographs that are shown: evenly spread, and of those that fit worst the first
 _NUM_SHOWN, _NUM_WORST = 4, 2
+_NUM_HOLLOWS = 5
 _SHOWN_PX, _QUALITY = 640, 85
 _STYLE = """<style>.trio{display:grid;grid-template-columns:repeat(3,1fr);gap:.8rem;margin-bottom:1rem}
 .key{display:inline-block;width:.8rem;height:.8rem;vertical-align:-.1rem;margin:0 .25rem 0 .6rem}</style>"""
@@ -45,6 +47,8 @@ def _body(
     yield _summary(report)
     yield from _photographs(report, views, silhouettes, mesh, read)
     yield from _fits(report)
+    if report.limits is not None:
+        yield _limits(report.limits)
     yield from _slices(octree, mesh)
     yield _levels(report)
     yield log_table("Decisions", report.decisions)
@@ -134,6 +138,28 @@ def _fits(report: CarveReport) -> Iterator[str]:
     yield f"<details><summary>All {len(rows)} photographs</summary>{table(head, rows)}</details>"
     for entry in report.left_out:
         yield f"<p class=dim>{escape(entry.name)}: {escape(entry.reason)}</p>"
+
+
+def _limits(limits: LimitsReport) -> str:
+    text = (
+        f"<h2>What is not known</h2><p>{limits.outlines_share:.1%} of the surface is told by outlines alone: "
+        f"photographs see it, and it may be hollow there. {limits.unseen_share:.1%} no photograph sees. The "
+        f"object's volume is no more than {limits.volume_high:.5g}"
+    )
+    text += f", its area no less than {limits.area_low:.5g}.</p>" if limits.area_low else ".</p>"
+    if limits.hollows:
+        rows = [[("", f"{one.share:.1%}"), ("t", _place(one.at)), ("t", _place(one.faces))] for one in limits.hollows]
+        head = [("", "of the surface"), ("t", "unseen about"), ("t", "looks towards")]
+        text += table(head, rows[:_NUM_HOLLOWS])
+    if limits.next_views:
+        rows = [[("t", _place(one.place)), ("", f"{one.gain_share:.1%}")] for one in limits.next_views]
+        head = [("t", "a photograph from here"), ("", "turned to it of the unseen")]
+        text += table(head, rows)
+    return text
+
+
+def _place(at: Sequence[float]) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in at) + ")"
 
 
 def _slices(octree: Octree, mesh: Mesh) -> Iterator[str]:

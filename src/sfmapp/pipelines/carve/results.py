@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sfmapp.carve.box import Box
 from sfmapp.carve.coloring import ColoringReport
+from sfmapp.carve.limits import LimitsReport
 from sfmapp.carve.masks_report import MasksReport
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.space_carving import LevelCounts
@@ -40,7 +41,8 @@ class CarvedVolume:
 
     Attributes:
         silhouettes: as they were carved by. masks, tolerance: how they were found, and what is doubtful about them.
-        mesh: its surface in colours. texture: of the GLB, None without.
+        mesh: its surface in colours. limits: what is not known of it; None where that was not asked.
+        texture: of the GLB, None without.
         files: names of what was written.
     """
 
@@ -52,6 +54,7 @@ class CarvedVolume:
     solid: Solid
     mesh: Mesh
     colors: ColoringReport
+    limits: LimitsReport | None
     texture: TextureReport | None
     files: tuple[str, ...]
 
@@ -68,7 +71,8 @@ def report_of(job: Job, volume: CarvedVolume) -> CarveReport:
         left_out=[NamedReason(name=name, reason=reason) for name, reason in source.left_out], masks=volume.masks,
         box=BoxFacts(low=box.low.tolist(), high=box.high.tolist(), told_by=box.told_by, apart=box.apart),
         tolerance=volume.tolerance, carving=solid.carving, shadows=solid.shadows, joining=solid.joining,
-        surface=_facts(volume.mesh), colors=volume.colors, texture=volume.texture, files=volume.files, usage=job.usage,
+        surface=_facts(volume.mesh), colors=volume.colors, limits=volume.limits,
+        texture=volume.texture, files=volume.files, usage=job.usage,
         warnings=job.log.warnings, decisions=job.log.decisions,
     )  # fmt: skip
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sfmapp.carve.box import Box, cameras_inside, find_box, user_box
 from sfmapp.carve.coloring import ColoringReport, color_surface
 from sfmapp.carve.isosurface import surface_of
+from sfmapp.carve.limits import find_known, find_limits
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette, find_silhouettes
 from sfmapp.carve.tolerance import doubt_holes
@@ -120,6 +121,11 @@ def carve(
                 silhouettes, tolerance = doubt_holes(source.views, silhouettes, *box.cube(), job.events)
         solid = find_solid(job, source, silhouettes, box, lights=what.lights, patches=patches)
         mesh, colors = _surface(job, source, silhouettes, solid)
+        limits = None
+        # bounds are the whole hull's: a box cuts them off, and patches have taken from it what is not asked here
+        if box.told_by != "user" and solid.joining is None:
+            with job.stage("limits"):
+                limits = find_limits(mesh, mesh, source.views, silhouettes, find_known(mesh, source.views))
         shown, texture = mesh, None
         if job.options.surface.texture:
             with job.stage("texture"):
@@ -127,7 +133,7 @@ def carve(
         with job.stage("files"):
             written = write_surface(job.workspace.folder, mesh, shown, up_of_views(source.views))
         volume = CarvedVolume(
-            source, silhouettes, masks, tolerance, box, solid, mesh, colors, texture, (*solid.files, *written)
+            source, silhouettes, masks, tolerance, box, solid, mesh, colors, limits, texture, (*solid.files, *written)
         )
         warn_of(job, volume)
         report = report_of(job, volume)
