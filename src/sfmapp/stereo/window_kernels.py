@@ -3,7 +3,8 @@
 For each row of the picture and each disparity, columns hold the sum of costs over the height of a window. A row further
 down, each column takes in one pixel and lets one go; along the row, each window takes in one column and lets one go.
 Both loops run over disparities, which are neighbours in memory. What is kept is a few rows of columns times
-disparities, however large the picture and the windows. Sums are whole numbers, so that nothing drifts.
+disparities, however tall the picture; of the census also the bits of as many rows as the largest window has. Sums are
+whole numbers, so that nothing drifts.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from sfmapp.simd.bits import count_bits
 from sfmapp.simd.pointers import Pointer, offset, pointer
 from sfmapp.stereo.costs import CENSUS, SAD, SSD, ZNCC, Planes
 
+Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 
 # how the costs of several windows become one
@@ -78,12 +80,7 @@ def _change_column(
     kind: int, column: Pointer, stride: int, inside: Pointer, outside: Pointer, l_in: np.int32, l_out: np.int32
 ) -> None:
     """Costs of one pixel of the left picture come into a column, of another they go out of it, at all disparities."""
-    if kind == CENSUS:
-        for d in range(stride):
-            gain = count_bits(np.uint64(np.uint32(l_in ^ inside[d])))
-            loss = count_bits(np.uint64(np.uint32(l_out ^ outside[d])))
-            column[d] += np.int32(gain) - np.int32(loss)
-    elif kind == SAD:
+    if kind == SAD:
         for d in range(stride):
             column[d] += abs(l_in - inside[d]) - abs(l_out - outside[d])
     elif kind == SSD:
@@ -123,6 +120,34 @@ def _move_down(
                     planes.left[gone, x],
                 )  # fmt: skip
     columns[0, 0] += zeros[0]  # which must live until here
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _count_bits(planes: Planes, search: Search, y: int, out: Bytes) -> None:
+    """Differing bits (beyond + W + beyond, stride) of row y, once for all windows that take it in and let it go."""
+    wide, stride = planes.left.shape[1], search.stride
+    start = search.margin + wide - 1 - search.beyond + search.first
+    right = pointer(planes.right[y])
+    for x in range(wide):
+        word, there, to = planes.left[y, x], offset(right, start - x), pointer(out[x])
+        for d in range(stride):
+            to[d] = np.uint8(count_bits(np.uint64(np.uint32(word ^ there[d]))))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _move_bits_down(bits: Bytes, height: int, columns: NDArray[np.int32], radius: int, y: int, is_first: bool) -> None:
+    """As :func:`_move_down`, of ``bits`` (R, beyond + W + beyond, stride), row y at y % R."""
+    ring, wide, stride = bits.shape
+    for step in range(-radius if is_first else radius, radius + 1):
+        come, gone = bits[_inside(y + step, height) % ring], bits[_inside(y - radius - 1, height) % ring]
+        for x in range(wide):
+            column, come_in, go_out = pointer(columns[x]), pointer(come[x]), pointer(gone[x])
+            if is_first:
+                for d in range(stride):
+                    column[d] += np.int32(come_in[d])
+            else:
+                for d in range(stride):
+                    column[d] += np.int32(come_in[d]) - np.int32(go_out[d])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -315,10 +340,21 @@ def match_rows(
     best_right = np.empty(width, np.uint32)
     first = max(rows[0] - moved, 0)
     following = first
+    # rows whose bits are counted: those that a window may take in or let go
+    reach = windows.radius.max()
+    bits = np.empty((2 * reach + 2, wide, search.stride) if kind == CENSUS else (1, 1, 1), np.uint8)
+    counted = max(first - reach, 0)
     for y in range(rows[0], rows[1]):
         while following <= min(y + moved, height - 1):
+            while kind == CENSUS and counted <= min(following + reach, height - 1):
+                _count_bits(planes, search, counted, bits[counted % len(bits)])
+                counted += 1
             for n in range(num):
-                _move_down(kind, planes, search, columns[n], windows.radius[n], following, following == first)
+                is_first, radius = following == first, windows.radius[n]
+                if kind == CENSUS:
+                    _move_bits_down(bits, height, columns[n], radius, following, is_first)
+                else:
+                    _move_down(kind, planes, search, columns[n], radius, following, is_first)
             _join_windows(kind, planes, search, windows, columns, following, kept[following % (2 * moved + 1)])
             following += 1
         if moved:
