@@ -102,6 +102,7 @@ def rows_of(folder: Path) -> list[Row]:
         "stereo_exposure": exposure_rows,
         "dense_pairs": pair_rows,
         "carving": carving_rows,
+        "carving_joined": joined_rows,
         "masks": mask_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
@@ -291,6 +292,21 @@ def plane_rows(folder: Path) -> Iterator[Row]:
                 what = f"rms on {picture}"
                 yield Row("planes", row["case"], what, "grey levels", "less", mine["rms"][picture], peer, rms, *about)
             yield Row("planes", row["case"], "CPU time", "ms", "less", mine["cpu_ms"], peer, row["cpu_ms"], *about)
+
+
+def joined_rows(folder: Path) -> Iterator[Row]:
+    """Silhouettes joined with patches, against each of them alone."""
+    report = read(folder, "carving_joined")
+    about = False, report["date"][:10], report["commit"]
+    for case in dict.fromkeys(run["case"] for run in report["runs"]):
+        runs = {run["way"]: run for run in report["runs"] if run["case"] == case}
+        ours = runs["joined"]
+        for way in ("hull", "patches", "mesh of patches"):
+            mine, theirs = (100.0 * run["at 0.01"]["f"] for run in (ours, runs[way]))
+            yield Row("carving_joined", case, "F-score at 1 % of the size", "%", "more", mine, way, theirs, *about)
+        if "volume_error" in ours:
+            mine, theirs = (100.0 * abs(runs[way]["volume_error"]) for way in ("joined", "hull"))
+            yield Row("carving_joined", case, "error of the volume", "%", "less", mine, "hull", theirs, *about)
 
 
 def carving_rows(folder: Path) -> Iterator[Row]:

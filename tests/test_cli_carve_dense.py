@@ -82,6 +82,7 @@ def test_patches_hollow_out_what_silhouettes_leave_full(photographs: Path, tmp_p
     # ten outlines leave a good deal below the trough as well, and that stays as far as they ask for it
     assert report["joining"]["hull_volume"] > 2.0 * VOLUME
     assert 0.97 * VOLUME < report["surface"]["volume"] < 1.3 * VOLUME
+    assert report["carving"]["volume_low"] < report["surface"]["volume"] < report["carving"]["volume_high"]
     assert "joined.npz" in report["files"]
     inner, outer = read_octree(tmp_path / "out" / "joined.npz").volume_bounds()
     assert inner < report["surface"]["volume"] < outer

@@ -358,10 +358,10 @@ def _fill(level: _Level, evidence: Evidence, cell: float, pool: ThreadPoolExecut
 
 def _near_surface(level: _Level, cell: float) -> NDArray[np.bool_]:
     """Nodes around which a finer level has to look: near a patch, the hull's surface, or a change of sign."""
-    near = (level.votes[:, 3 : BINS - 3] > 0).any(axis=1) & (level.hull > -cell)
-    near |= np.abs(level.hull) < cell
+    near = (level.votes[:, 2 : BINS - 2] > 0).any(axis=1) & (level.hull > -cell)
+    near |= np.abs(level.hull) < 1.75 * cell
     inside = level.value > 0.0
-    near |= (np.abs(level.value) < 0.5) & (level.hull > 0.0)
+    near |= (np.abs(level.value) < 0.9) & (level.hull > 0.0)
     for column in (level.after, level.prior):
         for axis in range(3):
             at = column[:, axis]

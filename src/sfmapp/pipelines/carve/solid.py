@@ -77,6 +77,8 @@ def find_solid(
     if patches is not None:
         joined, joining = join_patches(job, patches, Photographs(source.views, silhouettes, hull), octree)
         octree, distance = _joined_shape(joined, box)
+        inner, outer = octree.volume_bounds()
+        carving = replace(carving, volume_low=inner, volume_high=outer)
         write_octree(folder / JOINED, octree)
         return Solid(octree, distance, None, carving, None, joining, (OCTREE, JOINED))
     return Solid(octree, *_shape(job, hull, octree, box, None), carving, None, None, (OCTREE,))
