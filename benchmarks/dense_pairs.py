@@ -131,9 +131,9 @@ def rendered(
     width, height = SIZE
     k = np.array([FOCAL, FOCAL, width / 2, height / 2])
     renderer = Renderer(world, Camera(CameraModel.PINHOLE, width, height, k))
-    first = _pose(np.asarray(center, np.float64), *angles)
+    first = looking(np.asarray(center, np.float64), *angles)
     second_center = np.asarray(center) + baseline * rigid3.rotation_matrix(first)[0]
-    poses = (first, _pose(second_center, angles[0] + toe_deg, angles[1]))
+    poses = (first, looking(second_center, angles[0] + toe_deg, angles[1]))
     views, depths = [], []
     for side, pose in enumerate(poses):
         grey = renderer.photograph(pose, Optics(noise_sigma=2.0), [5, side], gain=1.0 - 0.05 * side)
@@ -147,7 +147,8 @@ def rendered(
     return DenseScene(tuple(views), np.array([[1], [0]], np.int32), points, ptr, seen), truths
 
 
-def _pose(center: Array, heading_deg: float, tilt_deg: float) -> Array:
+def looking(center: Array, heading_deg: float, tilt_deg: float) -> Array:
+    """(7,) pose of a camera somewhere that looks that way, z up."""
     heading, tilt = np.radians(heading_deg), np.radians(tilt_deg)
     forward = np.array([np.cos(heading) * np.cos(tilt), np.sin(heading) * np.cos(tilt), np.sin(tilt)])
     right = np.cross(forward, [0.0, 0.0, 1.0])

@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,9 +26,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dense_pairs import looking
 from machine import RESULTS, ROOT, describe_machine
 from rendered_worlds.rendering import Optics, Renderer, World
-from rendered_worlds.sequences import hall, hall_rig, street, street_rig
+from rendered_worlds.sequences import RenderedSequence, hall, hall_rig, street, street_rig
+from rendered_worlds.worlds import gallery_world, hall_world, room_world, street_world
 from rigs import calibrate_samples
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.names import CameraModel
@@ -38,9 +40,12 @@ from sfmapp.geometry.two_rays import fundamental_of
 from sfmapp.scene.rig import Rig
 from sfmapp.stereo.alignment import aligned_matches
 from sfmapp.stereo.depth import depth_of_disparity
+from sfmapp.stereo.disparity_error import disparity_error
 from sfmapp.stereo.match import match_pair
 from sfmapp.stereo.options import StereoOptions
-from sfmapp.stereo.prepare import PairCameras, PreparedPair, PrepareOptions, prepare_pair
+from sfmapp.stereo.polar import on_photograph
+from sfmapp.stereo.polar_pair import prepare_polar
+from sfmapp.stereo.prepare import PairCameras, PreparedPair, PrepareOptions, prepare_pair, turn_of_rig
 from sfmapp.stereo.rectification import Rectification, plan_rectification, rectify
 from sfmapp.stereo.sparse_matches import PairMatches, match_pictures
 from sfmapp.stereo.uncalibrated import rig_from_matches
@@ -50,6 +55,18 @@ Pixels = NDArray[np.uint8]
 
 NAMES = ("left", "right")
 TURN_DEG = 0.05
+WORLDS: dict[str, tuple[Callable[..., RenderedSequence], Rig]] = {
+    "street": (street, street_rig()), "hall": (hall, hall_rig())
+}  # fmt: skip
+# where the first camera stands, its heading and tilt, where the second is from it (right, down, forward), focal length
+FORWARD = (
+    ("street", street_world(1), (-24.0, -1.6, 1.65), (0.0, -1.0), (0.05, 0.02, 1.0), 700.0),
+    ("street, other way", street_world(3), (-10.0, 1.2, 1.6), (180.0, 0.0), (0.02, 0.0, 1.4), 700.0),
+    ("hall", hall_world(1), (2.0, -5.0, 1.8), (75.0, -8.0), (0.1, 0.0, 0.8), 600.0),
+    ("hall, other way", hall_world(2), (-2.5, 4.0, 2.2), (-70.0, -12.0), (-0.05, 0.05, 0.6), 600.0),
+    ("gallery", gallery_world(1), (-1.2, -1.5, 1.4), (60.0, -10.0), (0.03, 0.0, 0.25), 620.0),
+    ("room, backwards", room_world(1), (1.6, -1.9, 1.5), (120.0, -12.0), (-0.02, 0.02, -0.3), 600.0),
+)
 # two lenses of one size, which is all that stereoRectify takes
 _TURN = rigid3.exp_so3(np.radians([1.0, -8.0, 1.5]))
 CONVERGING = Rig(
@@ -73,6 +90,8 @@ def main() -> None:
     report["boards"] = boards(data / "opencv-doc-samples" / "calib")
     report["rendered"] = [rendered(seed) for seed in range(arguments.seeds)]
     report["turned"] = [row for seed in range(arguments.seeds) for row in turned(seed)]
+    report["together"] = [together(place, range(arguments.seeds)) for place in WORLDS]
+    report["forward"] = [forward(*case) for case in FORWARD]
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     arguments.output.write_text(tables(report), encoding="utf-8")
@@ -232,9 +251,61 @@ def rendered(seed: int) -> dict[str, Any]:
     return {"seed": seed, "matches": int(both.sum()), "sfmapp": rms[0], "OpenCV": rms[1], "kept": min(ours.kept)}
 
 
+def together(place: str, seeds: Iterable[int]) -> dict[str, Any]:
+    """Pairs of one rig, turned about the vertical, each of another world, together."""
+    make, rig = WORLDS[place]
+    axis = np.array([0.0, 1.0, 0.0])
+    moved = rigid3.compose(rigid3.from_matrix(rigid3.exp_so3(np.radians(TURN_DEG) * axis), np.zeros(3)),
+                           rig.cam_from_rig[1])  # fmt: skip
+    truth = Rig(rig.cameras, np.array([rigid3.IDENTITY, moved]))
+    pairs = []
+    for seed in seeds:
+        sequence = make(60, seed, rig=rig)
+        pairs.append(_photographs(sequence.worlds[0], truth, sequence.cam_from_world[20 + 7 * (seed % 5)], seed))
+    found = turn_of_rig(pairs, PairCameras(rig)).found
+    assert found is not None
+    away = found.turn_deg - plan_rectification(rig).right_from_camera @ (TURN_DEG * axis)
+    sigma = float(np.linalg.norm(found.sigma_deg[:3]))
+    return {"place": place, "pairs": len(pairs), "error_deg": float(np.linalg.norm(away)), "sigma_deg": sigma}
+
+
+def forward(
+    name: str, world: World, center: Sequence[float], angles_deg: Sequence[float], move: Sequence[float], focal: float
+) -> dict[str, Any]:
+    """Two pictures of a camera that goes forward or back, and turns a little, by polar rectification. Shares of the
+    pixels whose depth is known: matched, right to a tenth of it, and inside both intervals."""
+    width, height = 752, 480
+    camera = Camera(CameraModel.PINHOLE, width, height, np.array([focal, focal, 0.5 * width, 0.5 * height]))
+    first = looking(np.asarray(center, np.float64), *angles_deg)
+    there = np.asarray(center) + np.asarray(move) @ rigid3.rotation_matrix(first)
+    second = looking(there, angles_deg[0] + 0.5, angles_deg[1] - 1.0)
+    rig = Rig((camera, camera), np.array([rigid3.IDENTITY, rigid3.compose(second, rigid3.inverse(first))]))
+    renderer = Renderer(world, camera)
+    photographs = tuple(
+        np.repeat(renderer.photograph(pose, Optics(noise_sigma=2.0), [5, side])[..., None], 3, 2)
+        for side, pose in enumerate((first, second))
+    )
+    prepared, plan = prepare_polar(photographs[0], photographs[1], PairCameras(rig))
+    found = match_pair(prepared.pair, StereoOptions(), matches=prepared.matches)
+    error = disparity_error(prepared.pair, found)
+    pair, _, measured = on_photograph(plan, prepared.pair, found, error, (photographs[0], photographs[1]), "m")
+    assert pair.geometry is not None
+    assert measured.depth is not None
+    assert measured.depth_sigma is not None
+    true = renderer.view(first, edge_samples=False).depth
+    off = np.abs(measured.depth - true)
+    both = np.isfinite(off)
+    half = true**2 / (focal * float(pair.geometry.baseline or 0.0)) * measured.error.half_width_95
+    return {
+        "case": name, "matched": float(both.sum() / np.isfinite(true).sum()),
+        "median": float(np.median((off / true)[both])), "right": float(((off / true)[both] < 0.1).mean()),
+        "inside_68": float((off < measured.depth_sigma)[both].mean()), "inside_95": float((off < half)[both].mean()),
+    }  # fmt: skip
+
+
 def turned(seed: int) -> Iterator[dict[str, Any]]:
     """A car's rectified rig and a drone's of two barrel lenses, turned about the vertical and about any axis."""
-    for place, make, rig in (("street", street, street_rig()), ("hall", hall, hall_rig())):
+    for place, (make, rig) in WORLDS.items():
         sequence = make(60, seed, rig=rig)
         pose, world = sequence.cam_from_world[20 + 7 * (seed % 5)], sequence.worlds[0]
         any_axis = np.random.default_rng(seed).normal(size=3)
@@ -305,6 +376,16 @@ def tables(report: dict[str, Any]) -> str:
         found = f"{row['error_deg']:.4f} | {row['sigma_deg']:.4f}" if "error_deg" in row else "too few matches |"
         depths = " | ".join(f"{row[f'depth_{when}']:.2%}" for when in ("undisturbed", "turned", "corrected"))
         text.append(f"| {row['place']} {row['seed']} | {row['axis']} | {found} | {depths} |")
+    text += ["", "| pairs of one rig together, vertical | pairs | error, deg | sigma |", "|---|---|---|---|"]
+    for row in report["together"]:
+        text.append(f"| {row['place']} | {row['pairs']} | {row['error_deg']:.4f} | {row['sigma_deg']:.4f} |")
+    text += [
+        "", "| forward, polar | matched | median error of depth | within a tenth | inside 68 | inside 95 |",
+        "|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for row in report["forward"]:
+        shares = " | ".join(f"{row[key]:.1%}" for key in ("matched", "median", "right", "inside_68", "inside_95"))
+        text.append(f"| {row['case']} | {shares} |")
     return "\n".join(text) + "\n"
 
 

@@ -258,6 +258,15 @@ def test_metres_are_those_of_the_run_that_made_the_model(tmp_path: Path) -> None
     report["stages"] = {"units": {"scales": [{**other, "model": 0}], "levels": []}}
     (tmp_path / "report.json").write_text(json.dumps(report))
     assert metre_sigma_of_run(tmp_path) == 0.01
+    points = [{"xyz_m": [10.0 * x, 0.0, 1.0], "role": "control"} for x in (-1.0, 1.0)]
+    points.append({"xyz_m": [900.0, 0.0, 0.0], "role": "refuted"})  # it does not hold the model
+    on_control = {"model": 0, "reason": "", "points": points, "summary": {"expected_horizontal_m": 0.02}}
+    report["stages"] = {"control": {"models": [on_control]}}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    assert metre_sigma_of_run(tmp_path) == pytest.approx(0.002)
+    report["stages"] = {"control": {"models": [{**on_control, "reason": "too few"}]}}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    assert metre_sigma_of_run(tmp_path) is None
     place = ModelPlace(
         model=0, source="gps", scale=1.0, rotation=(0.0, 0.0, 0.0, 1.0), translation_m=(0.0, 0.0, 0.0),
         scale_sigma_share=0.2, rotation_sigma_deg=(0.1, 0.1, 0.1), position_sigma_m=(1.0, 1.0, 2.0),

@@ -34,6 +34,8 @@ Pixels = NDArray[np.uint8]
 
 # pixels of a result to one of the photograph where it is farthest from the epipole: rows there are not enlarged
 _SCALE = 0.75
+# and at most so many in all: what is about the epipole is enlarged anyway
+_MOST_PIXELS = 4e6
 # nearer to the epipole, as a share of the farthest corner, a disparity tells next to nothing
 _NEAREST_SHARE = 0.04
 # rows beyond a full turn on either side, so that every pixel has neighbours
@@ -126,6 +128,7 @@ def plan_polar(rig: Rig) -> PolarRectification:
     scale = _SCALE * camera.focal * math.sin(min(widest, 0.5 * math.pi))
     end = math.log(math.tan(0.5 * min(widest, 0.6 * math.pi)))
     start = math.log(math.tan(0.5 * _NEAREST_SHARE * widest))
+    scale = min(scale, math.sqrt(_MOST_PIXELS / (2.0 * math.pi * (end - start))))
     height = round(2.0 * math.pi * scale)
     width = max(round((end - start) * scale), 1)
     return PolarRectification(rig, axes, height / (2.0 * math.pi), start, width, height + 2 * _OVERLAP, is_ahead)
