@@ -9,6 +9,7 @@ squared distance over the solid angle; a rough surface may have any area, so the
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,13 +102,16 @@ class Known:
     num_seeing: NDArray[np.int32]
 
 
-def find_known(mesh: Mesh, views: Sequence[View], sights: Sequence[Sight] = (), band: float = 0.0) -> Known:
+def find_known(
+    mesh: Mesh, views: Sequence[View], sights: Sequence[Sight] = (), band: float = 0.0, *, threads: int = 1
+) -> Known:
     """Who vouches for each triangle.
 
     Args:
         mesh: closed.
         views: the photographs.
         sights: what they see of patches, if there are any. band: within which a patch vouches, units of the world.
+        threads: views at a time; the result does not depend on it.
     """
     vectors = face_vectors(mesh.xyz, mesh.faces)
     areas = np.linalg.norm(vectors, axis=1)
@@ -115,8 +119,9 @@ def find_known(mesh: Mesh, views: Sequence[View], sights: Sequence[Sight] = (), 
     centers = np.ascontiguousarray(mesh.xyz[mesh.faces].mean(axis=1))
     edge = float(np.sqrt(np.median(areas)) * 1.5)
     seeing = np.zeros(len(areas), np.int32)
-    for view in views:
-        seeing += _sees(view, mesh, centers, normals, edge)
+    with ThreadPoolExecutor(threads) as pool:
+        for sees in pool.map(lambda view: _sees(view, mesh, centers, normals, edge), views):
+            seeing += sees
     votes = np.zeros((len(areas), BINS), np.uint8)
     for sight in sights:
         outer = np.column_stack([rigid3.rotation_matrix(sight.cam_from_world), sight.cam_from_world[4:]])

@@ -125,7 +125,8 @@ def carve(
         # bounds are the whole hull's: a box cuts them off, and patches have taken from it what is not asked here
         if box.told_by != "user" and solid.joining is None:
             with job.stage("limits"):
-                limits = find_limits(mesh, mesh, source.views, silhouettes, find_known(mesh, source.views))
+                known = find_known(mesh, source.views, threads=job.threads)
+                limits = find_limits(mesh, mesh, source.views, silhouettes, known)
         shown, texture = mesh, None
         if job.options.surface.texture:
             with job.stage("texture"):
