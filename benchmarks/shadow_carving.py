@@ -44,10 +44,10 @@ ROWS = (
     ("house", "16x4", 0), ("house", "16x4", 1), ("house", "16x4", 2), ("jug", "16x4", 0), ("house", "24x4", 0),
     ("jug", "24x4", 0), ("drawn 1", "16x4", 0), ("drawn 2", "24x4", 0), ("house", "72x8", 0), ("jug", "72x8", 0),
 )  # fmt: skip
-WIDTH, NOISE_GREY = 480, 2.0
-# finest cells along the side of the cube; coarser for the many photographs, which take minutes otherwise
-CELLS = {"16x4": 256, "24x4": 256, "72x8": 128}
-POINTS = 200_000
+WIDTH, NOISE_GREY = 400, 2.0
+# finest cells along the side of the cube
+CELLS = 128
+POINTS = 100_000
 TITLE = """# Shadow carving
 
 Rendered solids of exact shape, photographs with two grey levels of noise. Errors are those of the volume, in the middle
@@ -149,10 +149,10 @@ def rows(only: Sequence[str]) -> Iterator[dict[str, Any]]:
     wanted = [row for row in ROWS if all(word in row for word in only)]
     for name, density in dict.fromkeys(row[:2] for row in wanted):
         scene = scene_of(name, density)
-        hull = hull_of_scene(scene, CELLS[density])
+        hull = hull_of_scene(scene, CELLS)
         for seed in (row[2] for row in wanted if row[:2] == (name, density)):
             row, _ = measure(scene, hull, seed)
-            yield {"scene": name, "density": density, "cells": CELLS[density], "seed": seed, **row}
+            yield {"scene": name, "density": density, "cells": CELLS, "seed": seed, **row}
 
 
 def table(measured: Sequence[dict[str, Any]]) -> str:
@@ -172,7 +172,7 @@ def table(measured: Sequence[dict[str, Any]]) -> str:
 def picture(path: Path) -> None:
     """House from one side: lit from the camera, under a lamp, its shadows, and slices of hull and carved volume."""
     scene = scene_of("house", "24x4", 320)
-    hull = hull_of_scene(scene, 128)
+    hull = hull_of_scene(scene, CELLS)
     shadows, _ = shadows_of(scene, 0, ShadowOptions())
     carved, _ = carve_shadows(hull, scene.views, shadows)
     first, before, after = scene.pictures[3], grid_of(hull), grid_of(carved)

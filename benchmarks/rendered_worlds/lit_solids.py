@@ -18,7 +18,7 @@ DISTANCE = 5.0
 # heights of the lowest and the highest camera, shares of the distance: 20 degrees below to 65 above the horizon
 LOWEST, HIGHEST = -0.35, 0.9
 # where lamps stand about the camera, as seen from the solid: degrees to the right and above
-LAMPS_DEG = ((-60, 0), (60, 0), (0, 60), (0, -60), (-25, 25), (25, 25), (25, -25), (-25, -25))
+LAMPS_DEG = ((-55, 0), (55, 0), (0, 32), (0, -32), (-20, 20), (20, 20), (35, -35), (-35, -35))
 X, Y = (0.0, np.pi / 2, 0.0), (np.pi / 2, 0.0, 0.0)
 
 

@@ -191,13 +191,14 @@ def _planes(grid: CellGrid, camera: Array, light: Array, fan_deg: float) -> Plan
     first /= np.linalg.norm(first)
     near, away = np.linalg.norm(grid.middle - camera), np.linalg.norm(grid.middle - light)
     at = np.arctan2((grid.middle - camera) @ first, (grid.middle - camera) @ axis)
-    step = _STEP * grid.tree.cell / np.array([near * np.sin(at), near, away])
+    between = np.sin(np.arccos((camera - grid.middle) @ (light - grid.middle) / (near * away)))
+    # a step at the light goes along a ray of the camera, which it crosses at that angle, by no more than the others
+    step = _STEP * grid.tree.cell / np.array([near * np.sin(at), near, away / between])
     axes = np.stack([axis, first, np.cross(axis, first)])
     planes = Planes(camera, light, axes, base, np.zeros(3), step, np.zeros(3, np.int64), 0.0)
     low, high = _ranges(grid, planes)
     low, high = low - 2.0 * step, high + 2.0 * step
     # along a way to the light, in samples: what the fan opens while the angle at the camera goes on by one
-    between = np.sin(np.arccos((camera - grid.middle) @ (light - grid.middle) / (near * away)))
     spread = np.tan(np.radians(fan_deg)) * near * step[1] / (between * away * step[2])
     return planes._replace(low=low, num=np.ceil((high - low) / step).astype(np.int64) + 1, spread=float(spread))
 

@@ -210,7 +210,8 @@ def _is_free(planes: Planes, first: Map, x: float, y: float, z: float, half: flo
     near = math.sqrt((x - planes.camera[0]) ** 2 + (y - planes.camera[1]) ** 2 + (z - planes.camera[2]) ** 2)
     away = math.sqrt((x - planes.light[0]) ** 2 + (y - planes.light[1]) ** 2 + (z - planes.light[2]) ** 2)
     wide, high = half / (near * math.sin(camera) * planes.step[0]), half / (near * planes.step[1])
-    deepest = (light - planes.low[2]) / planes.step[2] + half / (away * planes.step[2])
+    # one sample more, as what is held may begin between two of them
+    deepest = (light - planes.low[2]) / planes.step[2] + half / (away * planes.step[2]) + 1.0
     for s in range(math.floor(a - wide), math.ceil(a + wide) + 1):
         for t in range(math.floor(c - high), math.ceil(c + high) + 1):
             if s < 0 or t < 0 or s >= first.shape[0] or t >= first.shape[1] or first[s, t] <= deepest:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, label
+from scipy.ndimage import binary_dilation, label, uniform_filter
 
 from sfmapp.reporting import Report
 
@@ -25,8 +25,9 @@ Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 Levels = NDArray[np.float64]
 
-# standard deviations of noise by which both pictures may be off: of a hundred thousand pixels three
-_CERTAIN = 4.0
+# standard deviations by which means of 3 x 3 pixels may be off: of a hundred thousand three; and by which the pixel may
+# be off itself, for which half of the least brightness is left as well
+_CERTAIN, _PIXEL = 4.0, 1.0
 # of the least brightness of a lit surface what a shadow may have: light falls off with distance within the object, and
 # is sent on by its other parts
 _SHARE = 0.5
@@ -98,14 +99,16 @@ def find_shadows(
     masks: list[list[Mask]] = []
     for photograph in photographs:
         inside = photograph.inside
-        least = linear(_grey(photograph.lit) - _CERTAIN * sigma_lit)
+        least = linear(_mean(photograph.lit) - _CERTAIN / 3.0 * sigma_lit)
         mirrors = _mirrors(photograph) & inside
         masks.append([])
         for k, (sigma, gain) in enumerate(zip(sigmas, gains, strict=True)):
             limit = _SHARE * gain * least * quotient_of_lean(photograph.angles_deg[k], fan_deg)
             # what no light at all may look like
-            too_dark = inside & (limit <= linear(np.array(_CERTAIN * sigma)))
-            dark = inside & ~too_dark & ~mirrors & (linear(_grey(photograph.under[k]) + _CERTAIN * sigma) < limit)
+            too_dark = inside & (limit <= linear(np.array(_CERTAIN / 3.0 * sigma)))
+            dark = linear(_mean(photograph.under[k]) + _CERTAIN / 3.0 * sigma) < limit
+            dark &= linear(_grey(photograph.under[k]) + _PIXEL * sigma) < limit
+            dark &= inside & ~too_dark & ~mirrors
             masks[-1].append(dark)
             counts[k] += [mask.sum() for mask in (inside, dark, too_dark, mirrors)]
     reports = [
@@ -157,6 +160,11 @@ def noise_of(pictures: Sequence[Picture]) -> float:
 def _grey(picture: Picture) -> Levels:
     values = picture.astype(np.float64)
     return np.asarray(values.mean(axis=2) if values.ndim == 3 else values)
+
+
+def _mean(picture: Picture) -> Levels:
+    """Grey values of 3 x 3 pixels."""
+    return np.asarray(uniform_filter(_grey(picture), 3, mode="nearest"))
 
 
 def _gain(photographs: Sequence[LitPhotograph], k: int) -> float:
