@@ -54,6 +54,8 @@ _EVERYWHERE = 0.9
 _RIM_PX, _RAYS, _SAMPLES, _LEAST_HOLE_PX = 6, 48, 160, 12
 # before a dark background shadows on the object are taken for holes
 _WEAK = ("dark background",)
+# share of the silhouette above which a hole is no shadow: the temple's were 0.7 % at most
+_LARGEST_SHADOW = 0.02
 
 
 @dataclass(frozen=True)
@@ -128,21 +130,26 @@ def compare(
     used = [i for i, each in enumerate(silhouettes) if each.known is None or bool(each.known.any())]
     if len(used) < FEWEST:
         return verdicts
-    try:
-        box = find_box(views, silhouettes)
-    except InputError as reason:
-        events.warned(STAGE, f"silhouettes are not compared: {reason}")
-        return verdicts
-    low, side = box.cube()
-    out = {i: Verdict(_unknown(silhouettes[i]), "is apart from all others") for i in used if views[i].name in box.apart}
+    out: dict[int, Verdict] = {}
     most = max(1, len(used) // 10)
     while True:
+        voices = [out[i].silhouette if i in out else silhouette for i, silhouette in enumerate(silhouettes)]
+        try:
+            # anew without a camera that is out: a turned one cuts off a part of the object, which others seem to spill
+            box = find_box(views, voices)
+        except InputError as reason:
+            events.warned(STAGE, f"silhouettes are not compared: {reason}")
+            return verdicts
+        low, side = box.cube()
+        out |= {
+            i: Verdict(_unknown(silhouettes[i]), "is apart from all others") for i in used if views[i].name in box.apart
+        }
         kept = [i for i in used if i not in out]
         evidence = _weigh([views[i] for i in kept], [silhouettes[i] for i in kept], low, side, workers, events)
         odd = _odd_camera(evidence, [views[i] for i in kept], low + 0.5 * side)
         if odd is None:
             break
-        if len(out) == most:
+        if len(out) >= most:
             events.warned(STAGE, f"cameras and silhouettes disagree, and not only {_names(views, out)}: none is blamed")
             return verdicts
         out[kept[odd[0]]] = Verdict(_unknown(silhouettes[kept[odd[0]]]), odd[1], turned_deg=odd[2])
@@ -346,7 +353,9 @@ class _Holes:
                 continue
             far = float(np.linalg.norm(view.center - self._middle))
             wide = 2.0 * float(-distance[within].min()) * far / self._fields.scales[i]
-            sure = weak or wide >= float(np.median(through)) * self._nearest[i]
+            share = area / np.count_nonzero(inside)
+            looked_through = wide >= float(np.median(through)) * self._nearest[i]
+            sure = looked_through or (weak and share <= _LARGEST_SHADOW)
             (false if sure else doubtful)[cut] |= within
         return false, doubtful
 
