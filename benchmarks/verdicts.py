@@ -584,6 +584,16 @@ def promises(folder: Path) -> Iterator[Promise]:
     rows = report["runs"]["Photographs"]
     good = sum(60 <= row["inside_68"] <= 76 and 92 <= row["inside_95"] <= 97 for row in rows)
     yield Promise("stereo_filled_sigma", "the same of those that were filled in", good, len(rows), report["date"][:10])
+    report = read(folder, "plane_sweep")
+    rows, date = report["scores"], report["machine"]["date"][:10]
+    confirmed = [row for row in rows if row["which"] == "confirmed"]
+    good = sum(row["right_of_answered"] >= 0.9 for row in confirmed)
+    text = "of the depths of a swept map that others confirm 90 % are within 1 %"
+    yield Promise("plane_sweep", text, good, len(confirmed), date)
+    textured = [row for row in rows if row["which"] == "answered" and not row["case"].startswith("lego")]
+    good = sum(row["right_of_all"] >= 0.9 for row in textured)
+    text = "of the textured pixels of a courtyard 90 % have a depth within 1 %"
+    yield Promise("plane_sweep", text, good, len(textured), date)
     report = read(folder, "calibration")
     rows, date = report["trials"], report["date"][:10]
     good = sum(0.9 <= row["nees"] <= 1.1 and row["projections_covered"] >= 0.93 for row in rows)
