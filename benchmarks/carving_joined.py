@@ -251,19 +251,18 @@ def row(case: Case, way: str, made: Mesh | Patches, cpu_s: float) -> dict[str, A
 def markdown(report: dict[str, Any]) -> str:
     """One table."""
     lines = [
-        f"sfmapp at {report['commit']}; {report['cpu']}, {report['date']}. {report['cells']} cells.",
+        f"sfmapp at {report['commit']}; {report['cpu']}, {report['date']}.",
         "",
-        "| object | way | F % at 0.5 / 1 % | accuracy % | completeness % | volume | open edges | CPU s |",
-        "|---|---|---|---|---|---|---|---|",
+        "| object | cells | way | F % at 0.5 / 1 % | accuracy % | completeness % | volume | open edges | CPU s |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for run in report["runs"]:
         parts = [run[f"at {share:g}"] for share in SHARES]
         cells = [" / ".join(f"{100 * part[k]:.1f}" for part in parts) for k in ("f", "accuracy", "completeness")]
         volume = f"{100 * run['volume_error']:+.1f} %" if "volume_error" in run else ""
-        lines.append(
-            f"| {run['case']} | {run['way']} | {' | '.join(cells)} | {volume} | {run.get('open_edges', '')} | "
-            f"{run['cpu_s']:.0f} |"
-        )
+        about = f"| {run['case']} | {run['cells']} | {run['way']}"
+        told = f"{volume} | {run.get('open_edges', '')} | {run['cpu_s']:.0f}"
+        lines.append(f"{about} | {' | '.join(cells)} | {told} |")
     shares = {run["way"]: run for run in report["runs"] if run["case"] == "lego"}
     lines += ["", "Sizes are diagonals of boxes. CPU of patches is in what is made of them."]
     if shares:
@@ -279,18 +278,20 @@ def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--only", default="", help="objects whose names begin with this; others keep their results")
-    parser.add_argument("--cells", type=int, default=256)
+    parser.add_argument("--cells", type=int, help="default: 256 for the lego, 128 for solids")
     parser.add_argument("-o", "--output", type=Path, default=RESULTS / "carving_joined.json")
     args = parser.parse_args()
     runs = json.loads(args.output.read_text())["runs"] if args.output.is_file() else []
     names = [name for name in ("lego", *SOLIDS) if name.startswith(args.only)]
     if not (DATA / "nerf-lego-small").is_dir():
         names = [name for name in names if name != "lego"]
-    report: dict[str, Any] = describe_machine() | {"cells": args.cells}
+    report: dict[str, Any] = describe_machine()
     with tempfile.TemporaryDirectory(prefix="joined-") as folder:
         for name in names:
             case = lego_case(Path(folder)) if name == "lego" else solid_case(name)
-            for run in measure(case, args.cells):
+            cells = args.cells or (256 if name == "lego" else 128)
+            for measured in measure(case, cells):
+                run = measured | {"cells": cells, "commit": report["commit"]}
                 runs = [old for old in runs if (old["case"], old["way"]) != (run["case"], run["way"])] + [run]
                 print(json.dumps(run), file=sys.stderr, flush=True)
     order = ["lego", *SOLIDS]
