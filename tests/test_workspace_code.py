@@ -145,7 +145,10 @@ def test_what_is_loaded_is_in_the_key(stage: str) -> None:
 @pytest.mark.parametrize(
     ("module", "touched"),
     [
-        ("features.sift", {"features"}),
+        (
+            "features.sift",
+            {"features", "dense"},
+        ),  # patches of two views also come by stereo, which looks between keypoints
         ("matching.guided", {"matching"}),
         ("mapping.register", {"mapping"}),
         ("adjust.problem", {"mapping", "dense", "mesh", "undistort"}),  # a calibration given to these adjusts poses
