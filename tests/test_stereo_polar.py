@@ -42,7 +42,7 @@ def test_disparities_of_rays_are_distances(is_ahead: bool) -> None:
     assert (disparity > 0.0).all()
     distance = np.linalg.norm(places, axis=1)
     rays = places / distance[:, None]
-    np.testing.assert_allclose(plan.rays(left), rays, atol=1e-9)
+    np.testing.assert_allclose(plan.rays(left[:, 0], left[:, 1]), rays, atol=1e-9)
     found, slope = plan.ranges(rays, disparity)
     np.testing.assert_allclose(found, distance, rtol=1e-6)
     more, _ = plan.ranges(rays, disparity + 1e-4)

@@ -80,7 +80,8 @@ def resampled(source: NDArray[Any], find: Callable[[Array], Array], region: Regi
 
     Args:
         source: (H, W, C), uint8 or uint16. With four channels the last is alpha, and ``values`` are multiplied by it.
-        find: pixels (N, 2) of the result to those (N, 2) of the source; NaN for nowhere.
+        find: pixels (N, 2) of the result, a rectangle of them row by row, to those (N, 2) of the source; NaN for
+            nowhere.
         region: of the result.
     """
     x0, y0, x1, y1 = region

@@ -42,6 +42,8 @@ _NEAREST_SHARE = 0.04
 _OVERLAP = 24
 # share of a pixel that the photograph has to show
 _COVERED = 0.99
+# rows that are brought back at a time
+_STRIP = 16
 # neighbours whose disparities differ by more are of two surfaces, pixels
 _STEP_PX = 0.75
 
@@ -68,21 +70,28 @@ class PolarRectification:
     height: int
     is_second_ahead: bool
 
-    def rays(self, xy: Array) -> Array:
-        """(N, 3) directions in the first camera's frame of pixels (N, 2). Columns of a second camera that stands behind
-        run inwards, so that disparities are positive."""
-        along, about = self._along(xy[:, 0]), (xy[:, 1] - _OVERLAP) / self.scale
+    def rays(self, column: Array, row: Array, turn: Array | None = None) -> Array:
+        """(..., 3) directions of pixels in the frame of the first camera, or in one that is turned against it by
+        ``turn`` (3, 3). Columns and rows are broadcast: those of a rectangle, (C,) and (R, 1), cost little more than
+        its sides. Columns of a second camera that stands behind run inwards, so that disparities are positive."""
+        axes = self.axes if turn is None else self.axes @ turn.T
+        along, about = self._along(column), (row - _OVERLAP) / self.scale
         # tan(theta / 2) = exp(u): cos theta = -tanh u, sin theta = 1 / cosh u
-        across = 1.0 / np.cosh(along)
-        rays = np.stack([across * np.cos(about), across * np.sin(about), -np.tanh(along)], 1)
-        return np.asarray(rays @ self.axes)
+        across, ahead, cos, sin = 1.0 / np.cosh(along), -np.tanh(along), np.cos(about), np.sin(about)
+        rays = np.empty((*np.broadcast_shapes(column.shape, row.shape), 3))
+        for k in range(3):
+            rays[..., k] = across * (cos * axes[0, k] + sin * axes[1, k]) + ahead * axes[2, k]
+        return rays
 
     def places(self, rays: Array) -> Array:
         """(N, 2) pixels of directions (N, 3) in the first camera's frame."""
-        turned = rays @ self.axes.T
-        across = np.hypot(turned[:, 0], turned[:, 1])
-        along = np.arctanh(np.clip(-turned[:, 2] / np.hypot(across, turned[:, 2]), -1.0 + 1e-12, 1.0 - 1e-12))
-        about = np.arctan2(turned[:, 1], turned[:, 0]) % (2.0 * math.pi)
+        right, down, ahead = np.ascontiguousarray((rays @ self.axes.T).T)
+        across = right * right + down * down
+        length = np.sqrt(across + ahead * ahead)
+        # log tan(theta / 2), bounded in the direction of the baseline
+        along = np.log(np.maximum(np.sqrt(across), 1e-6 * length) / np.maximum(length + ahead, 1e-12 * length))
+        about = np.arctan2(down, right)
+        about[about < 0.0] += 2.0 * math.pi
         column = (along - self.start) * self.scale
         return np.stack([self.width - column if self.is_second_ahead else column, about * self.scale + _OVERLAP], 1)
 
@@ -95,13 +104,15 @@ class PolarRectification:
         how fast that changes with them; in the unit of the baseline, NaN beyond infinity."""
         baseline = float(np.linalg.norm(self.rig.cam_from_rig[1, 4:]))
         cos = np.clip(rays @ self.axes[2], -1.0, 1.0)
-        own = np.arccos(cos)
+        sin = np.sqrt(1.0 - cos * cos)
         sign = 1.0 if self.is_second_ahead else -1.0
-        along = np.log(np.maximum(np.tan(0.5 * own), 1e-12)) + sign * disparity / self.scale
-        other = 2.0 * np.arctan(np.exp(along))
-        between = np.sin(sign * (other - own))
+        # tan(theta / 2) of the other camera's ray: disparities are differences of logarithms
+        other = np.maximum(sin, 1e-12) / np.maximum(1.0 + cos, 1e-12) * np.exp(sign * disparity / self.scale)
+        square = other * other
+        other_sin, other_cos = 2.0 * other / (1.0 + square), (1.0 - square) / (1.0 + square)
+        between = sign * (other_sin * cos - other_cos * sin)
         between[~(between > 0.0)] = np.nan
-        return baseline * np.sin(other) / between, -baseline * np.sin(own) * np.sin(other) / (self.scale * between**2)
+        return baseline * other_sin / between, -baseline * sin * other_sin / (self.scale * between**2)
 
 
 def plan_polar(rig: Rig) -> PolarRectification:
@@ -142,7 +153,9 @@ def rectify_polar(plan: PolarRectification, left: Pixels, right: Pixels) -> Rect
         layers = photograph if photograph.ndim == 3 else photograph[..., None]
 
         def find(xy: Array, camera: Camera = camera, rotation: Array = rotation) -> Array:
-            return project(camera, plan.rays(xy) @ rotation.T)
+            # of a rectangle, row by row
+            width = int(np.count_nonzero(xy[:, 1] == xy[0, 1]))
+            return project(camera, plan.rays(xy[:width, 0], xy[::width, 1:], rotation).reshape(-1, 3))
 
         flat = np.zeros((plan.height, plan.width, layers.shape[2]), np.uint8)
         cover = np.zeros((plan.height, plan.width), np.bool_)
@@ -180,20 +193,12 @@ def on_photograph(
     )
     baseline = float(np.linalg.norm(plan.rig.cam_from_rig[1, 4:]))
     geometry = RectifiedGeometry(size[0], size[1], focal, k[2], k[3], 0.0, baseline if has_baseline else None, unit)
-    y, x = np.mgrid[: size[1], : size[0]] + 0.5
-    rays = np.stack([(x - k[2]) / focal, (y - k[3]) / focal, np.ones_like(x)], -1).reshape(-1, 3)
-    length = np.linalg.norm(rays, axis=1)
-    rays /= length[:, None]
-    place = (plan.places(rays) - 0.5).reshape(*x.shape, 2).astype(np.float32)
-    disparity = _sampled(found.disparity, place)
-    ranges, slope = plan.ranges(rays, disparity.ravel().astype(np.float64))
-    depth = (ranges / length).reshape(x.shape)
+    shape = size[1], size[0]
+    place, depth, steps = np.empty((*shape, 2), np.float32), np.empty(shape), np.empty(shape)
+    for top in range(0, shape[0], _STRIP):  # which stays near the processor
+        rows = slice(top, min(top + _STRIP, shape[0]))
+        place[rows], depth[rows], steps[rows] = _looked_up(plan, k, rows, found.disparity)
     beside = (focal * baseline / depth).astype(np.float32)
-    # of a disparity beside to one of the polar pair
-    steps = np.abs((slope / length).reshape(x.shape)) * focal * baseline / depth**2
-    # an error in pixels that are enlarged is enlarged with them, in one direction; it is averaged in the other
-    enlarged = plan.scale / np.maximum(focal * np.tan(np.arccos(np.clip(rays @ plan.axes[2], 0.1, 1.0))), 1.0)
-    steps *= np.sqrt(np.maximum(enlarged, 1.0)).reshape(x.shape)
     is_known = np.isfinite(beside) & (shown[0] == 255)
 
     def on_grid(values: Map, factor: Array | float = 1.0) -> Map:
@@ -212,6 +217,27 @@ def on_photograph(
     )  # fmt: skip
     both = RectifiedPair(flat[0], flat[1], shown[0] == 255, shown[1] == 255, geometry)
     return both, map_, measured_of(geometry, map_, DisparityError(sigma, half, confidence))
+
+
+def _looked_up(
+    plan: PolarRectification, k: Array, rows: slice, disparity: Map
+) -> tuple[NDArray[np.float32], Array, Array]:
+    """Where some rows (R) of the flat left photograph are in the pair, (R, W, 2); their depths (R, W), and how many
+    pixels of a disparity beside it one of the pair is, as errors are enlarged."""
+    focal = k[0]
+    y, x = np.mgrid[rows, : plan.rig.cameras[0].width] + 0.5
+    rays = np.stack([(x - k[2]) / focal, (y - k[3]) / focal, np.ones_like(x)], -1).reshape(-1, 3)
+    length = np.linalg.norm(rays, axis=1)
+    rays /= length[:, None]
+    place = (plan.places(rays) - 0.5).reshape(*x.shape, 2).astype(np.float32)
+    ranges, slope = plan.ranges(rays, _sampled(disparity, place).ravel().astype(np.float64))
+    depth = ranges / length
+    steps = np.abs(slope / length) * focal * np.linalg.norm(plan.rig.cam_from_rig[1, 4:]) / depth**2
+    # an error in pixels that are enlarged is enlarged with them, in one direction; it is averaged in the other
+    cos = np.clip(rays @ plan.axes[2], 0.1, 1.0)
+    enlarged = plan.scale / np.maximum(focal * np.sqrt(1.0 - cos * cos) / cos, 1.0)
+    steps *= np.sqrt(np.maximum(enlarged, 1.0))
+    return place, depth.reshape(x.shape), steps.reshape(x.shape)
 
 
 def _principal_point(camera: Camera) -> tuple[float, float]:
