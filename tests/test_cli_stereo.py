@@ -31,9 +31,10 @@ from sfmapp.scene.tracks import Tracks
 from sfmapp.stereo import prepare
 from sfmapp.stereo.depth import depth_of_disparity
 from sfmapp.stereo.prepare import PairCameras, prepare_pair
-from sfmapp.stereo.rectification import plan_rectification, rectified_as_is
+from sfmapp.stereo.rectification import plan_rectification, rectified_as_is, rectify
 from sfmapp.stereo.sparse_matches import match_pictures
 from sfmapp.stereo.uncertainty import depth_sigma
+from sfmapp.workspace.layout import FORMAT
 
 Pixels = NDArray[np.uint8]
 NEAR, FAR = 24, 12
@@ -177,8 +178,9 @@ def test_rows_of_a_rectified_pair_come_together_and_disparities_stay(pair: tuple
 def test_several_pairs_tell_one_turn_of_their_rig(
     pair: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    calls = []
+    calls, made = [], []
     monkeypatch.setattr(prepare, "match_pictures", lambda *pictures: calls.append(1) or match_pictures(*pictures))
+    monkeypatch.setattr(prepare, "rectify", lambda *pictures: made.append(1) or rectify(*pictures))
     left, right = (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in pair)
     lower = np.array([[1.0, 0.0, 0.0], [0.004, 1.0, 0.3]])
     (tmp_path / "l").mkdir()
@@ -190,8 +192,10 @@ def test_several_pairs_tell_one_turn_of_their_rig(
     calibration = pair[0].parent / "calib.txt"
     assert run(tmp_path / "l" / "a.png", tmp_path / "r" / "a.png", "--camera", calibration, "-o", tmp_path / "one") == 0
     calls.clear()
+    made.clear()
     assert run(tmp_path / "l", tmp_path / "r", "--camera", calibration, "-o", tmp_path / "both") == 0
-    assert len(calls) == 2  # no pair is matched twice, for its turn and for its rows after it
+    # no pair is rectified or matched twice, for its turn and for its rows after it
+    assert (len(calls), len(made)) == (2, 2)
     (alone,) = json.loads((tmp_path / "one" / "report.json").read_text())["pairs"]
     told = json.loads((tmp_path / "both" / "report.json").read_text())["pairs"]
     first, second = (one["rectification"]["misalignment"] for one in told)
@@ -202,13 +206,12 @@ def test_several_pairs_tell_one_turn_of_their_rig(
     assert max(one["rectification"]["rows"]["rms_px"] for one in told) < 0.25
 
 
-def test_pairs_out_of_a_model_and_out_of_a_video(pair: tuple[Path, Path], tmp_path: Path) -> None:
-    photographs = tmp_path / "images"
+def write_a_model(folder: Path, photographs: Path, pair: tuple[Path, Path]) -> None:
+    """Two cameras of one row, and one in front of the first; thirty points in a plane, seen by all."""
     photographs.mkdir()
     for path in (*pair, pair[0]):
         name = path.name if not (photographs / path.name).exists() else "again.png"
         (photographs / name).write_bytes(path.read_bytes())
-    # two cameras of one row, and one in front of the first; thirty points in a plane, seen by all
     camera = Camera(CameraModel.PINHOLE, 240, 160, np.array([200.0, 200.0, 120.0, 80.0]))
     points = np.random.default_rng(4).uniform((-0.6, -0.4, 1.6), (0.8, 0.4, 1.8), (30, 3))
     poses = np.tile(rigid3.IDENTITY, (3, 1))
@@ -217,8 +220,31 @@ def test_pairs_out_of_a_model_and_out_of_a_video(pair: tuple[Path, Path], tmp_pa
     tracks = Tracks.from_observations(np.tile(np.arange(30), 3), np.repeat(np.arange(3), 30), np.concatenate(seen))
     model = Reconstruction.empty([camera], ["left.png", "right.png", "again.png"], np.zeros(3, np.int32), tracks)
     model.cam_from_world[:], model.point_xyz[:], model.obs_is_inlier[:] = poses, points, True
-    write_model(tmp_path / "sparse" / "0", model)
-    folder = tmp_path / "sparse" / "0"
+    write_model(folder, model)
+
+
+def test_pairs_out_of_a_track_have_its_metres(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    write_a_model(tmp_path / "out" / "sparse" / "0", tmp_path / "frames", pair)
+    for source, sigma in (("stereo", 0.05), ("none", None)):
+        facts = {"scale_source": source, "scale_sigma": sigma, "contradictions": []}
+        manifest = {"format": FORMAT, "command": "odometry", "source": str(tmp_path / "frames"),
+                    "stages": {"odometry": {"is_done": True, "maps": [facts]}}}  # fmt: skip
+        (tmp_path / "out" / "run.json").write_text(json.dumps(manifest))
+        assert run(tmp_path / "out", "--pair", "left", "right", "-o", tmp_path / source) == 0
+        (told,) = json.loads((tmp_path / source / "report.json").read_text())["pairs"]
+        assert told["rectification"]["unit"] == ("m" if sigma else "")
+        folder = tmp_path / source / told["name"]
+        depth, error = (np.load(folder / f"{name}.npy") for name in ("depth", "depth_sigma"))
+        assert np.nanmedian(depth) == pytest.approx(200.0 * 0.1 / FAR, rel=0.02)
+        # 5 % of the metres are most of what is not known of depths
+        assert (np.nanmedian(error / depth) > 0.05) == (source == "stereo")
+    (tmp_path / "out" / "run.json").write_text(json.dumps({**manifest, "source": str(tmp_path / "film.mp4")}))
+    assert run(tmp_path / "out", "--best", "1", "-o", tmp_path / "film") == 3
+
+
+def test_pairs_out_of_a_model_and_out_of_a_video(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    folder, photographs = tmp_path / "sparse" / "0", tmp_path / "images"
+    write_a_model(folder, photographs, pair)
     (folder / "images").symlink_to(photographs)
     assert run(folder, "--best", "1", "-o", tmp_path / "best") == 0
     report = json.loads((tmp_path / "best" / "report.json").read_text())

@@ -56,7 +56,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "sources",
         metavar="SOURCE",
         nargs="+",
-        help="two photographs, two folders, a KITTI folder, a side-by-side video, or a reconstruction",
+        help="two photographs, two folders, a KITTI folder, a side-by-side video, a reconstruction, or a track",
     )
     parser.add_argument(
         "-o", "--output", metavar="DIR", help="output folder, new or empty; of a reconstruction, OUT/stereo"

@@ -77,7 +77,7 @@ def plan_views(
     _check_count(model, photographs, options)
     warn_of_sides(photographs.cameras, STAGE, "sfmapp undistort, then dense on its folder", events)
     poses = model.cam_from_world[photographs.image_idx]
-    xyz, ptr, view_idx = _points(model, photographs.image_idx)
+    xyz, ptr, view_idx = points_of_views(model, photographs.image_idx)
     depth = _median_depths(poses, xyz, ptr, view_idx)
     _check_baseline(poses, depth, photographs)
     canvases = tuple(
@@ -191,7 +191,7 @@ def _only(
     return np.concatenate([[0], np.cumsum(counts[kept])]).astype(np.int64), view_idx[np.repeat(kept, counts)]
 
 
-def _points(
+def points_of_views(
     model: Reconstruction, image_idx: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int32]]:
     """Points seen by two or more of the views, with the views in ascending order, each once.

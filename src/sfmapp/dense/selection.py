@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +17,52 @@ Array = NDArray[np.float64]
 MIN_SHARED = 10
 # under less than this the depth is as good as unknown; over more the images have little in common
 MIN_ANGLE_DEG, MAX_ANGLE_DEG = 1.0, 60.0
-# full weight from here
-GOOD_ANGLE_DEG, WIDE_ANGLE_DEG = 8.0, 20.0
+# full weight between these (Goesele et al., ICCV 2007); beyond the wider one it falls by this deviation
+GOOD_ANGLES_DEG, WIDE_SIGMA_DEG = (8.0, 20.0), 12.0
 # cameras without points: between views as seen from what they look at, and between their axes
 MIN_GEOMETRIC_DEG, BEST_GEOMETRIC_DEG, MAX_AXES_DEG = 1.5, 10.0, 70.0
+
+
+@dataclass(frozen=True)
+class CommonPoints:
+    """What points say of pairs of views, (V, V) each.
+
+    Attributes:
+        score: sum of the weights of common points. angle_deg: their mean angle. shared: how many there are.
+    """
+
+    score: Array
+    angle_deg: Array
+    shared: Array
+
+
+def weigh_common_points(
+    focal: Array,
+    cam_from_world: Array,
+    point_xyz: Array,
+    point_ptr: NDArray[np.int64],
+    point_view_idx: NDArray[np.int32],
+    good_deg: tuple[float, float] = GOOD_ANGLES_DEG,
+) -> CommonPoints:
+    """How well pairs of views suit the measuring of what both show.
+
+    A common point counts the more the nearer its triangulation angle is to the good ones (Goesele et al., ICCV 2007)
+    and the more alike its scales in the two images are.
+
+    Args:
+        focal: (V,) pixels.
+        cam_from_world: (V, 7).
+        point_xyz: (P, 3) sparse points, world.
+        point_ptr, point_view_idx: (P + 1,) and (O,), the views that see each point; see :class:`DenseScene`.
+        good_deg: between these angles a point has its full weight.
+    """
+    num_views = len(cam_from_world)
+    sums = np.zeros((3, num_views, num_views))
+    axis = np.ascontiguousarray(rigid3.rotation_matrix(cam_from_world)[:, 2])
+    center = rigid3.center(cam_from_world)
+    _score_points(point_xyz, point_ptr, point_view_idx, center, axis, focal, good_deg, sums)
+    score, angle, shared = sums
+    return CommonPoints(score, angle / np.maximum(shared, 1.0), shared)
 
 
 def select_neighbors(
@@ -31,9 +75,9 @@ def select_neighbors(
 ) -> tuple[NDArray[np.int32], NeighborsReport]:
     """Choose the neighbours of every view.
 
-    A common point counts the more the nearer its triangulation angle is to 8 to 20 degrees (Goesele et al., ICCV 2007)
-    and the more alike its scales in the two images are. A view that shares too few points with others gets the rest
-    from the places and directions of the cameras. Views without a baseline between them are never neighbours.
+    Those with which common points have most weight, as :func:`weigh_common_points` has it. A view that shares too few
+    points with others gets the rest from the places and directions of the cameras. Views without a baseline between
+    them are never neighbours.
 
     Args:
         focal: (V,) pixels, at working resolution.
@@ -46,12 +90,9 @@ def select_neighbors(
         (V, K) int32 positions of views, best first, -1 behind the last; and the report.
     """
     num_views = len(cam_from_world)
-    score, angle, shared = np.zeros((3, num_views, num_views))
+    common = weigh_common_points(focal, cam_from_world, point_xyz, point_ptr, point_view_idx)
+    score, angle, shared = common.score, common.angle_deg, common.shared
     rotation, center = rigid3.rotation_matrix(cam_from_world), rigid3.center(cam_from_world)
-    _score_points(
-        point_xyz, point_ptr, point_view_idx, center, np.ascontiguousarray(rotation[:, 2]), focal, score, angle, shared
-    )
-    angle /= np.maximum(shared, 1.0)
     by_points = (shared >= MIN_SHARED) & (angle >= MIN_ANGLE_DEG) & (angle <= MAX_ANGLE_DEG) & (score > 0.0)
     cost, geometric_angle = _camera_costs(center, rotation[:, 2], _targets(center, rotation[:, 2], point_xyz,
                                                                            point_ptr, point_view_idx))  # fmt: skip
@@ -83,10 +124,11 @@ def select_neighbors(
 @numba.njit(cache=True, nogil=True)
 def _score_points(
     point_xyz: NDArray[np.float64], point_ptr: NDArray[np.int64], point_view_idx: NDArray[np.int32],
-    center: NDArray[np.float64], axis: NDArray[np.float64], focal: NDArray[np.float64], score: NDArray[np.float64],
-    angle: NDArray[np.float64], shared: NDArray[np.float64],
+    center: NDArray[np.float64], axis: NDArray[np.float64], focal: NDArray[np.float64], good_deg: tuple[float, float],
+    sums: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """Add to (V, V) sums over common points: weights, angles in degrees, counts."""
+    """Add to (3, V, V) sums over common points: weights, angles in degrees, counts."""
+    good, wide = good_deg
     for p in range(point_xyz.shape[0]):
         for a in range(point_ptr[p], point_ptr[p + 1]):
             i = point_view_idx[a]
@@ -101,14 +143,14 @@ def _score_points(
                 if i == j or ni == 0.0 or nj == 0.0 or footprint_i <= 0.0 or footprint_j <= 0.0:
                     continue
                 degrees = np.degrees(np.arccos(min(1.0, max(-1.0, (di * dj).sum() / (ni * nj)))))
-                weight = min(1.0, degrees / GOOD_ANGLE_DEG) ** 2
-                if degrees > WIDE_ANGLE_DEG:
-                    weight = np.exp(-0.5 * ((degrees - WIDE_ANGLE_DEG) / 12.0) ** 2)
+                weight = min(1.0, degrees / good) ** 2
+                if degrees > wide:
+                    weight = np.exp(-0.5 * ((degrees - wide) / WIDE_SIGMA_DEG) ** 2)
                 weight *= min(footprint_i / footprint_j, footprint_j / footprint_i)
                 for x, y in ((i, j), (j, i)):
-                    score[x, y] += weight
-                    angle[x, y] += degrees
-                    shared[x, y] += 1.0
+                    sums[0, x, y] += weight
+                    sums[1, x, y] += degrees
+                    sums[2, x, y] += 1.0
 
 
 def _targets(

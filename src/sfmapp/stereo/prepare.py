@@ -37,6 +37,8 @@ _GROSS_SHARE, _ROWS_OFF_PX = 0.02, 1.0
 _LEAST_GAIN_PX = 0.1
 # share of a pixel that the photograph has to show
 _COVERED = 0.99
+# of rectified pairs that told a turn so much is held until they are matched: twelve of 1.4 MP in colour
+_HELD_BYTES = 1 << 27
 
 
 @dataclass(frozen=True)
@@ -100,12 +102,14 @@ class PrepareOptions:
             :class:`~sfmapp.stereo.options.StereoOptions`.
         turn: of the rig, by several pairs of it (:func:`turn_of_rig`); None: each pair tells its own.
         matches: of the pair as its calibration rectifies it, where they are known from there; None: they are found.
+        rectified: the pair as its calibration rectifies it, likewise; None: it is made.
     """
 
     is_cropped: bool = False
     corrects: Correction = "auto"
     turn: Misalignment | None = None
     matches: PairMatches | None = None
+    rectified: RectifiedPair | None = None
 
 
 @dataclass(frozen=True)
@@ -115,10 +119,12 @@ class RigTurn:
     Attributes:
         found: by all pairs together; None where they tell too little.
         matches: of each pair, as the calibration rectifies it.
+        rectified: each of these pairs; None beyond what may be held of pictures.
     """
 
     found: Misalignment | None
     matches: tuple[PairMatches, ...]
+    rectified: tuple[RectifiedPair | None, ...]
 
 
 def prepare_pair(
@@ -144,11 +150,12 @@ def prepare_pair(
         draft, cameras, is_swapped = _without_calibration(left, right, cameras, names, warnings)
         is_projective = draft.plan is not None
     else:
-        if cameras.rig.second_is_left:
+        rig = cameras.rig
+        if rig.second_is_left:
             # the calibration says so: it is obeyed, and said
-            left, right, is_swapped = right, left, True
-            cameras = replace(cameras, rig=cameras.rig.reversed_pair())
-        draft = _drafted(left, right, cameras.rig, options.matches)
+            left, right, is_swapped, rig = right, left, True, rig.reversed_pair()
+            cameras = replace(cameras, rig=rig)
+        draft = _with_plan(left, right, plan_rectification(rig), options.matches, options.rectified)
     misalignment = None
     is_corrected = with_rows = False
     if draft.plan is not None and not is_projective:
@@ -176,19 +183,19 @@ def prepare_pair(
     return PreparedPair(pair, plan, draft.matches, misalignment, report)
 
 
-def _drafted(left: Pixels, right: Pixels, rig: Rig | None, matches: PairMatches | None = None) -> _Draft:
+def _drafted(left: Pixels, right: Pixels, rig: Rig | None) -> _Draft:
     """The pair as a rig makes it; None: as it is."""
-    return _with_plan(left, right, None if rig is None else plan_rectification(rig), matches)
+    return _with_plan(left, right, None if rig is None else plan_rectification(rig))
 
 
 def _with_plan(
-    left: Pixels, right: Pixels, plan: Rectification | None, matches: PairMatches | None = None
+    left: Pixels, right: Pixels, plan: Rectification | None, matches: PairMatches | None = None,
+    pair: RectifiedPair | None = None,
 ) -> _Draft:  # fmt: skip
-    if plan is None:
+    """The pair as a plan makes it; its matches and the pair itself where they are known."""
+    if pair is None:
         everywhere = np.ones(left.shape[:2], np.bool_)
-        pair = RectifiedPair(left, right, everywhere, everywhere)
-    else:
-        pair = rectify(plan, left, right)
+        pair = RectifiedPair(left, right, everywhere, everywhere) if plan is None else rectify(plan, left, right)
     if matches is None:
         matches = match_pictures(pair.left, pair.right, pair.left_shown, pair.right_shown)
     return _Draft(pair, plan, matches, rows_of(matches, pair.left.shape[0]))
@@ -246,16 +253,21 @@ def turn_of_rig(pairs: Iterable[tuple[Pixels, Pixels]], cameras: PairCameras) ->
         InputError: cameras that cannot be rectified, or photographs of another size.
     """
     if cameras.rig is None or cameras.is_adjusted:
-        return RigTurn(None, ())
+        return RigTurn(None, (), ())
     is_swapped = cameras.rig.second_is_left
     plan = plan_rectification(cameras.rig.reversed_pair() if is_swapped else cameras.rig)
     found, matches = [PairMatches(np.zeros((0, 2)), np.zeros((0, 2)))], []
+    rectified: list[RectifiedPair | None] = []
+    num_bytes = 0
     for pair in pairs:
         draft = _with_plan(*(pair[::-1] if is_swapped else pair), plan)
         found.append(_aligned(draft))
         matches.append(draft.matches)
+        made = draft.pair
+        num_bytes += made.left.nbytes + made.right.nbytes + made.left_shown.nbytes + made.right_shown.nbytes
+        rectified.append(made if num_bytes <= _HELD_BYTES else None)
     left, right = (np.concatenate([getattr(one, side) for one in found]) for side in ("left", "right"))
-    return RigTurn(_misalignment(plan, PairMatches(left, right)), tuple(matches))
+    return RigTurn(_misalignment(plan, PairMatches(left, right)), tuple(matches), tuple(rectified))
 
 
 def _aligned(draft: _Draft) -> PairMatches:

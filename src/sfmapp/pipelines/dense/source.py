@@ -19,7 +19,7 @@ from sfmapp.pipelines.calibrated_model import with_calibration
 from sfmapp.pipelines.stored_pixels import has_stored_pixels
 from sfmapp.report.model import CalibratedModelReport
 from sfmapp.workspace.job import Job
-from sfmapp.workspace.layout import DENSE, MANIFEST, ODOMETRY, RECONSTRUCT, UNDISTORT, USUAL_FOLDERS
+from sfmapp.workspace.layout import DENSE, MANIFEST, ODOMETRY, RECONSTRUCT, STEREO, UNDISTORT, USUAL_FOLDERS
 from sfmapp.workspace.manifest import Manifest, image_root, missing_photographs, read_manifest
 from sfmapp.workspace.options import Options, options_from_dict, options_to_dict
 from sfmapp.workspace.usage import Stopwatch
@@ -180,16 +180,13 @@ def _in_workspace(
 ) -> DenseSource:
     manifest = read_manifest(folder)
     command = manifest.command
-    if command == ODOMETRY and asked_for == UNDISTORT and output is not None:
-        return DenseSource(
-            folder / "sparse" / "0",
-            _frame_folder(manifest.source, images),
-            Path(output),
-            DENSE,
-            False,
-            options,
-            options.images.camera,
-        )
+    if command == ODOMETRY and (asked_for == STEREO or (asked_for == UNDISTORT and output is not None)):
+        model = folder / "sparse" / "0"
+        if not has_model(model):
+            raise NoReconstructionError(f"{folder} holds no model", "run sfmapp odometry again")
+        target = folder if output is None else Path(output)
+        frames = _frame_folder(manifest.source, images, asked_for)
+        return DenseSource(model, frames, target, DENSE, False, options, options.images.camera)
     if command not in (RECONSTRUCT, DENSE):
         raise UsageError(
             f"{folder} holds the results of sfmapp {command}, not of sfmapp {RECONSTRUCT}",
@@ -230,13 +227,15 @@ def _photograph_folder(folder: Path, manifest: Manifest) -> Path:
     return found
 
 
-def _frame_folder(source: str, images: str | os.PathLike[str] | None) -> Path:
+def _frame_folder(source: str, images: str | os.PathLike[str] | None, asked_for: str) -> Path:
     """The folder that the names of an odometry run's keyframes are relative to."""
     folder = Path(source) if images is None else Path(images)
     if not folder.is_dir():
         raise InputError(
             f"{folder}: expected the folder of the frames, found {'a file' if folder.is_file() else 'no folder'}",
-            "name the folder that holds the keyframes as files: --images DIR",
+            "run sfmapp odometry on a folder of its frames"
+            if asked_for == STEREO
+            else "name the folder that holds the keyframes as files: --images DIR",
         )
     return folder
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfmapp.dense.photographs import Photographs, find_photographs
+from sfmapp.dense.prepare import points_of_views
+from sfmapp.dense.selection import weigh_common_points
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap import read_model
 from sfmapp.formats.text_input import read_json_object
@@ -24,7 +24,8 @@ from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig
 from sfmapp.stereo.prepare import PairCameras
 from sfmapp.stereo.rectification import plan_rectification
-from sfmapp.workspace.layout import REPORT, STEREO
+from sfmapp.workspace.layout import MANIFEST, ODOMETRY, REPORT, STEREO
+from sfmapp.workspace.manifest import read_manifest
 from sfmapp.workspace.options import Options
 
 __all__ = ["is_of_model", "pairs_of_model"]
@@ -74,54 +75,22 @@ def pairs_of_model(
 
 
 def best_pairs(model: Reconstruction, photographs: Photographs) -> list[tuple[int, int]]:
-    """Positions of photographs, the pair that stereo has most of first: by the points that both show, the angle between
-    their rays, and the share of both that is kept when they are rectified."""
+    """Positions of photographs, the pair that stereo has most of first: by the points that both show, the angles under
+    which they are seen, and the share of both that is kept when they are rectified."""
     images = photographs.image_idx
-    rated = []
-    for i, shared in _shared_counts(model, images):
-        for j, count in zip(range(i + 1, len(images)), shared[i + 1 :].tolist(), strict=True):
-            if count >= _LEAST_SHARED:
-                rated.append((count * _angle_weight(model, int(images[i]), int(images[j])), i, j))
-    rated.sort(reverse=True)
+    focal = np.array([camera.focal for camera in photographs.cameras])
+    common = weigh_common_points(focal, model.cam_from_world[images], *points_of_views(model, images), _GOOD_DEG)
+    pairs = np.argwhere(np.triu(common.shared >= _LEAST_SHARED, 1))
+    scores = common.score[pairs[:, 0], pairs[:, 1]]
     found = []
-    for score, i, j in itertools.islice(rated, _LOOKED_AT * max(len(images), 1)):
+    for k in np.argsort(-scores, kind="stable")[: _LOOKED_AT * len(images)]:
+        i, j = pairs[k].tolist()
         try:
             kept = min(plan_rectification(_rig(model, photographs, (i, j), leftmost=True)).kept)
         except InputError:
             continue  # one in front of the other
-        found.append((score * kept, i, j))
+        found.append((float(scores[k]) * kept, i, j))
     return [(i, j) for _, i, j in sorted(found, reverse=True)]
-
-
-def _shared_counts(model: Reconstruction, images: NDArray[np.int64]) -> list[tuple[int, NDArray[np.int64]]]:
-    """Of each photograph, how many points each of all shows with it."""
-    tracks = model.tracks
-    place = np.full(len(model.image_names), -1)
-    place[images] = np.arange(len(images))
-    kept = model.obs_is_inlier & (place[tracks.obs_image_idx] >= 0)
-    image, track = place[tracks.obs_image_idx[kept]], tracks.obs_track_idx[kept]
-    out = []
-    for i in range(len(images)):
-        is_shown = np.zeros(tracks.num_tracks, np.bool_)
-        is_shown[track[image == i]] = True
-        out.append((i, np.bincount(image[is_shown[track]], minlength=len(images))))
-    return out
-
-
-def _angle_weight(model: Reconstruction, first: int, second: int) -> float:
-    """From 0 to 1, by the median angle under which points that both show are seen."""
-    tracks = model.tracks
-    sets = [
-        tracks.obs_track_idx[obs[model.obs_is_inlier[obs]]]
-        for obs in (tracks.observations_of_image(first), tracks.observations_of_image(second))
-    ]
-    points = model.point_xyz[np.intersect1d(sets[0], sets[1])]
-    rays = [points - rigid3.center(model.cam_from_world[image]) for image in (first, second)]
-    cosine = (rays[0] * rays[1]).sum(1) / np.maximum(
-        np.linalg.norm(rays[0], axis=1) * np.linalg.norm(rays[1], axis=1), 1e-300
-    )
-    angle = float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))
-    return min(angle / _GOOD_DEG[0], 1.0) * min(_GOOD_DEG[1] / max(angle, 1e-9), 1.0)
 
 
 def _rig(model: Reconstruction, photographs: Photographs, pair: tuple[int, int], *, leftmost: bool = False) -> Rig:
@@ -135,7 +104,7 @@ def _rig(model: Reconstruction, photographs: Photographs, pair: tuple[int, int],
 
 def metre_sigma_of_run(run: Path) -> float | None:
     """Standard deviation of lengths, as a share, of the model of a run that was put into the world, lies on control of
-    a local frame or has its metres by known lengths; None where its unit is its own.
+    a local frame, has its metres by known lengths, or is a track that has them; None where its unit is its own.
 
     Raises:
         InputError: what the run says of it is damaged.
@@ -144,6 +113,9 @@ def metre_sigma_of_run(run: Path) -> float | None:
     place = None if placed is None else placed.place_of(_MODEL)
     if place is not None:
         return place.scale_sigma_share
+    if (run / MANIFEST).is_file() and (manifest := read_manifest(run)).command == ODOMETRY:
+        maps = manifest.stage(ODOMETRY).maps
+        return maps[_MODEL].scale_sigma if maps else None
     path = run / REPORT
     stages = read_json_object(path).get("stages") if path.is_file() else None
     if not isinstance(stages, dict):

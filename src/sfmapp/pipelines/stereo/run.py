@@ -39,8 +39,7 @@ from sfmapp.workspace.usage import Stopwatch
 
 STAGE = STEREO
 _QUANTILES = (0.01, 0.5, 0.99)
-# pairs that tell how far their rig has turned, and of a film frames from its beginning: they are rectified once more
-# for it, and matched once
+# pairs that tell how far their rig has turned, and of a film frames from its beginning: they are read once more for it
 _PAIRS_OF_TURN, _FRAMES_OF_TURN = 12, 6
 
 
@@ -118,7 +117,7 @@ def stereo(
         before: Moment | None = None
         for number, pair in enumerate(pairs):
             try:
-                turn = turns.get(number, turns.get(None, PrepareOptions()))
+                turn = turns.pop(number, turns.get(None, PrepareOptions()))
                 last, report, before = _do_pair(job, pair, turn, also or AlsoWritten(), before)
                 told.append(report)
             except InputError as error:
@@ -194,8 +193,9 @@ def _turns(
         except InputError:
             return pairs, {}  # named of the pair that has it
     told: dict[int | None, PrepareOptions] = {None: PrepareOptions(turn=turn.found)}
-    for place, matches in zip(places, turn.matches, strict=False):  # none of cameras that the photographs told
-        told[place] = PrepareOptions(turn=turn.found, matches=matches)
+    # none of cameras that the photographs told
+    for place, matches, rectified in zip(places, turn.matches, turn.rectified, strict=False):
+        told[place] = PrepareOptions(turn=turn.found, matches=matches, rectified=rectified)
     return pairs, told
 
 
