@@ -32,6 +32,7 @@ from rendered_worlds.solids import Lamps, Solid, render
 from sfmapp.carve.hull import hull_of
 from sfmapp.carve.isosurface import surface_of
 from sfmapp.carve.joined import Evidence, join
+from sfmapp.carve.limits import OUTLINES, PATCHES, find_known
 from sfmapp.carve.outlines import signed_distance
 from sfmapp.carve.sight import sights_of_patches
 from sfmapp.carve.silhouettes import Silhouette
@@ -215,9 +216,15 @@ def measure(case: Case, cells: int) -> Iterator[dict[str, Any]]:
     yield row(case, "mesh of patches", made, cpu_s=dense_s + report.cpu_s)
     begin = time.process_time()
     evidence = Evidence(case.views, case.silhouettes, hull, sights_of_patches(case.views, patches, names))
-    joined, _ = join(evidence, case.low, case.side, cells)
+    joined, told = join(evidence, case.low, case.side, cells)
     mesh = surface_of(joined.tree, joined.distance)
-    yield row(case, "joined", mesh, cpu_s=dense_s + time.process_time() - begin)
+    joined_s = dense_s + time.process_time() - begin
+    yield row(case, "joined", mesh, cpu_s=joined_s)
+    known = find_known(mesh, case.views, evidence, told.band, threads=2)
+    for least, way in ((OUTLINES, "of it, by patches or outlines"), (PATCHES, "of it, by patches")):
+        kept = known.kind >= least
+        part = Mesh(mesh.xyz, mesh.faces[kept], mesh.normal, mesh.rgb)
+        yield row(case, way, part, cpu_s=joined_s) | {"area_share": float(known.areas[kept].sum() / known.areas.sum())}
 
 
 def row(case: Case, way: str, made: Mesh | Patches, cpu_s: float) -> dict[str, Any]:
@@ -261,7 +268,9 @@ def markdown(report: dict[str, Any]) -> str:
         cells = [" / ".join(f"{100 * part[k]:.1f}" for part in parts) for k in ("f", "accuracy", "completeness")]
         volume = f"{100 * run['volume_error']:+.1f} %" if "volume_error" in run else ""
         about = f"| {run['case']} | {run['cells']} | {run['way']}"
-        told = f"{volume} | {run.get('open_edges', '')} | {run['cpu_s']:.0f}"
+        edges = "" if "area_share" in run else run.get("open_edges", "")
+        told = f"{volume} | {edges} | {run['cpu_s']:.0f}"
+        about += f" ({100 * run['area_share']:.0f} % of the area)" if "area_share" in run else ""
         lines.append(f"{about} | {' | '.join(cells)} | {told} |")
     shares = {run["way"]: run for run in report["runs"] if run["case"] == "lego"}
     lines += ["", "Sizes are diagonals of boxes. CPU of patches is in what is made of them."]

@@ -304,6 +304,10 @@ def joined_rows(folder: Path) -> Iterator[Row]:
         for way in ("hull", "patches", "mesh of patches"):
             mine, theirs = (100.0 * run["at 0.01"]["f"] for run in (ours, runs[way]))
             yield Row("carving_joined", case, "F-score at 1 % of the size", "%", "more", mine, way, theirs, *about)
+            if (part := "of it, by patches or outlines") in runs:
+                told = 100.0 * runs[part]["at 0.01"]["f"]
+                what = "F-score at 1 % of the size, what patches or outlines tell"
+                yield Row("carving_joined", case, what, "%", "more", told, way, theirs, *about)
         if "volume_error" in ours:
             mine, theirs = (100.0 * abs(runs[way]["volume_error"]) for way in ("joined", "hull"))
             yield Row("carving_joined", case, "error of the volume", "%", "less", mine, "hull", theirs, *about)

@@ -12,6 +12,7 @@ from sfmapp.carve.hull import hull_of
 from sfmapp.carve.isosurface import surface_of
 from sfmapp.carve.joined import Evidence, Joined, JoinReport, join
 from sfmapp.carve.joined_kernels import BINS, FULL, find_value, paint
+from sfmapp.carve.limits import CLOSURE, OUTLINES, PATCHES, find_known, find_limits
 from sfmapp.carve.octree import places_of
 from sfmapp.carve.sight import Sight, sights_of_patches
 from sfmapp.carve.views import View, view_of_matrix
@@ -61,9 +62,7 @@ def sight_of(view: View, solid: Solid, seen: NDArray[np.bool_] | None = None) ->
     )  # fmt: skip
 
 
-def joined(
-    solid: Solid, seen: Solid | None = None, threads: int = 2, cells: int = CELLS
-) -> tuple[Joined, JoinReport, Mesh]:
+def evidence_of(solid: Solid, seen: Solid | None = None) -> Evidence:
     """``seen``: patches are only where they are inside of this."""
     views = views_around()
     silhouettes = [silhouette_of(view, solid) for view in views]
@@ -80,8 +79,13 @@ def joined(
             keep = np.nan_to_num(seen(points), nan=1.0) < 0.0
             sight = sight_of(view, solid, keep)
         sights.append(sight)
-    hull = hull_of(views, silhouettes)
-    found, report = join(Evidence(views, silhouettes, hull, sights), LOW, SIDE, cells, threads=threads)
+    return Evidence(views, silhouettes, hull_of(views, silhouettes), sights)
+
+
+def joined(
+    solid: Solid, seen: Solid | None = None, threads: int = 2, cells: int = CELLS
+) -> tuple[Joined, JoinReport, Mesh]:
+    found, report = join(evidence_of(solid, seen), LOW, SIDE, cells, threads=threads)
     return found, report, surface_of(found.tree, found.distance)
 
 
@@ -137,6 +141,32 @@ def test_bytes_do_not_depend_on_threads() -> None:
     assert first.xyz.tobytes() == second.xyz.tobytes()
     assert one.tree.surface.tobytes() == two.tree.surface.tobytes()
     assert all(a.tobytes() == b.tobytes() for a, b in zip(one.tree.full, two.tree.full, strict=True))
+
+
+def test_triangles_say_who_tells_them() -> None:
+    # patches in one half of the hollow: outlines tell the outside, and nobody the other half
+    evidence = evidence_of(
+        BOWL, seen=without(ball(HOLLOW + 0.05, (0.0, 0.0, AT)), box((1.0, 2.0, 2.0), (1.0, 0.0, 0.0)))
+    )
+    found, report = join(evidence, LOW, SIDE, CELLS)
+    mesh, views = surface_of(found.tree, found.distance), views_around()
+    known = find_known(mesh, views, evidence, report.band)
+    error = np.abs(BOWL(known.centers))
+    patches, closure = known.kind == PATCHES, known.kind == CLOSURE
+    assert error[patches].max() < 2.0 * report.band
+    assert np.abs(evidence.hull.distance(known.centers[known.kind == OUTLINES])).max() < found.tree.cell
+    in_hollow = np.linalg.norm(known.centers - (0.0, 0.0, AT), axis=1) < HOLLOW + 0.02
+    assert patches[in_hollow & (known.centers[:, 2] < 0.6) & (known.centers[:, 0] < -0.1)].mean() > 0.95
+    # what nobody tells is typically farther off than nearly all that patches tell
+    assert np.quantile(error[patches], 0.9) < 0.5 * found.tree.cell
+    assert np.median(error[closure]) > 4.0 * np.quantile(error[patches], 0.9)
+    limits = find_limits(mesh, mesh, views, evidence.silhouettes, known)
+    shares = limits.patches_share, limits.outlines_share, limits.closure_share, limits.unseen_share
+    assert sum(shares) == pytest.approx(1.0)
+    assert min(shares[:3]) > 0.02
+    marks = known.of_vertices(mesh)
+    assert (marks[mesh.faces].max(axis=1) <= known.kind).all()
+    assert (marks[mesh.faces[patches]] == PATCHES).mean() > 0.8
 
 
 def test_cells_of_the_octree_are_inside_outside_or_cut() -> None:

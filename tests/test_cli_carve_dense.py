@@ -11,10 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 from carving_scenes import around, box, mask_of, without
-from sfmapp.carve.files import read_octree
+from sfmapp.carve.files import read_joined, read_octree
+from sfmapp.carve.limits import PATCHES
 from sfmapp.cli.main import main
 from sfmapp.dense.files import write_patches
 from sfmapp.dense.scene import Patches
+from sfmapp.formats.ply_reader import read_ply_geometry
 
 VIEWS = around(10, 5.0, 120, 90, 50.0)
 TROUGH = without(box((0.8, 0.6, 0.5)), box((0.6, 0.4, 0.5), (0.0, 0.0, 0.3)))
@@ -86,6 +88,36 @@ def test_patches_hollow_out_what_silhouettes_leave_full(photographs: Path, tmp_p
     assert "joined.npz" in report["files"]
     inner, outer = read_octree(tmp_path / "out" / "joined.npz").volume_bounds()
     assert inner < report["surface"]["volume"] < outer
+
+
+def test_the_surface_says_what_tells_it_and_a_second_call_joins_no_more(photographs: Path, tmp_path: Path) -> None:
+    write_patches(tmp_path / "patches.npz", patches_inside(), [view.name for view in VIEWS])
+    out = tmp_path / "out"
+    call = photographs, "-o", out, "--with-dense", tmp_path / "patches.npz"
+    assert carve(*call) == 0
+    limits = json.loads((out / "report.json").read_text())["limits"]
+    first = (out / "mesh.ply").read_bytes()
+    header, body = first.split(b"end_header\n", 1)
+    assert b"comment evidence: 0 unseen, 1 closure, 2 outlines, 3 patches\n" in header
+    assert header.endswith(b"property uchar evidence\nelement face " + header.split(b"element face ")[1])
+    num = int(header.split(b"element vertex ")[1].split()[0])
+    fields = [("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3), ("evidence", "u1")]
+    vertices = np.frombuffer(body, fields, num)
+    assert len(read_ply_geometry(out / "mesh.ply").xyz) == num
+    floor = np.abs(vertices["xyz"] - (0.0, 0.0, -0.2)).max(axis=1) < 0.3
+    assert (vertices["evidence"][floor & (vertices["normal"][:, 2] > 0.9)] == PATCHES).all()
+    assert (vertices["evidence"] == PATCHES).mean() == pytest.approx(limits["patches_share"], abs=0.1)
+    # of a trough that patches tell, the volume is bounded by its outlines still
+    assert limits["volume_high"] > VOLUME
+
+    assert carve(*call) == 0
+    decisions = json.loads((out / "report.json").read_text())["decisions"]
+    assert any("joined by an earlier call" in decision["message"] for decision in decisions)
+    assert (out / "mesh.ply").read_bytes() == first
+    (out / "joined.npz").write_bytes((out / "joined.npz").read_bytes()[:1000])
+    assert carve(*call) == 0
+    assert (out / "mesh.ply").read_bytes() == first
+    assert read_joined(out / "joined.npz").tree.cell > 0.0
 
 
 def test_missing_or_foreign_patches_are_named(

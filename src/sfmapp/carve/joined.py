@@ -98,6 +98,13 @@ class JoinReport(Report):
     filled_share: float
 
 
+def _find(codes: Codes, places: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Positions (M,) of places (M, 3) among ascending codes, -1 where they are not."""
+    wanted = codes_of(places)
+    at = np.minimum(np.searchsorted(codes, wanted), len(codes) - 1)
+    return np.where((codes[at] == wanted) & (places >= 0).all(axis=1), at, -1)
+
+
 @dataclass
 class _Level:
     """Nodes (N) of the lattice of a level: places, their sorted codes, and what is known of them."""
@@ -115,14 +122,27 @@ class _Level:
 
     def find(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
         """Positions (M,) of nodes at places (M, 3), -1 where none is."""
-        wanted = codes_of(places)
-        at = np.minimum(np.searchsorted(self.codes, wanted), len(self.codes) - 1)
-        return np.where((self.codes[at] == wanted) & (places >= 0).all(axis=1), at, -1)
+        return _find(self.codes, places)
+
+    def nodes(self, band: float, *, is_finest: bool) -> Nodes:
+        """Distances, cut off at a band."""
+        distance = np.where(self.hull > 0.0, np.minimum(self.value * band, self.hull), self.hull)
+        if not is_finest:
+            distance = np.where(distance > 0.0, band, -band)
+        return Nodes(self.codes, np.clip(distance, -band, band).astype(np.float32))
 
 
 class _Cube(NamedTuple):
     low: Array
     side: float
+
+
+class Nodes(NamedTuple):
+    """Nodes of a lattice: ascending codes (N,) uint64 of their places, and signed distances (N,) float32 there, units
+    of the world, positive inside; of a lattice that is not the finest, the sign alone."""
+
+    codes: Codes
+    distance: Floats
 
 
 @dataclass(frozen=True)
@@ -131,11 +151,12 @@ class Joined:
 
     Attributes:
         tree: the solid.
-        levels: nodes of the lattice, coarse to fine.
+        nodes: of the lattice of corners at each level, coarse to fine, the last of them of the octree's finest cells.
+        band: what is no nearer to the surface has this distance to it, units of the world.
     """
 
     tree: Octree
-    levels: tuple[_Level, ...]
+    nodes: tuple[Nodes, ...]
     band: float
 
     def distance(self, xyz: ArrayLike) -> Array:
@@ -144,12 +165,10 @@ class Joined:
         places = np.rint((np.asarray(xyz) - self.tree.low) / self.tree.cell).astype(np.int64)
         out = np.full(len(places), -self.band)
         left = np.arange(len(places))
-        for up, level in enumerate(reversed(self.levels)):
-            at = level.find((places[left] + (1 << up >> 1)) >> up)
+        for up, nodes in enumerate(reversed(self.nodes)):
+            at = _find(nodes.codes, (places[left] + (1 << up >> 1)) >> up)
             known = at >= 0
-            hull = level.hull[at[known]]
-            value = np.where(hull > 0.0, np.minimum(level.value[at[known]] * self.band, hull), hull)
-            out[left[known]] = value if up == 0 else np.where(value > 0.0, self.band, -self.band)
+            out[left[known]] = nodes.distance[at[known]]
             left = left[~known]
         return out
 
@@ -229,7 +248,8 @@ def join(
         filled_share=float((last.extra > 0.0).sum() / max(1, (last.hull > 0.0).sum())),
     )  # fmt: skip
     events.finished(STAGE, f"{100 * report.volume / report.hull_volume:.0f} % of the hull is left", **report)
-    return Joined(tree, tuple(levels), band), report
+    nodes = [level.nodes(band, is_finest=level is last) for level in levels]
+    return Joined(tree, tuple(nodes), band), report
 
 
 def _iterations(number: int) -> int:

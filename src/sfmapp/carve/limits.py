@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.carve.joined import Evidence
 from sfmapp.carve.joined_kernels import BINS, vote
 from sfmapp.carve.rendering import show_mesh
-from sfmapp.carve.sight import Sight
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View, project_points
 from sfmapp.geometry import rigid3
@@ -27,8 +27,12 @@ from sfmapp.surface.trim import pieces
 
 Array = NDArray[np.float64]
 
-# who vouches for a piece of the surface
-UNSEEN, OUTLINES, PATCHES = 0, 1, 2
+# who vouches for a piece of the surface, the least first
+UNSEEN, CLOSURE, OUTLINES, PATCHES = 0, 1, 2, 3
+KINDS = ("unseen", "closure", "outlines", "patches")
+# a piece lies on the hull if it is no farther from it, in edges of triangles: vertices of the hull's own surface are
+# within a tenth, centres of triangles across its creases within half
+_ON_HULL_EDGES = 0.5
 # a view sees a surface that is this much turned towards it, as ``sfmapp dense`` asks for
 _SMALLEST_COSINE = 0.2
 # a place is hidden if the surface in front of it is nearer by more than this, in edges of triangles
@@ -70,14 +74,16 @@ class LimitsReport(Report):
     """What is not known of a surface.
 
     Attributes:
-        patches_share, outlines_share, unseen_share: of its area, what patches vouch for; what photographs see, but
-            only outlines bound, so that a hollow may be there; and what no photograph sees.
+        patches_share, outlines_share, closure_share, unseen_share: of its area, what patches vouch for; what
+            photographs see, but only outlines bound, so that a hollow may be there; what photographs see and neither
+            tells, so that it is the least surface that closes the rest; and what no photograph sees.
         hollows: the largest unseen pieces. next_views: places for photographs, the most useful first.
         volume_high: the object has no more, cubic units of the world. area_low: no less, square units.
     """
 
     patches_share: float
     outlines_share: float
+    closure_share: float
     unseen_share: float
     hollows: Sequence[Hollow]
     next_views: Sequence[NextView]
@@ -90,7 +96,7 @@ class Known:
     """Triangles (F) of a surface and what is known of them.
 
     Attributes:
-        kind: (F,) ``UNSEEN``, ``OUTLINES`` or ``PATCHES``.
+        kind: (F,) ``UNSEEN``, ``CLOSURE``, ``OUTLINES`` or ``PATCHES``.
         centers, normals: (F, 3), world. areas: (F,).
         num_seeing: (F,) photographs that see it.
     """
@@ -101,16 +107,24 @@ class Known:
     areas: Array
     num_seeing: NDArray[np.int32]
 
+    def of_vertices(self, mesh: Mesh) -> NDArray[np.uint8]:
+        """(N,) what is known of the vertices of the mesh: the least of what is known of their triangles."""
+        found = np.full(len(mesh.xyz), PATCHES, np.uint8)
+        np.minimum.at(found, mesh.faces.ravel(), np.repeat(self.kind.astype(np.uint8), 3))
+        return found
+
 
 def find_known(
-    mesh: Mesh, views: Sequence[View], sights: Sequence[Sight] = (), band: float = 0.0, *, threads: int = 1
+    mesh: Mesh, views: Sequence[View], evidence: Evidence | None = None, band: float = 0.0, *, threads: int = 1
 ) -> Known:
     """Who vouches for each triangle.
 
     Args:
         mesh: closed.
         views: the photographs.
-        sights: what they see of patches, if there are any. band: within which a patch vouches, units of the world.
+        evidence: of a surface that is not the whole hull's: what is not on the hull is not told by outlines; None:
+            these tell all of it.
+        band: within which a patch of the evidence vouches, units of the world.
         threads: views at a time; the result does not depend on it.
     """
     vectors = face_vectors(mesh.xyz, mesh.faces)
@@ -122,13 +136,22 @@ def find_known(
     with ThreadPoolExecutor(threads) as pool:
         for sees in pool.map(lambda view: _sees(view, mesh, centers, normals, edge), views):
             seeing += sees
-    votes = np.zeros((len(areas), BINS), np.uint8)
-    for sight in sights:
+    kind = np.full(len(areas), OUTLINES, np.int8)
+    if evidence is not None:
+        kind[np.abs(evidence.hull.distance(centers, threads)) > _ON_HULL_EDGES * edge] = CLOSURE
+    kind[seeing == 0] = UNSEEN
+    if evidence is not None:
+        kind[_beside_patches(centers, evidence, band)] = PATCHES
+    return Known(kind, centers, normals, areas, seeing)
+
+
+def _beside_patches(centers: Array, evidence: Evidence, band: float) -> NDArray[np.bool_]:
+    """Which places (F, 3) lie within a band of a patch that a photograph sees there."""
+    votes = np.zeros((len(centers), BINS), np.uint8)
+    for sight in evidence.sights:
         outer = np.column_stack([rigid3.rotation_matrix(sight.cam_from_world), sight.cam_from_world[4:]])
         vote(centers, outer, sight.k, sight.depth, sight.normal, band, votes)
-    kind = np.where(seeing > 0, OUTLINES, UNSEEN).astype(np.int8)
-    kind[(votes[:, 1 : BINS - 1] > 0).any(axis=1)] = PATCHES
-    return Known(kind, centers, normals, areas, seeing)
+    return np.asarray((votes[:, 1 : BINS - 1] > 0).any(axis=1))
 
 
 def _sees(view: View, mesh: Mesh, centers: Array, normals: Array, edge: float) -> NDArray[np.bool_]:
@@ -156,9 +179,10 @@ def find_limits(
         views, silhouettes: one of each for a photograph.
     """
     total = float(known.areas.sum())
-    shares = [float(known.areas[known.kind == kind].sum()) / total for kind in (UNSEEN, OUTLINES, PATCHES)]
+    shares = [float(known.areas[known.kind == kind].sum()) / total for kind in range(len(KINDS))]
     return LimitsReport(
-        unseen_share=shares[UNSEEN], outlines_share=shares[OUTLINES], patches_share=shares[PATCHES],
+        unseen_share=shares[UNSEEN], closure_share=shares[CLOSURE], outlines_share=shares[OUTLINES],
+        patches_share=shares[PATCHES],
         hollows=_hollows(mesh, known), next_views=_next_views(mesh, views, known),
         volume_high=_volume_high(hull_mesh, views, silhouettes), area_low=_area_low(hull_mesh, views, silhouettes),
     )  # fmt: skip

@@ -65,7 +65,7 @@ class CarveReport(Report):
         cameras: what they are, in words. left_out: photographs without a camera, and cameras without a photograph.
         tolerance: holes of masks through which nothing was carved; absent where that was not asked for.
         shadows: what photographs under single lights took away; absent without.
-        limits: what is not known of the surface, and where to photograph from next; absent with a box or patches.
+        limits: what is not known of the surface, and where to photograph from next; absent with a box.
         texture: that of the GLB; absent where vertices have the colours.
         joining: what patches did to it; absent without.
         files: what was written, in the folder of the run.

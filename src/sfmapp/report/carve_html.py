@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.carve.limits import LimitsReport
+from sfmapp.carve.limits import CLOSURE, OUTLINES, PATCHES, UNSEEN, Known, LimitsReport
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View
 from sfmapp.report.carve_document import CarveReport
-from sfmapp.report.carve_pictures import cropped, overlap_picture, result_pictures, slice_picture
+from sfmapp.report.carve_pictures import TINTS, cropped, overlap_picture, result_pictures, slice_picture
 from sfmapp.report.drawing import jpeg_url
 from sfmapp.report.page import log_table, render_page, table, usage_table
 from sfmapp.scene.mesh import Mesh
@@ -28,28 +29,37 @@ _STYLE = """<style>.trio{display:grid;grid-template-columns:repeat(3,1fr);gap:.8
 .key{display:inline-block;width:.8rem;height:.8rem;vertical-align:-.1rem;margin:0 .25rem 0 .6rem}</style>"""
 
 
+@dataclass(frozen=True)
+class Shape:
+    """The volume that the page shows: its cells, its surface, and what is known of that."""
+
+    octree: Octree
+    mesh: Mesh
+    known: Known
+
+
 def carve_page(
-    report: CarveReport, views: Sequence[View], silhouettes: Sequence[Silhouette], octree: Octree, mesh: Mesh,
+    report: CarveReport, views: Sequence[View], silhouettes: Sequence[Silhouette], shape: Shape,
     read: Callable[[int], Pixels],
 ) -> str:  # fmt: skip
     """The page, self-contained, its pictures in it; ``read`` gives the photograph of a view."""
     title = f"A volume of {report.num_views} photographs"
-    return render_page(title, _body(report, views, silhouettes, octree, mesh, read))
+    return render_page(title, _body(report, views, silhouettes, shape, read))
 
 
 def _body(
-    report: CarveReport, views: Sequence[View], silhouettes: Sequence[Silhouette], octree: Octree, mesh: Mesh,
+    report: CarveReport, views: Sequence[View], silhouettes: Sequence[Silhouette], shape: Shape,
     read: Callable[[int], Pixels],
 ) -> Iterator[str]:  # fmt: skip
     yield _STYLE
     for line in report.warnings:
         yield f'<div class="failure"><p>{escape(line.message or "")}</p></div>'
     yield _summary(report)
-    yield from _photographs(report, views, silhouettes, mesh, read)
+    yield from _photographs(report, views, silhouettes, shape, read)
     yield from _fits(report)
     if report.limits is not None:
-        yield _limits(report.limits)
-    yield from _slices(octree, mesh)
+        yield _limits(report.limits, is_joined=report.joining is not None)
+    yield from _slices(shape.octree, shape.mesh)
     yield _levels(report)
     yield log_table("Decisions", report.decisions)
     yield usage_table(report.usage, report.run)
@@ -63,11 +73,19 @@ def _summary(report: CarveReport) -> str:
         f"<p>Seen again by its {report.num_views} photographs, the volume covers their silhouettes by "
         f"{np.median(fits):.2%} in the median (intersection over union; least {min(fits):.2%}). Cameras: "
         f"{escape(report.cameras)}.</p><p>Its closed surface of {surface.num_faces:,} triangles measures {size}, with "
-        f"a volume of {surface.volume:.5g} and an area of {surface.area:.5g}, in units of the world. The hull's volume "
-        f"lies between {carving.volume_low:.5g}, cells that are wholly inside, and {carving.volume_high:.5g}, with "
-        f"those at the surface. The object itself may be smaller: what no outline shows, such as the inside of a cup, "
-        "stays filled.</p>"
+        f"a volume of {surface.volume:.5g} and an area of {surface.area:.5g}, in units of the world. Its volume lies "
+        f"between {carving.volume_low:.5g}, cells that are wholly inside, and {carving.volume_high:.5g}, with those at "
+        "the surface. "
     )
+    if report.joining is None:
+        text += "The object itself may be smaller: what no outline shows, such as the inside of a cup, stays filled."
+    else:
+        joining = report.joining
+        text += (
+            f"That is {joining.volume / joining.hull_volume:.0%} of what outlines alone leave ("
+            f"{joining.hull_volume:.5g}): {joining.num_sights} photographs see patches in the hollows of it."
+        )
+    text += "</p>"
     if report.box.told_by != "silhouettes":
         text += f"<p>The box was told by {escape(report.box.told_by)}.</p>"
     if report.shadows is not None:
@@ -96,27 +114,39 @@ def _summary(report: CarveReport) -> str:
 
 
 def _photographs(
-    report: CarveReport, views: Sequence[View], silhouettes: Sequence[Silhouette], mesh: Mesh,
+    report: CarveReport, views: Sequence[View], silhouettes: Sequence[Silhouette], shape: Shape,
     read: Callable[[int], Pixels],
 ) -> Iterator[str]:  # fmt: skip
+    kind = None if report.joining is None else shape.known.kind
     fits = np.array([fit.iou for fit in report.colors.views])
     spread = np.unique(np.linspace(0, len(views) - 1, _NUM_SHOWN + 1)[:-1].round().astype(int)).tolist()
     chosen = [*spread, *(i for i in np.argsort(fits, kind="stable")[:_NUM_WORST].tolist() if i not in spread)]
     yield "<h2>Photographs and what was carved</h2>"
+    told = ""
+    if kind is not None:
+        named = (
+            (PATCHES, "patches"), (OUTLINES, "outlines alone"), (CLOSURE, "neither"), (UNSEEN, "no photograph"),
+        )  # fmt: skip
+        told = ", tinted by what tells it:" + ",".join(_key(TINTS[number], name) for number, name in named)
     yield (
         '<p class=dim>Left the photograph, pale outside its silhouette: <span class=key style="background:#eb3c28">'
         '</span>covered by the volume alone, <span class=key style="background:#286eff"></span>by the silhouette '
-        "alone. In the middle the volume in colours, right its shape lit from the camera. The last ones fit worst.</p>"
+        f"alone. In the middle the volume in colours, right its shape lit from the camera{told}. The last ones fit "
+        "worst.</p>"
     )
     for v in chosen:
-        shown, colors, shape = result_pictures(views[v], mesh)
-        pictures = [overlap_picture(read(v), shown, silhouettes[v]), colors, shape]
+        shown, colors, lit = result_pictures(views[v], shape.mesh, kind)
+        pictures = [overlap_picture(read(v), shown, silhouettes[v]), colors, lit]
         captions = [f"{report.colors.views[v].name}: {fits[v]:.2%}", "", ""]
         yield "<div class=trio>"
         for picture, caption in zip(cropped(pictures, shown, silhouettes[v]), captions, strict=True):
             url = jpeg_url(picture, _SHOWN_PX, _QUALITY)
             yield f'<figure><img src="{url}" alt=""><figcaption>{escape(caption)}</figcaption></figure>'
         yield "</div>"
+
+
+def _key(color: tuple[int, int, int], name: str) -> str:
+    return f'<span class=key style="background:rgb{color}"></span>{name}'
 
 
 def _fits(report: CarveReport) -> Iterator[str]:
@@ -140,11 +170,17 @@ def _fits(report: CarveReport) -> Iterator[str]:
         yield f"<p class=dim>{escape(entry.name)}: {escape(entry.reason)}</p>"
 
 
-def _limits(limits: LimitsReport) -> str:
-    text = (
-        f"<h2>What is not known</h2><p>{limits.outlines_share:.1%} of the surface is told by outlines alone: "
-        f"photographs see it, and it may be hollow there. {limits.unseen_share:.1%} no photograph sees. The "
-        f"object's volume is no more than {limits.volume_high:.5g}"
+def _limits(limits: LimitsReport, *, is_joined: bool) -> str:
+    text = "<h2>What is not known</h2><p>"
+    if is_joined:
+        text += (
+            f"Patches tell {limits.patches_share:.1%} of the surface. {limits.closure_share:.1%} is told by neither "
+            "patches nor outlines: the least surface that closes the rest, and not where the object's own has to be. "
+        )
+    text += (
+        f"{limits.outlines_share:.1%} of the surface is told by outlines alone: photographs see it, and it may be "
+        f"hollow there. {limits.unseen_share:.1%} no photograph sees. The object's volume is no more than "
+        f"{limits.volume_high:.5g}"
     )
     text += f", its area no less than {limits.area_low:.5g}.</p>" if limits.area_low else ".</p>"
     if limits.hollows:

@@ -21,6 +21,8 @@ _PAPER, _SURFACE = (255, 255, 255), (30, 34, 40)
 _BACKGROUND = (250, 250, 250)
 # what the silhouette alone covers, and what the result alone does
 UNDER, OVER = (40, 110, 255), (235, 60, 40)
+# what no photograph sees, what is told by neither outlines nor patches, by outlines alone, and by patches
+TINTS = ((200, 120, 200), (255, 170, 80), (130, 180, 255), (255, 255, 255))
 
 
 def slice_picture(octree: Octree, axis: int, at: float, ends: tuple[Array, Array]) -> Pixels:
@@ -71,8 +73,9 @@ def overlap_picture(photograph: Pixels, shown: Shown, silhouette: Silhouette) ->
     return out
 
 
-def result_pictures(view: View, mesh: Mesh) -> tuple[Shown, Pixels, Pixels]:
-    """What a view shows of the result, that in colours, and its shape lit from the camera."""
+def result_pictures(view: View, mesh: Mesh, kind: NDArray[np.int8] | None = None) -> tuple[Shown, Pixels, Pixels]:
+    """What a view shows of the result, that in colours, and its shape lit from the camera, tinted by what is known
+    (F,) of its triangles, see :class:`sfmapp.carve.limits.Known`, if that is given."""
     shown = show_mesh(view, mesh.xyz, mesh.faces)
     there = shown.face >= 0
     corners = mesh.faces[shown.face[there]]
@@ -82,7 +85,8 @@ def result_pictures(view: View, mesh: Mesh) -> tuple[Shown, Pixels, Pixels]:
     toward = view.center - mesh.xyz[corners].mean(axis=1)
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     lit = np.einsum("nc,nc->n", mesh.normal[corners].mean(axis=1), toward)
-    shape[there] = np.clip(60.0 + 180.0 * np.abs(lit), 0.0, 255.0).astype(np.uint8)[:, None]
+    tint = np.ones((len(lit), 3)) if kind is None else np.array(TINTS)[kind[shown.face[there]]] / 255.0
+    shape[there] = np.clip((60.0 + 180.0 * np.abs(lit))[:, None] * tint, 0.0, 255.0).astype(np.uint8)
     return shown, colors, shape
 
 

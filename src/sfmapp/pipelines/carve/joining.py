@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from sfmapp.carve.box import Box, clip_octree
+from sfmapp.carve.files import read_joined, write_joined
 from sfmapp.carve.hull import Hull
 from sfmapp.carve.joined import Evidence, Joined, JoinReport, join
 from sfmapp.carve.octree import Octree
@@ -15,8 +17,12 @@ from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View
 from sfmapp.dense.files import read_patches
 from sfmapp.errors import InputError
-from sfmapp.pipelines.dense.results import PATCHES
+from sfmapp.pipelines.carve.outputs import JOINED, JOINING
+from sfmapp.pipelines.dense.results import PATCHES, file_digest
+from sfmapp.reporting import from_plain
 from sfmapp.workspace.job import Job
+from sfmapp.workspace.keys import stage_key
+from sfmapp.workspace.layout import CARVE
 
 STAGE = "join"
 
@@ -47,16 +53,48 @@ def find_patches(source: str | os.PathLike[str], told: str | os.PathLike[str]) -
     return path
 
 
-def join_patches(job: Job, path: Path, photographs: Photographs, octree: Octree) -> tuple[Joined, JoinReport]:
-    """The volume that silhouettes and patches leave together, in the cube and the cells of the hull's octree.
+@dataclass(frozen=True)
+class Joining:
+    """A joined volume, and what it was joined of.
+
+    Attributes:
+        evidence: silhouettes and patches. hull_octree: the hull's cells.
+    """
+
+    joined: Joined
+    report: JoinReport
+    evidence: Evidence
+    hull_octree: Octree
+
+
+def join_patches(job: Job, path: Path, photographs: Photographs, octree: Octree, box: Box) -> Joining:
+    """The volume that silhouettes and patches leave together, in the cube and the cells of the hull's octree, what is
+    in the box if that is a user's; that of an earlier call where it was joined of the same.
 
     Raises:
         InputError: the file is no such file, its patches are of other photographs, or cameras are matrices.
         NoReconstructionError: patches are seen through all of the hull.
     """
-    with job.stage(STAGE):
+    with job.measured("sights"):
         sights = sights_of_patches(photographs.views, *read_patches(path))
-        evidence = Evidence(photographs.views, photographs.silhouettes, photographs.hull, sights)
-        return join(
+    evidence = Evidence(photographs.views, photographs.silhouettes, photographs.hull, sights)
+    folder = job.workspace.folder
+    # the octree's own key tells the photographs, their cameras and silhouettes
+    key = stage_key((__name__,), None, job.workspace.manifest.stage(CARVE).key, file_digest(path))
+    if job.workspace.is_current(STAGE, key):
+        try:
+            found = read_joined(folder / JOINED), from_plain(JoinReport, job.workspace.read_json(JOINING))
+            job.events.decided(STAGE, "patches were joined by an earlier call")
+            return Joining(*found, evidence, octree)
+        except (InputError, ValueError):
+            pass  # taken away or damaged: joined again
+    with job.stage(STAGE, key):
+        joined, report = join(
             evidence, octree.low, octree.side, 2**octree.depth, events=job.events, threads=job.threads
         )  # fmt: skip
+        if box.told_by == "user":
+            joined = replace(joined, tree=clip_octree(joined.tree, box))
+        write_joined(folder / JOINED, joined)
+        job.workspace.write_json(JOINING, report)
+    job.workspace.save()  # a call that is stopped from here on need not join again
+    return Joining(joined, report, evidence, octree)

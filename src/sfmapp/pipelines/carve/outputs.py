@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.carve.limits import KINDS
 from sfmapp.formats.glb import write_glb
-from sfmapp.formats.mesh_ply import write_mesh_ply
+from sfmapp.formats.mesh_ply import VertexMark, write_mesh_ply
 from sfmapp.scene.mesh import Mesh
 
 OCTREE, MESH_PLY, MESH_GLB = "octree.npz", "mesh.ply", "mesh.glb"
@@ -16,13 +17,19 @@ OCTREE, MESH_PLY, MESH_GLB = "octree.npz", "mesh.ply", "mesh.glb"
 SHADOWED = "octree_shadows.npz"
 # what is left with patches
 JOINED = "joined.npz"
-# what carving said of itself, for a call that resumes
-CARVING = "octree.json"
+# what carving and joining said of themselves, for a call that resumes
+CARVING, JOINING = "octree.json", "joined.json"
+# what is known of each vertex
+EVIDENCE = "evidence"
 
 
-def write_surface(folder: Path, mesh: Mesh, shown: Mesh, up: NDArray[np.float64]) -> list[str]:
+def write_surface(
+    folder: Path, mesh: Mesh, evidence: NDArray[np.uint8], shown: Mesh, up: NDArray[np.float64]
+) -> list[str]:
     """The mesh for programs, closed and with coloured vertices, and the one for viewers, which may have a texture and
-    is cut apart then; gives the names of the files. ``up``: (3,) in the world."""
-    write_mesh_ply(folder / MESH_PLY, mesh)
+    is cut apart then; gives the names of the files. ``evidence``: (N,) of the vertices, as
+    :meth:`sfmapp.carve.limits.Known.of_vertices` has it. ``up``: (3,) in the world."""
+    meaning = ", ".join(f"{number} {kind}" for number, kind in enumerate(KINDS))
+    write_mesh_ply(folder / MESH_PLY, mesh, VertexMark(EVIDENCE, meaning, evidence))
     write_glb(folder / MESH_GLB, shown, is_z_up=bool(up[2] > np.sqrt(0.5)))
     return [MESH_PLY, MESH_GLB]

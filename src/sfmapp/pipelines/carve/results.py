@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sfmapp.carve.box import Box
 from sfmapp.carve.coloring import ColoringReport
-from sfmapp.carve.limits import LimitsReport
+from sfmapp.carve.limits import Known, LimitsReport
 from sfmapp.carve.masks_report import MasksReport
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.space_carving import LevelCounts
@@ -19,7 +19,7 @@ from sfmapp.images.pixels import read_rgb
 from sfmapp.pipelines.carve.solid import Solid
 from sfmapp.pipelines.carve.sources import CarveSource
 from sfmapp.report.carve_document import BoxFacts, CarveReport, SurfaceFacts
-from sfmapp.report.carve_html import carve_page
+from sfmapp.report.carve_html import Shape, carve_page
 from sfmapp.reporting import NamedReason
 from sfmapp.scene.mesh import Mesh, face_areas
 from sfmapp.surface.report import TextureReport
@@ -41,7 +41,7 @@ class CarvedVolume:
 
     Attributes:
         silhouettes: as they were carved by. masks, tolerance: how they were found, and what is doubtful about them.
-        mesh: its surface in colours. limits: what is not known of it; None where that was not asked.
+        mesh: its surface in colours. known, limits: what is known of it, and what is not; the latter None with a box.
         texture: of the GLB, None without.
         files: names of what was written.
     """
@@ -54,6 +54,7 @@ class CarvedVolume:
     solid: Solid
     mesh: Mesh
     colors: ColoringReport
+    known: Known
     limits: LimitsReport | None
     texture: TextureReport | None
     files: tuple[str, ...]
@@ -70,7 +71,8 @@ def report_of(job: Job, volume: CarvedVolume) -> CarveReport:
         run=job.facts(), cameras=source.cameras, num_views=len(source.views),
         left_out=[NamedReason(name=name, reason=reason) for name, reason in source.left_out], masks=volume.masks,
         box=BoxFacts(low=box.low.tolist(), high=box.high.tolist(), told_by=box.told_by, apart=box.apart),
-        tolerance=volume.tolerance, carving=solid.carving, shadows=solid.shadows, joining=solid.joining,
+        tolerance=volume.tolerance, carving=solid.carving, shadows=solid.shadows,
+        joining=None if solid.joining is None else solid.joining.report,
         surface=_facts(volume.mesh), colors=volume.colors, limits=volume.limits,
         texture=volume.texture, files=volume.files, usage=job.usage,
         warnings=job.log.warnings, decisions=job.log.decisions,
@@ -80,9 +82,8 @@ def report_of(job: Job, volume: CarvedVolume) -> CarveReport:
 def write_page(job: Job, volume: CarvedVolume, report: CarveReport) -> None:
     """The page of the report."""
     with job.measured("page"):
-        page = carve_page(
-            report, volume.source.views, volume.silhouettes, volume.solid.octree, volume.mesh, volume.photograph
-        )
+        shape = Shape(volume.solid.octree, volume.mesh, volume.known)
+        page = carve_page(report, volume.source.views, volume.silhouettes, shape, volume.photograph)
         job.workspace.write_text(PAGE, page)
 
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from sfmapp.carve.box import Box, cameras_inside, find_box, user_box
 from sfmapp.carve.coloring import ColoringReport, color_surface
 from sfmapp.carve.isosurface import surface_of
-from sfmapp.carve.limits import find_known, find_limits
+from sfmapp.carve.joined import Evidence
+from sfmapp.carve.limits import Known, LimitsReport, find_known, find_limits
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette, find_silhouettes
 from sfmapp.carve.tolerance import doubt_holes
@@ -71,12 +72,15 @@ class CarveResult:
     Attributes:
         output: the folder. report: what is in ``report.json``.
         octree: the volume. mesh: its closed surface, in colours.
+        evidence: (N,) uint8 of the mesh's vertices: 0 no photograph sees it, 1 neither outlines nor patches tell it, 2
+            outlines do, 3 patches do.
     """
 
     output: Path
     report: CarveReport
     octree: Octree
     mesh: Mesh
+    evidence: NDArray[np.uint8]
 
 
 def carve(
@@ -121,28 +125,44 @@ def carve(
                 silhouettes, tolerance = doubt_holes(source.views, silhouettes, *box.cube(), job.events)
         solid = find_solid(job, source, silhouettes, box, lights=what.lights, patches=patches)
         mesh, colors = _surface(job, source, silhouettes, solid)
-        limits = None
-        # bounds are the whole hull's: a box cuts them off, and patches have taken from it what is not asked here
-        if box.told_by != "user" and solid.joining is None:
-            with job.stage("limits"):
-                known = find_known(mesh, source.views, threads=job.threads)
-                limits = find_limits(mesh, mesh, source.views, silhouettes, known)
+        with job.stage("limits"):
+            known, limits = _limits(job, source, silhouettes, box, solid, mesh)
         shown, texture = mesh, None
         if job.options.surface.texture:
             with job.stage("texture"):
                 shown, texture = with_texture(job, source, mesh)
         with job.stage("files"):
-            written = write_surface(job.workspace.folder, mesh, shown, up_of_views(source.views))
+            evidence = known.of_vertices(mesh)
+            written = write_surface(job.workspace.folder, mesh, evidence, shown, up_of_views(source.views))
         volume = CarvedVolume(
-            source, silhouettes, masks, tolerance, box, solid, mesh, colors, limits, texture, (*solid.files, *written)
-        )
+            source, silhouettes, masks, tolerance, box, solid, mesh, colors, known, limits, texture,
+            (*solid.files, *written),
+        )  # fmt: skip
         warn_of(job, volume)
         report = report_of(job, volume)
         write_page(job, volume, report)
         write_recording(job, volume, report, wanted=record)
         job.workspace.write_json(REPORT, report)
         job.workspace.save()
-        return CarveResult(job.workspace.folder, report, solid.octree, mesh)
+        return CarveResult(job.workspace.folder, report, solid.octree, mesh, evidence)
+
+
+def _limits(
+    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], box: Box, solid: Solid, mesh: Mesh
+) -> tuple[Known, LimitsReport | None]:  # fmt: skip
+    """What is known of the surface, and what is not; the latter not of one that a user's box cuts off, for bounds are
+    the whole hull's."""
+    joining = solid.joining
+    evidence, band = (None, 0.0) if joining is None else (joining.evidence, joining.report.band)
+    if evidence is None and solid.shadows is None and box.told_by == "user":  # its faces are told by nobody
+        evidence = Evidence(source.views, silhouettes, solid.hull, ())
+    known = find_known(mesh, source.views, evidence, band, threads=job.threads)
+    if box.told_by == "user":
+        return known, None
+    hull_mesh = mesh
+    if joining is not None:
+        hull_mesh = surface_of(joining.hull_octree, lambda xyz: solid.hull.distance(xyz, job.threads))
+    return known, find_limits(mesh, hull_mesh, source.views, silhouettes, known)
 
 
 def _patches(what: CarveInput) -> Path | None:

@@ -15,13 +15,12 @@ from sfmapp.carve.box import Box, clip_octree, tightened
 from sfmapp.carve.files import read_octree, write_octree
 from sfmapp.carve.hull import Hull, hull_of
 from sfmapp.carve.isosurface import Distance, Normals
-from sfmapp.carve.joined import Joined, JoinReport
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.space_carving import CarvingReport, carve_hull
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
-from sfmapp.pipelines.carve.joining import Photographs, join_patches
+from sfmapp.pipelines.carve.joining import Joining, Photographs, join_patches
 from sfmapp.pipelines.carve.lights import carve_by_lights
 from sfmapp.pipelines.carve.outputs import CARVING, JOINED, OCTREE, SHADOWED
 from sfmapp.pipelines.carve.sources import CarveSource
@@ -44,7 +43,9 @@ class Solid:
 
     Attributes:
         octree: its cells. distance, normals: of its surface, see :func:`sfmapp.carve.isosurface.surface_of`.
-        carving: how silhouettes carved it. shadows, joining: what shadows and patches did; None without.
+        carving: how silhouettes carved it. shadows, joining: what shadows and patches did; None without. The volume's
+            bounds are those of what is left.
+        hull: of the silhouettes.
         files: names of the octrees that were written.
     """
 
@@ -53,7 +54,8 @@ class Solid:
     normals: Normals | None
     carving: CarvingReport
     shadows: ShadowsReport | None
-    joining: JoinReport | None
+    hull: Hull
+    joining: Joining | None
     files: tuple[str, ...]
 
 
@@ -73,15 +75,15 @@ def find_solid(
             octree, shadows, taken = carve_by_lights(Path(lights), source, silhouettes, octree, job.events, job.threads)
             write_octree(folder / SHADOWED, octree)
         shape = _shape(job, hull, octree, box, taken)
-        return Solid(octree, *shape, carving, shadows, None, (OCTREE, SHADOWED))
+        return Solid(octree, *shape, carving, shadows, hull, None, (OCTREE, SHADOWED))
     if patches is not None:
-        joined, joining = join_patches(job, patches, Photographs(source.views, silhouettes, hull), octree)
-        octree, distance = _joined_shape(joined, box)
-        inner, outer = octree.volume_bounds()
+        joining = join_patches(job, patches, Photographs(source.views, silhouettes, hull), octree, box)
+        joined = joining.joined
+        inner, outer = joined.tree.volume_bounds()
         carving = replace(carving, volume_low=inner, volume_high=outer)
-        write_octree(folder / JOINED, octree)
-        return Solid(octree, distance, None, carving, None, joining, (OCTREE, JOINED))
-    return Solid(octree, *_shape(job, hull, octree, box, None), carving, None, None, (OCTREE,))
+        distance = _cut(joined.distance, box)
+        return Solid(joined.tree, distance, None, carving, None, hull, joining, (OCTREE, JOINED))
+    return Solid(octree, *_shape(job, hull, octree, box, None), carving, None, hull, None, (OCTREE,))
 
 
 def _carve(
@@ -159,8 +161,8 @@ def _shape(job: Job, hull: Hull, octree: Octree, box: Box, taken: Distance | Non
     return distance, normals
 
 
-def _joined_shape(joined: Joined, box: Box) -> tuple[Octree, Distance]:
-    """Octree and signed distance of what silhouettes and patches leave, cut off by the box of a user."""
+def _cut(distance: Distance, box: Box) -> Distance:
+    """Signed distance of what is in the box of a user."""
     if box.told_by != "user":
-        return joined.tree, joined.distance
-    return clip_octree(joined.tree, box), lambda xyz: np.minimum(joined.distance(xyz), box.distance(xyz))
+        return distance
+    return lambda xyz: np.minimum(distance(xyz), box.distance(xyz))
