@@ -14,7 +14,7 @@ from sfmapp import packages
 from sfmapp.cli.main import main
 from sfmapp.packages import MissingPackageError, missing_package, require
 
-RARE = ("av", "gtsam", "libusb_package", "open3d", "pycolmap", "rerun", "xatlas")
+RARE = ("av", "gtsam", "libusb_package", "mcap", "open3d", "pycolmap", "rerun", "rosbags", "xatlas")
 
 
 @pytest.fixture
@@ -53,7 +53,8 @@ def test_the_command_asks_for_the_versions_of_the_project() -> None:
     project = tomllib.loads((checkout / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     for distribution, _ in packages._DISTRIBUTIONS.values():
         found = packages._requirement(distribution).replace(" ", "")
-        named = project["dependencies"] + project["optional-dependencies"]["geo"]
+        extras = project["optional-dependencies"]
+        named = project["dependencies"] + extras["bags"] + extras["geo"]
         (mine,) = (r for r in named if r.partition(">")[0] == distribution)
         # pip and hatchling write the bounds in orders of their own
         assert set(found.replace(distribution, "").split(",")) == set(mine.replace(distribution, "").split(","))
@@ -91,6 +92,16 @@ def test_a_mesh_without_open3d(without: str, tmp_path: Path, capfd: pytest.Captu
     cloud.write_text(f"ply\nformat ascii 1.0\nelement vertex {len(xyz)}\n{head}\nend_header\n{rows}\n")
     assert main(["mesh", str(cloud), "-o", str(tmp_path / "mesh")]) == 3
     assert "pip install 'open3d-cpu" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(("without", "name"), [("rosbags", "drive.bag"), ("mcap", "drive.mcap")], indirect=["without"])
+def test_a_bag_without_what_reads_it(
+    without: str, name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_bytes(bytes(100))
+    command = ["odometry", str(tmp_path / name), "-o", str(tmp_path / "out"), "--camera", "PINHOLE,500,500,320,240"]
+    assert main(command) == 3
+    assert f"pip install '{without}" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("without", ["av"], indirect=True)

@@ -17,10 +17,12 @@ _DISTRIBUTIONS = {
     "laspy": ("laspy[lazrs]", "writing LAS"),
     "lazrs": ("laspy[lazrs]", "writing LAZ"),
     "libusb_package": ("libusb-package", "making meshes"),
+    "mcap": ("mcap", "reading MCAP files"),
     "open3d": ("open3d-cpu", "making meshes"),
     "pyproj": ("pyproj", "coordinate systems by EPSG code"),
     "pycolmap": ("pycolmap", "a second opinion by pycolmap"),
     "rerun": ("rerun-sdk", "recordings and live views"),
+    "rosbags": ("rosbags", "reading bags of ROS"),
     "xatlas": ("xatlas", "packing textures"),
 }
 

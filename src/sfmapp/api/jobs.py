@@ -133,8 +133,8 @@ def track_sequence(
     """Track a camera, or a stereo rig, through a sequence.
 
     Args:
-        source: a folder of frames, a video file or stream, or the folder of a KITTI, TUM or EuRoC sequence; or frames
-            in memory, :class:`ArraySequence`, or whatever has the members of one.
+        source: a folder of frames, a video file or stream, a bag of ROS 1 or 2, an MCAP file, or the folder of a KITTI,
+            TUM or EuRoC sequence; or frames in memory, :class:`ArraySequence`, or whatever has the members of one.
         output: folder of the results: new, empty, or of an earlier odometry run, whose results are replaced. None, for
             frames in memory alone: nothing is written.
         options: of these, ``sequence``, ``odometry`` and ``scale``.

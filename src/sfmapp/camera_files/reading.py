@@ -119,12 +119,12 @@ def _from_list(place: str, fields: Fields, image_sizes: Sequence[Size]) -> Calib
             "keep only the one that took them",
         )
     (section,) = cameras.values()
-    return _of_cameras(place, [camera_of_fields(place, section, image_sizes[0])], image_sizes)
+    return calibration_of(place, [camera_of_fields(place, section, image_sizes[0])], image_sizes)
 
 
 def _from_one(place: str, fields: Fields, image_sizes: Sequence[Size]) -> Calibration:
     camera = camera_of_fields(place, fields, image_sizes[0])
-    return _of_cameras(place, [camera, camera], image_sizes, _body_from_cam(place, fields), _beside(place, fields))
+    return calibration_of(place, [camera, camera], image_sizes, _body_from_cam(place, fields), _beside(place, fields))
 
 
 def _body_from_cam(place: str, fields: Fields) -> Array | None:
@@ -166,7 +166,7 @@ def _from_sections(place: str, fields: Fields, pair: Sequence[str], image_sizes:
             chain = rigid3.inverse(read_pose(f"{place}: T_cam0_cam1", fields["T_cam0_cam1"]))
         if chain is None:
             chain = _beside(place, fields)
-    found = _of_cameras(place, cameras, image_sizes, bodies[0], chain)
+    found = calibration_of(place, cameras, image_sizes, bodies[0], chain)
     if len(cameras) < 2 or "unknowns" not in fields or not found.rig.is_stereo:
         return found
     return replace(found, covariance=_joint_covariance(place, fields, pair, cameras, found.rig.cameras))
@@ -203,7 +203,7 @@ def _from_opencv_pair(place: str, fields: Fields, image_sizes: Sequence[Size]) -
     if "R" in fields and "T" in fields:
         rotation = nearest_rotation(f"{place}: R", numbers(f"{place}: R", fields["R"], (3, 3)))
         second = rigid3.from_matrix(rotation, numbers(f"{place}: T", fields["T"], (3,)))
-    return _of_cameras(place, cameras, image_sizes, None, second)
+    return calibration_of(place, cameras, image_sizes, None, second)
 
 
 def _from_projections(place: str, fields: Fields, image_sizes: Sequence[Size], first: int) -> Calibration:
@@ -223,7 +223,7 @@ def _from_projections(place: str, fields: Fields, image_sizes: Sequence[Size], f
     if len(positions) > 1 and np.linalg.norm(positions[1] - positions[0]) > 1e-6:
         second = np.array([0.0, 0.0, 0.0, 1.0, *(positions[1] - positions[0])])
     body = np.array([0.0, 0.0, 0.0, 1.0, *-positions[0]])
-    return _of_cameras(place, cameras, image_sizes, body, second)
+    return calibration_of(place, cameras, image_sizes, body, second)
 
 
 def kitti_calibration(path: Path, image_sizes: Sequence[Size], first: int) -> Calibration:
@@ -236,14 +236,25 @@ def kitti_calibration(path: Path, image_sizes: Sequence[Size], first: int) -> Ca
     return _from_projections(str(path), fields, image_sizes, first)
 
 
-def _of_cameras(
+def calibration_of(
     place: str,
     cameras: list[CalibratedCamera],
     image_sizes: Sequence[Size],
     body_from_cam: Array | None = None,
     second: Array | None = None,
 ) -> Calibration:
-    """The cameras scaled to their images; without the pose of the second in the frame of the first, the first alone."""
+    """The cameras scaled to their images; without the pose of the second in the frame of the first, the first alone.
+
+    Args:
+        place: begins the message of a failure.
+        cameras: one or two.
+        image_sizes: (width, height) of the images of each camera that is wanted.
+        body_from_cam: (7,) of the first; None if unknown.
+        second: (7,) pose that takes points of the first camera to the second; None if unknown.
+
+    Raises:
+        InputError: a camera does not fit its images.
+    """
     known = cameras if second is not None else cameras[:1]
     fitted = [scaled_to(place, camera, size) for camera, size in zip(known, image_sizes, strict=False)]
     poses = np.array([rigid3.IDENTITY] if len(fitted) < 2 else [rigid3.IDENTITY, second])

@@ -28,10 +28,12 @@ examples:
   sfmapp odometry dataset/sequences/00 -o out/ --ground-truth poses/00.txt
   sfmapp odometry MH_01_easy -o out/ --mono --scale imu
   sfmapp odometry frames/ -o out/ --camera calib.json --scale marker:DICT_4X4_50:0.16
+  sfmapp odometry drive.mcap -o out/ --image-topic /camera/image_raw
 
-Frames come from a folder of images, a video or stream, or a sequence of KITTI, TUM or EuRoC, whose cameras, times,
-ground truth and IMU are found automatically. With two cameras lengths are in metres; with one their unit is arbitrary
-unless --scale gives it. OUT/report.html says how good the result is, where there are gaps, and why."""
+Frames come from a folder of images, a video or stream, a bag of ROS 1 or 2, or a sequence of KITTI, TUM or EuRoC, whose
+cameras, times, ground truth and IMU are found automatically. With two cameras lengths are in metres; with one their
+unit is arbitrary unless --scale gives it. OUT/report.html says how good the result is, where there are gaps, and
+why."""
 
 SCALE = (
     "source of metric scale: marker:DICT:METRES (side of an ArUco or AprilTag marker), distance:A:B:METRES (between "
@@ -48,7 +50,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="Estimate the trajectory of a camera or a stereo pair, and a map, from a sequence of frames.",
     )  # fmt: skip
     parser.add_argument(
-        "sequence", metavar="SEQUENCE", nargs="?", help="a folder of frames, a video, a stream or a data set"
+        "sequence", metavar="SEQUENCE", nargs="?", help="a folder of frames, a video, a stream, a bag or a data set"
     )
     parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="output folder, created if missing")
     parser.add_argument(
@@ -84,6 +86,12 @@ def _add_sequence_flags(parser: argparse.ArgumentParser) -> None:
         "--ground-truth", metavar="FILE", help="ground-truth trajectory (TUM, KITTI or EuRoC) to compare with"
     )
     group.add_argument("--imu", metavar="FILE", help="inertial measurements in EuRoC's format")
+    group.add_argument(
+        "--image-topic",
+        metavar="TOPIC[,TOPIC]",
+        help="topic of a bag with the images, or of left and right ones",
+    )
+    group.add_argument("--imu-topic", metavar="TOPIC", help="topic of a bag with the IMU")
     group.add_argument("--scale", metavar="SOURCE", help=SCALE)
     group.add_argument("--start", metavar="N", help="first frame to play")
     group.add_argument("--stop", metavar="N", help="play the frames before this one")
@@ -111,7 +119,7 @@ def _options(args: argparse.Namespace) -> Options:
     limit_library_threads()
     from sfmapp.workspace.options import load_options
 
-    named = ("camera", "ground_truth", "imu", "start", "stop", "step", "fps")
+    named = ("camera", "ground_truth", "imu", "image_topic", "imu_topic", "start", "stop", "step", "fps")
     flags: dict[str, Any] = {"seed": args.seed, "threads": args.threads, "scale.source": args.scale}
     flags |= {f"sequence.{name}": getattr(args, name) for name in named}
     flags |= {f"sequence.{name}": True for name in ("mono", "reverse") if getattr(args, name)}

@@ -55,7 +55,7 @@ class TrajectoryFile:
     """
 
     path: Path
-    format: TrajectoryFormat | Literal["folder", "video", "arrays"]
+    format: TrajectoryFormat | Literal["folder", "video", "bag", "arrays"]
     trajectory: Trajectory
     is_numbered: bool = False
     note: str = ""

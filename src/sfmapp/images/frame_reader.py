@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import Camera
 from sfmapp.events import Events
 from sfmapp.images.headers import Header, UnusableImage, read_header
 from sfmapp.images.pixels import decode_bytes
@@ -181,8 +182,9 @@ def resampled(gray: Pixels, sampling: NDArray[np.float32] | None) -> Pixels:
     return image
 
 
-class _FileReader:
-    """One walk over files; called from the thread that reads ahead."""
+class FileReader:
+    """One walk over the frames of files; called from the thread that reads ahead. Other containers override how the
+    bytes of a frame are had (:meth:`read_bytes`) and what they show (:meth:`decode`)."""
 
     def __init__(self, sequence: FileSequence) -> None:
         self._sequence = sequence
@@ -201,14 +203,14 @@ class _FileReader:
         data: list[bytes] = []
         images: list[Pixels] = []
         try:
-            data.extend(map(read_regular_file, sequence.paths[idx]))
+            data.extend(self.read_bytes(idx))
             if tuple(data) == self._last_bytes:
                 return skipped_twin(idx, name, timestamp_s, self._last_idx)
             images.extend(map(self._decode, range(len(data)), data))
         except UnusableImage as reason:
             # what was read so far tells which of the files is at fault
             camera = len(images) if len(data) == len(sequence.paths[idx]) else len(data)
-            beside = f"{sequence.paths[idx][camera].name} of camera {camera}: " if camera else ""
+            beside = f"{self.name_of(idx, camera)} of camera {camera}: " if camera else ""
             return Skipped(name, f"{beside}{reason}")
         is_repeated = bool(self._last_images) and all(map(np.array_equal, images, self._last_images))
         self._last_bytes, self._last_images = tuple(data), tuple(images)
@@ -218,14 +220,34 @@ class _FileReader:
         elapsed_s = None if sequence.elapsed_s is None else float(sequence.elapsed_s[idx])
         return Frame(idx, name, timestamp_s, tuple(images), elapsed_s)
 
+    def name_of(self, idx: int, camera_idx: int) -> str:
+        """What an image of a frame is called."""
+        return self._sequence.paths[idx][camera_idx].name
+
+    def read_bytes(self, idx: int) -> Iterator[bytes]:
+        """Of the images of a frame, one after another. Raises UnusableImage: one cannot be read."""
+        return map(read_regular_file, self._sequence.paths[idx])
+
+    def decode(self, camera_idx: int, data: bytes, white: int) -> tuple[Pixels, int]:
+        """(H, W) grey of an image's bytes, and the new ``white`` as of :func:`decode_gray`. Raises UnusableImage."""
+        return decode_file_of(self._sequence.rig.cameras[camera_idx], data, white)
+
     def _decode(self, camera_idx: int, data: bytes) -> Pixels:
-        header, camera = read_header(data), self._sequence.rig.cameras[camera_idx]
-        if (header.width, header.height) != (camera.width, camera.height):
-            raise UnusableImage(
-                f"{header.width}x{header.height} pixels, where the camera has {camera.width}x{camera.height}"
-            )
-        gray, self._white[camera_idx] = decode_gray(data, header, self._white[camera_idx])
+        gray, self._white[camera_idx] = self.decode(camera_idx, data, self._white[camera_idx])
         return resampled(gray, self._sequence.sampling[camera_idx])
+
+
+def decode_file_of(camera: Camera, data: bytes, white: int) -> tuple[Pixels, int]:
+    """:func:`decode_gray` of an image file that has to have the size of a camera. Raises UnusableImage."""
+    header = read_header(data)
+    check_size(header.width, header.height, camera)
+    return decode_gray(data, header, white)
+
+
+def check_size(width: int, height: int, camera: Camera) -> None:
+    """Raise UnusableImage if an image is not of the size of its camera: before it is decoded."""
+    if (width, height) != (camera.width, camera.height):
+        raise UnusableImage(f"{width}x{height} pixels, where the camera has {camera.width}x{camera.height}")
 
 
 @dataclass
@@ -268,4 +290,4 @@ class FileSequence:
 
     def frames(self) -> Iterator[Frame]:
         """See :class:`~sfmapp.images.sequence.Sequence`."""
-        return self._teller.frames_without_problems(read_ahead(_FileReader(self)))
+        return self._teller.frames_without_problems(read_ahead(FileReader(self)))

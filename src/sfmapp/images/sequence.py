@@ -14,7 +14,7 @@ from sfmapp.option_checks import Range, check_options
 from sfmapp.scene.rig import Rig
 
 Array = NDArray[np.float64]
-SequenceKind = Literal["kitti", "tum", "euroc", "folder", "video", "arrays"]
+SequenceKind = Literal["kitti", "tum", "euroc", "folder", "video", "bag", "arrays"]
 
 STAGE = "sequence"
 """Stage of the events that tell of opening and reading a sequence."""
@@ -37,6 +37,9 @@ class SequenceOptions:
             10 for KITTI, 30 else, with a note.
         imu: path of IMU measurements in EuRoC's form, ``sensor.yaml`` beside it. None: what the sequence holds.
         ground_truth: path of a trajectory of TUM, KITTI or EuRoC. None: what the sequence holds.
+        image_topic: of a bag, the topic with the images, or two of a pair with a comma between them, the left one
+            first. None: the one camera, or the one pair that ``camera_info`` gives a baseline.
+        imu_topic: of a bag, the topic of the IMU. None: the only one there is.
     """
 
     camera: str | None = None
@@ -48,6 +51,8 @@ class SequenceOptions:
     fps: float | None = None
     imu: str | None = None
     ground_truth: str | None = None
+    image_topic: str | None = None
+    imu_topic: str | None = None
 
     def __post_init__(self) -> None:
         check_options("sequence", self, {"start": Range(0), "step": Range(1), "fps": Range(1e-3, 1e5)})

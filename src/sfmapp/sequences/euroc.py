@@ -40,14 +40,14 @@ Array = NDArray[np.float64]
 
 # Poses of the body, best first. What a laser tracker alone saw (leica0) is positions without rotations.
 _GROUND_TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
-# Noise of a common MEMS IMU (EuRoC's ADIS16448), for files that do not state it: rad/s/sqrt(Hz), m/s^2/sqrt(Hz),
-# rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz).
-_NOISE = {
+USUAL_NOISE = {
     "gyroscope_noise_density": 1.7e-4,
     "accelerometer_noise_density": 2.0e-3,
     "gyroscope_random_walk": 1.9e-5,
     "accelerometer_random_walk": 3.0e-3,
 }
+"""Noise of a common MEMS IMU (EuRoC's ADIS16448), for recordings that do not state it: rad/s/sqrt(Hz), m/s^2/sqrt(Hz),
+rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz); in the order of :class:`~sfmapp.images.sequence.Imu`."""
 
 
 def find_mav(folder: Path) -> Path | None:
@@ -172,7 +172,7 @@ def read_imu(path: Path, body_from_cam: Array, frames: Times | None = None) -> t
         body_from_cam if body_from_imu is None else rigid3.compose(rigid3.inverse(body_from_imu), body_from_cam)
     )
     noise = {}
-    for name, usual in _NOISE.items():
+    for name, usual in USUAL_NOISE.items():
         value = fields.get(name, usual)
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e3:
             raise InputError(f"{path.parent / 'sensor.yaml'}: {name}: expected a number of 0 or more, found {value!r}")

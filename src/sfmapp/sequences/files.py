@@ -21,6 +21,7 @@ from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.formats.clocks import Times, are_dates, parse_time, read_column, times_of_names
 from sfmapp.formats.text_input import read_limited_text
+from sfmapp.images.bag_sequence import BagFrames
 from sfmapp.images.frame_reader import LARGEST_FRAME_PX, read_regular_file, some
 from sfmapp.images.headers import UnusableImage, read_header
 from sfmapp.images.sequence import STAGE, GroundTruth, Imu, SequenceKind
@@ -51,6 +52,8 @@ class Recording:
             ``ground_truth_paths``; poses are of the first camera.
         ground_truth_paths: where a trajectory of the body may lie; the first that is there counts.
         notes: how times of the IMU and the ground truth were read, where that is not what the format says.
+        bag: where frames lie that are messages of a bag; ``paths`` then hold their names alone, and the pose of an IMU
+            that nothing tells is NaN.
     """
 
     kind: SequenceKind
@@ -64,6 +67,7 @@ class Recording:
     ground_truth: GroundTruth | None = None
     ground_truth_paths: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
+    bag: BagFrames | None = None
 
 
 def list_images(folder: Path) -> list[Path]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,14 @@ from sfmapp.camera.names import CameraModel
 from sfmapp.camera_files.fields import camera_from_text, is_calibration_path, oddity
 from sfmapp.camera_files.opencv_lens import sampling_map
 from sfmapp.camera_files.reading import Calibration, read_calibration
-from sfmapp.errors import InputError
+from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
+from sfmapp.formats.bags import is_bag
 from sfmapp.formats.clocks import Times, are_dates
 from sfmapp.formats.trajectory_input import read_trajectory
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.orientation import INVERSE, is_sideways, upright_size
+from sfmapp.images.bag_sequence import BagSequence
 from sfmapp.images.exif import ExifFacts, focal_prior, read_exif
 from sfmapp.images.frame_reader import FileSequence, read_regular_file, some
 from sfmapp.images.headers import UnusableImage, read_header
@@ -29,6 +32,7 @@ from sfmapp.images.sources import EXTENSIONS, printable
 from sfmapp.images.video import DEFAULT_FPS, VideoSequence, is_stream, read_video_facts
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.turned_camera import fault_of_upright, turned_camera
+from sfmapp.sequences.bags import read_bag_sequence
 from sfmapp.sequences.euroc import euroc_ground_truth, find_mav, read_euroc_sequence, read_imu
 from sfmapp.sequences.files import (
     Recording,
@@ -61,8 +65,9 @@ _FRAME_FOLDERS = ("images", "frames", "rgb", "color", "image", "img", "imgs", "d
 _WIDEST_BASELINE_M = 10.0
 _LAYOUTS = (
     "a folder with images; image_0 and calib.txt (KITTI); rgb.txt and rgb (TUM); mav0 or cam0/data (EuRoC); "
-    "left and right; or a video"
+    "left and right; a video; or a bag of ROS 1 (.bag), ROS 2 (metadata.yaml) or MCAP"
 )
+_LABELS = {"kitti": "KITTI", "tum": "TUM RGB-D", "euroc": "EuRoC", "folder": "images"}
 HOW_TO_CALIBRATE = (
     "give --camera PINHOLE,fx,fy,cx,cy or --camera FILE (calib.json, cameras.txt, sensor.yaml, camera_info.yaml, "
     "OpenCV's yml or xml), to be had from photographs or a video of a chessboard by sfmapp calibrate board; or let "
@@ -82,7 +87,7 @@ def open_sequence(
 
     Args:
         source: a folder of KITTI, TUM or EuRoC, a folder of images, one with ``left`` and ``right``, a glob pattern, a
-            list of images, a video file, a URL, or ``camera:0``.
+            list of images, a video file, a bag of ROS 1 or 2, an MCAP file, a URL, or ``camera:0``.
         options: what to play of it, and what it does not say itself.
         events: told what was recognised and assumed, and, while frames are read, what is left out.
         require_camera: False: where nothing tells the intrinsics, the rig has one SIMPLE_RADIAL camera with a focal
@@ -105,6 +110,11 @@ def open_sequence(
 
 def _open(text: str, options: SequenceOptions, events: Events, require_camera: bool, look_beside: bool) -> Sequence:
     path = Path(text)
+    if path.exists() and is_bag(path):
+        recording = read_bag_sequence(path, options, events)
+        return _sequence(text, recording, options, events, require_camera, look_beside)
+    if options.image_topic is not None or options.imu_topic is not None:
+        raise UsageError(f"topics are of bags, which {printable(text)} is not")
     if is_stream(text):
         return _open_video(text, options, events, require_camera, look_beside)
     if not path.exists():
@@ -271,11 +281,13 @@ def _sequence(
     look_beside: bool,
 ) -> FileSequence:  # fmt: skip
     """The wishes of the user applied to what a layout holds."""
+    if options.reverse and recording.bag is not None:
+        raise UsageError("reverse is not possible with a bag", "write its images to a folder first")
     first = [frame[0] for frame in recording.paths]
     folders = [recording.root, first[0].parent, *([recording.root.parent] if recording.kind == "euroc" else [])]
     folders = folders if look_beside else []
     sizes = recording.sizes[:1] if options.mono else recording.sizes
-    orientation = _exif_of(first[0]).orientation
+    orientation = 1 if recording.bag is not None else _exif_of(first[0]).orientation
     calibration = _calibration(
         options.camera, folders, recording.calibration, recording.kind == "tum", sizes, orientation
     )
@@ -288,19 +300,16 @@ def _sequence(
     )
     _warn_of_foreign_ground_truth(ground_truth, times, events)
     imu = _imu(recording, options, clock, body_from_cam, events)
-    kept = ascending(times)
-    if len(kept) < len(times):
-        lost = np.setdiff1d(np.arange(len(times)), kept)
-        names = [recording.names[i] for i in lost]
-        text = f"{len(names)} of {len(times)} frames are skipped, whose times do not ascend: {some(names)}"
-        events.warned(STAGE, text, names=names)
+    kept = _in_order(recording, times, events)
     played = kept[options.start : options.stop : options.step]
     if not len(played):
         raise InputError(f"{source}: expected frames from {options.start} to {options.stop}, found {len(kept)} in all")
     if options.reverse:
         played, times, elapsed, ground_truth, imu = _mirrored(played, times, elapsed, ground_truth, imu)
     fps = 1 / float(np.median(np.diff(times[played]))) if len(played) > 1 else clock.frames_per_second
-    sequence = FileSequence(
+    bag = None if recording.bag is None else replace(recording.bag, positions=recording.bag.positions[played])
+    make = FileSequence if bag is None else partial(BagSequence, bag=bag)
+    sequence = make(
         recording.kind,
         source,
         rig,
@@ -317,6 +326,17 @@ def _sequence(
     )
     _tell(sequence, events)
     return sequence
+
+
+def _in_order(recording: Recording, times: Array, events: Events) -> NDArray[np.int64]:
+    """Positions of the frames whose times ascend; the others are named."""
+    kept = ascending(times)
+    if len(kept) < len(times):
+        lost = np.setdiff1d(np.arange(len(times)), kept)
+        names = [recording.names[i] for i in lost]
+        text = f"{len(names)} of {len(times)} frames are skipped, whose times do not ascend: {some(names)}"
+        events.warned(STAGE, text, names=names)
+    return kept
 
 
 @dataclass(frozen=True)
@@ -396,7 +416,15 @@ def _imu(
     if recording.imu is not None and clock.own_s is not clock.frames_s:
         events.warned(STAGE, "the IMU is not used: its clock is that of the sequence, which --fps replaces")
         return None
-    return recording.imu
+    if recording.imu is None or recording.bag is None:
+        return recording.imu
+    # what the user's calibration says goes before the bag's transforms
+    imu_from_cam = recording.imu.imu_from_cam if body_from_cam is None else body_from_cam
+    if np.isnan(imu_from_cam).any():
+        text = "the IMU is not used: no /tf_static says where it is; --camera FILE can, a camchain.yaml with T_cam_imu"
+        events.warned(STAGE, text)
+        return None
+    return replace(recording.imu, imu_from_cam=imu_from_cam)
 
 
 def _ground_truth(
@@ -514,7 +542,7 @@ def _tell(sequence: Sequence, events: Events) -> None:
     count = "frames" if sequence.num_frames is None else f"{sequence.num_frames} frames"
     baseline = float(np.linalg.norm(sequence.rig.cam_from_rig[-1, 4:]))
     parts = [
-        {"kitti": "KITTI", "tum": "TUM RGB-D", "euroc": "EuRoC", "folder": "images", "video": "video"}[sequence.kind],
+        _LABELS.get(sequence.kind, sequence.kind),
         f"{count} of {camera.width}x{camera.height}",
         f"stereo, {100 * baseline:.1f} cm apart" if sequence.rig.is_stereo else "one camera",
         f"{sequence.frames_per_second:.4g} a second" if sequence.frames_per_second else "of unknown rate",

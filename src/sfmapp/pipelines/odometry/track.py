@@ -62,8 +62,8 @@ def track_sequence(
     """Follow a camera (or a stereo rig) through a sequence.
 
     Args:
-        source: a folder of frames, a video file or stream, or the folder of a KITTI, TUM or EuRoC sequence; or an
-            open sequence, such as one of frames in memory.
+        source: a folder of frames, a video file or stream, a bag, or the folder of a KITTI, TUM or EuRoC sequence; or
+            an open sequence, such as one of frames in memory.
         output: folder of the results: new, empty, or of an earlier odometry run, whose results are replaced.
         options: of all stages; ``sequence`` and ``odometry`` count here. See :func:`sfmapp.load_options`.
         events: listens in, and can ask the run to stop: what was tracked until then is written.
