@@ -11,13 +11,18 @@ from __future__ import annotations
 import os
 import stat
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import wraps
 from pathlib import Path
+from typing import Any
 
 VARIABLE = "NUMBA_CACHE_DIR"
 NAME = "sfmapp-kernels"
 ADVICE = f"set {VARIABLE} to a folder that you, and nobody else, can write to; one in OUT will do"
 _PACKAGE = Path(__file__).resolve().parent
+_PATCHING = threading.Lock()
 
 
 def provide_kernel_cache() -> None:
@@ -41,6 +46,25 @@ def is_without_cache(error: Exception) -> bool:
     return isinstance(error, RuntimeError) and str(error).startswith("cannot cache function")
 
 
+def take_turns(*, strict: bool = False) -> None:
+    """Have this process from now on read numba's cache, and add to it, while no other that does so is writing.
+
+    numba reads the index of a kernel, writes it with an entry more, and then the code. Two processes that do so at once
+    may give the same name to code for different arguments, and a third may read the code that had this name before.
+
+    Args:
+        strict: fail to read or write where the file system knows no locks, instead of doing without.
+    """
+    from fcntl import LOCK_EX, LOCK_SH
+
+    from numba.core.caching import IndexDataCacheFile as Files
+
+    with _PATCHING:
+        if not hasattr(Files.save, "__wrapped__"):  # a second lock would wait for the first
+            Files.load = _in_turn(Files.load, LOCK_SH, strict)
+            Files.save = _in_turn(Files.save, LOCK_EX, strict)
+
+
 def is_ours_alone(folder: Path) -> bool:
     """Whether nobody but this user and root can change what lies in a folder, nor put another in its place.
 
@@ -57,6 +81,32 @@ def is_ours_alone(folder: Path) -> bool:
         and (not _open_to_others(found) or (path != folder and bool(found.st_mode & stat.S_ISVTX)))
         for path, found in ways
     )
+
+
+def _in_turn(work: Callable[..., Any], how: int, strict: bool) -> Callable[..., Any]:
+    @wraps(work)
+    def method(files: Any, *args: Any) -> Any:
+        with _locked(files._cache_path, how, strict):
+            return work(files, *args)
+
+    return method
+
+
+@contextmanager
+def _locked(folder: str, how: int, strict: bool) -> Iterator[None]:
+    from fcntl import flock
+
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:  # made by the first who saves
+        yield
+        return
+    try:
+        with suppress(*(() if strict else (OSError,))):
+            flock(descriptor, how)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _open_to_others(found: os.stat_result) -> bool:

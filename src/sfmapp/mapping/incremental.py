@@ -22,7 +22,7 @@ from sfmapp.contradictions import Contradiction
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.images.folder import ImageSet
-from sfmapp.mapping import join, near_views, repair, structure, verified_pairs
+from sfmapp.mapping import verified_pairs
 from sfmapp.mapping.closing_move import closing_move, widened_by_move
 from sfmapp.mapping.focal import estimate_focal_ratio
 from sfmapp.mapping.focal_priors import MapFrom, Mapped, settle_focal_lengths
@@ -440,12 +440,10 @@ def image_reports(
 
 
 def compile_kernels() -> None:
-    """Compile the kernels of mapping and adjustment, or load them from numba's cache: one round on a tiny scene."""
-    from sfmapp.adjust.compile import compile_kernels as compile_adjustment
+    """Compile the kernels of this module, or load them from numba's cache."""
     from sfmapp.scene.synthetic import make_scene, true_correspondences
 
     scene = make_scene(0, 3, 24)
-    model = scene.observed
     features = [
         Features(
             np.zeros((len(scene.keypoints(i)), 4), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.uint8)
@@ -453,10 +451,4 @@ def compile_kernels() -> None:
         for i in range(3)
     ]
     build_tracks(true_correspondences(scene, min_matches=1), features)
-    structure.compile_kernels()
-    rank_next_images(model, np.arange(3))
-    verified_pairs.compile_kernels()
-    join.compile_kernels()
-    near_views.compile_kernels()
-    repair.compile_kernels()
-    compile_adjustment()
+    rank_next_images(scene.observed, np.arange(3))
