@@ -12,6 +12,7 @@ import pytest
 
 import sfmapp
 from carving_scenes import around, box, mask_of
+from schemas import check_schema
 from sfmapp.carve.files import read_octree
 from sfmapp.carve.octree import Octree
 from sfmapp.cli.main import main
@@ -61,6 +62,7 @@ def carved(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_volume_is_the_solids_and_a_little_more(carved: Path) -> None:
     report = json.loads((carved / "report.json").read_text())
+    check_schema("carve", report)
     low, high = report["carving"]["volume_low"], report["carving"]["volume_high"]
     # the hull of ten outlines is a few per cent more than the solid, and cells are a twelfth of its height
     assert high > VOLUME

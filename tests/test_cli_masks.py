@@ -12,6 +12,7 @@ import pytest
 import sfmapp
 from carving_photographs import coverage_of, photograph
 from carving_scenes import around, ball, both, box
+from schemas import check_schema
 from sfmapp.cli.main import main
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.images.load import load_images
@@ -49,6 +50,7 @@ def test_masks_are_written_that_others_take(folder: Path, tmp_path: Path, with_c
     paths = [tmp_path / "out" / "masks" / f"{view.name}.png" for view in VIEWS]
     assert min(agreement(path, true) for path, true in zip(paths, TRUE, strict=True)) > 0.97
     report = json.loads((tmp_path / "out" / "report.json").read_text())
+    check_schema("masks", report)
     assert report["masks"]["is_compared"] == with_cameras
     assert not report["warnings"]
     assert all(0.9 < mask["confidence"] <= 1.0 for mask in report["masks"]["masks"])

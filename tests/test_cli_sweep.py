@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dense_models import DEPTH, write_wall
+from schemas import check_schema
 from sfmapp.cli.main import main
 from sfmapp.geometry import rigid3
 
@@ -32,6 +33,7 @@ def test_depth_maps_of_a_wall_are_those_of_its_plane(
     assert "4 depth maps" in capsys.readouterr().out
     views = json.loads((out / "maps" / "views.json").read_text())
     report = json.loads((out / "report.json").read_text())
+    check_schema("sweep", report)
     assert len(views) == len(report["maps"]) == 4
     for view, row in zip(views, report["maps"], strict=True):
         base = out / "maps" / view["name"]

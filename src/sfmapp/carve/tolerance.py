@@ -1,13 +1,19 @@
 """Holes in silhouettes, by what all others show: a strict hull loses a tunnel to each.
 
 What one silhouette alone takes away of the hull of all others is thin, slivers along its outline, as every outline is
-tangent to the object. Behind a hole in a mask it is as thick as the object, and no other silhouette shows it empty. So
-the thickness of what each takes away alone is compared between photographs, most of which are taken to be right, and
-only where it stands out the silhouette is said not to know. What its outline cuts off is cut off as before; what spills
-over an outline is carved by the others.
+tangent to the object. Behind a hole in a mask it is as thick as the object, and no other silhouette shows it empty.
+Two things tell that it is a hole:
 
-A gap that is there and that one photograph alone looks through is the same thing to silhouettes: it is filled, and the
-photograph named.
+- Others lack it. The hull of silhouettes that are right covers each of them, gaps included; where it leaves a part of
+  several silhouettes uncovered, and what one other takes away alone would cover it, that one is wrong (the coherence of
+  silhouettes of Hernandez, Schmitt and Cipolla, "Silhouette Coherence for Camera Calibration under Circular Motion",
+  2007). It tells holes through thin parts, which they cut.
+- It is far thicker than what others take away alone, most of which are taken to be right. It tells holes in the middle
+  of what is thick, where nothing lacks them but a little of the surface at both ends. A gap that is there and that one
+  photograph alone looks through is the same thing to silhouettes: it is filled, and the photograph named.
+
+Where there is a hole the silhouette is said not to know. What its outline cuts off is cut off as before; what spills
+over an outline is carved by the others.
 """
 
 from __future__ import annotations
@@ -21,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import label
 
 from sfmapp.carve.hull import hull_of
-from sfmapp.carve.silhouettes import Silhouette
+from sfmapp.carve.outlines import Silhouette
 from sfmapp.carve.space_carving import CarveOptions, carve_hull
 from sfmapp.carve.views import View, project_points
 from sfmapp.events import Events
@@ -34,12 +40,25 @@ STAGE = "tolerance"
 # Of the usual thickness (median over photographs) of what silhouettes take away alone: beyond the first it is a hole,
 # beyond the second it belongs to one. On circles of 8 to 24 views none of six clean solids reached the first.
 _HOLE, _RIM = 3.0, 1.5
-# in coarse cells, below which thickness is not told from the size of these
-_LEAST = 3.0
+# of the side of the cube, below which thickness alone tells no hole
+_LEAST = 3.0 / 64.0
+# cells, two along each side, below which nothing is told: where few photographs look a single one may seem thick
+_FEWEST = 8
+# Silhouettes that have to lack what another takes away; one may spill over there itself, and counts only where what is
+# taken away is thicker than the second of the above. And the least thickness, of the side of the cube, for what others
+# lack: of 50 clean silhouettes of a model with many thin parts none took away more alone.
+_LACKED_BY, _LEAST_LACKED = 2, 1.0 / 64.0
+# pixels inside an outline where it has to be lacking: outlines and cameras are told to one
+_MARGIN_PX = 1.5
+# cells around the middle of one that is kept, which it covers, half of its diagonal; and how far outside an outline
+# the middle of a cell may be that a thin part passes through
+_COVERS, _PASSES = 0.87, 0.5
+# places, at least, by which it is told how large cells are in a picture
+_SAMPLES = 4096
 # pixels by which what is not known is widened: outlines around holes are not to be trusted either
 _WIDER_PX = 3
 # along the side of the cube: a hole of a twentieth of an object is a tenth of it wide
-_CELLS = 64
+_CELLS = 128
 
 
 class DoubtedSilhouette(Report):
@@ -47,11 +66,14 @@ class DoubtedSilhouette(Report):
 
     Attributes:
         thickness: of what it alone takes away, units of the world.
+        lacked_by: silhouettes that show something where it alone leaves nothing, of the hole that most speak against;
+            with none of them a gap that is there would look the same.
         share: of its picture that is not known now.
     """
 
     name: str
     thickness: float
+    lacked_by: int
     share: float
 
 
@@ -87,46 +109,126 @@ def doubt_holes(
     names = [view.name for view in views]
     tree, _ = carve_hull(hull, names, low, side, CarveOptions(cells=_CELLS, misses=1), Events())
     points = tree.centers(np.concatenate([tree.finest_full(), tree.surface]))
-    depth, by_view = hull.distance(points), hull.distance_by_view(points)
+    depth, by_view = hull.distance(points), np.nan_to_num(hull.distance_by_view(points), copy=False, nan=np.inf)
     # taken away by one alone, by more than its outline may be wrong
-    alone = (depth > 0.0) & (np.nanmin(by_view, axis=1, initial=np.inf) <= -tree.cell)
-    points, depth, missed = points[alone], np.minimum(depth[alone], side), by_view[alone] <= 0.0
-    thickness = np.where(missed, depth[:, None], 0.0).max(axis=0, initial=0.0)
-    usual = max(float(np.median(thickness)), _LEAST * tree.cell / _HOLE)
+    alone = (depth > 0.0) & (by_view.min(axis=1) <= -tree.cell)
+    whose = by_view[alone].argmin(axis=1)
+    lacked = _lacked(views, silhouettes, points, by_view > -_PASSES * tree.cell, alone, tree.cell)
+    points, depth = points[alone], np.minimum(depth[alone], side)
+    thickness = np.zeros(len(views))
+    np.maximum.at(thickness, whose, depth)
+    limit = _HOLE * max(float(np.median(thickness)), _LEAST * side / _HOLE)
     result, doubted = list(silhouettes), []
-    for i in np.flatnonzero(thickness > _HOLE * usual).tolist():
-        thin = missed[:, i] & (depth > _RIM * usual)
-        hole = _holes(views[i], silhouettes[i], points[thin], depth[thin] > _HOLE * usual, tree.cell)
+    for i in np.unique(whose[(depth > limit) | lacked.any(axis=1)]).tolist():
+        mine = whose == i
+        taken = _Taken(points[mine], depth[mine], lacked[mine])
+        hole, lacked_by = _holes(views[i], silhouettes[i], taken, limit, _LEAST_LACKED * side, tree.cell)
+        if not hole.any():
+            continue
         known = silhouettes[i].known
         told = ~hole if known is None else known & ~hole
         result[i] = dataclasses.replace(silhouettes[i], known=told)
-        doubted.append(DoubtedSilhouette(name=views[i].name, thickness=float(thickness[i]), share=float(hole.mean())))
-    if doubted:
-        events.warned(
-            STAGE, "holes that other silhouettes do not show, not carved: " + ", ".join(one.name for one in doubted)
+        one = DoubtedSilhouette(
+            name=views[i].name, thickness=float(thickness[i]), lacked_by=lacked_by, share=float(hole.mean())
         )
-    return result, ToleranceReport(usual_thickness=usual, doubted=doubted)
+        doubted.append(one)
+    if doubted:
+        events.warned(STAGE, f"nothing is carved through holes of masks: {'; '.join(map(_in_words, doubted))}")
+    return result, ToleranceReport(usual_thickness=float(np.median(thickness)), doubted=doubted)
 
 
-def _holes(view: View, silhouette: Silhouette, points: Array, is_deep: Mask, cell: float) -> Mask:
-    """(H, W) pixels of holes: outside the silhouette, on the picture of cells (N, 3) that it alone takes away, in parts
-    with one that is deep."""
+def _in_words(one: DoubtedSilhouette) -> str:
+    if one.lacked_by:
+        return f"{one.name}, where {one.lacked_by} others lack what it leaves out"
+    return f"{one.name}, which alone looks through there; a narrow gap would look the same"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Taken:
+    """Middles of cells (N, 3) that one silhouette alone takes away, how deep they lie in the hull of the others (N,),
+    and which of these (N, V) lack them."""
+
+    points: Array
+    depth: Array
+    lacked: Mask
+
+
+def _lacked(
+    views: Sequence[View], silhouettes: Sequence[Silhouette], points: Array, holds: Mask, alone: Mask, cell: float
+) -> Mask:
+    """(M, V) for each place that one silhouette takes away alone, M of N in ``alone`` (N,), which others show something
+    there, and have nothing else on that ray left. ``holds``: (N, V) what each silhouette leaves."""
+    num_against = (~holds).sum(axis=1)
+    result = np.zeros((int(alone.sum()), len(views)), bool)
+    for i, (view, silhouette) in enumerate(zip(views, silhouettes, strict=True)):
+        others = num_against - ~holds[:, i]
+        radius = float(_radius(view, points[:: max(1, len(points) // _SAMPLES)], cell).max(initial=0.0))
+        # a grid on which a cell covers a few points
+        step = max(1, int(radius) // 2)
+        distance = silhouette.distance[step // 2 :: step, step // 2 :: step]
+        rows, columns = (
+            np.minimum(at // step, n - 1) for at, n in zip(_pixels(view, points), distance.shape, strict=True)
+        )
+        held = np.zeros(distance.shape, np.uint8)
+        held[rows[others == 0], columns[others == 0]] = 1
+        held = cv2.dilate(held, _disk(max(1, int(np.ceil(radius / step)))))
+        lacks = (distance > _MARGIN_PX + 0.5 * (step - 1)) & (held == 0)
+        if silhouette.known is not None:
+            lacks &= silhouette.known[step // 2 :: step, step // 2 :: step]
+        result[:, i] = lacks[rows[alone], columns[alone]] & holds[alone, i]
+    return result
+
+
+def _pixels(view: View, points: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns (N,) of points (N, 3), of those beyond the picture at its edge."""
     shown = np.empty((len(points), 3))
     project_points(view.row, points, shown)
-    aside = np.empty((len(points), 3))
-    project_points(view.row, points + cell * _sideways(view), aside)
-    # half the diagonal of a cell: the pictures of neighbours meet
-    radius = np.ceil(0.87 * np.linalg.norm(aside[:, :2] - shown[:, :2], axis=1)).astype(int)
-    covered, deep = (np.zeros((view.height, view.width), np.uint8) for _ in range(2))
-    for (u, v, _), r, is_seed in zip(shown, radius, is_deep, strict=True):
+    shown = np.nan_to_num(shown, nan=-1.0)
+    rows, columns = np.clip(shown[:, 1], 0, view.height - 1), np.clip(shown[:, 0], 0, view.width - 1)
+    return rows.astype(np.int64), columns.astype(np.int64)
+
+
+def _radius(view: View, points: Array, cell: float) -> Array:
+    """Pixels (N,) that a cell covers around the picture of its middle (N, 3); 0 where the camera does not look."""
+    shown, aside = np.empty((len(points), 3)), np.empty((len(points), 3))
+    project_points(view.row, points, shown)
+    project_points(view.row, points + _COVERS * cell * _sideways(view), aside)
+    radius = np.nan_to_num(np.linalg.norm(aside[:, :2] - shown[:, :2], axis=1))
+    return np.asarray(np.where(shown[:, 2] > 0.0, np.minimum(radius, view.width), 0.0))
+
+
+def _holes(
+    view: View, silhouette: Silhouette, taken: _Taken, limit: float, thin: float, cell: float
+) -> tuple[Mask, int]:
+    """(H, W) pixels of holes of a silhouette, and how many others lack what the worst one takes away.
+
+    Holes are parts of the picture of what the silhouette alone takes away where that is thicker than a limit, or lacked
+    by others and not ``thin``.
+    """
+    is_told = (taken.depth > limit) | taken.lacked.any(axis=1)
+    rim = _RIM / _HOLE * min(limit, float(taken.depth[is_told].max()))
+    chosen = is_told | (taken.depth > rim)
+    rows, columns = _pixels(view, taken.points[chosen])
+    covered = np.zeros((view.height, view.width), np.uint8)
+    for v, u, r in zip(rows, columns, np.ceil(_radius(view, taken.points[chosen], cell)), strict=True):
         cv2.circle(covered, (int(u), int(v)), int(r), 1, -1)
-        if is_seed:
-            deep[min(max(int(v), 0), view.height - 1), min(max(int(u), 0), view.width - 1)] = 1
-    parts, _ = label((covered > 0) & ~silhouette.inside)
-    of_deep = np.unique(parts[deep > 0])
-    hole = np.isin(parts, of_deep[of_deep > 0])
-    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _WIDER_PX + 1, 2 * _WIDER_PX + 1))
-    return np.asarray(cv2.dilate(hole.astype(np.uint8), disk) > 0)
+    parts, num = label((covered > 0) & ~silhouette.inside)
+    part_of, lacked = parts[rows, columns], taken.lacked[chosen]
+    lacked_by = np.zeros(num + 1, np.int64)
+    for i in np.flatnonzero(lacked.any(axis=0)):
+        lacked_by[np.unique(part_of[lacked[:, i]])] += 1
+    deepest = np.zeros(num + 1)
+    np.maximum.at(deepest, part_of, taken.depth[chosen])
+    is_hole = (deepest > limit) | (lacked_by >= _LACKED_BY) & (deepest > thin)
+    is_hole |= (lacked_by > 0) & (deepest > _RIM / _HOLE * limit)
+    is_hole &= np.bincount(part_of[is_told[chosen]], minlength=num + 1) >= _FEWEST
+    is_hole[0] = False
+    hole = cv2.dilate(is_hole[parts].astype(np.uint8), _disk(_WIDER_PX))
+    return np.asarray(hole > 0), int(lacked_by[is_hole].max(initial=0))
+
+
+def _disk(radius: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)
 
 
 def _sideways(view: View) -> Array:

@@ -17,7 +17,9 @@ from sfmapp.calibration.file import CalibrationDocument
 from sfmapp.calibration.point_reports import LocationReport, MeasureReport, TargetReport, TargetsReport
 from sfmapp.georeference.world_frame import Georeference
 from sfmapp.planes.report import RectifyReport, WarpReport
+from sfmapp.report.carve_document import CarveReport
 from sfmapp.report.evaluation import EvaluationReport
+from sfmapp.report.masks_html import MaskFilesReport
 from sfmapp.report.model import (
     CalibrateReport,
     CalibrateRigReport,
@@ -31,6 +33,7 @@ from sfmapp.report.model import (
 from sfmapp.report.pair_html import PairReport
 from sfmapp.report.panorama_html import PanoramaReport
 from sfmapp.report.stereo_document import StereoReport
+from sfmapp.report.sweep_document import SweepReport
 from sfmapp.report.transfer_html import TransferRunReport
 from sfmapp.report.uncalibrated_html import UncalibratedReport
 from sfmapp.report.validation import CloudValidation, Validation
@@ -38,9 +41,9 @@ from sfmapp.reporting import Report, field_types
 from sfmapp.stereo.design import DesignReport
 
 # by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry, refine,
-# calibrate, locate, pair, panorama, warp, rectify and stereo; calibration.json; validation/report.json and
-# validation/cloud.json; what evaluate, undistort, export, measure and stereo-design print with --json; and
-# georeference.json
+# calibrate, locate, pair, panorama, warp, rectify, stereo, carve, masks and sweep; calibration.json;
+# validation/report.json and validation/cloud.json; what evaluate, undistort, export, measure and stereo-design print
+# with --json; and georeference.json
 KINDS: Mapping[str, type[Report]] = {
     "reconstruct": ReconstructionReport,
     "dense": DenseRunReport,
@@ -67,6 +70,9 @@ KINDS: Mapping[str, type[Report]] = {
     "warp": WarpReport,
     "rectify": RectifyReport,
     "stereo": StereoReport,
+    "carve": CarveReport,
+    "masks": MaskFilesReport,
+    "sweep": SweepReport,
 }
 _SIMPLE = {bool: "boolean", int: "integer", float: "number", str: "string", type(None): "null"}
 
