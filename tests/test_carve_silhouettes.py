@@ -103,6 +103,20 @@ def test_results_do_not_depend_on_threads() -> None:
     assert all(a.distance.tobytes() == b.distance.tobytes() for a, b in zip(one, three, strict=True))
 
 
+@pytest.mark.parametrize("level", [0, 255])
+def test_alpha_that_tells_nothing_is_said_to(level: int) -> None:
+    pictures = [np.dstack([p, np.full(p.shape[:2], level, np.uint8)]) for p in PHOTOGRAPHS]
+    silhouettes, report = found_in(pictures)
+    assert {mask.source for mask in report.masks} == {"background"}
+    assert [line.split(" of ")[0] for line in report.warnings] == ["the alpha channels"]
+    assert min(agreement(s, c) for s, c in zip(silhouettes, COVERAGES, strict=True)) > 0.98
+    # one photograph that tells is enough for alpha to be meant: the others are named
+    pictures[3] = np.dstack([PHOTOGRAPHS[3], bytes_of(COVERAGES[3])])
+    silhouettes, report = found_in(pictures)
+    assert {mask.source for mask in report.masks} == {"alpha", "none"}
+    assert "0.png has no alpha channel that tells the object" in report.warnings
+
+
 @pytest.mark.parametrize("kind", ["empty", "full", "inverted", "missing"])
 def test_masks_that_cannot_be_right_carve_nothing_and_are_named(kind: str) -> None:
     masks = [bytes_of(coverage) for coverage in COVERAGES]
@@ -113,7 +127,11 @@ def test_masks_that_cannot_be_right_carve_nothing_and_are_named(kind: str) -> No
     images, _ = load_images(named, ImageOptions(), Events(), masks=given)
     silhouettes, report = find_silhouettes(images, None, MaskOptions(), Events())
     assert ["2.png" in line for line in report.warnings] == [True]
-    assert {"missing": "no mask"}.get(kind, kind) in report.warnings[0]
+    told = {
+        "missing": "2.png has no mask",
+        "inverted": "the mask of 2.png is inverted: the object is what it leaves out",
+    }
+    assert report.warnings[0] == told.get(kind, f"the mask of 2.png is {kind}")
     known = silhouettes[2].known
     assert known is not None
     assert not known.any()

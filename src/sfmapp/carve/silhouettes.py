@@ -112,15 +112,16 @@ def find_silhouettes(
         raise InputError("silhouettes: expected photographs, found none")
     events.started(STAGE, f"silhouettes in {len(records)} photographs", total=len(records))
     source = _choose_source(records, options)
+    warnings = _useless_alpha(records, source, options, events)
     model = _learn(records, source, workers, events)
     index = {record.name: i for i, record in enumerate(records)}
 
     def work(record: ImageRecord) -> tuple[Silhouette, PhotographMask]:
         view = None if views is None else views[index[record.name]]
-        return _with_problem(record, _find(record, source, model, _rectangle(record, view, points)))
+        return _with_problem(record, _find(record, source, model, _rectangle(record, view, points)), source)
 
     found = _each(work, records, workers, lambda record: events.advanced(STAGE, message=record.name))
-    warnings = _warn([entry for _, entry in found], events)
+    warnings += _warn([entry for _, entry in found], events)
     if views is not None:
         found, more = _compared(views, found, workers, events)
         warnings += more
@@ -156,12 +157,27 @@ def _choose_source(records: Sequence[ImageRecord], options: MaskOptions) -> str:
         return options.mask_source
     if any(_has_mask(record) for record in records):
         return "mask"
-    alphas = [read_with_alpha(record)[1] for record in _spread(records, 3) if record.has_alpha]
-    if any(alpha is not None for alpha in alphas):
+    # most often the first of three tells; all are read only where it never does
+    asked = (*_spread(records, 3), *records)
+    if any(read_with_alpha(record)[1] is not None for record in asked if record.has_alpha):
         return "alpha"
     if all(is_mask(read_rgb(record)) for record in _spread(records, 3)):
         return "picture"
     return "background"
+
+
+def _useless_alpha(records: Sequence[ImageRecord], source: str, options: MaskOptions, events: Events) -> list[str]:
+    """Say that alpha channels are there which tell nothing, so that something weaker does."""
+    num = sum(record.has_alpha for record in records)
+    if options.mask_source != "auto" or source in ("alpha", "mask") or num < 0.5 * len(records):
+        return []
+    told = "their two colours" if source == "picture" else "the colours of their background"
+    line = (
+        f"the alpha channels of {num} photographs are the same everywhere and tell no object: it is told by {told}, "
+        "and what of it looks like that is lost"
+    )
+    events.warned(STAGE, f"{line}: look at the outlines, or give masks (--mask-path)")
+    return [line]
 
 
 def _has_mask(record: ImageRecord) -> bool:
@@ -255,8 +271,8 @@ def _coverage(levels: NDArray[np.uint8]) -> Coverage:
     return np.asarray(levels, np.float32) / np.float32(255.0)
 
 
-def _with_problem(record: ImageRecord, found: _Found | None) -> tuple[Silhouette, PhotographMask]:
-    """The silhouette of what was found, known nowhere if it cannot be right."""
+def _with_problem(record: ImageRecord, found: _Found | None, wanted: str) -> tuple[Silhouette, PhotographMask]:
+    """The silhouette of what was found, known nowhere if it cannot be right; ``wanted``: where it was looked for."""
     if found is None:
         found = _Found(np.zeros((record.height, record.width), np.float32), "none", 0.5)
     inside = found.coverage > 0.5
@@ -264,7 +280,7 @@ def _with_problem(record: ImageRecord, found: _Found | None) -> tuple[Silhouette
     share, border_share = float(inside.mean()), float(edge.mean())
     problem = ""
     if found.source == "none":
-        problem = "has no mask"
+        problem = "has no alpha channel that tells the object" if wanted == "alpha" else "has no mask"
     elif share < _LEAST_SHARE:
         problem = "is empty"
     elif share > 1.0 - _LEAST_SHARE:
@@ -290,7 +306,10 @@ def _warn(entries: Sequence[PhotographMask], events: Events) -> list[str]:
         InputError: none is left.
     """
     bad = [entry for entry in entries if entry.problem]
-    warnings = [f"the mask of {entry.name} {entry.problem}" for entry in bad]
+    warnings = [
+        f"{entry.name} {entry.problem}" if entry.source == "none" else f"the mask of {entry.name} {entry.problem}"
+        for entry in bad
+    ]
     if len(bad) == len(entries):
         raise InputError(
             f"no silhouette is usable: {'; '.join(warnings[:_NAMES_SHOWN])}",

@@ -6,10 +6,12 @@ import argparse
 from typing import TYPE_CHECKING
 
 from sfmapp.cli.common import (
+    add_object_flags,
     add_output_flags,
     limit_library_threads,
     listening,
     load_numba_without_blas,
+    object_options,
     options_of,
     tell_result,
     took,
@@ -54,11 +56,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("-o", "--output", metavar="OUT", help="output folder, new or empty; of a model, SOURCE/carve")
     cameras = parser.add_argument_group("photographs and cameras")
-    cameras.add_argument("--images", metavar="DIR", help="folder of the photographs, where SOURCE does not hold them")
-    cameras.add_argument("--poses", metavar="FILE", help="poses or projection matrices, where SOURCE holds none")
-    cameras.add_argument("--camera", metavar="MODEL,...|FILE", help="the lens, where poses come without one")
-    cameras.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; the object is white")
-    cameras.add_argument("--mask-source", metavar="NAME", help="alpha, mask, background or grabcut")
+    add_object_flags(cameras)
     cameras.add_argument(
         "--lights", metavar="FILE", help="JSON file of photographs under single lights, whose shadows carve hollows"
     )
@@ -85,8 +83,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _carve(args: argparse.Namespace) -> int:
     limit_library_threads()
     options = options_of({
-        "images.camera": args.camera, "images.mask_path": args.mask_path, "masks.mask_source": args.mask_source,
-        "carve.cells": args.cells, "carve.misses": args.misses,
+        **object_options(args), "carve.cells": args.cells, "carve.misses": args.misses,
         "carve.doubts_holes": "false" if args.keep_holes else None, "threads": args.threads,
         "surface.texture": "true" if args.texture else None,
     })  # fmt: skip

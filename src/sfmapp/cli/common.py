@@ -41,6 +41,24 @@ def add_output_flags(parser: argparse.ArgumentParser, *, has_log: bool = False) 
     group.add_argument("--json", action="store_true", help="result as JSON on stdout, events as JSON lines on stderr")
 
 
+def add_object_flags(group: argparse._ActionsContainer) -> None:
+    """Flags on photographs of an object, their cameras, and where the object is in them."""
+    group.add_argument("--images", metavar="DIR", help="folder of the photographs, where SOURCE does not hold them")
+    group.add_argument("--poses", metavar="FILE", help="poses or projection matrices, where SOURCE holds none")
+    group.add_argument("--camera", metavar="MODEL,...|FILE", help="the lens, where poses come without one")
+    group.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; the object is white")
+    group.add_argument(
+        "--mask-source", metavar="NAME", help="alpha, mask, background or grabcut; default: what is there"
+    )
+
+
+def object_options(args: argparse.Namespace) -> dict[str, str | None]:
+    """What flags of :func:`add_object_flags` set, for :func:`options_of`."""
+    return {
+        "images.camera": args.camera, "images.mask_path": args.mask_path, "masks.mask_source": args.mask_source,
+    }  # fmt: skip
+
+
 @contextlib.contextmanager
 def listening(args: argparse.Namespace) -> Iterator[Events]:
     """Events, shown as the flags ask. Ctrl-C, SIGTERM or SIGHUP ends the run at its next step, a second one at once."""

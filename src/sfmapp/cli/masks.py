@@ -6,10 +6,12 @@ import argparse
 from typing import TYPE_CHECKING
 
 from sfmapp.cli.common import (
+    add_object_flags,
     add_output_flags,
     limit_library_threads,
     listening,
     load_numba_without_blas,
+    object_options,
     options_of,
     tell_result,
     took,
@@ -42,15 +44,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )  # fmt: skip
     parser.add_argument("source", metavar="SOURCE", help="a workspace, a COLMAP model, or photographs")
     parser.add_argument("-o", "--output", metavar="DIR", required=True, help="output folder, new or empty")
-    parser.add_argument("--images", metavar="DIR", help="folder of the photographs, where SOURCE does not hold them")
-    parser.add_argument("--poses", metavar="FILE", help="poses or projection matrices, where SOURCE holds none")
-    parser.add_argument("--camera", metavar="MODEL,...|FILE", help="the lens, where poses come without one")
-    parser.add_argument("--mask-path", metavar="DIR", help="folder of masks named IMAGE.png; the object is white")
-    parser.add_argument(
-        "--mask-source",
-        metavar="NAME",
-        help="alpha, mask, background or grabcut; default: what is there",
-    )
+    add_object_flags(parser)
     parser.add_argument("--threads", metavar="N", help="default: all cores; results do not depend on it")
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_masks)
@@ -58,10 +52,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def _masks(args: argparse.Namespace) -> int:
     limit_library_threads()
-    options = options_of({
-        "images.camera": args.camera, "images.mask_path": args.mask_path, "masks.mask_source": args.mask_source,
-        "threads": args.threads,
-    })  # fmt: skip
+    options = options_of({**object_options(args), "threads": args.threads})
     load_numba_without_blas()
     from sfmapp.pipelines.carve.masks import MasksInput, find_masks
     from sfmapp.workspace.usage import Stopwatch
