@@ -537,6 +537,7 @@ def _told_of_frames(events: Events, on_frame: Callable[[FrameSnapshot], None] | 
 def _tracked_in_memory(source: FilePath | Sequence, options: Options, events: Events) -> OdometryResult:
     from sfmapp.errors import NoReconstructionError
     from sfmapp.odometry.run import run_odometry
+    from sfmapp.pipelines.odometry.filtering import filter_largest_map
     from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps, takes_imu
 
     if isinstance(source, str | os.PathLike):
@@ -552,6 +553,8 @@ def _tracked_in_memory(source: FilePath | Sequence, options: Options, events: Ev
         scale_maps(found, request, events)
     if not found.maps:
         raise NoReconstructionError(f"{len(found.frame_idx)} frames were given, but no map could be initialized")
+    if options.odometry.filter:
+        filter_largest_map(found, source.imu, found.timestamps_s, events)
     return _with_views(found)
 
 

@@ -154,6 +154,7 @@ def gather(
         np.array([r.frame_idx for r in records], np.int64), [r.name for r in records],
         np.array([r.timestamp_s for r in records]), poses, np.array([r.live for r in records]).reshape(-1, 7), place,
         np.array([r.state for r in records], np.uint8), results, np.array(covariance).reshape(-1, 6, 6),
+        measured_covariance=np.array([r.covariance for r in records]).reshape(-1, 6, 6),
     )  # fmt: skip
 
 

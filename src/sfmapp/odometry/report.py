@@ -115,6 +115,66 @@ class ShutterReport(Report):
     readout: float
 
 
+class FilterConsistency(Report):
+    """How far poses were from where a filter expected them, against what it expected of that.
+
+    Attributes:
+        num_innovations: poses that were compared, those that were not believed among them.
+        mean: of the normalised innovations squared, a degree of freedom: 1 where all is as modelled, and within
+            mean_low to mean_high in 95 % of runs then.
+        share_inside: of them inside the 95 % interval of one, both sides.
+    """
+
+    num_innovations: int
+    mean: float
+    mean_low: float
+    mean_high: float
+    share_inside: float
+
+
+class RejectedPose(Report):
+    """A pose that a filter did not believe."""
+
+    name: str
+    timestamp_s: float
+    reason: str
+
+
+class FilterGap(Report):
+    """A stretch without poses that a filter has bridged; sigmas at its end, in the map's unit and in degrees."""
+
+    first_s: float
+    last_s: float
+    position_sigma: float
+    rotation_sigma_deg: float
+
+
+class FilterReport(Report):
+    """What the error-state filter made of the largest map.
+
+    Attributes:
+        prediction: ``imu`` or ``constant velocity``; reason: why not by the sensor, where there is one.
+        num_poses: that were written; rate_hz: how many a second, in the middle.
+        num_used: measured poses that corrected it.
+        rejected: those that did not. gaps: that were bridged.
+        consistency: absent where nothing could be compared.
+        latency_ms_median, latency_ms_p95, latency_ms_max: from a sample or a pose to the filtered pose, the tracking of
+            the frame left out.
+    """
+
+    prediction: str
+    num_poses: int
+    rate_hz: float
+    num_used: int
+    rejected: Sequence[RejectedPose]
+    gaps: Sequence[FilterGap]
+    latency_ms_median: float
+    latency_ms_p95: float
+    latency_ms_max: float
+    reason: str | None = None
+    consistency: FilterConsistency | None = None
+
+
 class SharedErrors(Report):
     """By how much errors that observations share make the variance of the poses larger: along tracks, and between.
 

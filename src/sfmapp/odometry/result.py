@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sfmapp.adjust.options import AdjustReport
 from sfmapp.contradictions import Contradiction
 from sfmapp.images.sequence import RepeatedFrame
+from sfmapp.odometry.inertial.filtering import FilteredTrajectory
 from sfmapp.odometry.inertial.markers import MarkerSightings
 from sfmapp.odometry.inertial.scale import ScaleEstimate, ScaleRefusal
 from sfmapp.odometry.inertial.smoothing import SmoothedTrajectory
@@ -86,6 +87,9 @@ class OdometryResult:
             result read from files.
         smoothed: for each map its frames as the error-state filter has them; empty if not asked for.
         report: counts, times and decisions, JSON-able.
+        measured_covariance: (F, 6, 6) of the final poses given the map, whose errors neighbouring frames share, over
+            the same; NaN where not measured. None for a result read from files.
+        filtered: the largest map as the error-state filter that knows the past alone has it; None if not asked for.
     """
 
     frame_idx: NDArray[np.int64]
@@ -99,6 +103,8 @@ class OdometryResult:
     covariance: Array | None = None
     smoothed: list[SmoothedTrajectory] = field(default_factory=list)
     report: OdometryReport | None = None
+    measured_covariance: Array | None = None
+    filtered: FilteredTrajectory | None = None
 
     @property
     def twin_rows(self) -> NDArray[np.int64]:
@@ -124,4 +130,5 @@ class OdometryResult:
             self.live_cam_from_world[row], self.frame_map[row], state.astype(np.uint8), self.maps,
             None if self.covariance is None else self.covariance[row],
             [smoothed.at(row) for smoothed in self.smoothed], self.report,
+            None if self.measured_covariance is None else self.measured_covariance[row], self.filtered,
         )  # fmt: skip

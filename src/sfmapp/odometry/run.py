@@ -426,11 +426,10 @@ class Odometry:
             if entry.covariance_gap:
                 self.events.warned("adjustment", f"map {m}, covariances are missing: {entry.covariance_gap}")
         if self.options.smooth:
-            # given the map, whose errors neighbouring frames have in common
-            covariance = np.array([record.covariance for record in self.records]).reshape(-1, 6, 6)
+            assert result.measured_covariance is not None
             for m in range(len(result.maps)):
                 poses = np.where((result.frame_map == m)[:, None], result.cam_from_world, np.nan)
-                result.smoothed.append(smooth_trajectory(result.timestamps_s, poses, covariance))
+                result.smoothed.append(smooth_trajectory(result.timestamps_s, poses, result.measured_covariance))
         result.report = self._report(result)
         return result
 

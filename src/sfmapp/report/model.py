@@ -32,7 +32,7 @@ from sfmapp.georeference.report import GeoreferenceReport
 from sfmapp.images.report import ImagesReport
 from sfmapp.mapping.report import FocalEvidence, MappingReport, ModelEntry
 from sfmapp.matching.report import MatchingReport, PairsReport
-from sfmapp.odometry.report import OdometryReport, ScaleReport
+from sfmapp.odometry.report import FilterReport, OdometryReport, ScaleReport
 from sfmapp.reporting import NamedReason, Plain, Report, Step, Usage
 from sfmapp.surface.report import MeshReport
 
@@ -675,6 +675,7 @@ class OdometryStages(Report):
     kernels: Usage | None = None
     odometry: OdometryReport | None = None
     scale: Sequence[ScaleReport] | None = None
+    filter: FilterReport | None = None
 
 
 class OdometryRunReport(Report):

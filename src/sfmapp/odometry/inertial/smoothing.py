@@ -1,8 +1,10 @@
 """An error-state Kalman filter over measured poses, and its smoother.
 
 Position, orientation, velocity and turn rate; the camera goes on as it moves, disturbed by white acceleration and white
-angular acceleration. Sola, "Quaternion kinematics for the error-state Kalman filter", arXiv 1711.02508, 2017, sections
-5 and 6; Rauch, Tung and Striebel, "Maximum likelihood estimates of linear dynamic systems", AIAA Journal 1965.
+angular acceleration. Real accelerations last, so that what is white over a frame is too little over a gap: densities
+are fitted to each span apart, and a gap is bridged with that of its own length. Sola, "Quaternion kinematics for the
+error-state Kalman filter", arXiv 1711.02508, 2017, sections 5 and 6; Rauch, Tung and Striebel, "Maximum likelihood
+estimates of linear dynamic systems", AIAA Journal 1965.
 
 The error state is (position in the world, orientation in the camera's frame, velocity in the world, turn rate in the
 camera's frame): p + dp, R exp(dtheta), v + dv, w + dw with R = R_world_from_cam.
@@ -57,7 +59,8 @@ class SmoothedTrajectory:
         velocity: (F, 3) map units/s in the world. turn_rate: (F, 3) rad/s in the camera's frame.
         nis: (F,) normalised innovations squared, 6 in the mean where noise and motion are as modelled; NaN where
             there was nothing to compare.
-        acceleration_noise, turn_noise: the densities used, as in the options.
+        acceleration_noise, turn_noise: the densities used from frame to frame, as in the options; over gaps they are
+            larger where the motion is not white.
     """
 
     cam_from_world: Array
@@ -95,28 +98,20 @@ def smooth_trajectory(
     Raises:
         ValueError: times that do not ascend.
     """
-    times = np.ascontiguousarray(timestamps_s, np.float64)
-    poses, covariances = np.asarray(cam_from_world, np.float64), np.asarray(covariance, np.float64)
-    if len(times) > 1 and not (np.diff(times) > 0).all():
-        raise ValueError("the times of a trajectory must ascend strictly")
-    measured: Bools = np.asarray(np.isfinite(poses).all(1) & np.isfinite(covariances).all((1, 2)), bool)
-    measured[measured] = np.linalg.eigvalsh(covariances[measured])[:, 0] > 0
-    poses_in = _measurements(times, poses, covariances, measured)
-    speed, turn = _typical_rates(poses_in)
-    motion = _Motion(
-        *_process_noises(poses_in, options), _DIFFUSE * speed, _DIFFUSE * turn, options.max_nis, options.max_rejected
-    )
-    found = _Filtered.of_length(len(times))
-    for start, stop in _segments(times, measured, options.max_gap_s):
+    poses_in = read_measured(timestamps_s, cam_from_world, covariance)
+    speed, turn = unknown_rates(poses_in)
+    motion = _Motion(*_process_noises(poses_in, options), speed, turn, options.max_nis, options.max_rejected)
+    found = _Filtered.of_length(len(poses_in.times))
+    for start, stop in segments(poses_in, options.max_gap_s):
         part = slice(start, stop)
         _filter(poses_in.part(part), motion, found.part(part))
         if not options.is_causal:
-            _smooth(times[part], found.predicted_states[part], found.predicted[part], found.states[part],
+            _smooth(poses_in.times[part], found.predicted_states[part], found.predicted[part], found.states[part],
                     found.covariances[part])  # fmt: skip
     return _trajectory(poses_in, found, motion)
 
 
-class _Measured(NamedTuple):
+class MeasuredPoses(NamedTuple):
     """Poses (F) as the filter reads them.
 
     Attributes:
@@ -132,8 +127,8 @@ class _Measured(NamedTuple):
     noise: Array
     is_there: Bools
 
-    def part(self, rows: slice) -> _Measured:
-        return _Measured(
+    def part(self, rows: slice) -> MeasuredPoses:
+        return MeasuredPoses(
             self.times[rows], self.position[rows], self.rotation[rows], self.noise[rows], self.is_there[rows]
         )
 
@@ -142,13 +137,15 @@ class _Motion(NamedTuple):
     """What the filter expects of the motion.
 
     Attributes:
-        q_position, q_rotation: power densities of acceleration and angular acceleration.
+        spans: (M,) ascending seconds. q_position, q_rotation: (M,) power densities of acceleration and angular
+            acceleration over as long a time without a measurement; they do not descend.
         speed, turn_rate: standard deviations of what nothing is known of.
         max_nis, max_rejected: see :class:`SmoothingOptions`.
     """
 
-    q_position: float
-    q_rotation: float
+    spans: Array
+    q_position: Array
+    q_rotation: Array
     speed: float
     turn_rate: float
     max_nis: float
@@ -186,27 +183,34 @@ class _Filtered(NamedTuple):
         )  # fmt: skip
 
 
-def _measurements(times: Array, poses: Array, covariances: Array, measured: Bools) -> _Measured:
+def read_measured(timestamps_s: ArrayLike, cam_from_world: ArrayLike, covariance: ArrayLike) -> MeasuredPoses:
+    """Poses as a filter reads them; arguments and errors as of :func:`smooth_trajectory`."""
+    times = np.ascontiguousarray(timestamps_s, np.float64)
+    poses, covariances = np.asarray(cam_from_world, np.float64), np.asarray(covariance, np.float64)
+    if len(times) > 1 and not (np.diff(times) > 0).all():
+        raise ValueError("the times of a trajectory must ascend strictly")
+    measured: Bools = np.asarray(np.isfinite(poses).all(1) & np.isfinite(covariances).all((1, 2)), bool)
+    measured[measured] = np.linalg.eigvalsh(covariances[measured])[:, 0] > 0
     num = len(poses)
     position, rotation, noise = np.zeros((num, 3)), np.tile(np.eye(3), (num, 1, 1)), np.zeros((num, 6, 6))
     position[measured] = rigid3.center(poses[measured])
     rotation[measured] = rigid3.rotation_matrix(poses[measured]).swapaxes(1, 2)
     # x_cam <- exp(w) x_cam + v turns R_world_from_cam by exp(-w) on the right and moves the centre by -R v
-    change = _error_from_tangent(rotation[measured])
+    change = error_from_tangent(rotation[measured])
     noise[measured] = change @ covariances[measured] @ change.swapaxes(1, 2)
-    return _Measured(times, position, rotation, noise, measured)
+    return MeasuredPoses(times, position, rotation, noise, measured)
 
 
-def _error_from_tangent(rotation: Array) -> Array:
+def error_from_tangent(rotation: Array) -> Array:
     """(N, 6, 6): (position in the world, orientation in the camera) of (w, v), for R_world_from_cam (N, 3, 3)."""
     change = np.zeros((len(rotation), 6, 6))
     change[:, :3, 3:], change[:, 3:, :3] = -rotation, -np.eye(3)
     return change
 
 
-def _segments(times: Array, measured: Bools, max_gap_s: float) -> list[tuple[int, int]]:
+def segments(measured: MeasuredPoses, max_gap_s: float) -> list[tuple[int, int]]:
     """Runs of frames [start, stop) that are filtered together: no gap in them is longer than allowed."""
-    index = np.flatnonzero(measured)
+    times, index = measured.times, np.flatnonzero(measured.is_there)
     if not len(index):
         return []
     breaks = np.flatnonzero(np.diff(times[index]) > max_gap_s)
@@ -217,29 +221,32 @@ def _segments(times: Array, measured: Bools, max_gap_s: float) -> list[tuple[int
     return [(int(a), int(b)) for a, b in zip(starts, stops, strict=True)]
 
 
-def _typical_rates(measured: _Measured) -> tuple[float, float]:
-    """Root mean square speed and turn rate between measurements, never zero."""
+def unknown_rates(measured: MeasuredPoses) -> tuple[float, float]:
+    """Standard deviations of speeds and turn rates of which nothing is known: several times those between measurements,
+    never zero."""
     index = np.flatnonzero(measured.is_there)
     if len(index) < 2:
-        return 1.0, 1.0
+        return _DIFFUSE, _DIFFUSE
     dt = np.diff(measured.times[index])
     speed = np.linalg.norm(np.diff(measured.position[index], axis=0), axis=1) / dt
     turn = np.linalg.norm(_turns(measured.rotation, index[:-1], index[1:]), axis=1) / dt
     tiny = 1e-12
-    return float(np.sqrt((speed**2).mean())) + tiny, float(np.sqrt((turn**2).mean())) + tiny
+    return _DIFFUSE * float(np.sqrt((speed**2).mean())) + tiny, _DIFFUSE * float(np.sqrt((turn**2).mean())) + tiny
 
 
 def _turns(rotation: Array, first: NDArray[np.int64], second: NDArray[np.int64]) -> Array:
     return rigid3.log_so3(rotation[first].swapaxes(1, 2) @ rotation[second])
 
 
-def _process_noises(measured: _Measured, options: SmoothingOptions) -> tuple[float, float]:
-    """Power densities (squares of the options' noises) of acceleration and angular acceleration."""
+def _process_noises(measured: MeasuredPoses, options: SmoothingOptions) -> tuple[Array, Array, Array]:
+    """Spans, and power densities (squares of the options' noises) of acceleration and angular acceleration."""
     position, rotation, index = measured.position, measured.rotation, np.flatnonzero(measured.is_there)
-    q: list[float] = []
+    times, lags = measured.times[index], _lags(len(index))
+    spans = np.array([np.median(times[lag:] - times[:-lag]) for lag in lags]) if len(index) > 1 else np.ones(1)
+    q: list[Array] = []
     for given, is_rotation in ((options.acceleration_noise, False), (options.turn_noise, True)):
         if given is not None:
-            q.append(given**2)
+            q.append(np.full(len(lags), given**2))
             continue
         own = slice(3, 6) if is_rotation else slice(0, 3)
         variance = np.trace(measured.noise[index, own, own], axis1=1, axis2=2) / 3.0
@@ -248,22 +255,32 @@ def _process_noises(measured: _Measured, options: SmoothingOptions) -> tuple[flo
             i, j = index[first], index[second]
             return _turns(rotation, i, j) if turning else position[j] - position[i]
 
-        q.append(_fit_density(measured.times[index], variance, moves))
-    return q[0], q[1]
+        q.append(_fit_densities(times, variance, moves, lags))
+    return spans, q[0], q[1]
 
 
-def _fit_density(
-    times: Array, variance: Array, moves: Callable[[NDArray[np.int64], NDArray[np.int64]], Array]
-) -> float:
-    """Power density of the white acceleration that explains how mean velocities change.
+def _lags(num: int) -> list[int]:
+    """Over how many measurements motion is looked at, twice as many each time, while there are enough spans of them."""
+    lags = [1]
+    while num // (2 * lags[-1]) >= 8:
+        lags.append(2 * lags[-1])
+    return lags
+
+
+def _fit_densities(
+    times: Array, variance: Array, moves: Callable[[NDArray[np.int64], NDArray[np.int64]], Array], lags: list[int]
+) -> Array:
+    """Power densities (M,) of the white acceleration that explains how mean velocities change, by span.
 
     Mean velocities over two adjacent spans dt1 and dt2 differ by a variance of q (dt1 + dt2) / 3 beside the noise of
-    the three measurements. The shortest span at which the motion outweighs the noise is believed: over longer ones
-    real motion is less and less white.
+    the three measurements. From frame to frame the shortest span at which the motion outweighs the noise is believed.
+    Acceleration that lasts adds up to more over longer spans, so the largest of all shorter ones counts.
     """
-    num, lag, q = len(times), 1, 0.0
-    floor = 1e-12
-    while 2 * lag < num and (lag == 1 or num // lag >= 8):
+    num, found = len(times), np.full(len(lags), np.nan)
+    floor, is_told = 1e-12, False
+    for n, lag in enumerate(lags):
+        if 2 * lag >= num:
+            break
         first = np.arange(num - 2 * lag)
         second, third = first + lag, first + 2 * lag
         dt1, dt2 = times[second] - times[first], times[third] - times[second]
@@ -272,10 +289,15 @@ def _fit_density(
         gain = (dt1 + dt2) / 3.0
         floor = max(1e-4 * float(np.median(blur / gain)), 1e-300)
         q = _match_quantile(change2, blur, gain, floor)
-        if q * float(np.median(gain)) > float(np.median(blur)):
-            return q
-        lag *= 2
-    return max(q, floor)
+        if not is_told:  # what shorter spans say is noise
+            is_told = q * float(np.median(gain)) > float(np.median(blur))
+            found[:n] = np.nan
+        found[n] = q
+    known = np.flatnonzero(np.isfinite(found))
+    if not len(known):
+        return np.full(len(lags), floor)
+    filled = found[np.maximum(np.minimum(np.arange(len(lags)), known[-1]), known[0])]
+    return np.maximum(np.maximum.accumulate(filled), floor)
 
 
 def _match_quantile(change2: Array, blur: Array, gain: Array, floor: float) -> float:
@@ -292,19 +314,19 @@ def _match_quantile(change2: Array, blur: Array, gain: Array, floor: float) -> f
     return math.exp(0.5 * (low + high))
 
 
-def _trajectory(measured: _Measured, found: _Filtered, motion: _Motion) -> SmoothedTrajectory:
+def _trajectory(measured: MeasuredPoses, found: _Filtered, motion: _Motion) -> SmoothedTrajectory:
     """Out of the filter's arrays and its order of the error state."""
     states, num = found.states, len(found.states)
     cam_from_world, out = np.full((num, 7), np.nan), np.full((num, 6, 6), np.nan)
     has_pose = np.isfinite(states[:, 0])
     rotation = states[has_pose, 3:12].reshape(-1, 3, 3)
     cam_from_world[has_pose] = rigid3.inverse(rigid3.from_matrix(rotation, states[has_pose, :3]))
-    change = np.linalg.inv(_error_from_tangent(rotation))
+    change = np.linalg.inv(error_from_tangent(rotation))
     out[has_pose] = change @ found.covariances[has_pose, :6, :6] @ change.swapaxes(1, 2)
     is_predicted = has_pose & ~(measured.is_there & ~found.rejected)
     return SmoothedTrajectory(
         cam_from_world, out, is_predicted, found.rejected, states[:, 12:15].copy(), states[:, 15:].copy(), found.nis,
-        math.sqrt(motion.q_position), math.sqrt(motion.q_rotation),
+        math.sqrt(motion.q_position[0]), math.sqrt(motion.q_rotation[0]),
     )  # fmt: skip
 
 
@@ -498,16 +520,34 @@ def _begin(
 
 
 @numba.njit(cache=True, nogil=True)
+def _density(spans: Array, densities: Array, since: float) -> float:
+    """That of the time since a measurement, between those of the spans."""
+    if since <= spans[0]:
+        return float(densities[0])
+    for n in range(1, len(spans)):
+        if since <= spans[n]:
+            share = (since - spans[n - 1]) / (spans[n] - spans[n - 1])
+            return float((1.0 - share) * densities[n - 1] + share * densities[n])
+    return float(densities[-1])
+
+
+@numba.njit(cache=True, nogil=True)
 def _predict(
-    before: Array, p_before: Array, dt: float, motion: _Motion, scratch: _Scratch, state: Array, p: Array
+    before: Array, p_before: Array, dt: float, since: float, motion: _Motion, scratch: _Scratch, state: Array, p: Array
 ) -> None:
+    """On by dt, to a time since the last measurement that was used."""
     step = np.zeros(12)
     for i in range(3):
         step[i], step[3 + i] = before[12 + i] * dt, before[15 + i] * dt
     _move(before, step, scratch.turn, scratch.slope, state)
     _transition(before, dt, scratch.turn, scratch.slope, scratch.phi)
     _sandwich(scratch.phi, p_before, scratch.product, p)
-    _add_process_noise(p, dt, motion.q_position, motion.q_rotation)
+    # what longer spans bring in more, they bring in from the last measurement on
+    now, then = _density(motion.spans, motion.q_position, since), _density(motion.spans, motion.q_position, since - dt)
+    turning = _density(motion.spans, motion.q_rotation, since)
+    turned = _density(motion.spans, motion.q_rotation, since - dt)
+    _add_process_noise(p, dt, then, turned)
+    _add_process_noise(p, since, now - then, turning - turned)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -538,7 +578,7 @@ def _forget(p: Array, innovation: Array, speed: float, turn_rate: float) -> None
 
 
 @numba.njit(cache=True, nogil=True)
-def _filter(measured: _Measured, motion: _Motion, found: _Filtered) -> None:
+def _filter(measured: MeasuredPoses, motion: _Motion, found: _Filtered) -> None:
     """Fill what is found; the first frame is measured."""
     scratch = _Scratch(
         np.empty((12, 12)), np.empty((12, 12)), np.empty((12, 12)), np.empty((12, 12)), np.empty((12, 6)),
@@ -549,10 +589,11 @@ def _filter(measured: _Measured, motion: _Motion, found: _Filtered) -> None:
     states, covariances = found.states, found.covariances
     _begin(position[0], rotation[0], noise[0], motion.speed, motion.turn_rate, states[0], covariances[0])
     found.predicted_states[0], found.predicted[0] = states[0], covariances[0]
-    in_a_row = 0
+    in_a_row, last_s = 0, times[0]
     for f in range(1, len(times)):
         state, p = found.predicted_states[f], found.predicted[f]
-        _predict(states[f - 1], covariances[f - 1], times[f] - times[f - 1], motion, scratch, state, p)
+        dt = times[f] - times[f - 1]
+        _predict(states[f - 1], covariances[f - 1], dt, times[f] - last_s, motion, scratch, state, p)
         states[f], covariances[f] = state, p
         if not measured.is_there[f]:
             continue
@@ -567,7 +608,7 @@ def _filter(measured: _Measured, motion: _Motion, found: _Filtered) -> None:
                 continue
             _forget(p, innovation, motion.speed, motion.turn_rate)
             _normalize(p, noise[f], innovation, s, scratch.factor, whitened)
-        in_a_row = 0
+        in_a_row, last_s = 0, times[f]
         _update(state, p, innovation, noise[f], scratch, states[f], covariances[f])
 
 

@@ -18,6 +18,7 @@ from sfmapp.formats.trajectory import write_kitti, write_tum
 from sfmapp.formats.trajectory_input import read_tum
 from sfmapp.odometry.report import MapFacts
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
+from sfmapp.pipelines.odometry.filtering import filtered_csv
 from sfmapp.pipelines.odometry.live import numbered
 from sfmapp.pipelines.odometry.timing import frame_statistics
 from sfmapp.report.document import named_params
@@ -54,7 +55,9 @@ if TYPE_CHECKING:
     from sfmapp.pipelines.odometry.tracking import Tracking
     from sfmapp.workspace.workspace import Workspace
 
-_OUR_TRAJECTORY = re.compile(r"trajectory(_live)?(-\d+)?\.tum|trajectory_smooth\.tum|trajectory\.kitti(\.frames)?")
+_OUR_TRAJECTORY = re.compile(
+    r"trajectory(_live)?(-\d+)?\.tum|trajectory_smooth\.tum|trajectory_filtered\.(tum|csv)|trajectory\.kitti(\.frames)?"
+)
 _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 FRAME_COLUMNS = ("index", "timestamp_s", "name", "state", "map", "tracked_points", "mapped_points", "tracking_ms")
 COVARIANCE_COLUMNS = (
@@ -95,7 +98,8 @@ def write_odometry(run: Tracking, result: OdometryResult, failure: NoReconstruct
 
 
 def write_trajectories(workspace: Workspace, result: OdometryResult, facts: FrameTable | None = None) -> None:
-    """A file of final poses for each map, and one of live poses; the largest map also as KITTI has it, and smoothed.
+    """A file of final poses for each map, and one of live poses; the largest map also as KITTI has it, smoothed and
+    filtered.
 
     Maps have worlds of their own, so they cannot share a file. What an earlier run left is taken away.
 
@@ -115,6 +119,9 @@ def write_trajectories(workspace: Workspace, result: OdometryResult, facts: Fram
             path.unlink()
     for name, poses in files.items():
         write_tum(folder / name, result.timestamps_s, poses)
+    if result.filtered is not None:
+        write_tum(folder / "trajectory_filtered.tum", result.filtered.timestamps_s, result.filtered.cam_from_world)
+        workspace.write_text("trajectory_filtered.csv", filtered_csv(result.filtered))
     if result.maps:
         write_kitti(folder / "trajectory.kitti", poses_of_map(result, 0), result.frame_idx)
 

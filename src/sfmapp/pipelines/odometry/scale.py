@@ -182,6 +182,8 @@ def rescale(result: OdometryResult, map_idx: int, found: ScaleEstimate) -> None:
     result.cam_from_world[mine, 4:] *= found.scale
     if result.covariance is not None:
         result.covariance[mine] = scale_covariance(result.covariance[mine], found.scale)
+    if result.measured_covariance is not None:
+        result.measured_covariance[mine] = scale_covariance(result.measured_covariance[mine], found.scale)
     if result.smoothed:
         smooth = result.smoothed[map_idx]
         poses = np.concatenate([smooth.cam_from_world[:, :4], found.scale * smooth.cam_from_world[:, 4:]], 1)

@@ -20,6 +20,7 @@ from sfmapp.images.sequence import Frame, GroundTruth, Imu, Sequence, SequenceKi
 from sfmapp.images.video import VideoSequence
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
+from sfmapp.pipelines.odometry.filtering import filter_largest_map
 from sfmapp.pipelines.odometry.results import write_odometry
 from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps, takes_imu
 from sfmapp.pipelines.odometry.tracking import Tracking
@@ -139,7 +140,12 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
             without_cancellation = events.without_cancellation()
             scaled = scale_maps(result, run.scale_request, without_cancellation)
             run.stages = replace(run.stages, scale=scaled)
-    result = replace(result, timestamps_s=watched.times_as_given(result))
+    given_s = watched.times_as_given(result)
+    if options.odometry.filter and result.maps:
+        with run.measured("filter"):
+            filtered = filter_largest_map(result, watched.imu, given_s, events.without_cancellation())
+            run.stages = replace(run.stages, filter=filtered)
+    result = replace(result, timestamps_s=given_s)
     if isinstance(run.sequence, FileSequence | VideoSequence):  # frames in memory are all there
         result = result.with_repeated(run.sequence.repeated)
     failure = None if result.maps else no_map(run, result)

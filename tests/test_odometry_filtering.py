@@ -1,0 +1,291 @@
+"""The filter that predicts with a sensor, or without, on flights known exactly: consistent, and honest in gaps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from inertial_flights import ACCEL_BIAS, GRAVITY, GYRO_BIAS, IMU_FROM_CAM, Flight
+from sfmapp.adjust.factors import gtsam_pose
+from sfmapp.events import Events
+from sfmapp.geometry import rigid3
+from sfmapp.odometry.inertial.filtering import FilteredTrajectory, InertialSensor, consistency, filter_trajectory
+from sfmapp.odometry.inertial.graph import Placement
+from sfmapp.odometry.inertial.integration import ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA
+from sfmapp.odometry.inertial.scale import ScaleEstimate, ScaleRefusal
+from sfmapp.odometry.report import InertialEvidence
+from sfmapp.odometry.result import MapResult, OdometryResult
+from sfmapp.pipelines.odometry.filtering import COLUMNS, filter_largest_map, filtered_csv
+from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.scene.tracks import make_tracks
+from test_odometry_smoothing import perturbed, tangent
+
+RATE_HZ, FPS, DURATION_S = 100.0, 20.0, 12.0
+DOWN = np.array([0.0, 0.0, -GRAVITY])
+SIGMA = np.r_[np.full(3, np.radians(0.1)), np.full(3, 0.01)]
+TILT_SIGMA = np.radians(0.5)
+
+
+class Case:
+    """Frames of a flight with noisy poses, and what a sensor measured beside them."""
+
+    def __init__(self, seed: int, flight: Flight | None = None) -> None:
+        rng = np.random.default_rng([seed, 31])
+        self.flight = flight or Flight(seed)
+        self.times = np.arange(int(DURATION_S * FPS)) / FPS + 0.0021  # between the samples
+        self.truth = self.flight.cam_from_world(self.times)
+        root = np.exp(0.3 * rng.normal(size=(len(self.times), 1, 1))) * np.diag(SIGMA)
+        root = root @ (np.eye(6) + 0.2 * rng.normal(size=(len(self.times), 6, 6)))
+        self.covariance = root @ root.swapaxes(1, 2)
+        self.poses = perturbed(self.truth, np.einsum("nij,nj->ni", root, rng.normal(size=(len(self.times), 6))))
+        imu = self.flight.imu(seed, DURATION_S, rate_hz=RATE_HZ)
+        # what is known of gravity and biases is as uncertain as the filter is told
+        gravity = rigid3.exp_so3(TILT_SIGMA * np.r_[rng.normal(size=2), 0.0]) @ DOWN
+        gyro_bias = GYRO_BIAS + GYRO_BIAS_SIGMA * rng.normal(size=3)
+        accel_bias = ACCEL_BIAS + ACCEL_BIAS_SIGMA * rng.normal(size=3)
+        self.sensor = InertialSensor(imu, gravity, TILT_SIGMA, gyro_bias, accel_bias)
+
+    def filtered(self, sensor: InertialSensor | None) -> FilteredTrajectory:
+        return filter_trajectory(self.times, self.poses, self.covariance, sensor)
+
+    def nees(self, found: FilteredTrajectory, rows: np.ndarray) -> np.ndarray:
+        """Of the poses in some rows, 6 in the mean."""
+        error = tangent(found.cam_from_world[rows], self.flight.cam_from_world(found.timestamps_s[rows]))
+        return (error * np.linalg.solve(found.covariance[rows], error[..., None])[..., 0]).sum(1)
+
+
+CASES = [Case(seed) for seed in range(8)]
+
+
+def test_with_a_sensor_innovations_and_errors_are_as_stated() -> None:
+    found = [case.filtered(case.sensor) for case in CASES]
+    # of the first velocity less is said than is known
+    told = consistency(np.concatenate([f.nis[3:] for f in found]))
+    assert told is not None
+    assert told.num_innovations == len(CASES) * (len(CASES[0].times) - 3)
+    # independent from frame to frame: within the 95 % band, two-sided
+    assert told.mean_low < told.mean < told.mean_high
+    assert told.share_inside == pytest.approx(0.95, abs=1.96 * np.sqrt(0.95 * 0.05 / told.num_innovations))
+    # errors of neighbours are alike: poses two seconds apart count as draws
+    errors = []
+    for case, f in zip(CASES, found, strict=True):
+        assert not f.is_rejected.any()
+        rows = np.searchsorted(f.timestamps_s, np.arange(1.0, DURATION_S - 0.5, 2.0))
+        errors.append(case.nees(f, rows))
+    total = np.concatenate(errors)
+    low, high = chi2.ppf([0.025, 0.975], 6 * len(total)) / (6 * len(total))
+    assert low < total.mean() / 6 < high
+
+
+def test_poses_come_at_the_rate_of_the_sensor_and_are_better_than_measured() -> None:
+    gains, raw_errors = [], []
+    for case in CASES[:4]:
+        f = case.filtered(case.sensor)
+        assert (np.diff(f.timestamps_s) > 0).all()
+        assert np.array_equal(f.timestamps_s[f.frame_row], case.times)
+        assert len(f.timestamps_s) == pytest.approx((RATE_HZ + FPS) * DURATION_S, rel=0.02)
+        later = f.frame_row[40:]
+        errors = tangent(f.cam_from_world, case.flight.cam_from_world(f.timestamps_s))
+        raw = np.sqrt((tangent(case.poses, case.truth)[40:] ** 2).mean(0))
+        gains.append(np.sqrt((errors[later] ** 2).mean(0)) / raw)
+        raw_errors.append(np.sqrt((errors[later[0] :] ** 2).mean(0)) / raw)  # between frames no worse than at them
+        bias = (case.sensor.imu.gyro - case.flight.gyro(case.sensor.imu.timestamps_s)).mean(0)
+        assert np.abs(f.gyro_bias - bias).max() < 0.005
+    assert np.mean(gains) < 0.6
+    assert np.mean(raw_errors) < 0.65
+
+
+@pytest.mark.parametrize("gap_s", [0.5, 1.0, 2.0, 3.0])
+def test_gaps_are_bridged_within_three_sigma(gap_s: float) -> None:
+    """With the sensor: the error at the end of a gap, in its own covariance, is a draw of chi-squared."""
+    ends, ratios = [], []
+    for case in CASES:
+        first = 100
+        gap = slice(first, first + round(gap_s * FPS))
+        poses = case.poses.copy()
+        poses[gap] = np.nan
+        f = filter_trajectory(case.times, poses, case.covariance, case.sensor)
+        row, before = int(f.frame_row[gap.stop - 1]), int(f.frame_row[first - 1])
+        assert f.is_bridged[before + 1 : row + 1].sum() >= row - before - RATE_HZ / FPS - 1
+        assert not f.is_bridged[f.frame_row[gap.stop]]
+        assert f.since_pose_s[row] == pytest.approx(gap_s)
+        assert (np.diff(f.position_sigma[before : row + 1]) > 0).all()
+        inside = np.arange(before, row + 1)
+        error = tangent(f.cam_from_world[inside], case.flight.cam_from_world(f.timestamps_s[inside]))
+        ratios.append(np.abs(error) / np.sqrt(np.diagonal(f.covariance[inside], axis1=1, axis2=2)))
+        ends.append(case.nees(f, np.array([row]))[0])
+        assert f.nis[gap.stop] < 38.3
+    assert np.mean(np.concatenate(ratios) < 3.0) > 0.99
+    low, high = chi2.ppf([0.005, 0.995], 6 * len(ends)) / (6 * len(ends))
+    assert low < np.mean(ends) / 6 < high
+
+
+def test_wrong_poses_are_left_out_and_jumps_followed() -> None:
+    case, wrong = CASES[1], np.array([40, 41, 90, 150, 200])
+    rng = np.random.default_rng(8)
+    poses = case.poses.copy()
+    poses[wrong] = perturbed(poses[wrong], rng.choice([-1, 1], (5, 6)) * [0.03, 0.03, 0.03, 0.2, 0.2, 0.2])
+    f = filter_trajectory(case.times, poses, case.covariance, case.sensor)
+    assert f.is_rejected.nonzero()[0].tolist() == wrong.tolist()
+    assert f.is_bridged[f.frame_row[wrong]].all()
+    clean = case.filtered(case.sensor)
+    shift = rigid3.center(f.cam_from_world) - rigid3.center(clean.cam_from_world)
+    assert np.linalg.norm(shift, axis=1).max() < 0.03
+    jumped = case.poses.copy()
+    moved = rigid3.IDENTITY + np.array([0.0, 0.0, 0.0, 0.0, 10.0, 0.0, 0.0])
+    jumped[150:] = rigid3.compose(jumped[150:], moved)
+    f = filter_trajectory(case.times, jumped, case.covariance, case.sensor)
+    assert f.is_rejected.nonzero()[0].tolist() == [150, 151, 152]
+    after = f.frame_row[165:]
+    error = tangent(f.cam_from_world[after], rigid3.compose(case.truth[165:], moved))
+    assert np.abs(error[:, 3:]).max() < 0.06
+
+
+def test_silence_of_the_sensor_and_long_gaps_begin_anew() -> None:
+    case = CASES[2]
+    imu = case.sensor.imu
+    keep = (imu.timestamps_s < 4.0) | (imu.timestamps_s > 5.0)
+    silent = replace(imu, timestamps_s=imu.timestamps_s[keep], gyro=imu.gyro[keep], accel=imu.accel[keep])
+    f = case.filtered(replace(case.sensor, imu=silent))
+    assert (f.frame_row >= 0).all()
+    inside = (f.timestamps_s > 4.1) & (f.timestamps_s < 4.9)
+    assert np.array_equal(f.timestamps_s[inside], case.times[(case.times > 4.1) & (case.times < 4.9)])
+    rows = f.frame_row[(case.times > 6.0)]
+    assert np.mean(case.nees(f, rows)) / 6 == pytest.approx(1.0, abs=0.6)
+    poses = case.poses.copy()
+    poses[:3] = np.nan
+    poses[60:170] = np.nan  # 5.5 s
+    f = filter_trajectory(case.times, poses, case.covariance, case.sensor)
+    assert (f.frame_row < 0).nonzero()[0].tolist() == [0, 1, 2, *range(60, 170)]
+    nothing = filter_trajectory(case.times, np.full_like(poses, np.nan), case.covariance, case.sensor)
+    assert len(nothing.timestamps_s) == 0
+    assert consistency(nothing.nis) is None
+    with pytest.raises(ValueError, match="ascend"):
+        filter_trajectory(np.zeros(len(poses)), poses, case.covariance, case.sensor)
+
+
+def test_a_sensor_noisier_than_stated_shows_in_the_innovations() -> None:
+    case = CASES[3]
+    noisy = case.flight.imu(3, DURATION_S, noise=30.0, rate_hz=RATE_HZ)
+    told = consistency(case.filtered(replace(case.sensor, imu=replace(
+        noisy, gyro_noise=case.sensor.imu.gyro_noise, accel_noise=case.sensor.imu.accel_noise,
+        gyro_walk=case.sensor.imu.gyro_walk, accel_walk=case.sensor.imu.accel_walk))).nis)  # fmt: skip
+    assert told is not None
+    assert told.mean > told.mean_high
+
+
+# ---- without a sensor
+
+
+@pytest.mark.parametrize("gap_s", [0.5, 1.0, 2.0, 3.0])
+def test_without_a_sensor_gaps_of_lasting_accelerations_are_honest(gap_s: float) -> None:
+    """Motion of sines is far from constant velocity, and its acceleration lasts for many frames: what is white over a
+    frame would promise too much over a gap. Nor may the sigma be beyond all use."""
+    ratios = []
+    for case in CASES:
+        for first in (60, 110, 160):
+            gap = slice(first, first + round(gap_s * FPS))
+            poses = case.poses.copy()
+            poses[gap] = np.nan
+            f = filter_trajectory(case.times, poses, case.covariance)
+            assert f.is_bridged.nonzero()[0].tolist() == list(range(gap.start, gap.stop))
+            assert f.since_pose_s[gap.stop - 1] == pytest.approx(gap_s)
+            last = np.array([gap.stop - 1])
+            error = tangent(f.cam_from_world[last], case.flight.cam_from_world(f.timestamps_s[last]))[0]
+            ratios.append(error / np.sqrt(np.diagonal(f.covariance[last[0]])))
+    ratio = np.array(ratios)
+    assert np.mean(np.abs(ratio) < 3.0) > 0.99
+    assert 0.2 < np.sqrt((ratio**2).mean()) < 1.3
+
+
+def test_without_a_sensor_innovations_are_near_what_is_stated() -> None:
+    told = consistency(np.concatenate([case.filtered(None).nis[5:] for case in CASES]))
+    assert told is not None
+    # accelerations that last are not white, and the filter says no more of them than their level
+    assert told.mean == pytest.approx(1.0, abs=0.25)
+    assert told.share_inside > 0.88
+
+
+def test_the_mounting_counts() -> None:
+    """A camera away from the sensor on a turning head is another place."""
+    case = CASES[4]
+    wrong = rigid3.from_matrix(rigid3.rotation_matrix(IMU_FROM_CAM), IMU_FROM_CAM[4:] + np.array([0.3, 0, 0]))
+    sensor = replace(case.sensor, imu=replace(case.sensor.imu, imu_from_cam=wrong))
+    told = consistency(case.filtered(sensor).nis)
+    assert told is not None
+    assert told.mean > told.mean_high
+
+
+# ---- as a run has it
+
+
+def result_of(case: Case, inertial: ScaleEstimate | ScaleRefusal | None) -> OdometryResult:
+    num, none = len(case.times), np.zeros(0, np.int32)
+    tracks = make_tracks(0, 0, none, none, none, np.zeros((0, 2)))
+    entry = MapResult(Reconstruction.empty([], [], none, tracks), none, none, inertial=inertial)
+    return OdometryResult(
+        np.arange(num), [str(k) for k in range(num)], case.times, case.poses.copy(), case.poses.copy(),
+        np.zeros(num, np.int32), np.ones(num, np.uint8), [entry], measured_covariance=case.covariance,
+    )  # fmt: skip
+
+
+TURN, SHIFT, LATE_S = np.array([0.02, -0.01, 0.015]), np.array([0.03, -0.02, 0.01]), 0.03
+
+
+def told(case: Case) -> InertialEvidence:
+    """What a closing adjustment says of a sensor with a wrong mounting and a late clock."""
+    return InertialEvidence(
+        num_poses=9, num_intervals=8, residual=1.0, gravity_in_map=DOWN.tolist(), gravity_sigma_deg=0.1,
+        gyro_bias=GYRO_BIAS.tolist(), accel_bias=ACCEL_BIAS.tolist(), clock_offset_s=LATE_S,
+        mounting_turn_deg=np.degrees(TURN).tolist(), mounting_shift_m=SHIFT.tolist(),
+    )  # fmt: skip
+
+
+def test_clock_and_mounting_are_those_of_the_closing_adjustment() -> None:
+    case = CASES[5]
+    # given such that with TURN and SHIFT, as the adjustment means them, it is the true one
+    cam_from_imu = rigid3.inverse(IMU_FROM_CAM)
+    back = rigid3.rotation_matrix(cam_from_imu) @ rigid3.exp_so3(TURN).T
+    given = rigid3.inverse(rigid3.from_matrix(back, cam_from_imu[4:] - SHIFT))
+    place = Placement(given, np.eye(3))
+    world_from_cam = rigid3.inverse(case.truth[7])
+    pose = place.sensor(gtsam_pose(case.truth[7]), np.zeros(3), np.zeros(4), np.r_[TURN, SHIFT], np.zeros(3))
+    assert np.allclose(pose.translation(), rigid3.compose(world_from_cam, cam_from_imu)[4:])
+    assert np.allclose(pose.rotation().matrix(), rigid3.rotation_matrix(rigid3.compose(world_from_cam, cam_from_imu)))
+    imu = replace(case.sensor.imu, imu_from_cam=given, timestamps_s=case.sensor.imu.timestamps_s + LATE_S)
+    result = result_of(case, ScaleEstimate(1.0, 0.001, "imu", told(case)))
+    report = filter_largest_map(result, imu, case.times + 1e9, Events())
+    assert (report.prediction, report.reason, report.rejected, report.gaps) == ("imu", None, [], [])
+    assert report.num_used == len(case.times)
+    assert report.consistency is not None
+    # biases and gravity are better known than the filter takes them to be, so it is a little low to begin with
+    assert 0.8 < report.consistency.mean < report.consistency.mean_high
+    filtered = result.filtered
+    assert filtered is not None
+    assert np.allclose(filtered.timestamps_s[filtered.frame_row], case.times + 1e9)
+    lines = filtered_csv(filtered).splitlines()
+    assert lines[0] == ",".join(COLUMNS)
+    assert len(lines) == len(filtered.timestamps_s) + 1
+
+
+def test_a_sensor_that_had_no_part_in_the_map_does_not_predict() -> None:
+    case = CASES[6]
+    refused = ScaleRefusal("imu", "the motion is too even", told(case))
+    for inertial, reason in ((refused, "too even"), (None, "without the inertial")):
+        result = result_of(case, inertial)
+        result.cam_from_world[100:120] = np.nan
+        result.cam_from_world[150:151] = perturbed(case.poses[150:151], np.array([[0, 0, 0, 3.0, 0, 0]]))
+        report = filter_largest_map(result, case.sensor.imu, case.times, Events())
+        assert report.prediction == "constant velocity"
+        assert report.reason is not None
+        assert reason in report.reason
+        assert [row.name for row in report.rejected] == ["150"]
+        assert [(gap.first_s, gap.last_s) for gap in report.gaps] == [
+            (pytest.approx(case.times[99]), pytest.approx(case.times[119])),
+            (pytest.approx(case.times[149]), pytest.approx(case.times[150])),
+        ]
+        assert report.gaps[0].position_sigma > 3 * report.gaps[1].position_sigma
+    assert filter_largest_map(result_of(case, None), None, case.times, Events()).reason is None
