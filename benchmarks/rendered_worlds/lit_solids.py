@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,19 +42,25 @@ def around(num_views: int, num_lamps: int, width: int = 480) -> Rig:
     Heights rise evenly along the axis and each position is the golden angle from the last, which spreads any number of
     them evenly over the sphere.
     """
+    n = np.arange(num_views)
+    heights = LOWEST + (HIGHEST - LOWEST) * (n + 0.5) / num_views
+    elevations = np.degrees(np.arcsin(heights))
+    return looking_in(n * 180.0 * (3.0 - np.sqrt(5.0)), elevations, LAMPS_DEG[:num_lamps], width)
+
+
+def looking_in(azimuths_deg: Array, elevations_deg: Array, lamps_deg: Sequence[tuple[int, int]], width: int) -> Rig:
+    """A camera at given places about a solid, with lamps to the right of it and above it, degrees."""
     camera = simple_camera(CameraModel.PINHOLE, width, width * 3 // 4, 1.65 * width)
     poses, lamps = [], []
-    for n in range(num_views):
-        height = LOWEST + (HIGHEST - LOWEST) * (n + 0.5) / num_views
-        azimuth, elevation = n * 180.0 * (3.0 - np.sqrt(5.0)), float(np.degrees(np.arcsin(height)))
-        out = _direction(azimuth, elevation)
+    # directions from the middle, in the camera's axes: x to the right, y down, z ahead
+    aside, above = np.radians(np.array(lamps_deg)).T
+    toward = np.stack([np.sin(aside) * np.cos(above), -np.sin(above), -np.cos(aside) * np.cos(above)], axis=1)
+    for azimuth, elevation in zip(azimuths_deg, elevations_deg, strict=True):
+        out = _direction(float(azimuth), float(elevation))
         right = np.cross(-out, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         rotation = np.stack([right, np.cross(-out, right), -out])
         poses.append(np.concatenate([rigid3.quaternion(rotation), [0.0, 0.0, DISTANCE]]))
-        # directions from the middle, in the camera's axes: x to the right, y down, z ahead
-        aside, above = np.radians(np.array(LAMPS_DEG[:num_lamps])).T
-        toward = np.stack([np.sin(aside) * np.cos(above), -np.sin(above), -np.cos(aside) * np.cos(above)], axis=1)
         lamps.append(DISTANCE * toward @ rotation)
     return Rig(camera, np.array(poses), lamps)
 

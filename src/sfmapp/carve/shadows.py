@@ -5,6 +5,10 @@ light l falls, n being the surface's normal, c the camera's direction, g the quo
 shadow. What leans towards the light enough for :mod:`sfmapp.carve.shadow_carving` to tell is brighter than
 ``g sin(fan) / sin(angle + fan)``. Dark is what stays below a share of that, whatever noise has done to both pictures.
 
+A surface that is turned away from the light is as dark as one in the shadow of another, but of an edge between one that
+only the camera sees and one that only the light falls on it says nothing. Where light and camera are farther apart than
+the sharpest edge, dark is therefore only what certainly leans towards the light, by :mod:`sfmapp.carve.leaning`.
+
 Where the quotient says nothing, nothing is called dark: surfaces that are very dark themselves, where noise alone is as
 bright as what is asked for; and surfaces that mirror, which may look dark though they are lit.
 """
@@ -19,10 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, label, uniform_filter
 
+from sfmapp.carve.leaning import Quotients, lamp_gains, leans_towards, quotients_of
+from sfmapp.carve.octree import Octree, places_of
+from sfmapp.carve.views import View, angle_deg
 from sfmapp.reporting import Report
 
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Array = NDArray[np.float64]
 Levels = NDArray[np.float64]
 
 # standard deviations by which means of 3 x 3 pixels may be off: of a hundred thousand three; and by which the pixel may
@@ -48,7 +56,9 @@ class DetectionReport(Report):
         light: its name.
         gain: typical quotient of a photograph under it and the one that is lit from the camera, in linear brightness.
         noise_grey: standard deviation of the noise, grey levels.
-        dark_share: of the object's pixels, in shadow. too_dark_share: of surfaces too dark to be told.
+        dark_share: of the object's pixels, in shadow that something throws.
+        turned_share: as dark, but the surface may be turned away from the light.
+        too_dark_share: of surfaces too dark to be told.
         mirror_share: about the mirrored images of lights.
     """
 
@@ -56,6 +66,7 @@ class DetectionReport(Report):
     gain: float
     noise_grey: float
     dark_share: float
+    turned_share: float
     too_dark_share: float
     mirror_share: float
 
@@ -68,17 +79,25 @@ class LitPhotograph:
         lit: (H, W) uint8, or (H, W, 3).
         under: as many of the same shape as there are lights.
         inside: (H, W) bool pixels that show nothing but the object.
-        angles_deg: between camera and each light, as seen from the object.
+        view: their camera. lamps: (3,) places of the lights, world. hull: that holds the object.
     """
 
     lit: Picture
     under: Sequence[Picture]
     inside: Mask
-    angles_deg: Sequence[float]
+    view: View
+    lamps: Sequence[Array]
+    hull: Octree
+
+    @property
+    def angles_deg(self) -> list[float]:
+        """Between camera and each light, as seen from the object."""
+        middle = self.hull.low + self.hull.cell * (places_of(self.hull.surface).mean(axis=0) + 0.5)
+        return [angle_deg(middle, self.view, lamp) for lamp in self.lamps]
 
 
 def find_shadows(
-    photographs: Sequence[LitPhotograph], names: Sequence[str], *, fan_deg: float
+    photographs: Sequence[LitPhotograph], names: Sequence[str], *, fan_deg: float, edge_deg: float
 ) -> tuple[list[list[Mask]], list[DetectionReport]]:
     """Pixels that are certainly in shadow.
 
@@ -86,7 +105,7 @@ def find_shadows(
         photographs: of one camera from different places, each under the same lights, exposed alike; grey values are
             those of sRGB.
         names: of the lights.
-        fan_deg: as in :class:`~sfmapp.carve.shadow_carving.ShadowOptions`.
+        fan_deg, edge_deg: as in :class:`~sfmapp.carve.shadow_carving.ShadowOptions`.
 
     Returns:
         for each photograph a mask (H, W) for each light, and a report for each light.
@@ -95,26 +114,30 @@ def find_shadows(
     sigmas = [noise_of([p.under[k] for p in photographs]) for k in range(num)]
     sigma_lit = noise_of([p.lit for p in photographs])
     gains = [_gain(photographs, k) for k in range(num)]
-    counts = np.zeros((num, 4))
+    # made twice, as those of all photographs together would take much memory
+    told = lamp_gains((_quotients(photograph) for photograph in photographs), np.maximum(gains, 1e-6))
+    counts = np.zeros((num, 5))
     masks: list[list[Mask]] = []
     for photograph in photographs:
-        inside = photograph.inside
+        inside, angles, quotients = photograph.inside, photograph.angles_deg, _quotients(photograph)
         least = linear(_mean(photograph.lit) - _CERTAIN / 3.0 * sigma_lit)
         mirrors = _mirrors(photograph) & inside
         masks.append([])
         for k, (sigma, gain) in enumerate(zip(sigmas, gains, strict=True)):
-            limit = _SHARE * gain * least * quotient_of_lean(photograph.angles_deg[k], fan_deg)
+            limit = _SHARE * gain * least * quotient_of_lean(angles[k], fan_deg)
             # what no light at all may look like
             too_dark = inside & (limit <= linear(np.array(_CERTAIN / 3.0 * sigma)))
-            dark = linear(_mean(photograph.under[k]) + _CERTAIN / 3.0 * sigma) < limit
-            dark &= linear(_grey(photograph.under[k]) + _PIXEL * sigma) < limit
-            dark &= inside & ~too_dark & ~mirrors
+            seen = linear(_mean(photograph.under[k]) + _CERTAIN / 3.0 * sigma) < limit
+            seen &= linear(_grey(photograph.under[k]) + _PIXEL * sigma) < limit
+            seen &= inside & ~too_dark & ~mirrors
+            dark = seen if angles[k] <= edge_deg else leans_towards(quotients, told, k, seen)
             masks[-1].append(dark)
-            counts[k] += [mask.sum() for mask in (inside, dark, too_dark, mirrors)]
+            counts[k] += [mask.sum() for mask in (inside, dark, seen & ~dark, too_dark, mirrors)]
+    shares = counts[:, 1:] / np.maximum(counts[:, :1], 1.0)
     reports = [
-        DetectionReport(light=name, gain=gain, noise_grey=sigma, dark_share=float(row[1] / max(row[0], 1.0)),
-                        too_dark_share=float(row[2] / max(row[0], 1.0)), mirror_share=float(row[3] / max(row[0], 1.0)))
-        for name, gain, sigma, row in zip(names, gains, sigmas, counts, strict=True)
+        DetectionReport(light=name, gain=gain, noise_grey=sigma, dark_share=float(row[0]), turned_share=float(row[1]),
+                        too_dark_share=float(row[2]), mirror_share=float(row[3]))
+        for name, gain, sigma, row in zip(names, gains, sigmas, shares, strict=True)
     ]  # fmt: skip
     return masks, reports
 
@@ -124,6 +147,12 @@ def doubts_of(reports: Sequence[DetectionReport]) -> list[str]:
     doubts = []
     dark = max((report.too_dark_share for report in reports), default=0.0)
     mirror = max((report.mirror_share for report in reports), default=0.0)
+    turned = max((report.turned_share for report in reports), default=0.0)
+    if turned > _NOTEWORTHY and not any(report.dark_share for report in reports):
+        doubts.append(
+            "no shadow is told from surfaces that are turned away from a light, which takes lamps on all sides of the "
+            "camera: nothing is carved by shadows"
+        )
     if dark > _NOTEWORTHY:
         doubts.append(f"{dark:.0%} of the object is too dark to tell shadows on it: nothing is carved there by shadows")
     if mirror > _NOTEWORTHY:
@@ -131,9 +160,10 @@ def doubts_of(reports: Sequence[DetectionReport]) -> list[str]:
     return doubts
 
 
-def quotient_of_lean(angle_deg: float, fan_deg: float) -> float:
-    """Least ``(n l) / (n c)`` of a surface that is seen from the camera and from ``fan_deg`` beyond the light."""
-    return float(np.sin(np.radians(fan_deg)) / np.sin(np.radians(angle_deg + fan_deg)))
+def quotient_of_lean(angle: float, fan: float) -> float:
+    """Least ``(n l) / (n c)`` of a surface that is seen from the camera, and from ``fan`` degrees beyond a light at
+    ``angle`` degrees from it."""
+    return float(np.sin(np.radians(fan)) / np.sin(np.radians(angle + fan)))
 
 
 def linear(grey: Levels) -> Levels:
@@ -178,6 +208,15 @@ def _gain(photographs: Sequence[LitPhotograph], k: int) -> float:
     if not len(values):
         return 0.0
     return float(np.median(values[values > _LIT * np.quantile(values, 0.9)]))
+
+
+def _quotients(photograph: LitPhotograph) -> Quotients:
+    """Of 3 x 3 pixels, 0 where the object is black; usable where no picture is full."""
+    lit = linear(_mean(photograph.lit))
+    under = np.array([linear(_mean(picture)) for picture in photograph.under])
+    usable = photograph.inside & ~_mirrors(photograph) & (lit > 0.0)
+    quotients = np.where(usable, under / np.where(usable, lit, 1.0), 0.0)
+    return quotients_of(photograph.view, photograph.lamps, photograph.hull, quotients, usable)
 
 
 def _mirrors(photograph: LitPhotograph) -> Mask:

@@ -76,6 +76,12 @@ class View:
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
+def angle_deg(place: Array, view: View, light: Array) -> float:
+    """Between a camera and a light (3,) as seen from a place (3,), degrees."""
+    a, b = view.center - place, light - place
+    return float(np.degrees(np.arccos(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), -1.0, 1.0))))
+
+
 def up_of_views(views: Sequence[View]) -> Array:
     """(3,) unit vector that was probably up when photographs were taken, see
     :func:`sfmapp.geometry.upright.up_direction`."""

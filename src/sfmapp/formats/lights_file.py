@@ -1,13 +1,13 @@
 """Photographs under one light at a time, and where the lights were: a JSON file of ours.
 
-    {"lit": "camera_light/",
+    {"lit": "camera_light/", "sharpest_edge_deg": 60,
      "lights": [{"name": "left", "photographs": "left/", "position": [-1.2, -0.4, 0.1], "frame": "camera"},
                 {"name": "lamp", "photographs": "lamp/", "position": [0.3, 2.0, 1.5], "frame": "world"}]}
 
 Folders are relative to the file and hold photographs named as those of the cameras. ``lit`` has those that are lit from
 the camera; without it the photographs that are carved are taken for these. Positions are in units of the world, in the
 frame of the world, or in that of each camera (x to the right, y down, z ahead) for lights that stand beside a camera
-before a turntable.
+before a turntable. ``sharpest_edge_deg``, if it is known, is the least interior angle of the object's edges.
 """
 
 from __future__ import annotations
@@ -42,8 +42,21 @@ class Light:
     is_with_camera: bool
 
 
-def read_lights(path: Path) -> tuple[Path | None, list[Light]]:
-    """The folder of photographs lit from the camera, None where it is not said, and the lights.
+@dataclass(frozen=True)
+class LightsFile:
+    """Attributes:
+    lit: folder of photographs lit from the camera, None where it is not said.
+    lights: one or more.
+    sharpest_edge_deg: of the object, degrees; None where it is not said.
+    """
+
+    lit: Path | None
+    lights: list[Light]
+    sharpest_edge_deg: float | None
+
+
+def read_lights(path: Path) -> LightsFile:
+    """What a file says.
 
     Raises:
         InputError: names the file, what was expected and what was found; also for folders that are not there.
@@ -53,8 +66,10 @@ def read_lights(path: Path) -> tuple[Path | None, list[Light]]:
     if not isinstance(entries, list) or not entries:
         raise InputError(f'{path}: expected a list of lights under "lights", found {entries!r}', f"write {_ADVICE}")
     lights = [_light(path, n, entry) for n, entry in enumerate(entries)]
-    lit = document.get("lit")
-    return (None if lit is None else _folder(path, "lit", lit)), lights
+    lit, edge = document.get("lit"), document.get("sharpest_edge_deg")
+    if edge is not None and not (isinstance(edge, int | float) and 0.0 <= edge <= 90.0):
+        raise InputError(f"{path}: sharpest_edge_deg: expected degrees from 0 to 90, found {edge!r}")
+    return LightsFile(None if lit is None else _folder(path, "lit", lit), lights, None if edge is None else float(edge))
 
 
 def _light(path: Path, n: int, entry: Any) -> Light:

@@ -91,7 +91,7 @@ def _summary(report: CarveReport) -> str:
     if report.shadows is not None:
         taken = report.shadows.carving
         told = "; ".join(
-            f"{light.light} {light.dark_share:.0%} in shadow"
+            f"{light.light} {light.dark_share:.0%} in shadow, {light.turned_share:.0%} as dark but perhaps turned away"
             + (
                 f", {light.too_dark_share + light.mirror_share:.0%} not to be told"
                 if light.too_dark_share + light.mirror_share > 0.005
@@ -102,7 +102,7 @@ def _summary(report: CarveReport) -> str:
         text += (
             f"<p>Shadows took away {1.0 - taken.volume_after / taken.volume_before:.1%} of what silhouettes left, by "
             f"{taken.num_pairs} photographs under single lights ({escape(told)}). What is left still holds the object, "
-            "as far as its edges are no sharper than the angle between light and camera.</p>"
+            "as far as it is matt and nothing else throws shadows on it.</p>"
         )
     colors = report.colors
     if colors.seen_share < 1.0:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sfmapp.carve.cell_grid import depth_under, grid_of
 from sfmapp.carve.octree import Octree
-from sfmapp.carve.shadow_carving import Shadow, ShadowOptions, angle_deg, carve_shadows
+from sfmapp.carve.shadow_carving import Shadow, ShadowOptions, carve_shadows
 from sfmapp.carve.shadows import LitPhotograph, doubts_of, find_shadows
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.errors import InputError
@@ -45,9 +45,10 @@ def carve_by_lights(
     Raises:
         InputError: a light without photographs of these cameras, photographs of another size, or a volume too fine.
     """
-    lit_folder, lights = read_lights(path)
+    file = read_lights(path)
+    lights = file.lights
     grid = grid_of(octree)
-    lit = list(source.records) if lit_folder is None else _photographs(lit_folder, source, events, threads)
+    lit = list(source.records) if file.lit is None else _photographs(file.lit, source, events, threads)
     under = [_photographs(light.photographs, source, events, threads) for light in lights]
     chosen = [v for v in range(len(source.views)) if lit[v] is not None and all(row[v] is not None for row in under)]
     if not chosen:
@@ -65,12 +66,12 @@ def carve_by_lights(
             inside &= silhouette.known
         at = [_place(light, view.outer) for light in lights]
         pictures = [_read(record, view.width, view.height) for record in (lit[v], *(row[v] for row in under))]
-        photographs.append(
-            LitPhotograph(pictures[0], pictures[1:], inside, [angle_deg(grid.middle, view, place) for place in at])
-        )
+        photographs.append(LitPhotograph(pictures[0], pictures[1:], inside, view, at, octree))
         places.append(at)
-    options = ShadowOptions()
-    masks, lamps = find_shadows(photographs, [light.name for light in lights], fan_deg=options.fan_deg)
+    options = ShadowOptions() if file.sharpest_edge_deg is None else ShadowOptions(edge_deg=file.sharpest_edge_deg)
+    masks, lamps = find_shadows(
+        photographs, [light.name for light in lights], fan_deg=options.fan_deg, edge_deg=options.edge_deg
+    )
     for doubt in doubts_of(lamps):
         events.warned("shadows", doubt)
     shadows = [
