@@ -26,7 +26,8 @@ _NUM_SHOWN, _NUM_WORST = 4, 2
 _NUM_HOLLOWS = 5
 _SHOWN_PX, _QUALITY = 640, 85
 _STYLE = """<style>.trio{display:grid;grid-template-columns:repeat(3,1fr);gap:.8rem;margin-bottom:1rem}
-.key{display:inline-block;width:.8rem;height:.8rem;vertical-align:-.1rem;margin:0 .25rem 0 .6rem}</style>"""
+.key{display:inline-block;width:.8rem;height:.8rem;vertical-align:-.1rem;margin:0 .25rem 0 .6rem;
+box-shadow:0 0 0 1px #bbb}</style>"""
 
 
 @dataclass(frozen=True)
