@@ -598,6 +598,14 @@ def promises(folder: Path) -> Iterator[Promise]:
     good = sum(row["right_of_all"] >= 0.9 for row in textured)
     text = "of the textured pixels of a courtyard 90 % have a depth within 1 %"
     yield Promise("plane_sweep", text, good, len(textured), date)
+    report = read(folder, "stereo_chance")
+    for group, is_named, text in (
+        ("true", False, "a pair that shows the same, however noisy, dark or plain, is not said to show something else"),
+        ("unrelated", True, "a pair that does not show the same is named"),
+    ):
+        rows = report[group]
+        good = sum(row["is_named"] == is_named for row in rows)
+        yield Promise("stereo_chance", text, good, len(rows), report["date"][:10])
     report = read(folder, "calibration")
     rows, date = report["trials"], report["date"][:10]
     good = sum(0.9 <= row["nees"] <= 1.1 and row["projections_covered"] >= 0.93 for row in rows)

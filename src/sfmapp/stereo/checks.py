@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.stereo.result import RectifiedPair
+from sfmapp.stereo.result import DisparityMap, PixelState, RectifiedPair
 
 Disparity = NDArray[np.float32]
 
@@ -42,6 +42,19 @@ def without_speckles(disparity: Disparity, num_pixels: int, step_px: float) -> D
     steps = np.where(known, np.rint(_FRACTIONS * (disparity - middle)), _NOTHING).astype(np.int16)
     cv2.filterSpeckles(steps, _NOTHING, num_pixels, int(_FRACTIONS * step_px))
     return np.where(steps == _NOTHING, np.float32(np.nan), disparity)
+
+
+def largest_patch(found: DisparityMap) -> int:
+    """Matched pixels of the largest patch without a step of more than a pixel, less those right behind one."""
+    import cv2
+
+    known = found.state == PixelState.MATCHED
+    whole = known.copy()
+    disparity = np.where(known, found.disparity, np.float32(0.0))
+    whole[:, 1:] &= (np.abs(np.diff(disparity, axis=1)) <= 1.0) | ~known[:, :-1]
+    whole[1:] &= (np.abs(np.diff(disparity, axis=0)) <= 1.0) | ~known[:-1]
+    _, _, stats, _ = cv2.connectedComponentsWithStats(whole.astype(np.uint8), connectivity=4)
+    return int(stats[1:, cv2.CC_STAT_AREA].max(initial=0))
 
 
 def fill_holes(disparity: Disparity) -> Disparity:
