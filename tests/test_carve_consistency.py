@@ -9,6 +9,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from carving_scenes import Solid, around, ball, both, box, mask_of, ring, without
+from sfmapp.carve import consistency
 from sfmapp.carve.consistency import Verdict, compare
 from sfmapp.carve.outlines import Silhouette, coverage_of_mask, signed_distance
 from sfmapp.carve.views import View, view_of_camera
@@ -18,6 +19,12 @@ from sfmapp.geometry import rigid3
 Mask = NDArray[np.bool_]
 VIEWS = around(12, width=120, height=90)
 TURNED, HOLED, SPILT = 3, 5, 8
+
+
+@pytest.fixture
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cells of two pixels, as those of photographs are of several."""
+    monkeypatch.setattr(consistency, "_CELLS", 60)
 
 
 def lumps(seed: int) -> Solid:
@@ -72,6 +79,7 @@ def agreement(a: Mask, b: Mask) -> float:
     return float((a & b).sum() / (a | b).sum())
 
 
+@pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize("name", SOLIDS)
 def test_clean_silhouettes_are_left_alone(name: str) -> None:
     for verdict, mask in zip(verdicts(VIEWS, MASKS[name]), MASKS[name], strict=True):
@@ -94,6 +102,7 @@ def test_one_camera_turned_by_five_degrees_is_named_and_no_other(name: str, seed
     assert all(verdict.spilled == verdict.filled == 0.0 for i, verdict in enumerate(found) if i != TURNED)
 
 
+@pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize(("name", "seed"), [("bitten", 1), ("lumps", 2)])
 def test_holes_and_spills_are_found(name: str, seed: int) -> None:
     true = MASKS[name]
@@ -118,6 +127,7 @@ def test_holes_and_spills_are_found(name: str, seed: int) -> None:
     assert after > before + 0.2 * (1.0 - before)
 
 
+@pytest.mark.usefixtures("coarse")
 def test_holes_that_are_there_stay() -> None:
     found = verdicts(VIEWS, MASKS["ring"], "background")
     through = [i for i, mask in enumerate(MASKS["ring"]) if not mask[45, 60]]
@@ -125,6 +135,7 @@ def test_holes_that_are_there_stay() -> None:
     assert all(not found[i].silhouette.inside[45, 60] for i in through)
 
 
+@pytest.mark.usefixtures("coarse")
 def test_wide_holes_that_many_views_should_look_through_are_none() -> None:
     # 48 views, 7.5 degrees apart: behind a plate 0.2 thick a hole 0.3 wide would be seen by its neighbours
     views = around(48, width=80, height=60, elevation_deg=10.0)
@@ -142,6 +153,7 @@ def test_with_three_views_nothing_is_judged() -> None:
     assert not any(verdict.problem for verdict in verdicts([VIEWS[i] for i in (0, 4, 8)], masks))
 
 
+@pytest.mark.usefixtures("coarse")
 def test_views_that_disagree_as_a_whole_blame_nobody() -> None:
     views = [turned(view, 6.0, seed) if seed % 2 else view for seed, view in enumerate(VIEWS)]
     lines: list[str] = []
