@@ -214,6 +214,7 @@ def test_what_turns_away_from_a_light_is_no_shadow() -> None:
     found, reports = photographed(scene("ball")[4], rig, scene("ball")[3], 0)
     assert not any(shadow.dark.any() for shadow in found)
     assert all(report.turned_share > 0.05 for report in reports if report.light in "ab")
+    assert "turned away from the light" in doubts_of(reports)[0]
 
 
 def test_gains_of_lamps_are_found_beside_the_shapes() -> None:

@@ -148,10 +148,10 @@ def doubts_of(reports: Sequence[DetectionReport]) -> list[str]:
     dark = max((report.too_dark_share for report in reports), default=0.0)
     mirror = max((report.mirror_share for report in reports), default=0.0)
     turned = max((report.turned_share for report in reports), default=0.0)
-    if turned > _NOTEWORTHY and not any(report.dark_share for report in reports):
+    if turned > max([_NOTEWORTHY, *(report.dark_share for report in reports)]):
         doubts.append(
-            "no shadow is told from surfaces that are turned away from a light, which takes lamps on all sides of the "
-            "camera: nothing is carved by shadows"
+            f"{turned:.0%} of the object is dark, but may be turned away from the light: if you know how sharp its "
+            "edges are, say so (sharpest_edge_deg in the file of lights), and shadows carve more"
         )
     if dark > _NOTEWORTHY:
         doubts.append(f"{dark:.0%} of the object is too dark to tell shadows on it: nothing is carved there by shadows")

@@ -103,7 +103,7 @@ def _summary(report: CarveReport) -> str:
         text += (
             f"<p>Shadows took away {1.0 - taken.volume_after / taken.volume_before:.1%} of what silhouettes left, by "
             f"{taken.num_pairs} photographs under single lights ({escape(told)}). What is left still holds the object, "
-            "as far as it is matt and nothing else throws shadows on it.</p>"
+            "as far as it is matt, has no edge sharper than was said, and nothing else throws shadows on it.</p>"
         )
     colors = report.colors
     if colors.seen_share < 1.0:
