@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -29,6 +30,9 @@ _CLEAR_PX = 2.0
 # places that no view shows take the mean colour of so many that are near
 _NEAREST = 4
 _GREY = 192
+# places of which photographs are held against each other, and by how many degrees these look from elsewhere
+_COMPARED = 2000
+_APART_DEG = (0.0, 15.0, 30.0, 60.0, 180.0)
 
 
 class ViewFit(Report):
@@ -49,10 +53,28 @@ class ViewFit(Report):
     source: str
 
 
+class Difference(Report):
+    """How much photographs of one place differ that look at it from directions some degrees apart.
+
+    Attributes:
+        from_deg, to_deg: the angle between them.
+        num: of pairs.
+        levels: median difference of their colours, grey levels.
+    """
+
+    from_deg: float
+    to_deg: float
+    num: int
+    levels: float
+
+
 class ColoringReport(Report):
     """Where the colours are from.
 
     Attributes:
+        differences: of the photograph that shows a place best to others, by the angle between them. What differs at
+            small angles is noise and surface that is not where it is said to be; what grows with the angle is either
+            the latter, or the object does not look the same from everywhere.
         seen_share: of the vertices, those that a photograph shows; the others have the colour of what is near.
         median_views: that show a vertex.
         views: how well the surface fits each silhouette.
@@ -61,6 +83,7 @@ class ColoringReport(Report):
     seen_share: float
     median_views: float
     views: Sequence[ViewFit]
+    differences: Sequence[Difference] = ()
 
 
 def color_surface(
@@ -99,11 +122,14 @@ def color_surface(
         )  # fmt: skip
         return seen, fit
 
-    fits = []
+    compared = slice(None, None, max(1, len(mesh.xyz) // _COMPARED))
+    samples = np.zeros((len(views), len(mesh.xyz[compared]), 4), np.float32)
+    fits: list[ViewFit] = []
     with ThreadPoolExecutor(threads) as pool:
         # so many at a time, as each holds an array of all vertices
         for first in range(0, len(views), threads):
             for seen, fit in pool.map(work, range(first, min(first + threads, len(views)))):
+                samples[len(fits)] = seen[compared]
                 total += seen[:, :3] * seen[:, 3:]
                 weight += seen[:, 3]
                 count += seen[:, 3] > 0.0
@@ -114,12 +140,32 @@ def color_surface(
     report = ColoringReport(
         seen_share=float(is_seen.mean()) if len(is_seen) else 0.0,
         median_views=float(np.median(count)) if len(count) else 0.0, views=fits,
+        differences=_differences(mesh.xyz[compared], np.array([view.center for view in views]), samples),
     )  # fmt: skip
     events.finished(STAGE, f"{report.seen_share:.1%} of the vertices seen")
     rgb = np.full((len(mesh.xyz), 3), float(_GREY))
     rgb[is_seen] = total[is_seen] / weight[is_seen, None]
     _fill(mesh.xyz, rgb, is_seen)
     return np.rint(rgb).astype(np.uint8), report
+
+
+def _differences(xyz: Array, centers: Array, samples: NDArray[np.float32]) -> list[Difference]:
+    """How colours and weights (V, N, 4) of places (N, 3) differ from those of the view with the most weight."""
+    if not len(xyz):
+        return []
+    best, at = samples[..., 3].argmax(axis=0), np.arange(len(xyz))
+    way = centers[:, None] - xyz
+    way /= np.linalg.norm(way, axis=2, keepdims=True)
+    angle = np.degrees(np.arccos(np.clip((way * way[best, at]).sum(axis=2), -1.0, 1.0)))
+    off = np.sqrt(((samples[..., :3] - samples[best, at, :3]) ** 2).mean(axis=2))
+    is_pair = samples[..., 3] > 0.0
+    is_pair[best, at] = False
+    found = []
+    for low, high in itertools.pairwise(_APART_DEG):
+        chosen = off[is_pair & (angle >= low) & (angle < high)]
+        if len(chosen):
+            found.append(Difference(from_deg=low, to_deg=high, num=len(chosen), levels=float(np.median(chosen))))
+    return found
 
 
 def _fill(xyz: Array, rgb: Array, is_seen: NDArray[np.bool_]) -> None:

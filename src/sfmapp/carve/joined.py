@@ -12,7 +12,8 @@ which is convex (Zach, Pock and Bischof, "A globally optimal algorithm for robus
 2007, with votes in bins as Zach, "Fast and high quality fusion of depth maps", 3DPVT 2008, has them). Without votes the
 surface that is least wins, as under a statue; but what is left has to fill every silhouette (Kolev and Cremers,
 "Integration of multiview stereo and silhouettes via convex functionals on convex domains", ECCV 2008): where it does
-not, the hull is put back along the rays, unless patches are seen through it.
+not, the hull is put back along the rays, unless patches are seen through it. In the end outlines close by are told by
+silhouettes alone.
 
 The lattice is that of an octree's corners, from coarse to fine, and at each level only nodes near a surface are there.
 """
@@ -232,6 +233,8 @@ def join(
                 if not _fill(level, evidence, cell, pool):
                     break
                 _solve(level, weight, iterations, events, pool)
+            if number == depth:
+                _hold_to_outlines(level, band, cell)
             level.flagged = _near_surface(level, cell)
             levels.append(level)
             events.advanced(STAGE, message=f"{2**number} cells a side, {len(level.codes)} nodes")
@@ -374,6 +377,17 @@ def _fill(level: _Level, evidence: Evidence, cell: float, pool: ThreadPoolExecut
     is_new = marked & (level.extra[idx] == 0.0)
     level.extra[idx[is_new]] = _FILL_VOTES
     return bool(is_new.any())
+
+
+def _hold_to_outlines(level: _Level, band: float, cell: float) -> None:
+    """Bring the solid out to outlines that are within a cell of it.
+
+    Where a photograph has its outline within a cell, that tells the surface to a fraction of a pixel. What sights tell
+    is spread over the band, and rims and thin parts, which they see from the side, come out too small by it.
+    """
+    is_inside = level.hull > 0.0
+    room = np.maximum(cell - level.hull[is_inside], 0.0) / band
+    level.value[is_inside] = np.minimum(level.value[is_inside] + room, 1.0)
 
 
 def _near_surface(level: _Level, cell: float) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""How far photographs look: depth maps of the patches that they see, for :mod:`sfmapp.carve.joined`."""
+"""How far photographs look: depth maps, of the patches that they see or swept, for :mod:`sfmapp.carve.joined`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sfmapp.carve.views import View
 from sfmapp.dense.maps import splat_view
-from sfmapp.dense.scene import Patches
+from sfmapp.dense.scene import DenseView, Patches
 from sfmapp.errors import InputError
 from sfmapp.geometry import rigid3
 
@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 
 # patches of a view by which it is told how far apart they lie in its picture
 _SAMPLED = 4000
+# a surface that is seen at less than this cosine is taken to face the camera: its slope in a map is noise
+_LEAST_COSINE = 0.2
 # a patch is drawn so far from its centre, a side, in distances to its nearest neighbour: squares that meet, as
 # ``sfmapp dense --maps`` draws them, and a pixel at least
 _REACH = 0.75
@@ -30,9 +32,9 @@ class Sight:
     Attributes:
         k: (4,) ``fx, fy, cx, cy`` in pixels of the map, the centre of the top-left one (0.5, 0.5).
         cam_from_world: (7,).
-        depth: (H, W) float32, units of the world, NaN where no patch is known.
+        depth: (H, W) float32, units of the world, NaN where nothing is known.
         normal: (H, W, 3) float32 in the frame of the camera, towards it.
-        pixel: what a pixel measures at the patches, units of the world; the median.
+        pixel: what a pixel measures at the surface, units of the world; the median.
     """
 
     k: Array
@@ -71,6 +73,26 @@ def sights_of_patches(views: Sequence[View], patches: Patches, names: Sequence[s
             "photographs and patches have to be of the same model, with the same names",
         )
     return sights
+
+
+def sight_of_map(view: DenseView, depth: NDArray[np.float32]) -> Sight:
+    """What a photograph sees by its depth map (H, W), NaN where nothing is known; normals by differences of it."""
+    height, width = depth.shape
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    ray = np.stack([(x - view.k[2]) / view.k[0], (y - view.k[3]) / view.k[1], np.ones_like(x)], axis=-1)
+    points = ray * depth[..., None]
+    across, down = np.full_like(points, np.nan), np.full_like(points, np.nan)
+    across[:, 1:-1] = points[:, 2:] - points[:, :-2]
+    down[1:-1] = points[2:] - points[:-2]
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    normal = np.cross(down, across)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    cosine = -(normal * ray).sum(axis=-1)
+    normal = np.where((cosine > _LEAST_COSINE)[..., None], normal, -ray).astype(np.float32)
+    known = np.isfinite(depth)
+    pixel = float(np.median(depth[known])) / float(np.sqrt(view.k[0] * view.k[1])) if known.any() else np.inf
+    return Sight(view.k, view.cam_from_world, depth, normal, pixel)
 
 
 def _sight(view: View, xyz: Array, normal: NDArray[np.float32], size: NDArray[np.float32]) -> Sight:

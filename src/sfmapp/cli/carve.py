@@ -25,6 +25,7 @@ examples:
   sfmapp carve out/                                   a reconstruction: OUT/carve
   sfmapp carve lego/ -o volume/                       photographs and their cameras.json or transforms.json
   sfmapp carve out/ --with-dense                      after sfmapp dense: hollows that patches show are carved too
+  sfmapp carve lego/ -o volume/ --colors              hollows by the colours of the photographs, without dense patches
   sfmapp carve dinosaur/ -o volume/ --cells 512       photographs and a file of 3x4 projection matrices
   sfmapp carve photos/ -o volume/ --mask-path masks/  masks named IMAGE.png, the object white
   sfmapp carve figure/ --lights lights.json -o volume/  photographs under single lights too: hollows by their shadows
@@ -38,7 +39,7 @@ would see lit, and is dark, is not there.
 Writes
   OUT/mesh.ply, OUT/mesh.glb   the closed surface, in colours of the photographs
   OUT/octree.npz               the volume as cells; what shadows have left of it: OUT/octree_shadows.npz,
-                               with patches: OUT/joined.npz
+                               of colours: OUT/octree_colors.npz; with patches: OUT/joined.npz
   OUT/report.html              how well it fits each silhouette, its slices, volume and area, what is wrong
   OUT/recording.rrd            how it was carved, level by level
 The same command again goes on where an earlier one was stopped."""
@@ -74,6 +75,11 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="join the patches of sfmapp dense with the silhouettes: hollows that no outline shows are carved where "
         "patches are seen in them; a workspace or its patches.npz; default: SOURCE",
     )  # fmt: skip
+    volume.add_argument(
+        "--colors", action="store_true",
+        help="carve hollows by the colours of the photographs: where those of several look alike something is, and "
+        "what they see through is not; surfaces with texture that look the same from everywhere",
+    )  # fmt: skip
     volume.add_argument("--threads", metavar="N", help="default: all cores; results do not depend on it")
     volume.add_argument("--no-recording", action="store_true", help="do not write recording.rrd")
     add_output_flags(parser, has_log=True)
@@ -92,7 +98,7 @@ def _carve(args: argparse.Namespace) -> int:
     from sfmapp.workspace.usage import Stopwatch
 
     watch = Stopwatch(whole_process=True)
-    what = CarveInput(args.source, args.images, args.poses, args.box, args.lights, args.with_dense)
+    what = CarveInput(args.source, args.images, args.poses, args.box, args.lights, args.with_dense, args.colors)
     with listening(args) as events:
         result = carve(what, args.output, options, record=not args.no_recording, events=events, watch=watch)
     tell_result(args, result, lambda: _print(result))
@@ -120,8 +126,8 @@ def _print(result: CarveResult) -> None:
     if report.joining is not None:
         joining = report.joining
         print(
-            f"{joining.num_sights} photographs see patches; of the hull {joining.volume / joining.hull_volume:.0%} is "
-            "left with them"
+            f"{joining.num_sights} photographs see {'patches' if report.sights is None else 'colours that agree'}; of "
+            f"the hull {joining.volume / joining.hull_volume:.0%} is left with them"
         )
     print(f"{surface.num_faces} triangles, {report.colors.seen_share:.1%} of the vertices in colours of photographs")
     print(took(result.output, report.run))

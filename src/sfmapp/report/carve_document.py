@@ -11,6 +11,7 @@ from sfmapp.carve.masks_report import MasksReport
 from sfmapp.carve.shadow_carving import ShadowCarvingReport
 from sfmapp.carve.shadows import DetectionReport
 from sfmapp.carve.space_carving import CarvingReport
+from sfmapp.carve.swept_sights import SightsReport
 from sfmapp.carve.tolerance import ToleranceReport
 from sfmapp.report.model import LogLine, RunFacts
 from sfmapp.reporting import NamedReason, Report, Usage
@@ -67,7 +68,7 @@ class CarveReport(Report):
         shadows: what photographs under single lights took away; absent without.
         limits: what is not known of the surface, and where to photograph from next; absent with a box.
         texture: that of the GLB; absent where vertices have the colours.
-        joining: what patches did to it; absent without.
+        joining: what patches or colours did to it, and sights: what colours told; absent without.
         files: what was written, in the folder of the run.
         usage: of each step.
     """
@@ -90,3 +91,4 @@ class CarveReport(Report):
     decisions: Sequence[LogLine]
     shadows: ShadowsReport | None = None
     joining: JoinReport | None = None
+    sights: SightsReport | None = None

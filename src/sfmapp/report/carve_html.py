@@ -9,9 +9,12 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.carve.coloring import Difference
+from sfmapp.carve.joined import JoinReport
 from sfmapp.carve.limits import CLOSURE, OUTLINES, PATCHES, UNSEEN, Known, LimitsReport
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette
+from sfmapp.carve.swept_sights import SightsReport
 from sfmapp.carve.views import View
 from sfmapp.report.carve_document import CarveReport
 from sfmapp.report.carve_pictures import TINTS, cropped, overlap_picture, result_pictures, slice_picture
@@ -105,6 +108,8 @@ def _summary(report: CarveReport) -> str:
             f"{taken.num_pairs} photographs under single lights ({escape(told)}). What is left still holds the object, "
             "as far as it is matt, has no edge sharper than was said, and nothing else throws shadows on it.</p>"
         )
+    if report.sights is not None and report.joining is not None:
+        text += _sights(report.sights, report.joining, report.colors.differences)
     colors = report.colors
     if colors.seen_share < 1.0:
         text += (
@@ -112,6 +117,19 @@ def _summary(report: CarveReport) -> str:
             f"({colors.median_views:.0f} in the median); the others those of what is near.</p>"
         )
     return text
+
+
+def _sights(sights: SightsReport, joining: JoinReport, differences: Sequence[Difference]) -> str:
+    """What colours took away, and whether the object looks the same from everywhere, as they suppose."""
+    text = (
+        f"<p>Colours tell the depth of {sights.known_share:.0%} of what {sights.num_maps} photographs show of the "
+        f"object, each confirmed by another one; {joining.volume / joining.hull_volume:.0%} of the hull is left. "
+        "Surfaces are supposed to look the same from everywhere"
+    )
+    told = [f"{row.levels:.0f} at {row.from_deg:.0f} to {row.to_deg:.0f} degrees" for row in differences]
+    if told:
+        text += ": photographs of one place differ by grey levels of " + ", ".join(told) + " between their directions"
+    return text + ".</p>"
 
 
 def _photographs(

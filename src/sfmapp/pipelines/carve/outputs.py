@@ -15,6 +15,8 @@ from sfmapp.scene.mesh import Mesh
 OCTREE, MESH_PLY, MESH_GLB = "octree.npz", "mesh.ply", "mesh.glb"
 # what shadows have left of the octree
 SHADOWED = "octree_shadows.npz"
+# what colours have left of it
+COLORED = "octree_colors.npz"
 # what is left with patches
 JOINED = "joined.npz"
 # what carving and joining said of themselves, for a call that resumes

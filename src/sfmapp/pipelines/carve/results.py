@@ -72,7 +72,7 @@ def report_of(job: Job, volume: CarvedVolume) -> CarveReport:
         left_out=[NamedReason(name=name, reason=reason) for name, reason in source.left_out], masks=volume.masks,
         box=BoxFacts(low=box.low.tolist(), high=box.high.tolist(), told_by=box.told_by, apart=box.apart),
         tolerance=volume.tolerance, carving=solid.carving, shadows=solid.shadows,
-        joining=None if solid.joining is None else solid.joining.report,
+        joining=None if solid.joining is None else solid.joining.report, sights=solid.sights,
         surface=_facts(volume.mesh), colors=volume.colors, limits=volume.limits,
         texture=volume.texture, files=volume.files, usage=job.usage,
         warnings=job.log.warnings, decisions=job.log.decisions,

@@ -55,6 +55,7 @@ class CarveInput:
         box: lower x, y, z and upper ones of the box that the object is in; None: as the silhouettes say.
         with_dense: patches to join with the silhouettes: a ``patches.npz``, the workspace that holds one, or "" for
             that of ``source``; None: silhouettes alone.
+        by_colors: see into hollows by the colours of the photographs.
     """
 
     source: FilePath
@@ -63,6 +64,7 @@ class CarveInput:
     box: Sequence[float] | None = None
     lights: FilePath | None = None
     with_dense: FilePath | None = None
+    by_colors: bool = False
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,7 @@ def carve(
         if job.options.carve.doubts_holes:
             with job.stage("tolerance"):
                 silhouettes, tolerance = doubt_holes(source.views, silhouettes, *box.cube(), job.events)
-        solid = find_solid(job, source, silhouettes, box, lights=what.lights, patches=patches)
+        solid = find_solid(job, source, silhouettes, box, lights=what.lights, patches=patches, by_colors=what.by_colors)
         mesh, colors = _surface(job, source, silhouettes, solid)
         with job.stage("limits"):
             known, limits = _limits(job, source, silhouettes, box, solid, mesh)
@@ -166,11 +168,14 @@ def _limits(
 
 
 def _patches(what: CarveInput) -> Path | None:
-    """The file of patches, if any. Raises UsageError beside lights, InputError if there is no such file."""
+    """The file of patches, if any. Raises UsageError beside lights or colours, InputError if there is no such file."""
+    if (what.with_dense is not None) + (what.lights is not None) + what.by_colors > 1:
+        raise UsageError(
+            "patches, shadows and colours cannot be joined with each other",
+            "give one of --with-dense, --lights and --colors",
+        )
     if what.with_dense is None:
         return None
-    if what.lights is not None:
-        raise UsageError("patches and shadows cannot be joined", "give either --with-dense or --lights")
     return find_patches(what.source, what.with_dense)
 
 

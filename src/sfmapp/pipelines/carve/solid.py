@@ -1,4 +1,4 @@
-"""The solid that is left of a box: by silhouettes, then by shadows, or by silhouettes and patches together."""
+"""The solid that is left of a box: by silhouettes, then by shadows, or by silhouettes with patches or colours."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from sfmapp.carve.isosurface import Distance, Normals
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.space_carving import CarvingReport, carve_hull
+from sfmapp.carve.swept_sights import SightsReport
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
+from sfmapp.pipelines.carve.colors import join_colors
 from sfmapp.pipelines.carve.joining import Joining, Photographs, join_patches
 from sfmapp.pipelines.carve.lights import carve_by_lights
-from sfmapp.pipelines.carve.outputs import CARVING, JOINED, OCTREE, SHADOWED
+from sfmapp.pipelines.carve.outputs import CARVING, COLORED, JOINED, OCTREE, SHADOWED
 from sfmapp.pipelines.carve.sources import CarveSource
 from sfmapp.report.carve_document import ShadowsReport
 from sfmapp.reporting import from_plain
@@ -43,9 +45,9 @@ class Solid:
 
     Attributes:
         octree: its cells. distance, normals: of its surface, see :func:`sfmapp.carve.isosurface.surface_of`.
-        carving: how silhouettes carved it. shadows, joining: what shadows and patches did; None without. The volume's
-            bounds are those of what is left.
-        hull: of the silhouettes.
+        carving: how silhouettes carved it. shadows, joining: what shadows, and patches or colours, did; None without.
+            The volume's bounds are those of what is left.
+        hull: of the silhouettes. sights: what colours told, where they were joined; None otherwise.
         files: names of the octrees that were written.
     """
 
@@ -56,17 +58,19 @@ class Solid:
     shadows: ShadowsReport | None
     hull: Hull
     joining: Joining | None
+    sights: SightsReport | None
     files: tuple[str, ...]
 
 
 def find_solid(
     job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], box: Box, *,
-    lights: FilePath | None = None, patches: Path | None = None,
+    lights: FilePath | None = None, patches: Path | None = None, by_colors: bool = False,
 ) -> Solid:  # fmt: skip
     """Carve a box by silhouettes, and by what else there is.
 
     Args:
-        lights: file of photographs under single lights. patches: file of dense patches. Not both.
+        lights: file of photographs under single lights. patches: file of dense patches.
+        by_colors: see into hollows by the photographs' colours. At most one of the three.
     """
     hull, octree, carving = _carve(job, source, silhouettes, box)
     folder = job.workspace.folder
@@ -75,15 +79,21 @@ def find_solid(
             octree, shadows, taken = carve_by_lights(Path(lights), source, silhouettes, octree, job.events, job.threads)
             write_octree(folder / SHADOWED, octree)
         shape = _shape(job, hull, octree, box, taken)
-        return Solid(octree, *shape, carving, shadows, hull, None, (OCTREE, SHADOWED))
-    if patches is not None:
-        joining = join_patches(job, patches, Photographs(source.views, silhouettes, hull), octree, box)
+        return Solid(octree, *shape, carving, shadows, hull, None, None, (OCTREE, SHADOWED))
+    if patches is not None or by_colors:
+        photographs, sights = Photographs(source.views, silhouettes, hull), None
+        if patches is not None:
+            file, joining = JOINED, join_patches(job, patches, photographs, octree, box)
+        else:
+            joining, sights = join_colors(job, source, photographs, octree, box)
+            file = COLORED
+            write_octree(folder / COLORED, joining.joined.tree)
         joined = joining.joined
         inner, outer = joined.tree.volume_bounds()
         carving = replace(carving, volume_low=inner, volume_high=outer)
         distance = _cut(joined.distance, box)
-        return Solid(joined.tree, distance, None, carving, None, hull, joining, (OCTREE, JOINED))
-    return Solid(octree, *_shape(job, hull, octree, box, None), carving, None, hull, None, (OCTREE,))
+        return Solid(joined.tree, distance, None, carving, None, hull, joining, sights, (OCTREE, file))
+    return Solid(octree, *_shape(job, hull, octree, box, None), carving, None, hull, None, None, (OCTREE,))
 
 
 def _carve(
