@@ -103,6 +103,7 @@ def rows_of(folder: Path) -> list[Row]:
         "dense_pairs": pair_rows,
         "carving": carving_rows,
         "carving_joined": joined_rows,
+        "voxel_coloring": color_rows,
         "masks": mask_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
@@ -311,6 +312,25 @@ def joined_rows(folder: Path) -> Iterator[Row]:
         if "volume_error" in ours:
             mine, theirs = (100.0 * abs(runs[way]["volume_error"]) for way in ("joined", "hull"))
             yield Row("carving_joined", case, "error of the volume", "%", "less", mine, "hull", theirs, *about)
+
+
+def color_rows(folder: Path) -> Iterator[Row]:
+    """Carving by colours against the coloured hull, drawn alike, and both against what was asked for."""
+    report = read(folder, "voxel_coloring")
+    about = False, report["date"][:10], report["commit"]
+    hulls = {(run["case"], run["drawn"]): run for run in report["runs"] if run["way"] == "hull"}
+    for run in report["runs"]:
+        hull = hulls[run["case"], run["drawn"]]
+        if run is hull:
+            continue
+        benchmark, case = "voxel_coloring", f"{run['case']}, {run['way']}, {run['drawn']}"
+        yield Row(
+            benchmark, case, "PSNR of unused photographs", "dB", "more", run["psnr"], "coloured hull", hull["psnr"],
+            *about,
+        )  # fmt: skip
+        if "volume_error" in run:
+            mine, theirs = (100.0 * abs(each["volume_error"]) for each in (run, hull))
+            yield Row(benchmark, case, "error of the volume", "%", "less", mine, "hull", theirs, *about)
 
 
 def carving_rows(folder: Path) -> Iterator[Row]:
