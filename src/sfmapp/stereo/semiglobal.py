@@ -218,16 +218,16 @@ class Level:
             cv2.boxFilter(self.fine, cv2.CV_16U, (side, side), dst=sums, normalize=False)
         if self.coarse is not None:
             self._look_again(self.coarse, left, right, tolerance, pool)
-        unseen = np.uint8(UNSEEN)
-
-        def fill(first: int, last: int, part: int) -> None:
-            fill_costs(views, unseen, first, last, self.raw[part], rows)
 
         def settle(first: int, last: int, part: int) -> None:
             decide(views, tolerance, first, last, rows, self.cost[part], self.label[part], self.found)
 
-        follow_strips(views, self.penalties, rows, self.strip, (self.down, self.up), fill, settle, pool)
+        follow_strips(views, self.penalties, rows, self.strip, (self.down, self.up), self.fill, settle, pool)
         return self.found
+
+    def fill(self, first: int, last: int, part: int) -> None:
+        """Make the costs of the rows first to last - 1; see :func:`follow_strips`."""
+        fill_costs(self.views, np.uint8(UNSEEN), first, last, self.raw[part], self.rows)
 
     def _transform(self, side: int, grey: Bytes, margin: int, out: Words) -> None:
         describe(grey, self.padded[side], self.blurred[side], self.bits[side], margin, out)
