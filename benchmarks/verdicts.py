@@ -100,6 +100,7 @@ def rows_of(folder: Path) -> list[Row]:
         "planes": plane_rows,
         "stereo": stereo_rows,
         "stereo_exposure": exposure_rows,
+        "stereo_zncc": zncc_rows,
         "dense_pairs": pair_rows,
         "carving": carving_rows,
         "carving_joined": joined_rows,
@@ -222,6 +223,18 @@ def exposure_rows(folder: Path) -> Iterator[Row]:
         own, peer = (runs[name, change, matcher]["none_or_bad1"] for matcher in ("sfmapp", "StereoSGBM"))
         case = f"{name}, right picture: {change}"
         yield Row("stereo_exposure", case, "none or bad-1", "%", "less", own, "StereoSGBM", peer, *about)
+
+
+def zncc_rows(folder: Path) -> Iterator[Row]:
+    """Semi-global matching on census against the same on ZNCC, of the windows that serve it best."""
+    report = read(folder, "stereo_zncc")
+    about = (False, report["date"][:10], report["commit"])
+    costs: dict[str, dict[int, float]] = {}
+    for run in report["runs"]:
+        costs.setdefault(run["set"], {})[run["side"]] = run["bad1_answered_visible"]
+    for name, of_side in costs.items():
+        zncc = min(value for side, value in of_side.items() if side)
+        yield Row("stereo_zncc", name, "bad-1 of answers", "%", "less", of_side[0], "ZNCC as the cost", zncc, *about)
 
 
 def circle_rows(folder: Path) -> Iterator[Row]:
