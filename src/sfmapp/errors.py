@@ -7,6 +7,7 @@ exit code. A message names the file or option, what was expected and what was fo
 from __future__ import annotations
 
 import errno
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -129,3 +130,9 @@ def refusal(error: OSError) -> InputError | None:
     if "temporary directory" in str(error.strerror):  # of tempfile
         advice = "set TMPDIR to a folder that you can write to"
     return InputError(str(error.strerror), advice)
+
+
+def listed(names: Sequence[str], most: int = 3) -> str:
+    """The first names of a list, for a message, and how many more there are."""
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sfmapp.carve.octree import Codes, Octree
 from sfmapp.carve.outlines import Silhouette
 from sfmapp.carve.views import View
-from sfmapp.errors import InputError
+from sfmapp.errors import InputError, listed
 from sfmapp.events import Events
 
 Array = NDArray[np.float64]
@@ -101,7 +101,7 @@ def find_box(
     frame = _Frame.of(centers[used])
     apart = _apart(cones, frame.inner(centers), [view.name for view in views])
     if apart and events is not None:
-        names = ", ".join(views[i].name for i in apart[:_NAMES_SHOWN])
+        names = listed([views[i].name for i in apart], _NAMES_SHOWN)
         events.warned(STAGE, f"{names}: no place that the other silhouettes hold is in its own: a wrong camera or mask")
     owner = np.concatenate([np.full(len(cones[i]), i) for i in used if i not in apart])
     planes = np.concatenate([cones[i] for i in used if i not in apart])
@@ -238,10 +238,9 @@ def _apart(cones: Sequence[Array], centers: Array, names: Sequence[str]) -> list
     moved = found.x[3:] if found.status == 0 else np.zeros(len(used))
     odd = [used[k] for k in np.flatnonzero(moved > _TOUCH)]
     if len(odd) > max(1, len(used) // 10) or len(used) - len(odd) < 2:
-        listed = ", ".join(names[i] for i in odd[:_NAMES_SHOWN])
         raise InputError(
-            f"the silhouettes have no place in common: those of {listed}{', ...' if len(odd) > _NAMES_SHOWN else ''} "
-            "are apart from the others",
+            f"the silhouettes have no place in common: those of {listed([names[i] for i in odd], _NAMES_SHOWN)} are "
+            "apart from the others",
             "check that cameras belong to these photographs, and that masks show the object and not the background",
         )
     return odd

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
-from sfmapp.carve.octree import Codes, Octree, codes_of, places_of
+from sfmapp.carve.octree import Octree, codes_of, merged, places_of
 
 Array = NDArray[np.float64]
 Cells = NDArray[np.uint8]
@@ -99,15 +99,10 @@ def octree_of(grid: CellGrid) -> Octree:
     kept = np.sort(codes_of(np.argwhere(grid.filled) + grid.first))
     whole = np.sort(codes_of(np.argwhere(inner) + grid.first))
     whole = np.setdiff1d(whole, tree.surface, assume_unique=True)
-    return Octree(tree.low, tree.side, tree.depth, merged(whole, tree.depth), np.setdiff1d(kept, whole, True))
-
-
-def merged(codes: Codes, depth: int) -> tuple[Codes, ...]:
-    """Finest cells, codes (N,) ascending, as lists for levels 0 to ``depth``: eight of one parent become the parent."""
-    levels = []
-    for _ in range(depth):
-        parents, counts = np.unique(codes >> np.uint64(3), return_counts=True)
-        parents = parents[counts == 8]
-        levels.append(codes[~np.isin(codes >> np.uint64(3), parents)])
-        codes = parents
-    return (codes, *reversed(levels))
+    return Octree(
+        tree.low,
+        tree.side,
+        tree.depth,
+        merged([*[np.empty(0, np.uint64)] * tree.depth, whole]),
+        np.setdiff1d(kept, whole, True),
+    )

@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.carve.hull import Hull
 from sfmapp.carve.joined_kernels import BINS, EMPTY, FULL, find_flow, find_value, mark_behind, paint, vote
-from sfmapp.carve.octree import Codes, Octree, codes_of, places_of
+from sfmapp.carve.octree import Codes, Octree, codes_of, merged, places_of
 from sfmapp.carve.sight import Sight
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View
@@ -426,18 +426,9 @@ def _tree(levels: Sequence[_Level], cube: _Cube, depth: int) -> Octree:
         below, is_full = is_split[~whole], inside[~whole]
         full[number + 1].append(codes_of(children[~below & is_full]))
         cells = children[below]
-    return Octree(cube.low, cube.side, depth, _merged(full), surface)
-
-
-def _merged(parts: Sequence[Sequence[Codes]]) -> tuple[Codes, ...]:
-    """Codes of each level, ascending, eight that make up a parent in place of it."""
-    full = [np.sort(np.concatenate([np.empty(0, np.uint64), *part])) for part in parts]
-    for number in range(len(full) - 1, 0, -1):
-        parents, counts = np.unique(full[number] >> np.uint64(3), return_counts=True)
-        whole = parents[counts == 8]
-        full[number] = full[number][~np.isin(full[number] >> np.uint64(3), whole)]
-        full[number - 1] = np.sort(np.concatenate([full[number - 1], whole]))
-    return tuple(full)
+    return Octree(
+        cube.low, cube.side, depth, merged([np.concatenate([np.empty(0, np.uint64), *part]) for part in full]), surface
+    )
 
 
 def _hull_volume(levels: Sequence[_Level], side: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numba
@@ -109,3 +110,15 @@ def places_of(codes: Codes) -> NDArray[np.int64]:
     out = np.empty((len(codes), 3), np.int64)
     _places(np.ascontiguousarray(codes, np.uint64), out)
     return out
+
+
+def merged(levels: Sequence[Codes]) -> tuple[Codes, ...]:
+    """Codes (N,) of cells of each level from the root on, each in one level alone, as :attr:`Octree.full` has them:
+    ascending, and the parent in place of eight that make it up."""
+    full = [np.sort(codes) for codes in levels]
+    for level in range(len(full) - 1, 0, -1):
+        parents, counts = np.unique(full[level] >> np.uint64(3), return_counts=True)
+        whole = parents[counts == 8]
+        full[level] = full[level][~np.isin(full[level] >> np.uint64(3), whole)]
+        full[level - 1] = np.sort(np.concatenate([full[level - 1], whole]))
+    return tuple(full)

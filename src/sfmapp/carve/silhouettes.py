@@ -22,7 +22,7 @@ from sfmapp.carve.graph_cut import cut_by_mask, cut_by_rectangle
 from sfmapp.carve.masks_report import MasksReport, PhotographMask
 from sfmapp.carve.outlines import Coverage, Silhouette, coverage_of_mask, refined_coverage, signed_distance
 from sfmapp.carve.views import View, project_points
-from sfmapp.errors import InputError
+from sfmapp.errors import InputError, listed
 from sfmapp.images.pixels import read_mask_coverage, read_rgb, read_with_alpha
 from sfmapp.option_checks import check_options
 
@@ -358,8 +358,7 @@ def _told_of_repairs(entries: Sequence[PhotographMask], repairs: bool, events: E
     for share, what in kinds.items():
         which = sorted((entry for entry in entries if entry[share] > _WORTH_A_LINE), key=lambda entry: -entry[share])
         if which:
-            named = ", ".join(f"{entry.name} ({100 * entry[share]:.1f} %)" for entry in which[:_NAMES_SHOWN])
-            more = f" and {len(which) - _NAMES_SHOWN} more" if len(which) > _NAMES_SHOWN else ""
-            lines.append(f"{len(which)} silhouettes {what}, {done.get(share, 'left as they are')}: {named}{more}")
+            named = listed([f"{entry.name} ({100 * entry[share]:.1f} %)" for entry in which])
+            lines.append(f"{len(which)} silhouettes {what}, {done.get(share, 'left as they are')}: {named}")
             events.decided(STAGE, lines[-1])
     return lines

@@ -20,7 +20,7 @@ from sfmapp.carve.hull import Hull, hull_of
 from sfmapp.carve.octree import MAX_DEPTH, Codes, Octree, codes_of
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View
-from sfmapp.errors import InputError, NoReconstructionError
+from sfmapp.errors import InputError, NoReconstructionError, listed
 from sfmapp.events import Events
 from sfmapp.option_checks import Range, check_options
 from sfmapp.reporting import Report
@@ -291,7 +291,7 @@ def _blame(hull: Hull, names: Sequence[str], low: NDArray[np.float64], side: flo
     empty = [name for name, shows in zip(names, is_shown.tolist(), strict=True) if not shows]
     if empty:
         return (
-            f"nothing is left: {_some(empty)} show no object in the volume",
+            f"nothing is left: {listed(empty, 5)} show no object in the volume",
             "look at their masks (empty, or inverted?), or give another box",
         )
     spared = outside.sum(axis=1)
@@ -301,10 +301,6 @@ def _blame(hull: Hull, names: Sequence[str], low: NDArray[np.float64], side: flo
     worst = [names[i] for i in np.argsort(-culprits, kind="stable")[:least]] if least else list(names)
     return (
         f"nothing is left: each place is outside {max(least, 1)} silhouettes or more, most often those of "
-        f"{_some(worst)}",
+        f"{listed(worst, 5)}",
         "look at their masks and cameras; leave them out, or let some silhouettes miss",
     )
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

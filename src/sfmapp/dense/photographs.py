@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.models import PARAM_NAMES
-from sfmapp.errors import InputError
+from sfmapp.errors import InputError, listed
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.orientation import upright_size
@@ -87,7 +87,7 @@ def find_photographs(
         )
     kept, copies = (found, []) if with_copies else _without_copies(found, model.cam_from_world)
     if copies:
-        events.warned(STAGE, f"{_some(copies)}: copies of other images in the same place, left out", names=copies)
+        events.warned(STAGE, f"{listed(copies)}: copies of other images in the same place, left out", names=copies)
     return Photographs(
         np.array([image for image, _, _ in kept], np.int64), tuple(record for _, record, _ in kept),
         tuple(camera for _, _, camera in kept), tuple(missing), tuple(copies),
@@ -148,8 +148,3 @@ def _without_copies(
         else:
             kept.append(i)
     return [found[i] for i in kept], copies
-
-
-def _some(names: list[str]) -> str:
-    rest = len(names) - _NAMES_SHOWN
-    return ", ".join(names[:_NAMES_SHOWN]) + (f" and {rest} more" if rest > 0 else "")

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.contradictions import Contradiction
+from sfmapp.errors import listed
 from sfmapp.geometry import rigid3
 from sfmapp.georeference.consensus import Rival
 from sfmapp.georeference.fit import Similarity
@@ -91,5 +92,4 @@ def _between(a: Similarity, b: Similarity) -> tuple[float, float, float]:
 def _listed(names: Sequence[str]) -> str:
     if not names:
         return "none of them, and all are poor"
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return f"{', '.join(names[:3])}{more}"
+    return listed(names)

@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
-from sfmapp.errors import InputError
+from sfmapp.errors import InputError, listed
 from sfmapp.events import Events
 from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.images.cameras import Shot, group_cameras, tell_cameras
@@ -306,8 +306,7 @@ def _by_reason(items: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
 
 
 def _some(names: list[str]) -> str:
-    rest = len(names) - _NAMES_SHOWN
-    return ", ".join(names[:_NAMES_SHOWN]) + (f" and {rest} more" if rest > 0 else "")
+    return listed(names, _NAMES_SHOWN)
 
 
 def _report(

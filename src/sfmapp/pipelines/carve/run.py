@@ -19,7 +19,7 @@ from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette, find_silhouettes
 from sfmapp.carve.tolerance import doubt_holes
 from sfmapp.carve.views import up_of_views
-from sfmapp.errors import InputError, NoReconstructionError, UsageError
+from sfmapp.errors import InputError, NoReconstructionError, UsageError, listed
 from sfmapp.events import Events
 from sfmapp.images.image_set import ImageSet
 from sfmapp.images.pixels import read_rgb
@@ -219,7 +219,7 @@ def _box(what: CarveInput, source: CarveSource, silhouettes: Sequence[Silhouette
             "check that masks show the object and not the background, or give its box: --box X Y Z X Y Z",
         )
     if inside:
-        job.events.warned("box", f"cameras stand inside the volume: {', '.join(inside[:_NAMES_SHOWN])}")
+        job.events.warned("box", f"cameras stand inside the volume: {listed(inside, _NAMES_SHOWN)}")
     return found
 
 
