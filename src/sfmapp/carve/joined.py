@@ -304,17 +304,15 @@ def _begin(number: int, above: _Level | None, cube: _Cube, hull: Hull, pool: Thr
     return level
 
 
+def cast_votes(xyz: Array, sights: Sequence[Sight], band: float, votes: NDArray[np.uint8]) -> None:
+    """Add what each sight says of points (N, 3) to their votes (N, BINS), see :func:`~.joined_kernels.vote`."""
+    for sight in sights:
+        vote(xyz, rigid3.to_matrix(sight.cam_from_world), sight.k, sight.depth, sight.normal, band, votes)
+
+
 def _votes(xyz: Array, sights: Sequence[Sight], band: float, pool: ThreadPoolExecutor) -> NDArray[np.uint8]:
     votes = np.zeros((len(xyz), BINS), np.uint8)
-    outers = [
-        np.column_stack([rigid3.rotation_matrix(sight.cam_from_world), sight.cam_from_world[4:]]) for sight in sights
-    ]
-
-    def run(first: int, last: int) -> None:
-        for sight, outer in zip(sights, outers, strict=True):
-            vote(xyz[first:last], outer, sight.k, sight.depth, sight.normal, band, votes[first:last])
-
-    _in_parts(run, len(xyz), pool)
+    _in_parts(lambda first, last: cast_votes(xyz[first:last], sights, band, votes[first:last]), len(xyz), pool)
     return votes
 
 

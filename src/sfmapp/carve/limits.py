@@ -15,12 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.carve.joined import Evidence
-from sfmapp.carve.joined_kernels import BINS, vote
+from sfmapp.carve.joined import Evidence, cast_votes
+from sfmapp.carve.joined_kernels import BINS
 from sfmapp.carve.rendering import show_mesh
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View, project_points
-from sfmapp.geometry import rigid3
 from sfmapp.reporting import Report
 from sfmapp.scene.mesh import Mesh, face_areas, face_vectors
 from sfmapp.surface.trim import pieces
@@ -148,9 +147,7 @@ def find_known(
 def _beside_patches(centers: Array, evidence: Evidence, band: float) -> NDArray[np.bool_]:
     """Which places (F, 3) lie within a band of a patch that a photograph sees there."""
     votes = np.zeros((len(centers), BINS), np.uint8)
-    for sight in evidence.sights:
-        outer = np.column_stack([rigid3.rotation_matrix(sight.cam_from_world), sight.cam_from_world[4:]])
-        vote(centers, outer, sight.k, sight.depth, sight.normal, band, votes)
+    cast_votes(centers, evidence.sights, band, votes)
     return np.asarray((votes[:, 1 : BINS - 1] > 0).any(axis=1))
 
 

@@ -99,8 +99,7 @@ def up_of_views(views: Sequence[View]) -> Array:
 def view_of_camera(name: str, camera: Camera, cam_from_world: ArrayLike) -> View:
     """The view of a calibrated camera with a pose (7,), x y z w and translation."""
     pose = np.asarray(cam_from_world, np.float64)
-    outer = np.column_stack([rigid3.rotation_matrix(pose), pose[4:]])
-    return View(name, camera.width, camera.height, outer, camera.canonical, camera, pose)
+    return View(name, camera.width, camera.height, rigid3.to_matrix(pose), camera.canonical, camera, pose)
 
 
 def views_of_matrices(names: Sequence[str], matrices: ArrayLike, sizes: Sequence[tuple[int, int]]) -> list[View]:

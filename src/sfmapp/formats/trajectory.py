@@ -92,7 +92,7 @@ def write_kitti(path: str | Path, cam_from_world: NDArray[np.float64], frame_idx
     has_pose = np.isfinite(cam_from_world).all(1)
     poses = np.asarray(cam_from_world, np.float64)[has_pose]
     relative = rigid3.compose(poses[:1], rigid3.inverse(poses)) if len(poses) else poses
-    matrices = np.concatenate([rigid3.rotation_matrix(relative), relative[:, 4:, None]], 2).reshape(-1, 12)
+    matrices = rigid3.to_matrix(relative).reshape(-1, 12)
     with replaced_file(path) as beside:
         beside.write_text("".join(" ".join(f"{v:.9e}" for v in row) + "\n" for row in matrices), encoding="utf-8")
     sidecar = frames_beside(path)

@@ -86,6 +86,12 @@ def from_matrix(rotation: ArrayLike, translation: ArrayLike) -> Array:
     return np.concatenate([quaternion(rotation), np.asarray(translation, np.float64)], -1)
 
 
+def to_matrix(b_from_a: ArrayLike) -> Array:
+    """Matrices (..., 3, 4) of poses (..., 7): the rotation, and the translation as the last column."""
+    pose = np.asarray(b_from_a, np.float64)
+    return np.concatenate([rotation_matrix(pose), pose[..., 4:, None]], -1)
+
+
 def compose(c_from_b: ArrayLike, b_from_a: ArrayLike) -> Array:
     """``c_from_a``: first the second argument, then the first; read as fractions that cancel."""
     left, right = np.asarray(c_from_b, np.float64), np.asarray(b_from_a, np.float64)

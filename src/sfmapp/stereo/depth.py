@@ -74,7 +74,7 @@ def points_of_rays(
     """
     seen = [pixels_to_normalized(camera, xy) for camera, xy in zip(cameras, (xy_left, xy_right), strict=True)]
     first = np.eye(3, 4)
-    second = np.column_stack([rigid3.rotation_matrix(right_from_left), np.asarray(right_from_left, np.float64)[4:]])
+    second = rigid3.to_matrix(right_from_left)
     focal = 0.5 * (cameras[0].focal + cameras[1].focal)
     noise = None if noise_px is None else noise_px / focal
     return triangulate_pair(first, second, seen[0], seen[1], method, noise)

@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.errors import InputError
 from sfmapp.stereo.polar import PolarRectification, plan_polar, rectify_polar
 from sfmapp.stereo.prepare import PairCameras, PreparedPair, rows_of
+from sfmapp.stereo.rectification import check_sizes
 from sfmapp.stereo.report import RectificationReport
 from sfmapp.stereo.sparse_matches import match_pictures
 
@@ -30,12 +30,7 @@ def prepare_polar(left: Pixels, right: Pixels, cameras: PairCameras) -> tuple[Pr
         InputError: cameras that cannot be rectified, or photographs of other sizes than theirs.
     """
     assert cameras.rig is not None
-    for name, camera, photograph in zip(("left", "right"), cameras.rig.cameras, (left, right), strict=True):
-        if photograph.shape[1::-1] != (camera.width, camera.height):
-            raise InputError(
-                f"the {name} photograph has {photograph.shape[1]} x {photograph.shape[0]} pixels, its camera "
-                f"{camera.width} x {camera.height}"
-            )
+    check_sizes(cameras.rig, left, right)
     plan = plan_polar(cameras.rig)
     pair = rectify_polar(plan, left, right)
     matches = match_pictures(pair.left, pair.right, pair.left_shown, pair.right_shown)

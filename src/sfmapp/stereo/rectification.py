@@ -266,6 +266,16 @@ def _kept_share(plan: Rectification, side: int) -> float:
     return float(((flat >= 0.0) & (flat <= [g.width, g.height])).all(1).mean())
 
 
+def check_sizes(rig: Rig, left: Pixels, right: Pixels) -> None:
+    """Raise InputError where a photograph has not the size of its camera."""
+    for name, camera, photograph in zip(("left", "right"), rig.cameras, (left, right), strict=True):
+        if photograph.shape[1::-1] != (camera.width, camera.height):
+            raise InputError(
+                f"the {name} photograph has {photograph.shape[1]} x {photograph.shape[0]} pixels, its camera "
+                f"{camera.width} x {camera.height}"
+            )
+
+
 def rectify(plan: Rectification, left: Pixels, right: Pixels) -> RectifiedPair:
     """The pictures of a pair, each pixel interpolated by cubics.
 
@@ -275,12 +285,7 @@ def rectify(plan: Rectification, left: Pixels, right: Pixels) -> RectifiedPair:
     Raises:
         InputError: a photograph that has not the size of its camera.
     """
-    for name, camera, photograph in zip(("left", "right"), plan.rig.cameras, (left, right), strict=True):
-        if photograph.shape[1::-1] != (camera.width, camera.height):
-            raise InputError(
-                f"the {name} photograph has {photograph.shape[1]} x {photograph.shape[0]} pixels, its camera "
-                f"{camera.width} x {camera.height}"
-            )
+    check_sizes(plan.rig, left, right)
     g = plan.geometry
     if plan.is_identity:
         everywhere = np.ones(left.shape[:2], np.bool_)

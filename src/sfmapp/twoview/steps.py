@@ -234,7 +234,7 @@ def four_clouds(poses: Array, xn1: Array, xn2: Array) -> tuple[Array, Mask]:
     first = np.eye(3, 4)
     clouds, in_front = [], []
     for pose in poses:
-        second = np.column_stack([rigid3.rotation_matrix(pose), pose[4:]])
+        second = rigid3.to_matrix(pose)
         xyz, info = triangulate_pair(first, second, xn1, xn2, "homogeneous")
         clouds.append(xyz)
         in_front.append(info.is_inlier)
@@ -243,7 +243,7 @@ def four_clouds(poses: Array, xn1: Array, xn2: Array) -> tuple[Array, Mask]:
 
 def ways(pose: Array, xn: tuple[Array, Array], noise: float, views: tuple[View, View]) -> Sequence[TriangulationStep]:
     """Every way to triangulate, on the chosen pose."""
-    first, second = np.eye(3, 4), np.column_stack([rigid3.rotation_matrix(pose), pose[4:]])
+    first, second = np.eye(3, 4), rigid3.to_matrix(pose)
     best, info = triangulate_pair(first, second, *xn, "nonlinear", noise)
     assert info.covariance is not None
     sigma = np.sqrt(np.trace(info.covariance, axis1=1, axis2=2))

@@ -74,7 +74,7 @@ def upgrade_by_self_calibration(
     sigma = math.sqrt(float(covariances.intrinsics[0][0, 0])) if len(covariances.intrinsics) else math.inf
     # turns as the adjustment has them: those of the start are too rough to tell one axis from several
     poses = model.cam_from_world[found.view_idx]
-    motion = kind_of_motion(np.eye(4), np.concatenate([rigid3.rotation_matrix(poses), poses[:, 4:, None]], 2))
+    motion = kind_of_motion(np.eye(4), rigid3.to_matrix(poses))
     left = model.residuals_px()[model.obs_is_inlier]
     rms = float(np.sqrt(np.nanmean(left**2)))
     if not sigma < _MAX_SIGMA * focal:

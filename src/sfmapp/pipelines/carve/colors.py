@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from sfmapp.carve.box import Box, clip_octree
-from sfmapp.carve.joined import Evidence, join
+from sfmapp.carve.box import Box
+from sfmapp.carve.joined import Evidence
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.swept_sights import SightsReport, sights_by_colors
 from sfmapp.errors import InputError
-from sfmapp.pipelines.carve.joining import Joining, Photographs
+from sfmapp.pipelines.carve.joining import Joining, Photographs, join_in_box
 from sfmapp.pipelines.carve.sources import CarveSource
 from sfmapp.pipelines.carve.undistorted import undistorted
 from sfmapp.workspace.job import Job
@@ -47,9 +45,5 @@ def join_colors(
         sights, report = sights_by_colors(views, surface, job.events, threads=job.threads)
     with job.stage("join"):
         evidence = Evidence(photographs.views, photographs.silhouettes, photographs.hull, sights)
-        joined, joining = join(
-            evidence, octree.low, octree.side, 2**octree.depth, events=job.events, threads=job.threads
-        )  # fmt: skip
-        if box.told_by == "user":
-            joined = replace(joined, tree=clip_octree(joined.tree, box))
+        joined, joining = join_in_box(job, evidence, octree, box)
     return Joining(joined, joining, evidence, octree), report

@@ -67,6 +67,19 @@ class Joining:
     hull_octree: Octree
 
 
+def join_in_box(job: Job, evidence: Evidence, octree: Octree, box: Box) -> tuple[Joined, JoinReport]:
+    """The volume that silhouettes and sights leave together, in the cube and the cells of the hull's octree, what is in
+    the box if that is a user's.
+
+    Raises:
+        NoReconstructionError: all of the hull is seen through.
+    """
+    joined, report = join(evidence, octree.low, octree.side, 2**octree.depth, events=job.events, threads=job.threads)
+    if box.told_by == "user":
+        joined = replace(joined, tree=clip_octree(joined.tree, box))
+    return joined, report
+
+
 def join_patches(job: Job, path: Path, photographs: Photographs, octree: Octree, box: Box) -> Joining:
     """The volume that silhouettes and patches leave together, in the cube and the cells of the hull's octree, what is
     in the box if that is a user's; that of an earlier call where it was joined of the same.
@@ -89,11 +102,7 @@ def join_patches(job: Job, path: Path, photographs: Photographs, octree: Octree,
         except (InputError, ValueError):
             pass  # taken away or damaged: joined again
     with job.stage(STAGE, key):
-        joined, report = join(
-            evidence, octree.low, octree.side, 2**octree.depth, events=job.events, threads=job.threads
-        )  # fmt: skip
-        if box.told_by == "user":
-            joined = replace(joined, tree=clip_octree(joined.tree, box))
+        joined, report = join_in_box(job, evidence, octree, box)
         write_joined(folder / JOINED, joined)
         job.workspace.write_json(JOINING, report)
     job.workspace.save()  # a call that is stopped from here on need not join again
