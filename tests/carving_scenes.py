@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,3 +100,16 @@ def silhouette_of(view: View, solid: Solid) -> Silhouette:
     inside = mask_of(view, solid)
     distance = distance_transform_edt(inside) - distance_transform_edt(~inside)
     return Silhouette((distance - 0.5 * np.sign(distance)).astype(np.float32))
+
+
+def write_cameras(folder: Path, views: Iterable[View]) -> None:
+    """``cameras.json`` of photographs in ``images/``, which counts pixels from the centre of the first one."""
+    cameras = []
+    for view in views:
+        assert view.camera is not None
+        k = view.camera.k_matrix - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        cameras.append({
+            "file": f"images/{view.name}", "K": k.tolist(), "R_w2c": view.outer[:, :3].tolist(),
+            "t_w2c": view.outer[:, 3].tolist(), "width": view.width, "height": view.height,
+        })  # fmt: skip
+    (folder / "cameras.json").write_text(json.dumps({"cameras": cameras}))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import sfmapp
-from carving_scenes import around, box, mask_of
+from carving_scenes import around, box, mask_of, write_cameras
 from schemas import check_schema
 from sfmapp.carve.files import read_octree
 from sfmapp.carve.octree import Octree
@@ -32,7 +32,6 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A box, red where x is positive and blue elsewhere, with an alpha channel."""
     folder = tmp_path_factory.mktemp("box")
     (folder / "images").mkdir()
-    cameras = []
     for view in VIEWS:
         assert view.camera is not None
         shown = mask_of(view, box())
@@ -40,12 +39,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         rgba[shown, 2] = 200 if view.center[0] > 0.0 else 30
         rgba[shown, 3] = 255
         cv2.imwrite(str(folder / "images" / view.name), rgba)
-        k = view.camera.k_matrix - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-        cameras.append({
-            "file": f"images/{view.name}", "K": k.tolist(), "R_w2c": view.outer[:, :3].tolist(),
-            "t_w2c": view.outer[:, 3].tolist(), "width": view.width, "height": view.height,
-        })  # fmt: skip
-    (folder / "cameras.json").write_text(json.dumps({"cameras": cameras}))
+    write_cameras(folder, VIEWS)
     return folder
 
 

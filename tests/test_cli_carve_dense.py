@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from carving_scenes import around, box, mask_of, without
+from carving_scenes import around, box, mask_of, without, write_cameras
 from sfmapp.carve.files import read_joined, read_octree
 from sfmapp.carve.limits import PATCHES
 from sfmapp.cli.main import main
@@ -59,17 +59,11 @@ def sees(xyz: NDArray[np.float64], normal: NDArray[np.float64], center: NDArray[
 def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("trough")
     (folder / "images").mkdir()
-    cameras = []
     for view in VIEWS:
         assert view.camera is not None
         shown = mask_of(view, TROUGH)
         cv2.imwrite(str(folder / "images" / view.name), np.uint8(255) * np.repeat(shown[..., None], 4, axis=2))
-        k = view.camera.k_matrix - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-        cameras.append({
-            "file": f"images/{view.name}", "K": k.tolist(), "R_w2c": view.outer[:, :3].tolist(),
-            "t_w2c": view.outer[:, 3].tolist(), "width": view.width, "height": view.height,
-        })  # fmt: skip
-    (folder / "cameras.json").write_text(json.dumps({"cameras": cameras}))
+    write_cameras(folder, VIEWS)
     return folder
 
 

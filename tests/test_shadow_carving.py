@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from carving_scenes import write_cameras
 from rendered_worlds.lit_solids import LAMPS_DEG, Rig, around, lamps_at, looking_in
 from rendered_worlds.solids import BALL, BOX, Rendering, Solid, photograph, render, shape
 from sfmapp.carve.cell_grid import grid_of, octree_of
@@ -287,8 +288,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Photographs of the block with alpha and cameras, and under each lamp alone."""
     folder = tmp_path_factory.mktemp("block")
     rig, (_, views, _, _, pictures) = around(16, 4, width=160), scene("block")
-    cameras = []
-    for i, (view, picture) in enumerate(zip(views, pictures, strict=True)):
+    for i, picture in enumerate(pictures):
         grey = [photograph(light, 2.0, [i, k]) for k, light in enumerate(picture.light)]
         alpha = (255.0 * picture.cover).round().astype(np.uint8)
         for name, value in zip("abcd", grey[1:], strict=True):
@@ -296,12 +296,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             cv2.imwrite(str(folder / name / f"{i:03d}.png"), value)
         (folder / "images").mkdir(exist_ok=True)
         cv2.imwrite(str(folder / "images" / f"{i:03d}.png"), np.dstack([grey[0]] * 3 + [alpha]))
-        k = rig.camera.k_matrix - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-        cameras.append({
-            "file": f"images/{i:03d}.png", "K": k.tolist(), "R_w2c": view.outer[:, :3].tolist(),
-            "t_w2c": view.outer[:, 3].tolist(), "width": view.width, "height": view.height,
-        })  # fmt: skip
-    (folder / "cameras.json").write_text(json.dumps({"cameras": cameras}))
+    write_cameras(folder, (replace(view, name=f"{i:03d}.png") for i, view in enumerate(views)))
     beside = [rigid3.apply(rig.poses[0], lamp) for lamp in rig.lamps[0]]
     lights = [
         {"name": f"lamp {name}", "photographs": name, "position": place.tolist(), "frame": "camera"}

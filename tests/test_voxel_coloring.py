@@ -10,7 +10,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from carving_scenes import Solid, around, ball, box, pixel_centers, shown_depth, silhouette_of, without
+from carving_scenes import (
+    Solid,
+    around,
+    ball,
+    box,
+    pixel_centers,
+    shown_depth,
+    silhouette_of,
+    without,
+    write_cameras,
+)
 from sfmapp.camera.camera import pixels_to_rays
 from sfmapp.carve.cell_grid import CellGrid, grid_of
 from sfmapp.carve.files import read_octree
@@ -137,18 +147,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Photographs of a painted trough from above, with alpha."""
     path = tmp_path_factory.mktemp("painted")
     (path / "images").mkdir()
-    cameras = []
-    for n, view in enumerate(around(24, 5.0, 160, 120, 50.0)):
-        assert view.camera is not None
+    views = around(24, 5.0, 160, 120, 50.0)
+    for n, view in enumerate(views):
         picture, silhouette = photograph(view, CUP, n, 4.0)
         alpha = np.where(silhouette.inside, np.uint8(255), np.uint8(0))
         cv2.imwrite(str(path / "images" / view.name), np.dstack([picture[..., ::-1], alpha]))
-        k = view.camera.k_matrix - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-        cameras.append({
-            "file": f"images/{view.name}", "K": k.tolist(), "R_w2c": view.outer[:, :3].tolist(),
-            "t_w2c": view.outer[:, 3].tolist(), "width": view.width, "height": view.height,
-        })  # fmt: skip
-    (path / "cameras.json").write_text(json.dumps({"cameras": cameras}))
+    write_cameras(path, views)
     return path
 
 
