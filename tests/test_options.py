@@ -142,7 +142,8 @@ def test_a_range_says_what_it_holds() -> None:
     [
         ({"max_tracks": 600.0}, "a whole number"), ({"max_tracks": True}, "a whole number"),
         ({"keyframe_loss": "0.5"}, "a finite number"), ({"max_lost_s": float("inf")}, "a finite number"),
-        ({"loops": 1}, "true or false"), ({"motion": "wheels"}, "one of free, planar"), ({"window": None}, "a whole"),
+        ({"loops": 1}, "true or false"), ({"motion": "wheels"}, "one of free, planar, ackermann"),
+        ({"window": None}, "a whole"),
     ],
 )  # fmt: skip
 def test_options_made_in_code_are_checked_as_well(wrong: dict[str, Any], expected: str) -> None:

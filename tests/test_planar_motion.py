@@ -1,4 +1,4 @@
-"""The two-point algorithm for planar motion against ground truth, physics and the five-point algorithm."""
+"""Planar motion of one, two and three points against ground truth, physics and the five-point algorithm."""
 
 from __future__ import annotations
 
@@ -11,7 +11,16 @@ from hypothesis import strategies as st
 
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.epipolar import essential_from_pose, sampson_errors
-from sfmapp.geometry.planar_motion import _basis, _essential, _pose, _solve_two, estimate_planar_motion
+from sfmapp.geometry.planar_motion import (
+    NumPoints,
+    _basis,
+    _essential,
+    _pose,
+    _solve_one,
+    _solve_three,
+    _solve_two,
+    estimate_planar_motion,
+)
 
 FOCAL = 700.0
 
@@ -72,6 +81,81 @@ def test_two_points_hold_the_true_motion(seed: int, theta: float, phi: float, ti
         other = _essential(basis, out[k])
         residual = np.einsum("ni,ij,nj->n", moved, other, rays)
         assert np.abs(residual).max() < 1e-9 * condition * (np.linalg.norm(moved) * np.linalg.norm(rays) + 1)
+
+
+def rays_seen(rng: np.random.Generator, basis: np.ndarray, angles: np.ndarray, num: int) -> list[np.ndarray]:
+    """Rays of some points before and after a motion, in the basis of the plane, none level with the camera."""
+    level = rng.uniform(0.3, 2.0, num) * rng.choice([-1.0, 1.0], num)
+    pose = _pose(basis, angles)
+    rays = np.column_stack([rng.normal(size=(num, 2)), level]) @ basis
+    return [r @ basis.T for r in (rays, rays @ rigid3.rotation_matrix(pose).T + pose[4:])]
+
+
+def off(found: np.ndarray, angles: np.ndarray) -> float:
+    """Largest difference of two pairs of angles; both turned by pi are the same line."""
+    return float(min(np.abs(np.exp(1j * (found - angles + flip)) - 1).max() for flip in (0.0, np.pi)))
+
+
+@settings(deadline=None, max_examples=60)
+@given(seed=st.integers(0, 10**6), theta=st.floats(-3.0, 3.0), forward=st.floats(-3.1, 3.1))
+def test_one_point_holds_the_way_along_a_circle(seed: int, theta: float, forward: float) -> None:
+    """A camera over the rear axle that goes from one place of a circle to another, made of the circle itself."""
+    rng = np.random.default_rng(seed)
+    basis = _basis(np.array([0.1, -1.0, 0.2]))
+    yaw, radius = -theta, 3.0
+    # in the frame of the first camera, whose first axis looks ahead: about the circle's centre (0, radius)
+    if abs(yaw) > 1e-6:
+        ahead, aside = radius * np.sin(yaw), radius * (1.0 - np.cos(yaw))
+    else:
+        ahead, aside = 1.0, 0.5 * yaw
+    turned = np.array([[np.cos(forward), -np.sin(forward)], [np.sin(forward), np.cos(forward)]]) @ [ahead, aside]
+    turn = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+    way = -turn @ turned
+    phi = np.arctan2(way[1], way[0])
+    angles = np.array([phi, theta - phi])
+    rays1, rays2 = rays_seen(rng, basis, angles, 1)
+    out = np.empty((2, 2))
+    assert _solve_one(rays1, rays2, 0, forward, out) == 1
+    row = np.array([rays2[0, 0] * rays1[0, 2], -rays2[0, 1] * rays1[0, 2], *(rays2[0, 2] * rays1[0, :2])])
+    alpha = forward + np.pi
+    phi, psi = alpha + theta / 2, theta / 2 - alpha
+    slope = row @ [np.cos(phi), -np.sin(phi), np.cos(psi), -np.sin(psi)]
+    if abs(slope) > 1e-3 * np.linalg.norm(row):  # else the point hardly tells the turn
+        assert off(out[0], angles) < 1e-9
+
+
+@settings(deadline=None, max_examples=60)
+@given(seed=st.integers(0, 10**6), theta=st.floats(-1.0, 1.0), phi=st.floats(-3.1, 3.1))
+def test_three_points_hold_the_true_motion(seed: int, theta: float, phi: float) -> None:
+    rng = np.random.default_rng(seed)
+    basis, angles = _basis(np.array([0.1, -1.0, 0.2])), np.array([phi, theta - phi])
+    rays1, rays2 = rays_seen(rng, basis, angles, 3)
+    rows = np.column_stack([rays2[:, 0] * rays1[:, 2], -rays2[:, 1] * rays1[:, 2], rays2[:, 2:] * rays1[:, :2]])
+    rows /= np.linalg.norm(rows, axis=1)[:, None]
+    out = np.empty((2, 2))
+    weakest = np.linalg.svd(rows)[1][-1]
+    if weakest > 1e-4:
+        assert _solve_three(rays1, rays2, 0, 1, 2, out) == 1
+        assert off(out[0], angles) < 1e-9
+
+
+def test_solvers_leave_open_what_points_do_not_tell() -> None:
+    rng, out = np.random.default_rng(2), np.empty((2, 2))
+    level = rng.normal(size=(3, 3)) * [1.0, 1.0, 0.0]
+    assert _solve_one(level, level, 0, 0.3, out) == 0
+    assert _solve_three(level, level, 0, 1, 2, out) == 0
+    # a camera that does not move: each point says sin(phi) p - cos(phi) q = -(sin(psi) p + cos(psi) q), true of any phi
+    still = rng.normal(size=(3, 3)) + np.array([0.0, 0.0, 2.0])
+    assert _solve_three(still, still, 0, 1, 2, out) == 0
+    # one point of a camera that turns on the spot by theta: along the circle it is told to have turned by theta
+    for theta in (0.0, 0.2, -0.7):
+        turn = np.array([[np.cos(theta), -np.sin(theta), 0.0], [np.sin(theta), np.cos(theta), 0.0], [0.0, 0.0, 1.0]])
+        assert _solve_one(still, still @ turn.T, 0, 0.3, out) == 1
+        assert out[0].sum() == pytest.approx(theta, abs=1e-9)
+    # straight on: nothing turns
+    ahead = still + 0.1 * np.array([np.cos(0.3), np.sin(0.3), 0.0])
+    assert _solve_one(still, ahead, 0, 0.3 + np.pi, out) == 1
+    assert out[0].sum() == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("theta", [0.0, 0.05, -0.4])
@@ -159,9 +243,29 @@ def test_same_seed_same_bytes_and_fast() -> None:
     assert elapsed < 0.01
 
 
+@pytest.mark.parametrize(("num_points", "share"), [(1, 0.9), (2, 0.8), (3, 0.6)])
+def test_fewer_points_bear_more_outliers(num_points: NumPoints, share: float) -> None:
+    """A camera ahead of the rear axle, so that the way along a circle is a guess, among outliers."""
+    up, errors = np.array([0.0, -1.0, 0.0]), []
+    for seed in range(20):
+        rng = np.random.default_rng([seed, num_points])
+        theta = rng.normal(0.0, 0.03)
+        # looking ahead the way is against the optical axis; half of theta over the axle, more ahead of it
+        phi = np.arctan2(*(_basis(up)[[1, 0]] @ [0.0, 0.0, -1.0])) + theta
+        pose, xn1, xn2 = planar_pair(rng, theta, phi, up, 400, sigma_px=0.5)
+        bad = rng.random(len(xn1)) < share
+        xn2[bad] = rng.uniform(-1, 1, (int(bad.sum()), 2)) * [0.9, 0.3]
+        found = estimate_planar_motion(xn1, xn2, 2.0 / FOCAL, up, seed=seed, num_points=num_points)
+        assert found is not None
+        errors.append(max(errors_deg(found[0], pose)))
+    assert np.mean(np.array(errors) < 2.0) >= 0.9
+
+
 def test_what_determines_nothing_gives_none() -> None:
     assert estimate_planar_motion(np.zeros((1, 2)), np.zeros((1, 2)), 0.01) is None
     level = np.column_stack([np.linspace(-0.5, 0.5, 20), np.zeros(20)])
     assert estimate_planar_motion(level, level + np.array([0.01, 0.0]), 0.01) is None
     with pytest.raises(ValueError, match="up_in_cam"):
         estimate_planar_motion(level, level, 0.01, up_in_cam=(0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="forward_in_cam"):
+        estimate_planar_motion(level, level, 0.01, num_points=1, forward_in_cam=(0.0, 2.0, 0.0))

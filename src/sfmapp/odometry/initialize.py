@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sfmapp.adjust.pose import refine_pose
 from sfmapp.camera.camera import Camera, pixels_to_normalized, project
 from sfmapp.geometry import epipolar, homography, rigid3
-from sfmapp.geometry.planar_motion import estimate_planar_motion
+from sfmapp.geometry.planar_motion import NumPoints, estimate_planar_motion
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.search import Ransac
 from sfmapp.matching.two_view import TwoViewGeometry, verify_front
@@ -145,7 +145,7 @@ class MapInitializer:
         found = verify_front(
             xy1, xy2, self.camera, self.camera, MatchingOptions(max_error_px=limit), Ransac(2000, self.seed)
         )
-        if self.options.motion == "planar" and found.config != TwoViewConfig.PANORAMIC:
+        if self.options.motion != "free" and found.config != TwoViewConfig.PANORAMIC:
             self._hold_to_plane(found, xy1, xy2, limit)
         num = int(found.is_inlier.sum())
         usable = found.config in (TwoViewConfig.CALIBRATED, TwoViewConfig.PLANAR, TwoViewConfig.UNCALIBRATED)
@@ -247,7 +247,10 @@ class MapInitializer:
     def _hold_to_plane(self, found: TwoViewGeometry, xy1: Array, xy2: Array, limit_px: float) -> None:
         """Put a wheeled robot's motion in the place of a free one: two unknowns bear more outliers than five."""
         xn1, xn2 = (pixels_to_normalized(self.camera, xy) for xy in (xy1, xy2))
-        planar = estimate_planar_motion(xn1, xn2, limit_px / self.camera.focal, seed=self.seed)
+        num_points: NumPoints = 1 if self.options.motion == "ackermann" else 2
+        planar = estimate_planar_motion(
+            xn1, xn2, limit_px / self.camera.focal, seed=self.seed, num_points=num_points
+        )  # fmt: skip
         if planar is None:
             return
         found.cam2_from_cam1, found.is_inlier = planar
