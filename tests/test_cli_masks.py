@@ -53,7 +53,6 @@ def test_masks_are_written_that_others_take(folder: Path, tmp_path: Path, with_c
     check_schema("masks", report)
     assert report["masks"]["is_compared"] == with_cameras
     assert not report["warnings"]
-    assert all(0.9 < mask["confidence"] <= 1.0 for mask in report["masks"]["masks"])
     assert "Outlines over the photographs" in (tmp_path / "out" / "report.html").read_text()
     options = ImageOptions(mask_path=str(tmp_path / "out" / "masks"))
     images, _ = load_images(folder / "images", options, sfmapp.Events())

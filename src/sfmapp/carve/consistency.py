@@ -166,7 +166,7 @@ def _names(views: Sequence[View], which: Sequence[int] | dict[int, Verdict]) -> 
 
 
 def _unknown(silhouette: Silhouette) -> Silhouette:
-    return replace(silhouette, known=np.zeros(silhouette.distance.shape, bool), confidence=0.5)
+    return replace(silhouette, known=np.zeros(silhouette.distance.shape, bool))
 
 
 def _weigh(

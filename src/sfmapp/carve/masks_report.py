@@ -16,7 +16,6 @@ class PhotographMask(Report):
             nothing did.
         share: of the pixels that are inside.
         border_share: of the pixels along the edge of the picture that are inside.
-        confidence: between 0.5 and 1, see :class:`sfmapp.carve.silhouettes.Silhouette`.
         outline_sigma_px: standard deviation of the outline.
         is_usable: the mask is neither missing, empty, full nor inverted, whatever its camera.
         problem: what is wrong with it, empty if nothing is known to be; such a silhouette carves nothing.
@@ -29,7 +28,6 @@ class PhotographMask(Report):
     source: str
     share: float
     border_share: float
-    confidence: float
     outline_sigma_px: float
     is_usable: bool
     problem: str

@@ -25,14 +25,12 @@ class Silhouette:
             a pixel near it; +inf everywhere if there is no outside, -inf if there is no object.
         known: (H, W) bool, False where the picture cannot tell (a hand in front, a hole in the lens's field): nothing
             is carved there; None for everywhere. Beyond the picture nothing is ever known.
-        confidence: between 0.5 and 1: how probable it is that a pixel far from the outline is told rightly.
         outline_sigma_px: standard deviation of the outline's place, pixels.
         source: how it was found, in a word for reports: ``alpha``, ``mask``, ``background``, ...
     """
 
     distance: NDArray[np.float32]
     known: NDArray[np.bool_] | None = None
-    confidence: float = 1.0
     outline_sigma_px: float = 0.5
     source: str = "mask"
 

@@ -46,8 +46,8 @@ _TWO_VALUED = 0.98
 _NAMES_SHOWN = 3
 # colours that overlap by more than this are not all: neighbours that look alike are kept together then
 _TELLING = 0.005
-# share of the shorter side along the edges where GrabCut expects no object, and its confidence (benchmarks/masks.py)
-_EDGE, _GRABCUT = 0.04, 0.95
+# share of the shorter side along the edges where GrabCut expects no object (benchmarks/masks.py)
+_EDGE = 0.04
 # points that tell where the object is
 _FEW_POINTS = 16
 # share of a silhouette above which a spill or a hole is told
@@ -72,11 +72,10 @@ class MaskOptions:
 
 @dataclass(frozen=True)
 class _Found:
-    """What was found in one photograph: coverage (H, W), what told it, and how probably it is right."""
+    """What was found in one photograph: coverage (H, W), and what told it."""
 
     coverage: Coverage
     source: str
-    confidence: float
 
 
 def find_silhouettes(
@@ -228,24 +227,22 @@ def _find(
     """What the source says of a photograph; None if it says nothing."""
     if source == "mask":
         levels = read_mask_coverage(record)
-        return None if levels is None else _Found(_coverage(levels), "mask", 1.0)
+        return None if levels is None else _Found(_coverage(levels), "mask")
     if source == "picture":
         levels = read_rgb(record)[..., 0]
-        return _Found(_coverage(np.where(levels >= max(1, levels.max() / 2), 255, 0).astype(np.uint8)), "mask", 1.0)
+        return _Found(_coverage(np.where(levels >= max(1, levels.max() / 2), 255, 0).astype(np.uint8)), "mask")
     if source == "alpha":
         _, alpha = read_with_alpha(record)
-        return None if alpha is None else _Found(_coverage(alpha), "alpha", 1.0)
+        return None if alpha is None else _Found(_coverage(alpha), "alpha")
     picture = read_rgb(record)
     if source == "grabcut":
         coverage = refined_coverage(picture, without_specks(cut_by_rectangle(picture, rectangle)))
-        return _Found(coverage, "grabcut", _GRABCUT)
+        return _Found(coverage, "grabcut")
     assert model is not None
     mask = object_mask(picture, model)
     if model.error > _TELLING:
         mask = without_specks(cut_by_mask(picture, mask))
-    coverage = refined_coverage(picture, mask)
-    source = "dark background" if model.is_dark else "background"
-    return _Found(coverage, source, float(np.clip(1.0 - model.error, 0.5, 1.0)))
+    return _Found(refined_coverage(picture, mask), "dark background" if model.is_dark else "background")
 
 
 def _rectangle(record: ImageRecord, view: View | None, points: NDArray[np.float64] | None) -> tuple[int, int, int, int]:
@@ -274,7 +271,7 @@ def _coverage(levels: NDArray[np.uint8]) -> Coverage:
 def _with_problem(record: ImageRecord, found: _Found | None, wanted: str) -> tuple[Silhouette, PhotographMask]:
     """The silhouette of what was found, known nowhere if it cannot be right; ``wanted``: where it was looked for."""
     if found is None:
-        found = _Found(np.zeros((record.height, record.width), np.float32), "none", 0.5)
+        found = _Found(np.zeros((record.height, record.width), np.float32), "none")
     inside = found.coverage > 0.5
     edge = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])
     share, border_share = float(inside.mean()), float(edge.mean())
@@ -289,11 +286,11 @@ def _with_problem(record: ImageRecord, found: _Found | None, wanted: str) -> tup
         problem = "is inverted: the object is what it leaves out"
     silhouette = Silhouette(
         signed_distance(found.coverage), np.zeros(inside.shape, bool) if problem else None,
-        0.5 if problem else found.confidence, _SIGMA_PX.get(found.source, 0.5), found.source,
+        _SIGMA_PX.get(found.source, 0.5), found.source,
     )  # fmt: skip
     entry = PhotographMask(
         name=record.name, source=found.source, share=share, border_share=border_share,
-        confidence=silhouette.confidence, outline_sigma_px=silhouette.outline_sigma_px, problem=problem,
+        outline_sigma_px=silhouette.outline_sigma_px, problem=problem,
         is_usable=not problem, spilled=0.0, filled=0.0, doubtful=0.0,
     )  # fmt: skip
     return silhouette, entry
@@ -329,18 +326,14 @@ def _compared(
     verdicts = compare(views, [each for each, _ in found], repairs=repairs, workers=workers, events=events)
     result, warnings = [], []
     for (_, entry), verdict in zip(found, verdicts, strict=True):
-        # what others speak against was wrong, whatever has become of it
-        wrong = verdict.spilled + verdict.filled + 0.5 * verdict.doubtful
-        silhouette = replace(verdict.silhouette, confidence=max(0.5, verdict.silhouette.confidence - wrong))
         told = replace(
             entry, spilled=verdict.spilled, filled=verdict.filled, doubtful=verdict.doubtful,
-            turned_deg=verdict.turned_deg,
-            problem=entry.problem or verdict.problem, confidence=silhouette.confidence,
+            turned_deg=verdict.turned_deg, problem=entry.problem or verdict.problem,
         )  # fmt: skip
         if verdict.problem:
             warnings.append(f"{entry.name} {verdict.problem}")
             events.warned(STAGE, f"{warnings[-1]}; it carves nothing")
-        result.append((silhouette, told))
+        result.append((verdict.silhouette, told))
     return result, warnings + _told_of_repairs([entry for _, entry in result], repairs, events)
 
 

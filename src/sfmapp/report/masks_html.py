@@ -120,12 +120,12 @@ def _caption(entry: PhotographMask) -> str:
 
 def _all(entries: Sequence[PhotographMask]) -> str:
     head = [
-        ("t", "photograph"), ("t", "told by"), ("", "of the picture"), ("", "confidence"), ("", "outline sigma px"),
+        ("t", "photograph"), ("t", "told by"), ("", "of the picture"), ("", "outline sigma px"),
         ("", "spill"), ("", "holes filled"), ("", "doubtful"), ("t", "problem"),
     ]  # fmt: skip
     rows = [
         [
-            ("t", entry.name), ("t", entry.source), ("", f"{entry.share:.1%}"), ("", f"{entry.confidence:.3f}"),
+            ("t", entry.name), ("t", entry.source), ("", f"{entry.share:.1%}"),
             ("", f"{entry.outline_sigma_px:.2f}"), ("", f"{entry.spilled:.2%}"), ("", f"{entry.filled:.2%}"),
             ("", f"{entry.doubtful:.2%}"), ("w", entry.problem),
         ]
