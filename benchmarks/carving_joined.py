@@ -129,9 +129,10 @@ class LegoJudge:
         return shown
 
 
-def solid_case(name: str) -> Case:
-    """A rendered solid: its texture is fixed in space, there is none in a third of it, before black with alpha."""
-    solid = SOLIDS[name]()
+def solid_case(name: str, solid: Solid | None = None) -> Case:
+    """A rendered solid, by default that of the name: its texture is fixed in space, there is none in a third of it,
+    before black with alpha."""
+    solid = solid or SOLIDS[name]()
     rig = around(SOLID_VIEWS, 1)
     texture = np.random.default_rng([7, 0x7E47]).uniform(40.0, 220.0, (64, 64, 64)).astype(np.float32)
     nothing = Lamps(np.zeros((0, 3)), np.zeros(0))

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 RESULTS = Path(__file__).resolve().parent / "results"
-# below these, differences are noise: of costs and errors as a share, of scores in percentage points
-SHARE, POINTS = 0.1, 1.0
+# below these, differences are noise: of costs and errors as a share, of scores in percentage points, of pictures in dB
+SHARE, POINTS, DECIBELS = 0.1, 1.0, 0.25
 SPARSE = (
     ("model.num_registered", "registered images", "count", "more"),
     ("wall_s", "wall time", "s", "less"),
@@ -71,7 +71,7 @@ class Row:
 
 def is_level(a: float, b: float, unit: str) -> bool:
     """Whether two figures of a unit differ by no more than noise."""
-    margin = {"%": POINTS, "count": 0.0}.get(unit, SHARE * max(abs(a), abs(b)))
+    margin = {"%": POINTS, "count": 0.0, "dB": DECIBELS}.get(unit, SHARE * max(abs(a), abs(b)))
     return abs(a - b) <= margin
 
 

@@ -10,7 +10,7 @@ from carving_scenes import Solid, around, ball, both, box, pixel_centers, ring, 
 from sfmapp.camera.camera import pixels_to_rays
 from sfmapp.carve.hull import hull_of
 from sfmapp.carve.isosurface import surface_of
-from sfmapp.carve.joined import Evidence, Joined, JoinReport, join
+from sfmapp.carve.joined import Evidence, Joined, JoinOptions, JoinReport, join
 from sfmapp.carve.joined_kernels import BINS, FULL, find_value, paint
 from sfmapp.carve.limits import CLOSURE, OUTLINES, PATCHES, find_known, find_limits
 from sfmapp.carve.octree import places_of
@@ -123,6 +123,23 @@ def test_the_hull_closes_what_has_no_patches() -> None:
     _, report, mesh = joined(BOWL, seen=lambda xyz: xyz[:, 2] + 0.2)
     assert 0.9 * report.hull_volume < volume_of(mesh) < 1.02 * report.hull_volume
     assert hull.distance(mesh.xyz).min() > -0.5 * SIDE / CELLS
+
+
+def test_the_hull_stays_where_nothing_tells_if_it_is_kept() -> None:
+    # patches in the hollow alone, and no camera looks at it from below
+    evidence = evidence_of(BOWL, ball(HOLLOW + 0.05, (0.0, 0.0, AT)))
+    off, in_hollow = {}, {}
+    for keep in (0.0, 1.0):
+        found, _ = join(evidence, LOW, SIDE, CELLS, JoinOptions(keep=keep), threads=2)
+        xyz = surface_of(found.tree, found.distance).xyz
+        is_inside = np.linalg.norm(xyz - (0.0, 0.0, AT), axis=1) < HOLLOW + 0.02
+        below = ~is_inside & (xyz[:, 2] < 0.0)
+        off[keep] = np.abs(evidence.hull.distance(xyz[below])).max()
+        in_hollow[keep] = np.quantile(np.abs(BOWL(xyz[is_inside & (xyz[:, 2] < 0.6)])), 0.9)
+    cell = SIDE / CELLS
+    assert off[0.0] > cell
+    assert off[1.0] < 0.6 * cell
+    assert max(in_hollow.values()) < 0.5 * cell
 
 
 def test_every_silhouette_stays_filled() -> None:

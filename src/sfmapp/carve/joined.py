@@ -38,7 +38,7 @@ from sfmapp.carve.views import View
 from sfmapp.errors import InputError, NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.option_checks import check_options, positive
+from sfmapp.option_checks import Range, check_options, positive
 from sfmapp.reporting import Report
 
 Array = NDArray[np.float64]
@@ -61,7 +61,7 @@ _MARGIN_PX = 1.0
 # what is put back along uncovered rays counts as so many sights
 _FILL_VOTES = 4.0
 _CHUNK = 1 << 15
-_RANGES = {"trust": positive(100.0)}
+_RANGES = {"trust": positive(100.0), "keep": Range(0.0, 100.0)}
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,12 @@ class JoinOptions:
 
     Attributes:
         trust: how much surface a sight of the band's width is worth; less is smoother and closes more.
+        keep: the hull counts as so many sights where it is full. With 0 the least surface closes what nothing tells;
+            the more it is, the more of the hull stays there.
     """
 
     trust: float = 1.5
+    keep: float = 0.0
 
     def __post_init__(self) -> None:
         check_options(STAGE, self, _RANGES)
@@ -227,6 +230,7 @@ def join(
             width = max(band, _BAND_CELLS * cell)
             level.votes = _votes(level.xyz, sights, width, pool)
             _hold_outside(level, width)
+            np.maximum(level.extra, np.float32(options.keep), out=level.extra, where=level.hull > 0.0)
             weight, iterations = options.trust * cell / band, _iterations(number)
             _solve(level, weight, iterations, events, pool)
             for _ in range(_ROUNDS):
@@ -248,7 +252,7 @@ def join(
     report = JoinReport(
         cells=2**depth, num_nodes=[len(level.codes) for level in levels], num_sights=len(sights), band=band,
         hull_volume=_hull_volume(levels, side), volume=float(np.mean(tree.volume_bounds())),
-        filled_share=float((last.extra > 0.0).sum() / max(1, (last.hull > 0.0).sum())),
+        filled_share=float((last.extra >= _FILL_VOTES).sum() / max(1, (last.hull > 0.0).sum())),
     )  # fmt: skip
     events.finished(STAGE, f"{100 * report.volume / report.hull_volume:.0f} % of the hull is left", **report)
     nodes = [level.nodes(band, is_finest=level is last) for level in levels]
@@ -372,7 +376,7 @@ def _fill(level: _Level, evidence: Evidence, cell: float, pool: ThreadPoolExecut
     marked = np.zeros(len(idx), np.bool_)
     for part in pool.map(look, range(len(evidence.views))):
         marked |= part
-    is_new = marked & (level.extra[idx] == 0.0)
+    is_new = marked & (level.extra[idx] < _FILL_VOTES)
     level.extra[idx[is_new]] = _FILL_VOTES
     return bool(is_new.any())
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.carve.coloring import Difference
-from sfmapp.carve.joined import JoinReport
 from sfmapp.carve.limits import CLOSURE, OUTLINES, PATCHES, UNSEEN, Known, LimitsReport
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette
@@ -62,7 +61,7 @@ def _body(
     yield from _photographs(report, views, silhouettes, shape, read)
     yield from _fits(report)
     if report.limits is not None:
-        yield _limits(report.limits, is_joined=report.joining is not None)
+        yield _limits(report.limits, None if report.joining is None else _teller(report))
     yield from _slices(shape.octree, shape.mesh)
     yield _levels(report)
     yield log_table("Decisions", report.decisions)
@@ -87,7 +86,7 @@ def _summary(report: CarveReport) -> str:
         joining = report.joining
         text += (
             f"That is {joining.volume / joining.hull_volume:.0%} of what outlines alone leave ("
-            f"{joining.hull_volume:.5g}): {joining.num_sights} photographs see patches in the hollows of it."
+            f"{joining.hull_volume:.5g}): {joining.num_sights} photographs tell its hollows by {_teller(report)}."
         )
     text += "</p>"
     if report.box.told_by != "silhouettes":
@@ -108,8 +107,8 @@ def _summary(report: CarveReport) -> str:
             f"{taken.num_pairs} photographs under single lights ({escape(told)}). What is left still holds the object, "
             "as far as it is matt, has no edge sharper than was said, and nothing else throws shadows on it.</p>"
         )
-    if report.sights is not None and report.joining is not None:
-        text += _sights(report.sights, report.joining, report.colors.differences)
+    if report.sights is not None:
+        text += _sights(report.sights, report.colors.differences)
     colors = report.colors
     if colors.seen_share < 1.0:
         text += (
@@ -119,12 +118,17 @@ def _summary(report: CarveReport) -> str:
     return text
 
 
-def _sights(sights: SightsReport, joining: JoinReport, differences: Sequence[Difference]) -> str:
-    """What colours took away, and whether the object looks the same from everywhere, as they suppose."""
+def _teller(report: CarveReport) -> str:
+    """What was joined with the silhouettes."""
+    return "patches" if report.sights is None else "colours"
+
+
+def _sights(sights: SightsReport, differences: Sequence[Difference]) -> str:
+    """What colours told, and whether the object looks the same from everywhere, as they suppose."""
     text = (
         f"<p>Colours tell the depth of {sights.known_share:.0%} of what {sights.num_maps} photographs show of the "
-        f"object, each confirmed by another one; {joining.volume / joining.hull_volume:.0%} of the hull is left. "
-        "Surfaces are supposed to look the same from everywhere"
+        "object, each confirmed by another one; where they tell nothing the hull stays. Surfaces are supposed to look "
+        "the same from everywhere"
     )
     told = [f"{row.levels:.0f} at {row.from_deg:.0f} to {row.to_deg:.0f} degrees" for row in differences]
     if told:
@@ -144,7 +148,7 @@ def _photographs(
     told = ""
     if kind is not None:
         named = (
-            (PATCHES, "patches"), (OUTLINES, "outlines alone"), (CLOSURE, "neither"), (UNSEEN, "no photograph"),
+            (PATCHES, _teller(report)), (OUTLINES, "outlines alone"), (CLOSURE, "neither"), (UNSEEN, "no photograph"),
         )  # fmt: skip
         told = ", tinted by what tells it:" + ",".join(_key(TINTS[number], name) for number, name in named)
     yield (
@@ -189,12 +193,13 @@ def _fits(report: CarveReport) -> Iterator[str]:
         yield f"<p class=dim>{escape(entry.name)}: {escape(entry.reason)}</p>"
 
 
-def _limits(limits: LimitsReport, *, is_joined: bool) -> str:
+def _limits(limits: LimitsReport, teller: str | None) -> str:
+    """``teller``: what was joined with the silhouettes, if anything."""
     text = "<h2>What is not known</h2><p>"
-    if is_joined:
+    if teller is not None:
         text += (
-            f"Patches tell {limits.patches_share:.1%} of the surface. {limits.closure_share:.1%} is told by neither "
-            "patches nor outlines: the least surface that closes the rest, and not where the object's own has to be. "
+            f"{teller.capitalize()} tell {limits.patches_share:.1%} of the surface. {limits.closure_share:.1%} is told "
+            f"by neither {teller} nor outlines: it closes the rest, and the object's own surface may be elsewhere. "
         )
     text += (
         f"{limits.outlines_share:.1%} of the surface is told by outlines alone: photographs see it, and it may be "

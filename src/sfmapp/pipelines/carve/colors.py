@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfmapp.carve.box import Box
-from sfmapp.carve.joined import Evidence
+from sfmapp.carve.joined import Evidence, JoinOptions
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.swept_sights import SightsReport, sights_by_colors
 from sfmapp.errors import InputError
@@ -18,6 +18,9 @@ from sfmapp.workspace.job import Job
 _PIXEL_BYTES = 36.0
 # a photograph that is finer than so many pixels for a cell says no more
 _PIXELS_A_CELL = 2.0
+# Depths of plain surfaces are not told, and the least surface there cuts off what is the object's: it looked worse than
+# the hull. Against the hull, which counts as one sight, it takes two that agree.
+JOIN = JoinOptions(keep=1.0)
 
 
 def join_colors(
@@ -45,5 +48,5 @@ def join_colors(
         sights, report = sights_by_colors(views, surface, job.events, threads=job.threads)
     with job.stage("join"):
         evidence = Evidence(photographs.views, photographs.silhouettes, photographs.hull, sights)
-        joined, joining = join_in_box(job, evidence, octree, box)
+        joined, joining = join_in_box(job, evidence, octree, box, JOIN)
     return Joining(joined, joining, evidence, octree), report

@@ -10,7 +10,7 @@ from pathlib import Path
 from sfmapp.carve.box import Box, clip_octree
 from sfmapp.carve.files import read_joined, write_joined
 from sfmapp.carve.hull import Hull
-from sfmapp.carve.joined import Evidence, Joined, JoinReport, join
+from sfmapp.carve.joined import Evidence, Joined, JoinOptions, JoinReport, join
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.sight import sights_of_patches
 from sfmapp.carve.silhouettes import Silhouette
@@ -67,14 +67,18 @@ class Joining:
     hull_octree: Octree
 
 
-def join_in_box(job: Job, evidence: Evidence, octree: Octree, box: Box) -> tuple[Joined, JoinReport]:
+def join_in_box(
+    job: Job, evidence: Evidence, octree: Octree, box: Box, options: JoinOptions | None = None
+) -> tuple[Joined, JoinReport]:
     """The volume that silhouettes and sights leave together, in the cube and the cells of the hull's octree, what is in
     the box if that is a user's.
 
     Raises:
         NoReconstructionError: all of the hull is seen through.
     """
-    joined, report = join(evidence, octree.low, octree.side, 2**octree.depth, events=job.events, threads=job.threads)
+    joined, report = join(
+        evidence, octree.low, octree.side, 2**octree.depth, options, events=job.events, threads=job.threads
+    )  # fmt: skip
     if box.told_by == "user":
         joined = replace(joined, tree=clip_octree(joined.tree, box))
     return joined, report
