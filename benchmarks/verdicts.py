@@ -576,6 +576,18 @@ def promises(folder: Path) -> Iterator[Promise]:
     live = [[row["ate_live_mm"] for row in pair] for pair in both if all("ate_live_mm" in row for row in pair)]
     text = "poses given out live drift less with an IMU than without"
     yield Promise("inertial", text, sum(b < a for a, b in live), len(live), report["date"][:10])
+    report = read(folder, "wheeled")
+    pairs = [(run["free"], run["planar"]) for run in report["runs"]]
+    text = "on wheels planar motion gives no fewer frames a pose than free motion"
+    kept = [planar["num_frames"] >= free["num_frames"] for free, planar in pairs]
+    yield Promise("wheeled", text, sum(kept), len(kept), report["date"][:10])
+    posed = [pair for pair in pairs if all("ate_m" in row for row in pair)]
+    text = "on wheels planar motion has half the error of free motion"
+    halved = [planar["ate_m"] <= 0.5 * free["ate_m"] for free, planar in posed]
+    yield Promise("wheeled", text, sum(halved), len(halved), report["date"][:10])
+    text = "on wheels, ramps and leaning cars among them, planar motion has a NEES below 2"
+    honest = [planar["nees"] < 2.0 for _, planar in posed if planar["nees"] is not None]
+    yield Promise("wheeled", text, sum(honest), len(honest), report["date"][:10])
     report = read(folder, "odometry")
     same = [row["same_bytes"] for row in report["rows"]]
     yield Promise("odometry", "two runs write the same bytes", sum(same), len(same), report["date"][:10])

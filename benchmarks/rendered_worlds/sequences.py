@@ -238,18 +238,30 @@ def street_rig() -> Rig:
 
 
 def street(
-    num_frames: int = 600, seed: int = 0, optics: Optics | None = None, rig: Rig | None = None, *, moving_cars: int = 0
-) -> RenderedSequence:
+    num_frames: int = 600, seed: int = 0, optics: Optics | None = None, rig: Rig | None = None, *, moving_cars: int = 0,
+    lean_deg: float = 0.0, ramp_m: float = 0.0,
+) -> RenderedSequence:  # fmt: skip
     """A car drives clockwise round a block: rectified stereo 1241x376 at 10 frames a second.
 
     5 m/s in the turns, up to 11 m/s between them; a round of about 390 m takes some 450 frames, then it starts again.
+
+    Args:
+        lean_deg: roll of the car in the turns. ramp_m: by how much it rises from the 4th to the 9th second and stays.
     """
     rng = np.random.default_rng([seed, 0x57E8])
     times = np.arange(num_frames) / 10.0
     knots = np.arange(-1.5, times[-1] + 1.6, 0.25)
     degree = np.pi / 180
     sway = tremor(rng, times[-1] + 1.0, 0.5, [0.015, 0.015, 0.012, 0.15 * degree, 0.25 * degree, 0.2 * degree])
-    body = Motion((interpolate(knots, _drive(knots)), sway))
+    state = _drive(knots)
+    turning = np.abs(np.gradient(state[:, 3], knots))
+    state[:, 5] += lean_deg * degree * turning / max(float(turning.max()), 1e-9)
+    share = np.clip((knots - 4.0) / 5.0, 0.0, 1.0)
+    rise = ramp_m * share**2 * (3.0 - 2.0 * share)
+    way = np.linalg.norm(np.gradient(state[:, :2], axis=0), axis=1)
+    state[:, 2] += rise
+    state[:, 4] -= np.arctan2(np.gradient(rise), way)
+    body = Motion((interpolate(knots, state), sway))
     return _sequence(
         "street", street_world(seed, moving_cars=moving_cars), rig or street_rig(), times,
         lambda t: rigid3.compose(CAM_FROM_BODY, body.body_from_world(t)), _wandering_gain(rng, times, 3.0, 0.04, 1.25),

@@ -156,9 +156,8 @@ class MapInitializer:
         if found.median_angle_deg < _MIN_MEDIAN_ANGLE_DEG or num < max(_MIN_POINTS, 0.5 * len(track)):
             self.reason = f"{num} of {len(track)} corners agree, {found.median_angle_deg:.2f} deg of parallax"
             return None
-        pose: Array | None = found.cam2_from_cam1
-        if self.options.motion == "free":
-            pose = self._only_pose(found.cam2_from_cam1, track[found.is_inlier], limit)
+        # a plane tells which corners agree; how the camera nodded and rolled in it they tell by themselves
+        pose = self._only_pose(found.cam2_from_cam1, track[found.is_inlier], limit)
         if pose is None:
             self.reason = "several motions explain the two views alike"
             return None
@@ -245,13 +244,14 @@ class MapInitializer:
         return left < _MAX_LEFT_SHARE**2 * turned
 
     def _hold_to_plane(self, found: TwoViewGeometry, xy1: Array, xy2: Array, limit_px: float) -> None:
-        """Put a wheeled robot's motion in the place of a free one: two unknowns bear more outliers than five."""
+        """Put a wheeled robot's motion in the place of a free one where that explains fewer corners: two unknowns bear
+        more outliers than five, but springs and a camera that does not look level have no place in them."""
         xn1, xn2 = (pixels_to_normalized(self.camera, xy) for xy in (xy1, xy2))
         num_points: NumPoints = 1 if self.options.motion == "ackermann" else 2
         planar = estimate_planar_motion(
             xn1, xn2, limit_px / self.camera.focal, seed=self.seed, num_points=num_points
         )  # fmt: skip
-        if planar is None:
+        if planar is None or planar[1].sum() <= found.is_inlier.sum():
             return
         found.cam2_from_cam1, found.is_inlier = planar
         found.config = TwoViewConfig.CALIBRATED

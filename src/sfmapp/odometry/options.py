@@ -36,8 +36,8 @@ class OdometryOptions:
         min_triangulation_deg: smallest angle between the rays of a new point of one moving camera
         min_stereo_deg: the same for a rig, whose baseline is known; depths are then good to about 10 %
         max_lost_s: seconds without relocalization before a new map is begun
-        motion: of the first two views; planar for a wheeled robot on level ground whose camera looks level, ackermann
-            for a car of which it looks ahead: one point tells its motion, which bears the most outliers
+        motion: planar for a wheeled robot on level ground: a ground plane takes part in the closing adjustment, where
+            the images agree; ackermann for a car of which the camera looks ahead, whose map may begin by one point
         loops: recognise places seen before, close loops and join maps
         refine_camera: refine the calibration where the images clearly contradict it
         smooth: also write the trajectory smoothed by an error-state filter: steadier, with short gaps bridged

@@ -189,6 +189,7 @@ def _map_result(keyframes: KeyframeMap, final: FinalAdjustment, images: Keyframe
         model, frame_idx, image_idx, covariance, final.gauge, "stereo" if num_sensors > 1 else "none",
         widened_scale_sigma(final.scale_sigma, found), found, _covariance_gap(final, num), final.noise_covariance,
         images.sightings(frame_idx, image_idx), final.adjustment, final.inertial,
+        final.report.plane,
     )  # fmt: skip
 
 

@@ -187,6 +187,37 @@ class SharedErrors(Report):
     wider_loss_sigmas: float | None = None
 
 
+class PlaneEvidence(Report):
+    """The plane that a camera on wheels moves in.
+
+    Attributes:
+        state: ``held``: the closing adjustment holds the keyframes to it; ``offered``: the motion, taken to be free,
+            looks as if it could; ``dropped``: it was asked for and does not hold.
+        reason: why, with the numbers behind it.
+        turned_deg: how far the camera turned in the plane.
+        deviation_deg: (2,) nod and roll about the plane, rms. deviation_height: of the camera's height, map units, rms.
+        sigma_deg, sigma_height: the standard deviations that they were held with: learned, and as much larger as
+            deviations hang together along the way, by ``hang_together`` (3,) of the variances of nod, roll and height.
+        up_in_cam: (3,) the plane's normal as the camera sees it.
+        camera_pitch_deg: of the optical axis above the plane; camera_roll_deg: of the normal to the right in the
+            picture; and their standard deviations.
+    """
+
+    state: str
+    reason: str
+    turned_deg: float | None = None
+    deviation_deg: Sequence[float] | None = None
+    deviation_height: float | None = None
+    sigma_deg: Sequence[float] | None = None
+    sigma_height: float | None = None
+    hang_together: Sequence[float] | None = None
+    up_in_cam: Sequence[float] | None = None
+    camera_pitch_deg: float | None = None
+    camera_roll_deg: float | None = None
+    camera_pitch_sigma_deg: float | None = None
+    camera_roll_sigma_deg: float | None = None
+
+
 class AdjustmentReport(Report):
     """The adjustment of a whole map at its end.
 
@@ -197,6 +228,7 @@ class AdjustmentReport(Report):
         shutter: absent where it was not looked for.
         is_piecewise: the map is too large to be adjusted at once.
         inertial: measurements of a sensor that took part, or why they did not; absent without one.
+        plane: that of a camera on wheels; absent where the motion is free and does not look like one.
     """
 
     camera: CalibrationCheck
@@ -205,6 +237,7 @@ class AdjustmentReport(Report):
     shutter: ShutterReport | None = None
     is_piecewise: bool | None = None
     inertial: ScaleEvidence | None = None
+    plane: PlaneEvidence | None = None
 
 
 # ------------------------------------------------------------------------------------------- the unit of length

@@ -16,7 +16,7 @@ from sfmapp.odometry.inertial.filtering import FilteredTrajectory
 from sfmapp.odometry.inertial.markers import MarkerSightings
 from sfmapp.odometry.inertial.scale import ScaleEstimate, ScaleRefusal
 from sfmapp.odometry.inertial.smoothing import SmoothedTrajectory
-from sfmapp.odometry.report import OdometryReport
+from sfmapp.odometry.report import OdometryReport, PlaneEvidence
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -53,6 +53,7 @@ class MapResult:
         sightings: the markers in the keyframes, where they were looked for.
         adjustment: the closing adjustment; None for a map that was adjusted piece by piece, or read from files.
         inertial: what an inertial sensor that took part in it says of the unit of length, or why it does not.
+        plane: that of a camera on wheels, held, dropped or offered; None where the motion is free and looks so.
     """
 
     reconstruction: Reconstruction
@@ -68,6 +69,7 @@ class MapResult:
     sightings: MarkerSightings = field(default_factory=MarkerSightings.none)
     adjustment: AdjustReport | None = None
     inertial: ScaleEstimate | ScaleRefusal | None = None
+    plane: PlaneEvidence | None = None
 
 
 @dataclass

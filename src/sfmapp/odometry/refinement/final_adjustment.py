@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.options import AdjustReport
+from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
@@ -17,7 +17,7 @@ from sfmapp.mapping.structure import residual_scale_px
 from sfmapp.odometry.inertial.scale import ScaleEstimate, ScaleRefusal
 from sfmapp.odometry.inertial.visual_inertial import InertialAlignment
 from sfmapp.odometry.loops.sweep import is_too_large, sweep
-from sfmapp.odometry.map.backend import classify, make_job, take_over
+from sfmapp.odometry.map.backend import Job, classify, make_job, take_over
 from sfmapp.odometry.map.covariance import (
     covariance_of_refinement,
     estimate_map_covariance,
@@ -34,7 +34,8 @@ from sfmapp.odometry.refinement.calibration_check import (
     question_calibration,
 )
 from sfmapp.odometry.refinement.inertial_adjustment import adjust_with_imu
-from sfmapp.odometry.report import AdjustmentReport
+from sfmapp.odometry.refinement.planar_adjustment import PlanarMap, hold_to_plane, offer_plane
+from sfmapp.odometry.report import AdjustmentReport, PlaneEvidence
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig
 
@@ -124,10 +125,12 @@ def adjust_finally(
         None,
         FinalAdjustment(None, "", report, list(answer.contradictions), answer.scale_sigma, None, adjustment),
     )
-    if 1 < len(everything) <= MAX_COVARIANCE_KEYFRAMES and (options.covariance or imu is not None):
+    asks_for_covariance = options.covariance or imu is not None or options.motion != "free"
+    if 1 < len(everything) <= MAX_COVARIANCE_KEYFRAMES and asks_for_covariance:
         found = estimate_map_covariance(model, num_sensors, LOSS_SIGMAS * sigma)
     if imu is not None:
         final = _with_imu(final, keyframes, imu, (sigma, None if found is None else found.noise_px), events)
+    final = _with_plane(final, job, keyframes, options, (sigma, None if found is None else found.noise_px), events)
     if found is None or not options.covariance:
         return final
     found = widened_by_loss(found, model, num_sensors, LOSS_SIGMAS * sigma)
@@ -171,6 +174,44 @@ def _with_imu(
     return replace(final, report=report, inertial=found, contradictions=contradictions)
 
 
+def _with_plane(
+    final: FinalAdjustment, job: Job, keyframes: KeyframeMap, options: OdometryOptions,
+    noise_px: tuple[float, float | None], events: Events,
+) -> FinalAdjustment:  # fmt: skip
+    """What there is so far, and what the plane of a camera on wheels makes of it; or what speaks for such a plane.
+
+    Args:
+        job: the map as the images alone have it, which is in ``keyframes``.
+        noise_px: of an observation, and what that comes to with what errors have in common, where it is known.
+    """
+    sigma, together = noise_px
+    num_sensors, found = len(keyframes.rig.cameras), None
+    if options.motion == "free":
+        found = offer_plane(job.model.cam_from_world[::num_sensors]) if final.inertial is None else None
+    elif final.inertial is not None:
+        found = PlaneEvidence(state="dropped", reason="an inertial sensor holds the map, or contradicts it")
+    elif together is None or not math.isfinite(together):
+        reason = f"the observations do not determine the poses, or keyframes are more than {MAX_COVARIANCE_KEYFRAMES}"
+        found = PlaneEvidence(state="dropped", reason=reason)
+    else:
+        adjust = AdjustOptions(
+            loss="cauchy", loss_scale_px=LOSS_SIGMAS * sigma, refine_focal=False, refine_distortion=False
+        )
+        answer = hold_to_plane(job.model, adjust, together, num_sensors)
+        events.raise_if_cancelled()
+        found = answer.evidence if isinstance(answer, PlanarMap) else answer
+        if isinstance(answer, PlanarMap):
+            job.model = answer.model
+            take_over(job, keyframes)
+            numbers = answer.adjustment
+            events.decided(STAGE, f"closing adjustment on a ground plane: {numbers.text}", **numbers)
+            final = replace(final, adjustment=numbers, noise_covariance=answer.pose_covariance)
+    if found is None:
+        return final
+    events.decided(STAGE, f"ground plane {found.state}: {found.reason}", **found)
+    return replace(final, report=replace(final.report, plane=found))
+
+
 def _left_open(covariance: Array, size: float, events: Events) -> list[Contradiction]:
     """A contradiction where a refined calibration leaves the positions (K, 6, 6) open against the size of the map."""
     known = covariance[np.isfinite(covariance).all((1, 2)), 3:, 3:]
@@ -201,7 +242,12 @@ def _adjust_large_map(
         if answer.model.rig is not None:
             _rescale(keyframes, rigid3.spread(answer.model.cam_from_world) / rigid3.spread(job.model.cam_from_world))
     sweep(keyframes, options, events)
-    report = AdjustmentReport(camera=answer.report, is_piecewise=True)
+    plane = None
+    if options.motion != "free":
+        reason = f"the map has more than {MAX_COVARIANCE_KEYFRAMES} keyframes"
+        plane = PlaneEvidence(state="dropped", reason=reason)
+        events.decided(STAGE, f"ground plane dropped: {reason}")
+    report = AdjustmentReport(camera=answer.report, is_piecewise=True, plane=plane)
     final = FinalAdjustment(None, "", report, answer.contradictions, answer.scale_sigma)
     return final if imu is None else _with_imu(final, keyframes, imu, (sigma, None), events)
 
