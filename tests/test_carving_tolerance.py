@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from carving_scenes import Solid, around, ball, both, box, pixel_centers, ring, silhouette_of, without
+from rendered_worlds.lit_solids import around as all_round
 from sfmapp.carve.hull import hull_of
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.tolerance import doubt_holes
-from sfmapp.carve.views import View, project_points
+from sfmapp.carve.views import View, project_points, view_of_camera
 
 LOW, SIDE = np.full(3, -1.3), 2.6
 TWO = both(ball(0.45, (0.5, 0.0, 0.3)), box((0.3, 0.5, 0.6), (-0.4, 0.0, 0.0)))
@@ -84,3 +85,19 @@ def test_good_silhouettes_are_left_alone(num: int, solid: Solid) -> None:
     mended, report = doubt_holes(views, clean, LOW, SIDE)
     assert not report.doubted
     assert all(a is b for a, b in zip(mended, clean, strict=True))
+
+
+def test_an_arch_in_an_outline_that_others_do_not_contradict_is_left() -> None:
+    # one of twelve views on all sides looks along the arch, and takes away far more alone than any other does
+    rig = all_round(12, 1, 160)
+    views = [view_of_camera(f"view_{i:03d}.png", rig.camera, pose) for i, pose in enumerate(rig.poses)]
+    house = without(box((0.62, 0.5, 0.5)), box((0.2, 0.8, 0.3), (0.0, 0.0, -0.4)))
+    clean = [silhouette_of(view, house) for view in views]
+    mended, report = doubt_holes(views, clean, LOW, SIDE)
+    assert not report.doubted
+    # where a mask has a hole beside it, that alone is named
+    spoiled = [holed(s, (80.0, 60.0)) if i == 10 else s for i, s in enumerate(clean)]
+    mended, report = doubt_holes(views, spoiled, LOW, SIDE)
+    assert [one.name for one in report.doubted] == ["view_010.png"]
+    assert agreement(inside(views, clean), inside(views, spoiled)) < 0.98
+    assert agreement(inside(views, clean), inside(views, mended)) > 0.99
