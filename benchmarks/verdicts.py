@@ -105,6 +105,7 @@ def rows_of(folder: Path) -> list[Row]:
         "carving": carving_rows,
         "carving_joined": joined_rows,
         "voxel_coloring": color_rows,
+        "shadow_carving": shadow_rows,
         "masks": mask_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
@@ -346,6 +347,16 @@ def color_rows(folder: Path) -> Iterator[Row]:
             yield Row(benchmark, case, "error of the volume", "%", "less", mine, "hull", theirs, *about)
 
 
+def shadow_rows(folder: Path) -> Iterator[Row]:
+    """Carving by silhouettes and shadows against silhouettes alone."""
+    report = read(folder, "shadow_carving")
+    about = False, report["date"][:10], report["commit"]
+    for run in report["rows"]:
+        case = f"{run['scene']}, {run['density']}, {run['cells']} cells, noise {run['seed']}"
+        mine, theirs = run["error_percent"], run["hull_error_percent"]
+        yield Row("shadow_carving", case, "error of the volume", "%", "less", mine, "hull", theirs, *about)
+
+
 def carving_rows(folder: Path) -> Iterator[Row]:
     """Space carving against dense grids and, of silhouettes with holes and spills, against strict carving."""
     report = read(folder, "carving")
@@ -538,6 +549,13 @@ def promises(folder: Path) -> Iterator[Promise]:
     within = sum(abs(run["error_percent"]) <= 2 * run["sigma_percent"] for run in found)
     text = "a self-calibrated focal length is within two stated sigmas"
     yield Promise("self_calibration", text, within, len(found), report["date"][:10])
+    report = read(folder, "shadow_carving")
+    runs = report["rows"]
+    points, lost = (sum(run[name] for run in runs) for name in ("points", "points_lost"))
+    about = "shadow_carving", report["date"][:10]
+    yield Promise(about[0], "no true point of a surface is taken away by shadows", points - lost, points, about[1])
+    met = sum(run["below_hull_percent"] >= 30.0 for run in runs)
+    yield Promise(about[0], "shadows lower the error of the hull's volume by 30 %", met, len(runs), about[1])
     report = read(folder, "surveys")
     found, wrong = (sum(row[name] for row in report["rows"]) for name in ("found", "wrong"))
     yield Promise("surveys", "a grossly wrong position is found", found, wrong, report["date"][:10])

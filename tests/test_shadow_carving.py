@@ -18,7 +18,9 @@ from rendered_worlds.lit_solids import LAMPS_DEG, Rig, around, lamps_at, looking
 from rendered_worlds.solids import BALL, BOX, Rendering, Solid, photograph, render, shape
 from sfmapp.carve.cell_grid import grid_of, octree_of
 from sfmapp.carve.files import read_octree
+from sfmapp.carve.lamp_mixtures import LampLight
 from sfmapp.carve.leaning import lamp_gains, quotients_of
+from sfmapp.carve.mixture_kernels import least_mixture
 from sfmapp.carve.octree import Octree, codes_of
 from sfmapp.carve.outlines import signed_distance
 from sfmapp.carve.shadow_carving import Shadow, ShadowOptions, carve_shadows
@@ -151,16 +153,17 @@ def test_a_tree_and_its_grid_are_one() -> None:
 
 def photographed(
     pictures: list[Rendering], rig: Rig, hull: Octree, seed: int, edge_deg: float = 20.0
-) -> tuple[list[Shadow], list[DetectionReport]]:
-    """Shadows found in photographs with noise."""
+) -> tuple[list[Shadow], list[LampLight], list[DetectionReport]]:
+    """Shadows and brightness found in photographs with noise."""
     photographs = []
     for i, (picture, pose) in enumerate(zip(pictures, rig.poses, strict=True)):
         lit, *under = (photograph(light, 2.0, [seed, i, k]) for k, light in enumerate(picture.light))
         view = view_of_camera("", rig.camera, pose)
         photographs.append(LitPhotograph(lit, under, picture.cover == 1.0, view, rig.lamps[i], hull))
     names = ["a", "b", "c", "d"][: len(rig.lamps[0])]
-    masks, reports = find_shadows(photographs, names, fan_deg=2.0, edge_deg=edge_deg)
-    return [Shadow(i, rig.lamps[i][k], dark) for i, row in enumerate(masks) for k, dark in enumerate(row)], reports
+    masks, brightness, reports = find_shadows(photographs, names, fan_deg=2.0, edge_deg=edge_deg)
+    shadows = [Shadow(i, rig.lamps[i][k], dark) for i, row in enumerate(masks) for k, dark in enumerate(row)]
+    return shadows, [LampLight(i, rig.lamps[i], most) for i, most in enumerate(brightness)], reports
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -168,7 +171,7 @@ def test_shadows_found_in_photographs_carve_as_well(seed: int) -> None:
     solid, views, exact, hull, pictures = scene("block")
     rig = around(16, 4, width=160)
     # none of its edges is sharper than a right angle
-    found, reports = photographed(pictures, rig, hull, seed, 75.0)
+    found, mixed, reports = photographed(pictures, rig, hull, seed, 75.0)
     for n, (shadow, true) in enumerate(zip(found, exact, strict=True)):
         picture, lamp = pictures[n // 4], 1 + n % 4
         # what is called dark though light falls there hardly leans towards it: below 2 degrees, at less than
@@ -176,11 +179,42 @@ def test_shadows_found_in_photographs_carve_as_well(seed: int) -> None:
         wrong = shadow.dark & ~true.dark & (picture.cover == 1.0)
         assert (picture.light[lamp][wrong] <= 0.1 * picture.light[0][wrong]).all()
     assert all(0.6 < report.gain < 1.6 and 1.0 < report.noise_grey < 4.0 for report in reports)
-    carved, _ = carve_shadows(hull, views, found)
+    carved, _ = carve_shadows(hull, views, found, lights=mixed)
     points = surface_points(solid, 20000)
     assert not (grid_of(hull).holds(points) & ~grid_of(carved).holds(points)).any()
     best, _ = carve_shadows(hull, views, exact)
     assert grid_of(hull).volume - grid_of(carved).volume > 0.7 * (grid_of(hull).volume - grid_of(best).volume)
+
+
+def test_mixtures_of_lamps_need_no_edge_told() -> None:
+    solid, views, _, hull, pictures = scene("block")
+    _, mixed, _ = photographed(pictures, around(16, 4, width=160), hull, 0)
+    carved, _ = carve_shadows(hull, views, [], lights=mixed)
+    taken = 1.0 - grid_of(carved).volume / grid_of(hull).volume
+    # the lamps are 32 and 55 degrees from the camera, and cells as large as three pixels
+    assert 0.01 < taken < 1.0 - solid.volume(96) / grid_of(hull).volume
+    points = surface_points(solid, 20000)
+    assert not (grid_of(hull).holds(points) & ~grid_of(carved).holds(points)).any()
+    # of two lamps the camera is never among
+    two = [LampLight(light.view, light.lamps[:2], light.most[:2]) for light in mixed]
+    assert carve_shadows(hull, views, [], lights=two)[0] is hull
+    # nothing is in the way of any lamp
+    _, views, _, hull, pictures = scene("ball")
+    _, mixed, _ = photographed(pictures, around(16, 4, width=160), hull, 0)
+    assert carve_shadows(hull, views, [], lights=mixed)[0] is hull
+
+
+def test_a_mixture_is_no_darker_than_the_camera_wherever_lamps_reach() -> None:
+    rng = np.random.default_rng(0)
+    lamps = np.array([[0.5, 0.1, 1.0], [-0.4, 0.3, 1.0], [0.1, -0.5, 1.0], [0.9, 0.9, 0.3]])
+    normals = rng.normal(0, 1, (2000, 3))
+    normals[:, 2] = np.abs(normals[:, 2])
+    for shown in np.maximum(normals @ lamps.T, 0.0) / normals[:, 2:]:
+        assert least_mixture(lamps, shown, np.ones(4, np.bool_), 0.0, 0.0, 1.0) > 1.0 - 1e-9
+    # facing the camera, one lamp in shadow; and none that shines from the other side
+    shown = np.array([0.0, 1.0, 1.0, 0.3])
+    assert least_mixture(lamps, shown, np.ones(4, np.bool_), 0.0, 0.0, 1.0) < 0.75
+    assert least_mixture(lamps, shown, np.array([True, True, False, True]), 0.0, 0.0, 1.0) == np.inf
 
 
 def leans(solid: Solid, view: View, picture: Rendering, lamp: Array) -> Array:
@@ -199,7 +233,7 @@ def leans(solid: Solid, view: View, picture: Rendering, lamp: Array) -> Array:
 def test_what_turns_away_from_a_light_is_no_shadow() -> None:
     solid, views, _, hull, pictures = scene("block")
     rig = around(16, 4, width=160)
-    found, _ = photographed(pictures, rig, hull, 0)
+    found, _, _ = photographed(pictures, rig, hull, 0)
     thrown, kept, wrong = 0, 0, 0
     for n, shadow in enumerate(found):
         picture, lamp = pictures[n // 4], 1 + n % 4
@@ -212,7 +246,7 @@ def test_what_turns_away_from_a_light_is_no_shadow() -> None:
     assert wrong <= 2e-3 * kept
     assert kept > 0.2 * thrown
     # nothing throws a shadow on a ball: all that is dark on it is turned away
-    found, reports = photographed(scene("ball")[4], rig, scene("ball")[3], 0)
+    found, _, reports = photographed(scene("ball")[4], rig, scene("ball")[3], 0)
     assert not any(shadow.dark.any() for shadow in found)
     assert all(report.turned_share > 0.05 for report in reports if report.light in "ab")
     assert "turned away from the light" in doubts_of(reports)[0]
@@ -263,8 +297,8 @@ def test_an_edge_sharper_than_the_angle_to_the_light_stays() -> None:
     # all that is dark takes the edge away
     carved, _ = carve_shadows(hull, views, exact_shadows(rig, pictures)[1:2])
     assert (~grid_of(carved).holds(points)).sum() > 20
-    found, _ = photographed(pictures, rig, hull, 0)
-    carved, _ = carve_shadows(hull, views, found)
+    found, mixed, _ = photographed(pictures, rig, hull, 0)
+    carved, _ = carve_shadows(hull, views, found, lights=mixed)
     assert grid_of(carved).holds(points).all()
 
 
@@ -272,14 +306,18 @@ def test_black_and_mirroring_surfaces_are_left_alone_and_named() -> None:
     black = Solid(np.array([shape(BOX, (0, 0, 0), (0.5, 0.5, 0.5), albedo=0.01)]), 1.0)
     rig = around(6, 4, width=160)
     pictures = rendered(black, rig)
-    found, reports = photographed(pictures, rig, hull_of(views_of(rig), pictures), 0)
+    hull = hull_of(views_of(rig), pictures)
+    found, mixed, reports = photographed(pictures, rig, hull, 0)
     assert not any(shadow.dark.any() for shadow in found)
+    assert carve_shadows(hull, views_of(rig), [], lights=mixed)[0] is hull
     assert "too dark" in doubts_of(reports)[0]
     # nothing but mirrored lamps is bright
     mirror = Solid(np.array([shape(BALL, (0, 0, 0), 0.8, gloss=1.0)]), 1.0)
     pictures = rendered(mirror, rig)
-    found, reports = photographed(pictures, rig, hull_of(views_of(rig), pictures), 0)
+    hull = hull_of(views_of(rig), pictures)
+    found, mixed, reports = photographed(pictures, rig, hull, 0)
     assert not any(shadow.dark.any() for shadow in found)
+    assert carve_shadows(hull, views_of(rig), [], lights=mixed)[0] is hull
     assert all(report.mirror_share > 0.0 for report in reports)
 
 

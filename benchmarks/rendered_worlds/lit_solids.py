@@ -20,6 +20,9 @@ DISTANCE = 5.0
 LOWEST, HIGHEST = -0.35, 0.9
 # where lamps stand about the camera, as seen from the solid: degrees to the right and above
 LAMPS_DEG = ((-55, 0), (55, 0), (0, 32), (0, -32), (-20, 20), (20, 20), (35, -35), (-35, -35))
+# the same near the camera, where single shadows tell of all edges that are no sharper than 20 degrees; the last four
+# are farther, and of use by their mixtures
+NEAR_LAMPS_DEG = ((-19, 0), (19, 0), (0, 19), (0, -19), (-28, 28), (28, 28), (28, -28), (-28, -28))
 X, Y = (0.0, np.pi / 2, 0.0), (np.pi / 2, 0.0, 0.0)
 
 
@@ -36,7 +39,7 @@ class Rig:
     lamps: list[Array]
 
 
-def around(num_views: int, num_lamps: int, width: int = 480) -> Rig:
+def around(num_views: int, num_lamps: int, width: int = 480, lamps_deg: Sequence[tuple[int, int]] = LAMPS_DEG) -> Rig:
     """A camera with lamps goes round a solid of radius 1, from a little below it to high above.
 
     Heights rise evenly along the axis and each position is the golden angle from the last, which spreads any number of
@@ -45,7 +48,7 @@ def around(num_views: int, num_lamps: int, width: int = 480) -> Rig:
     n = np.arange(num_views)
     heights = LOWEST + (HIGHEST - LOWEST) * (n + 0.5) / num_views
     elevations = np.degrees(np.arcsin(heights))
-    return looking_in(n * 180.0 * (3.0 - np.sqrt(5.0)), elevations, LAMPS_DEG[:num_lamps], width)
+    return looking_in(n * 180.0 * (3.0 - np.sqrt(5.0)), elevations, lamps_deg[:num_lamps], width)
 
 
 def looking_in(azimuths_deg: Array, elevations_deg: Array, lamps_deg: Sequence[tuple[int, int]], width: int) -> Rig:

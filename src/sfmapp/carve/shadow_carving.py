@@ -21,7 +21,8 @@ from the light, and the side that is lit from the camera, if its interior angle 
 camera. Nothing lit is seen of it then, though nothing is in its way, and it would be taken away: of a solid with edges
 of 23 to 46 degrees 0.2 % of the surface was, by lights at 55. But if the side that is seen leans towards the light, it
 is lit. So 1. is asked of pixels whose surface leans towards l, as the other lights show (:mod:`sfmapp.carve.leaning`),
-unless no edge of the object is as sharp (``edge_deg``).
+unless no edge of the object is as sharp (``edge_deg``). Mixtures of three lights take away more, whatever the edges:
+:mod:`sfmapp.carve.lamp_mixtures`.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from sfmapp.carve.cell_grid import CellGrid, grid_of, octree_of
+from sfmapp.carve.lamp_mixtures import LampLight, proven_empty
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.shadow_kernels import Planes, angles_of_all, find_held, take_free
 from sfmapp.carve.views import View, angle_deg
@@ -118,7 +120,7 @@ class ShadowCarvingReport(Report):
 
 def carve_shadows(
     tree: Octree, views: Sequence[View], shadows: Sequence[Shadow], options: ShadowOptions | None = None,
-    events: Events | None = None, *, threads: int = 2,
+    events: Events | None = None, *, lights: Sequence[LampLight] = (), threads: int = 2,
 ) -> tuple[Octree, ShadowCarvingReport]:  # fmt: skip
     """Take cells away that cannot belong to the object, as the camera would see them lit.
 
@@ -126,6 +128,7 @@ def carve_shadows(
         tree: holds the object wholly, such as its hull; at most 512 cells on a side.
         views: cameras.
         shadows: what is dark in their photographs, in any order; nothing but the object throws shadows on it.
+        lights: brightness of their photographs, one for each camera at most, for mixtures of lamps.
         options, events: as for every stage.
         threads: do not change the result.
 
@@ -143,14 +146,15 @@ def carve_shadows(
     used = [s for s in shadows if angle_deg(grid.middle, views[s.view], s.light) <= options.max_angle_deg]
     for shadow in used:
         by_view.setdefault(shadow.view, []).append(shadow)
+    mixed = {light.view: _within(light, views[light.view], grid.middle, options.max_angle_deg) for light in lights}
     before, sweeps = int(np.count_nonzero(grid.filled)), list[int]()
-    events.started("shadows", f"{len(used)} photographs under lights", options.max_sweeps * len(by_view))
+    events.started("shadows", f"{len(used)} photographs under lights", options.max_sweeps * len(by_view | mixed))
     left = before
     with ThreadPoolExecutor(max(1, threads)) as pool:
-        while used and len(sweeps) < options.max_sweeps and (not sweeps or sweeps[-1] > _SETTLED * left):
+        while (used or mixed) and len(sweeps) < options.max_sweeps and (not sweeps or sweeps[-1] > _SETTLED * left):
             taken = 0
-            for view, of_view in sorted(by_view.items()):
-                taken += _carve_by_view(grid, views[view], of_view, options, pool)
+            for view in sorted(by_view | mixed):
+                taken += _carve_by_view(grid, views[view], by_view.get(view, []), mixed.get(view), options, pool)
                 events.advanced("shadows", message=views[view].name)
             sweeps.append(taken)
             left -= taken
@@ -174,6 +178,12 @@ def _check(tree: Octree, views: Sequence[View], shadows: Sequence[Shadow]) -> No
                 f"{view.name}: expected a shadow mask of {view.width} x {view.height} pixels, found "
                 f"{shadow.dark.shape[1]} x {shadow.dark.shape[0]}"
             )
+
+
+def _within(light: LampLight, view: View, middle: Array, max_angle_deg: float) -> LampLight:
+    """The lamps that are not too far from the camera, as seen from a place."""
+    near = np.array([angle_deg(middle, view, lamp) <= max_angle_deg for lamp in light.lamps], np.bool_)
+    return LampLight(light.view, light.lamps[near], light.most[near])
 
 
 def reach_of(dark: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -214,8 +224,9 @@ def _ranges(grid: CellGrid, planes: Planes) -> tuple[Array, Array]:
 
 
 def _carve_by_view(
-    grid: CellGrid, view: View, shadows: Sequence[Shadow], options: ShadowOptions, pool: ThreadPoolExecutor
-) -> int:
+    grid: CellGrid, view: View, shadows: Sequence[Shadow], light: LampLight | None, options: ShadowOptions,
+    pool: ThreadPoolExecutor,
+) -> int:  # fmt: skip
     """Take away what the photographs of one camera vouch for, each by itself against the volume as it was before; how
     many cells that is. What several volumes lack, the object lacks."""
     empty = np.zeros(grid.filled.shape, np.uint8)
@@ -226,7 +237,13 @@ def _carve_by_view(
         find_held(planes, view.row, reach, options.margin_px, grid.low, grid.tree.cell, grid.filled, first)
         take_free(planes, view.row, reach, grid.low, grid.tree.cell, grid.filled, first, empty)
 
+    def mix(light: LampLight) -> None:
+        empty[tuple(proven_empty(grid, view, light).T)] = 1
+
     # all write the same number, in any order
+    tasks = [pool.submit(mix, light)] if light is not None and len(light.lamps) >= 3 else []
     list(pool.map(carve, shadows))
+    for task in tasks:
+        task.result()
     grid.filled[empty == 1] = 0
     return int(np.count_nonzero(empty))

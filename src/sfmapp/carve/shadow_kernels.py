@@ -77,7 +77,8 @@ def _is_dark(planes: Planes, row: Array, reach: NDArray[np.float32], margin: flo
         return False
     a, b = _seen(planes, row, about + planes.step[0], at)
     c, d = _seen(planes, row, about, at + planes.step[1])
-    half = 0.5 * (math.hypot(a - u, b - v) + math.hypot(c - u, d - v))
+    # nothing between four samples is farther from the nearest than half the longer diagonal
+    half = 0.5 * max(math.hypot(a + c - 2.0 * u, b + d - 2.0 * v), math.hypot(a - c, b - d))
     # a pixel reaches half its diagonal beyond its centre
     free = float(reach[i, j]) - math.hypot(u - j - 0.5, v - i - 0.5)
     return free > half + math.sqrt(0.5) + margin
@@ -182,7 +183,6 @@ def take_free(
     out: Cells,
 ) -> None:  # fmt: skip
     """Mark with 1 in ``out`` (X, Y, Z) the filled cells that are free wherever the planes pass through them."""
-    half = math.sqrt(0.75) * cell
     height, width = reach.shape
     for i in range(filled.shape[0]):
         for j in range(filled.shape[1]):
@@ -194,13 +194,13 @@ def take_free(
                 u, v, depth = project_point(row, x, y, z)
                 if not (depth > 0.0 and u >= 0.0 and v >= 0.0 and u < width and v < height):
                     continue
-                if reach[int(v), int(u)] > 0.0 and _is_free(planes, first, x, y, z, half):
+                if reach[int(v), int(u)] > 0.0 and _is_free(planes, first, x, y, z, cell):
                     out[i, j, k] = 1
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _is_free(planes: Planes, first: Map, x: float, y: float, z: float, half: float) -> bool:
-    """Whether a ball lies before everything that is held in all directions that meet it."""
+def _is_free(planes: Planes, first: Map, x: float, y: float, z: float, cell: float) -> bool:
+    """Whether a cell lies before everything that is held in all directions that meet it."""
     about, camera, light = angles_of(planes, x, y, z)
     a = (about - planes.low[0]) / planes.step[0]
     c = (camera - planes.low[1]) / planes.step[1]
@@ -209,11 +209,27 @@ def _is_free(planes: Planes, first: Map, x: float, y: float, z: float, half: flo
         return False
     near = math.sqrt((x - planes.camera[0]) ** 2 + (y - planes.camera[1]) ** 2 + (z - planes.camera[2]) ** 2)
     away = math.sqrt((x - planes.light[0]) ** 2 + (y - planes.light[1]) ** 2 + (z - planes.light[2]) ** 2)
-    wide, high = half / (near * math.sin(camera) * planes.step[0]), half / (near * planes.step[1])
+    p, q = math.cos(about), math.sin(about)
+    wide = _half_of_cell(planes, 0.0, -q, p, cell) / (near * math.sin(camera) * planes.step[0])
+    s, t = math.sin(camera), math.cos(camera)
+    high = _half_of_cell(planes, -s, t * p, t * q, cell) / (near * planes.step[1])
     # one sample more, as what is held may begin between two of them
-    deepest = (light - planes.low[2]) / planes.step[2] + half / (away * planes.step[2]) + 1.0
-    for s in range(math.floor(a - wide), math.ceil(a + wide) + 1):
-        for t in range(math.floor(c - high), math.ceil(c + high) + 1):
-            if s < 0 or t < 0 or s >= first.shape[0] or t >= first.shape[1] or first[s, t] <= deepest:
+    s, t = math.sin(light), math.cos(light)
+    deepest = _half_of_cell(planes, s, t * p, t * q, cell) / (away * planes.step[2])
+    deepest += (light - planes.low[2]) / planes.step[2] + 1.0
+    for m in range(math.floor(a - wide), math.ceil(a + wide) + 1):
+        for n in range(math.floor(c - high), math.ceil(c + high) + 1):
+            if m < 0 or n < 0 or m >= first.shape[0] or n >= first.shape[1] or first[m, n] <= deepest:
                 return False
     return True
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _half_of_cell(planes: Planes, along: float, p: float, q: float, cell: float) -> float:
+    """How far a cell reaches from its middle in a direction, given by the axes of the half planes."""
+    a = planes.axes
+    return 0.5 * cell * (
+        abs(along * a[0, 0] + p * a[1, 0] + q * a[2, 0])
+        + abs(along * a[0, 1] + p * a[1, 1] + q * a[2, 1])
+        + abs(along * a[0, 2] + p * a[1, 2] + q * a[2, 2])
+    )  # fmt: skip

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, label, uniform_filter
+from scipy.ndimage import binary_dilation, label, maximum_filter, uniform_filter
 
 from sfmapp.carve.leaning import Quotients, lamp_gains, leans_towards, quotients_of
 from sfmapp.carve.octree import Octree, places_of
@@ -30,6 +30,7 @@ from sfmapp.reporting import Report
 
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Most = NDArray[np.float32]
 Array = NDArray[np.float64]
 Levels = NDArray[np.float64]
 
@@ -98,7 +99,7 @@ class LitPhotograph:
 
 def find_shadows(
     photographs: Sequence[LitPhotograph], names: Sequence[str], *, fan_deg: float, edge_deg: float
-) -> tuple[list[list[Mask]], list[DetectionReport]]:
+) -> tuple[list[list[Mask]], list[Most], list[DetectionReport]]:
     """Pixels that are certainly in shadow.
 
     Args:
@@ -108,7 +109,8 @@ def find_shadows(
         fan_deg, edge_deg: as in :class:`~sfmapp.carve.shadow_carving.ShadowOptions`.
 
     Returns:
-        for each photograph a mask (H, W) for each light, and a report for each light.
+        for each photograph a mask (H, W) for each light; for each (L, H, W) as in
+        :class:`~sfmapp.carve.lamp_mixtures.LampLight`; and a report for each light.
     """
     num = len(names)
     sigmas = [noise_of([p.under[k] for p in photographs]) for k in range(num)]
@@ -118,18 +120,27 @@ def find_shadows(
     told = lamp_gains((_quotients(photograph) for photograph in photographs), np.maximum(gains, 1e-6))
     counts = np.zeros((num, 5))
     masks: list[list[Mask]] = []
+    lights: list[Most] = []
     for photograph in photographs:
         inside, angles, quotients = photograph.inside, photograph.angles_deg, _quotients(photograph)
         least = linear(_mean(photograph.lit) - _CERTAIN / 3.0 * sigma_lit)
         mirrors = _mirrors(photograph) & inside
         masks.append([])
+        lights.append(np.full((num, *inside.shape), np.inf, np.float32))
         for k, (sigma, gain) in enumerate(zip(sigmas, gains, strict=True)):
             limit = _SHARE * gain * least * quotient_of_lean(angles[k], fan_deg)
             # what no light at all may look like
             too_dark = inside & (limit <= linear(np.array(_CERTAIN / 3.0 * sigma)))
-            seen = linear(_mean(photograph.under[k]) + _CERTAIN / 3.0 * sigma) < limit
-            seen &= linear(_grey(photograph.under[k]) + _PIXEL * sigma) < limit
-            seen &= inside & ~too_dark & ~mirrors
+            shown = np.maximum(
+                linear(_mean(photograph.under[k]) + _CERTAIN / 3.0 * sigma),
+                linear(_grey(photograph.under[k]) + _PIXEL * sigma),
+            )
+            seen = (shown < limit) & inside & ~too_dark & ~mirrors
+            # nothing by lamps whose power is not known
+            usable = inside & ~mirrors & (told[k] * least > 0.0)
+            most = np.where(usable, shown / np.where(usable, told[k] * least, 1.0), np.inf)
+            # a pixel beside may show what the middle of a cell does not
+            lights[-1][k] = maximum_filter(most, 3)
             dark = seen if angles[k] <= edge_deg else leans_towards(quotients, told, k, seen)
             masks[-1].append(dark)
             counts[k] += [mask.sum() for mask in (inside, dark, seen & ~dark, too_dark, mirrors)]
@@ -139,7 +150,7 @@ def find_shadows(
                         too_dark_share=float(row[2]), mirror_share=float(row[3]))
         for name, gain, sigma, row in zip(names, gains, sigmas, shares, strict=True)
     ]  # fmt: skip
-    return masks, reports
+    return masks, lights, reports
 
 
 def doubts_of(reports: Sequence[DetectionReport]) -> list[str]:

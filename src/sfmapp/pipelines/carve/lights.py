@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.carve.cell_grid import depth_under, grid_of
+from sfmapp.carve.lamp_mixtures import LampLight
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.shadow_carving import Shadow, ShadowOptions, carve_shadows
 from sfmapp.carve.shadows import LitPhotograph, doubts_of, find_shadows
@@ -69,7 +70,7 @@ def carve_by_lights(
         photographs.append(LitPhotograph(pictures[0], pictures[1:], inside, view, at, octree))
         places.append(at)
     options = ShadowOptions() if file.sharpest_edge_deg is None else ShadowOptions(edge_deg=file.sharpest_edge_deg)
-    masks, lamps = find_shadows(
+    masks, brightness, lamps = find_shadows(
         photographs, [light.name for light in lights], fan_deg=options.fan_deg, edge_deg=options.edge_deg
     )
     for doubt in doubts_of(lamps):
@@ -77,7 +78,10 @@ def carve_by_lights(
     shadows = [
         Shadow(v, places[n][k], dark, lights[k].name) for n, v in enumerate(chosen) for k, dark in enumerate(masks[n])
     ]
-    carved, report = carve_shadows(octree, source.views, shadows, options, events, threads=threads or 2)
+    mixed = [LampLight(v, np.array(places[n]), brightness[n]) for n, v in enumerate(chosen)]
+    carved, report = carve_shadows(
+        octree, source.views, shadows, options, events, lights=mixed, threads=threads or 2
+    )  # fmt: skip
     if report.num_too_far:
         events.warned(
             "shadows",
