@@ -107,6 +107,7 @@ class ShadowCarvingReport(Report):
         sweeps: cells taken away in each passage of all photographs.
         cells_before, cells_after: of the finest level.
         volume_before, volume_after: of these, cubic units of the world.
+        volume_within: of those left that are wholly inside.
     """
 
     num_pairs: int
@@ -116,6 +117,7 @@ class ShadowCarvingReport(Report):
     cells_after: int
     volume_before: float
     volume_after: float
+    volume_within: float
 
 
 def carve_shadows(
@@ -158,12 +160,14 @@ def carve_shadows(
                 events.advanced("shadows", message=views[view].name)
             sweeps.append(taken)
             left -= taken
+    carved = octree_of(grid) if left < before else tree
     report = ShadowCarvingReport(
         num_pairs=len(used), num_too_far=len(shadows) - len(used), sweeps=sweeps, cells_before=before, cells_after=left,
         volume_before=before * tree.cell**3, volume_after=left * tree.cell**3,
+        volume_within=carved.volume_bounds()[0],
     )  # fmt: skip
     events.finished("shadows", f"{100.0 * (before - left) / max(before, 1):.1f} % of the hull taken away", **report)
-    return (octree_of(grid) if left < before else tree), report
+    return carved, report
 
 
 def _check(tree: Octree, views: Sequence[View], shadows: Sequence[Shadow]) -> None:

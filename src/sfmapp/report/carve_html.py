@@ -70,17 +70,21 @@ def _body(
 
 def _summary(report: CarveReport) -> str:
     fits = [fit.iou for fit in report.colors.views]
-    carving, surface = report.carving, report.surface
+    surface, low, high = report.surface, report.carving.volume_low, report.carving.volume_high
+    if report.shadows is not None:
+        low, high = report.shadows.carving.volume_within, report.shadows.carving.volume_after
     size = " x ".join(f"{high - low:.4g}" for low, high in zip(surface.low, surface.high, strict=True))
     text = (
         f"<p>Seen again by its {report.num_views} photographs, the volume covers their silhouettes by "
         f"{np.median(fits):.2%} in the median (intersection over union; least {min(fits):.2%}). Cameras: "
         f"{escape(report.cameras)}.</p><p>Its closed surface of {surface.num_faces:,} triangles measures {size}, with "
         f"a volume of {surface.volume:.5g} and an area of {surface.area:.5g}, in units of the world. Its volume lies "
-        f"between {carving.volume_low:.5g}, cells that are wholly inside, and {carving.volume_high:.5g}, with those at "
+        f"between {low:.5g}, cells that are wholly inside, and {high:.5g}, with those at "
         "the surface. "
     )
-    if report.joining is None:
+    if report.shadows is not None:
+        text += "The object itself may be smaller: what neither outlines nor shadows show stays filled."
+    elif report.joining is None:
         text += "The object itself may be smaller: what no outline shows, such as the inside of a cup, stays filled."
     else:
         joining = report.joining
@@ -94,7 +98,8 @@ def _summary(report: CarveReport) -> str:
     if report.shadows is not None:
         taken = report.shadows.carving
         told = "; ".join(
-            f"{light.light} {light.dark_share:.0%} in shadow, {light.turned_share:.0%} as dark but perhaps turned away"
+            f"{light.light} {light.dark_share:.0%} in shadow"
+            + (f", {light.turned_share:.0%} as dark but perhaps turned away" if light.turned_share > 0.005 else "")
             + (
                 f", {light.too_dark_share + light.mirror_share:.0%} not to be told"
                 if light.too_dark_share + light.mirror_share > 0.005
