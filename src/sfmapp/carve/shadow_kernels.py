@@ -228,8 +228,7 @@ def _is_free(planes: Planes, first: Map, x: float, y: float, z: float, cell: flo
 def _half_of_cell(planes: Planes, along: float, p: float, q: float, cell: float) -> float:
     """How far a cell reaches from its middle in a direction, given by the axes of the half planes."""
     a = planes.axes
-    return 0.5 * cell * (
-        abs(along * a[0, 0] + p * a[1, 0] + q * a[2, 0])
-        + abs(along * a[0, 1] + p * a[1, 1] + q * a[2, 1])
-        + abs(along * a[0, 2] + p * a[1, 2] + q * a[2, 2])
-    )  # fmt: skip
+    reach = 0.0
+    for n in range(3):
+        reach += 0.5 * cell * abs(along * a[0, n] + p * a[1, n] + q * a[2, n])
+    return reach
