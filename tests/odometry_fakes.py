@@ -85,6 +85,7 @@ class FakeRunner:
         events: Events,
         markers: object = None,
         with_imu: bool = True,
+        known: object = None,
     ) -> OdometryResult:
         events.started("odometry", total=sequence.num_frames)
         assert sequence.ground_truth is not None

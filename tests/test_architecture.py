@@ -60,7 +60,7 @@ FLOORS = (
 INNER_FLOORS = {
     "odometry": (
         ("run",),
-        ("recognition", "shutter"),
+        ("known_map_check", "recognition", "shutter"),
         ("records",),
         ("tracker", "initialize", "stereo_clock"),
         ("refinement",),
@@ -79,7 +79,7 @@ INNER_FLOORS = {
         ("calibration", "dense", "odometry"),
         ("sparse",),
         ("calibrated_model",),
-        ("lens_fit", "stored_pixels"),
+        ("lens_fit", "metres", "stored_pixels"),
     ),
 }
 LEVEL = {room: level for level, floor in enumerate(FLOORS) for room in floor}

@@ -24,7 +24,7 @@ from sfmapp.formats.ply_reader import read_ply_geometry
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.geodesy import LocalFrame
 from sfmapp.georeference.world_frame import Georeference, ModelPlace, write_georeference
-from sfmapp.pipelines.stereo.model_pairs import metre_sigma_of_run
+from sfmapp.pipelines.metres import metre_sigma_of_run
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.tracks import Tracks

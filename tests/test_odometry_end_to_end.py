@@ -104,6 +104,37 @@ def test_what_is_written_can_be_read_again(tracked: tuple[Path, TrackResult]) ->
         assert np.allclose(poses[0], poses[1], atol=1e-12)
 
 
+def test_a_second_run_is_localised_in_the_first_and_a_third_in_both(
+    room: Path, tracked: tuple[Path, TrackResult], tmp_path: Path
+) -> None:
+    second, third = tmp_path / "second", tmp_path / "third"
+    options = options_of(room, "sequence.start=20", f"odometry.known_map={tracked[0]}")
+    found, report = track_sequence(room / "frames", second, options, record=False)
+    assert report.stages.odometry is not None
+    told = report.stages.odometry.known_map
+    assert told is not None
+    assert told.num_localised == report["frames"]["num_with_pose"] == report["frames"]["num_frames"]
+    check_schema("odometry", json.loads((second / "report.json").read_text()))
+    assert [row["light"] for row in report["checks"] if row["name"] == f"found in {tracked[0]}"] == ["green"]
+    assert "frames localised in" in (second / "report.html").read_text()
+    # the same moments in the same place, without an alignment
+    names, poses = tracked[1].odometry.frame_names, tracked[1].odometry.cam_from_world
+    before = rigid3.center(np.array([poses[names.index(name)] for name in found.frame_names]))
+    assert np.linalg.norm(rigid3.center(found.cam_from_world) - before, axis=1).max() < 0.05 * np.ptp(before, 0).max()
+    assert all(name in read_odometry(second).frame_names for name in found.frame_names)
+    # a map in a map has pictures of both
+    options = options_of(room, "sequence.stop=12", f"odometry.known_map={second}")
+    _, report = track_sequence(room / "frames", third, options, record=False)
+    assert report.stages.odometry is not None
+    again = report.stages.odometry.known_map
+    assert again is not None
+    assert again.is_found
+    assert again.num_places == again.num_keyframes > told.num_keyframes
+    options = options_of(room, "scale.source=camera_height:1.5", f"odometry.known_map={second}")
+    with pytest.raises(UsageError, match="the unit of length is that of the map"):
+        track_sequence(room / "frames", tmp_path / "other", options)
+
+
 def test_what_contradicts_a_map_is_read_again_with_it(tracked: tuple[Path, TrackResult], tmp_path: Path) -> None:
     output = tmp_path / "out"
     found = Contradiction("given calibration", "f is too long", "calibrate", {"sigmas": 9.0}, 0.3)

@@ -124,6 +124,7 @@ def track_sequence(
     options: Options | None = None,
     *,
     self_calibrate: bool = False,
+    known_map: FilePath | None = None,
     record: bool = True,
     on_frame: Callable[[FrameSnapshot], None] | None = None,
     events: Events | None = None,
@@ -139,6 +140,8 @@ def track_sequence(
             frames in memory alone: nothing is written.
         options: of these, ``sequence``, ``odometry`` and ``scale``.
         self_calibrate: find the intrinsics by a reconstruction from the first minute.
+        known_map: OUT of an earlier ``track_sequence`` or ``reconstruct``, or a COLMAP model with its photographs: what
+            the sequence sees of it is localised there, in its frame and unit of length, and the rest is mapped anew.
         record: write ``recording.rrd``, which replays the run.
         on_frame: called with each frame as soon as its pose is known, in the thread that tracks: ``cam_from_world``
             (7,), NaN without a pose, ``state``, ``xy`` (N, 2) tracked pixels.
@@ -161,8 +164,12 @@ def track_sequence(
         >>> sfmapp.track_sequence(frames, on_frame=lambda frame: steer(frame.cam_from_world))
     """
     options, events = options_with(options, threads, seed), events or Events()
+    if known_map is not None:
+        options = replace(options, odometry=replace(options.odometry, known_map=os.fspath(known_map)))
     with _told_of_frames(events, on_frame):
         if output is None:
+            if options.odometry.known_map is not None:
+                raise UsageError("a sequence in a known map needs a folder for its results", "give the second argument")
             return TrackResult(_tracked_in_memory(source, options, events), None)
         from sfmapp.pipelines.odometry import track
 

@@ -28,6 +28,7 @@ examples:
   sfmapp odometry dataset/sequences/00 -o out/ --ground-truth poses/00.txt
   sfmapp odometry MH_01_easy -o out/ --mono --scale imu
   sfmapp odometry frames/ -o out/ --camera calib.json --scale marker:DICT_4X4_50:0.16
+  sfmapp odometry second_walk.mp4 -o out2/ --map out/ --camera PINHOLE,525,525,320,240
   sfmapp odometry drive.mcap -o out/ --image-topic /camera/image_raw
 
 Frames come from a folder of images, a video or stream, a bag of ROS 1 or 2, or a sequence of KITTI, TUM or EuRoC, whose
@@ -93,6 +94,10 @@ def _add_sequence_flags(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--imu-topic", metavar="TOPIC", help="topic of a bag with the IMU")
     group.add_argument("--scale", metavar="SOURCE", help=SCALE)
+    group.add_argument(
+        "--map", metavar="OUT", type=Path,
+        help="localise the sequence in the map of an earlier run, a reconstruction or a COLMAP model, and go on there",
+    )  # fmt: skip
     group.add_argument("--start", metavar="N", help="first frame to play")
     group.add_argument("--stop", metavar="N", help="play the frames before this one")
     group.add_argument("--step", metavar="N", help="play every Nth frame")
@@ -121,6 +126,7 @@ def _options(args: argparse.Namespace) -> Options:
 
     named = ("camera", "ground_truth", "imu", "image_topic", "imu_topic", "start", "stop", "step", "fps")
     flags: dict[str, Any] = {"seed": args.seed, "threads": args.threads, "scale.source": args.scale}
+    flags["odometry.known_map"] = args.map
     flags |= {f"sequence.{name}": getattr(args, name) for name in named}
     flags |= {f"sequence.{name}": True for name in ("mono", "reverse") if getattr(args, name)}
     settings = [*args.set, *(f"{name}={value}" for name, value in flags.items() if value is not None)]
@@ -222,7 +228,7 @@ def summary(output: Path, report: OdometryRunReport) -> dict[str, object]:
 
 
 def _print_summary(args: argparse.Namespace, report: OdometryRunReport) -> None:
-    from sfmapp.report.odometry_html import scale_text
+    from sfmapp.report.odometry_html import known_map_text, scale_text
 
     output, frames, first, run, timing = (
         args.output, report.frames, report.maps[0], report.run, report.timing,
@@ -244,6 +250,8 @@ def _print_summary(args: argparse.Namespace, report: OdometryRunReport) -> None:
                 f"  against the ground truth{which}: off by {ate.rmse:.3f} m rmse,"
                 f" {ate.max:.3f} m at worst, over {row.true_path_m:.1f} m ({row.alignment.upper()})"
             )
+    if report.stages.odometry is not None and report.stages.odometry.known_map is not None:
+        print(f"  {known_map_text(report.stages.odometry.known_map)}")
     print_contradictions(row for found in report.maps for row in found.contradictions)
     pace = ""
     if timing is not None:

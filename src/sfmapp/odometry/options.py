@@ -38,6 +38,8 @@ class OdometryOptions:
         max_lost_s: seconds without relocalization before a new map is begun
         motion: planar for a wheeled robot on level ground: a ground plane takes part in the closing adjustment, where
             the images agree; ackermann for a car of which the camera looks ahead, whose map may begin by one point
+        known_map: OUT of an earlier odometry run or reconstruction, or a COLMAP model with its photographs, that the
+            sequence is localised in
         loops: recognise places seen before, close loops and join maps
         refine_camera: refine the calibration where the images clearly contradict it
         smooth: also write the trajectory smoothed by an error-state filter: steadier, with short gaps bridged
@@ -56,6 +58,7 @@ class OdometryOptions:
     min_stereo_deg: float = 0.2
     max_lost_s: float = 1.0
     motion: Literal["free", "planar", "ackermann"] = "free"
+    known_map: str | None = None
     loops: bool = True
     refine_camera: bool = True
     smooth: bool = False

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from sfmapp.odometry.frontend.corners import find_corners
 from sfmapp.odometry.loops.closing import apply_closure, join_maps
-from sfmapp.odometry.loops.detection import LoopClosure, LoopFinder
+from sfmapp.odometry.loops.detection import LoopClosure, LoopFinder, LoopOptions
 from sfmapp.odometry.loops.place_recognition import PlaceIndex
 from sfmapp.odometry.loops.place_recognition import View as PlaceView
-from sfmapp.odometry.loops.relocalize import RelocalizeOptions, relocalize
+from sfmapp.odometry.loops.relocalize import Relocalization, RelocalizeOptions, is_ambiguous, relocalize
 from sfmapp.odometry.map.local_map import LocalMap, View
 from sfmapp.odometry.records import FrameRecord
 
@@ -36,14 +36,33 @@ _REST = 30
 
 
 class Recognition:
-    """All places of all maps."""
+    """All places of all maps.
+
+    Attributes:
+        num_ambiguous: frames that might have been at several places of a known map.
+    """
 
     def __init__(self, seed: int) -> None:
         self._places, self._finder = PlaceIndex(seed=seed), LoopFinder()
-        self._num_searches = 0
+        self._num_searches, self.num_ambiguous = 0, 0
         # keyframe of the current map up to which no loop is looked for
         self._resting_until = 0
         self._last = np.zeros(0, np.int64)
+
+    @property
+    def num_places(self) -> int:
+        """How many keyframes are remembered."""
+        return len(self._places)
+
+    def know(self, local: LocalMap) -> None:
+        """Remember the keyframes of a map that was there before, as far as there are pictures of them."""
+        for position, picture in local.known.pictures.items():
+            keyframe = local.keyframes.keyframes[position]
+            if len(keyframe.point_id) >= _MIN_POINTS:
+                self._places.add(
+                    local.map_idx, keyframe.frame_idx, picture, keyframe.xy[:, 0], keyframe.point_id
+                )  # fmt: skip
+        self._places.learn()
 
     def remember(
         self, maps: dict[int, LocalMap], local: LocalMap, view: View, xy: Array, ids: Ids
@@ -64,7 +83,22 @@ class Recognition:
         if local.newest < self._resting_until:
             return None
         keyframes = {number: other.keyframes for number, other in maps.items()}
-        return self._finder.find(keyframes, local.map_idx, self._places, view.frame_idx, seen)
+        closure = self._finder.find(keyframes, local.map_idx, self._places, view.frame_idx, seen)
+        if closure is not None and closure.old_map != closure.new_map and maps[closure.old_map].keyframes.num_known:
+            last = closure.views[-1]
+            frame_idx = maps[closure.old_map].keyframes.keyframes[last.old_idx].frame_idx
+            if self._is_elsewhere(maps, seen, Relocalization(closure.old_map, frame_idx, last.located)):
+                return None
+        return closure
+
+    def _is_elsewhere(
+        self, maps: dict[int, LocalMap], seen: PlaceView, found: Relocalization, roll: float = 0.0
+    ) -> bool:
+        """Whether what was found in a known map might be another place of it, and so is not to be believed."""
+        known = maps[found.map_idx].keyframes
+        is_open = is_ambiguous(known, self._places, seen, found, RelocalizeOptions(), roll)
+        self.num_ambiguous += is_open
+        return is_open
 
     def forget(self, frame_idx: int) -> bool:
         """Let go of a keyframe that is to be dropped; False if it is needed to confirm a loop."""
@@ -123,7 +157,7 @@ class Recognition:
         return kept, float(joined.kept_from_absorbed[7]) if newest is absorbed else 1.0
 
     def find(self, maps: dict[int, LocalMap], view: View) -> tuple[LocalMap, int, Array, Ids, Array] | None:
-        """Find a lost frame in any of the maps.
+        """Find a lost frame in any of the maps; in a known one as surely as a loop is, for nothing leads there.
 
         Returns:
             The map, the frame that it looks like, the pose (7,), and the points seen: ids (N,) and pixels (N, 2).
@@ -135,8 +169,13 @@ class Recognition:
             return None
         keyframes = {number: local.keyframes for number, local in maps.items()}
         roll, self._num_searches = math.radians(_ROLLS_DEG[self._num_searches % 3]), self._num_searches + 1
-        found = relocalize(keyframes, self._places, PlaceView(view.images[0], corners), RelocalizeOptions(), roll)
+        seen = PlaceView(view.images[0], corners)
+        found = relocalize(keyframes, self._places, seen, RelocalizeOptions(), roll)
         if found is None:
+            return None
+        if keyframes[found.map_idx].num_known and (
+            found.located.agreement < LoopOptions().min_agreement or self._is_elsewhere(maps, seen, found, roll)
+        ):
             return None
         located = found.located
         return (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,7 +149,10 @@ def gather(
     order = sorted(maps, key=lambda m: (-int((frame_map == m).sum()), m))
     place = np.array([-1 if m < 0 else order.index(int(m)) for m in frame_map], np.int32)
     results = [_map_result(maps[m], conclusions[m], images) for m in order]
-    covariance = [_covariance(record, results[m] if m >= 0 else None) for record, m in zip(records, place, strict=True)]
+    covariance = [
+        _covariance(record, results[m], maps[record.map_idx].num_known) if m >= 0 else _NO_COVARIANCE
+        for record, m in zip(records, place, strict=True)
+    ]
     return OdometryResult(
         np.array([r.frame_idx for r in records], np.int64), [r.name for r in records],
         np.array([r.timestamp_s for r in records]), poses, np.array([r.live for r in records]).reshape(-1, 7), place,
@@ -158,15 +161,15 @@ def gather(
     )  # fmt: skip
 
 
-def _covariance(record: FrameRecord, found: MapResult | None) -> Array:
-    """(6, 6) of a frame's pose in the gauge of its map; NaN where it is not known.
+def _covariance(record: FrameRecord, found: MapResult, num_known: int) -> Array:
+    """(6, 6) of a frame's pose in the gauge of its map, which knew so many keyframes before; NaN where it is not known.
 
     Points near a frame err together with the keyframe that it hangs on, whose covariance goes through the adjoint of
     the frame's pose relative to it; what the frame was measured with, given the points, is independent of that.
     """
-    if found is None or found.covariance is None:
+    if found.covariance is None:
         return _NO_COVARIANCE
-    of_keyframe: Array = found.covariance[record.keyframe]
+    of_keyframe: Array = found.covariance[record.keyframe - num_known]
     if record.is_keyframe:
         return of_keyframe
     rotation, adjoint = rigid3.rotation_matrix(record.frame_from_keyframe), np.zeros((6, 6))
@@ -181,16 +184,24 @@ def _map_result(keyframes: KeyframeMap, final: FinalAdjustment, images: Keyframe
     frame_idx = np.array([k.frame_idx for k in keyframes.keyframes], np.int64)
     image_idx = np.arange(num, dtype=np.int64) * num_sensors
     model.point_rgb = images.colors(model, frame_idx, image_idx)
+    own = slice(keyframes.num_known, None)  # keyframes of a known map are in the model, and no frames of this run
+    frame_idx, image_idx = frame_idx[own], image_idx[own]
+    final = replace(final, covariance=_own(final.covariance, own), noise_covariance=_own(final.noise_covariance, own))
     covariance, found = final.covariance, final.contradictions
+    gap = _covariance_gap(final, len(frame_idx))
     if covariance is not None:
-        poses = np.array([k.rig_from_world for k in keyframes.keyframes])
+        poses = np.array([k.rig_from_world for k in keyframes.keyframes[own]])
         covariance = widened(covariance, rigid3.spread(poses), found)
     return MapResult(
         model, frame_idx, image_idx, covariance, final.gauge, "stereo" if num_sensors > 1 else "none",
-        widened_scale_sigma(final.scale_sigma, found), found, _covariance_gap(final, num), final.noise_covariance,
+        widened_scale_sigma(final.scale_sigma, found), found, gap, final.noise_covariance,
         images.sightings(frame_idx, image_idx), final.adjustment, final.inertial,
         final.report.plane,
     )  # fmt: skip
+
+
+def _own(covariance: Array | None, own: slice) -> Array | None:
+    return None if covariance is None else covariance[own]
 
 
 def _covariance_gap(final: FinalAdjustment, num_keyframes: int) -> str:

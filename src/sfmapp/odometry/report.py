@@ -9,6 +9,38 @@ from sfmapp.contradictions import Contradiction
 from sfmapp.reporting import Report
 
 
+class KnownMapReport(Report):
+    """What a map that was there before has to do with a sequence.
+
+    Attributes:
+        source: of the known map. num_keyframes, num_places: keyframes (or photographs) of it, and those that have a
+            picture by which a place can be recognised.
+        is_found: frames were found in it.
+        num_localised: frames whose pose was measured against its landmarks. num_new: frames with a pose in its frame,
+            which see what was mapped anew. num_elsewhere: frames with a pose in a map of their own.
+        num_ambiguous: times that a frame might have been at several of its places, which was not believed.
+        max_sigmas: beyond that, position_sigmas or rotation_sigmas are a contradiction.
+        position_sigmas, rotation_sigmas: what the poses of keyframes by its landmarks alone, and by the sequence alone,
+            differ by, rms, in standard deviations. Absent where fewer than three keyframes tell.
+        moved: what positions differ by, rms, as a share of the size of the path.
+        worst: the frame that differs most.
+    """
+
+    source: str
+    num_keyframes: int
+    num_places: int
+    is_found: bool
+    num_localised: int
+    num_new: int
+    num_elsewhere: int
+    num_ambiguous: int
+    max_sigmas: float
+    position_sigmas: float | None = None
+    rotation_sigmas: float | None = None
+    moved: float | None = None
+    worst: str | None = None
+
+
 class OdometryReport(Report):
     """Counts of an odometry run.
 
@@ -18,6 +50,7 @@ class OdometryReport(Report):
         looked_still, looked_turned: frames in which the camera seemed to stand still, or to turn on the spot.
         right_late_frames: by how many frames the images of the second camera came late.
         pairs: what contradicts that the images of the two cameras are of the same moments.
+        known_map: of the map that was there before; absent without one.
     """
 
     num_frames: int
@@ -34,6 +67,7 @@ class OdometryReport(Report):
     looked_turned: int
     right_late_frames: int
     pairs: Sequence[Contradiction]
+    known_map: KnownMapReport | None = None
 
 
 class MapFacts(Report):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -19,16 +20,18 @@ from sfmapp.odometry.inertial.markers import MarkerDetector
 from sfmapp.odometry.inertial.smoothing import smooth_trajectory
 from sfmapp.odometry.initialize import MapInitializer, TwoViews
 from sfmapp.odometry.keyframe_images import KeyframeImages
+from sfmapp.odometry.known_map_check import KnownMapCheck
 from sfmapp.odometry.loops.sweep import is_too_large
 from sfmapp.odometry.map.atlas import Atlas
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
+from sfmapp.odometry.map.known_map import KnownMap, known_keyframes
 from sfmapp.odometry.map.local_map import LocalMap, View
 from sfmapp.odometry.motion_model import MotionModel
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.recognition import Recognition
 from sfmapp.odometry.records import FrameRecord, gather, leave_keyframe, measure_again
 from sfmapp.odometry.refinement.early_calibration import EarlyCalibration
-from sfmapp.odometry.refinement.final_adjustment import adjust_finally
+from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment, adjust_finally
 from sfmapp.odometry.report import OdometryReport, ShutterReport
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.shutter import straighten
@@ -94,7 +97,10 @@ class Odometry:
         events: Events,
         markers: MarkerDetector | None = None,
         with_imu: bool = True,
+        known: KnownMap | None = None,
     ) -> None:
+        if known is not None:  # its points were made with the cameras as they are: a refined one would not fit them
+            options = replace(options, refine_camera=False)
         self.rig, self.options, self.seed, self.events = sequence.rig, options, seed, events
         self.given_rig, self.calibration = sequence.rig, EarlyCalibration(options.refine_camera)
         self.executor = ThreadPoolExecutor(1, "adjust") if threads > 1 else None
@@ -107,7 +113,20 @@ class Odometry:
         self.recognition, self.keyframe_images = Recognition(seed), KeyframeImages(markers)
         self.tracked, self.motion = _Tracked(), MotionModel(sequence.imu)
         self.clock = StereoClock(self.rig)
+        self.known = None if known is None else self._enter_known_map(known)
         self._begin_to_wait()
+
+    def _enter_known_map(self, known: KnownMap) -> KnownMapCheck:
+        """Have a known map beside those that the run makes; whether the camera is in it the frames say."""
+        local = self.atlas.new_map(self.rig)
+        local.keyframes, local.known = known_keyframes(known, self.rig)
+        self.atlas.begin(local)
+        self.recognition.know(local)
+        for position, picture in local.known.pictures.items():
+            self.keyframe_images.look(local.keyframes.keyframes[position].frame_idx, picture)
+        self.state.expect_known_map()
+        self.local = local
+        return KnownMapCheck(known, local.keyframes, local.map_idx, self.recognition.num_places)
 
     def process(self, frame: Frame) -> FrameRecord:
         """Find the pose of the next frame."""
@@ -250,8 +269,9 @@ class Odometry:
     def _make_keyframe(self, record: FrameRecord, view: View, state: FrameState, reason: str) -> None:
         local, tracked = self.local, self.tracked
         assert local is not None
-        assert tracked.previous is not None
-        seen = self.clock.look(tracked.previous, view, self.records[-2].timestamp_s)
+        seen = view  # the first frame of all, which a known map may have told a pose, has none before it
+        if tracked.previous is not None:
+            seen = self.clock.look(tracked.previous, view, self.records[-2].timestamp_s)
         self._take_over(local, None)
         self._cull(local)
         tracked.tracks = local.add_keyframe(seen, tracked.pose, tracked.tracks, len(self.records))
@@ -310,10 +330,10 @@ class Odometry:
         """After a loss: look for the tracks where they were. They are dropped where a map may begin."""
         local, tracked = self.local, self.tracked
         assert local is not None
-        assert tracked.previous is not None
         self._take_over(local, None)
         if len(tracked.tracks) < MIN_INLIERS:
             return False
+        assert tracked.previous is not None
         found = track(local, tracked.tracks, tracked.pose, rigid3.IDENTITY, tracked.previous, view.pyramids[0])
         if found is None or found.num_inliers <= 0.5 * found.num_found:
             return False
@@ -332,12 +352,24 @@ class Odometry:
         self._begin_to_wait()
         self.local, frame_idx, self.tracked.pose, point_id, xy = found
         self.tracked.tracks = self.local.tracks_at(point_id, xy, self.tracked.pose)
+        self._find_known(view)
         self.motion.stop()
         self.counts.relocalizations += 1
         self._make_keyframe(record, view, FrameState.RELOCALIZED, f"relocalised at frame {frame_idx}")
         return True
 
+    def _find_known(self, view: View) -> None:
+        """Go by the pictures of a known map, in place of the corners that led there, where enough of it is found so."""
+        assert self.local is not None
+        found = self.local.find_known(view.pyramids[0], self.tracked.pose)
+        xyz = self.local.keyframes.point_xyz[found.point_id]
+        measured = measure_pose(self.local.camera, self.tracked.pose, xyz, found.xy)
+        if measured is not None:
+            self.tracked.pose, self.tracked.tracks = measured[0], found.subset(measured[2])
+
     def _note_loss(self, record: FrameRecord) -> None:
+        if self.counts.losses == 0:  # nothing is lost yet: the camera has not been found in the known map
+            return
         record.state = FrameState.LOST
         if record.timestamp_s == self.state.lost_since_s:
             self.events.warned(STAGE, f"{record.name}: tracking is lost", frame_idx=record.frame_idx)
@@ -408,12 +440,18 @@ class Odometry:
     def finish(self) -> OdometryResult:
         """Adjust what there is once more, and gather the result."""
         conclusions, maps = {}, dict[int, KeyframeMap]()
+        if self.known is not None and not self.known.is_entered(self.records):
+            del self.atlas.maps[self.known.map_idx]
+            self.events.warned(STAGE, "no frame was found in the known map: the sequence is a map of its own")
         for number, local in self.atlas.maps.items():
             local.backend.finish(local.keyframes)
-            maps[number] = local.keyframes
+            is_known = self.known is not None and number == self.known.map_idx
             self.events.started("adjustment", f"adjusting {local.newest + 1} keyframes together")
-            straightened = self._straighten(local)
-            conclusion = adjust_finally(local.keyframes, self.options, self.events, self.given_rig, self.imu)
+            straightened = None if is_known else self._straighten(local)
+            conclusion = self._conclude_known(local) if is_known else adjust_finally(
+                local.keyframes, self.options, self.events, self.given_rig, self.imu
+            )  # fmt: skip
+            maps[number] = local.keyframes
             conclusion.contradictions.extend(self.clock.contradictions(local.keyframes))
             conclusion.contradictions.extend(local.witnesses.contradictions(local.keyframes))
             conclusions[number] = replace(conclusion, report=replace(conclusion.report, shutter=straightened))
@@ -422,6 +460,8 @@ class Odometry:
         if self.executor is not None:
             self.executor.shutdown()
         result = gather(self.records, maps, conclusions, self.keyframe_images)
+        if self.known is not None and self.known.map_idx in maps:
+            self.known.hand_on(result, self.records)
         for m, entry in enumerate(result.maps):
             if entry.covariance_gap:
                 self.events.warned("adjustment", f"map {m}, covariances are missing: {entry.covariance_gap}")
@@ -430,8 +470,28 @@ class Odometry:
             for m in range(len(result.maps)):
                 poses = np.where((result.frame_map == m)[:, None], result.cam_from_world, np.nan)
                 result.smoothed.append(smooth_trajectory(result.timestamps_s, poses, result.measured_covariance))
-        result.report = self._report(result)
+        result.report = self._report(result, maps)
         return result
+
+    def _conclude_known(self, local: LocalMap) -> FinalAdjustment:
+        """Hold what was seen against the known map, and adjust both together where they agree; where they do not, the
+        sequence keeps a map of its own, in the known one's frame."""
+        assert self.known is not None
+        against = self.known.compare(local.keyframes)
+        if against is None or not against.is_contradiction:
+            # photographs of the map were not taken from a vehicle
+            options = replace(self.options, motion="free")
+            conclusion = adjust_finally(local.keyframes, options, self.events, self.given_rig)
+            self.known.restore_frame(local.keyframes)
+            return conclusion
+        found = self.known.contradiction(against)
+        self.events.warned(STAGE, found.message, subject=found.subject)
+        together = local.keyframes
+        local.keyframes = self.known.take_apart(together, self.records)
+        conclusion = adjust_finally(local.keyframes, self.options, self.events, self.given_rig)
+        self.known.lay_onto(local.keyframes, together)
+        conclusion.contradictions.append(found)
+        return conclusion
 
     def _straighten(self, local: LocalMap) -> ShutterReport | None:
         """Undo a rolling shutter where the images clearly show one; the numbers behind that, None where it was not
@@ -444,14 +504,19 @@ class Odometry:
             self.events.decided("adjustment", "the images show a rolling shutter, which is undone", **numbers)
         return numbers
 
-    def _report(self, result: OdometryResult) -> OdometryReport:
+    def _report(self, result: OdometryResult, maps: Mapping[int, KeyframeMap]) -> OdometryReport:
         tracked = np.isfinite(result.cam_from_world[:, 0])
+        known_map = None
+        if self.known is not None:
+            inside = maps.get(self.known.map_idx)
+            known_map = self.known.report(self.records, inside, self.recognition.num_ambiguous)
         return OdometryReport(
             num_frames=len(self.records), num_tracked=int(tracked.sum()), num_maps=len(result.maps),
             num_keyframes=[len(m.keyframe_frame_idx) for m in result.maps],
             tracking_cpu_s=sum(record.cpu_s for record in self.records),
             backend_cpu_s=sum(local.backend.cpu_s for local in self.atlas), **asdict(self.counts),
             right_late_frames=self.clock.shift, pairs=self.clock.contradictions(),
+            known_map=known_map,
         )  # fmt: skip
 
 
@@ -464,6 +529,7 @@ def run_odometry(
     events: Events | None = None,
     markers: MarkerDetector | None = None,
     with_imu: bool = True,
+    known: KnownMap | None = None,
 ) -> OdometryResult:
     """Follow the camera through a sequence.
 
@@ -476,13 +542,17 @@ def run_odometry(
         markers: looks for markers in the keyframes; what it finds is in the result's maps.
         with_imu: inertial measurements of the sequence count, in the windows of one camera and in the closing
             adjustment.
+        known: a map that the camera may be in from the start. What is seen of it is localised there, in its frame and
+            unit; the rest is mapped anew. The calibration is not refined then, and what lies in the known map is
+            adjusted by the images alone.
 
     Raises:
         InterruptedRunError: on cancellation.
     """
     events = events or Events()
     odometry = Odometry(
-        sequence, options, seed=seed, threads=threads, events=events, markers=markers, with_imu=with_imu
+        sequence, options, seed=seed, threads=threads, events=events, markers=markers, with_imu=with_imu,
+        known=known,
     )  # fmt: skip
     events.started(STAGE, total=sequence.num_frames)
     for frame in odometry.clock.pair(sequence.frames(), events):

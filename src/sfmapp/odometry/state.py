@@ -12,7 +12,8 @@ class Phase(Enum):
     INITIALIZING = auto()  # there is no map yet: one is begun as soon as the views allow it
     TRACKING = auto()  # its pose is measured in the current map
     LOST = auto()  # it is looked for where its tracks were, and in the places of all maps
-    STARTING_OVER = auto()  # it is looked for in the places of all maps, and another map may begin
+    # it is looked for in the places of all maps, and another map may begin; so begins a run that knows a map
+    STARTING_OVER = auto()
 
 
 _NEXT = {
@@ -44,6 +45,11 @@ class RunState:
     def may_begin_map(self) -> bool:
         """A map may begin with the next frame."""
         return self.phase in (Phase.INITIALIZING, Phase.STARTING_OVER)
+
+    def expect_known_map(self) -> None:
+        """There is a map from the start, and the camera may be in it; until it is found there another may begin."""
+        assert self.phase is Phase.INITIALIZING
+        self.phase = Phase.STARTING_OVER
 
     def track(self) -> None:
         """A map has begun, or the camera was found again in one."""

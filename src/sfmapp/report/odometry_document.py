@@ -21,6 +21,7 @@ from sfmapp.evaluation.trajectory import (
 )
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import GroundTruth
+from sfmapp.odometry.report import KnownMapReport
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.report.document import check, check_contradictions
 from sfmapp.report.model import Check, FramesReport, Gap, GroundTruthReport, Light, MapReport, MedianMax, TimingReport
@@ -218,7 +219,11 @@ def ground_truth_row(fit: GroundTruthFit, map_idx: int, poses: Literal["final", 
 
 
 def make_checks(
-    frames: FramesReport, maps: Sequence[MapReport], timing: TimingReport | None, facts: FrameTable
+    frames: FramesReport,
+    maps: Sequence[MapReport],
+    timing: TimingReport | None,
+    facts: FrameTable,
+    known_map: KnownMapReport | None = None,
 ) -> list[Check]:
     """Traffic lights over a run, each with its thresholds in words."""
     share = 100 * frames.num_in_largest_map / max(1, frames.num_frames)
@@ -242,4 +247,17 @@ def make_checks(
             thresholds = "green: every keyframe has a covariance, amber: some have"
             name = f"uncertainty of the keyframes of map {found.idx}"
             rows.append(Check(name=name, value=found.covariance_gap, light=light, thresholds=thresholds))
+    if known_map is not None:
+        rows.append(_known_map_check(known_map))
     return rows + check_contradictions(each for found in maps for each in found.contradictions)
+
+
+def _known_map_check(row: KnownMapReport) -> Check:
+    """Whether the sequence was found in the known map, and agrees with it."""
+    name, thresholds = f"found in {row.source}", "green: and in agreement, amber: cannot be compared, red: not found"
+    if not row.is_found:
+        return Check(name=name, value="no frame", light="red", thresholds=thresholds)
+    sigmas = [s for s in (row.position_sigmas, row.rotation_sigmas) if s is not None]
+    light: Light = "amber" if not sigmas else "green" if max(sigmas) <= row.max_sigmas else "red"
+    told = f", {max(sigmas):.1f} standard deviations off" if sigmas else ""
+    return Check(name=name, value=f"{row.num_localised} frames{told}", light=light, thresholds=thresholds)

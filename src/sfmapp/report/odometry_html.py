@@ -10,6 +10,7 @@ import numpy as np
 
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import GroundTruth
+from sfmapp.odometry.report import KnownMapReport
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.report.model import (
     Gap,
@@ -44,6 +45,8 @@ def render_odometry_html(
         body.append("<h2>Frame by frame</h2>" + _plots(result, facts, against))
         body.append(_gaps(report.frames.gaps))
     body.append(_maps(report.maps) + _ground_truth(report.ground_truth))
+    if report.stages.odometry is not None and report.stages.odometry.known_map is not None:
+        body.append(_known_map(report.stages.odometry.known_map))
     body.append(_loops(report.decisions) + _sequence(report.sequence, report.stages))
     body.append(adjustment_table((f"map {row.idx}", row.adjustment) for row in report.maps))
     body.append(_timing(report.timing) + usage_table(report.usage, report.run))
@@ -214,6 +217,27 @@ def _ground_truth(rows: Sequence[GroundTruthReport]) -> str:
             ]
         )  # fmt: skip
     return "<h2>Against the ground truth</h2>" + table(head, cells)
+
+
+def known_map_text(row: KnownMapReport) -> str:
+    """What a known map has to do with the sequence, in one sentence."""
+    if not row.is_found:
+        open_places = f"; {row.num_ambiguous} times it might have been at several places" if row.num_ambiguous else ""
+        return f"no frame was found in {row.source}{open_places}"
+    text = f"{row.num_localised} frames localised in {row.source}, {row.num_new} mapped anew beside it"
+    if row.num_elsewhere:
+        text += f", {row.num_elsewhere} in a map of their own"
+    if row.position_sigmas is None or row.rotation_sigmas is None:
+        return f"{text}; too few keyframes hang together to say whether both agree"
+    return (
+        f"{text}; positions by its landmarks and by the sequence alone differ by {row.position_sigmas:.1f} standard "
+        f"deviations, rotations by {row.rotation_sigmas:.1f} (rms)"
+    )
+
+
+def _known_map(row: KnownMapReport) -> str:
+    places = f"It has {row.num_keyframes} keyframes or photographs, {row.num_places} with a picture to know it by."
+    return f"<h2>Known map</h2><p>{escape(known_map_text(row))}.</p><p class=dim>{escape(places)}</p>"
 
 
 def _loops(decisions: Iterable[LogLine]) -> str:

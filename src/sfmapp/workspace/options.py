@@ -129,8 +129,11 @@ def with_absolute_paths(options: Options) -> Options:
     control = _with_absolute_paths(options.control, "file")
     poses = _with_absolute_paths(options.poses, "file")
     sequence = _with_absolute_paths(options.sequence, "camera", "imu", "ground_truth")
+    odometry = _with_absolute_paths(options.odometry, "known_map")
     gps = options.gps if options.gps.source in ("exif", "none") else _with_absolute_paths(options.gps, "source")
-    return dataclasses.replace(options, images=images, control=control, poses=poses, sequence=sequence, gps=gps)
+    return dataclasses.replace(
+        options, images=images, control=control, poses=poses, sequence=sequence, odometry=odometry, gps=gps
+    )
 
 
 def _with_absolute_paths(stage: Any, *names: str) -> Any:

@@ -68,7 +68,9 @@ def apply_closure(keyframes: KeyframeMap, places: PlaceIndex, closure: LoopClosu
         LoopEdge(v.old_idx, v.new_idx, closure.old_from_new, n)
         for v, n in zip(closure.views, closure.num_inliers, strict=True)
     ]
-    corrections = optimize_pose_graph(poses, essential_edges(keyframes), loops, keyframes.rig.is_stereo)
+    corrections = optimize_pose_graph(
+        poses, essential_edges(keyframes), loops, keyframes.rig.is_stereo, max(1, keyframes.num_known)
+    )
     apply_corrections(keyframes, corrections)
     pairs = closure.point_pairs
     renamed = np.stack([pairs.max(1), pairs.min(1)], 1)
@@ -80,7 +82,8 @@ def apply_closure(keyframes: KeyframeMap, places: PlaceIndex, closure: LoopClosu
 
 
 def join_maps(maps: dict[int, KeyframeMap], places: PlaceIndex, closure: LoopClosure) -> Joined:
-    """Bring the smaller of two maps into the larger. ``maps`` is not changed; ``places`` is.
+    """Bring the smaller of two maps into the larger, or into the one that was there before. ``maps`` is not changed;
+    ``places`` is.
 
     Raises:
         ValueError: the loop lies within one map.
@@ -88,7 +91,7 @@ def join_maps(maps: dict[int, KeyframeMap], places: PlaceIndex, closure: LoopClo
     if closure.new_map == closure.old_map:
         raise ValueError(f"the loop lies within map {closure.old_map}: use apply_closure")
     old, new = maps[closure.old_map], maps[closure.new_map]
-    keep_old = len(old.keyframes) >= len(new.keyframes)
+    keep_old = (old.num_known, len(old.keyframes)) >= (new.num_known, len(new.keyframes))
     kept_map, absorbed_map = (closure.old_map, closure.new_map) if keep_old else (closure.new_map, closure.old_map)
     kept, absorbed = maps[kept_map], maps[absorbed_map]
     kept_from_absorbed = closure.old_from_new if keep_old else similarity.inverse(closure.old_from_new)
@@ -100,6 +103,7 @@ def join_maps(maps: dict[int, KeyframeMap], places: PlaceIndex, closure: LoopClo
     joined.point_xyz[offset : offset + absorbed.num_points] = moved
     others = [_moved(k, kept_from_absorbed, offset) for k in absorbed.keyframes]
     joined.keyframes = sorted([*kept.keyframes, *others], key=lambda k: k.frame_idx)
+    joined.hold_same_known(kept)
     kept_id, absorbed_id = closure.point_pairs.T[::-1] if keep_old else closure.point_pairs.T
     renamed = np.stack([absorbed_id + offset, kept_id], 1)
     fuse_points(joined, renamed)
@@ -167,7 +171,7 @@ def adjust_seam(keyframes: KeyframeMap, fused: Ids, sides: list[list[int]]) -> N
         mine = np.flatnonzero(nearest[n] == nearest.min(0))
         order = np.lexsort((nearest[n][mine], -seeing[mine]))
         variable[mine[order[:_SEAM]]] = True
-    variable[0] = False
+    variable[: max(1, keyframes.num_known)] = False
     seen = np.zeros(keyframes.num_points, bool)
     for k in np.flatnonzero(variable):
         seen[keyframes.keyframes[k].point_id] = True

@@ -231,6 +231,11 @@ class PlaceIndex:
         for frame, other in self._row.items():
             self._row[frame] = other - (other > row)
 
+    def learn(self) -> None:
+        """Learn a vocabulary from the places so far, however few, if there is none: all of a map are known at once."""
+        if self._words is None and self._places:
+            self._learn()
+
     def _learn(self) -> None:
         """Learn a vocabulary from all places so far and embed them again."""
         self._num_learnt = len(self._places)

@@ -129,17 +129,19 @@ def _count_shared(ids: Ids, owner: Ids, counts: Ids) -> None:
             start = n
 
 
-def optimize_pose_graph(rig_from_world: Array, edges: GraphEdges, loops: Sequence[LoopEdge], fix_scale: bool) -> Array:
+def optimize_pose_graph(
+    rig_from_world: Array, edges: GraphEdges, loops: Sequence[LoopEdge], fix_scale: bool, num_fixed: int = 1
+) -> Array:
     """Where the keyframes belong once the loops count.
 
     Args:
         rig_from_world: (K, 7) as they are.
         edges: their ties. loops: the new ties.
         fix_scale: all keyframes keep the unit of length: the rig is stereo.
+        num_fixed: the first so many keyframes stay.
 
     Returns:
-        (K, 8) for each keyframe the similarity that takes the world around it to the corrected world. The first
-        keyframe stays.
+        (K, 8) for each keyframe the similarity that takes the world around it to the corrected world.
     """
     import gtsam
 
@@ -150,7 +152,8 @@ def optimize_pose_graph(rig_from_world: Array, edges: GraphEdges, loops: Sequenc
     size = 6 if fix_scale else 7
     between = gtsam.BetweenFactorPose3 if fix_scale else gtsam.BetweenFactorSimilarity3
     equal = gtsam.NonlinearEqualityPose3 if fix_scale else gtsam.NonlinearEqualitySimilarity3
-    graph.add(equal(0, world_from_rig[0]))
+    for k in range(num_fixed):
+        graph.add(equal(k, world_from_rig[k]))
     rows = zip(edges.pair, edges.num_shared, edges.depth, edges.baseline, strict=True)
     for (i, j), count, depth, baseline in rows:
         relative = world_from_rig[i].between(world_from_rig[j])

@@ -36,6 +36,9 @@ _SIFT_NORM2 = 512 * 512
 _CHANCE_RANK = 0.05
 # Points nearer than this to each other, in scales of a descriptor, show the same and do not count as others.
 _SAME_PATCH_SIGMAS = 8.0
+# Two poses of one image are two places beyond this: shares of the depth of what it sees, and degrees. An image that is
+# right in both agrees to a hundredth of that.
+_ELSEWHERE_DEPTHS, _ELSEWHERE_DEG = 0.1, 5.0
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,35 @@ def relocalize(
         if found is not None and is_convincing(found, view, options):
             return Relocalization(candidate.map_idx, candidate.frame_idx, found)
     return None
+
+
+def is_ambiguous(
+    keyframes: KeyframeMap,
+    places: PlaceIndex,
+    view: View,
+    found: Relocalization,
+    options: RelocalizeOptions,
+    roll: float = 0.0,
+) -> bool:
+    """Whether an image that was found in a map could as well be elsewhere in it: in a street of equal houses, a hall of
+    equal pillars.
+
+    Args:
+        keyframes, places: the map that it was found in. found: where. Others as of :func:`relocalize`.
+    """
+    pose = found.located.cam_from_world
+    depth = float(np.median(rigid3.apply(pose, keyframes.point_xyz[found.located.point_id])[:, 2]))
+    for candidate in places.query_view(view, roll):
+        if candidate.map_idx != found.map_idx or candidate.frame_idx == found.frame_idx:
+            continue
+        other = locate(keyframes, places, view, candidate, options, roll)
+        if other is None or not is_convincing(other, view, options):
+            continue
+        change = rigid3.compose(other.cam_from_world, rigid3.inverse(pose))
+        turn = rigid3.rotation_angle_deg(rigid3.rotation_matrix(change))
+        if np.linalg.norm(change[4:]) > _ELSEWHERE_DEPTHS * depth or turn > _ELSEWHERE_DEG:
+            return True
+    return False
 
 
 def locate(

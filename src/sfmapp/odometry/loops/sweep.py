@@ -21,10 +21,10 @@ def is_too_large(keyframes: KeyframeMap) -> bool:
 
 def sweep(keyframes: KeyframeMap, options: OdometryOptions, events: Events, num_sweeps: int = 2) -> None:
     """Adjust overlapping windows from the first keyframe to the last and again, in place; what is around a window and
-    shares points with it stays (block Gauss-Seidel)."""
+    shares points with it stays (block Gauss-Seidel), and so do the keyframes of a map that was there before."""
     num, step = len(keyframes.keyframes), max(1, options.window // 2)
     for _ in range(num_sweeps):
-        for newest in range(min(options.window, num) - 1, num, step):
+        for newest in range(max(min(options.window, num) - 1, keyframes.num_known), num, step):
             job = make_job(keyframes, *choose_window(keyframes, options, newest))
             take_over(run_job(job), keyframes)
             events.raise_if_cancelled()

@@ -68,11 +68,12 @@ def choose_window(
         newest: the last keyframe of the window; None for the newest there is.
 
     Returns:
-        (K,) ascending keyframe positions, (K,) which of them may move. The first keyframe never moves.
+        (K,) ascending keyframe positions, (K,) which of them may move. The first keyframe never moves, nor do those of
+        a map that was there before.
     """
     all_keyframes = keyframes.keyframes
     newest = len(all_keyframes) - 1 if newest is None else newest
-    first = max(0, newest - options.window + 1)
+    first = max(keyframes.num_known, newest - options.window + 1)
     seen = np.zeros(keyframes.num_points, bool)
     for keyframe in all_keyframes[first : newest + 1]:
         seen[keyframe.point_id] = True

@@ -45,13 +45,19 @@ class KeyframeMap:
         keyframes: K, in the order of time.
         point_xyz: (P, 3) float64 world, by point id; NaN where not triangulated. Grows with :meth:`new_points`.
         num_points: ids given out so far (``point_xyz`` has room for more).
+        num_known: the first so many keyframes are those of a map that was there before: only the closing adjustment
+            may move them.
+        num_known_points: ids below that are its points.
     """
 
     rig: Rig
     keyframes: list[Keyframe] = field(default_factory=list)
     point_xyz: Array = field(default_factory=lambda: np.full((1024, 3), np.nan))
     num_points: int = 0
+    num_known: int = 0
+    num_known_points: int = 0
     _num_observations: NDArray[np.int32] = field(default_factory=lambda: np.zeros(1024, np.int32))
+    _num_known_observations: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
 
     def append(self, keyframe: Keyframe) -> None:
         """Add a keyframe."""
@@ -77,6 +83,23 @@ class KeyframeMap:
     def num_observations(self, point_id: NDArray[np.int64]) -> NDArray[np.int32]:
         """(N,) how often points are seen, outliers included."""
         return self._num_observations[point_id]
+
+    def hold_known(self) -> None:
+        """All keyframes and points so far are those of a map that was there before."""
+        self.num_known, self.num_known_points = len(self.keyframes), self.num_points
+        self._num_known_observations = self._num_observations[: self.num_points].copy()
+
+    def hold_same_known(self, other: KeyframeMap) -> None:
+        """The known keyframes and points of another map are the first of this one, too."""
+        self.num_known, self.num_known_points = other.num_known, other.num_known_points
+        self._num_known_observations = other._num_known_observations
+
+    def num_own_observations(self, point_id: NDArray[np.int64]) -> NDArray[np.int32]:
+        """(N,) how often points are seen by other keyframes than those of a known map."""
+        own = self._num_observations[point_id]
+        known = point_id < len(self._num_known_observations)
+        own[known] -= self._num_known_observations[point_id[known]]
+        return own
 
     def new_points(self, count: int) -> NDArray[np.int64]:
         """Ids of so many new points, not triangulated yet."""

@@ -20,6 +20,7 @@ from sfmapp.odometry.frontend.stereo import match_stereo
 from sfmapp.odometry.inertial.window import NUM_KEYFRAMES, turns_between
 from sfmapp.odometry.map.backend import Backend, Job, choose_window, make_job
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.map.known_map import KnownPictures
 from sfmapp.odometry.map.moving import Witnesses
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.scene.rig import Rig
@@ -86,6 +87,7 @@ class LocalMap:
         self.backend = Backend(executor)
         self.images: dict[int, Pyramid] = {}
         self.witnesses = Witnesses()
+        self.known = KnownPictures({})
 
     @property
     def camera(self) -> Camera:
@@ -114,14 +116,14 @@ class LocalMap:
         return xyz, mapped
 
     def redundant_keyframe(self) -> int | None:
-        """The keyframe whose image was dropped last, if others see nearly all that it sees (Mur-Artal et al.,
-        "ORB-SLAM", 2015, section VI-E)."""
+        """The keyframe whose image was dropped last, if others of this run see nearly all that it sees (Mur-Artal et
+        al., "ORB-SLAM", 2015, section VI-E)."""
         position = self.newest - _KEPT_IMAGES
-        if position <= 0 or self.options.cull_seen >= 1:
+        if position <= self.keyframes.num_known or self.options.cull_seen >= 1:
             return None
         keyframe = self.keyframes.keyframes[position]
         ids = keyframe.point_id[keyframe.is_inlier[:, 0] & self.keyframes.is_triangulated(keyframe.point_id)]
-        others = self.keyframes.num_observations(ids) // len(self.rig.cameras) - 1
+        others = self.keyframes.num_own_observations(ids) // len(self.rig.cameras) - 1
         return position if (others >= 3).mean() > self.options.cull_seen else None
 
     def remove_keyframe(self, position: int) -> Keyframe:
@@ -154,6 +156,19 @@ class LocalMap:
         ray = pixels_to_normalized(self.camera, xy)
         return ActiveTracks(point_id, xy, number, xy.copy(), ray, 1 / depth, np.ones(len(xy), np.float32))
 
+    def find_known(self, pyramid: Pyramid, pose: Array) -> ActiveTracks:
+        """The landmarks of the known map that should be in sight from a pose (7,), as its pictures show them.
+
+        A corner that looks like a landmark is up to a pixel from it; its patch is found to a tenth.
+        """
+        known = self.known.near(self.keyframes, pose)
+        if not known:
+            return ActiveTracks.none()
+        recent, self.images = self.images, known
+        found = self._find_again(self._expected(ActiveTracks.none(), pyramid, pose), ActiveTracks.none(), pyramid)
+        self.images = recent
+        return found
+
     def add_keyframe(self, view: View, pose: Array, tracks: ActiveTracks, frame_number: int) -> ActiveTracks:
         """Make a keyframe of a tracked view: find lost points again, add corners, triangulate, begin to adjust.
 
@@ -165,11 +180,15 @@ class LocalMap:
             The tracks to follow from here.
         """
         pyramid = view.pyramids[0]
+        known = self.known.near(self.keyframes, pose)
+        self.images |= known
         if self.images:
             sought = self._expected(tracks, pyramid, pose)
             found = self._find_again(sought, tracks, pyramid)
             self._count_visible(view.frame_idx, tracks.point_id, found.point_id, sought, pyramid)
             tracks = tracks.joined(found)
+        for position in known:
+            del self.images[position]
         number = self.newest + 1
         self.images[number] = pyramid
         tracks = self._renew_references(tracks, number, pose)
@@ -196,7 +215,7 @@ class LocalMap:
         job = make_job(self.keyframes, *choose_window(self.keyframes, self.options))
         self._triangulate(job, tracks.point_id)
         if self._imu is not None:
-            first = max(0, self.newest + 1 - NUM_KEYFRAMES)
+            first = max(self.keyframes.num_known, self.newest + 1 - NUM_KEYFRAMES)
             recent = self.keyframes.keyframes[first:]
             times = np.array([keyframe.timestamp_s for keyframe in recent])
             poses = np.array([keyframe.rig_from_world for keyframe in recent])
@@ -217,6 +236,9 @@ class LocalMap:
     def _count_visible(self, frame_idx: int, tracked: Ids, found: Ids, sought: _Sought, pyramid: Pyramid) -> None:
         """Note how many of the points that should be in sight, and that have been seen often, are."""
         num_seen = _OFTEN * len(self.rig.cameras)
+        # of a map that was there before the report tells apart from these
+        tracked, found = (ids[ids >= self.keyframes.num_known_points] for ids in (tracked, found))
+        sought = sought.subset(sought.tracks.point_id >= self.keyframes.num_known_points)
         tracked = tracked[self.keyframes.is_triangulated(tracked)]
         num = [
             int((self.keyframes.num_observations(ids) >= num_seen).sum())
@@ -301,7 +323,8 @@ class LocalMap:
 
     def _renew_references(self, tracks: ActiveTracks, number: int, pose: Array) -> ActiveTracks:
         """Give tracks whose patch has changed, or whose reference image will be dropped, the new keyframe."""
-        stale = (tracks.zncc < _MIN_LIKENESS) | (tracks.reference <= number - _KEPT_IMAGES + 1)
+        oldest = max(number - _KEPT_IMAGES + 1, self.keyframes.num_known - 1)
+        stale = (tracks.zncc < _MIN_LIKENESS) | (tracks.reference <= oldest)
         xyz, _ = self.points_of(tracks)
         reference, reference_xy = tracks.reference.copy(), tracks.reference_xy.copy()
         ray, inverse_depth = tracks.reference_ray.copy(), tracks.inverse_depth.copy()

@@ -243,6 +243,7 @@ def make_report(
     assert run.sequence is not None
     frames = frame_summary(result)
     maps = [map_row(result, m) for m in range(len(result.maps))]
+    known_map = None if result.report is None else result.report.known_map
     timing = run.threads_cpu.timing(
         len(result.frame_idx), run.frames.tracking_s, run.sequence.frames_per_second, frame_statistics(facts.time_ms)
     )
@@ -255,7 +256,7 @@ def make_report(
         maps=maps,
         ground_truth=_ground_truth_rows(run, result, facts, against),
         timing=timing,
-        checks=make_checks(frames, maps, timing, facts) if maps else [],
+        checks=make_checks(frames, maps, timing, facts, known_map) if maps else [],
         usage=run.usage,
         warnings=run.log.warnings,
         decisions=run.log.decisions,

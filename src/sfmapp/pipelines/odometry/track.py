@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from sfmapp.images.video import VideoSequence
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
 from sfmapp.pipelines.odometry.filtering import filter_largest_map
+from sfmapp.pipelines.odometry.known_map import read_known_map
 from sfmapp.pipelines.odometry.results import write_odometry
 from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps, takes_imu
 from sfmapp.pipelines.odometry.tracking import Tracking
@@ -91,6 +93,11 @@ def track_sequence(
             "observation each takes ten times as long",
             "leave it out; sfmapp refine --set adjust.backend=gtsam adjusts the finished map so",
         )
+    if options is not None and options.odometry.known_map is not None and options.scale.source is not None:
+        raise UsageError(
+            f"--scale {options.scale.source}: the unit of length is that of the map in {options.odometry.known_map}",
+            "leave it out, or give that map its metres",
+        )
     request = parse_scale(options.scale.source) if options is not None and options.scale.source is not None else None
     with Tracking.opened(
         ODOMETRY, name, output, options, events=events, watch=watch, scale_request=request, sequence=sequence
@@ -111,14 +118,19 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
             run.stages = replace(run.stages, self_calibration=calibration)
         if run.sequence is None:
             run.sequence = open_sequence(run.source, options.sequence, events)
-        run.scale_request = resolve_scale_request(run.scale_request, options.scale.source is None, run.sequence)
+        is_auto = options.scale.source is None and options.odometry.known_map is None
+        run.scale_request = resolve_scale_request(run.scale_request, is_auto, run.sequence)
+    watched, known = Watched(run.sequence, run), None
+    if options.odometry.known_map is not None:
+        with run.stage("known map"):
+            found = read_known_map(Path(options.odometry.known_map), options, events)
+            known, watched.rig = found.known, found.rig_for(run.sequence.rig)
     if run.live is not None:
         run.live.begin(run.sequence)
     with run.stage("kernels"):
         compiled = compile_odometry_kernels(events, inertial=run.sequence.imu is not None)
         run.stages = replace(run.stages, kernels=compiled)
     run.save_first(lambda: run.workspace.begin(ODOMETRY, ""))
-    watched = Watched(run.sequence, run)
     with run.measured("odometry"):
         result = run_odometry(
             watched,
@@ -127,7 +139,8 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
             threads=run.threads,
             events=events.without_cancellation(),
             markers=None if run.scale_request is None else run.scale_request.detector(),
-            with_imu=takes_imu(run.scale_request, options.scale.source is None),
+            with_imu=takes_imu(run.scale_request, is_auto),
+            known=known,
         )
         run.threads_cpu.sample()
     run.stages = replace(run.stages, odometry=result.report)

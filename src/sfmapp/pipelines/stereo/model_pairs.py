@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,25 +12,21 @@ from sfmapp.dense.prepare import points_of_views
 from sfmapp.dense.selection import weigh_common_points
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap import read_model
-from sfmapp.formats.text_input import read_json_object
 from sfmapp.geometry import rigid3
-from sfmapp.georeference.world_frame import read_georeference
 from sfmapp.images.pixels import read_rgb
 from sfmapp.images.sources import position_of_name
 from sfmapp.pipelines.dense.source import find_source, is_of_model
+from sfmapp.pipelines.metres import metre_sigma_of_run
 from sfmapp.pipelines.stereo.sources import PairSource
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig
 from sfmapp.stereo.prepare import PairCameras
 from sfmapp.stereo.rectification import plan_rectification
-from sfmapp.workspace.layout import MANIFEST, ODOMETRY, REPORT, STEREO
-from sfmapp.workspace.manifest import read_manifest
+from sfmapp.workspace.layout import STEREO
 from sfmapp.workspace.options import Options
 
 __all__ = ["is_of_model", "pairs_of_model"]
 
-# the largest model of a run, whose pairs these are
-_MODEL = 0
 # under fewer degrees depths are poor, under more the two photographs look too different to be matched (Furukawa and
 # Hernandez, "Multi-view stereo: a tutorial", 2015, 2.3)
 _GOOD_DEG = (3.0, 15.0)
@@ -100,46 +95,6 @@ def _rig(model: Reconstruction, photographs: Photographs, pair: tuple[int, int],
     if leftmost and rigid3.center(second)[0] < 0.0:
         return _rig(model, photographs, pair[::-1])
     return Rig(tuple(photographs.cameras[one] for one in pair), np.array([rigid3.IDENTITY, second]))
-
-
-def metre_sigma_of_run(run: Path) -> float | None:
-    """Standard deviation of lengths, as a share, of the model of a run that was put into the world, lies on control of
-    a local frame, has its metres by known lengths, or is a track that has them; None where its unit is its own.
-
-    Raises:
-        InputError: what the run says of it is damaged.
-    """
-    placed = read_georeference(run)
-    place = None if placed is None else placed.place_of(_MODEL)
-    if place is not None:
-        return place.scale_sigma_share
-    if (run / MANIFEST).is_file() and (manifest := read_manifest(run)).command == ODOMETRY:
-        maps = manifest.stage(ODOMETRY).maps
-        return maps[_MODEL].scale_sigma if maps else None
-    path = run / REPORT
-    stages = read_json_object(path).get("stages") if path.is_file() else None
-    if not isinstance(stages, dict):
-        return None
-    if (by_control := _sigma_by_control(stages.get("control"))) is not None:
-        return by_control
-    units = stages.get("units")
-    scales = units.get("scales") if isinstance(units, dict) else None
-    told = [one.get("sigma_share") for one in scales or () if isinstance(one, dict) and one.get("model") == _MODEL]
-    return next((float(one) for one in told if isinstance(one, int | float)), None)
-
-
-def _sigma_by_control(control: Any) -> float | None:
-    """Of a model on control points that no coordinate system belongs to: what points that were left out are expected to
-    be off by horizontally, over how far they are apart: somewhat more than what all together leave of the scale."""
-    models = control.get("models") if isinstance(control, dict) else None
-    for one in models or ():
-        summary = one.get("summary")
-        if one.get("model") != _MODEL or one.get("reason") or not isinstance(summary, dict):
-            continue
-        places = np.array([point["xyz_m"] for point in one["points"] if point["role"] == "control"])
-        spread = float(np.sqrt(np.square(places - places.mean(0)).sum(1).mean())) if len(places) else 0.0
-        return float(summary["expected_horizontal_m"]) / spread if spread > 0.0 else None
-    return None
 
 
 def _source(
